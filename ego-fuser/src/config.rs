@@ -10,7 +10,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ego::Ego;
-use crate::misbehaviour::MisbehaviourConfig;
 use crate::pairing::PairingConfig;
 use fusion::method::Method;
 
@@ -94,6 +93,9 @@ pub struct EgoSettings {
     /// Leave out neighbours whose messages contradict what the ego perceives itself.
     #[arg(long)]
     pub trust: bool,
+    /// Track the detected objects, and publish their identities and velocities (stream `tracks`).
+    #[arg(long)]
+    pub tracks: bool,
     /// Limits of the messages of other vehicles.
     #[command(flatten)]
     pub inbox: InboxConfig,
@@ -122,6 +124,7 @@ impl Default for EgoSettings {
             max_age_ms: 150,
             pace: PaceMode::Auto,
             trust: false,
+            tracks: true,
             inbox: InboxConfig::default(),
         }
     }
@@ -142,12 +145,6 @@ impl EgoSettings {
     #[must_use]
     pub fn pairing(&self) -> PairingConfig {
         PairingConfig::with_max_age_nanos(self.max_age_ms.saturating_mul(1_000_000))
-    }
-
-    /// Misbehaviour detection, if it is enabled.
-    #[must_use]
-    pub fn trust(&self) -> Option<MisbehaviourConfig> {
-        self.trust.then(MisbehaviourConfig::default)
     }
 }
 

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use nalgebra::Isometry3;
 use perception::boxes::decode::Decoded;
-use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, detections, postprocess};
 use perception::detector::{Detector, check_values};
 use perception::weights::{METHOD_KEY, Weights};
 use protocol::{
@@ -19,7 +19,7 @@ use protocol::{
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
-use crate::misbehaviour::{Assessment, MisbehaviourConfig, MisbehaviourDetector};
+use crate::misbehaviour::{Assessment, MisbehaviourDetector};
 use fusion::f64_tensor;
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
@@ -130,16 +130,14 @@ impl Ego {
         }
     }
 
-    /// The same with misbehaviour detection: leaves out neighbours whose messages contradict the ego's perception.
+    /// The same with misbehaviour detection, if it is enabled: leaves out neighbours whose messages contradict the
+    /// ego's perception.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn with_misbehaviour_detection(
-        mut self,
-        config: Option<MisbehaviourConfig>,
-    ) -> Result<Self, EgoError> {
-        self.trust = config
-            .map(|config| MisbehaviourDetector::new(config, &mut self.detector))
+    pub fn with_misbehaviour_detection(mut self, is_enabled: bool) -> Result<Self, EgoError> {
+        self.trust = is_enabled
+            .then(|| MisbehaviourDetector::new(&mut self.detector))
             .transpose()?;
         Ok(self)
     }
@@ -493,14 +491,7 @@ impl Ego {
         let heads = self.detector.heads(features)?;
         stages.lap("head");
         let decoded = self.detector.boxes(&heads, self.limits.score_threshold)?;
-        let boxes = AgentBoxes {
-            boxes: &decoded,
-            output_from_agent: Isometry3::identity(),
-        };
-        let detections = postprocess(&[boxes], &self.limits)
-            .iter()
-            .map(|found| found.detection(None))
-            .collect();
+        let detections = detections(&decoded, &self.limits);
         stages.lap("boxes");
         Ok(detections)
     }

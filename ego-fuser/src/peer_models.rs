@@ -9,20 +9,6 @@ use perception::detector::Detector;
 use protocol::message::{Descriptor, ModelHash};
 use protocol::{BevGrid, CavId, EncodedFeatures, WireError};
 
-/// A network that differs from the ego's: the differing field, and both values.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub(crate) enum OtherModel {
-    /// Another grid.
-    #[error("grid is {found}, the ego's is {own}")]
-    Grid { found: BevGrid, own: BevGrid },
-    /// Another number of channels.
-    #[error("channels are {found}, the ego's are {own}")]
-    Channels { found: u32, own: u32 },
-    /// Other weights.
-    #[error("model_hash is {found}, the ego's is {own}")]
-    Hash { found: ModelHash, own: ModelHash },
-}
-
 /// The ego's network, and the agents known to run another one. Agents without a descriptor are not among them.
 pub(crate) struct PeerModels {
     grid: BevGrid,
@@ -30,7 +16,8 @@ pub(crate) struct PeerModels {
     channels: u32,
     code_of: Option<u32>,
     model_hash: ModelHash,
-    others: BTreeMap<CavId, OtherModel>,
+    /// The field that differs, and both values.
+    others: BTreeMap<CavId, String>,
 }
 
 impl PeerModels {
@@ -54,7 +41,7 @@ impl PeerModels {
     }
 
     /// Processes an agent's descriptor; returns the difference of its network when it is new.
-    pub(crate) fn update(&mut self, cav: &CavId, descriptor: &Descriptor) -> Option<OtherModel> {
+    pub(crate) fn update(&mut self, cav: &CavId, descriptor: &Descriptor) -> Option<String> {
         let Some(other) = self.difference(descriptor) else {
             if self.others.remove(cav).is_some() {
                 tracing::info!(%cav, "its maps are of the ego's network now");
@@ -75,18 +62,18 @@ impl PeerModels {
         self.others.remove(cav);
     }
 
-    fn difference(&self, descriptor: &Descriptor) -> Option<OtherModel> {
+    fn difference(&self, descriptor: &Descriptor) -> Option<String> {
         // Its streams and numeric type are not part of the network.
         let (found, own) = (descriptor.grid, self.grid);
         if found != own {
-            return Some(OtherModel::Grid { found, own });
+            return Some(format!("grid is {found}, the ego's is {own}"));
         }
         let (found, own) = (descriptor.channels, self.channels);
         if found != own {
-            return Some(OtherModel::Channels { found, own });
+            return Some(format!("channels are {found}, the ego's are {own}"));
         }
         let (found, own) = (descriptor.model_hash, self.model_hash);
-        (found != own).then_some(OtherModel::Hash { found, own })
+        (found != own).then(|| format!("model_hash is {found}, the ego's is {own}"))
     }
 }
 
@@ -129,7 +116,7 @@ mod tests {
             model_hash: ModelHash([8; 32]),
             ..same.clone()
         };
-        let text = models.update(&cav, &hash).unwrap().to_string();
+        let text = models.update(&cav, &hash).unwrap();
         assert!(
             text.contains("model_hash")
                 && text.contains(&"07".repeat(32))
@@ -143,19 +130,13 @@ mod tests {
         };
         assert_eq!(
             models.update(&cav, &narrow),
-            Some(OtherModel::Channels { found: 32, own: 64 })
+            Some("channels are 32, the ego's are 64".to_owned())
         );
         let wide = Descriptor {
             grid: BevGrid { width: 256, ..grid },
             ..narrow
         };
-        assert!(
-            models
-                .update(&cav, &wide)
-                .unwrap()
-                .to_string()
-                .starts_with("grid is ")
-        );
+        assert!(models.update(&cav, &wide).unwrap().starts_with("grid is "));
 
         assert_eq!(models.update(&cav, &same), None);
         assert!(!models.is_other(&cav));

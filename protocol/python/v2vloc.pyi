@@ -105,6 +105,47 @@ class Detections:
         """Durations of the ego's stages, milliseconds."""
     def __len__(self) -> int: ...
 
+class Tracks:
+    """Tracks of an ego after a frame, in the frame of its LiDAR."""
+
+    @property
+    def cav(self) -> str:
+        """The ego."""
+    @property
+    def agent_frame(self) -> int:
+        """Frame of the ego's own agent, from 0."""
+    @property
+    def ids(self) -> NDArray[np.uint64]:
+        """``[N]``: identities, rising, from 1; never used again by the same ego."""
+    @property
+    def boxes(self) -> NDArray[np.float64]:
+        """``[N, 7]``: x, y, z, dx, dy, dz (metres), heading (radians)."""
+    @property
+    def velocities_mps(self) -> NDArray[np.float64]:
+        """``[N, 2]``: velocity over ground along x, y of the ego's LiDAR frame."""
+    @property
+    def covariances(self) -> NDArray[np.float32]:
+        """``[N, 4, 4]``: of x, y, velocity x, velocity y; metres and metres per second."""
+    @property
+    def scores(self) -> NDArray[np.float64]:
+        """``[N]``, 0 to 1: mean score of the detections times the probability that the object exists."""
+    @property
+    def hits(self) -> NDArray[np.uint32]:
+        """``[N]``: number of detections."""
+    @property
+    def ages_s(self) -> NDArray[np.float64]:
+        """``[N]``: time since the first detection."""
+    @property
+    def unseen_s(self) -> NDArray[np.float64]:
+        """``[N]``: time since the last detection; 0: detected in this frame, else the place is predicted."""
+    @property
+    def pose(self) -> PoseEstimate:
+        """Pose of the ego; without one there are no tracks."""
+    @property
+    def left_out(self) -> int:
+        """Detections that were left out: too many, or with a number that is none."""
+    def __len__(self) -> int: ...
+
 class Objects:
     """Annotated objects."""
 
@@ -203,6 +244,9 @@ class Frame:
     @property
     def detections(self) -> dict[str, Detections]:
         """Results by the id of the ego."""
+    @property
+    def tracks(self) -> dict[str, Tracks]:
+        """Tracks by the id of the ego, if it tracks."""
     @property
     def ego(self) -> Optional[str]:
         """The vehicle of the first result; without one the first agent."""
@@ -328,7 +372,7 @@ def listen(
     :param timeout_s: iteration ends when no message has arrived for so long; ``None``: it waits.
     :param credentials: folder with keys of a viewer or recorder (``v2vloc keys``), for runs with access control. Feature
         maps need those of a recorder.
-    :param streams: default: gnss, imu, pose, bev, boxes, points, detections and truth. Also lidar, radar, camera,
+    :param streams: default: gnss, imu, pose, bev, boxes, points, detections, tracks and truth. Also lidar, radar, camera,
         descriptor, pace, stats.
     :param settle_s: a frame is handed over when its last message is so old. Later ones are counted.
     :raises Error: if there is no such router, or no message of the run.

@@ -3,13 +3,13 @@
 //! | principal | publishes | subscribes to |
 //! | --- | --- | --- |
 //! | `agent-<cav>` | its pose, maps, boxes, points, descriptor | its own sensors |
-//! | `ego-<cav>` | its detections | the streams of all agents, directly or behind its link |
+//! | `ego-<cav>` | its detections and tracks | the streams of all agents, directly or behind its link |
 //! | `link-<ego>` | `rx/<ego>/...` | the streams of all agents, and their `gnss` poses |
 //! | `replay` | sensors of every vehicle and previews of them, the truth, the end of the scene | control, readiness, detections |
-//! | `scorer` | control | the truth, detections, poses, statistics |
+//! | `scorer` | control | the truth, detections, tracks, poses, statistics |
 //! | `recorder` | nothing | everything but previews |
 //! | `viewer` | nothing | results, descriptors, previews of sweeps, feature maps, images, statistics |
-//! | `ros2` | sweeps, motion and stated poses of every vehicle | sweeps, motion, poses, detections, statistics |
+//! | `ros2` | sweeps, motion and stated poses of every vehicle | sweeps, motion, poses, detections, tracks, statistics |
 //!
 //! In addition every process declares a liveliness token and publishes its readiness and its ledger, each under its own
 //! name.
@@ -96,20 +96,33 @@ impl Principal {
             Role::Scorer => {
                 publish.push(keys(&"control/*"));
                 subscribe.extend(["truth", "stats/*", "control/*"].map(|topic| keys(&topic)));
-                subscribe.extend(everyones(&[Stream::Detections, Stream::Pose]));
+                subscribe.extend(everyones(&[
+                    Stream::Detections,
+                    Stream::Tracks,
+                    Stream::Pose,
+                ]));
             }
             Role::Recorder => subscribe.push(keys(&"**")),
             Role::Viewer => {
-                use Stream::{Bev, Boxes, Camera, Descriptor, Detections, Pose, Preview};
-                let shown = [Pose, Boxes, Detections, Preview, Descriptor, Bev, Camera(0)];
+                use Stream::{Bev, Boxes, Camera, Descriptor, Detections, Pose, Preview, Tracks};
+                let shown = [
+                    Pose,
+                    Boxes,
+                    Detections,
+                    Tracks,
+                    Preview,
+                    Descriptor,
+                    Bev,
+                    Camera(0),
+                ];
                 subscribe.extend(everyones(&shown));
                 let rest = ["rx/*/*/pose", "truth", "stats/*", "control/*"];
                 subscribe.extend(rest.map(|topic| keys(&topic)));
             }
             Role::Ros2 => {
-                publish.extend(everyones(&[Stream::Lidar, Stream::Imu, Stream::Gnss]));
-                let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
-                subscribe.extend(everyones(&streams));
+                use Stream::{Detections, Gnss, Imu, Lidar, Pose, Tracks};
+                publish.extend(everyones(&[Lidar, Imu, Gnss]));
+                subscribe.extend(everyones(&[Lidar, Imu, Pose, Detections, Tracks]));
                 subscribe.push(keys(&"stats/*"));
             }
         }

@@ -3,6 +3,7 @@
 use crc32fast::Hasher;
 
 use crate::WireError;
+use crate::checks::check_each;
 
 // Bodies are cast, not converted.
 #[cfg(target_endian = "big")]
@@ -79,12 +80,7 @@ pub enum BodyShape {
 impl BodyShape {
     /// Checks a length in bytes against the shape.
     pub(crate) fn check(self, body_len: u64) -> Result<(), WireError> {
-        let (min, max) = match self {
-            Self::Empty => (0, 0),
-            Self::Bytes { min, max } => (min, max),
-            Self::Floats(count) => exactly(count, 4),
-            Self::Points(count) => exactly(count, 16),
-        };
+        let (min, max) = self.bounds();
         if (min..=max).contains(&body_len) {
             return Ok(());
         }
@@ -94,6 +90,16 @@ impl BodyShape {
             expected,
             found: body_len,
         })
+    }
+
+    /// Least and greatest length in bytes.
+    pub(crate) fn bounds(self) -> (u64, u64) {
+        match self {
+            Self::Empty => (0, 0),
+            Self::Bytes { min, max } => (min, max),
+            Self::Floats(count) => exactly(count, 4),
+            Self::Points(count) => exactly(count, 16),
+        }
     }
 }
 
@@ -293,20 +299,9 @@ pub(crate) fn check_values(
         return Ok(());
     }
     let headroom = headroom(max_abs);
-    match values
-        .iter()
-        .enumerate()
-        .find(|(_, value)| excess_over(headroom, **value) < 0)
-    {
-        None => Ok(()),
-        Some((index, value)) => Err(WireError::Value {
-            what,
-            index,
-            value: f64::from(*value),
-            min: f64::from(-max_abs),
-            max: f64::from(max_abs),
-        }),
-    }
+    check_each(what, values, [-max_abs, max_abs], |value| {
+        excess_over(headroom, value) >= 0
+    })
 }
 
 #[cfg(test)]

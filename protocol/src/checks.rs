@@ -22,6 +22,25 @@ pub(crate) fn check_within(
     })
 }
 
+/// Refuses the first number that is not valid; `min` and `max` are for the message only.
+pub(crate) fn check_each(
+    what: &'static str,
+    values: &[f32],
+    [min, max]: [f32; 2],
+    is_valid: impl Fn(f32) -> bool,
+) -> Result<(), WireError> {
+    let Some(index) = values.iter().position(|value| !is_valid(*value)) else {
+        return Ok(());
+    };
+    Err(WireError::Value {
+        what,
+        index,
+        value: values.get(index).copied().unwrap_or(f32::NAN).into(),
+        min: min.into(),
+        max: max.into(),
+    })
+}
+
 /// Refuses more than the limit.
 pub(crate) fn check_limit(what: &'static str, found: u64, max: u64) -> Result<(), WireError> {
     if found <= max {

@@ -5,6 +5,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::string_enum::written_as_text;
+
 /// Reserved chunks at the position of a CAV in a key: a vehicle of that name would publish onto a key of another
 /// process.
 pub(crate) const RESERVED_CAV_IDS: [&str; 6] =
@@ -103,19 +105,7 @@ macro_rules! identifier {
             }
         }
 
-        impl TryFrom<String> for $name {
-            type Error = IdError;
-
-            fn try_from(text: String) -> Result<Self, IdError> {
-                Self::new(&text)
-            }
-        }
-
-        impl From<$name> for String {
-            fn from(id: $name) -> Self {
-                id.0.into()
-            }
-        }
+        written_as_text!($name);
     };
 }
 

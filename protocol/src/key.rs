@@ -19,7 +19,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use crate::text::excerpt;
-use crate::{CavId, IdError, ProcessId, Role, RunId, RunScope, Stream, Topic, Verb};
+use crate::{CavId, IdError, ProcessId, Role, RunId, RunScope, Stream, Topic};
 
 /// First chunk of every key.
 pub(crate) const KEY_ROOT: &str = "v2v";
@@ -76,36 +76,7 @@ pub struct Key {
 impl Key {
     /// `v2v/<run>/<cav>/<stream>`.
     pub fn stream(run: &RunId, cav: &CavId, stream: Stream) -> Self {
-        Topic::Stream {
-            cav: cav.clone(),
-            stream,
-        }
-        .in_run(run)
-    }
-
-    /// `v2v/<run>/rx/<ego>/<cav>/<stream>`.
-    pub fn received(run: &RunId, ego: &CavId, cav: &CavId, stream: Stream) -> Self {
-        Topic::Received {
-            ego: ego.clone(),
-            cav: cav.clone(),
-            stream,
-        }
-        .in_run(run)
-    }
-
-    /// `v2v/<run>/truth`.
-    pub fn truth(run: &RunId) -> Self {
-        Topic::Truth.in_run(run)
-    }
-
-    /// `v2v/<run>/control/<verb>`.
-    pub fn control(run: &RunId, verb: Verb) -> Self {
-        Topic::Control(verb).in_run(run)
-    }
-
-    /// `v2v/<run>/ready/<process>`.
-    pub fn ready(run: &RunId, process: &ProcessId) -> Self {
-        Topic::Ready(process.clone()).in_run(run)
+        Topic::stream(cav, stream).in_run(run)
     }
 
     /// `v2v/<run>/stats/<process>`.
@@ -248,6 +219,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::Verb;
 
     fn cav(text: &str) -> CavId {
         CavId::new(text).unwrap()
@@ -284,14 +256,27 @@ mod tests {
                 Key::stream(run, ego, Stream::DetectionsJson),
                 "v2v/r1/4279/detections/json",
             ),
+            (Key::stream(run, ego, Stream::Tracks), "v2v/r1/4279/tracks"),
             (
-                Key::received(run, ego, other, Stream::Bev),
+                Key::stream(run, ego, Stream::TracksJson),
+                "v2v/r1/4279/tracks/json",
+            ),
+            (
+                Topic::Received {
+                    ego: ego.clone(),
+                    cav: other.clone(),
+                    stream: Stream::Bev,
+                }
+                .in_run(run),
                 "v2v/r1/rx/4279/-1/bev",
             ),
-            (Key::truth(run), "v2v/r1/truth"),
-            (Key::control(run, Verb::Start), "v2v/r1/control/start"),
+            (Topic::Truth.in_run(run), "v2v/r1/truth"),
             (
-                Key::ready(run, &ProcessId::new("agent-4279").unwrap()),
+                Topic::Control(Verb::Start).in_run(run),
+                "v2v/r1/control/start",
+            ),
+            (
+                Topic::Ready(ProcessId::new("agent-4279").unwrap()).in_run(run),
                 "v2v/r1/ready/agent-4279",
             ),
             (
@@ -309,7 +294,7 @@ mod tests {
             assert_eq!(text.parse::<Key>().unwrap(), key);
         }
         for verb in Verb::ALL {
-            let key = Key::control(&RunId::new("r").unwrap(), verb);
+            let key = Topic::Control(verb).in_run(&RunId::new("r").unwrap());
             assert_eq!(key.to_string().parse::<Key>().unwrap(), key);
         }
         for role in Role::ALL {

@@ -50,7 +50,8 @@
 //! | [`Points`] | `points` | agent | ego-fusers (early fusion) |
 //! | [`Descriptor`] | `descriptor` | agent | ego-fusers |
 //! | [`Detections`] | `detections` | ego-fuser | scorer, anyone |
-//! | [`DetectionsReport`] | `detections/json` | ego-fuser | any reader of JSON |
+//! | [`Tracks`] | `tracks` | ego-fuser | scorer, anyone |
+//! | [`DetectionsReport`], [`TracksReport`] | `detections/json`, `tracks/json` | ego-fuser | any reader of JSON |
 //! | [`Truth`] | `truth` | replay | scorer |
 //! | [`Control`] | `control/*`, and probes on any key | operator, replay, every process | replay, every process |
 //! | [`Stats`] | `stats/<process>` | every process | operator |
@@ -137,10 +138,11 @@ pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Camera, CameraMetadata, Control, Descriptor, Detections,
-    DetectionsReport, EgoMotion, FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind, Lidar,
-    Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, Pinhole, PlanarCovariance,
-    Points, PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats,
-    SweepArrival, TopicCount, TopicTraffic, TrueObject, Truth,
+    DetectionsReport, EgoMotion, FrameReport, FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind,
+    Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, Pinhole,
+    PlanarCovariance, Points, PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary,
+    StageTiming, Stats, SweepArrival, TopicCount, TopicTraffic, Track, Tracks, TracksReport,
+    TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

@@ -132,6 +132,10 @@ streams! {
     Detections = "detections": Some(Kind::Detections), Ego, true, Some(4 << 20);
     /// `detections/json`: the same as JSON.
     DetectionsJson = "detections/json": None, Ego, true, None;
+    /// `tracks`: tracks of an ego.
+    Tracks = "tracks": Some(Kind::Tracks), Ego, true, Some(4 << 20);
+    /// `tracks/json`: the same as JSON.
+    TracksJson = "tracks/json": None, Ego, true, None;
 }
 
 impl Stream {

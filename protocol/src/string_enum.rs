@@ -35,6 +35,8 @@ macro_rules! named {
 
 /// Conversions from and to an owned text, by way of `FromStr` and `Display`, as serde requires them for a type that is
 /// written as text.
+#[doc(hidden)]
+#[macro_export]
 macro_rules! written_as_text {
     ($name:ident) => {
         impl TryFrom<String> for $name {

@@ -269,6 +269,7 @@ fn smaller_limits_are_kept_too() {
             Message::Radar(_) | Message::Points(_) | Message::Boxes(_) | Message::Bev(_) => true,
             Message::Descriptor(_)
             | Message::Detections(_)
+            | Message::Tracks(_)
             | Message::Truth(_)
             | Message::Stats(_) => true,
             Message::Control(protocol::Control::End { .. } | protocol::Control::Ready { .. }) => {

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use proptest::prelude::*;
 use protocol::{
     Bev, BevFeatures, Body, CodecConfig, DecodedFeatures, DetectionsReport, Dtype, Limits, Message,
-    WireError, encode_features, wire,
+    TracksReport, WireError, encode_features, wire,
 };
 use sample::any::{any_map, any_message, any_stamp};
 
@@ -93,6 +93,22 @@ fn detections_json_is_stable() {
     assert_eq!(value["pose"]["pose"]["confidence"], 0.875);
     let back: DetectionsReport = serde_json::from_str(&json).unwrap();
     assert_eq!((back.tick, back.result), (Some(7), sample::detections()));
+}
+
+#[test]
+fn tracks_json_is_stable() {
+    let json = TracksReport::new(&sample::stamp(), Some(7), sample::tracks()).to_json();
+    let value: serde_json::Value = serde_json::from_str(&json).unwrap();
+    let track = &value["tracks"][1];
+    assert_eq!((&value["tick"], &value["left_out"]), (&7.into(), &2.into()));
+    assert_eq!(
+        (&track["id"], &track["unseen_s"]),
+        (&7.into(), &0.25.into())
+    );
+    assert_eq!(track["velocity_mps"], serde_json::json!([8.5, -0.25]));
+    assert_eq!(track["covariance"][0][2], 0.125);
+    let back: TracksReport = serde_json::from_str(&json).unwrap();
+    assert_eq!((back.tick, back.result), (Some(7), sample::tracks()));
 }
 
 /// Largest error of a value that was sent, given the largest value of its channel among those sent.

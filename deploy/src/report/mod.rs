@@ -56,6 +56,9 @@ pub struct RunReport {
     pub processes: Vec<ProcessResources>,
     /// Published bytes by stream.
     pub streams: Vec<StreamBytes>,
+    /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
+    #[serde(default)]
+    pub causes: Vec<String>,
     /// Vehicles whose clocks differ from the ego's.
     #[serde(default)]
     pub other_clocks: BTreeMap<CavId, OtherClock>,
@@ -116,6 +119,7 @@ impl RunReport {
             stages: resources::stages(processes),
             processes: resources::processes(processes, &pace),
             streams: resources::streams(processes),
+            causes: Vec::new(),
             other_clocks: clocks::others(&metrics.neighbours),
             pace,
         }

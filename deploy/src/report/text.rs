@@ -22,6 +22,9 @@ impl fmt::Display for RunReport {
         }
         let latency = milliseconds(&self.latency_ms);
         writeln!(f, "latency   capture to detection: {latency}")?;
+        for cause in &self.causes {
+            writeln!(f, "observed  {cause}")?;
+        }
         for (cav, clock) in &self.other_clocks {
             writeln!(f, "clock     {cav}: {clock}")?;
         }

@@ -1,7 +1,8 @@
-//! Quality of the tracks that the detections of a run give: `v2vloc report --tracks`.
+//! Quality of the tracks of a run: `v2vloc report --tracks`.
 //!
-//! Needs `detections.jsonl` and `truth.jsonl` only: the folder of a run, or of a method of an evaluation. The tracker
-//! gets what a live one would have: detections and the ego's own pose, no truth.
+//! Needs `detections.jsonl` and `truth.jsonl`: the folder of a run, or of a method of an evaluation. Where the ego tracked,
+//! its tracks are judged (`tracks.jsonl`), else those that its detections give: the tracker gets what a live one would
+//! have, detections and the ego's own pose, no truth.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -9,19 +10,19 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use dataset::ground_truth::{GroundTruth, TrueBox};
-use protocol::{Box3d, DetectionsReport, PoseEstimate, corners_within};
+use protocol::{Box3d, Detections, DetectionsReport, Track, TracksReport, corners_within};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
-use terminal::text_table::{Side, TextTable, number};
+use terminal::text_table::{TextTable, number};
 use tracking::metrics::{
     MATCH_DISTANCE_M, Sequence, TrackPoint, TrackQuality, TrackedFrame, TruePoint,
 };
 use tracking::{Tracker, TrackerConfig};
 
 use super::ReportError;
-use crate::score::TruthLine;
+use crate::score::{TRACKS, TruthLine};
 
 /// Longest line that is read, bytes: a result with the most boxes that a message may hold has less.
 const MAX_LINE_BYTES: u64 = 16 << 20;
@@ -41,8 +42,10 @@ pub struct TrackReport {
     pub without_pose: usize,
     /// Results without a line in `truth.jsonl`, which are left out.
     pub without_truth: usize,
-    /// Detections that are left out, because a number is none.
+    /// Detections that are left out, because a number is none or there are too many.
     pub rejected_detections: u64,
+    /// True if the tracks are those of the ego, false if they are made from its detections.
+    pub recorded: bool,
     /// The metrics.
     #[serde(flatten)]
     pub quality: TrackQuality,
@@ -59,6 +62,13 @@ struct OfScenario<T> {
 /// Scenario, ego and tick.
 type Key = (Option<String>, String, u64);
 
+/// Lines of a folder by their key; those of the tracks are empty where the ego did not track.
+#[derive(Default)]
+struct Results {
+    detections: HashMap<Key, DetectionsReport>,
+    tracks: HashMap<Key, TracksReport>,
+}
+
 /// Tracks of one ego in one scenario.
 struct Followed {
     scenario: Option<String>,
@@ -74,7 +84,7 @@ impl TrackReport {
     /// # Errors
     /// [`ReportError`] names file and line.
     pub fn read(folder: &Path) -> Result<Self, ReportError> {
-        let mut results: HashMap<Key, DetectionsReport> = HashMap::new();
+        let mut results = Results::default();
         let mut method = None;
         let mut without_truth = 0;
         for_each_line(
@@ -88,13 +98,24 @@ impl TrackReport {
                 match tick {
                     Some(tick) => {
                         let key = (scenario, result.ego.to_string(), tick);
-                        results.entry(key).or_insert(line);
+                        results.detections.entry(key).or_insert(line);
                     }
                     None => without_truth += 1,
                 }
                 Ok(())
             },
         )?;
+        let recorded = folder.join(TRACKS);
+        if recorded.exists() {
+            for_each_line(&recorded, |line: OfScenario<TracksReport>| {
+                let OfScenario { scenario, line } = line;
+                if let Some(tick) = line.tick {
+                    let key = (scenario, line.result.ego.to_string(), tick);
+                    results.tracks.entry(key).or_insert(line);
+                }
+                Ok(())
+            })?;
+        }
         let name = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         let mut report = Self {
             run: name
@@ -103,6 +124,7 @@ impl TrackReport {
                 .to_string_lossy()
                 .into_owned(),
             method,
+            recorded: !results.tracks.is_empty(),
             ..Self::default()
         };
         let mut followed: Vec<Followed> = Vec::new();
@@ -112,8 +134,7 @@ impl TrackReport {
                 report.follow(&mut followed, scenario, &line, &mut results)
             },
         )?;
-        report.without_truth = without_truth + results.len();
-        report.rejected_detections = followed.iter().map(|one| one.tracker.rejected()).sum();
+        report.without_truth = without_truth + results.detections.len();
         let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
         report.quality = TrackQuality::of(&sequences);
         Ok(report)
@@ -125,11 +146,12 @@ impl TrackReport {
         followed: &mut Vec<Followed>,
         scenario: Option<String>,
         line: &TruthLine,
-        results: &mut HashMap<Key, DetectionsReport>,
+        results: &mut Results,
     ) -> Result<(), String> {
         let ego = line.ego.to_string();
         let key = (scenario, ego, line.tick);
-        let result = results.remove(&key);
+        let result = results.detections.remove(&key);
+        let recorded = results.tracks.remove(&key).map(|line| line.result);
         let (scenario, ego, _) = key;
         let last = followed
             .iter()
@@ -146,9 +168,16 @@ impl TrackReport {
         one.last_nanos = line.capture_nanos;
         self.ticks += 1;
         self.answered += usize::from(result.is_some());
-        let boxes = result.map(|result| one.boxes(line.capture_nanos, &result));
-        self.without_pose += usize::from(matches!(boxes, Some(None)));
-        let tracks = boxes.flatten().unwrap_or_default();
+        self.without_pose += usize::from(result.as_ref().is_some_and(|of| !has_pose(&of.result)));
+        let tracks = match result {
+            Some(of) if !self.recorded => {
+                Some({ &mut one.tracker }.follow(line.capture_nanos, &of.result))
+            }
+            _ => recorded,
+        };
+        let (tracks, left_out) =
+            tracks.map_or_else(Default::default, |of| (of.tracks, of.left_out));
+        self.rejected_detections += u64::from(left_out);
         let frame = frame(&line.truth, tracks);
         one.sequence.add(frame).map_err(|error| error.to_string())
     }
@@ -168,45 +197,19 @@ impl Followed {
             sequence: Sequence::default(),
         }
     }
+}
 
-    /// Tracks after a result: id, box in the ego's LiDAR frame, score; `None` if the ego had no usable pose.
-    fn boxes(
-        &mut self,
-        capture_nanos: u64,
-        report: &DetectionsReport,
-    ) -> Option<Vec<(u64, Box3d, f64)>> {
-        let PoseEstimate::Pose {
-            world_from_cav,
-            covariance,
-            ..
-        } = &report.result.pose
-        else {
-            return None;
-        };
-        let detections = &report.result.detections;
-        let tracked = { &mut self.tracker }.update(
-            capture_nanos,
-            world_from_cav,
-            covariance.as_ref(),
-            detections,
-        );
-        let tracks = tracked.ok()?;
-        let ego_from_world = world_from_cav.isometry().inverse();
-        let in_ego = tracks.iter().map(|track| {
-            let box3d = track.box3d.transformed(&ego_from_world);
-            (track.id, box3d, track.score)
-        });
-        Some(in_ego.collect())
-    }
+fn has_pose(result: &Detections) -> bool {
+    { result.pose.world_from_cav() }.is_some_and(|pose| pose.validate().is_ok())
 }
 
 /// A tick with the tracks that count, as for detections: all corners in range, and not on an object that does not count.
-fn frame(truth: &GroundTruth, tracks: Vec<(u64, Box3d, f64)>) -> TrackedFrame {
+fn frame(truth: &GroundTruth, tracks: Vec<Track>) -> TrackedFrame {
     let objects = truth.objects.iter().map(|object| TruePoint {
         id: object.id,
         center_m: center_m(&object.box3d),
     });
-    let counting = tracks.into_iter().filter(|(_, box3d, _)| {
+    let counting = tracks.into_iter().filter(|Track { box3d, .. }| {
         let distance = |others: &[TrueBox]| {
             let distances = others.iter().map(|other| distance_m(&other.box3d, box3d));
             distances.fold(f64::INFINITY, f64::min)
@@ -215,10 +218,10 @@ fn frame(truth: &GroundTruth, tracks: Vec<(u64, Box3d, f64)>) -> TrackedFrame {
         let is_on_ignored = to_ignored < MATCH_DISTANCE_M && to_ignored < distance(&truth.objects);
         corners_within(&box3d.corners(), truth.area_m) && !is_on_ignored
     });
-    let tracks = counting.map(|(id, box3d, score)| TrackPoint {
-        id,
-        center_m: center_m(&box3d),
-        score,
+    let tracks = counting.map(|track| TrackPoint {
+        id: track.id,
+        center_m: center_m(&track.box3d),
+        score: track.score,
     });
     TrackedFrame {
         objects: objects.collect(),
@@ -263,13 +266,11 @@ pub struct TrackTable<'a>(pub &'a [TrackReport]);
 
 impl fmt::Display for TrackTable<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let names = ["run", "method"].map(|name| (name, Side::Left));
         let numbers = [
             "answered", "AMOTA", "AMOTP, m", "MOTA", "MOTP, m", "recall", "IDS", "FRAG", "MT",
             "ML", "HOTA", "DetA", "AssA", "IDF1",
         ];
-        let numbers = numbers.map(|name| (name, Side::Right));
-        let mut table = TextTable::new(names.into_iter().chain(numbers));
+        let mut table = TextTable::of(&["run", "method"], &numbers);
         for report in self.0 {
             let quality = &report.quality;
             let count = |count: Option<usize>| count.map_or("-".into(), |count| count.to_string());
@@ -302,7 +303,7 @@ impl fmt::Display for TrackTable<'_> {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{CavId, Detection, Detections, Pose, Stamp};
+    use protocol::{CavId, Detection, Pose, PoseEstimate, Stamp};
 
     use super::*;
 
@@ -373,12 +374,27 @@ mod tests {
     }
 
     fn read(truth: &[String], detections: &[String]) -> Result<TrackReport, ReportError> {
+        read_all(truth, detections, &[])
+    }
+
+    fn read_all(
+        truth: &[String],
+        detections: &[String],
+        tracks: &[String],
+    ) -> Result<TrackReport, ReportError> {
         let folder = tempfile::tempdir().unwrap();
-        for (name, lines) in [("truth.jsonl", truth), ("detections.jsonl", detections)] {
+        let run = folder.path().join("run");
+        std::fs::create_dir(&run).unwrap();
+        let files = [
+            ("truth.jsonl", truth),
+            ("detections.jsonl", detections),
+            (TRACKS, tracks),
+        ];
+        for (name, lines) in files {
             let text: String = lines.iter().map(|line| format!("{line}\n")).collect();
-            std::fs::write(folder.path().join(name), text).unwrap();
+            std::fs::write(run.join(name), text).unwrap();
         }
-        TrackReport::read(folder.path())
+        TrackReport::read(&run)
     }
 
     #[test]
@@ -400,6 +416,65 @@ mod tests {
         assert!(quality.hota > Some(0.99), "{quality:?}");
         let text = TrackTable(&[report]).to_string();
         assert!(text.contains("pastat") && text.contains("20/20"), "{text}");
+    }
+
+    #[test]
+    fn recorded_tracks_are_judged_as_those_made_from_the_detections() {
+        let boxes = |tick: u64| [car(5.0, 3.5), car(30.0 - tick as f64, -4.0)];
+        let truths: Vec<String> = (0..20)
+            .map(|tick| truth(tick, &[(7, boxes(tick)[0]), (9, boxes(tick)[1])], &[]))
+            .collect();
+        let results: Vec<String> = (0..20)
+            .map(|tick| {
+                result(
+                    tick,
+                    posed(tick as f64),
+                    &boxes(tick)[usize::from(tick % 3 == 1)..],
+                )
+            })
+            .collect();
+        let made = read(&truths, &results).unwrap();
+        let mut tracker = Tracker::new(TrackerConfig {
+            area_m: [-50.0, -50.0, 50.0, 50.0],
+            ..TrackerConfig::default()
+        });
+        let recorded = results.iter().map(|line| {
+            let DetectionsReport {
+                tick,
+                epoch,
+                sequence,
+                capture_nanos,
+                publish_nanos,
+                result,
+            } = serde_json::from_str(line).unwrap();
+            let result = tracker.follow(capture_nanos, &result);
+            TracksReport {
+                tick,
+                epoch,
+                sequence,
+                capture_nanos,
+                publish_nanos,
+                result,
+            }
+        });
+        let lines: Vec<String> = recorded.map(|report| report.to_json()).collect();
+        let read = read_all(&truths, &results, &lines).unwrap();
+        assert!(read.recorded && !made.recorded);
+        // Numbers in JSON are rounded in their last digit.
+        let numbers = |report: &TrackReport| {
+            let quality = serde_json::to_value(&report.quality).unwrap();
+            let numbers = quality.as_object().unwrap().values();
+            let rounded = |number: f64| (number * 1e9).round();
+            numbers
+                .map(|number| number.as_f64().map(rounded))
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(numbers(&read), numbers(&made));
+        // What the ego has tracked counts, whatever its detections are.
+        let read = read_all(&truths, &results, &lines[..10]).unwrap();
+        assert!(read.quality.recall < made.quality.recall, "{read:?}");
+        // A file without a line is that of an ego that did not track.
+        assert_eq!(read_all(&truths, &results, &[]).unwrap(), made);
     }
 
     #[test]

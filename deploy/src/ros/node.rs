@@ -17,7 +17,7 @@ use super::initial_pose::InitialPose;
 use super::lidar_input::{LidarInputs, LidarReport};
 use super::motion_input::MotionReport;
 use super::node_options::NodeOptions;
-use super::other_nodes::{Namesakes, publishes_clock};
+use super::other_nodes::{publishes_clock, watch_namesakes};
 use super::publisher::RosPublisher;
 use super::robot_frames::RobotFrames;
 use super::scene_clock::SceneClock;
@@ -33,7 +33,10 @@ const POLL_PERIOD: Duration = Duration::from_millis(50);
 
 /// Topics of a vehicle while its agent is there, and while its ego-fuser is.
 const OF_AGENT: [VehicleTopic; 2] = [VehicleTopic::Pose, VehicleTopic::Odometry];
-const OF_EGO: [VehicleTopic; 2] = [VehicleTopic::Detections, VehicleTopic::Markers];
+const OF_EGO: [VehicleTopic; 4] = {
+    use VehicleTopic::{Detections, Markers, TrackMarkers, Tracks};
+    [Detections, Markers, Tracks, TrackMarkers]
+};
 
 /// Summary of a node: messages published and received.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
@@ -67,7 +70,8 @@ pub fn run(
     options: &NodeOptions,
     stop: &Stop,
 ) -> Result<NodeReport, BusError> {
-    let streams = [Stream::Imu, Stream::Pose, Stream::Detections];
+    use Stream::{Detections, Imu, Pose, Tracks};
+    let streams = [Imu, Pose, Detections, Tracks];
     let run = &bus.identity().run;
     let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
     selectors.push(KeyExpr::stats(run));
@@ -85,7 +89,7 @@ pub fn run(
     let inputs = (!options.lidars.is_empty())
         .then(|| LidarInputs::open(bus, session, (options, &frames), stop))
         .transpose()?;
-    let _namesakes = Namesakes::watch(session)?;
+    let _namesakes = watch_namesakes(session)?;
     let presence = bus.announce(Role::Ros2)?;
     let report = std::thread::scope(|scope| {
         let reading = inputs.map(|inputs| scope.spawn(move || inputs.run()));
@@ -215,35 +219,35 @@ impl<'scope, 'env> Node<'scope, 'env> {
             LivelinessEvent::Joined { role, cav } => match role {
                 Role::Agent => {
                     self.agents.insert(cav.clone());
-                    self.declare_all(&cav, OF_AGENT)?;
+                    self.declare_all(&cav, &OF_AGENT)?;
                     if !self.options.no_points {
                         self.forward_sweeps(&cav)?;
                     }
                 }
-                _ => self.declare_all(&cav, OF_EGO)?,
+                _ => self.declare_all(&cav, &OF_EGO)?,
             },
             LivelinessEvent::Left { role, cav } => match role {
                 Role::Agent => {
                     self.agents.remove(&cav);
-                    self.withdraw(&cav, OF_AGENT);
+                    self.withdraw(&cav, &OF_AGENT);
                     if let Some(forwarding) = self.sweeps.remove(&cav) {
                         forwarding.end();
                     }
                 }
-                _ => self.withdraw(&cav, OF_EGO),
+                _ => self.withdraw(&cav, &OF_EGO),
             },
         }
         Ok(())
     }
 
-    fn declare_all(&mut self, cav: &CavId, topics: [VehicleTopic; 2]) -> Result<(), BusError> {
-        let mut topics = topics.into_iter();
-        topics.try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic)))
+    fn declare_all(&mut self, cav: &CavId, topics: &[VehicleTopic]) -> Result<(), BusError> {
+        let mut topics = topics.iter();
+        topics.try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), *topic)))
     }
 
-    fn withdraw(&mut self, cav: &CavId, topics: [VehicleTopic; 2]) {
+    fn withdraw(&mut self, cav: &CavId, topics: &[VehicleTopic]) {
         for topic in topics {
-            let topic = RosTopic::Vehicle(cav.clone(), topic);
+            let topic = RosTopic::Vehicle(cav.clone(), *topic);
             self.publishers.remove(&topic);
         }
     }

@@ -7,6 +7,7 @@ use bus::BusError;
 use ros2::endpoint::NodeName;
 use ros2::{RosName, RosTopic};
 use zenoh::Wait;
+use zenoh::pubsub::Subscriber;
 use zenoh::sample::SampleKind;
 
 use super::node_options::ClockMode;
@@ -15,32 +16,24 @@ use super::session::RosSession;
 /// Timeout of a query for tokens.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// Subscription to the nodes of this program; ends when dropped.
-pub(super) struct Namesakes {
-    _subscriber: zenoh::pubsub::Subscriber<()>,
-}
-
-impl Namesakes {
-    /// Names other nodes of this program in the log, those that are there and those that come. In one namespace every
-    /// topic and frame has two publishers.
-    pub(super) fn watch(session: &RosSession) -> Result<Self, BusError> {
-        let (own, domain_id) = (session.node().name_in_network(), session.node().domain_id);
-        let selector = session.node().namesakes();
-        let liveliness = session.zenoh().liveliness();
-        let builder = liveliness.declare_subscriber(&selector).history(true);
-        let subscriber = builder.callback(move |sample| {
-            let token = sample.key_expr().as_str();
-            if sample.kind() == SampleKind::Put
-                && let Some(other) = NodeName::of_token(token)
-                && other.zid != own.zid
-            {
-                warn(&own, &other, domain_id);
-            }
-        });
-        let refused = |cause| BusError::zenoh(format!("watching {selector}"), &cause);
-        let _subscriber = subscriber.wait().map_err(refused)?;
-        Ok(Self { _subscriber })
-    }
+/// Names other nodes of this program in the log, those that are there and those that come. In one namespace every
+/// topic and frame has two publishers. Ends when the subscription is dropped.
+pub(super) fn watch_namesakes(session: &RosSession) -> Result<Subscriber<()>, BusError> {
+    let (own, domain_id) = (session.node().name_in_network(), session.node().domain_id);
+    let selector = session.node().namesakes();
+    let liveliness = session.zenoh().liveliness();
+    let builder = liveliness.declare_subscriber(&selector).history(true);
+    let subscriber = builder.callback(move |sample| {
+        let token = sample.key_expr().as_str();
+        if sample.kind() == SampleKind::Put
+            && let Some(other) = NodeName::of_token(token)
+            && other.zid != own.zid
+        {
+            warn(&own, &other, domain_id);
+        }
+    });
+    let refused = |cause| BusError::zenoh(format!("watching {selector}"), &cause);
+    subscriber.wait().map_err(refused)
 }
 
 fn warn(own: &NodeName, other: &NodeName, domain_id: u32) {

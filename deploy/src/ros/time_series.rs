@@ -16,14 +16,8 @@ const KEPT_NANOS: u64 = 10_000_000_000;
 const MOST: usize = 4096;
 
 /// Measurements in the order of time.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct TimeSeries<T>(VecDeque<(u64, T)>);
-
-impl<T> Default for TimeSeries<T> {
-    fn default() -> Self {
-        Self(VecDeque::new())
-    }
-}
 
 /// Reason why there is no pose at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -15,27 +15,25 @@ use super::precision::{FrameCounts, by_iou, by_part, precision_recall_csv};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::ground_truth;
 use super::truth_line::TruthLine;
-use crate::score::metrics::{
-    ByIou, Communication, Latencies, PartPrecision, Percentiles, PoseErrors,
-};
+use crate::score::metrics::{ByIou, PartPrecision};
 
 /// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
 
 /// Scores so far. Ticks are scored in the order of their capture times, independent of the order of their messages.
 pub struct FrameScores {
-    ego: CavId,
+    pub(super) ego: CavId,
     rule: GroundTruthRule,
-    nominal_values: u64,
+    pub(super) nominal_values: u64,
     open: OpenTicks,
     scorer: Scorer,
-    live: LivePrecision,
+    pub(super) live: LivePrecision,
     records: Vec<FrameRecord>,
-    pose_errors: Vec<PoseError>,
-    no_pose: u64,
-    bytes: Vec<(u64, u64)>,
-    ages_ms: Vec<f64>,
-    neighbours: BTreeMap<CavId, NeighbourRecord>,
+    pub(super) pose_errors: Vec<PoseError>,
+    pub(super) no_pose: u64,
+    pub(super) bytes: Vec<(u64, u64)>,
+    pub(super) ages_ms: Vec<f64>,
+    pub(super) neighbours: BTreeMap<CavId, NeighbourRecord>,
     best: Option<JudgedFrame>,
 }
 
@@ -140,40 +138,6 @@ impl FrameScores {
         precision_recall_csv(&self.scorer)
     }
 
-    /// Average precision over all ticks, ordered by score; one without a result is a frame without detections.
-    pub fn unanswered_empty(&self) -> ByIou {
-        self.live.unanswered_empty()
-    }
-
-    /// Streaming average precision (Li et al. 2020, "Towards Streaming Perception"), ordered by score; `None` if
-    /// results have no time of publication.
-    pub fn streaming(&self) -> Option<ByIou> {
-        self.live.streaming()
-    }
-
-    /// Id of the ego.
-    pub fn ego(&self) -> &CavId {
-        &self.ego
-    }
-
-    /// Errors of all vehicles' poses.
-    pub(crate) fn pose_errors(&self) -> PoseErrors {
-        PoseErrors::of(&self.pose_errors, self.no_pose)
-    }
-
-    /// Latencies of all frames.
-    pub fn latencies(&self) -> Latencies {
-        let sample = self.records.iter().filter_map(|record| record.latency_ms);
-        Latencies {
-            capture_to_detection: Percentiles::of(&sample.collect::<Vec<_>>()),
-        }
-    }
-
-    /// Ages of all fused data.
-    pub fn ages(&self) -> Percentiles {
-        Percentiles::of(&self.ages_ms)
-    }
-
     /// From the first to the last frame on the scene's clock, seconds; scenarios that follow one another add up.
     pub fn seconds(&self) -> f64 {
         let times = self.records.iter().map(|record| record.capture_nanos);
@@ -182,16 +146,6 @@ impl FrameScores {
         // The clock jumps at the start of another scenario, ahead or back.
         let steps = steps.filter(|nanos| *nanos < SCENARIO_GAP_NANOS);
         steps.map(|nanos| nanos as f64 * 1e-9).sum()
-    }
-
-    /// Bytes of all fused messages.
-    pub fn communication(&self) -> Communication {
-        Communication::of(&self.bytes, self.nominal_values)
-    }
-
-    /// Every neighbour from which messages were received.
-    pub fn neighbours(&self) -> &BTreeMap<CavId, NeighbourRecord> {
-        &self.neighbours
     }
 
     fn add(&mut self, stamp: &Stamp, part: Part) {

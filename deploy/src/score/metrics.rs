@@ -106,6 +106,10 @@ impl Metrics {
         let fused = scores.records().iter().map(|record| record.fused).sum();
         let (ap_global, ap_frame_order) = scores.average_precision();
         let [ap_by_distance, ap_by_class] = scores.average_precision_by_part();
+        let latencies_ms = scores
+            .records()
+            .iter()
+            .filter_map(|record| record.latency_ms);
         let (ticks, answered) = scores.ticks();
         Self {
             frames: answered,
@@ -118,16 +122,18 @@ impl Metrics {
             ap_global,
             ap_frame_order,
             ap_answered: ap_global,
-            ap_unanswered_empty: scores.unanswered_empty(),
-            ap_streaming: scores.streaming(),
+            ap_unanswered_empty: scores.live.unanswered_empty(),
+            ap_streaming: scores.live.streaming(),
             ap_by_distance,
             ap_by_class,
-            pose: scores.pose_errors(),
-            latency_ms: scores.latencies(),
-            age_ms: scores.ages(),
-            comm: scores.communication(),
-            contribution: Contribution::of(answered, fused, scores.ego(), ledger, sent_bytes),
-            neighbours: scores.neighbours().clone(),
+            pose: PoseErrors::of(&scores.pose_errors, scores.no_pose),
+            latency_ms: Latencies {
+                capture_to_detection: Percentiles::of(&latencies_ms.collect::<Vec<_>>()),
+            },
+            age_ms: Percentiles::of(&scores.ages_ms),
+            comm: Communication::of(&scores.bytes, scores.nominal_values),
+            contribution: Contribution::of(answered, fused, &scores.ego, ledger, sent_bytes),
+            neighbours: scores.neighbours.clone(),
             messages: Messages::of(&ledger.total()),
             ..Self::default()
         }
@@ -146,6 +152,13 @@ pub struct ByIou {
     /// At IoU 0.7.
     #[serde(rename = "0.7")]
     pub at_70: Option<f64>,
+}
+
+impl ByIou {
+    /// The values at 0.3, 0.5 and 0.7.
+    pub fn values(&self) -> [Option<f64>; 3] {
+        [self.at_30, self.at_50, self.at_70]
+    }
 }
 
 /// Average precision of a part of the objects. Detections on objects of other parts count neither way.

@@ -15,9 +15,13 @@ mod stage_stamps;
 mod true_boxes;
 mod truth_line;
 
+/// File of a run or evaluation with its tracks, if the ego tracks.
+pub const TRACKS: &str = "tracks.jsonl";
+
 pub use frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
+pub(crate) use node::SCORER;
 pub use node::{ProcessStats, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use stage_stamps::StageStamps;
 pub(crate) use true_boxes::ground_truth;

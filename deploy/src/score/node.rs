@@ -1,4 +1,4 @@
-//! Scorer process on the bus: receives truth, detections, poses and the ledgers of all processes, and keeps the scores.
+//! Scorer process on the bus: receives truth, detections, tracks, poses and the ledgers of all processes, and keeps the scores.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::mem;
@@ -14,9 +14,11 @@ use bus::{
     process_id, process_usage,
 };
 use protocol::{
-    CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate,
-    ProcessId, ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
+    CavId, Detections, FrameReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate,
+    ProcessId, ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Tracks,
+    Truth,
 };
+use serde::Serialize;
 use support::sync::lock;
 use zenoh::Session;
 
@@ -26,7 +28,7 @@ use super::result_lines::ResultLines;
 use crate::score::offline_intervals::OfflineIntervals;
 
 /// Name of the scorer in keys, ledgers and routes.
-const SCORER: &str = "scorer";
+pub(crate) const SCORER: &str = "scorer";
 /// Largest number of waiting messages of one topic: seconds of a run.
 const PLACES: usize = 256;
 /// Longest time for closing the session.
@@ -69,7 +71,7 @@ impl Progress {
 }
 
 /// Ledger and resources of one process instance.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct ProcessStats {
     /// Name of the process.
     pub process: ProcessId,
@@ -78,10 +80,13 @@ pub struct ProcessStats {
     /// Its stages.
     pub stages: Vec<StageSummary>,
     /// Its CPU time and memory.
+    #[serde(skip)]
     pub usage: ProcessUsage,
     /// CPU time before the first tick, seconds: for loading models and for joining the run.
+    #[serde(skip)]
     pub cpu_before_s: f64,
     /// Its published bytes, by topic.
+    #[serde(skip)]
     pub traffic: Vec<TopicTraffic>,
 }
 
@@ -99,8 +104,8 @@ pub struct Scored {
     pub stats: Vec<ProcessStats>,
     /// Progress of the run.
     pub progress: Progress,
-    /// Number of results and of ticks that are not in their files, for lack of disk space.
-    pub unwritten: [u64; 2],
+    /// Number of results, of ticks and of tracks of a frame that are not in their files, for lack of disk space.
+    pub unwritten: [u64; 3],
 }
 
 /// Reason why the scorer cannot start.
@@ -123,13 +128,13 @@ pub enum ScorerError {
 pub struct ScorerNode {
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
-    thread: JoinHandle<(FrameScores, ScoreStats, [u64; 2])>,
+    thread: JoinHandle<(FrameScores, ScoreStats, [u64; 3])>,
     connection: Connection,
 }
 
 impl ScorerNode {
     /// Subscribes to the run of `agents` on `session`; results and ground truth are appended to `files`, one JSON object
-    /// a line.
+    /// a line, and so are the tracks if their file is named.
     ///
     /// # Errors
     /// [`ScorerError`] when the bus, the file or the system refuses.
@@ -140,6 +145,7 @@ impl ScorerNode {
         ego: &CavId,
         scores: FrameScores,
         files: [PathBuf; 2],
+        tracks: Option<PathBuf>,
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
         let process = process_id(Role::Scorer, &cav);
@@ -156,6 +162,10 @@ impl ScorerNode {
             bus.subscribe(detections, &inbox)?,
             bus.subscribe_all(&KeyExpr::stats(run), &inbox)?,
         ];
+        if tracks.is_some() {
+            let topic = Topic::stream(ego, Stream::Tracks);
+            subscriptions.push(bus.subscribe(topic, &inbox)?);
+        }
         for cav in agents {
             subscriptions.push(bus.subscribe(Topic::stream(cav, Stream::Pose), &inbox)?);
         }
@@ -166,6 +176,7 @@ impl ScorerNode {
             |file: &PathBuf| ResultLines::create(file).map_err(io(file.display().to_string()));
         let [detections, truth] = &files;
         let (detections, truth_lines) = (lines(detections)?, lines(truth)?);
+        let tracks = tracks.as_ref().map(lines).transpose()?;
         let progress = Arc::<Mutex<Progress>>::default();
         let worker = Worker {
             inbox: Arc::clone(&inbox),
@@ -176,7 +187,9 @@ impl ScorerNode {
             progress: Arc::clone(&progress),
             detections,
             truth_lines,
+            tracks,
             numbered: NumberedResults::default(),
+            numbered_tracks: NumberedResults::default(),
             published: BTreeMap::new(),
         };
         let thread = thread::Builder::new()
@@ -212,6 +225,11 @@ impl ScorerNode {
     /// Progress so far.
     pub fn progress(&self) -> Progress {
         lock(&self.progress).clone()
+    }
+
+    /// Time since which the scorer has had no connection to the router.
+    pub fn router_lost_since(&self) -> Option<Instant> {
+        self.connection.bus.router_lost_since()
     }
 
     /// Processes that were offline so far.
@@ -303,13 +321,15 @@ struct Worker {
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
     truth_lines: ResultLines,
-    numbered: NumberedResults,
+    tracks: Option<ResultLines>,
+    numbered: NumberedResults<Detections>,
+    numbered_tracks: NumberedResults<Tracks>,
     // Time of publication of each recent tick, by capture time: for the latency that is displayed during the run.
     published: BTreeMap<u64, u64>,
 }
 
 impl Worker {
-    fn run(mut self) -> (FrameScores, ScoreStats, [u64; 2]) {
+    fn run(mut self) -> (FrameScores, ScoreStats, [u64; 3]) {
         loop {
             match self.inbox.take(None) {
                 Pop::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
@@ -322,15 +342,23 @@ impl Worker {
         }
         self.write_results(true);
         self.scores.close();
-        let unwritten = [self.detections.finish(), self.truth_lines.finish()];
+        let unwritten = [
+            self.detections.finish(),
+            self.truth_lines.finish(),
+            self.tracks.map_or(0, ResultLines::finish),
+        ];
         (self.scores, self.stats, unwritten)
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
         let used = match topic {
             Topic::Truth => self.truth(arrival),
-            Topic::Stream { stream, .. } if *stream == Stream::Detections => self.result(arrival),
-            Topic::Stream { stream, .. } if *stream == Stream::Pose => self.pose(arrival),
+            Topic::Stream { stream, .. } => match stream {
+                Stream::Detections => self.result(arrival),
+                Stream::Tracks => self.tracks(arrival),
+                Stream::Pose => self.pose(arrival),
+                _ => None,
+            },
             Topic::Stats(sender) => return self.stats(sender, arrival),
             _ => None,
         };
@@ -349,6 +377,7 @@ impl Worker {
             self.published.pop_first();
         }
         self.numbered.tick(capture_nanos, truth.tick);
+        self.numbered_tracks.tick(capture_nanos, truth.tick);
         if let Some(line) = self.scores.truth_line(stamp, &truth) {
             self.truth_lines.add(line.to_json());
         }
@@ -362,7 +391,7 @@ impl Worker {
     fn result(&mut self, arrival: &Arrival) -> Option<()> {
         let result: Detections = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        let report = DetectionsReport::new(stamp, None, result.clone());
+        let report = FrameReport::new(stamp, None, result.clone());
         self.numbered.result(report);
         self.write_results(false);
         let began = self.published.get(&stamp.capture_nanos);
@@ -386,10 +415,23 @@ impl Worker {
         Some(())
     }
 
+    fn tracks(&mut self, arrival: &Arrival) -> Option<()> {
+        let tracks: Tracks = self.inbox.decode(arrival, &Limits::DEFAULT)?;
+        let report = FrameReport::new(&arrival.header.stamp, None, tracks);
+        self.numbered_tracks.result(report);
+        self.write_results(false);
+        Some(())
+    }
+
     /// Writes the results whose tick is known, or will not be.
     fn write_results(&mut self, is_over: bool) {
         while let Some(report) = self.numbered.next(is_over) {
             self.detections.add(report.to_json());
+        }
+        if let Some(lines) = &mut self.tracks {
+            while let Some(report) = self.numbered_tracks.next(is_over) {
+                lines.add(report.to_json());
+            }
         }
     }
 

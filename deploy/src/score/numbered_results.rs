@@ -2,20 +2,28 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use protocol::DetectionsReport;
+use protocol::FrameReport;
 
 /// Largest number of results that wait for their truth, and of ticks that are remembered.
 const PLACES: usize = 256;
 
 /// Results that wait to be written. They keep their order, and wait only while their truth may still arrive.
-#[derive(Default)]
-pub(super) struct NumberedResults {
+pub(super) struct NumberedResults<T> {
     /// Tick by capture time.
     ticks: BTreeMap<u64, u64>,
-    waiting: VecDeque<DetectionsReport>,
+    waiting: VecDeque<FrameReport<T>>,
 }
 
-impl NumberedResults {
+impl<T> Default for NumberedResults<T> {
+    fn default() -> Self {
+        Self {
+            ticks: BTreeMap::new(),
+            waiting: VecDeque::new(),
+        }
+    }
+}
+
+impl<T> NumberedResults<T> {
     /// Records the tick of a capture time.
     pub(super) fn tick(&mut self, capture_nanos: u64, tick: u64) {
         self.ticks.insert(capture_nanos, tick);
@@ -25,13 +33,13 @@ impl NumberedResults {
     }
 
     /// Appends a result.
-    pub(super) fn result(&mut self, report: DetectionsReport) {
+    pub(super) fn result(&mut self, report: FrameReport<T>) {
         self.waiting.push_back(report);
     }
 
     /// The next result whose tick is known, or will not be: a later truth has arrived, too many wait, or the run
     /// `is_over`.
-    pub(super) fn next(&mut self, is_over: bool) -> Option<DetectionsReport> {
+    pub(super) fn next(&mut self, is_over: bool) -> Option<FrameReport<T>> {
         let capture_nanos = self.waiting.front()?.capture_nanos;
         let tick = self.ticks.get(&capture_nanos).copied();
         let newest = self.ticks.last_key_value();
@@ -40,7 +48,7 @@ impl NumberedResults {
             return None;
         }
         let report = self.waiting.pop_front()?;
-        Some(DetectionsReport { tick, ..report })
+        Some(FrameReport { tick, ..report })
     }
 }
 
@@ -50,7 +58,7 @@ mod tests {
 
     use super::*;
 
-    fn report(capture_nanos: u64) -> DetectionsReport {
+    fn report(capture_nanos: u64) -> FrameReport<Detections> {
         let ego = CavId::new("e").unwrap();
         let stamp = Stamp {
             cav: ego.clone(),
@@ -73,10 +81,10 @@ mod tests {
             neighbours,
             stages,
         };
-        DetectionsReport::new(&stamp, None, result)
+        FrameReport::new(&stamp, None, result)
     }
 
-    fn ticks(results: &mut NumberedResults, is_over: bool) -> Vec<(u64, Option<u64>)> {
+    fn ticks(results: &mut NumberedResults<Detections>, is_over: bool) -> Vec<(u64, Option<u64>)> {
         std::iter::from_fn(|| results.next(is_over))
             .map(|report| (report.capture_nanos, report.tick))
             .collect()

@@ -79,7 +79,12 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
         | Topic::Truth => vec![replay],
         Topic::Stream {
             cav,
-            stream: Stream::Detections | Stream::DetectionsJson | Stream::Pace,
+            stream:
+                Stream::Detections
+                | Stream::DetectionsJson
+                | Stream::Tracks
+                | Stream::TracksJson
+                | Stream::Pace,
         } => vec![process_id(Role::Ego, cav).to_string()],
         Topic::Stream { cav, .. } => vec![agent(cav)],
         Topic::Received { ego, cav, .. } => {
@@ -113,6 +118,7 @@ mod tests {
             ("20/lidar", "agent-20", "replay"),
             ("truth", "scorer", "replay"),
             ("10/detections", "scorer", "ego-10"),
+            ("10/tracks", "scorer", "ego-10"),
         ] {
             assert!(concerns(topic, to, offline), "{topic} {to} {offline}");
             assert!(!concerns(topic, to, "agent-30"), "{topic} {to}");

@@ -1,4 +1,4 @@
-//! `detections.jsonl` and `truth.jsonl`: a line per result or tick, appended during the run.
+//! `detections.jsonl`, `tracks.jsonl` and `truth.jsonl`: a line per result or tick, appended during the run.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};

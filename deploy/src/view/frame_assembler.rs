@@ -8,14 +8,16 @@ use nalgebra::Vector3;
 use protocol::message::AgentTruth;
 use protocol::{
     Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload,
-    Pose, PoseEstimate, StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
+    Pose, PoseEstimate, StageSummary, Stats, Stream, Topic, Tracks, TrueObject, Truth, wire,
 };
 
 use super::judgement::{DetectionArea, Judge, Judgement};
 use super::pace_counter::PaceCounter;
 use super::scene_frame::{
-    Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate,
+    Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, ShownTrack, Vehicle,
+    decimate,
 };
+use super::trails::Trails;
 
 /// Largest number of incomplete scene frames.
 const MOST_OPEN: usize = 16;
@@ -55,6 +57,9 @@ pub(crate) struct FrameAssembler {
     ego: Option<CavId>,
     /// All egos with results.
     egos: BTreeSet<CavId>,
+    trails: Trails,
+    /// True if tracks follow the results of the ego.
+    awaits_tracks: bool,
 }
 
 /// Messages of one scene frame.
@@ -62,6 +67,7 @@ pub(crate) struct FrameAssembler {
 struct OpenFrame {
     truth: Option<(u64, Truth)>,
     result: Option<(u64, Detections)>,
+    tracks: Option<Vec<ShownTrack>>,
     /// Each with its time of publication.
     poses: BTreeMap<CavId, (u64, PoseEstimate)>,
     /// Encoded: most scene frames of a busy run are never shown, and decoding is the largest cost.
@@ -105,8 +111,8 @@ impl FrameAssembler {
         }
     }
 
-    /// Adds a message. A result of the ego completes its scene frame, which is returned; so is a scene frame without a
-    /// result when too many wait. Invalid messages are ignored here and counted by their receivers.
+    /// Adds a message. A result of the ego, with its tracks if the ego tracks, completes its scene frame, which is returned;
+    /// so is a scene frame without a result when too many wait. Invalid messages are ignored here and counted by their receivers.
     pub(crate) fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
         if let Topic::Stats(_) = seen.topic {
             self.keep_ledger(seen);
@@ -129,10 +135,15 @@ impl FrameAssembler {
             self.begin_again_with(seen.header.stamp.epoch);
         }
         let at = seen.header.stamp.capture_nanos;
+        if let Topic::Stream { cav, stream } = seen.topic
+            && *stream == Stream::Tracks
+        {
+            self.track(at, cav, seen);
+        }
         if self.shown_until.is_some_and(|shown| at <= shown) {
             return None;
         }
-        if self.fill(at, seen) {
+        if self.fill(at, seen) && self.is_complete(at) {
             return self.show(at);
         }
         if self.open.len() > MOST_OPEN {
@@ -140,6 +151,27 @@ impl FrameAssembler {
             return self.show(oldest);
         }
         None
+    }
+
+    /// Adds tracks of the ego, also late ones: the trails of the next frames have them.
+    fn track(&mut self, at: u64, cav: &CavId, seen: &ReceivedMessage<'_>) {
+        let is_of_ego = self.ego.as_ref() == Some(cav);
+        if let Some(tracks) = decode::<Tracks>(seen).filter(|_| is_of_ego) {
+            self.awaits_tracks = true;
+            let shown = self.trails.add(at, &tracks);
+            if self.shown_until.is_none_or(|until| at > until) {
+                self.frame(at).tracks = Some(shown);
+            }
+        }
+    }
+
+    /// True if nothing is missing at `at`: results come before their tracks.
+    fn is_complete(&mut self, at: u64) -> bool {
+        let has_none = |frame: &OpenFrame| frame.result.is_some() && frame.tracks.is_none();
+        // An earlier result is still without: the ego tracks no more.
+        self.awaits_tracks &= !self.open.range(..at).any(|(_, frame)| has_none(frame));
+        let frame = self.open.get(&at);
+        frame.is_some_and(|it| it.result.is_some() && !(self.awaits_tracks && it.tracks.is_none()))
     }
 
     fn admits(&mut self, cav: &CavId) -> bool {
@@ -188,11 +220,12 @@ impl FrameAssembler {
         let known = self.replay_epoch.replace(epoch);
         if known.is_some_and(|known| known != epoch) {
             self.open.clear();
+            self.trails = Trails::default();
             self.shown_until = None;
         }
     }
 
-    /// Adds a message to its scene frame; returns true if that is complete now.
+    /// Adds a message to its scene frame; returns true for a result or tracks of the ego.
     fn fill(&mut self, at: u64, seen: &ReceivedMessage<'_>) -> bool {
         let published = seen.header.stamp.publish_nanos;
         let (cav, stream) = match seen.topic {
@@ -222,6 +255,7 @@ impl FrameAssembler {
                     return true;
                 }
             }
+            Stream::Tracks => return self.ego.as_ref() == Some(cav),
             Stream::Lidar | Stream::Preview => {
                 if let Some(payload) = seen.payload {
                     self.frame(at).sweeps.insert(cav.clone(), payload.to_vec());
@@ -329,6 +363,7 @@ impl OpenFrame {
             truth: self.true_boxes(judgement),
             detections: self.detections(judgement),
             single: self.single(),
+            tracks: self.tracks.clone().unwrap_or_default(),
             links: self.links(),
             stages: result.map_or(Vec::new(), |result| result.stages.clone()),
             processes: ledgers.iter().map(process).collect(),

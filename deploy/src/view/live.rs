@@ -231,38 +231,25 @@ struct Listener {
     others: BTreeMap<CavId, FrameAssembler>,
 }
 
-/// Subscriptions while a page is open.
-struct Subscriptions {
-    previews: PassiveSubscriber,
-    rest: PassiveSubscriber,
-}
-
-impl Subscriptions {
-    fn open(bus: &Bus, run: &RunId) -> Result<Self, BusError> {
-        let streams = [
-            Stream::Pose,
-            Stream::Boxes,
-            Stream::Detections,
-            Stream::Descriptor,
-        ];
-        let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
-        selectors.extend([
-            KeyExpr::received_by_anyone(run, Stream::Pose),
-            KeyExpr::truth(run),
-            KeyExpr::stats(run),
-            KeyExpr::control(run),
-        ]);
-        let previews = bus.tap(&[KeyExpr::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
-        Ok(Self {
-            previews,
-            rest: bus.tap(&selectors, PLACES)?,
-        })
-    }
+/// Subscribes to previews, and to all else that is shown.
+fn subscribe(bus: &Bus, run: &RunId) -> Result<[PassiveSubscriber; 2], BusError> {
+    use Stream::{Boxes, Descriptor, Detections, Pose, Tracks};
+    let streams = [Pose, Boxes, Detections, Tracks, Descriptor];
+    let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
+    selectors.extend([
+        KeyExpr::received_by_anyone(run, Stream::Pose),
+        KeyExpr::truth(run),
+        KeyExpr::stats(run),
+        KeyExpr::control(run),
+    ]);
+    let previews = bus.tap(&[KeyExpr::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
+    Ok([previews, bus.tap(&selectors, PLACES)?])
 }
 
 impl Listener {
     fn run(mut self) {
-        let (mut subscriptions, mut cameras, mut maps) = (None, None, None);
+        let mut subscriptions: Option<[PassiveSubscriber; 2]> = None;
+        let (mut cameras, mut maps) = (None, None);
         while !self.shared.ending.load(Ordering::Relaxed) {
             self.watch_router();
             if !self.is_watched() {
@@ -270,8 +257,8 @@ impl Listener {
                 thread::sleep(CHECK_PERIOD);
                 continue;
             }
-            let Some(Subscriptions { previews, rest }) = &subscriptions else {
-                match Subscriptions::open(&self.bus, &self.run) {
+            let Some([previews, rest]) = &subscriptions else {
+                match subscribe(&self.bus, &self.run) {
                     Ok(opened) => subscriptions = Some(opened),
                     Err(error) => {
                         tracing::error!("nothing is shown: {error}");

@@ -17,6 +17,7 @@ mod server;
 mod show;
 #[cfg(test)]
 mod tests;
+mod trails;
 
 pub use judgement::DetectionArea;
 pub use live::LiveRun;

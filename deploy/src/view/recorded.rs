@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use bytes::Bytes;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{
-    Camera, CavId, Descriptor, Detections, ImageFormat, Payload, PoseEstimate, Stream, Topic, Truth,
+    Camera, CavId, Descriptor, Detections, ImageFormat, Payload, PoseEstimate, Stream, Topic,
+    Tracks, Truth,
 };
 use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
@@ -16,7 +17,8 @@ use super::heat_map::HeatMap;
 use super::judgement::{DetectionArea, Judge};
 use super::link_series::{LinkSeries, LinkTraffic};
 use super::pace_counter::PaceCounter;
-use super::scene_frame::SceneFrame;
+use super::scene_frame::{SceneFrame, ShownTrack};
+use super::trails::Trails;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
 use crate::operate::status::RunStatus;
 
@@ -35,11 +37,6 @@ pub enum ViewError {
     /// Neither truth nor detections in the recording.
     #[error("{}: no truth and no detections in it", .0.display())]
     Empty(PathBuf),
-}
-
-/// Protocol of the run in a folder.
-fn protocol_of(folder: &Path) -> Option<EvaluationProtocol> {
-    RunStatus::read(folder).ok()?.protocol
 }
 
 /// Score from which detections are shown and counted at first.
@@ -74,6 +71,7 @@ struct Timeline {
     ego: Option<CavId>,
     /// One for each moment.
     summaries: Vec<MomentSummary>,
+    tracks: Vec<Option<Tracks>>,
     pace: PaceCounter,
 }
 
@@ -149,7 +147,7 @@ impl RecordedRun {
             arrivals,
             stats,
             areas,
-            protocol: { file.parent() }.and_then(protocol_of),
+            protocol: { file.parent() }.and_then(|folder| RunStatus::read(folder).ok()?.protocol),
         };
         let moment = |(at, entries)| run.moment(at, entries);
         run.moments = moments.into_iter().filter_map(moment).collect();
@@ -317,6 +315,7 @@ impl RecordedRun {
         let links = ego.as_ref().map(links_to).unwrap_or_default();
         let (mut pace, mut judge) = (PaceCounter::default(), Judge::new(self.protocol.clone()));
         let mut summaries = Vec::with_capacity(self.moments.len());
+        let mut tracks = Vec::with_capacity(self.moments.len());
         for moment in &self.moments {
             let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;
             summary.links = links.at(moment.capture_nanos, moment.began_nanos);
@@ -325,10 +324,17 @@ impl RecordedRun {
                 pace.tick(summary.latency_ms.map(done));
             }
             summaries.push(summary);
+            let topic = ego.as_ref().map(|ego| Topic::stream(ego, Stream::Tracks));
+            let entry = self
+                .entries_of(moment)
+                .find(|entry| topic.as_ref() == Some(&entry.key.topic));
+            let found = entry.map(|entry| self.published(entry)).transpose()?;
+            tracks.push(found.flatten().map(|(_, tracks)| tracks));
         }
         Ok(Timeline {
             ego,
             summaries,
+            tracks,
             pace,
         })
     }
@@ -344,11 +350,26 @@ impl RecordedRun {
         let egos = { self.timelines.iter() }.filter_map(|timeline| timeline.ego.clone());
         SceneFrame {
             swept_ms,
+            tracks: self.tracks_at(index, timeline),
             pace: timeline.pace.pace(),
             ap_50: summary.and_then(|summary| summary.ap_50),
             egos: egos.collect(),
             ..frame
         }
+    }
+
+    /// Tracks of a scene frame with their trails, the same on every way to it.
+    fn tracks_at(&self, index: usize, timeline: &Timeline) -> Vec<ShownTrack> {
+        let (mut trails, mut shown) = (Trails::default(), Vec::new());
+        let now_nanos = { self.moments.get(index) }.map_or(0, |moment| moment.capture_nanos);
+        let until = self.moments.iter().zip(&timeline.tracks).take(index + 1);
+        for (Moment { capture_nanos, .. }, tracks) in until {
+            if Trails::covers(now_nanos, *capture_nanos) {
+                let tracks = tracks.as_ref();
+                shown = tracks.map_or(Vec::new(), |tracks| trails.add(*capture_nanos, tracks));
+            }
+        }
+        shown
     }
 
     fn entries_of<'a>(&'a self, moment: &'a Moment) -> impl Iterator<Item = &'a Entry> {

@@ -46,6 +46,8 @@ pub struct SceneFrame {
     pub detections: Vec<ShownBox>,
     /// Detections that single vehicles send (late fusion).
     pub single: Vec<ShownBox>,
+    /// Tracks of the ego, placed by its estimated pose.
+    pub tracks: Vec<ShownTrack>,
     /// Traffic of each link.
     pub links: Vec<Link>,
     /// Durations of the ego's stages.
@@ -124,6 +126,19 @@ pub struct ShownBox {
     pub found_score: Option<f32>,
     /// True if a detection is a true positive; `None` if that is not known, or if it counts neither way.
     pub is_hit: Option<bool>,
+}
+
+/// A track in the world frame.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ShownTrack {
+    /// Its identity.
+    pub id: u64,
+    /// Its places in the last seconds, x, y in metres, the newest last.
+    pub trail_m: Vec<[f64; 2]>,
+    /// Speed over ground, metres per second.
+    pub speed_mps: f64,
+    /// True if it is detected in this frame, false if its place is predicted.
+    pub is_seen: bool,
 }
 
 /// Traffic from one vehicle to an ego for one frame.

@@ -12,7 +12,7 @@ use bus::{Bus, BusOptions, Endpoint, Identity, PublisherOptions};
 use protocol::message::{AgentTruth, FusedNeighbour, NeighbourState, StageTiming};
 use protocol::{
     Bev, BevFeatures, BevGrid, Box3d, CavId, CodecConfig, Detection, Detections, Key, Lidar,
-    PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic, TrueObject, Truth,
+    PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic, Track, Tracks, TrueObject, Truth,
     encode_features, wire,
 };
 use recording::{RecordingOptions, RecordingWriter};
@@ -223,6 +223,43 @@ fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
     all
 }
 
+/// The tracks that follow the ego's result of a tick: one object, 10 m ahead.
+fn tracks(tick: u64) -> (Topic, Vec<u8>) {
+    let Detections {
+        ego,
+        agent_frame,
+        pose,
+        detections,
+        ..
+    } = detections_of(EGO, tick);
+    let track = Track {
+        id: 3,
+        box3d: detections[0].box3d,
+        velocity_mps: [3.0, 4.0],
+        covariance: [[0.0; 4]; 4],
+        score: 0.8,
+        hits: 1,
+        age_s: 0.0,
+        unseen_s: 0.0,
+    };
+    let stamp = Stamp {
+        cav: ego.clone(),
+        epoch: 1,
+        sequence: tick,
+        capture_nanos: 100_000_000 * (tick + 1),
+        publish_nanos: 51_000_000,
+    };
+    let topic = Topic::stream(&ego, Stream::Tracks);
+    let message = Tracks {
+        ego,
+        agent_frame,
+        pose,
+        tracks: vec![track],
+        left_out: 0,
+    };
+    (topic, wire::encode(&stamp, message).unwrap().to_vec())
+}
+
 fn record(folder: &Path, has_second_ego: bool) -> RecordedRun {
     let file = folder.join(crate::operate::run_folder::RECORDING);
     let mut writer = RecordingWriter::create(&file, RecordingOptions::default()).unwrap();
@@ -232,6 +269,7 @@ fn record(folder: &Path, has_second_ego: bool) -> RecordedRun {
         if has_second_ego {
             all.extend(messages_of_a_second_ego(tick, 1_000_000_000 * tick));
         }
+        all.push(tracks(tick));
         for (topic, payload) in all {
             let key: Key = topic.in_run(&run);
             writer
@@ -319,6 +357,17 @@ fn a_recorded_run_is_shown_in_any_order() {
         assert_eq!(frame["tick"], index);
         check(&frame, points);
         assert!(points > 10_000, "two sweeps");
+        let track = &frame["tracks"][0];
+        let trail = track["trail_m"].as_array().unwrap();
+        assert_eq!(
+            (&track["id"], trail.len()),
+            (&3.into(), index + 1),
+            "{track}"
+        );
+        assert_eq!(
+            trail.last().unwrap()[0],
+            frame["detections"][0]["center_m"][0]
+        );
         assert_eq!(
             frame["pace"],
             serde_json::json!({"ticks": 5, "answered": 5, "rate_hz": 1.0})
@@ -466,6 +515,36 @@ fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
     assert_eq!(shown(1, 2), [0; 0], "never back in time");
     assert_eq!(shown(2, 0), [0], "but another replay has a time of its own");
     assert_eq!(shown(2, 1), [1]);
+}
+
+#[test]
+fn a_live_frame_waits_for_tracks_as_long_as_the_ego_tracks() {
+    let mut assembly = FrameAssembler::default();
+    // Tracks shown with each tick as they complete it, after its result and after its tracks.
+    let mut shown = |tick: u64, has_tracks: bool| {
+        let mut add = |(topic, payload): (Topic, Vec<u8>)| {
+            let seen = ReceivedMessage {
+                topic: &topic,
+                header: &wire::decode_header([payload.as_slice()]).unwrap(),
+                arrived_nanos: 0,
+                payload: Some(&payload),
+            };
+            assembly.add(&seen).map(|frame| frame.tracks)
+        };
+        let mut result = None;
+        for message in messages(tick, 100_000_000 * tick, Stream::Preview) {
+            result = add(message);
+        }
+        [result, has_tracks.then(|| add(tracks(tick))).flatten()]
+    };
+    assert_eq!(shown(0, true), [Some(vec![]), None], "not known yet");
+    for tick in [1, 2] {
+        let [result, tracks] = shown(tick, true);
+        assert!(result.is_none(), "tick {tick}");
+        assert_eq!(tracks.unwrap()[0].trail_m.len() as u64, tick + 1);
+    }
+    assert_eq!(shown(3, false), [None, None]);
+    assert_eq!(shown(4, false), [Some(vec![]), None], "it tracks no more");
 }
 
 #[test]

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use agent::input_log::RecordedInputs;
 use anyhow::{Context, bail};
 use bus::log_to_stderr;
-use protocol::Limits;
-use protocol::message::{Detections, DetectionsReport};
+use protocol::message::{Detections, FrameReport};
+use protocol::{Limits, Stream, Tracks};
 use serde::Deserialize;
 use support::cli::Outcome;
 use support::{bounded_file, output};
@@ -20,7 +20,7 @@ use crate::node::NodeOptions;
 /// Largest file of ground truth, bytes.
 const MAX_TRUTH_BYTES: u64 = 1 << 30;
 
-/// Decide again from the recorded inputs of a run: prints its detections.jsonl, byte for byte.
+/// Decide again from the recorded inputs of a run: prints its detections.jsonl or tracks.jsonl, byte for byte.
 ///
 /// `v2vloc up` records them with `record: {inputs: true}`. Results differ only if the program or the weights do.
 #[derive(Debug, clap::Args)]
@@ -33,6 +33,9 @@ pub(crate) struct Arguments {
     /// File with the tick of each capture time. Default: truth.jsonl of the run folder, if there is one.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
+    /// Print the tracks in place of the detections.
+    #[arg(long)]
+    tracks: bool,
 }
 
 /// A line of `truth.jsonl`, as far as it is needed.
@@ -55,18 +58,31 @@ impl Arguments {
         records.check_model(Some(ego.detector()), &config.models.weights)?;
         ego.warm_up(&cav)?;
         let mut ego_loop = EgoLoop::new(&cav, &ego, NodeOptions::from(&config).of_loop);
-        let mut results: BTreeMap<u64, Detections> = BTreeMap::new();
+        let mut results: BTreeMap<u64, (Detections, Option<Tracks>)> = BTreeMap::new();
         for record in &mut records {
             let (now_nanos, input) = match record {
                 Record::Input { now_nanos, input } => (now_nanos, input),
-                Record::Published(Published { stamp, stages }) => {
+                Record::Published(Published {
+                    stream,
+                    stamp,
+                    stages,
+                }) => {
+                    if (stream == Stream::Tracks) != self.tracks {
+                        continue;
+                    }
                     let capture_nanos = stamp.capture_nanos;
-                    let result = results.remove(&capture_nanos).with_context(|| {
-                        format!("no result of the frame captured at {capture_nanos} ns")
-                    })?;
+                    let missing =
+                        || format!("no result of the frame captured at {capture_nanos} ns");
+                    let result = results.remove(&capture_nanos);
+                    let (result, tracks) = result.with_context(missing)?;
                     let tick = ticks.get(&capture_nanos).copied();
-                    let result = Detections { stages, ..result };
-                    output::line(DetectionsReport::new(&stamp, tick, result).to_json())?;
+                    output::line(if self.tracks {
+                        let tracks = tracks.with_context(missing)?;
+                        FrameReport::new(&stamp, tick, tracks).to_json()
+                    } else {
+                        let result = Detections { stages, ..result };
+                        FrameReport::new(&stamp, tick, result).to_json()
+                    })?;
                     continue;
                 }
                 Record::Start(_) => continue,
@@ -83,9 +99,10 @@ impl Arguments {
                 if let Output::Publish {
                     capture_nanos,
                     result,
+                    tracks,
                 } = output
                 {
-                    results.insert(capture_nanos, *result);
+                    results.insert(capture_nanos, (*result, tracks));
                 }
             }
         }

@@ -69,6 +69,6 @@ pub(super) fn build(config: &EgoConfig) -> anyhow::Result<(CavId, Ego)> {
     let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
     let ego = ego
         .with_comm_range(config.comm_range_m)
-        .with_misbehaviour_detection(config.ego.trust())?;
+        .with_misbehaviour_detection(config.ego.trust)?;
     Ok((cav, ego))
 }

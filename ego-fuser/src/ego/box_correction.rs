@@ -3,8 +3,7 @@
 //! The head applied to a single vehicle's map gives that vehicle's ego-only boxes. The ego has both, map and head: it
 //! detects in a neighbour's map the boxes that the neighbour would have sent, without waiting for another message.
 
-use nalgebra::Isometry3;
-use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::detector::{Detector, DetectorError};
 use protocol::Detection;
 use tch::Tensor;
@@ -49,12 +48,5 @@ fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detection>, Detecto
         ..PostprocessConfig::for_late_fusion(detector.config())
     };
     let boxes = detector.boxes(&detector.heads(map)?, limits.score_threshold)?;
-    let own = AgentBoxes {
-        boxes: &boxes,
-        output_from_agent: Isometry3::identity(),
-    };
-    Ok(postprocess(&[own], &limits)
-        .iter()
-        .map(|candidate| candidate.detection(None))
-        .collect())
+    Ok(detections(&boxes, &limits))
 }

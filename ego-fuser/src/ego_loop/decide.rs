@@ -42,7 +42,8 @@ impl EgoLoop {
                 }
             }
         }
-        let has_ended = self.ends_nanos.is_some() && (is_over || self.all_have_ended());
+        let has_ended =
+            self.ends_nanos.is_some() && (is_over || self.members.is_subset(&self.ended));
         if has_ended && self.frames.is_empty() {
             self.finish();
         }
@@ -73,10 +74,6 @@ impl EgoLoop {
                 || self.models.is_other(cav)
                 || self.pairing.has_reached(cav, capture_nanos)
         })
-    }
-
-    fn all_have_ended(&self) -> bool {
-        self.members.iter().all(|cav| self.ended.contains(cav))
     }
 
     fn fuse(&mut self, ego: &mut Ego, frame: OwnFrame, now_nanos: u64) {
@@ -110,9 +107,12 @@ impl EgoLoop {
                     stages: transport.into_iter().chain([wait]).chain(stages).collect(),
                 };
                 self.report.frames += 1;
+                let tracker = self.tracker.as_mut();
+                let tracks = tracker.map(|tracker| tracker.follow(own.capture_nanos, &result));
                 self.outputs.push(Output::Publish {
                     capture_nanos: own.capture_nanos,
                     result: Box::new(result),
+                    tracks,
                 });
             }
             Err(error) => {

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use protocol::message::{Descriptor, Detections};
-use protocol::{CavId, DropReason, Pace};
+use protocol::{CavId, DropReason, Pace, Tracks};
 use serde::{Deserialize, Serialize};
 
 use crate::capture_clock::SweepTime;
@@ -94,6 +94,8 @@ pub enum Output {
         capture_nanos: u64,
         /// The result.
         result: Box<Detections>,
+        /// The tracks after it, if the ego tracks.
+        tracks: Option<Tracks>,
     },
     /// A frame has no result.
     Failed {

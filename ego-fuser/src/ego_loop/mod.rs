@@ -29,6 +29,7 @@ use crate::silence::Silence;
 use crate::view::View;
 use fusion::method::Exchange;
 use pace_keeper::PaceKeeper;
+use tracking::{Tracker, TrackerConfig};
 use waits::Waits;
 
 pub(crate) use admit::Refusal;
@@ -48,6 +49,8 @@ pub struct LoopOptions {
     pub sets_pace: bool,
     /// True where arrivals of sweeps are exact, as in simulation time.
     pub has_exact_arrivals: bool,
+    /// True to track the detected objects.
+    pub tracks: bool,
 }
 
 impl LoopOptions {
@@ -58,6 +61,7 @@ impl LoopOptions {
             pairing: settings.pairing(),
             sets_pace: false,
             has_exact_arrivals: true,
+            tracks: settings.tracks,
         }
     }
 }
@@ -101,6 +105,7 @@ pub struct EgoLoop {
     clock_offsets_s: BTreeMap<CavId, f64>,
     frames: VecDeque<OwnFrame>,
     pace: PaceKeeper,
+    tracker: Option<Tracker>,
     /// Capture time of the ego's newest sweep, nanoseconds.
     own_nanos: Option<u64>,
     ended: BTreeSet<CavId>,
@@ -129,6 +134,7 @@ impl EgoLoop {
             clock_offsets_s: BTreeMap::new(),
             frames: VecDeque::new(),
             pace: PaceKeeper::new(options.sets_pace),
+            tracker: options.tracks.then(|| tracker_of(ego)),
             own_nanos: None,
             ended: BTreeSet::new(),
             ends_nanos: None,
@@ -197,6 +203,15 @@ impl EgoLoop {
     pub fn unused(&self, cav: &CavId) -> usize {
         self.pairing.unused(cav)
     }
+}
+
+/// A tracker of the objects in the area in which an ego detects.
+fn tracker_of(ego: &Ego) -> Tracker {
+    let [x_low, y_low, _, x_high, y_high, _] = ego.detector().config().lidar_range_m;
+    Tracker::new(TrackerConfig {
+        area_m: [x_low, y_low, x_high, y_high],
+        ..TrackerConfig::default()
+    })
 }
 
 fn stream_of(exchange: Exchange) -> Stream {

@@ -2,23 +2,25 @@
 
 use agent::input_log;
 use protocol::message::StageTiming;
-use protocol::{Limits, Stamp, wire};
+use protocol::{Limits, Stamp, Stream, wire};
 use serde::{Deserialize, Serialize};
 
 use super::{EgoLoop, Input, Message, Reception, Refusal};
 
 /// Kind of a log of an ego's inputs.
-pub const KIND: &str = "ego inputs, 2";
+pub const KIND: &str = "ego inputs, 3";
 
 /// A record of an ego's inputs.
 pub type Record = input_log::Record<Input<WireMessage>, Published>;
 
-/// A published result: its stamp, and the measured durations of its stages.
+/// Published detections or tracks: their stamp, and the measured durations of stages.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Published {
+    /// Their stream.
+    pub stream: Stream,
     /// Stamp of the message.
     pub stamp: Stamp,
-    /// Durations of the stages.
+    /// Durations of the stages; empty for tracks.
     pub stages: Vec<StageTiming>,
 }
 

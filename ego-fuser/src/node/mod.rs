@@ -13,8 +13,11 @@ use bus::shutdown::Stop;
 use bus::{
     Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription, unix_nanos,
 };
-use protocol::message::{DetectionsReport, StageTiming};
-use protocol::{Body, CavId, Detections, Encoded, Limits, Role, Stream, Topic, wire};
+use protocol::message::{FrameReport, StageTiming};
+use protocol::{
+    Body, CavId, Detections, Encoded, Limits, Payload, Role, Stamp, Stream, Topic, Tracks, wire,
+};
+use serde::Serialize;
 
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::Ego;
@@ -114,16 +117,73 @@ pub fn run(
     node.receive(stop)?;
     let Node {
         detections,
-        json,
+        tracks,
         pace,
         ego_loop,
         ..
     } = node;
     pace.finish();
     detections.finish();
-    json.finish();
+    if let Some(tracks) = tracks {
+        tracks.finish();
+    }
     presence.withdraw()?;
     Ok(ego_loop.report().clone())
+}
+
+/// Publishers of one kind of result: as a message, and as JSON.
+struct Results {
+    binary: Publisher,
+    json: Publisher,
+}
+
+impl Results {
+    fn open(bus: &Bus, cav: &CavId, [binary, json]: [Stream; 2]) -> Result<Self, BusError> {
+        let options = PublisherOptions::DETECTIONS;
+        Ok(Self {
+            binary: bus.publisher(Topic::stream(cav, binary), options.waiting(RESULTS))?,
+            json: bus.publisher(Topic::stream(cav, json), options)?,
+        })
+    }
+
+    /// Submits a result, which is completed when its message has a stamp.
+    fn submit<T: Payload + Serialize + Clone + Send + 'static>(
+        &self,
+        capture_nanos: u64,
+        result: T,
+        complete: impl FnOnce(&Stamp, &mut T) + Send + 'static,
+    ) {
+        let mut binary = result.clone();
+        self.binary.submit_encoded(capture_nanos, move |stamp| {
+            complete(stamp, &mut binary);
+            wire::encode(stamp, binary)
+        });
+        self.json.submit_encoded(capture_nanos, move |stamp| {
+            Ok(Encoded {
+                head: FrameReport::new(stamp, None, result).to_json().into_bytes(),
+                body: Body::Empty,
+            })
+        });
+    }
+
+    fn finish(self) {
+        self.binary.finish();
+        self.json.finish();
+    }
+}
+
+/// Log of the inputs of an ego.
+type Log = InputLog<Input<WireMessage>, Published>;
+
+/// Records that a result was published.
+fn note(log: Option<Log>, stream: Stream, stamp: &Stamp, stages: Vec<StageTiming>) {
+    if let Some(log) = log {
+        log.add(&Record::Published(Published {
+            stream,
+            stamp: stamp.clone(),
+            stages,
+        }));
+    }
 }
 
 struct Node<'a> {
@@ -136,9 +196,9 @@ struct Node<'a> {
     neighbourhood: Option<Neighbourhood>,
     clock: LoopClock,
     pace: Publisher,
-    detections: Publisher,
-    json: Publisher,
-    log: Option<InputLog<Input<WireMessage>, Published>>,
+    detections: Results,
+    tracks: Option<Results>,
+    log: Option<Log>,
     _own: Vec<Subscription>,
 }
 
@@ -161,7 +221,7 @@ impl<'a> Node<'a> {
         let streams = vec![Stream::Descriptor, ego_loop.stream()];
         let own = streams
             .iter()
-            .map(|&stream| bus.subscribe(own_topic(cav, stream), &inbox))
+            .map(|&stream| bus.subscribe(Topic::stream(cav, stream), &inbox))
             .collect::<Result<_, _>>()?;
         // An ego-only method needs no messages of others.
         let neighbourhood = (ego.method().exchange() != Exchange::Nothing)
@@ -181,15 +241,11 @@ impl<'a> Node<'a> {
             options,
             neighbourhood,
             clock: LoopClock::start(),
-            pace: bus.publisher(own_topic(cav, Stream::Pace), PublisherOptions::POSE)?,
-            detections: bus.publisher(
-                own_topic(cav, Stream::Detections),
-                PublisherOptions::DETECTIONS.waiting(RESULTS),
-            )?,
-            json: bus.publisher(
-                own_topic(cav, Stream::DetectionsJson),
-                PublisherOptions::DETECTIONS,
-            )?,
+            pace: bus.publisher(Topic::stream(cav, Stream::Pace), PublisherOptions::POSE)?,
+            detections: Results::open(bus, cav, [Stream::Detections, Stream::DetectionsJson])?,
+            tracks: { options.of_loop.tracks }
+                .then(|| Results::open(bus, cav, [Stream::Tracks, Stream::TracksJson]))
+                .transpose()?,
             log,
             _own: own,
             ego_loop,
@@ -253,7 +309,13 @@ impl<'a> Node<'a> {
                 Output::Publish {
                     capture_nanos,
                     result,
-                } => self.publish(capture_nanos, *result),
+                    tracks,
+                } => {
+                    self.publish(capture_nanos, *result);
+                    if let Some(tracks) = tracks {
+                        self.publish_tracks(capture_nanos, tracks);
+                    }
+                }
                 Output::Failed {
                     capture_nanos,
                     error,
@@ -287,28 +349,22 @@ impl<'a> Node<'a> {
         }
         // The ego does not know when the sensors of its vehicle measured.
         stats.answered(None, result.fused.len());
-        let (fused, binary, log) = (unix_nanos(), result.clone(), self.log.clone());
-        self.detections.submit_encoded(capture_nanos, move |stamp| {
-            let mut result = binary;
+        let (fused, log) = (unix_nanos(), self.log.clone());
+        let complete = move |stamp: &Stamp, result: &mut Detections| {
             let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
             result.stages.push(StageTiming::new("send", sending));
-            if let Some(log) = log {
-                log.add(&Record::Published(Published {
-                    stamp: stamp.clone(),
-                    stages: result.stages.clone(),
-                }));
-            }
-            wire::encode(stamp, result)
-        });
-        self.json.submit_encoded(capture_nanos, move |stamp| {
-            let head = DetectionsReport::new(stamp, None, result)
-                .to_json()
-                .into_bytes();
-            Ok(Encoded {
-                head,
-                body: Body::Empty,
-            })
-        });
+            note(log, Stream::Detections, stamp, result.stages.clone());
+        };
+        self.detections.submit(capture_nanos, result, complete);
+    }
+
+    fn publish_tracks(&self, capture_nanos: u64, tracks: Tracks) {
+        if let Some(results) = &self.tracks {
+            let log = self.log.clone();
+            results.submit(capture_nanos, tracks, move |stamp, _| {
+                note(log, Stream::Tracks, stamp, Vec::new());
+            });
+        }
     }
 
     fn topic(&self, cav: &CavId) -> Topic {
@@ -320,12 +376,5 @@ impl<'a> Node<'a> {
         let look_round = Instant::now() + LOOK_ROUND;
         let wakes = self.ego_loop.wakes_nanos();
         wakes.map_or(look_round, |wakes| self.clock.moment(wakes).min(look_round))
-    }
-}
-
-fn own_topic(cav: &CavId, stream: Stream) -> Topic {
-    Topic::Stream {
-        cav: cav.clone(),
-        stream,
     }
 }

@@ -2,8 +2,9 @@
 //!
 //! [`Tracker`] follows objects in the ground plane of the world (map) frame, so that the motion of the ego does not
 //! matter: a constant-velocity Kalman filter for each ([`kalman`]), an optimal assignment of detections to tracks
-//! ([`assignment`]), and a probability of existence that hits raise and misses in the area of view lower. Time is an
-//! argument; equal inputs give equal tracks. [`metrics`] has CLEAR MOT, AMOTA, AMOTP, HOTA and IDF1.
+//! ([`assignment`]), and a probability of existence that hits raise and misses in the area of view lower. It reports them
+//! in the LiDAR frame of the ego. Time is an argument; equal inputs give equal tracks. [`metrics`] has CLEAR MOT, AMOTA,
+//! AMOTP, HOTA and IDF1.
 //!
 //! ```
 //! use protocol::{Box3d, Detection, Pose};
@@ -29,5 +30,4 @@ pub mod metrics;
 mod track;
 mod tracker;
 
-pub use track::Track;
 pub use tracker::{Tracker, TrackerConfig, TrackingError};

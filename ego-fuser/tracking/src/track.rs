@@ -2,9 +2,8 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-use nalgebra::Vector2;
-use protocol::Box3d;
-use serde::{Deserialize, Serialize};
+use nalgebra::{Isometry3, Matrix4, Rotation2, Vector2, Vector3};
+use protocol::{Box3d, Track};
 
 use crate::TrackerConfig;
 use crate::kalman::{ConstantVelocity, Innovation};
@@ -17,26 +16,6 @@ const MAX_EXISTENCE: f64 = 0.99;
 /// Speed from which the direction of motion tells front from rear, metres per second.
 const CLEAR_MOTION_MPS: f64 = 3.0;
 
-/// A tracked object at a capture time.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Track {
-    /// Identity, from 1 on; never used again by the same tracker.
-    pub id: u64,
-    /// The object in the world frame.
-    #[serde(rename = "box")]
-    pub box3d: Box3d,
-    /// Velocity x, y in the world frame, metres per second.
-    pub velocity_mps: [f64; 2],
-    /// Covariance of x, y, velocity x, velocity y, by rows: metres and metres per second.
-    pub covariance: [[f64; 4]; 4],
-    /// Mean score of its detections times the probability that the object exists, 0..=1.
-    pub score: f64,
-    /// Number of its detections.
-    pub hits: u32,
-    /// Time since its last detection, seconds; 0 if it is in this frame.
-    pub unseen_s: f64,
-}
-
 /// State of a track between frames.
 #[derive(Debug, Clone)]
 pub(crate) struct TrackState {
@@ -48,6 +27,7 @@ pub(crate) struct TrackState {
     existence: f64,
     score_sum: f64,
     hits: u32,
+    age_s: f64,
     unseen_s: f64,
 }
 
@@ -64,12 +44,14 @@ impl TrackState {
             existence: measured.score.min(MAX_EXISTENCE),
             score_sum: measured.score,
             hits: 1,
+            age_s: 0.0,
             unseen_s: 0.0,
         }
     }
 
     pub(crate) fn predict(&mut self, elapsed_s: f64, config: &TrackerConfig) {
         self.filter.predict(elapsed_s, config.acceleration_mps2);
+        self.age_s += elapsed_s;
         self.unseen_s += elapsed_s;
     }
 
@@ -132,15 +114,24 @@ impl TrackState {
         }
     }
 
-    pub(crate) fn report(&self) -> Track {
-        let covariance = self.filter.covariance;
+    /// The track in the LiDAR frame of the ego.
+    pub(crate) fn report(&self, ego_from_world: &Isometry3<f64>) -> Track {
+        let axis = ego_from_world * Vector3::x();
+        let turn = Rotation2::new(axis.y.atan2(axis.x));
+        let mut both = Matrix4::zeros();
+        for first in [0, 2] {
+            both.fixed_view_mut::<2, 2>(first, first)
+                .copy_from(turn.matrix());
+        }
+        let covariance = both * self.filter.covariance * both.transpose();
         Track {
             id: self.id,
-            box3d: self.box3d(),
-            velocity_mps: self.filter.velocity_mps().into(),
-            covariance: covariance.transpose().into(),
+            box3d: self.box3d().transformed(ego_from_world),
+            velocity_mps: (turn * self.filter.velocity_mps()).into(),
+            covariance: covariance.transpose().map(|value| value as f32).into(),
             score: self.existence * self.score_sum / f64::from(self.hits),
             hits: self.hits,
+            age_s: self.age_s,
             unseen_s: self.unseen_s,
         }
     }

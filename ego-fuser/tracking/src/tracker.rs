@@ -1,12 +1,14 @@
 //! Tracker: the tracks of an ego from frame to frame.
 
 use nalgebra::{Isometry3, Point3};
-use protocol::{Detection, InvalidPose, PlanarCovariance, Pose};
+use protocol::{
+    Detection, Detections, InvalidPose, PlanarCovariance, Pose, PoseEstimate, Track, Tracks,
+};
 
 use crate::assignment;
 use crate::kalman::Innovation;
 use crate::measurement::Measurement;
-use crate::track::{Track, TrackState};
+use crate::track::TrackState;
 
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -36,6 +38,11 @@ pub struct TrackerConfig {
     pub death_existence: f64,
     /// Longest time without a detection, seconds.
     pub max_unseen_s: f64,
+    /// Largest number of detections of a frame: those of the highest scores, in the order of the list where these are
+    /// equal.
+    pub max_detections: usize,
+    /// Largest number of tracks: detections beyond it, those of the lowest scores, begin none.
+    pub max_tracks: usize,
 }
 
 impl Default for TrackerConfig {
@@ -54,6 +61,8 @@ impl Default for TrackerConfig {
             report_existence: 0.3,
             death_existence: 0.05,
             max_unseen_s: 1.0,
+            max_detections: 200,
+            max_tracks: 400,
         }
     }
 }
@@ -75,13 +84,13 @@ pub enum TrackingError {
 }
 
 /// Tracks of one ego.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Tracker {
     config: TrackerConfig,
     tracks: Vec<TrackState>,
     begun: u64,
     last_nanos: Option<u64>,
-    rejected: u64,
+    left_out: u64,
 }
 
 impl Tracker {
@@ -90,21 +99,50 @@ impl Tracker {
     pub fn new(config: TrackerConfig) -> Self {
         Self {
             config,
-            tracks: Vec::new(),
-            begun: 0,
-            last_nanos: None,
-            rejected: 0,
+            ..Self::default()
         }
     }
 
-    /// Number of detections so far that were left out: a number is not finite, a size negative, or the score not within
-    /// 0..=1.
+    /// Number of detections so far that were left out: a number is not finite, a size negative, the score not within
+    /// 0..=1, or there were more than [`TrackerConfig`] allows.
     #[must_use]
-    pub fn rejected(&self) -> u64 {
-        self.rejected
+    pub fn left_out(&self) -> u64 {
+        self.left_out
     }
 
-    /// Takes a frame and returns the tracks at its capture time, ordered by id.
+    /// Takes the result of an ego and returns its tracks, none without a usable pose. Where time does not advance the
+    /// scene begins again: all tracks end.
+    pub fn follow(&mut self, capture_nanos: u64, result: &Detections) -> Tracks {
+        if self.last_nanos.is_some_and(|last| capture_nanos <= last) {
+            (self.tracks, self.last_nanos) = (Vec::new(), None);
+        }
+        let (before, pose) = (self.left_out, result.pose);
+        let tracks = match &pose {
+            PoseEstimate::Pose {
+                world_from_cav,
+                covariance,
+                ..
+            } => {
+                let covariance = covariance.as_ref();
+                self.update(
+                    capture_nanos,
+                    world_from_cav,
+                    covariance,
+                    &result.detections,
+                )
+            }
+            PoseEstimate::NoPose { .. } => Ok(Vec::new()),
+        };
+        Tracks {
+            ego: result.ego.clone(),
+            agent_frame: result.agent_frame,
+            pose,
+            tracks: tracks.unwrap_or_default(),
+            left_out: u32::try_from(self.left_out - before).unwrap_or(u32::MAX),
+        }
+    }
+
+    /// Takes a frame and returns the tracks at its capture time in the ego's LiDAR frame, ordered by id.
     ///
     /// `world_from_ego` is the pose of the ego's LiDAR, `covariance` that of this pose in the plane of the world (`None`:
     /// taken as 0), and `detections` are in the ego's LiDAR frame.
@@ -123,19 +161,21 @@ impl Tracker {
         let world_from_ego = world_from_ego.isometry();
         let measure =
             |detection| Measurement::new(detection, &world_from_ego, covariance, &self.config);
-        let measurements: Vec<_> = detections.iter().filter_map(measure).collect();
-        self.rejected += (detections.len() - measurements.len()) as u64;
+        let mut measurements: Vec<_> = detections.iter().filter_map(measure).collect();
+        keep_best(&mut measurements, self.config.max_detections);
+        self.left_out += (detections.len() - measurements.len()) as u64;
         for track in &mut self.tracks {
             track.predict(elapsed_s, &self.config);
         }
         let owners = self.assign(&measurements);
-        self.count_misses(&owners, &world_from_ego.inverse());
+        let ego_from_world = world_from_ego.inverse();
+        self.count_misses(&owners, &ego_from_world);
         self.tracks.retain(|track| track.is_alive(&self.config));
         self.begin(&measurements, &owners);
         let reported = self.tracks.iter();
         Ok(reported
             .filter(|track| track.is_reported(&self.config))
-            .map(TrackState::report)
+            .map(|track| track.report(&ego_from_world))
             .collect())
     }
 
@@ -211,13 +251,32 @@ impl Tracker {
     }
 
     fn begin(&mut self, measurements: &[Measurement], owners: &[Option<usize>]) {
-        for (measured, owner) in measurements.iter().zip(owners) {
-            if owner.is_none() && measured.score >= self.config.birth_score {
-                self.begun += 1;
-                let track = TrackState::new(self.begun, measured, &self.config);
-                self.tracks.push(track);
-            }
+        let free = measurements.iter().zip(owners);
+        let mut new: Vec<Measurement> = free
+            .filter(|(measured, owner)| {
+                owner.is_none() && measured.score >= self.config.birth_score
+            })
+            .map(|(measured, _)| *measured)
+            .collect();
+        let (found, room) = (
+            new.len(),
+            self.config.max_tracks.saturating_sub(self.tracks.len()),
+        );
+        keep_best(&mut new, room);
+        self.left_out += (found - new.len()) as u64;
+        for measured in &new {
+            self.begun += 1;
+            let track = TrackState::new(self.begun, measured, &self.config);
+            self.tracks.push(track);
         }
+    }
+}
+
+/// Keeps as many measurements, those of the highest scores.
+fn keep_best(measurements: &mut Vec<Measurement>, most: usize) {
+    if measurements.len() > most {
+        measurements.sort_by(|a, b| b.score.total_cmp(&a.score));
+        measurements.truncate(most);
     }
 }
 

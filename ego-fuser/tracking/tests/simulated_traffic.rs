@@ -85,13 +85,10 @@ fn quality(miss: f64, false_alarms: f64) -> TrackQuality {
                 &detections,
             )
             .unwrap();
-        let in_ego = tracks.iter().map(|track| {
-            let center = ego_from_world * Point3::from(track.box3d.center_m);
-            TrackPoint {
-                id: track.id,
-                center_m: [center.x, center.y],
-                score: track.score,
-            }
+        let in_ego = tracks.iter().map(|track| TrackPoint {
+            id: track.id,
+            center_m: [track.box3d.center_m[0], track.box3d.center_m[1]],
+            score: track.score,
         });
         let tracks = in_ego
             .filter(|track| track.center_m[0].abs() <= 48.0 && track.center_m[1].abs() <= 38.0)

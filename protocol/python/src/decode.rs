@@ -7,7 +7,7 @@ use pyo3::{Py, PyAny, PyResult, Python, pyclass, pyfunction, pymethods};
 use crate::error::error;
 use crate::frame::Agent;
 use crate::frame_parts::{AgentParts, decode_stream};
-use crate::payload::{Bev, Camera, DecodedBev, Detections, PoseEstimate};
+use crate::payload::{Bev, Camera, DecodedBev, Detections, PoseEstimate, Tracks};
 use crate::{arrays, json};
 
 /// One message: header and payload.
@@ -99,6 +99,7 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
         WireMessage::Pose(pose) => PoseEstimate::new(py, &pose)?.into_any(),
         WireMessage::Boxes(boxes) => Detections::of_agent(py, cav.as_str(), &boxes)?.into_any(),
         WireMessage::Detections(found) => Detections::of_ego(py, &found)?.into_any(),
+        WireMessage::Tracks(tracks) => Tracks::new(py, &tracks)?.into_any(),
         WireMessage::Camera(camera) => Camera::new(py, &camera)?.into_any(),
         WireMessage::Points(sent) => Agent::new(py, AgentParts::of_points(cav, sent))?
             .0

@@ -11,7 +11,7 @@ use pyo3::{Py, PyResult, Python, pyclass, pymethods};
 use crate::arrays::{self, Matrix};
 use crate::error::error;
 use crate::frame_parts::{AgentParts, FrameParts};
-use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate};
+use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate, Tracks};
 
 /// One agent at one capture time.
 #[pyclass(frozen, get_all, module = "v2vloc")]
@@ -114,6 +114,8 @@ pub(crate) struct Frame {
     #[pyo3(get)]
     detections: Py<PyDict>,
     #[pyo3(get)]
+    tracks: Py<PyDict>,
+    #[pyo3(get)]
     problems: Vec<String>,
     #[pyo3(get)]
     ego: Option<String>,
@@ -123,7 +125,7 @@ pub(crate) struct Frame {
 
 impl Frame {
     pub(crate) fn new(py: Python<'_>, parts: FrameParts) -> PyResult<Self> {
-        let (agents, detections) = (PyDict::new(py), PyDict::new(py));
+        let [agents, detections, tracks] = std::array::from_fn(|_| PyDict::new(py));
         let mut truth = Vec::with_capacity(parts.agents.len());
         for agent in parts.agents {
             let (agent, recorded) = Agent::new(py, agent)?;
@@ -132,6 +134,9 @@ impl Frame {
         }
         for result in &parts.detections {
             detections.set_item(result.ego.as_str(), Detections::of_ego(py, result)?)?;
+        }
+        for found in &parts.tracks {
+            tracks.set_item(found.ego.as_str(), Tracks::new(py, found)?)?;
         }
         let ego = (parts.detections)
             .first()
@@ -143,6 +148,7 @@ impl Frame {
             capture_time_ns: parts.capture_nanos,
             agents: agents.unbind(),
             detections: detections.unbind(),
+            tracks: tracks.unbind(),
             problems: parts.problems,
             ego: ego.map(ToString::to_string),
             truth,

@@ -4,7 +4,7 @@ use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use protocol::{
     Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream, Topic,
-    Truth, WireError, wire,
+    Tracks, Truth, WireError, wire,
 };
 
 use crate::payload::DecodedBev;
@@ -19,6 +19,8 @@ pub(crate) struct FrameParts {
     pub(crate) agents: Vec<AgentParts>,
     /// Results of egos.
     pub(crate) detections: Vec<Detections>,
+    /// Tracks of egos.
+    pub(crate) tracks: Vec<Tracks>,
     /// Reasons for which parts were left out.
     pub(crate) problems: Vec<String>,
     /// The rule of the ground truth.
@@ -46,6 +48,7 @@ impl FrameParts {
             capture_nanos,
             agents: Vec::new(),
             detections: Vec::new(),
+            tracks: Vec::new(),
             problems: Vec::new(),
             protocol: protocol.clone(),
         }
@@ -68,6 +71,11 @@ impl FrameParts {
                     if !self.detections.iter().any(|known| known.ego == found.ego) =>
                 {
                     self.detections.push(found);
+                }
+                Message::Tracks(found)
+                    if !self.tracks.iter().any(|known| known.ego == found.ego) =>
+                {
+                    self.tracks.push(found);
                 }
                 message => self.agent(cav).take(*stream, message)?,
             },

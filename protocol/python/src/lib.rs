@@ -39,5 +39,5 @@ mod package {
     #[pymodule_export]
     use crate::listener::{Listener, MessageIterator, listen};
     #[pymodule_export]
-    use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate};
+    use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate, Tracks};
 }

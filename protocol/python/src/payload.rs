@@ -1,9 +1,9 @@
-//! Payloads of messages and parts of frames: pose estimate, feature map, detections, objects, image.
+//! Payloads of messages and parts of frames: pose estimate, feature map, detections, tracks, objects, image.
 
 use dataset::frame::{Frame, Object};
 use dataset::ground_truth::{GroundTruth, upright_box};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
-use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose};
+use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose, Track};
 use pyo3::types::{PyBytes, PyDict, PyDictMethods, PyList};
 use pyo3::{Py, PyAny, PyResult, Python, pyclass, pymethods};
 
@@ -244,6 +244,58 @@ impl Detections {
 
     fn __len__(&self, py: Python<'_>) -> usize {
         numpy::PyUntypedArrayMethods::len(self.scores.bind(py))
+    }
+}
+
+/// Tracks of an ego.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct Tracks {
+    cav: String,
+    agent_frame: u64,
+    ids: Py<PyArray1<u64>>,
+    boxes: Matrix,
+    velocities_mps: Matrix,
+    covariances: Py<PyArray3<f32>>,
+    scores: Py<PyArray1<f64>>,
+    hits: Py<PyArray1<u32>>,
+    ages_s: Py<PyArray1<f64>>,
+    unseen_s: Py<PyArray1<f64>>,
+    pose: Py<PoseEstimate>,
+    left_out: u32,
+}
+
+impl Tracks {
+    pub(crate) fn new(py: Python<'_>, found: &protocol::Tracks) -> PyResult<Py<Self>> {
+        let all = || found.tracks.iter();
+        let numbers = |of: fn(&Track) -> f64| PyArray1::from_vec(py, all().map(of).collect());
+        let covariances: Vec<[f32; 4]> = all().flat_map(|track| track.covariance).collect();
+        let covariances = PyArray1::from_vec(py, covariances.into_flattened());
+        let made = Self {
+            cav: found.ego.to_string(),
+            agent_frame: found.agent_frame,
+            ids: PyArray1::from_vec(py, all().map(|track| track.id).collect()).unbind(),
+            boxes: arrays::boxes(py, all().map(|track| &track.box3d))?,
+            velocities_mps: arrays::rows(py, all().map(|track| track.velocity_mps).collect())?,
+            covariances: covariances.reshape([found.tracks.len(), 4, 4])?.unbind(),
+            scores: numbers(|track| track.score).unbind(),
+            hits: PyArray1::from_vec(py, all().map(|track| track.hits).collect()).unbind(),
+            ages_s: numbers(|track| track.age_s).unbind(),
+            unseen_s: numbers(|track| track.unseen_s).unbind(),
+            pose: PoseEstimate::new(py, &found.pose)?,
+            left_out: found.left_out,
+        };
+        Py::new(py, made)
+    }
+}
+
+#[pymethods]
+impl Tracks {
+    fn __repr__(&self, py: Python<'_>) -> String {
+        format!("Tracks(cav={:?}, {} tracks)", self.cav, self.__len__(py))
+    }
+
+    fn __len__(&self, py: Python<'_>) -> usize {
+        numpy::PyUntypedArrayMethods::len(self.ids.bind(py))
     }
 }
 

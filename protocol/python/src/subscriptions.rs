@@ -6,7 +6,7 @@ use pyo3::{PyErr, PyResult};
 use crate::error::error;
 
 /// Streams of a listener that asks for none: all but sweeps and images, which are most of the traffic.
-const STREAMS: [&str; 8] = [
+const STREAMS: [&str; 9] = [
     "gnss",
     "imu",
     "pose",
@@ -14,6 +14,7 @@ const STREAMS: [&str; 8] = [
     "boxes",
     "points",
     "detections",
+    "tracks",
     "truth",
 ];
 
@@ -79,6 +80,6 @@ fn selector(run: &RunId, name: &str) -> PyResult<KeyExpr> {
 }
 
 fn no_stream(name: &str) -> PyErr {
-    let known = "lidar, radar, camera, gnss, imu, pose, bev, boxes, points, detections, descriptor, pace, truth, stats";
+    let known = "lidar, radar, camera, gnss, imu, pose, bev, boxes, points, detections, tracks, descriptor, pace, truth, stats";
     error(format!("streams: {name:?} is none; there are {known}"))
 }

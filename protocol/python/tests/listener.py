@@ -40,6 +40,14 @@ def test_a_live_fleet_is_followed(run):
         assert found.method == "max" and found.boxes.shape == (len(found.scores), 7)
         assert {one["cav"] for one in found.fused} == set(frame.agents) - {frame.ego}
         assert "detections of 1" in repr(frame), repr(frame)
+        tracks = frame.tracks[frame.ego]
+        count = len(tracks)
+        assert (tracks.cav, tracks.agent_frame, tracks.left_out) == (frame.ego, found.agent_frame, 0)
+        assert tracks.boxes.shape == (count, 7) and tracks.velocities_mps.shape == (count, 2)
+        assert tracks.covariances.shape == (count, 4, 4) and tracks.scores.shape == (count,)
+        assert (np.diff(tracks.ids) > 0).all() and (tracks.unseen_s <= tracks.ages_s).all() and (tracks.hits > 0).all()
+    last = frames[-1].tracks[frames[-1].ego]
+    assert last.hits.max() >= FRAMES // 2 and (last.unseen_s == 0).any(), last
 
 
 def test_a_closed_listener_ends(run):

@@ -11,6 +11,8 @@
 //! | `/cav_<id>/points` | `sensor_msgs/PointCloud2` | sweep | best effort, 5 |
 //! | `/cav_<id>/detections` | `vision_msgs/Detection3DArray` | detections of an ego | reliable, 10 |
 //! | `/cav_<id>/markers` | `visualization_msgs/MarkerArray` | the same, for viewers | reliable, 10 |
+//! | `/cav_<id>/tracks` | `vision_msgs/Detection3DArray` | tracks of an ego, `id` is the identity | reliable, 10 |
+//! | `/cav_<id>/track_markers` | `visualization_msgs/MarkerArray` | the same, for viewers | reliable, 10 |
 //! | `/tf` | `tf2_msgs/TFMessage` | `map` to `cav_<id>/lidar`, or to the odometry frame of a robot | reliable, 100 |
 //! | `/tf_static` | `tf2_msgs/TFMessage` | `cav_<id>/lidar` to `cav_<id>/base_link` | reliable, latched, 1 |
 //! | `/clock` | `rosgraph_msgs/Clock` | capture times | best effort, 1 |

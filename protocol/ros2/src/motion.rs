@@ -70,12 +70,6 @@ impl MotionType {
         }
     }
 
-    /// True if the message has a speed.
-    #[must_use]
-    pub fn has_speed(self) -> bool {
-        self != Self::Imu
-    }
-
     /// Reads a message in CDR, with its encapsulation header.
     ///
     /// # Errors
@@ -317,7 +311,7 @@ mod tests {
             for ty in TYPES {
                 let expected = TimedMotion {
                     capture_nanos: 7_000_000_008,
-                    motion: EgoMotion { speed_mps: ty.has_speed().then_some(speed), yaw_rate_rad_s: Some(yaw_rate) },
+                    motion: EgoMotion { speed_mps: (ty != MotionType::Imu).then_some(speed), yaw_rate_rad_s: Some(yaw_rate) },
                 };
                 prop_assert_eq!(ty.read(&little(ty, numbers)).unwrap(), expected.clone());
                 let big = written::<BigEndian>(ty, [0, 0, 0, 0], numbers);

@@ -25,6 +25,10 @@ pub enum VehicleTopic {
     Detections,
     /// The same, for viewers.
     Markers,
+    /// Tracks of an ego.
+    Tracks,
+    /// The same, for viewers.
+    TrackMarkers,
 }
 
 impl VehicleTopic {
@@ -48,6 +52,8 @@ impl VehicleTopic {
             }
             Self::Detections => ("detections".into(), RosType::Detection3dArray, Qos::DEFAULT),
             Self::Markers => ("markers".into(), RosType::MarkerArray, Qos::DEFAULT),
+            Self::Tracks => ("tracks".into(), RosType::Detection3dArray, Qos::DEFAULT),
+            Self::TrackMarkers => ("track_markers".into(), RosType::MarkerArray, Qos::DEFAULT),
         }
     }
 }

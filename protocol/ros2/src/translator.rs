@@ -6,11 +6,12 @@ use protocol::{
     Camera, CavId, EgoMotion, Message, PoseEstimate, ProcessId, RunId, Stats, Stream, Topic, Truth,
 };
 
-use super::encode::{self, Level, Marked, Status};
+use super::encode::{self, FrameInParent, Level, Marked, Status};
 use super::names::{FrameNames, MAP_FRAME};
 use super::topic::{RosTopic, VehicleTopic};
 
 const DETECTION_RGB: [f32; 3] = [1.0, 0.37, 0.30];
+const TRACK_RGB: [f32; 3] = [0.91, 0.30, 0.74];
 const TRUTH_RGB: [f32; 3] = [0.25, 0.81, 0.47];
 
 /// A message of ROS 2.
@@ -20,6 +21,14 @@ pub struct RosMessage {
     pub topic: RosTopic,
     /// The message in CDR, with its encapsulation header.
     pub cdr: Vec<u8>,
+}
+
+impl RosMessage {
+    /// `cdr` for `topic`.
+    #[must_use]
+    pub fn new(topic: RosTopic, cdr: Vec<u8>) -> Self {
+        Self { topic, cdr }
+    }
 }
 
 /// Translator of the messages of one run. It remembers the last motion of each vehicle, for its odometry, and the losses
@@ -68,7 +77,12 @@ impl Translator {
             Topic::Truth | Topic::Stats(_) => true,
             Topic::Stream { stream, .. } => matches!(
                 stream,
-                Stream::Lidar | Stream::Imu | Stream::Camera(_) | Stream::Pose | Stream::Detections
+                Stream::Lidar
+                    | Stream::Imu
+                    | Stream::Camera(_)
+                    | Stream::Pose
+                    | Stream::Detections
+                    | Stream::Tracks
             ),
             _ => false,
         }
@@ -89,10 +103,8 @@ impl Translator {
             (Topic::Truth, Message::Truth(truth)) => self.truth_messages(capture_nanos, truth),
             (Topic::Stats(_), Message::Stats(stats)) => {
                 let status = self.status(stats);
-                vec![RosMessage {
-                    topic: RosTopic::Diagnostics,
-                    cdr: encode::diagnostics(self.latest_nanos, &[status]),
-                }]
+                let cdr = encode::diagnostics(self.latest_nanos, &[status]);
+                vec![RosMessage::new(RosTopic::Diagnostics, cdr)]
             }
             _ => Vec::new(),
         }
@@ -129,6 +141,15 @@ impl Translator {
                     of_vehicle(cav, VehicleTopic::Markers, markers),
                 ]
             }
+            (Stream::Tracks, Message::Tracks(tracks)) => {
+                let boxes: Vec<Marked> = tracks.tracks.iter().map(Marked::from).collect();
+                let markers = encode::markers(at, &frame, "tracks", TRACK_RGB, &boxes);
+                let tracks = encode::tracks(at, &frame, &tracks.tracks);
+                vec![
+                    of_vehicle(cav, VehicleTopic::Tracks, tracks),
+                    of_vehicle(cav, VehicleTopic::TrackMarkers, markers),
+                ]
+            }
             _ => Vec::new(),
         }
     }
@@ -143,10 +164,8 @@ impl Translator {
         let frame = self.names.lidar(cav);
         let odometry = encode::odometry(at, &frame, pose, covariance, motion);
         // The transform first: a receiver of the others can use them at once.
-        let transform = (!self.placed.contains(cav)).then(|| RosMessage {
-            topic: RosTopic::Tf,
-            cdr: encode::transforms(at, &[(MAP_FRAME.into(), frame, *pose)]),
-        });
+        let transform = (!self.placed.contains(cav))
+            .then(|| transforms(at, &[(MAP_FRAME.into(), frame, *pose)]));
         transform
             .into_iter()
             .chain([
@@ -159,10 +178,9 @@ impl Translator {
     /// An image, and the calibration that is known of its camera: projection and place on the vehicle.
     fn image_messages(&self, cav: &CavId, number: u8, at: u64, image: &Camera) -> Vec<RosMessage> {
         let (frame, metadata) = (self.names.camera(cav, number), &image.metadata);
-        let place = metadata.lidar_from_camera.map(|pose| RosMessage {
-            topic: RosTopic::Tf,
-            cdr: encode::transforms(at, &[(self.names.lidar(cav), frame.clone(), pose)]),
-        });
+        let place = metadata
+            .lidar_from_camera
+            .map(|pose| transforms(at, &[(self.names.lidar(cav), frame.clone(), pose)]));
         let info = metadata.pinhole.map(|pinhole| {
             let cdr = encode::camera_info(at, &frame, metadata, &pinhole);
             of_vehicle(cav, VehicleTopic::CameraInfo(number), cdr)
@@ -191,15 +209,10 @@ impl Translator {
                 (MAP_FRAME.to_owned(), name, agent.world_from_lidar)
             })
             .collect();
+        let markers = encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes);
         vec![
-            RosMessage {
-                topic: RosTopic::Tf,
-                cdr: encode::transforms(at, &frames),
-            },
-            RosMessage {
-                topic: RosTopic::Truth,
-                cdr: encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes),
-            },
+            transforms(at, &frames),
+            RosMessage::new(RosTopic::Truth, markers),
         ]
     }
 
@@ -242,10 +255,11 @@ impl Translator {
 }
 
 fn of_vehicle(cav: &CavId, topic: VehicleTopic, cdr: Vec<u8>) -> RosMessage {
-    RosMessage {
-        topic: RosTopic::Vehicle(cav.clone(), topic),
-        cdr,
-    }
+    RosMessage::new(RosTopic::Vehicle(cav.clone(), topic), cdr)
+}
+
+fn transforms(at: u64, frames: &[FrameInParent]) -> RosMessage {
+    RosMessage::new(RosTopic::Tf, encode::transforms(at, frames))
 }
 
 #[cfg(test)]
@@ -395,6 +409,7 @@ mod tests {
     #[test]
     fn only_streams_that_ros_has_types_for_are_wanted() {
         assert!(Translator::wants(&topic(Stream::Lidar)) && Translator::wants(&Topic::Truth));
+        assert!(Translator::wants(&topic(Stream::Tracks)));
         assert!(
             !Translator::wants(&topic(Stream::Bev))
                 && !Translator::wants(&topic(Stream::DetectionsJson))

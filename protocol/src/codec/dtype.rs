@@ -6,6 +6,7 @@ use half::slice::HalfFloatSliceExt;
 use serde::{Deserialize, Serialize};
 
 use crate::WireError;
+use crate::checks::check_each;
 
 /// Values converted at a time, through a buffer on the stack.
 const BLOCK: usize = 1024;
@@ -170,23 +171,10 @@ pub(super) fn read(
 fn read_scales(bytes: &[u8]) -> Result<Vec<f32>, WireError> {
     let mut scales = vec![0f32; bytes.len() / 4];
     cast_slice_mut(&mut scales).copy_from_slice(bytes);
-    match scales
-        .iter()
-        .enumerate()
-        .find(|(_, scale)| !(scale.is_finite() && **scale >= 0.0))
-    {
-        None => Ok(scales),
-        Some((index, scale)) => {
-            let value = (*scale).into();
-            Err(WireError::Value {
-                what: "channel scale",
-                index,
-                value,
-                min: 0.0,
-                max: f32::MAX.into(),
-            })
-        }
-    }
+    check_each("channel scale", &scales, [0.0, f32::MAX], |scale| {
+        scale.is_finite() && scale >= 0.0
+    })?;
+    Ok(scales)
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! Confidence gate: selects the cells around which a vehicle is likely (Where2comm, Hu et al., NeurIPS 2022).
 
+use std::fmt::Display;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
@@ -60,23 +61,15 @@ impl FromStr for ConfidenceGate {
         let (threshold, smoothing) = text
             .split_once(',')
             .map_or((text, None), |(first, rest)| (first, Some(rest)));
-        let threshold = threshold
-            .trim()
-            .parse()
-            .map_err(|error| format!("threshold {threshold:?}: {error}"))?;
-        Ok(match smoothing {
-            None => Self {
-                threshold,
-                ..Self::default()
-            },
-            Some("none") => Self {
-                threshold,
-                smoothing: None,
-            },
-            Some(window) => Self {
-                threshold,
-                smoothing: Some(window.parse()?),
-            },
+        let threshold = number("threshold", threshold)?;
+        let smoothing = match smoothing {
+            None => Self::default().smoothing,
+            Some("none") => None,
+            Some(window) => Some(window.parse()?),
+        };
+        Ok(Self {
+            threshold,
+            smoothing,
         })
     }
 }
@@ -89,16 +82,16 @@ impl FromStr for Smoothing {
         let (kernel, sigma) = text
             .split_once(',')
             .ok_or_else(|| format!("{text:?} is not CELLS,SIGMA or none"))?;
-        let kernel = kernel
-            .trim()
-            .parse()
-            .map_err(|error| format!("window {kernel:?}: {error}"))?;
-        let sigma = sigma
-            .trim()
-            .parse()
-            .map_err(|error| format!("sigma {sigma:?}: {error}"))?;
-        Ok(Self { kernel, sigma })
+        Ok(Self {
+            kernel: number("window", kernel)?,
+            sigma: number("sigma", sigma)?,
+        })
     }
+}
+
+fn number<T: FromStr<Err: Display>>(name: &str, text: &str) -> Result<T, String> {
+    let number: Result<T, _> = text.trim().parse();
+    number.map_err(|error| format!("{name} {text:?}: {error}"))
 }
 
 impl ConfidenceGate {

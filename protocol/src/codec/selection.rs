@@ -2,7 +2,7 @@
 
 use super::Dtype;
 use crate::WireError;
-use crate::checks::check_size;
+use crate::checks::{check_each, check_size};
 
 /// Checks that there is one finite confidence per cell.
 ///
@@ -10,21 +10,12 @@ use crate::checks::check_size;
 /// [`WireError`] states the first that is not finite, or both counts.
 pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), WireError> {
     check_size("confidence map", confidence.len() as u64, cells as u64)?;
-    if let Some((index, value)) = confidence
-        .iter()
-        .enumerate()
-        .find(|(_, value)| !value.is_finite())
-    {
-        let (value, min, max) = ((*value).into(), f32::MIN.into(), f32::MAX.into());
-        return Err(WireError::Value {
-            what: "confidence",
-            index,
-            value,
-            min,
-            max,
-        });
-    }
-    Ok(())
+    check_each(
+        "confidence",
+        confidence,
+        [f32::MIN, f32::MAX],
+        f32::is_finite,
+    )
 }
 
 /// The cells with the highest confidence that fit into `budget` bytes, among `candidates` (`None`: all cells), in

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use clap::builder::{Resettable, StyledStr};
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches};
 use serde::Serialize;
 use serde_json::Value;
@@ -73,16 +74,9 @@ fn with_default(option: Arg, default: Option<String>) -> Arg {
         option.get_help().map(|help| add(help)),
         option.get_long_help().map(|help| add(help)),
     );
-    let option = if let Some(help) = short {
-        option.help(help)
-    } else {
-        option
-    };
-    if let Some(help) = long {
-        option.long_help(help)
-    } else {
-        option
-    }
+    let styled =
+        |help: Option<String>| -> Resettable<StyledStr> { help.map(StyledStr::from).into() };
+    option.help(styled(short)).long_help(styled(long))
 }
 
 fn switchable(option: Arg) -> Arg {

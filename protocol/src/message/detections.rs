@@ -6,7 +6,7 @@ use super::{
     PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos,
     check_within, metadata_only,
 };
-use crate::{CavId, Detection, DropReason, Limits, MisbehaviourReason, Stamp, WireError};
+use crate::{CavId, Detection, DropReason, Limits, MisbehaviourReason, WireError};
 
 /// The result of one ego frame: ego-fuser to anyone, also as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -117,50 +117,3 @@ impl Detections {
 }
 
 metadata_only!(Detections, Detections);
-
-/// [`Detections`] with the fields of its [`Stamp`], as written to `detections/json` and `detections.jsonl`: one flat
-/// JSON object.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct DetectionsReport {
-    /// Tick of the scene, counted from 0, if known: the scorer knows it, the ego does not.
-    pub tick: Option<u64>,
-    /// See [`Stamp::epoch`].
-    pub epoch: u64,
-    /// See [`Stamp::sequence`].
-    pub sequence: u64,
-    /// See [`Stamp::capture_nanos`].
-    pub capture_nanos: u64,
-    /// See [`Stamp::publish_nanos`].
-    pub publish_nanos: u64,
-    /// The result.
-    #[serde(flatten)]
-    pub result: Detections,
-}
-
-impl DetectionsReport {
-    /// The result of `stamp`'s frame, at a tick of the scene if that is known.
-    pub fn new(stamp: &Stamp, tick: Option<u64>, result: Detections) -> Self {
-        let Stamp {
-            cav: _,
-            epoch,
-            sequence,
-            capture_nanos,
-            publish_nanos,
-        } = *stamp;
-        Self {
-            tick,
-            epoch,
-            sequence,
-            capture_nanos,
-            publish_nanos,
-            result,
-        }
-    }
-
-    /// As JSON, on one line.
-    pub fn to_json(&self) -> String {
-        // Serialisation fails only for maps with keys that are not strings or a failing `Serialize`; neither occurs
-        // here.
-        serde_json::to_string(self).unwrap_or_default()
-    }
-}

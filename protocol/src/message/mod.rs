@@ -10,12 +10,14 @@ mod control;
 mod descriptor;
 mod detections;
 mod ego_motion;
+mod frame_report;
 mod gnss;
 mod pace;
 mod pose_estimate;
 mod stats;
 mod sweep;
 mod table;
+mod tracks;
 mod truth;
 
 use serde::Serialize;
@@ -29,10 +31,9 @@ pub use boxes::Boxes;
 pub use camera::{Camera, CameraMetadata, ImageFormat, Pinhole};
 pub use control::{Control, TopicCount};
 pub use descriptor::{Descriptor, ModelHash, SweepArrival};
-pub use detections::{
-    Detections, DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour,
-};
+pub use detections::{Detections, FusedNeighbour, NeighbourState, SkippedNeighbour};
 pub use ego_motion::EgoMotion;
+pub use frame_report::{DetectionsReport, FrameReport, TracksReport};
 pub use gnss::{Gnss, GnssSource};
 pub use pace::Pace;
 pub use pose_estimate::{NoPoseReason, PlanarCovariance, PoseEstimate};
@@ -40,6 +41,7 @@ pub use stats::{ProcessUsage, StageSummary, StageTiming, Stats, TopicTraffic};
 pub use sweep::{Lidar, Points, PointsMetadata, Radar, SweepMetadata};
 pub use table::{Kind, Message};
 pub(crate) use table::{MessageSource, MessageVisitor};
+pub use tracks::{Track, Tracks};
 pub use truth::{AgentTruth, TrueObject, Truth};
 
 /// One kind of message. Implemented by messages of this crate only.
@@ -113,12 +115,7 @@ fn check_name(what: &'static str, name: &str) -> Result<(), WireError> {
 }
 
 fn wrong_body(shape: BodyShape, body: &Body) -> WireError {
-    let expected = match shape {
-        BodyShape::Empty => 0,
-        BodyShape::Bytes { min, .. } => min,
-        BodyShape::Floats(count) => count.saturating_mul(4),
-        BodyShape::Points(count) => count.saturating_mul(16),
-    };
+    let (expected, _) = shape.bounds();
     WireError::Shape {
         what: "body bytes",
         expected,

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     Bev, Boxes, Camera, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Payload,
-    Points, PoseEstimate, Radar, Stats, Truth,
+    Points, PoseEstimate, Radar, Stats, Tracks, Truth,
 };
 use crate::WireError;
 
@@ -116,6 +116,8 @@ messages! {
     14 => Pace(Pace) = "pace",
     /// Image of a camera, replay to viewers and recorders.
     15 => Camera(Camera) = "camera",
+    /// Tracks of the ego, ego to any subscriber.
+    16 => Tracks(Tracks) = "tracks",
 }
 
 #[cfg(test)]

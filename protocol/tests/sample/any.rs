@@ -42,7 +42,9 @@ fn any_stream() -> impl Strategy<Value = Stream> {
             Stream::Points,
             Stream::Descriptor,
             Stream::Detections,
-            Stream::DetectionsJson
+            Stream::DetectionsJson,
+            Stream::Tracks,
+            Stream::TracksJson
         ]),
     ]
 }
@@ -247,6 +249,49 @@ fn any_descriptor() -> impl Strategy<Value = Descriptor> {
 fn any_timing() -> impl Strategy<Value = StageTiming> {
     ("[a-z ]{0,16}", 0..1_000_000_000_000u64)
         .prop_map(|(stage, nanos)| StageTiming { stage, nanos })
+}
+
+fn any_track() -> impl Strategy<Value = Track> {
+    let covariance =
+        (prop::array::uniform4(0.0..1e3f32), -1.0..1.0f32).prop_map(|(sigmas, correlation)| {
+            let at = |row: usize, column: usize| {
+                let scale = if row == column { 1.0 } else { correlation };
+                sigmas[row] * sigmas[column] * scale
+            };
+            std::array::from_fn(|row| std::array::from_fn(|column| at(row, column)))
+        });
+    let times = (0.0..1e5f64, 0.0..=1.0f64);
+    (
+        any_detection(),
+        any::<(u64, u32)>(),
+        [-50.0..50.0f64, -50.0..50.0f64],
+        (covariance, 0.0..=1.0f64, times),
+    )
+        .prop_map(
+            |(seen, (id, hits), velocity_mps, (covariance, score, (age_s, share)))| Track {
+                id,
+                box3d: seen.box3d,
+                velocity_mps,
+                covariance,
+                score,
+                hits,
+                age_s,
+                unseen_s: age_s * share,
+            },
+        )
+}
+
+fn any_tracks() -> impl Strategy<Value = Tracks> {
+    let numbers = any::<(u64, u32)>();
+    (any_cav(), numbers, any_estimate(), vec(any_track(), 0..20)).prop_map(
+        |(ego, (agent_frame, left_out), pose, tracks)| Tracks {
+            ego,
+            agent_frame,
+            pose,
+            tracks,
+            left_out,
+        },
+    )
 }
 
 fn any_detections() -> impl Strategy<Value = Detections> {
@@ -476,6 +521,7 @@ pub(crate) fn any_message() -> impl Strategy<Value = Message> {
         1 => (any_estimate(), any_points()).prop_map(|(pose, points)| Message::Points(Points { pose, points })),
         1 => any_descriptor().prop_map(Message::Descriptor),
         1 => any_detections().prop_map(Message::Detections),
+        1 => any_tracks().prop_map(Message::Tracks),
         1 => any_truth().prop_map(Message::Truth),
         1 => any_control().prop_map(Message::Control),
         1 => any_stats().prop_map(Message::Stats),

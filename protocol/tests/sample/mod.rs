@@ -214,6 +214,30 @@ pub(crate) fn detections() -> Detections {
     }
 }
 
+pub(crate) fn tracks() -> Tracks {
+    let mut covariance = [[0.0; 4]; 4];
+    covariance[0] = [0.25, 0.0, 0.125, 0.0];
+    (covariance[1][1], covariance[2]) = (0.25, [0.125, 0.0, 1.0, 0.0]);
+    covariance[3][3] = 1.0;
+    let track = |id, unseen_s| Track {
+        id,
+        box3d: detection(0.5).box3d,
+        velocity_mps: [8.5, -0.25],
+        covariance,
+        score: 0.75,
+        hits: 4,
+        age_s: 0.5,
+        unseen_s,
+    };
+    Tracks {
+        ego: cav("4279"),
+        agent_frame: 3,
+        pose: pose(),
+        tracks: vec![track(1, 0.0), track(7, 0.25)],
+        left_out: 2,
+    }
+}
+
 fn truth() -> Truth {
     let object = TrueObject {
         id: -17,
@@ -358,5 +382,6 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Control::Done { process, tick: 4 },
     ];
     messages.extend(controls.map(Message::Control));
+    messages.push(Message::Tracks(tracks()));
     messages
 }

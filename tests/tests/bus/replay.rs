@@ -429,7 +429,7 @@ fn what_the_scene_does_not_have_is_named() {
 }
 
 #[test]
-fn an_unreadable_frame_is_named_and_the_rest_goes_on() {
+fn an_unreadable_frame_is_named_and_the_rest_is_replayed() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, 3);
     let broken = folder.path().join("scene/20/000062.pcd");

@@ -228,7 +228,7 @@ pub(super) fn tokens(session: &Session, selector: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn nodes_of_ros_see_and_hear_the_run() {
+fn ros_nodes_discover_and_receive_the_run() {
     let (router, stop) = (TestRouter::open(), Stop::new());
     let vehicle = router.join("agent-1000", "1000");
     std::thread::scope(|scope| {

@@ -125,7 +125,7 @@ fn has_odometry_in_map(tf: &Subscriber) -> bool {
 }
 
 #[test]
-fn a_robot_gets_map_to_odom_and_its_agent_stays_when_the_node_comes_and_goes() {
+fn a_robot_gets_map_to_odom_and_its_agent_survives_restarts_of_the_node() {
     let router = TestRouter::open();
     let stated = Arc::<Mutex<Vec<PoseMeasurement>>>::default();
     std::thread::scope(|scope| {

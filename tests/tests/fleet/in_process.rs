@@ -590,7 +590,7 @@ fn fused(result: &Detections) -> Vec<&str> {
 }
 
 #[test]
-fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
+fn late_killed_and_faulty_neighbours_are_named_and_the_ego_continues() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);

@@ -55,7 +55,7 @@ fn digested_files(up: &Up) -> Vec<String> {
 }
 
 #[test]
-fn a_vehicle_without_a_pose_reports_it_and_the_fleet_goes_on() {
+fn a_vehicle_without_a_pose_reports_it_and_the_fleet_continues() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     localizer::write(folder.path(), 3);

@@ -6,13 +6,15 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use protocol::{Stream, Topic};
+use deploy::report::TrackReport;
+use protocol::{Stream, Topic, TracksReport};
 use recording::Recording;
 use runner::scenario::Scenario;
 use serde_json::Value;
 use support::file_digests::FileDigests;
 use tests::fleet::{
     TIMEOUT, Up, check_origin, fused, is_running, programs, results, signal, write_scenario,
+    write_sighted_weights,
 };
 use tests::locks::exclusive_lock;
 
@@ -30,6 +32,8 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
         "lockstep: true, seek: 2",
         "record: {without: [bev]}",
     );
+    // There are no tracks without detections.
+    write_sighted_weights(&folder.path().join("weights.safetensors"));
     let mut up = Up::start(folder.path(), &scenario);
     let status = up.wait();
     let run = &up.folder;
@@ -96,8 +100,14 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
             .count()
     };
     assert_eq!(
-        [Stream::Lidar, Stream::Detections, Stream::Bev].map(recorded),
-        [12, 6, 0]
+        [
+            Stream::Lidar,
+            Stream::Detections,
+            Stream::Tracks,
+            Stream::Bev
+        ]
+        .map(recorded),
+        [12, 6, 6, 0]
     );
     for process in ["agent-4279", "agent-4288", "ego-4279", "replay", "recorder"] {
         assert!(run.join(format!("log/{process}.log")).exists(), "{process}");
@@ -111,6 +121,39 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     let provenance = resolved.provenance.unwrap();
     assert_eq!(provenance.data_sha256.len(), 64);
     assert_eq!(provenance.files_sha256.len(), 1, "the weights");
+    check_tracks(run);
+}
+
+/// Tracks that the ego has made are those that a report makes of its detections.
+fn check_tracks(run: &Path) {
+    let file = run.join("tracks.jsonl");
+    let lines = fs::read_to_string(&file).unwrap();
+    let frames: Vec<TracksReport> = { lines.lines() }
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    let ticks: Vec<_> = frames.iter().map(|frame| frame.tick).collect();
+    assert_eq!(ticks, (2..8).map(Some).collect::<Vec<_>>());
+    assert!(frames.iter().any(|frame| !frame.result.tracks.is_empty()));
+    let recorded = TrackReport::read(run).unwrap();
+    fs::remove_file(file).unwrap();
+    let made = TrackReport::read(run).unwrap();
+    assert!(recorded.recorded && !made.recorded);
+    let numbers = |report: &TrackReport| match serde_json::to_value(&report.quality).unwrap() {
+        Value::Object(fields) => fields
+            .into_iter()
+            .map(|(name, value)| (name, value.as_f64())),
+        other => panic!("{other}"),
+    };
+    // Numbers in JSON are rounded in their last digit.
+    for ((name, one), (_, other)) in numbers(&recorded).zip(numbers(&made)) {
+        let difference = one
+            .zip(other)
+            .map_or(0.0, |(one, other)| (one - other).abs());
+        assert!(
+            one.is_some() == other.is_some() && difference < 1e-9,
+            "{name}: {one:?} {other:?}"
+        );
+    }
 }
 
 #[test]
@@ -202,20 +245,27 @@ fn a_killed_agent_is_started_again_and_fused_again() {
         "what was lost with the agent is not hidden"
     );
 
-    let replayed = replay_inputs("ego-fuser", &up.folder.join("inputs-ego-4279.log"), &[0]);
-    let recorded = fs::read_to_string(up.folder.join("detections.jsonl")).unwrap();
-    assert_eq!(
-        replayed, recorded,
-        "the same decisions from the same inputs"
-    );
+    let inputs = up.folder.join("inputs-ego-4279.log");
+    for (options, file) in [
+        (&[][..], "detections.jsonl"),
+        (&["--tracks"][..], "tracks.jsonl"),
+    ] {
+        let replayed = replay_inputs("ego-fuser", &inputs, options, &[0]);
+        let recorded = fs::read_to_string(up.folder.join(file)).unwrap();
+        assert_eq!(
+            replayed, recorded,
+            "the same decisions from the same inputs"
+        );
+    }
     check_replayed_agents(&up.folder);
 }
 
 /// Replays recorded inputs; returns the standard output.
-fn replay_inputs(program: &str, file: &Path, codes: &[i32]) -> String {
+fn replay_inputs(program: &str, file: &Path, options: &[&str], codes: &[i32]) -> String {
     let replayed = Command::new(programs().join(program))
         .arg("replay-inputs")
         .arg(file)
+        .args(options)
         .output()
         .unwrap();
     let errors = String::from_utf8_lossy(&replayed.stderr);
@@ -238,8 +288,8 @@ fn check_replayed_agents(run: &Path) {
     ];
     let replayed = files.map(|(file, codes)| {
         let file = run.join(file);
-        let published = replay_inputs("agent", &file, codes);
-        assert_eq!(published, replay_inputs("agent", &file, codes));
+        let published = replay_inputs("agent", &file, &[], codes);
+        assert_eq!(published, replay_inputs("agent", &file, &[], codes));
         published
     });
     let published: Vec<Value> = { replayed.iter().flat_map(|published| published.lines()) }
@@ -281,7 +331,7 @@ fn check_replayed_agents(run: &Path) {
 }
 
 #[test]
-fn a_killed_replay_goes_on_where_it_was() {
+fn a_killed_replay_resumes_at_its_checkpoint() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 40, "loop: false", "");

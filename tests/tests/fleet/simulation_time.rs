@@ -383,12 +383,12 @@ fn a_clock_that_is_set_costs_only_its_vehicle() {
 #[test]
 fn fewer_vehicles_leave_the_truth_as_it_is() {
     let folder = scene();
-    let crew = |count| Setup {
+    let with_agents = |count| Setup {
         pool: AgentPool::First(count),
         ..config(LinkConfig::default())
     };
-    let (all, _) = evaluate(folder.path(), crew(3));
-    let (two, _) = evaluate(folder.path(), crew(2));
+    let (all, _) = evaluate(folder.path(), with_agents(3));
+    let (two, _) = evaluate(folder.path(), with_agents(2));
     assert!(
         all.iter()
             .zip(&two)
@@ -430,11 +430,12 @@ fn losses_are_counted_and_come_from_the_seed() {
     assert_ne!(run(2).1, ledger);
 }
 
-const FILES: [&str; 5] = [
+const FILES: [&str; 6] = [
     "metrics.json",
     "frames.csv",
     "ledger.json",
     "detections.jsonl",
+    "tracks.jsonl",
     "truth.jsonl",
 ];
 

@@ -7,6 +7,7 @@ use protocol::{
 
 use super::super::open_ticks::MOST_OPEN;
 use super::*;
+use crate::score::metrics::{Communication, PoseErrors};
 
 const RULE: GroundTruthRule = GroundTruthRule {
     x_m: [-50.0, 50.0],
@@ -122,7 +123,10 @@ fn a_frame_is_judged_against_everyones_truth() {
         Some(1.0),
         "the false box has the same score and comes last"
     );
-    assert_eq!(scores.communication().payload_bytes_mean, Some(1000.0));
+    assert_eq!(
+        Communication::of(&scores.bytes, scores.nominal_values).payload_bytes_mean,
+        Some(1000.0)
+    );
     assert_eq!(scores.showpiece().unwrap().truth.len(), 2);
 }
 
@@ -199,9 +203,9 @@ fn the_three_precisions_differ_in_what_they_count() {
     let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
     // Five of the six boxes of the answered ticks, and five of the eight of all.
     assert!(is_near(scores.average_precision().0.at_50, 5.0 / 6.0));
-    assert!(is_near(scores.unanswered_empty().at_50, 5.0 / 8.0));
+    assert!(is_near(scores.live.unanswered_empty().at_50, 5.0 / 8.0));
     // Nothing is published by tick 0; its result is the newest at the three that follow: 6 of 8 boxes.
-    assert!(is_near(scores.streaming().unwrap().at_50, 6.0 / 8.0));
+    assert!(is_near(scores.live.streaming().unwrap().at_50, 6.0 / 8.0));
     let streamed: Vec<Option<u64>> = scores
         .records()
         .iter()
@@ -238,7 +242,7 @@ fn poses_of_all_vehicles_are_judged() {
     );
     scores.truth(&stamp("replay", 0, 0), truth(0));
     scores.close();
-    let errors = scores.pose_errors();
+    let errors = PoseErrors::of(&scores.pose_errors, scores.no_pose);
     assert_eq!(
         (errors.mean_m, errors.no_pose, errors.success_3m),
         (Some(4.0), 1, Some(0.0))
@@ -285,7 +289,7 @@ fn neighbours_are_followed_over_the_run() {
         scores.result(&stamp("e", tick, 100 * tick + 50), result);
     }
     scores.close();
-    let record = &scores.neighbours()[&cav("n")];
+    let record = &scores.neighbours[&cav("n")];
     assert_eq!(
         (
             record.fused,

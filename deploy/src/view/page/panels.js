@@ -235,6 +235,7 @@ function legend(frame) {
     ["hit", "detection, matches an object", "var(--hit)", "solid"], ["wrong", "detection, matches none", "var(--wrong)", "solid"],
     ["truth", "object, found or not expected", "var(--truth)", "thin"], ["missed", "object, missed", "var(--truth)", "dashed"],
     ["single", "detections of single vehicles", "var(--faint)", "dotted"], ["area", "detection area of the ego", "var(--area)", "thin"],
+    ["tracks", "track: number, path of 2 s", "var(--track)", "solid"],
     ["sigma", "95 % of the position (σ)", "var(--faint)", "round"],
     ["map", `feature map of ${focused(frame) || "a vehicle"}${heat.isMissing ? ": none" : ""}`, swatch(focused(frame) || ""), "shade"],
   ].concat(known.map((cav) => [`points ${cav}`, `vehicle ${cav}, its points`, swatch(cav), "dots"]));

@@ -49,6 +49,8 @@ function draw() {
     pen.globalAlpha = fade * (0.5 + 0.5 * box.score);
     outline(pen, box, place, colour(box.is_hit === false ? "--wrong" : "--hit"), 2, false, [], view.chosen && view.chosen.box === box);
   }
+  pen.globalAlpha = fade;
+  if (!view.hidden.has("tracks")) result.tracks.forEach((track) => trail(pen, track, place));
   pen.globalAlpha = 1;
   frame.vehicles.forEach((vehicle) => vehicleMark(pen, vehicle, place));
 }
@@ -66,6 +68,22 @@ function area(pen, { x_m: [x0, x1], y_m: [y0, y1] }, m, place) {
   pen.strokeStyle = colour("--area");
   pen.lineWidth = 1.5;
   pen.stroke();
+}
+
+/// Path of a track with its number; dashed where its place is predicted.
+function trail(pen, { id, trail_m: path, is_seen: isSeen }, place) {
+  const places = path.map(([x, y]) => place(x, y));
+  const [u, v] = places.at(-1);
+  pen.strokeStyle = pen.fillStyle = colour("--track");
+  pen.lineWidth = 2;
+  pen.setLineDash(isSeen ? [] : [3, 3]);
+  pen.beginPath();
+  places.forEach(([a, b], index) => pen[index ? "lineTo" : "moveTo"](a, b));
+  pen.stroke();
+  pen.setLineDash([]);
+  pen.font = "11px system-ui, sans-serif";
+  pen.textAlign = "left";
+  pen.fillText(String(id), u + 6, v + 14);
 }
 
 function rings(pen, middle, width, height) {

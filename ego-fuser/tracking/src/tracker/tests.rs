@@ -75,10 +75,12 @@ fn standing_objects_stand_while_the_ego_drives_and_turns() {
         (pose, in_ego.to_vec())
     });
     let tracks = run(TrackerConfig::default(), frames);
+    let last = Pose::from_xyz_yaw([12.0 * 3.9, 3.9 * 3.9, 0.0], 0.3 * 3.9);
     for (track, [x, y]) in tracks.last().unwrap().iter().zip(objects) {
-        assert!((track.box3d.center_m[0] - x).hypot(track.box3d.center_m[1] - y) < 1e-6);
+        let in_world = track.box3d.transformed(&last.isometry());
+        assert!((in_world.center_m[0] - x).hypot(in_world.center_m[1] - y) < 1e-6);
         assert!(track.velocity_mps[0].hypot(track.velocity_mps[1]) < 1e-6);
-        assert!(track.box3d.heading_rad.abs() < 1e-6);
+        assert!(in_world.heading_rad.abs() < 1e-6);
     }
     assert_eq!(ids(&tracks[39]), [1, 2]);
 }
@@ -209,7 +211,103 @@ fn detections_that_are_none_are_counted_and_the_others_are_taken() {
     let tracks = tracker
         .update(1, &Pose::IDENTITY, None, &detections)
         .unwrap();
-    assert_eq!((tracks.len(), tracker.rejected()), (1, 2));
+    assert_eq!((tracks.len(), tracker.left_out()), (1, 2));
+}
+
+#[test]
+fn velocity_and_covariance_are_along_the_axes_of_the_ego() {
+    // The ego looks along y of the world, and so does the object move, at 6 m/s.
+    let pose = Pose::from_xyz_yaw([50.0, 20.0, 0.0], PI / 2.0);
+    let covariance = PlanarCovariance {
+        xx_m2: 0.0,
+        xy_m2: 0.0,
+        yy_m2: 1.0,
+        yaw_rad2: 0.0,
+    };
+    let mut tracker = Tracker::new(TrackerConfig::default());
+    let mut tracks = Vec::new();
+    for tick in 1..=40_u32 {
+        let seen = [detection(0.6 * f64::from(tick), 3.0, 0.9)];
+        let nanos = u64::from(tick) * TICK_NANOS;
+        tracks = { tracker.update(nanos, &pose, Some(&covariance), &seen) }.unwrap();
+    }
+    let track = &tracks[0];
+    assert!((track.velocity_mps[0] - 6.0).abs() < 0.1 && track.velocity_mps[1].abs() < 0.1);
+    assert!((track.box3d.center_m[0] - 24.0).hypot(track.box3d.center_m[1] - 3.0) < 0.1);
+    let [x, y, u, v] = track.covariance;
+    assert!(
+        x[0] > 2.0 * y[1] && u[2] > 1.5 * v[3] && x[2] > 0.0,
+        "{track:?}"
+    );
+    assert!((track.age_s - 3.9).abs() < 1e-9 && track.unseen_s == 0.0);
+}
+
+#[test]
+fn detections_beyond_the_largest_number_are_counted_and_those_of_the_highest_scores_are_taken() {
+    let config = TrackerConfig {
+        max_detections: 30,
+        max_tracks: 40,
+        ..TrackerConfig::default()
+    };
+    let mut tracker = Tracker::new(config);
+    let frame = |offset: f64| {
+        let seen = |k: u16| {
+            let (x, score) = (f64::from(k) * 10.0, 0.3 + f32::from(k) / 200.0);
+            detection(x, offset, score)
+        };
+        (0..100).map(seen).collect::<Vec<_>>()
+    };
+    let mut update = |tick: u64, offset| {
+        let tracks = tracker.update(tick * TICK_NANOS, &Pose::IDENTITY, None, &frame(offset));
+        (tracks.unwrap(), tracker.left_out())
+    };
+    let (tracks, left_out) = update(1, 0.0);
+    assert_eq!((tracks.len(), left_out), (30, 70));
+    let least = tracks.iter().map(|track| track.box3d.center_m[0]);
+    assert_eq!(least.fold(f64::INFINITY, f64::min), 700.0);
+    // All 30 are new objects; there is room for 10.
+    let (tracks, left_out) = update(2, 500.0);
+    assert_eq!((tracks.len(), left_out), (40, 160));
+    let new = tracks
+        .iter()
+        .filter(|track| track.hits == 1 && track.unseen_s == 0.0);
+    let least = new.map(|track| track.box3d.center_m[0]);
+    assert_eq!(least.fold(f64::INFINITY, f64::min), 900.0);
+}
+
+#[test]
+fn results_are_followed_through_frames_without_pose_and_scenes_that_begin_again() {
+    let result = |pose| Detections {
+        ego: protocol::CavId::new("7").unwrap(),
+        agent_frame: 4,
+        method: "max".into(),
+        pose,
+        detections: vec![detection(5.0, 0.0, 0.9), detection(f64::NAN, 0.0, 0.9)],
+        fused: vec![],
+        skipped: vec![],
+        neighbours: vec![],
+        stages: vec![],
+    };
+    let posed = result(PoseEstimate::new(Pose::IDENTITY, 0.9));
+    let unposed = result(PoseEstimate::NoPose {
+        reason: protocol::NoPoseReason::TooFewPoints,
+        inlier_count: 0,
+    });
+    let mut tracker = Tracker::new(TrackerConfig::default());
+    let found = [
+        (1, &posed),
+        (2, &unposed),
+        (3, &posed),
+        (3, &posed),
+        (2, &posed),
+    ];
+    let found = found.map(|(tick, result)| tracker.follow(tick * TICK_NANOS, result));
+    assert_eq!(
+        found.clone().map(|frame| ids(&frame.tracks)),
+        [vec![1], vec![], vec![1], vec![2], vec![3]]
+    );
+    assert_eq!(found.clone().map(|frame| frame.left_out), [1, 0, 1, 1, 1]);
+    assert_eq!((found[2].agent_frame, found[1].pose), (4, unposed.pose));
 }
 
 #[test]

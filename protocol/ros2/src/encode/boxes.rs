@@ -1,6 +1,6 @@
 //! Boxes: `vision_msgs/Detection3DArray` for programs, `visualization_msgs/MarkerArray` for viewers.
 
-use protocol::{Box3d, Detection, Pose, TrueObject};
+use protocol::{Box3d, Detection, Pose, Track, TrueObject};
 
 use crate::cdr;
 use crate::cdr::Cdr;
@@ -15,23 +15,50 @@ const CLASS: &str = "vehicle";
 
 /// Detections in the frame `frame_id`. The id of a detection is the vehicle that alone made it, if one did.
 pub(crate) fn detections(nanos: u64, frame_id: &str, detections: &[Detection]) -> Vec<u8> {
+    let found = detections.iter().map(|detection| {
+        let source = detection.source.as_ref().map(ToString::to_string);
+        // The covariance is not known: zeros, as other detectors write.
+        let (score, covariance) = (f64::from(detection.score), [[0.0; 6]; 6]);
+        (
+            detection.box3d,
+            score,
+            covariance,
+            source.unwrap_or_default(),
+        )
+    });
+    array(nanos, frame_id, found)
+}
+
+/// Tracks in the frame `frame_id`, each with its identity and the covariance of its place. The type has no velocity.
+pub(crate) fn tracks(nanos: u64, frame_id: &str, tracks: &[Track]) -> Vec<u8> {
+    let found = tracks.iter().map(|track| {
+        let mut covariance = [[0.0; 6]; 6];
+        let [[xx, xy, ..], [_, yy, ..], ..] = track.covariance.map(|row| row.map(f64::from));
+        (covariance[0][0], covariance[0][1]) = (xx, xy);
+        (covariance[1][0], covariance[1][1]) = (xy, yy);
+        (track.box3d, track.score, covariance, track.id.to_string())
+    });
+    array(nanos, frame_id, found)
+}
+
+/// Box, score, covariance of its pose, id.
+type Found = (Box3d, f64, [[f64; 6]; 6], String);
+
+fn array(nanos: u64, frame_id: &str, found: impl ExactSizeIterator<Item = Found>) -> Vec<u8> {
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, frame_id);
-        cdr.write_sequence_length(detections.len());
-        for detection in detections {
-            let box3d = detection.box3d;
+        cdr.write_sequence_length(found.len());
+        for (box3d, score, covariance, id) in found {
             let pose = Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad);
             cdr::header(cdr, nanos, frame_id);
             cdr.write_sequence_length(1);
             cdr.write_string(CLASS);
-            cdr.write_f64(f64::from(detection.score));
+            cdr.write_f64(score);
             cdr::pose(cdr, &pose);
-            // Not known: zeros, as other detectors write.
-            cdr::covariance(cdr, &[[0.0; 6]; 6]);
+            cdr::covariance(cdr, &covariance);
             cdr::pose(cdr, &pose);
             cdr::xyz(cdr, box3d.size_m);
-            let source = detection.source.as_ref();
-            cdr.write_string(source.map_or("", protocol::CavId::as_str));
+            cdr.write_string(&id);
         }
     })
 }
@@ -53,6 +80,19 @@ impl From<&Detection> for Marked {
             box3d: detection.box3d,
             alpha: 0.25 + 0.6 * detection.score,
             text: detection.score.to_string(),
+        }
+    }
+}
+
+impl From<&Track> for Marked {
+    #[expect(clippy::cast_possible_truncation, reason = "wanted")]
+    fn from(track: &Track) -> Self {
+        let [x, y] = track.velocity_mps;
+        Self {
+            id: Some(marker_id(track.id.cast_signed())),
+            box3d: track.box3d,
+            alpha: 0.25 + 0.6 * track.score as f32,
+            text: format!("{}: {:.1} m/s", track.id, x.hypot(y)),
         }
     }
 }
@@ -150,6 +190,39 @@ fn marker(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_track_has_its_identity_and_the_covariance_of_its_place() {
+        let box3d = Box3d {
+            center_m: [1.0, 2.0, 3.0],
+            size_m: [4.0, 5.0, 6.0],
+            heading_rad: 0.0,
+        };
+        let mut covariance = [[0.0; 4]; 4];
+        (covariance[0][0], covariance[0][1]) = (0.5, 0.25);
+        (covariance[1][0], covariance[1][1]) = (0.25, 1.0);
+        let track = Track {
+            id: 417,
+            box3d,
+            velocity_mps: [3.0, 4.0],
+            covariance,
+            score: 0.75,
+            hits: 3,
+            age_s: 0.2,
+            unseen_s: 0.0,
+        };
+        let cdr = tracks(7, "f", std::slice::from_ref(&track));
+        let values: Vec<u8> = { [0.5, 0.25].iter() }
+            .flat_map(|value: &f64| value.to_le_bytes())
+            .collect();
+        let has = |bytes: &[u8]| cdr.windows(bytes.len()).any(|window| window == bytes);
+        assert!(has(b"\x04\0\0\x00417\0") && has(&values) && has(&0.75f64.to_le_bytes()));
+        let marked = Marked::from(&track);
+        assert_eq!(
+            (marked.id, marked.text.as_str()),
+            (Some(417), "417: 5.0 m/s")
+        );
+    }
 
     #[test]
     fn a_detection_is_laid_out_as_vision_msgs_lays_it_out() {

@@ -7,7 +7,7 @@ mod motion;
 mod mount;
 mod sweep;
 
-pub(crate) use boxes::{Marked, detections, markers, truth_marker};
+pub(crate) use boxes::{Marked, detections, markers, tracks, truth_marker};
 pub(crate) use camera::{camera_info, compressed_image};
 pub(crate) use diagnostics::{Level, Status, diagnostics};
 pub(crate) use motion::odometry;
