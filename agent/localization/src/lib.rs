@@ -6,7 +6,7 @@
 //! - [`registration`]: pose from correspondences (Kabsch, RANSAC, SC2-PCR) and ICP.
 //! - [`pose_source`]: origins of a vehicle's pose: recorded, noisy, estimated by one of the above.
 //! - [`tracker`]: the pose from sweep to sweep, with its covariance.
-//! - [`pose_covariance`]: covariance of the pose of one sweep.
+//! - [`pose_covariance`]: covariance of the pose of one sweep; [`covariance_scale`]: its fitted size.
 //! - [`statistics`]: measures of their accuracy.
 //!
 //! ```
@@ -33,6 +33,7 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod baselines;
+pub mod covariance_scale;
 pub mod map_registration;
 pub mod pgc;
 pub mod pose_covariance;

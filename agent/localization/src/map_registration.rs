@@ -12,6 +12,7 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Matrix6};
 use perception::weights::FileError;
 
+use crate::covariance_scale::CovarianceScale;
 use crate::pgc::pose_evidence::PoseEvidence;
 use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
@@ -44,13 +45,19 @@ impl MapRegistration {
     /// Poses of a localizer, registered to the map in a file; without a file the localizer itself.
     ///
     /// # Errors
-    /// [`FileError`] as [`SurfelMap::load`].
+    /// [`FileError`] as [`SurfelMap::load`], and of a map of another place than the localizer's.
     pub fn of(localizer: Box<dyn Localize>, map: &Path) -> Result<Box<dyn Localize>, FileError> {
         if map.as_os_str().is_empty() {
             return Ok(localizer);
         }
-        let map = Arc::new(SurfelMap::load(map)?);
-        Ok(Box::new(Self::new(localizer, map)))
+        let surfels = SurfelMap::load(map)?;
+        match (localizer.place(), surfels.place()) {
+            (Some(head), place) if !place.is_empty() && place != head => {
+                let problem = format_args!("a surfel map of {place:?}, the head is of {head:?}");
+                Err(FileError::new(map, problem))
+            }
+            _ => Ok(Box::new(Self::new(localizer, Arc::new(surfels)))),
+        }
     }
 
     /// Poses of `localizer`, registered to `map`.
@@ -78,14 +85,16 @@ impl Localize for MapRegistration {
         let near = sweep.predicted.and_then(|start| self.fit(&source, &start));
         let registering = times.lap(REGISTER);
         if let Some(fit) = near.filter(|fit| fit.overlap_above_ground >= CONFIRMED) {
-            return Ok(Localization::of_found(registered(&fit), times));
+            let found = registered(&fit, self.map.covariance_scale());
+            return Ok(Localization::of_found(found, times));
         }
         let mut localization = self.localizer.localize(sweep)?;
         localization.times.add(REGISTER, registering);
         let published = localization.found.filter(|found| !found.is_rejected);
         if let Some(found) = published {
             if let Some(fit) = self.fit(&source, &found.world_from_sensor) {
-                localization = judged(localization, &found, &fit);
+                let registered = registered(&fit, self.map.covariance_scale());
+                localization = judged(localization, &found, &fit, registered);
             }
             localization.times.lap(REGISTER);
         }
@@ -95,15 +104,23 @@ impl Localize for MapRegistration {
     fn detector_encoder(&self) -> Option<&str> {
         self.localizer.detector_encoder()
     }
+
+    fn place(&self) -> Option<&str> {
+        self.localizer.place()
+    }
 }
 
 /// A localization whose pose was registered.
-fn judged(localization: Localization, found: &FoundPose, fit: &IcpFit) -> Localization {
-    let share = fit.overlap_above_ground;
-    let judged = match share {
+fn judged(
+    localization: Localization,
+    found: &FoundPose,
+    fit: &IcpFit,
+    registered: FoundPose,
+) -> Localization {
+    let judged = match fit.overlap_above_ground {
         CONFIRMED.. => FoundPose {
             evidence: found.evidence,
-            ..registered(fit)
+            ..registered
         },
         CONTRADICTED.. => return localization,
         _ => FoundPose {
@@ -120,7 +137,7 @@ fn judged(localization: Localization, found: &FoundPose, fit: &IcpFit) -> Locali
 }
 
 /// The pose of a registration. Its confidence is that of the expected squared error (Eq. 6).
-fn registered(fit: &IcpFit) -> FoundPose {
+fn registered(fit: &IcpFit, covariance_scale: Option<CovarianceScale>) -> FoundPose {
     let [position, rotation] = LEAST_STD.map(|std: f64| std * std);
     let least = Matrix6::from_diagonal(
         &[position, position, position, rotation, rotation, rotation].into(),
@@ -131,6 +148,7 @@ fn registered(fit: &IcpFit) -> FoundPose {
         evidence: PoseEvidence::none(),
         cell_covariance: rows(&covariance),
         is_registered: true,
+        covariance_scale,
         sigma: 1.0 / (1.0 + covariance[(0, 0)] + covariance[(1, 1)]),
         is_rejected: false,
     }
@@ -138,4 +156,130 @@ fn registered(fit: &IcpFit) -> FoundPose {
 
 fn rows(matrix: &Matrix6<f64>) -> [[f64; 6]; 6] {
     std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+    use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+
+    use super::*;
+    use crate::registration::icp::surfel_map::tests::{stored, yard};
+
+    /// A localizer of a place that always finds one pose.
+    #[derive(Debug)]
+    struct Fixed {
+        found: FoundPose,
+        place: &'static str,
+    }
+
+    impl Localize for Fixed {
+        fn localize(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+            Ok(Localization::of_found(self.found, stopwatch()))
+        }
+
+        fn place(&self) -> Option<&str> {
+            Some(self.place)
+        }
+    }
+
+    /// The yard with points in the air above it that have no partner on its map.
+    fn sweep(strangers: u32) -> PointCloud {
+        let mut xyzi = yard();
+        let place = |step: u32| step as f32 * 0.6 - 7.8;
+        let stranger = |k: u32| {
+            [
+                place(k % 27),
+                place(k / 27 % 27),
+                14.0 + place(k / 729),
+                0.1,
+            ]
+        };
+        xyzi.extend((0..strangers).map(stranger));
+        PointCloud { xyzi }
+    }
+
+    /// The localizer that finds `start`, behind the map of the yard.
+    fn registration(start: Isometry3<f64>) -> (Box<dyn Localize>, FoundPose) {
+        let (_folder, file, _) = stored();
+        let found = FoundPose {
+            world_from_sensor: start,
+            evidence: PoseEvidence::none(),
+            cell_covariance: rows(&Matrix6::identity()),
+            is_registered: false,
+            covariance_scale: None,
+            sigma: 0.9,
+            is_rejected: false,
+        };
+        let place = "yard";
+        let registration = MapRegistration::of(Box::new(Fixed { found, place }), &file);
+        (registration.unwrap(), found)
+    }
+
+    /// Distance between a pose and the true one, metres.
+    fn off_m(found: &FoundPose, truth: &Isometry3<f64>) -> f64 {
+        let off = truth.inv_mul(&found.world_from_sensor);
+        off.translation.vector.norm()
+    }
+
+    #[test]
+    fn points_above_the_ground_decide_whether_a_pose_is_taken_kept_or_rejected() {
+        let (_folder, _, truth) = stored();
+        let start = truth * Isometry3::new(Vector3::new(0.3, -0.2, 0.0), Vector3::z() * 0.01);
+        let (mut registration, found) = registration(start);
+        let mut localize = |strangers| {
+            let cloud = sweep(strangers);
+            registration.localize(LocalizerInput::of(&cloud)).unwrap()
+        };
+        let taken = localize(0);
+        let pose = taken.found.unwrap();
+        assert!(pose.is_registered && !pose.is_rejected && off_m(&pose, &truth) < 5e-3);
+        assert!(pose.sigma > 0.999 && taken.estimate.world_from_cav().is_some());
+        // Between the thresholds the localizer's pose stays as it was.
+        let kept = localize(9_500);
+        assert_eq!(kept.found, Some(found));
+        assert_eq!(kept.estimate, PoseEstimate::new(start.into(), 0.9));
+        let rejected = localize(19_000);
+        assert!(rejected.found.unwrap().is_rejected);
+        let PoseEstimate::NoPose { reason, .. } = rejected.estimate else {
+            panic!("{:?}", rejected.estimate);
+        };
+        assert_eq!(reason, NoPoseReason::LowConfidence);
+    }
+
+    #[test]
+    fn a_predicted_pose_that_the_map_confirms_needs_no_localizer() {
+        let (_folder, _, truth) = stored();
+        let elsewhere = Isometry3::translation(90.0, 0.0, 0.0) * truth;
+        let (mut registration, found) = registration(elsewhere);
+        let cloud = sweep(0);
+        let mut localize = |predicted: Isometry3<f64>| {
+            let sweep = LocalizerInput {
+                predicted: Some(predicted),
+                ..LocalizerInput::of(&cloud)
+            };
+            registration.localize(sweep).unwrap().found.unwrap()
+        };
+        assert!(
+            off_m(
+                &localize(truth * Isometry3::translation(0.2, 0.1, 0.0)),
+                &truth
+            ) < 5e-3
+        );
+        // A prediction without planes falls back on the localizer, whose pose has no planes either.
+        assert_eq!(localize(elsewhere), found);
+    }
+
+    #[test]
+    fn a_map_of_another_place_is_refused_with_both_names() {
+        let (_folder, file, truth) = stored();
+        let (_, found) = registration(truth);
+        let place = "town1";
+        let refused = MapRegistration::of(Box::new(Fixed { found, place }), &file).unwrap_err();
+        let message = refused.to_string();
+        assert!(
+            message.contains("\"yard\"") && message.contains("\"town1\""),
+            "{message}"
+        );
+    }
 }

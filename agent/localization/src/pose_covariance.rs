@@ -1,18 +1,28 @@
-//! Covariance of a localized pose: its shape from the residuals of the cells, its size from the confidence.
+//! Covariance of a localized pose: its shape from the residuals of the cells or planes, its size fitted to known errors.
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::Vector6;
 
+use crate::covariance_scale::{MAX_VARIANCE, scaled};
 use crate::pgc::pose_solver::FoundPose;
 use crate::tracker::PoseMeasurement;
 
-/// Largest variance, square metres or radians: that of a pose that nothing constrains.
-const MAX_VARIANCE: f64 = 1e6;
-
 /// Covariance of x, y, z (metres) and of rotations about the world's x, y, z (radians), row by row, in ROS's order.
 ///
-/// Residuals determine the ratios between axes; errors of neighbouring cells are correlated, so that their size is that
-/// of a [`PoseMeasurement`]: the error which the fitted confidence stands for. That of a registered pose is its own.
+/// That of [`unscaled_covariance`] times the factors that were fitted, if they were ([`crate::covariance_scale`]).
 pub fn pose_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
+    let unscaled = unscaled_covariance(found);
+    let scale = found.covariance_scale;
+    scale.map_or(unscaled, |scale| scale.applied(&unscaled))
+}
+
+/// Distance in the plane that one of 1,000 poses exceeds, metres; `None` where it was not fitted.
+pub fn position_bound_m(found: &FoundPose) -> Option<f64> {
+    found.covariance_scale?.bound_m(&unscaled_covariance(found))
+}
+
+/// The covariance without the fitted factors. Residuals determine its shape; its size is that of a [`PoseMeasurement`], the
+/// error which the fitted confidence stands for. That of a registered pose is its own.
+pub fn unscaled_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
     if found.is_registered {
         return found.cell_covariance;
     }
@@ -21,34 +31,34 @@ pub fn pose_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
         yaw_std_rad,
         ..
     } = PoseMeasurement::new(0, found);
-    let shape = Matrix6::from_fn(|row, column| found.cell_covariance[row][column]);
-    let planar_variance = f64::midpoint(shape[(0, 0)], shape[(1, 1)]);
+    let shape = &found.cell_covariance;
     let factor = |wanted_std: f64, variance: f64| match variance > 0.0 && variance < MAX_VARIANCE {
         true => wanted_std / variance.sqrt(),
         false => 1.0,
     };
-    let position = factor(position_std_m, planar_variance);
-    let rotation = factor(yaw_std_rad, shape[(5, 5)]);
-    let scale = Matrix6::from_diagonal(&Vector6::new(
-        position, position, position, rotation, rotation, rotation,
-    ));
-    let covariance = scale * shape * scale;
-    std::array::from_fn(|row| {
-        std::array::from_fn(|column| covariance[(row, column)].clamp(-MAX_VARIANCE, MAX_VARIANCE))
-    })
+    let position = factor(position_std_m, f64::midpoint(shape[0][0], shape[1][1]));
+    let rotation = factor(yaw_std_rad, shape[5][5]);
+    let factors = [position, position, position, rotation, rotation, rotation];
+    scaled(shape, &Vector6::from(factors))
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Matrix6;
+
     use super::*;
+    use crate::covariance_scale::CovarianceScale;
     use crate::pgc::pose_solver::PoseSolver;
     use crate::pgc::synthetic::SyntheticScene;
 
+    fn found() -> FoundPose {
+        let coordinates = SyntheticScene::default().coordinates(1);
+        PoseSolver::default().solve(&coordinates).unwrap()
+    }
+
     #[test]
     fn it_is_a_covariance_of_the_size_that_the_confidence_stands_for() {
-        let found = PoseSolver::default()
-            .solve(&SyntheticScene::default().coordinates(1))
-            .unwrap();
+        let found = found();
         let covariance = pose_covariance(&found);
         let measured = PoseMeasurement::new(0, &found);
         let planar = f64::midpoint(covariance[0][0], covariance[1][1]);
@@ -66,11 +76,26 @@ mod tests {
 
     #[test]
     fn a_pose_that_nothing_constrains_has_the_largest_variance() {
-        let mut found = PoseSolver::default()
-            .solve(&SyntheticScene::default().coordinates(1))
-            .unwrap();
+        let mut found = found();
         found.cell_covariance =
             std::array::from_fn(|row| std::array::from_fn(|c| if row == c { 1e6 } else { 0.0 }));
         assert_eq!(pose_covariance(&found)[0][0], MAX_VARIANCE);
+    }
+
+    #[test]
+    fn fitted_factors_scale_its_standard_deviations() {
+        let (mut found, factor) = (found(), 3.0);
+        found.covariance_scale = Some(CovarianceScale {
+            planar: factor,
+            height: 1.0,
+            tilt: 1.0,
+            yaw: 1.0,
+            bound: None,
+        });
+        let (scaled, unscaled) = (pose_covariance(&found), unscaled_covariance(&found));
+        assert!((scaled[0][1] - 9.0 * unscaled[0][1]).abs() < 1e-12);
+        assert!((scaled[0][2] - 3.0 * unscaled[0][2]).abs() < 1e-12);
+        assert_eq!(scaled[5][5], unscaled[5][5]);
+        assert_eq!(position_bound_m(&found), None);
     }
 }

@@ -1,4 +1,4 @@
-//! Rank correlation of paired samples.
+//! Rank correlation of paired samples, and the limit of a share.
 
 use support::statistics::mean;
 
@@ -6,6 +6,30 @@ use support::statistics::mean;
 /// not vary, or there are fewer than two pairs.
 pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
     pearson(&ranks(a), &ranks(b))
+}
+
+/// Upper 95 % confidence limit of a share of which `count` of `all` were seen (Clopper and Pearson 1934); 1 of none.
+pub fn share_limit(count: usize, all: usize) -> f64 {
+    // Probability of at most `count`, at this share.
+    let at_most = |share: f64| {
+        let mut term = (1.0 - share).powf(all as f64);
+        (0..count).fold(term, |sum, seen| {
+            term *= (all - seen) as f64 / (seen + 1) as f64 * share / (1.0 - share);
+            sum + term
+        })
+    };
+    if count >= all {
+        return 1.0;
+    }
+    let (mut low, mut high) = (0.0, 1.0);
+    for _ in 0..50 {
+        let share = f64::midpoint(low, high);
+        match at_most(share) > 0.05 {
+            true => low = share,
+            false => high = share,
+        }
+    }
+    high
 }
 
 /// Ranks from 0; equal values share their mean rank.
@@ -52,6 +76,24 @@ mod tests {
         // From the definition: ranks 0.5 0.5 2 against 0 1 2.
         let expected = (0.75_f64).sqrt();
         assert!((spearman(&[1.0, 1.0, 2.0], &[1.0, 2.0, 3.0]).unwrap() - expected).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_limit_of_a_share_is_that_of_the_tables() {
+        // Of none seen, 1 - 0.05^(1/n), about 3 in n; 1 of 10 and 5 of 223 by the tables of Clopper and Pearson.
+        for (count, all, limit) in [
+            (0, 3000, 0.000_998),
+            (0, 10, 0.258_9),
+            (1, 10, 0.394_2),
+            (5, 223, 0.046_5),
+        ] {
+            let found = share_limit(count, all);
+            assert!(
+                (found / limit - 1.0).abs() < 0.01,
+                "{count} of {all}: {found}"
+            );
+        }
+        assert_eq!((share_limit(0, 0), share_limit(4, 4)), (1.0, 1.0));
     }
 
     #[test]

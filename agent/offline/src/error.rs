@@ -37,7 +37,6 @@ pub enum Error {
 
 impl Error {
     /// True if the input is at fault.
-    #[must_use]
     pub fn is_bad_input(&self) -> bool {
         matches!(self, Self::Read(_) | Self::NoSweeps(..) | Self::Input(_))
     }

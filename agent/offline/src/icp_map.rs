@@ -12,7 +12,7 @@ use dataset::{self, LeftOut, LoadOptions, Problem};
 use nalgebra::Isometry3;
 use protocol::{NoPoseReason, PoseEstimate};
 
-use localization::pose_source::{NO_SOURCE, PoseInput, PoseSource};
+use localization::pose_source::{NO_SOURCE, PoseInput, PoseSource, no_pose};
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget, NoIcpFit};
 
 /// Registers every sweep against a point-cloud map, starting at the measured pose.
@@ -24,7 +24,6 @@ pub struct IcpMapPose {
 
 impl IcpMapPose {
     /// Source with a point-cloud map that was built with the same settings.
-    #[must_use]
     pub fn new(map: Arc<IcpTarget>, config: IcpConfig) -> Self {
         Self { map, config }
     }
@@ -47,13 +46,6 @@ impl PoseSource for IcpMapPose {
                 no_pose(NoPoseReason::TooFewInliers)
             }
         }
-    }
-}
-
-fn no_pose(reason: NoPoseReason) -> PoseEstimate {
-    PoseEstimate::NoPose {
-        reason,
-        inlier_count: 0,
     }
 }
 

@@ -32,5 +32,7 @@ pub mod icp_map;
 pub mod mapping;
 pub mod sweep_database;
 pub mod training;
+mod training_bar;
 
 pub use error::Error;
+pub use training_bar::TrainingBar;

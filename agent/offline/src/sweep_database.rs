@@ -24,8 +24,9 @@ pub fn read_database(
         left_out.add_files(&dataset.problems);
     }
     let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
-    let of_scenario = |scenario| present_sweeps(scenario).map(move |sweep| (scenario, sweep));
-    let all: Vec<_> = scenarios.flat_map(of_scenario).collect();
+    let all: Vec<_> = scenarios
+        .flat_map(|scenario| present_sweeps(scenario).map(move |sweep| (scenario, sweep)))
+        .collect();
     let mut sweeps = Vec::new();
     for (place, &(scenario, (agent, tick))) in all.iter().enumerate() {
         progress(place + 1, all.len());
@@ -43,8 +44,8 @@ pub fn read_database(
 
 /// Agent and tick of all sweeps of a scenario, vehicle by vehicle, in the order of time.
 pub(crate) fn present_sweeps(scenario: &Scenario) -> impl Iterator<Item = (usize, usize)> {
-    let of_agent = move |agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick));
-    let all = (0..scenario.agents.len()).flat_map(of_agent);
+    let all = (0..scenario.agents.len())
+        .flat_map(move |agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)));
     all.filter(move |&(agent, tick)| scenario.is_present(agent, tick))
 }
 

@@ -34,4 +34,8 @@ impl Localize for LightLoc {
     fn detector_encoder(&self) -> Option<&str> {
         self.localizer.detector_encoder()
     }
+
+    fn place(&self) -> Option<&str> {
+        self.localizer.place()
+    }
 }

@@ -70,6 +70,7 @@ impl Localization {
                     evidence: PoseEvidence::none(),
                     cell_covariance: PoseStd::UNBOUNDED.covariance,
                     is_registered: false,
+                    covariance_scale: None,
                     sigma: f64::from(confidence),
                     is_rejected: false,
                 };

@@ -43,4 +43,9 @@ pub trait Localize: std::fmt::Debug + Send {
     fn detector_encoder(&self) -> Option<&str> {
         None
     }
+
+    /// Name of the place in whose map the poses are; `None` if it is not known.
+    fn place(&self) -> Option<&str> {
+        None
+    }
 }

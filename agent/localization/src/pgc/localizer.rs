@@ -7,6 +7,8 @@ use perception::int8::ScaleSearch;
 use perception::tensor_values::{tensor, values};
 use perception::weights::Weights;
 use protocol::PointCloud;
+use protocol::config::FieldError;
+use serde::de::DeserializeOwned;
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, TchError, Tensor, nn, no_grad};
 
@@ -19,10 +21,11 @@ use super::head_config::SceneHeadConfig;
 use super::localization::{ENCODE, REGRESS, VOXELISE, stopwatch};
 use super::localize::LocalizerInput;
 use super::pose_refinement::SweepCells;
-use super::pose_solver::PoseSolver;
+use super::pose_solver::{PoseSolver, Solver};
 use super::scene_coordinates::SceneCoordinates;
 use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
+use crate::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 
 /// Largest number of regressed cells, where the head allows for more: more cells hardly improve poses, and they take
 /// time.
@@ -58,6 +61,7 @@ impl Localizer {
     pub fn load(encoder: &Path, head: &Path, inference: Inference) -> Result<Self, LocalizerError> {
         let (mut localizer, weights) = Self::open(encoder, head, inference)?;
         localizer.solver.confidence = stored_confidence(&weights)?;
+        localizer.solver.covariance = fitted(&weights, COVARIANCE_KEY, CovarianceScale::check)?;
         Ok(localizer)
     }
 
@@ -243,33 +247,44 @@ impl Localizer {
         })
     }
 
-    /// Search and confidence.
-    pub fn solver(&self) -> &PoseSolver {
-        &self.solver
-    }
-
     /// Sets the largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
     pub fn set_most_parts(&mut self, most: usize) {
         self.most_parts = most;
     }
 
-    /// Sets another search or confidence.
-    pub fn set_solver(&mut self, solver: PoseSolver) {
-        self.solver = solver;
+    /// Sets the confidence below which poses are rejected, beside the threshold of the head.
+    pub fn set_min_confidence(&mut self, least: f64) {
+        self.solver.min_confidence = least;
+    }
+
+    /// Sets another search.
+    pub fn set_solver(&mut self, solver: Solver) {
+        self.solver.solver = solver;
     }
 }
 
 /// The confidence model in a head's file; the plain confidence if there is none.
-fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
-    if weights.metadata(CONFIDENCE_KEY).is_none() {
-        return Ok(Confidence::Plain);
+///
+/// # Errors
+/// [`LocalizerError`] names the file and the value that is wrong.
+pub fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
+    let model = fitted(weights, CONFIDENCE_KEY, ConfidenceModel::check)?;
+    Ok(model.map_or(Confidence::Plain, Confidence::Calibrated))
+}
+
+/// What was fitted and stored in a head's file under `key`, checked.
+fn fitted<T: DeserializeOwned>(
+    weights: &Weights,
+    key: &str,
+    check: impl Fn(&T) -> Result<(), FieldError>,
+) -> Result<Option<T>, LocalizerError> {
+    if weights.metadata(key).is_none() {
+        return Ok(None);
     }
-    let model: ConfidenceModel = weights.metadata_json(CONFIDENCE_KEY)?;
+    let fitted = weights.metadata_json(key)?;
     let head = weights.path().display().to_string();
-    model
-        .check()
-        .map_err(|reason| LocalizerError::Confidence { head, reason })?;
-    Ok(Confidence::Calibrated(model))
+    check(&fitted).map_err(|reason| LocalizerError::Confidence { head, reason })?;
+    Ok(Some(fitted))
 }
 
 #[cfg(test)]

@@ -46,7 +46,7 @@ pub use error::LocalizerError;
 pub use head_config::{RefinerConfig, SceneHeadConfig};
 pub use localization::{Localization, stopwatch};
 pub use localize::{Localize, LocalizerInput};
-pub use localizer::Localizer;
+pub use localizer::{Localizer, stored_confidence};
 pub use pose_evidence::{PoseEvidence, RefinementEvidence};
 pub use refinement_network::Refiner;
 pub use scene_coordinates::{SceneCoordinates, sigma};
@@ -84,6 +84,10 @@ impl Localize for Localizer {
     fn detector_encoder(&self) -> Option<&str> {
         let [encoder, _] = &self.sha256;
         self.encoder.takes_levels().then_some(encoder)
+    }
+
+    fn place(&self) -> Option<&str> {
+        Some(&self.head.config().scene_name)
     }
 }
 

@@ -7,6 +7,7 @@ use super::confidence::Confidence;
 use super::pose_evidence::{PoseEvidence, std_of};
 use super::pose_refinement::RefinedPose;
 use super::scene_coordinates::SceneCoordinates;
+use crate::covariance_scale::CovarianceScale;
 use crate::registration::ransac::{self, RansacConfig};
 use crate::registration::sc2pcr::{self, Sc2PcrConfig};
 use crate::registration::{NoRegistration, Registration};
@@ -36,6 +37,10 @@ pub struct PoseSolver {
     pub solver: Solver,
     /// Confidence of the pose.
     pub confidence: Confidence,
+    /// Confidence below which a pose is rejected, beside the threshold that was fitted, 0..=1.
+    pub min_confidence: f64,
+    /// Scale of the pose's covariance, if it was fitted.
+    pub covariance: Option<CovarianceScale>,
 }
 
 /// A pose with its evidence.
@@ -51,6 +56,8 @@ pub struct FoundPose {
     pub cell_covariance: [[f64; 6]; 6],
     /// True if the pose was registered to a map: then `cell_covariance` is that of the registration, in full.
     pub is_registered: bool,
+    /// Fitted scale of its covariance.
+    pub covariance_scale: Option<CovarianceScale>,
     /// Confidence, 0..=1.
     pub sigma: f64,
     /// True if the confidence is below the threshold: the pose is not published.
@@ -137,12 +144,13 @@ impl PoseSolver {
         let mut world_from_sensor = last.target_from_source;
         world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
         let cell_covariance = std_of(coordinates, registration, second).covariance;
-        let is_rejected = self.confidence.rejects(sigma);
+        let is_rejected = self.confidence.rejects(sigma) || sigma < self.min_confidence;
         FoundPose {
             world_from_sensor,
             evidence,
             cell_covariance,
             is_registered: false,
+            covariance_scale: self.covariance,
             sigma,
             is_rejected,
         }
@@ -173,6 +181,7 @@ pub(super) fn confirm(
             evidence: PoseEvidence::of_refinement(refined, start),
             cell_covariance: refined.std.covariance,
             is_registered: false,
+            covariance_scale: None,
             sigma: 1.0 / (1.0 + error_m * error_m),
             is_rejected: false,
         }

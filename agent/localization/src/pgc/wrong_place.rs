@@ -3,12 +3,15 @@
 use std::path::Path;
 
 use perception::weights::Weights;
+use protocol::PointCloud;
 
 use super::head_config::SceneHeadConfig;
 
 /// Smallest ratio of numbers of points, and the inverse of the largest, at which sweeps count as those of one LiDAR: the
 /// numbers of one in a street and on a square differ by less.
 const LEAST_RATIO: f64 = 0.6;
+/// Largest height of the ground that counts as 0, metres.
+const LEVEL_M: f32 = 0.3;
 
 /// The hint, with the place in the head's metadata and the map of the scene, as far as they are known.
 pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> String {
@@ -33,6 +36,28 @@ pub fn other_lidar_hint(head_points: Option<usize>, points: &[usize]) -> Option<
         format!(
             "the sweeps have {own} points (median), those that the head was made from {of_head}: for another LiDAR it finds \
              few poses, or wrong ones; make a head with this one (agent map)"
+        )
+    })
+}
+
+/// Height that 5 % of the points of a cloud are below, metres: mostly that of the ground; `None` of an empty cloud.
+pub fn lowest_m(cloud: &PointCloud) -> Option<f32> {
+    let mut heights: Vec<f32> = cloud.xyzi.iter().map(|point| point[2]).collect();
+    heights.retain(|height| height.is_finite());
+    let rank = heights.len() / 20;
+    (!heights.is_empty()).then(|| *heights.select_nth_unstable_by(rank, f32::total_cmp).1)
+}
+
+/// The hint that clouds without a pose are in the frame of the vehicle, of the heights of their lowest points
+/// ([`lowest_m`]): their ground is at a height of 0, not a metre or more below the LiDAR.
+pub fn vehicle_frame_hint(lowest_m: &[f32]) -> Option<String> {
+    let is_level = |height: &&f32| height.abs() < LEVEL_M;
+    let count = lowest_m.iter().filter(is_level).count();
+    (count > 0).then(|| {
+        format!(
+            "{count} of {} clouds without a pose have their ground at z 0, as in the frame of the vehicle (base_link): give \
+             them in the frame of the LiDAR, z less its height above the ground",
+            lowest_m.len()
         )
     })
 }
@@ -64,6 +89,27 @@ mod tests {
             wrong_place_hint(3, Path::new("/no/head"), None)
                 .ends_with("is /no/head the head of this place and this LiDAR?")
         );
+    }
+
+    #[test]
+    fn clouds_whose_ground_is_at_zero_are_named() {
+        let cloud = |ground: f32| PointCloud {
+            xyzi: (0..200)
+                .map(|k| [k as f32, 1.0, ground + (k / 40) as f32, 0.0])
+                .collect(),
+        };
+        let lowest = [-1.9, 0.05, 0.02].map(|ground| lowest_m(&cloud(ground)).unwrap());
+        assert_eq!(lowest, [-1.9, 0.05, 0.02]);
+        let text = vehicle_frame_hint(&lowest).unwrap();
+        assert!(
+            text.starts_with("2 of 3 clouds") && text.contains("base_link"),
+            "{text}"
+        );
+        assert_eq!(vehicle_frame_hint(&lowest[..1]), None);
+        let nan = PointCloud {
+            xyzi: vec![[f32::NAN; 4]; 9],
+        };
+        assert_eq!(lowest_m(&nan), None);
     }
 
     #[test]

@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 
 use perception::inference::Inference;
-use protocol::config::FieldError;
+use protocol::config::{FieldError, within};
 use protocol::{NoPoseReason, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::motion_gate::{MotionGate, MotionGateConfig};
 use super::settings::{PoseBasis, PoseSettings, require_file};
-use super::{PoseInput, PoseSource, PoseSourceError};
+use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
 use crate::baselines::{LightLoc, load_baseline};
 use crate::map_registration::MapRegistration;
 use crate::pgc::pose_solver::PoseSolver;
@@ -34,6 +34,11 @@ pub struct PgcConfig {
     #[arg(id = "surfel_map", long = "surfel-map", value_name = "FILE|NAME")]
     #[serde(default)]
     pub surfel_map: PathBuf,
+    /// Least confidence of a pose that is found without a prediction, 0 to 1: others are rejected, beside those that the
+    /// head rejects (pose sources pgc and tracked).
+    #[arg(id = "min_confidence", long = "min-confidence", value_name = "SHARE")]
+    #[serde(default)]
+    pub min_confidence: f64,
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence (pose source pgc).
     #[arg(long)]
     #[serde(default)]
@@ -71,9 +76,15 @@ impl LocalizedPose {
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn pgc(config: &PgcConfig, inference: Inference) -> Result<Self, LocalizerError> {
-        let localizer = Localizer::load(&config.encoder, &config.head, inference)?;
+        let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
+        let min_confidence = config.min_confidence;
+        localizer.set_min_confidence(min_confidence);
+        let solver = PoseSolver {
+            min_confidence,
+            ..PoseSolver::default()
+        };
         let localizer: Box<dyn Localize> = match config.lightloc {
-            true => Box::new(LightLoc::new(localizer, PoseSolver::default())),
+            true => Box::new(LightLoc::new(localizer, solver)),
             false => Box::new(localizer),
         };
         let localizer = MapRegistration::of(localizer, &config.surfel_map)?;
@@ -112,7 +123,12 @@ impl PoseSettings for PgcConfig {
     }
 
     fn validate(&self) -> Result<(), FieldError> {
-        require_file("pgc.head", "--head", &self.head)
+        require_file("pgc.head", "--head", &self.head)?;
+        within("pgc.min_confidence", self.min_confidence, 0.0, 1.0)
+    }
+
+    fn min_confidence(&mut self) -> Option<&mut f64> {
+        Some(&mut self.min_confidence)
     }
 
     fn networks(&mut self) -> Option<[&mut PathBuf; 3]> {
@@ -149,10 +165,7 @@ impl PoseSource for LocalizedPose {
             }
             Err(error) => {
                 tracing::error!(cav = %input.cav, capture_nanos = input.capture_nanos, "no pose: {error}");
-                return PoseEstimate::NoPose {
-                    reason: NoPoseReason::Failed,
-                    inlier_count: 0,
-                };
+                return no_pose(NoPoseReason::Failed);
             }
         };
         match estimate {

@@ -107,10 +107,15 @@ pub trait PoseSource: std::fmt::Debug + Send {
 }
 
 /// Result if there is no measured pose.
-pub const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose {
-    reason: NoPoseReason::NoSource,
-    inlier_count: 0,
-};
+pub const NO_SOURCE: PoseEstimate = no_pose(NoPoseReason::NoSource);
+
+/// Result without a pose and without inliers.
+pub const fn no_pose(reason: NoPoseReason) -> PoseEstimate {
+    PoseEstimate::NoPose {
+        reason,
+        inlier_count: 0,
+    }
+}
 
 /// Error of setting up a pose source.
 #[derive(Debug, thiserror::Error)]

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::error_table::{ErrorTable, TableRow};
 use super::noise::{self, PlanarError, PoseNoise};
 use super::settings::{PoseBasis, PoseSettings};
-use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError};
+use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError, no_pose};
 
 /// Error that is added to the measured pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -238,10 +238,7 @@ fn replayed(row: TableRow, pose: &Pose) -> PoseEstimate {
         TableRow::Pose { error, confidence } => {
             PoseEstimate::new(error.added_in_vehicle(pose), confidence)
         }
-        TableRow::NoPose => PoseEstimate::NoPose {
-            reason: NoPoseReason::TooFewInliers,
-            inlier_count: 0,
-        },
+        TableRow::NoPose => no_pose(NoPoseReason::TooFewInliers),
     }
 }
 

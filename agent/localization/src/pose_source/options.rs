@@ -15,6 +15,8 @@ use super::settings::PoseSettings;
 pub(super) const CHOICE: &str = "pose_source";
 /// Options of the networks of PGC, for every source that has them.
 const NETWORKS: [&str; 3] = ["encoder", "head", "surfel_map"];
+/// Option of the least confidence of its poses.
+const MIN_CONFIDENCE: &str = "min_confidence";
 
 /// The option that chooses the source.
 pub(super) fn choice<K: ValueEnum + Clone + Send + Sync + 'static>() -> Arg {
@@ -49,6 +51,12 @@ pub(super) fn update<S: PoseSettings + Args>(
         own.push(Arg::new(option));
         if let Some(given) = matches.get_one::<PathBuf>(option) {
             file.clone_from(given);
+        }
+    }
+    if let Some(least) = settings.min_confidence() {
+        own.push(Arg::new(MIN_CONFIDENCE));
+        if let Some(given) = matches.get_one::<f64>(MIN_CONFIDENCE) {
+            *least = *given;
         }
     }
     Ok(own)
@@ -121,6 +129,15 @@ mod tests {
             (pgc.encoder.to_str(), pgc.head.to_str()),
             (Some("e"), Some("h"))
         );
+        let least = |words: &[&str]| match parsed(words) {
+            PoseSourceConfig::Pgc(pgc) => pgc.min_confidence,
+            PoseSourceConfig::Tracked(tracked) => tracked.min_confidence,
+            other => panic!("{other:?}"),
+        };
+        for source in ["--pose-source=pgc", "--pose-source=tracked"] {
+            assert_eq!(least(&[source, "--head=h", "--min-confidence=0.8"]), 0.8);
+            assert_eq!(least(&[source, "--head=h"]), 0.0);
+        }
         let message = parsed(&["--pose-source=pgc", "--encoder=e"])
             .validate()
             .unwrap_err()

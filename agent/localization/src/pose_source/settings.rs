@@ -38,6 +38,11 @@ pub(crate) trait PoseSettings {
         None
     }
 
+    /// Least confidence of a pose of PGC, by the option `--min-confidence`.
+    fn min_confidence(&mut self) -> Option<&mut f64> {
+        None
+    }
+
     /// Files that the source reads.
     fn files(&mut self) -> Vec<&mut PathBuf> {
         let networks = self.networks().into_iter().flatten();

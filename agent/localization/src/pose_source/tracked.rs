@@ -12,28 +12,29 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::settings::{PoseBasis, PoseSettings, require_file};
-use super::{PoseInput, PoseSource, PoseSourceError};
+use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
 use crate::map_registration::MapRegistration;
 use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
 use crate::tracker::{Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits};
 
 /// Networks of PGC and settings of the tracker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
-#[serde(deny_unknown_fields)]
+#[serde(default, deny_unknown_fields)]
 pub struct TrackedPoseConfig {
     /// Weights of the encoder: the scene encoder, or a detector whose backbone serves both. Absent: those that the head
     /// names.
     #[arg(skip)]
-    #[serde(default)]
     pub encoder: PathBuf,
     /// Weights of the scene-specific head, or the name of a released one.
     #[arg(skip)]
-    #[serde(default)]
     pub head: PathBuf,
     /// Surfel map of the place, or the name of a released one. Absent: poses are not registered to a map.
     #[arg(skip)]
-    #[serde(default)]
     pub surfel_map: PathBuf,
+    /// Least confidence of a pose that is found without a prediction, 0 to 1: others are rejected, beside those that the
+    /// head rejects.
+    #[arg(skip)]
+    pub min_confidence: f64,
     /// Sweeps from one measurement to the next, 1 to 100, of a vehicle that measures its yaw rate; of one without, half
     /// as many (pose source tracked).
     #[arg(
@@ -41,11 +42,9 @@ pub struct TrackedPoseConfig {
         long = "measure-every",
         value_name = "SWEEPS"
     )]
-    #[serde(default = "TrackedPoseConfig::measure_every")]
     pub measure_every: u32,
     /// Number of the first measured sweep: vehicles on one machine take turns (pose source tracked).
     #[arg(id = "tracking_phase", long = "measure-phase", value_name = "SWEEPS")]
-    #[serde(default)]
     pub phase: u32,
     /// Longest time between two measurements by the whole localizer, which uses no prediction, seconds (pose source
     /// tracked).
@@ -54,11 +53,9 @@ pub struct TrackedPoseConfig {
         long = "global-period-s",
         value_name = "S"
     )]
-    #[serde(default = "TrackedPoseConfig::global_period_s")]
     pub global_period_s: f64,
     /// Longest time without an accepted measurement, seconds; then the vehicle is lost (pose source tracked).
     #[arg(id = "tracking_max_coast_s", long = "max-coast-s", value_name = "S")]
-    #[serde(default = "TrackedPoseConfig::max_coast_s")]
     pub max_coast_s: f64,
 }
 
@@ -69,42 +66,22 @@ impl Default for TrackedPoseConfig {
             encoder: PathBuf::new(),
             head: PathBuf::new(),
             surfel_map: PathBuf::new(),
-            measure_every: Self::measure_every(),
+            min_confidence: 0.0,
+            measure_every: 4,
             phase: 0,
-            global_period_s: Self::global_period_s(),
-            max_coast_s: Self::max_coast_s(),
+            global_period_s: 2.0,
+            max_coast_s: 3.0,
         }
     }
 }
 
 impl TrackedPoseConfig {
-    fn measure_every() -> u32 {
-        4
-    }
-
-    fn global_period_s() -> f64 {
-        2.0
-    }
-
-    fn max_coast_s() -> f64 {
-        3.0
-    }
-
-    /// Sweeps from one measurement to the next of a vehicle with this motion: without yaw rate the prediction lags in
-    /// turns.
-    fn interval(&self, motion: &EgoMotion) -> u32 {
-        if motion.yaw_rate_rad_s.is_some() {
-            self.measure_every
-        } else {
-            self.measure_every.div_ceil(2)
-        }
-    }
-
     /// Checks the values; files are not opened.
     ///
     /// # Errors
     /// [`FieldError`] of the first value that is out of range.
     pub fn validate(&self) -> Result<(), FieldError> {
+        within("tracked.min_confidence", self.min_confidence, 0.0, 1.0)?;
         within("tracked.measure_every", self.measure_every, 1, 100)?;
         within("tracked.global_period_s", self.global_period_s, 0.0, 3600.0)?;
         within("tracked.max_coast_s", self.max_coast_s, 0.0, 60.0)
@@ -129,6 +106,10 @@ impl PoseSettings for TrackedPoseConfig {
         Some([&mut self.encoder, &mut self.head, &mut self.surfel_map])
     }
 
+    fn min_confidence(&mut self) -> Option<&mut f64> {
+        Some(&mut self.min_confidence)
+    }
+
     fn option_prefix() -> &'static str {
         "tracking"
     }
@@ -141,8 +122,13 @@ impl PoseSettings for TrackedPoseConfig {
         self.measure_every = 1;
     }
 
+    /// Without yaw rate the prediction lags in turns.
     fn measuring_interval(&self, motion: &EgoMotion) -> u32 {
-        self.interval(motion)
+        if motion.yaw_rate_rad_s.is_some() {
+            self.measure_every
+        } else {
+            self.measure_every.div_ceil(2)
+        }
     }
 }
 
@@ -190,6 +176,7 @@ impl TrackedPose {
     ) -> Result<Box<dyn Localize>, LocalizerError> {
         let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         localizer.set_most_parts(MOST_PARTS);
+        localizer.set_min_confidence(config.min_confidence);
         Ok(MapRegistration::of(
             Box::new(localizer),
             &config.surfel_map,
@@ -278,10 +265,7 @@ impl TrackedPose {
     /// Localizes a vehicle that is lost.
     fn start(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         let Some(localization) = self.measure(input, None) else {
-            return PoseEstimate::NoPose {
-                reason: NoPoseReason::Failed,
-                inlier_count: 0,
-            };
+            return no_pose(NoPoseReason::Failed);
         };
         self.correct(input.capture_nanos, &localization);
         match self.tracker.state() {
@@ -292,7 +276,7 @@ impl TrackedPose {
 
     /// True if the sweep is one of those that are measured.
     fn is_due(&self, motion: &EgoMotion) -> bool {
-        let interval = u64::from(self.config.interval(motion));
+        let interval = u64::from(self.config.measuring_interval(motion));
         let turn = self.sweeps + interval - 1 + u64::from(self.config.phase);
         self.tracker.needs_measurement() || turn.is_multiple_of(interval)
     }

@@ -41,11 +41,6 @@ impl PairMoments {
         self.cross += weighted * target_m.transpose();
     }
 
-    /// Sum of all weights.
-    pub fn weight(&self) -> f64 {
-        self.weight
-    }
-
     /// `target_from_source` with the least weighted sum of squared residuals.
     ///
     /// # Errors
@@ -91,17 +86,6 @@ impl PairMoments {
     }
 }
 
-impl<'a> Extend<(&'a Vector3<f64>, &'a Vector3<f64>, f64)> for PairMoments {
-    fn extend<T: IntoIterator<Item = (&'a Vector3<f64>, &'a Vector3<f64>, f64)>>(
-        &mut self,
-        pairs: T,
-    ) {
-        pairs
-            .into_iter()
-            .for_each(|(source_m, target_m, weight)| self.add(source_m, target_m, weight));
-    }
-}
-
 /// The rotation `R` that maximises `trace(R H)` for the covariance `H` of source and target.
 fn rotation_of(covariance: &Matrix3<f64>) -> Result<Rotation3<f64>, Degenerate> {
     let svd = SVD::try_new(*covariance, true, true, f64::EPSILON, MAX_SVD_ITERATIONS)
@@ -136,7 +120,7 @@ mod tests {
 
     fn fit(pairs: &[(Vector3<f64>, Vector3<f64>, f64)]) -> Result<Isometry3<f64>, Degenerate> {
         let mut moments = PairMoments::default();
-        moments.extend(pairs.iter().map(|(a, b, weight)| (a, b, *weight)));
+        (pairs.iter()).for_each(|(a, b, weight)| moments.add(a, b, *weight));
         moments.fit()
     }
 

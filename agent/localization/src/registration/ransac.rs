@@ -163,7 +163,7 @@ pub fn solve(
         inliers: near.len(),
         reason,
     };
-    let refined = refine::converge(&near.iter().copied(), &best, scale_m, FINAL_STEPS);
+    let refined = refine::converge(&near, &best, scale_m, FINAL_STEPS);
     let refined = refined.map_err(degenerate)?;
     let motion = match config.allows_tilt_of(&refined) {
         true => refined,
@@ -218,7 +218,7 @@ impl Search<'_> {
     fn optimise(&mut self, motion: &Isometry3<f64>, gain: Gain) -> bool {
         let scales = LOCAL_SCALES.map(|scale| scale * self.config.inlier_threshold_m);
         let near = self.pairs.near(motion, refine::CUTOFF_SCALES * scales[0]);
-        let optimised = (refine::reweighted(&near.iter().copied(), motion, scales).ok())
+        let optimised = (refine::reweighted(&near, motion, scales).ok())
             .filter(|optimised| self.config.allows_tilt_of(optimised))
             .and_then(|optimised| Some((self.gain(&optimised, &gain)?, optimised)))
             .filter(|(optimised, _)| optimised.total > gain.total);

@@ -19,34 +19,28 @@ const CONVERGED: f64 = 1e-4;
 ///
 /// # Errors
 /// [`Degenerate`] when the pairs near the motion do not constrain it.
-pub(crate) fn reweighted<I>(
-    pairs: &I,
+pub(crate) fn reweighted(
+    pairs: &[(Vector3<f64>, Vector3<f64>, f64)],
     start: &Isometry3<f64>,
     scales_m: impl IntoIterator<Item = f64>,
-) -> Result<Isometry3<f64>, Degenerate>
-where
-    I: IntoIterator<Item = (Vector3<f64>, Vector3<f64>, f64)> + Clone,
-{
+) -> Result<Isometry3<f64>, Degenerate> {
     let mut motion = *start;
     for scale_m in scales_m {
-        motion = step(pairs.clone(), &motion, scale_m)?;
+        motion = step(pairs, &motion, scale_m)?;
     }
     Ok(motion)
 }
 
 /// Re-fits a motion at one scale until it converges, at most `max_steps` times.
-pub(crate) fn converge<I>(
-    pairs: &I,
+pub(crate) fn converge(
+    pairs: &[(Vector3<f64>, Vector3<f64>, f64)],
     start: &Isometry3<f64>,
     scale_m: f64,
     max_steps: usize,
-) -> Result<Isometry3<f64>, Degenerate>
-where
-    I: IntoIterator<Item = (Vector3<f64>, Vector3<f64>, f64)> + Clone,
-{
+) -> Result<Isometry3<f64>, Degenerate> {
     let mut motion = *start;
     for _ in 0..max_steps {
-        let next = step(pairs.clone(), &motion, scale_m)?;
+        let next = step(pairs, &motion, scale_m)?;
         let moved_m = (next.translation.vector - motion.translation.vector).norm();
         let turned_rad = next.rotation.angle_to(&motion.rotation);
         motion = next;
@@ -69,7 +63,7 @@ pub(crate) fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
 
 /// One weighted fit with the weights of the residuals of `motion`.
 fn step(
-    pairs: impl IntoIterator<Item = (Vector3<f64>, Vector3<f64>, f64)>,
+    pairs: &[(Vector3<f64>, Vector3<f64>, f64)],
     motion: &Isometry3<f64>,
     scale_m: f64,
 ) -> Result<Isometry3<f64>, Degenerate> {
@@ -79,7 +73,7 @@ fn step(
         let residual = rotation * source_m + motion.translation.vector - target_m;
         let kernel = forgiveness(residual.norm(), scale_m);
         if kernel > 0.0 {
-            moments.add(&source_m, &target_m, weight * kernel);
+            moments.add(source_m, target_m, weight * kernel);
         }
     }
     moments.fit()

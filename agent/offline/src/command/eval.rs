@@ -14,14 +14,15 @@ use anyhow::Context;
 use clap::{ArgGroup, ValueEnum};
 use dataset::{self, LeftOut};
 use localization::baselines::{LightLoc, Retrieval, load_baseline};
+use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 use localization::map_registration::MapRegistration;
 use localization::pgc::confidence::{
-    CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss,
+    CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Labelled, Rejection,
 };
 use localization::pgc::head_files::{encoder_or_named, surfel_map_file};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
-use localization::pgc::{Localize, Localizer};
+use localization::pgc::{Localize, Localizer, stored_confidence};
 use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::ransac::RansacConfig;
@@ -29,11 +30,13 @@ use localization::registration::sc2pcr::Sc2PcrConfig;
 use perception::compute_device::ComputeDevice;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
-use perception::weights::annotate;
+use perception::weights::{Weights, annotate};
 use protocol::config::Section;
+use serde::Serialize;
 use serde_json::json;
+use support::output;
 use support::provenance::Provenance;
-use support::{output, progress};
+use terminal::progress;
 
 use super::scene_heads::{SceneHeadFile, by_head, with_files};
 use support::cli::{BadInput, Outcome};
@@ -122,6 +125,14 @@ pub(crate) struct Args {
     /// sweeps that results are reported on.
     #[arg(long)]
     fit_confidence: bool,
+    /// Fit the size of the covariances to these sweeps and write it into the head, or with --surfel-map into that map; the
+    /// confidence stays. From 999 poses on also the bound that one of 1,000 exceeds.
+    #[arg(long, conflicts_with_all = ["fit_confidence", "baseline", "icp_map", "lightloc", "retrieval", "tracked"])]
+    fit_covariance: bool,
+    /// Reject as few poses as leave at most this share of wrong ones, by its upper 95 % confidence limit; of too few sweeps
+    /// for that, as leave the smallest limit (--fit-confidence, --fit-covariance).
+    #[arg(long, value_name = "SHARE", conflicts_with_all = ["good_loss", "surfel_map"])]
+    max_wrong: Option<f64>,
     /// Largest share of poses less than 3 m off that --fit-confidence may reject.
     #[arg(
         long,
@@ -172,8 +183,14 @@ enum Subject {
 /// Localizes, fits, writes and prints.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
-    check_good_loss(args.good_loss)
-        .map_err(|error| BadInput::new(format!("--good-loss: {error}")))?;
+    let (option, rejection) = args.rejection();
+    let checked = rejection.check();
+    checked.map_err(|error| BadInput::new(format!("{option}: {error}")))?;
+    if args.max_wrong.is_some() && !args.fits() {
+        return Err(
+            BadInput::new("--max-wrong is for --fit-confidence or --fit-covariance").into(),
+        );
+    }
     if args.seed.is_some() && args.solver == Search::Sc2pcr {
         return Err(BadInput::new("--seed is for --solver ransac: sc2pcr draws nothing").into());
     }
@@ -182,9 +199,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         false => args.head.clone(),
     };
     let groups = by_head(&heads, &args.dataset)?;
-    if args.fit_confidence && groups.len() > 1 {
+    if args.fits() && groups.len() > 1 {
         let count = groups.len();
-        let reason = format!("--fit-confidence fits one head, {count} are given");
+        let reason = format!("one head is fitted, {count} are given");
         return Err(BadInput::new(reason).into());
     }
     let (mut sweeps, mut tracked, mut left_out) = (Vec::new(), Vec::new(), LeftOut::default());
@@ -196,9 +213,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             tracked.extend(args.evaluate(args.tracking(head)?, scenes)?.sweeps);
         }
     }
-    if let ([(head, _)], true) = (&groups[..], args.fit_confidence) {
-        let report = args.fit(head, &mut sweeps)?;
-        output::note(report_line(&report));
+    if let ([(head, _)], true) = (&groups[..], args.fits()) {
+        args.fit(head, &mut sweeps)?;
     }
     args.write(if args.tracked { &tracked } else { &sweeps })?;
     let summary = LocalizationSummary::of(&sweeps);
@@ -314,8 +330,7 @@ impl Args {
         if !self.retrieval.is_empty() {
             return self.retrieval(localizer, left_out);
         }
-        let confidence = localizer.solver().confidence.clone();
-        localizer.set_solver(PoseSolver { solver, confidence });
+        localizer.set_solver(solver);
         self.registered(Box::new(localizer))
     }
 
@@ -336,11 +351,10 @@ impl Args {
         left_out: &mut LeftOut,
     ) -> Result<Box<dyn Localize>, BadInput> {
         let bar = progress::bar(0, "sweeps described");
-        let mut on_sweep = |done, all| {
+        let database = read_database(&self.retrieval, &localizer, left_out, &mut |done, all| {
             bar.set_length(all as u64);
             bar.set_position(done as u64);
-        };
-        let database = read_database(&self.retrieval, &localizer, left_out, &mut on_sweep);
+        });
         bar.finish_and_clear();
         let database = database.map_err(BadInput::of)?;
         Ok(Box::new(Retrieval::new(localizer, database)))
@@ -375,20 +389,64 @@ impl Args {
         }
     }
 
-    fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<FitReport> {
-        let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
-        let (model, report) =
-            ConfidenceModel::fit(&labelled, self.good_loss).map_err(BadInput::of)?;
-        let sha256 = annotate(head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
-        output::note(format_args!(
-            "{}: confidence written, SHA-256 is now {sha256}",
-            head.display()
-        ));
-        let confidence = Confidence::Calibrated(model);
-        for sweep in sweeps {
-            sweep.judge_again(&confidence);
+    /// Choice of the threshold, and its option.
+    fn rejection(&self) -> (&'static str, Rejection) {
+        match self.max_wrong {
+            Some(share) => ("--max-wrong", Rejection::MaxWrong(share)),
+            None => ("--good-loss", Rejection::GoodLoss(self.good_loss)),
         }
-        Ok(report)
+    }
+
+    fn fits(&self) -> bool {
+        self.fit_confidence || self.fit_covariance
+    }
+
+    /// Fits confidence, threshold and covariance, as far as the options ask for, and writes them.
+    fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<()> {
+        if self.fit_confidence || self.max_wrong.is_some() {
+            let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
+            let (model, report) = self.fit_confidence(head, &labelled)?;
+            write_fit(head, CONFIDENCE_KEY, &model)?;
+            output::note(report_line(&report));
+            let confidence = Confidence::Calibrated(model);
+            for sweep in &mut *sweeps {
+                sweep.judge_again(&confidence);
+            }
+        }
+        let samples: Vec<_> = (sweeps.iter())
+            .filter_map(EvaluatedSweep::pose_sample)
+            .collect();
+        let Some(scale) = CovarianceScale::fit(&samples) else {
+            let count = samples.len();
+            let reason = format!("a covariance is fitted on 50 poses or more, there are {count}");
+            return Err(BadInput::new(reason).into());
+        };
+        let map = self.surfel_map_file()?;
+        match self.surfel_map.is_some() {
+            true => write_fit(&map, COVARIANCE_KEY, &scale),
+            false => write_fit(head, COVARIANCE_KEY, &scale),
+        }
+    }
+
+    fn fit_confidence(
+        &self,
+        head: &Path,
+        labelled: &[Labelled],
+    ) -> anyhow::Result<(ConfidenceModel, FitReport)> {
+        let (_, rejection) = self.rejection();
+        if self.fit_confidence {
+            return Ok(ConfidenceModel::fit(labelled, rejection).map_err(BadInput::of)?);
+        }
+        let stored = Weights::load(head).map_err(BadInput::of)?;
+        let Confidence::Calibrated(mut model) = stored_confidence(&stored).map_err(BadInput::of)?
+        else {
+            let reason = format!("{}: has no confidence: --fit-confidence", head.display());
+            return Err(BadInput::new(reason).into());
+        };
+        let report = model
+            .choose_threshold(labelled, rejection)
+            .map_err(BadInput::of)?;
+        Ok((model, report))
     }
 
     fn write(&self, sweeps: &[EvaluatedSweep]) -> anyhow::Result<()> {
@@ -406,6 +464,17 @@ impl Args {
     }
 }
 
+/// Writes fitted numbers into a file of weights or a map.
+fn write_fit(file: &Path, key: &str, fitted: &impl Serialize) -> anyhow::Result<()> {
+    let text = serde_json::to_string(fitted)?;
+    let sha256 = annotate(file, key, &text)?;
+    let file = file.display();
+    output::note(format_args!(
+        "{file}: {key} written, SHA-256 is now {sha256}: {text}"
+    ));
+    Ok(())
+}
+
 /// Name of the generated map of the first scenario.
 fn map_text(scenes: &[PathBuf]) -> Option<String> {
     let dataset = dataset::open(scenes.first()?).ok()?;
@@ -416,8 +485,10 @@ fn report_line(report: &FitReport) -> String {
     let (sweeps, bad) = (report.sweeps, report.bad);
     let (bad_rejected, good_rejected) = (report.bad_rejected, report.good_rejected);
     let good = sweeps - bad;
+    let limit = 100.0 * report.wrong_limit;
     format!(
-        "fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones"
+        "fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones; of the \
+         others at most {limit:.2} % are bad (95 % limit)"
     )
 }
 

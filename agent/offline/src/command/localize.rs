@@ -11,7 +11,8 @@ use localization::pose_source::{
 };
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
-use support::{output, progress};
+use support::output;
+use terminal::progress;
 
 use super::scene_heads::{SceneHeadFile, head_of, with_files};
 use support::cli::{BadInput, Outcome};

@@ -8,11 +8,12 @@ use dataset::findings::{self, SweepFindings};
 use localization::map_registration::MapRegistration;
 use localization::pgc::head_files::{encoder_or_named, head_file, surfel_map_file};
 use localization::pgc::pose_solver::FoundPose;
-use localization::pgc::wrong_place::other_lidar_hint;
+use localization::pgc::wrong_place::{lowest_m, other_lidar_hint, vehicle_frame_hint};
 use localization::pgc::{Localization, Localize, Localizer, LocalizerInput};
-use localization::pose_covariance::pose_covariance;
+use localization::pose_covariance::{pose_covariance, position_bound_m};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
+use protocol::config::within;
 use protocol::{NoPoseReason, PoseEstimate};
 use serde::Serialize;
 use support::cli::{BadInput, Outcome};
@@ -48,6 +49,9 @@ pub(crate) struct Args {
     /// wrote, or a released one (town1) [default: none].
     #[arg(long, value_name = "FILE|NAME")]
     surfel_map: Option<PathBuf>,
+    /// Least confidence of a pose, 0 to 1: others are rejected, beside those that the head rejects.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
+    min_confidence: f64,
     /// Direction of the y axis in files that belong to no data set: left, right (CARLA, OPV2V), or whichever gives a pose,
     /// left first.
     #[arg(long, value_enum, default_value_t = YAxis::Auto)]
@@ -71,7 +75,7 @@ enum YAxis {
 }
 
 /// Result of one cloud.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 struct Located {
     /// Path of the file.
     cloud: String,
@@ -91,6 +95,9 @@ struct Located {
     points: usize,
     /// Number of points left out: not finite, or exactly at the origin.
     points_left_out: usize,
+    /// Height that 5 % of the points are below, metres.
+    #[serde(skip)]
+    lowest_m: Option<f32>,
     /// True if y of the file was negated.
     is_mirrored: bool,
 }
@@ -106,6 +113,8 @@ struct LocatedPose {
     quaternion_xyzw: [f64; 4],
     /// Covariance of x, y, z (metres) and rotations about x, y, z (radians), row by row.
     covariance: [[f64; 6]; 6],
+    /// Distance in the plane that one of 1,000 poses exceeds, metres; null where it was not fitted.
+    bound_m: Option<f64>,
     /// Confidence, 0..=1.
     confidence: f64,
 }
@@ -116,20 +125,25 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let head = head_file(&args.head).map_err(BadInput::of)?;
     let encoder = encoder_or_named(args.encoder.as_deref(), &head).map_err(BadInput::of)?;
     let inference = Inference::new(Device::Cpu, args.precision);
-    let localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
+    within("--min-confidence", args.min_confidence, 0.0, 1.0).map_err(BadInput::of)?;
+    let mut localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
+    localizer.set_min_confidence(args.min_confidence);
     let head_config = localizer.head_config().clone();
     let map = args.surfel_map.as_deref().map(surfel_map_file).transpose();
     let map = map.map_err(BadInput::of)?.unwrap_or_default();
     let localizer = MapRegistration::of(Box::new(localizer), &map);
     let mut localizer = localizer.map_err(BadInput::of)?;
     let (mut found, mut lost, mut bad) = (0, 0, 0);
-    let (mut points, mut sweeps) = (Vec::new(), Vec::new());
+    let (mut points, mut sweeps, mut lowest) = (Vec::new(), Vec::new(), Vec::new());
     for file in clouds_at(&args.clouds) {
         let located = args.locate(&mut *localizer, &head_config.scene_name, file, &mut sweeps)?;
         match (&located.error, &located.pose) {
             (Some(_), _) => bad += 1,
             (None, Some(_)) => found += 1,
-            (None, None) => lost += 1,
+            (None, None) => {
+                lost += 1;
+                lowest.extend(located.lowest_m);
+            }
         }
         if located.error.is_none() {
             points.push(located.points);
@@ -155,7 +169,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let folder = args.clouds.first().map_or(Path::new(""), PathBuf::as_path);
     let sweeps: Vec<&SweepFindings> = sweeps.iter().collect();
     findings::note(&findings::of_clouds(folder, &sweeps, IntensityScale::AUTO));
-    if let Some(hint) = other_lidar_hint(head_config.sweep_points, &points) {
+    let other_lidar = other_lidar_hint(head_config.sweep_points, &points);
+    for hint in other_lidar.into_iter().chain(vehicle_frame_hint(&lowest)) {
         output::note(hint);
     }
     Ok(match bad > 0 {
@@ -214,6 +229,7 @@ impl Args {
             inlier_ratio: localization.inlier_ratio,
             points: count,
             points_left_out: read.left_out,
+            lowest_m: lowest_m(&points),
             is_mirrored,
         })
     }
@@ -253,6 +269,7 @@ impl LocatedPose {
             roll_pitch_yaw_deg: [roll, pitch, yaw].map(f64::to_degrees),
             quaternion_xyzw: rotation.coords.into(),
             covariance: pose_covariance(&found),
+            bound_m: position_bound_m(&found),
             confidence: found.sigma,
         }
     }
@@ -263,14 +280,8 @@ impl Located {
         Self {
             cloud,
             map,
-            pose: None,
-            no_pose: None,
             error: Some(error.to_string()),
-            inliers: 0,
-            inlier_ratio: 0.0,
-            points: 0,
-            points_left_out: 0,
-            is_mirrored: false,
+            ..Self::default()
         }
     }
 
@@ -313,12 +324,13 @@ mod tests {
             inlier_ratio: 0.1,
             points: 900,
             points_left_out: 0,
+            lowest_m: None,
             is_mirrored: false,
         }
     }
 
     #[test]
-    fn a_line_tells_the_pose_the_reason_or_the_fault() {
+    fn a_line_states_the_pose_the_reason_or_the_fault() {
         let mut covariance = [[0.0; 6]; 6];
         (covariance[0][0], covariance[1][1]) = (0.0025, 0.0025);
         let pose = LocatedPose {
@@ -326,6 +338,7 @@ mod tests {
             roll_pitch_yaw_deg: [0.0, 0.1, 90.0],
             quaternion_xyzw: [0.0, 0.0, 0.7, 0.7],
             covariance,
+            bound_m: None,
             confidence: 0.9876,
         };
         assert_eq!(

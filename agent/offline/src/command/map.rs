@@ -3,23 +3,25 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use agent_offline::TrainingBar;
 use agent_offline::icp_map::{check_spacing, read_map};
 use agent_offline::mapping::{MapConfig, MapProgress, MapReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
 use dataset::LeftOut;
+use localization::pgc::confidence::Rejection;
 use localization::pgc::head_files::{ENCODER_FILE, SURFELS_FILE, released_encoder};
 use localization::registration::icp::surfel_map::SurfelMap;
 use perception::compute_device::ComputeDevice;
-use perception::train::{
-    ComputePrecision, Interruption, Length, ModelCard, RunConfig, TrainingBar, check_out,
-};
+use perception::train::{ComputePrecision, Interruption, Length, ModelCard, RunConfig, check_out};
 use support::cli::{BadInput, Outcome};
 use support::file_error::AtFile;
 use support::output;
 
 use super::train::options::check_folders;
 
+/// Choice of the threshold without `--max-wrong`.
+const GOOD_LOSS: Rejection = Rejection::GoodLoss(0.01);
 /// Name of the report beside the weights.
 const REPORT_FILE: &str = "map.json";
 
@@ -38,7 +40,8 @@ pub(crate) struct Args {
     /// Folder of the results.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Name of the place, for messages and the model card [default: name of the folder].
+    /// Name of the place, for messages and the model card [default: name of the folder; of a surfel map alone: none].
+    /// Only the surfel map of the same place goes with a head.
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
     /// Time of everything, reading and encoding included, minutes.
@@ -50,6 +53,11 @@ pub(crate) struct Args {
     /// Distance between two sweeps of a drive in the surfel map, metres.
     #[arg(long, value_name = "M", default_value_t = 5.0)]
     surfel_spacing_m: f64,
+    /// Reject as few poses as leave at most this share of wrong ones, by its upper 95 % confidence limit on held-out sweeps
+    /// and their mirror images; of too few sweeps for that, as leave the smallest limit [default: reject 1 % of the right
+    /// ones].
+    #[arg(long, value_name = "SHARE", conflicts_with = "surfels_only")]
+    max_wrong: Option<f64>,
     /// Largest number of training sweeps, evenly spread [default: as many as there is time for].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     sweeps: Option<u32>,
@@ -89,11 +97,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let config = args.config()?;
     let bar = TrainingBar::of(Length::Time(config.time));
     let total_s = config.time.as_secs_f64();
-    let mut observe = |progress: MapProgress| match progress {
+    let made = make_map(&config, &mut |progress: MapProgress| match progress {
         MapProgress::Note(text) => bar.print_line(&text),
         MapProgress::At(seconds, text) => bar.report((seconds / total_s).min(1.0), seconds, &text),
-    };
-    let made = make_map(&config, &mut observe);
+    });
     bar.finish();
     let report = made.map_err(|error| match error.is_bad_input() {
         true => BadInput::of(error).into(),
@@ -123,10 +130,19 @@ impl Args {
         let target = read_map(&self.drives, self.surfel_spacing_m, &config, &mut left_out);
         let target = target.map_err(BadInput::of)?;
         let path = self.out.join(SURFELS_FILE);
-        let sha256 = SurfelMap::write(&path, &target)?;
+        let sha256 = SurfelMap::write(&path, &self.place(), &target)?;
         let (planes, path) = (target.planes(), path.display());
         output::note(format_args!("{path}: {planes} planes, SHA-256 {sha256}"));
         Ok(left_out)
+    }
+
+    /// Name of the place. That of a surfel map alone is not known unless it is given: its head may have another.
+    fn place(&self) -> String {
+        let unnamed = || match self.surfels_only {
+            true => String::new(),
+            false => name_of(&self.out),
+        };
+        self.name.clone().unwrap_or_else(unnamed)
     }
 
     fn config(&self) -> anyhow::Result<MapConfig> {
@@ -140,6 +156,9 @@ impl Args {
         let missing = || BadInput::new("no released encoder is found: --encoder FILE");
         let encoder = self.encoder.clone().or_else(released_encoder);
         let encoder = encoder.ok_or_else(missing)?;
+        let rejection = self.max_wrong.map_or(GOOD_LOSS, Rejection::MaxWrong);
+        let checked = rejection.check();
+        checked.map_err(|error| BadInput::new(format!("--max-wrong: {error}")))?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = self.threads.map_or((cores / 2).clamp(1, 16), usize::from);
         tch::set_num_threads(i32::try_from(threads).unwrap_or(1));
@@ -148,9 +167,10 @@ impl Args {
             device.map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
         Ok(MapConfig {
             drives: self.drives.clone(),
-            place: self.name.clone().unwrap_or_else(|| name_of(&self.out)),
+            place: self.place(),
             encoder,
             time,
+            rejection,
             most_sweeps: self.sweeps.map(|count| count as usize),
             run: RunConfig {
                 learning_rate: 2e-3,
@@ -187,8 +207,11 @@ fn text(report: &MapReport) -> String {
         .map_or("not fitted: too few poses".to_owned(), |fit| {
             let good = fit.sweeps - fit.bad;
             format!(
-                "rejects {} of {} wrong poses, {} of {good} right ones",
-                fit.bad_rejected, fit.bad, fit.good_rejected
+                "rejects {} of {} wrong poses, {} of {good} right ones; of the others at most {:.1} % are wrong (95 % limit)",
+                fit.bad_rejected,
+                fit.bad,
+                fit.good_rejected,
+                100.0 * fit.wrong_limit
             )
         });
     format!(

@@ -77,8 +77,9 @@ pub(crate) fn head_of<'a>(
         .with_context(|| format!("the map of scenario {}", scenario.name))
         .map_err(BadInput::of)?;
     let head = heads.iter().find(|head| head.map.as_ref() == Some(&map));
-    let missing = || BadInput::new(format!("{}: no --head for map {map}", scenario.name));
-    Ok(&head.ok_or_else(missing)?.weights)
+    Ok(&head
+        .ok_or_else(|| BadInput::new(format!("{}: no --head for map {map}", scenario.name)))?
+        .weights)
 }
 
 /// Each head that scenes need, with those scenes, in the order of their first use.
@@ -99,8 +100,9 @@ pub(crate) fn by_head<'a>(
             .iter()
             .map(|scenario| head_of(heads, scenario))
             .collect::<Result<Vec<_>, _>>()?;
-        let missing = || BadInput::new(format!("{}: there is no scenario in it", folder.display()));
-        let &head = needed.first().ok_or_else(missing)?;
+        let &head = needed.first().ok_or_else(|| {
+            BadInput::new(format!("{}: there is no scenario in it", folder.display()))
+        })?;
         if needed.iter().any(|other| *other != head) {
             return Err(BadInput::new(format!(
                 "{}: scenarios of several maps",

@@ -16,8 +16,10 @@ pub use summary::{
 };
 pub use table::{write_csv, write_error_table};
 
+use localization::covariance_scale::PoseSample;
 use localization::pgc::confidence::{Confidence, Labelled};
 use localization::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
+use localization::pose_covariance::unscaled_covariance;
 use localization::pose_source::{PoseInput, PoseSource};
 use support::sampling::evenly_spread;
 
@@ -51,7 +53,6 @@ pub struct EvaluatedSweep {
 
 impl EvaluatedSweep {
     /// Error of the estimated pose, rejected or not.
-    #[must_use]
     pub fn error(&self) -> Option<PoseError> {
         let found = self.localization.found?;
         Some(PoseError::between(
@@ -61,19 +62,26 @@ impl EvaluatedSweep {
     }
 
     /// Error of the pose that is published, if there is one.
-    pub(crate) fn told_error(&self) -> Option<PoseError> {
+    pub(crate) fn published_error(&self) -> Option<PoseError> {
         let pose = self.localization.estimate.world_from_cav()?;
         Some(PoseError::between(pose, &self.truth))
     }
 
     /// Sample for the fit of a confidence model.
-    #[must_use]
     pub fn labelled(&self) -> Option<Labelled> {
         let found = self.localization.found?;
         Some(Labelled {
             evidence: found.evidence,
             error_m: self.error()?.distance_m,
         })
+    }
+
+    /// Sample for the fit of a covariance: a pose that is published.
+    #[must_use]
+    pub fn pose_sample(&self) -> Option<PoseSample> {
+        let found = self.localization.found.filter(|found| !found.is_rejected)?;
+        let (pose, truth) = (&found.world_from_sensor, self.truth.isometry());
+        Some(PoseSample::of(pose, unscaled_covariance(&found), &truth))
     }
 
     /// Applies another confidence model to the estimated pose.
@@ -130,6 +138,7 @@ pub fn evaluate_source(
             measured: measured.as_ref(),
             motion: frame.motion(),
         };
+        // As in a live run: the answer first, then what the source keeps of the sweep.
         let estimate = source.estimate(&input);
         source.observe(&input);
         times.lap("pose solve");
@@ -145,10 +154,10 @@ fn evaluate_with(
 ) -> Result<Evaluated, Error> {
     let datasets = options.scenes.iter().map(|dir| dataset::open(dir));
     let datasets = datasets.collect::<Result<Vec<_>, _>>()?;
-    let is_used = |(_, tick): &(usize, usize)| tick.is_multiple_of(options.every.max(1));
     let mut all = Vec::new();
     for scenario in datasets.iter().flat_map(|dataset| &dataset.scenarios) {
-        let used = present_sweeps(scenario).filter(is_used);
+        let used =
+            present_sweeps(scenario).filter(|(_, tick)| tick.is_multiple_of(options.every.max(1)));
         all.extend(used.map(|sweep| (scenario, sweep)));
     }
     let chosen = evenly_spread(&all, options.sweeps.unwrap_or(usize::MAX));
@@ -256,13 +265,16 @@ pub(crate) mod tests {
     fn another_confidence_changes_the_published_pose_and_not_the_estimated_one() {
         let mut sweep = evaluated(10).swap_remove(0);
         let found = sweep.error().unwrap();
-        assert_eq!(sweep.told_error(), Some(found));
+        assert_eq!(sweep.published_error(), Some(found));
         let strict = localization::pgc::confidence::ConfidenceModel {
             reject_below: 1.0,
             ..localization::pgc::confidence::ConfidenceModel::example()
         };
         sweep.judge_again(&Confidence::Calibrated(strict));
-        assert_eq!((sweep.error(), sweep.told_error()), (Some(found), None));
+        assert_eq!(
+            (sweep.error(), sweep.published_error()),
+            (Some(found), None)
+        );
         assert_eq!(outcome(&sweep.localization.estimate), "low_confidence");
     }
 

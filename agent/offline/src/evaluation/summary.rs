@@ -113,9 +113,8 @@ struct Judged {
 
 impl LocalizationSummary {
     /// Summary of sweeps.
-    #[must_use]
     pub fn of(sweeps: &[EvaluatedSweep]) -> Self {
-        let published = sweeps.iter().filter_map(EvaluatedSweep::told_error);
+        let published = sweeps.iter().filter_map(EvaluatedSweep::published_error);
         let (metres, degrees): (Vec<f64>, Vec<f64>) = published
             .map(|error| (error.distance_m, error.angle_deg))
             .unzip();
@@ -258,11 +257,10 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
 }
 
 /// The reliability curve, and every pose by sigma and error.
-#[must_use]
 pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let judged = judged(sweeps);
     let bins = calibration(&judged);
-    let is_published = |sweep: &&EvaluatedSweep| sweep.told_error().is_some();
+    let is_published = |sweep: &&EvaluatedSweep| sweep.published_error().is_some();
     let published = sweeps.iter().filter(is_published).count();
     let series = |name: &str, points, mark| Series {
         name: name.into(),

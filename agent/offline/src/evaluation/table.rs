@@ -146,7 +146,7 @@ mod tests {
         write_error_table(&path, &sweeps).unwrap();
         let table = ErrorTable::read(&path).unwrap();
         for (step, sweep) in sweeps.iter().enumerate() {
-            match (table.row(0, step as u64), sweep.told_error()) {
+            match (table.row(0, step as u64), sweep.published_error()) {
                 (TableRow::Pose { error, .. }, Some(estimated)) => {
                     assert!((error.distance_m() - estimated.distance_m).abs() < 1e-3);
                 }

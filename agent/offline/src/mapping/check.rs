@@ -26,15 +26,14 @@ const KEEP: f64 = 0.7;
 pub(super) struct Check {
     /// The sweeps as they are.
     pub(super) sweeps: Vec<EvaluatedSweep>,
+    /// Their copies.
+    pub(super) copies: Vec<EvaluatedSweep>,
     /// Poses of these, of copies and of mirrored sweeps, with their errors.
     pub(super) labelled: Vec<Labelled>,
 }
 
 /// Localizes the sweeps of `list` and their mirror images, then copies of both until `deadline`; `progress` gets the
-/// number done and of all.
-///
-/// # Errors
-/// [`LocalizerError`] when the tensor library fails. Sweeps that cannot be read are left out and counted in `list`.
+/// number done and of all. Sweeps that cannot be read are left out and counted in `list`.
 pub(super) fn check(
     localizer: &mut Localizer,
     list: &SweepList,
@@ -77,8 +76,9 @@ pub(super) fn check(
         let wrong = mirrored.labelled();
         let wrong = wrong.filter(|labelled| labelled.error_m > BAD_M);
         check.labelled.extend(wrong);
-        if copy == 0 {
-            check.sweeps.push(sweep);
+        match copy {
+            0 => check.sweeps.push(sweep),
+            _ => check.copies.push(sweep),
         }
     }
     Ok(check)

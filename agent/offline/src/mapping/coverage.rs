@@ -77,7 +77,6 @@ impl Coverage {
     }
 
     /// The grid as text, north up: `#` where there are sweeps, `.` where there are none.
-    #[must_use]
     pub fn picture(&self) -> String {
         let place =
             |corner_m: [f64; 2]| corner_m.map(|metres| (metres / self.cell_m).round() as i64);

@@ -18,12 +18,15 @@ pub use report::{HeldOutAccuracy, MapReport};
 use self::check::Check;
 use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
 use crate::Error;
-use crate::evaluation::LocalizationSummary;
+use crate::evaluation::{EvaluatedSweep, LocalizationSummary};
 use crate::training::{
     CELLS, FeatureCache, SceneSummary, SceneSweeps, SceneTrainConfig, SweepAugmentation, SweepList,
     train_scene_on,
 };
-use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
+use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
+use localization::pgc::confidence::{
+    CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Rejection,
+};
 use localization::pgc::head_files::ENCODER_FILE;
 use localization::pgc::{CellEncoder, Localizer};
 use perception::inference::Inference;
@@ -39,8 +42,6 @@ const PROBES: usize = 8;
 const BATCHES: usize = 40;
 const LEAST_BATCH: usize = 512;
 const MOST_BATCH: usize = 1024;
-/// Largest share of good poses that the confidence may reject.
-const GOOD_LOSS: f64 = 0.01;
 /// Time between two checkpoints.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(120);
 
@@ -57,6 +58,8 @@ pub struct MapConfig {
     pub time: Duration,
     /// Largest number of training sweeps.
     pub most_sweeps: Option<usize>,
+    /// Choice of the confidence below which poses are rejected.
+    pub rejection: Rejection,
     /// Folder, device, precision, threads and seed, true to resume; its length is not used.
     pub run: RunConfig,
 }
@@ -402,19 +405,31 @@ impl Map<'_> {
         Ok(checked?)
     }
 
-    /// Fits the confidence, writes it into the head and applies it; the report and the new digest.
+    /// Fits confidence and covariance, writes them into the head and applies the confidence; the report and the new digest.
     fn fit(
         &mut self,
         weights: &Path,
         checked: &mut Check,
     ) -> Result<(Option<FitReport>, Option<String>), Error> {
-        match ConfidenceModel::fit(&checked.labelled, GOOD_LOSS) {
+        match ConfidenceModel::fit(&checked.labelled, self.config.rejection) {
             Ok((model, report)) => {
                 let text = serde_json::to_string(&model).expect("a model is numbers");
-                let sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
+                let mut sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
                 let confidence = Confidence::Calibrated(model);
-                for sweep in &mut checked.sweeps {
+                for sweep in checked.sweeps.iter_mut().chain(&mut checked.copies) {
                     sweep.judge_again(&confidence);
+                }
+                let all = checked.sweeps.iter().chain(&checked.copies);
+                let samples: Vec<_> = all.filter_map(EvaluatedSweep::pose_sample).collect();
+                match CovarianceScale::fit(&samples) {
+                    Some(scale) => {
+                        let text = serde_json::to_string(&scale).expect("a scale is numbers");
+                        sha256 = annotate(weights, COVARIANCE_KEY, &text)?;
+                    }
+                    None => self.note(format!(
+                        "the covariance is not fitted: {} held-out poses are too few",
+                        samples.len()
+                    )),
                 }
                 Ok((Some(report), Some(sha256)))
             }

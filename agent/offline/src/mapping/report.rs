@@ -76,7 +76,6 @@ impl HeldOutAccuracy {
     }
 
     /// One line.
-    #[must_use]
     pub fn text(&self) -> String {
         let number = |value: Option<f64>, digits: usize| {
             value.map_or("-".into(), |value| format!("{value:.digits$}"))
@@ -95,7 +94,6 @@ impl HeldOutAccuracy {
 
 impl MapReport {
     /// The driven area, in one line.
-    #[must_use]
     pub fn coverage_text(&self) -> String {
         let coverage = &self.coverage;
         let ([x_low, y_low], [x_high, y_high]) = (coverage.low_m, coverage.high_m);
@@ -107,7 +105,6 @@ impl MapReport {
     }
 
     /// The training, in one line.
-    #[must_use]
     pub fn training_text(&self) -> String {
         let copies = match self.copies {
             0 | 1 => String::new(),
@@ -121,7 +118,6 @@ impl MapReport {
     }
 
     /// The limits of the head, in sentences.
-    #[must_use]
     pub fn limits_text(&self) -> String {
         let roads = "Roads that were not driven give no pose: drive every road, and both directions of wide ones.";
         let limits = [self.training_limit(), self.confidence_limit()];

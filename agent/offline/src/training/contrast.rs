@@ -93,6 +93,7 @@ impl Contrast {
             log_shares.f_nll_loss::<Tensor>(&matches, None, tch::Reduction::Mean, -100)?;
         let found = logits.f_argmax(1, false)?.f_eq_tensor(&matches)?;
         let found = found.f_to_kind(Kind::Float)?;
+        // Offsets are learnt between true matches only.
         let matched = partners.f_index_select(0, &matches)?;
         let offset = self.offset_error(&anchors, &matched, pairs, device)?;
         Ok(ContrastLoss {
@@ -163,6 +164,7 @@ fn neither(pairs: &[Pair], device: Device) -> Result<Tensor, TchError> {
         let (anchor, partner) = (places(&pair.anchor)?, places(&pair.partner)?);
         let distance = Tensor::f_cdist(&anchor, &partner, 2.0, 2_i64)?;
         let near = distance.f_lt(NEITHER_M)?.f_to_kind(Kind::Float)? * NEVER;
+        // The match itself is near too, and must stay a candidate.
         let own: Vec<i64> = pair.matches.iter().map(|&partner| partner as i64).collect();
         let near = near.f_scatter_value(1, &tensor(&own, &[-1, 1], device)?, 0.0)?;
         let (rows, columns) = (cells(&pair.anchor), cells(&pair.partner));

@@ -84,14 +84,13 @@ pub fn train_encoder(
     };
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     let (batch, anchors) = (run.batch as u64, maker.anchors());
-    let prepare = move |number| {
-        let pairs = number * batch..(number + 1) * batch;
-        pairs.map(|pair| maker.pair(pair)).collect()
-    };
     let mut training = Training {
         config,
         observe,
-        loader: Prefetch::start(run.loader_threads, trainer.steps(), prepare),
+        loader: Prefetch::start(run.loader_threads, trainer.steps(), move |number| {
+            let pairs = number * batch..(number + 1) * batch;
+            pairs.map(|pair| maker.pair(pair)).collect()
+        }),
         anchors,
         validation,
         variables,

@@ -30,6 +30,7 @@ pub(crate) fn kmeans<const N: usize>(
             *count += 1.0;
         }
         for (centre, (sum, count)) in centres.iter_mut().zip(&sums) {
+            // A centre without points stays where it is.
             if *count > 0.0 {
                 *centre = sum.map(|sum| sum / count);
             }
@@ -44,13 +45,13 @@ fn spread<const N: usize>(points: &[[f64; N]], count: usize, seed: u64) -> Vec<[
     let mut centres: Vec<[f64; N]> = Vec::with_capacity(count);
     while centres.len() < count {
         let indices: Vec<usize> = (0..points.len()).collect();
-        let weight = |&index: &usize| match centres.is_empty() {
+        // All weights are zero when points repeat: any point is a valid choice then.
+        let chosen = indices.choose_weighted(&mut rng, |&index: &usize| match centres.is_empty() {
             true => 1.0,
             false => squares[index],
-        };
-        // All weights are zero when points repeat: any point is a valid choice then.
-        let chosen = indices.choose_weighted(&mut rng, weight);
+        });
         let centre = points[chosen.copied().unwrap_or(0)];
+        // The chance of a point to become a centre grows with its squared distance to the nearest one.
         for (least, point) in squares.iter_mut().zip(points) {
             *least = least.min(square(&centre, point));
         }

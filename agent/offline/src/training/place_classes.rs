@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn features_that_tell_the_class_have_a_small_loss() {
+    fn features_that_separate_the_classes_have_a_small_loss() {
         let variables = VarStore::new(Device::Cpu);
         let classes =
             PlaceClasses::new([variables.root()], 4, &poses(), [100.0, 100.0, 1.0], 0).unwrap();

@@ -92,6 +92,7 @@ impl Redundancy {
         }
         for (recorded, mut losses) in self.recorded.iter_mut().zip(by_sweep) {
             if !losses.is_empty() {
+                // The median: a few cells on moving objects must not decide about a sweep.
                 let middle = losses.len() / 2;
                 recorded.push(*losses.select_nth_unstable_by(middle, f32::total_cmp).1);
             }
@@ -146,6 +147,7 @@ impl Redundancy {
             members.sort_by(|&a, &b| order[a].total_cmp(&order[b]));
             let known = members.partition_point(|&sweep| order[sweep] < f32::MAX);
             let dropped = ((members.len() as f64 * self.config.drop) as usize).min(known);
+            // What stays weighs more, so that each class keeps its share of the loss.
             let kept = (members.len() - dropped) as f32 / members.len().max(1) as f32;
             for (place, &sweep) in members.iter().enumerate() {
                 self.weights[sweep] = match place < dropped {

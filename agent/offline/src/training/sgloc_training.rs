@@ -129,8 +129,9 @@ fn drawn_rows(
 ) -> Result<Tensor, TchError> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(step);
-    let draw = |_| rng.random_range(0..cache.cell_count());
-    let rows: Vec<i64> = (0..wanted).map(draw).collect();
+    let rows: Vec<i64> = (0..wanted)
+        .map(|_| rng.random_range(0..cache.cell_count()))
+        .collect();
     tensor(&rows, &[-1], cache.cells.device())
 }
 

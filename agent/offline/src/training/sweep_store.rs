@@ -39,20 +39,22 @@ impl StoredSweep {
         world_from_sensor: Isometry3<f64>,
         points: &[[f32; 4]],
     ) -> Self {
-        let stored =
-            |point: &[f32; 4]| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16);
         Self {
             world,
             drive,
             world_from_sensor,
-            points: points.iter().map(stored).collect(),
+            points: points
+                .iter()
+                .map(|point| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16))
+                .collect(),
         }
     }
 
     /// x, y, z of every point, metres in the sensor frame.
     pub(crate) fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        let metres = |point: &[i16; 3]| point.map(|axis| f32::from(axis) * UNIT_M);
-        self.points.iter().map(metres)
+        self.points
+            .iter()
+            .map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
     }
 
     /// The voxels of the same sweep for a sensor in another orientation, `turned_from_sensor`; each point is kept with
@@ -282,11 +284,10 @@ impl SweepStore {
         let count = list.len();
         let source = Arc::clone(&list);
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let read = move |number: u64| {
+        let mut reader = Prefetch::start(threads, 0, move |number: u64| {
             let is_known = (number as usize) < count;
             is_known.then(|| source.read(number as usize, range_m))?
-        };
-        let mut reader = Prefetch::start(threads, 0, read);
+        });
         let mut sweeps = Vec::with_capacity(count);
         for _ in 0..count {
             sweeps.extend(reader.next_batch()?);

@@ -22,8 +22,10 @@ const START_SEED: u64 = 7;
 pub struct DiffLoc {
     config: DiffLocConfig,
     encoder: SweepEncoder,
-    denoiser: PoseDenoiser,
-    schedule: NoiseSchedule,
+    /// Denoiser of poses.
+    pub denoiser: PoseDenoiser,
+    /// Noise schedule.
+    pub schedule: NoiseSchedule,
 }
 
 impl DiffLoc {
@@ -49,16 +51,6 @@ impl DiffLoc {
     /// Encoder of range images.
     pub fn encoder(&self) -> &SweepEncoder {
         &self.encoder
-    }
-
-    /// Denoiser of poses.
-    pub fn denoiser(&self) -> &PoseDenoiser {
-        &self.denoiser
-    }
-
-    /// Noise schedule.
-    pub fn schedule(&self) -> &NoiseSchedule {
-        &self.schedule
     }
 
     /// Normalised poses `[W, F, 5]` (position in deviations from the mean, cosine and sine of the heading) of sweeps

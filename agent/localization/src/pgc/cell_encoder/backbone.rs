@@ -17,7 +17,7 @@ pub(super) struct BackboneEncoder {
     /// Reuses its buffers from sweep to sweep.
     detector: Mutex<Detector>,
     is_quantised: bool,
-    format: BevFormat,
+    pub(super) format: BevFormat,
     /// Of the features.
     device: Device,
 }
@@ -41,11 +41,6 @@ impl BackboneEncoder {
             format,
             device,
         })
-    }
-
-    /// Grids of its levels.
-    pub(super) fn format(&self) -> &BevFormat {
-        &self.format
     }
 
     /// True for levels in the number format of its own and on the same grids: the same weights may have another area.

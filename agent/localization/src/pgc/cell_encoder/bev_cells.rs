@@ -16,7 +16,7 @@ pub struct BevFormat {
     /// x, y of the grids' lower corner in the network's frame, metres.
     low_m: [f32; 2],
     /// Largest horizontal distance in the detector's area, metres.
-    range_m: f64,
+    pub(super) range_m: f64,
     /// -1 if the network's y axis points to the right.
     y_sign: f32,
     levels: Vec<LevelGrid>,
@@ -70,10 +70,6 @@ impl BevFormat {
             },
             levels,
         }
-    }
-
-    pub(super) fn range_m(&self) -> f64 {
-        self.range_m
     }
 
     pub(super) fn local_channels(&self) -> i64 {
@@ -250,7 +246,7 @@ mod tests {
             (224, 480, 256)
         );
         assert_eq!(format.windows().collect::<Vec<_>>(), [[7, 7], [19, 19]]);
-        assert!((format.range_m() - 64.0).abs() < 0.1);
+        assert!((format.range_m - 64.0).abs() < 0.1);
     }
 
     #[test]

@@ -79,7 +79,7 @@ impl CellEncoder {
         if BackboneEncoder::is_in(&weights) {
             let encoder = Box::new(BackboneEncoder::of_detector(&weights, device)?);
             let encoder = Self {
-                format: SweepFormat::Bev(encoder.format().clone()),
+                format: SweepFormat::Bev(encoder.format.clone()),
                 network: Network::Backbone(encoder),
                 device,
             };
@@ -212,7 +212,7 @@ impl SweepFormat {
     pub fn range_m(&self) -> f64 {
         match self {
             Self::Voxels(config) => config.range_m,
-            Self::Bev(format) => format.range_m(),
+            Self::Bev(format) => format.range_m,
         }
     }
 

@@ -6,6 +6,7 @@ use serde::Serialize;
 use super::isotonic::MonotoneMap;
 use super::{ConfidenceModel, FEATURES, features};
 use crate::pgc::pose_evidence::PoseEvidence;
+use crate::statistics::share_limit;
 
 /// Error above which a pose is bad, metres: the paper's limit of success.
 pub const BAD_M: f64 = 3.0;
@@ -41,6 +42,18 @@ pub struct FitReport {
     pub bad_rejected: usize,
     /// Number of good poses that are rejected.
     pub good_rejected: usize,
+    /// Upper 95 % confidence limit of the share of bad poses among those that are not rejected, 0..=1.
+    pub wrong_limit: f64,
+}
+
+/// Choice of the threshold below which poses are rejected.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Rejection {
+    /// At most this share of the good poses is rejected.
+    GoodLoss(f64),
+    /// As few poses are rejected as leave at most this share of bad ones among the others, by its upper 95 % confidence
+    /// limit; of too few sweeps for that, as leave the smallest limit.
+    MaxWrong(f64),
 }
 
 /// Error of a fit.
@@ -52,26 +65,34 @@ pub enum FitError {
     /// The share leaves no pose.
     #[error("the share of good poses that may be rejected is {0}, must be 0 to less than 1")]
     GoodLoss(f64),
+    /// The share is none, or every threshold leaves it.
+    #[error("the share of wrong poses that may be left is {0}, must be above 0 and below 1")]
+    MaxWrong(f64),
 }
 
-/// Checks the share of good poses that a fit may reject.
-///
-/// # Errors
-/// [`FitError::GoodLoss`] unless it is at least 0 and below 1.
-pub fn check_good_loss(good_loss: f64) -> Result<(), FitError> {
-    match (0.0..1.0).contains(&good_loss) {
-        true => Ok(()),
-        false => Err(FitError::GoodLoss(good_loss)),
+impl Rejection {
+    /// Checks the share.
+    ///
+    /// # Errors
+    /// [`FitError`] with the share that is out of range.
+    pub fn check(&self) -> Result<(), FitError> {
+        match *self {
+            Self::GoodLoss(share) if !(0.0..1.0).contains(&share) => Err(FitError::GoodLoss(share)),
+            Self::MaxWrong(share) if !(share > 0.0 && share < 1.0) => {
+                Err(FitError::MaxWrong(share))
+            }
+            _ => Ok(()),
+        }
     }
 }
 
 impl ConfidenceModel {
-    /// Fits weights, isotonic function and threshold; at most the share `good_loss` of good poses is rejected.
+    /// Fits weights, isotonic function and threshold.
     ///
     /// # Errors
-    /// [`FitError`] when there are too few sweeps, or `good_loss` is not at least 0 and below 1.
-    pub fn fit(sweeps: &[Labelled], good_loss: f64) -> Result<(Self, FitReport), FitError> {
-        check_good_loss(good_loss)?;
+    /// [`FitError`] when there are too few sweeps, or the share of `rejection` is out of range.
+    pub fn fit(sweeps: &[Labelled], rejection: Rejection) -> Result<(Self, FitReport), FitError> {
+        let all = sweeps;
         let sweeps = sweeps.iter().filter(|sweep| sweep.error_m.is_finite());
         let sweeps: Vec<_> = sweeps.collect();
         if sweeps.len() < MIN_SWEEPS {
@@ -92,22 +113,45 @@ impl ConfidenceModel {
             .iter()
             .map(|sweep| (model.log_error(&sweep.evidence), observed(sweep.error_m)));
         model.sigma = MonotoneMap::fit(samples.collect(), GROUPS.0, GROUPS.1);
+        let report = model.choose_threshold(all, rejection)?;
+        Ok((model, report))
+    }
 
+    /// Chooses the threshold anew.
+    ///
+    /// # Errors
+    /// As [`Self::fit`].
+    pub fn choose_threshold(
+        &mut self,
+        sweeps: &[Labelled],
+        rejection: Rejection,
+    ) -> Result<FitReport, FitError> {
+        rejection.check()?;
+        let sweeps = sweeps.iter().filter(|sweep| sweep.error_m.is_finite());
         let sigmas: Vec<(f64, bool)> = sweeps
-            .iter()
-            .map(|sweep| (model.sigma(&sweep.evidence), sweep.error_m <= BAD_M))
+            .map(|sweep| (self.sigma(&sweep.evidence), sweep.error_m <= BAD_M))
             .collect();
-        model.reject_below = threshold(&sigmas, good_loss);
+        if sigmas.len() < MIN_SWEEPS {
+            return Err(FitError::TooFew(sigmas.len()));
+        }
+        self.reject_below = match rejection {
+            Rejection::GoodLoss(share) => threshold(&sigmas, share),
+            Rejection::MaxWrong(share) => threshold_of_risk(&sigmas, share),
+        };
+        let below = self.reject_below;
         let count = |is_counted: &dyn Fn(&(f64, bool)) -> bool| {
             sigmas.iter().filter(|sigma| is_counted(sigma)).count()
         };
-        let report = FitReport {
-            sweeps: sweeps.len(),
-            bad: count(&|(_, is_good)| !is_good),
-            bad_rejected: count(&|(sigma, is_good)| !is_good && *sigma < model.reject_below),
-            good_rejected: count(&|(sigma, is_good)| *is_good && *sigma < model.reject_below),
-        };
-        Ok((model, report))
+        let accepted = count(&|(sigma, _)| *sigma >= below);
+        let wrong = count(&|(sigma, is_good)| !is_good && *sigma >= below);
+        let bad = count(&|(_, is_good)| !is_good);
+        Ok(FitReport {
+            sweeps: sigmas.len(),
+            bad,
+            bad_rejected: bad - wrong,
+            good_rejected: count(&|(sigma, is_good)| *is_good && *sigma < below),
+            wrong_limit: share_limit(wrong, accepted),
+        })
     }
 }
 
@@ -124,6 +168,26 @@ fn threshold(sigmas: &[(f64, bool)], good_loss: f64) -> f64 {
     good.sort_by(f64::total_cmp);
     let lost = (good_loss * good.len() as f64).floor() as usize;
     good.get(lost).copied().unwrap_or(1.0)
+}
+
+/// The lowest threshold above which the share of bad poses is at most `max_wrong`, by its upper confidence limit; where
+/// none is, the one with the smallest limit.
+fn threshold_of_risk(sigmas: &[(f64, bool)], max_wrong: f64) -> f64 {
+    let mut falling = sigmas.to_vec();
+    falling.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let (mut wrong, mut best) = (0, (1.0_f64, 1.0));
+    for (index, (sigma, is_good)) in falling.iter().enumerate() {
+        wrong += usize::from(!is_good);
+        // Poses of one sigma are accepted together.
+        if falling.get(index + 1).is_some_and(|next| next.0 == *sigma) {
+            continue;
+        }
+        let limit = share_limit(wrong, index + 1);
+        if limit <= best.0.max(max_wrong) {
+            best = (limit, *sigma);
+        }
+    }
+    best.1
 }
 
 /// Ridge regression with weights that are not negative, on standardised features, by coordinate descent.
@@ -194,7 +258,8 @@ mod tests {
 
     #[test]
     fn a_fitted_confidence_ranks_and_is_calibrated_on_other_sweeps() {
-        let (model, report) = ConfidenceModel::fit(&sweeps(0..600), 0.01).unwrap();
+        let (model, report) =
+            ConfidenceModel::fit(&sweeps(0..600), Rejection::GoodLoss(0.01)).unwrap();
         assert!(
             report.bad > 5 && report.bad_rejected * 2 >= report.bad,
             "{report:?}"
@@ -225,24 +290,51 @@ mod tests {
     fn a_few_sweeps_are_too_few() {
         let few = sweeps(0..20);
         assert_eq!(
-            ConfidenceModel::fit(&few, 0.01),
+            ConfidenceModel::fit(&few, Rejection::GoodLoss(0.01)),
             Err(FitError::TooFew(few.len()))
         );
     }
 
     #[test]
     fn a_share_that_leaves_no_pose_is_rejected() {
-        for good_loss in [1.0, -0.1, 1.5] {
-            assert_eq!(
-                ConfidenceModel::fit(&[], good_loss),
-                Err(FitError::GoodLoss(good_loss))
-            );
+        for share in [1.0, -0.1, 1.5] {
+            for (rejection, error) in [
+                (Rejection::GoodLoss(share), FitError::GoodLoss(share)),
+                (Rejection::MaxWrong(share), FitError::MaxWrong(share)),
+            ] {
+                let mut model = ConfidenceModel::example();
+                assert_eq!(model.choose_threshold(&[], rejection), Err(error));
+            }
         }
+        assert!(Rejection::GoodLoss(f64::NAN).check().is_err());
+        assert!(Rejection::MaxWrong(0.0).check().is_err());
+        for share in [0.0, 0.99] {
+            assert_eq!(Rejection::GoodLoss(share).check(), Ok(()));
+        }
+    }
+
+    #[test]
+    fn the_threshold_leaves_no_more_risk_than_allowed() {
+        // 4,000 poses; of those below a sigma of 0.3 every tenth is bad.
+        let sigmas: Vec<(f64, bool)> = (0..4000)
+            .map(|k| (f64::from(k) / 4000.0, k >= 1200 || k % 10 > 0))
+            .collect();
+        let wrong_above = |below: f64| {
+            let accepted: Vec<_> = sigmas.iter().filter(|(sigma, _)| *sigma >= below).collect();
+            let wrong = accepted.iter().filter(|(_, is_good)| !is_good).count();
+            (wrong, accepted.len())
+        };
+        let below = threshold_of_risk(&sigmas, 0.01);
+        let (wrong, accepted) = wrong_above(below);
+        assert!(wrong > 5 && share_limit(wrong, accepted) <= 0.01);
+        let (wrong, accepted) = wrong_above(below - 20.0 / 4000.0);
         assert!(
-            check_good_loss(f64::NAN).is_err()
-                && check_good_loss(0.0).is_ok()
-                && check_good_loss(0.99).is_ok()
+            share_limit(wrong, accepted) > 0.01,
+            "a lower one would leave more"
         );
+        // 2,800 good poses do not show one in 2,000: the smallest limit is taken, that of no bad pose.
+        let strict = threshold_of_risk(&sigmas, 0.0005);
+        assert!(wrong_above(strict).0 == 0 && strict < 0.31, "{strict}");
     }
 
     #[test]

@@ -10,7 +10,7 @@ mod isotonic;
 use protocol::config::{FieldError, within};
 use serde::{Deserialize, Serialize};
 
-pub use fit::{BAD_M, FitError, FitReport, Labelled, check_good_loss, observed};
+pub use fit::{BAD_M, FitError, FitReport, Labelled, Rejection, observed};
 pub use isotonic::MonotoneMap;
 
 use super::pose_evidence::{PoseEvidence, RefinementEvidence};

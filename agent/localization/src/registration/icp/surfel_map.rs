@@ -18,6 +18,7 @@ use support::{atomic_file, bounded_file};
 
 use super::surfels::{Surfel, Surfels};
 use super::{IcpConfig, IcpLevel, IcpTarget};
+use crate::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 
 /// Kind of the file.
 const KIND: &str = "surfel_map";
@@ -36,12 +37,17 @@ struct Config {
     origin_m: [f64; 3],
     /// Nearest and farthest points of a sweep that were used, metres.
     range_m: [f64; 2],
+    /// Name of the place, as of its head; empty if it has none.
+    #[serde(default)]
+    place: String,
 }
 
 /// A place to register sweeps to.
 #[derive(Debug, Clone)]
 pub struct SurfelMap {
     target: IcpTarget,
+    place: String,
+    covariance_scale: Option<CovarianceScale>,
     sha256: String,
 }
 
@@ -75,17 +81,29 @@ impl SurfelMap {
         &self.target
     }
 
+    /// Name of the place, as of its head; empty if it is not known.
+    #[must_use]
+    pub fn place(&self) -> &str {
+        &self.place
+    }
+
+    /// Scale of the covariance of registered poses, if it was fitted.
+    #[must_use]
+    pub fn covariance_scale(&self) -> Option<CovarianceScale> {
+        self.covariance_scale
+    }
+
     /// SHA-256 of the file.
     #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
-    /// Writes the finest planes of a fitted target; returns the file's SHA-256.
+    /// Writes the finest planes of a fitted target of a place; returns the file's SHA-256.
     ///
     /// # Errors
     /// [`FileError`] when the place is wider than 32,767 voxels, or the file cannot be written.
-    pub fn write(path: &Path, target: &IcpTarget) -> Result<String, FileError> {
+    pub fn write(path: &Path, place: &str, target: &IcpTarget) -> Result<String, FileError> {
         let (Some(surfels), Some(origin_m)) = (target.levels.last(), target.origin_m) else {
             return Err(FileError::new(path, "the map has no sweep"));
         };
@@ -100,15 +118,16 @@ impl SurfelMap {
                     FileError::new(path, "the place is wider than 32,767 voxels of the map")
                 })?;
                 voxels.extend(held.to_le_bytes());
-                let inside = centre_m / surfels.voxel_m() - f64::from(*index);
+                let inside = centre_m / surfels.voxel_m - f64::from(*index);
                 centres.push((inside * 256.0) as u8);
                 normals.push((normal * 127.0).round() as i8 as u8);
             }
         }
         let config = Config {
-            voxel_m: surfels.voxel_m(),
+            voxel_m: surfels.voxel_m,
             origin_m: origin_m.into(),
             range_m: target.range_m,
+            place: place.to_owned(),
         };
         let bytes = encode(&config, planes.len(), [&voxels, &centres, &normals])
             .map_err(|error| FileError::new(path, error))?;
@@ -122,11 +141,7 @@ impl SurfelMap {
     /// [`FileError`] when the file is missing, truncated, of another kind, or holds values that are no planes.
     pub fn load(path: &Path) -> Result<Self, FileError> {
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-        let target = decode(&bytes).map_err(|problem| FileError::new(path, problem))?;
-        Ok(Self {
-            target,
-            sha256: hex(&Sha256::digest(&bytes)),
-        })
+        decode(&bytes).map_err(|problem| FileError::new(path, problem))
     }
 }
 
@@ -150,7 +165,7 @@ fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>,
     with_header(&bytes, |_| ()).map_err(|error| error.to_string())
 }
 
-fn decode(bytes: &[u8]) -> Result<IcpTarget, String> {
+fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
     let incomplete = |error| {
         format!(
             "not a complete safetensors file ({} bytes): {error}",
@@ -194,10 +209,23 @@ fn decode(bytes: &[u8]) -> Result<IcpTarget, String> {
         let normal = normal.try_normalize(0.5).unwrap_or_else(Vector3::z);
         (voxel, Surfel { centre_m, normal })
     });
-    Ok(IcpTarget {
-        levels: vec![Surfels::of_planes(config.voxel_m, planes)],
-        origin_m: Some(config.origin_m.into()),
-        range_m: config.range_m,
+    let scale = metadata.get(COVARIANCE_KEY);
+    let scale: Option<CovarianceScale> =
+        scale
+            .map(|text| serde_json::from_str(text))
+            .transpose()
+            .map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?;
+    let checked = scale.as_ref().map_or(Ok(()), CovarianceScale::check);
+    checked.map_err(|error| error.to_string())?;
+    Ok(SurfelMap {
+        target: IcpTarget {
+            levels: vec![Surfels::of_planes(config.voxel_m, planes)],
+            origin_m: Some(config.origin_m.into()),
+            range_m: config.range_m,
+        },
+        place: config.place,
+        covariance_scale: scale,
+        sha256: hex(&Sha256::digest(bytes)),
     })
 }
 
@@ -207,6 +235,7 @@ impl Config {
             voxel_m,
             origin_m,
             range_m,
+            ..
         } = self;
         if !(0.05..=10.0).contains(voxel_m) {
             return Err(format!("voxel_m is {voxel_m}, must be 0.05 to 10"));
@@ -237,14 +266,14 @@ fn column<'a>(file: &SafeTensors<'a>, name: &str, dtype: Dtype) -> Result<&'a [u
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use nalgebra::Isometry3;
 
     use super::super::{IcpSource, register};
     use super::*;
 
     /// Ground and two walls around the origin, 2 m below and around the sensor.
-    fn yard() -> Vec<[f32; 4]> {
+    pub(crate) fn yard() -> Vec<[f32; 4]> {
         let ground = (0..6400).map(|k| {
             [
                 (k % 80) as f32 * 0.5 - 20.0,
@@ -266,15 +295,16 @@ mod tests {
         ground.chain(walls).collect()
     }
 
-    fn stored() -> (tempfile::TempDir, std::path::PathBuf, Isometry3<f64>) {
+    /// A map of the yard in a file, and the pose from which it was seen.
+    pub(crate) fn stored() -> (tempfile::TempDir, std::path::PathBuf, Isometry3<f64>) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("yard.safetensors");
         let pose = Isometry3::new(Vector3::new(1200.0, -340.0, 20.0), Vector3::z() * 0.8);
         let mut target = IcpTarget::new(&SurfelMap::building());
         target.add(&yard(), &pose);
         target.fit();
-        let sha256 = SurfelMap::write(&path, &target).unwrap();
-        assert_eq!(SurfelMap::write(&path, &target).unwrap(), sha256);
+        let sha256 = SurfelMap::write(&path, "yard", &target).unwrap();
+        assert_eq!(SurfelMap::write(&path, "yard", &target).unwrap(), sha256);
         (folder, path, pose)
     }
 
@@ -298,7 +328,7 @@ mod tests {
         // Two hundred metres beside it nothing above the ground has a partner.
         let elsewhere = Isometry3::translation(200.0, 0.0, 0.0) * truth;
         assert!(register(&source, map.target(), &elsewhere, &config).is_err());
-        assert_eq!(map.sha256().len(), 64);
+        assert_eq!((map.sha256().len(), map.place()), (64, "yard"));
     }
 
     #[test]
@@ -315,6 +345,7 @@ mod tests {
             voxel_m: 0.0,
             origin_m: [0.0; 3],
             range_m: [1.0, 80.0],
+            place: String::new(),
         };
         let one = encode(&config, 1, [&[0; 6], &[0; 3], &[0; 3]]).unwrap();
         assert!(message(&one).contains("voxel_m is 0, must be 0.05 to 10"));

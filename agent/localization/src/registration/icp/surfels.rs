@@ -75,7 +75,7 @@ impl Moments {
 /// A cloud, or many clouds in one frame, as planes on a voxel grid.
 #[derive(Debug, Clone)]
 pub(super) struct Surfels {
-    voxel_m: f64,
+    pub(super) voxel_m: f64,
     sites: Sites,
     moments: Vec<Moments>,
     /// By row of `sites`; made by [`Self::fit`].
@@ -183,11 +183,6 @@ impl Surfels {
 
     fn corner_m(&self, voxel: [i32; 3]) -> Vector3<f64> {
         Vector3::from(voxel.map(f64::from)) * self.voxel_m
-    }
-
-    /// Side of a voxel, metres.
-    pub(super) fn voxel_m(&self) -> f64 {
-        self.voxel_m
     }
 
     /// Number of voxels with a plane.

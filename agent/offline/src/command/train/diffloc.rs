@@ -2,9 +2,10 @@
 
 use std::path::PathBuf;
 
+use agent_offline::TrainingBar;
 use agent_offline::training::{DiffLocTrainConfig, train_diffloc};
 use localization::baselines::diffloc::DiffLocConfig;
-use perception::train::{AdamWConfig, ModelCard, RunConfig, TrainingBar, TrainingOptions};
+use perception::train::{AdamWConfig, ModelCard, RunConfig, TrainingOptions};
 
 use super::options::{SceneSweeps, SensorTurns, bad, check_folders, run_config, with_bar};
 
@@ -58,8 +59,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
     card.configuration(&summary.network);
     card.write(&config.run.out)?;
-    args.options.print(&summary.trained, &more)?;
-    Ok(())
+    Ok(args.options.print(&summary.trained, &more)?)
 }
 
 impl Args {

@@ -2,9 +2,10 @@
 
 use std::path::PathBuf;
 
+use agent_offline::TrainingBar;
 use agent_offline::training::{EncoderAccuracy, EncoderSummary, EncoderTrainConfig, train_encoder};
 use localization::pgc::SceneEncoderConfig;
-use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+use perception::train::{ModelCard, TrainingOptions};
 
 use super::options::{bad, check_folders, run_config, with_bar};
 

@@ -1,7 +1,8 @@
 //! `agent train hypliloc`: arguments, progress and model card.
 
+use agent_offline::TrainingBar;
 use agent_offline::training::{HypLiLocTrainConfig, train_hypliloc};
-use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+use perception::train::{ModelCard, TrainingOptions};
 
 use super::options::{SceneSweeps, SensorTurns, check_folders, run_config, with_bar};
 

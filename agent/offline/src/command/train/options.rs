@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use agent_offline::Error;
+use agent_offline::{Error, TrainingBar};
 use anyhow::Context;
-use perception::train::{Observe, Progress, RunConfig, TrainingBar, TrainingOptions};
+use perception::train::{Observe, Progress, RunConfig, TrainingOptions};
 
 use support::cli::BadInput;
 

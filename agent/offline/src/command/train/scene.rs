@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use agent_offline::TrainingBar;
 use agent_offline::training::{
     LeaveOut, RedundancyConfig, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
 };
-use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+use perception::train::{ModelCard, TrainingOptions};
 
 use super::options::{SceneSweeps, bad, check_folders, run_config, with_bar};
 

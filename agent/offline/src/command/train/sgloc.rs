@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
+use agent_offline::TrainingBar;
 use agent_offline::training::{SgLocTrainConfig, train_sgloc};
-use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+use perception::train::{ModelCard, TrainingOptions};
 
 use super::options::{SceneSweeps, check_folders, run_config, with_bar};
 

@@ -72,7 +72,7 @@ fn pose_losses(
     let (features, poses) = (drawn(features)?, drawn(poses)?);
     let (count, frames, _) = poses.size3()?;
     let on = (Kind::Float, poses.device());
-    let schedule = network.schedule();
+    let schedule = &network.schedule;
     // The larger of two: where noise hides the pose, it has to come from the features.
     let steps = Tensor::f_randint(schedule.steps(), [2, count], (Kind::Int64, on.1))?;
     let steps = steps.f_amax(0_i64, false)?;
@@ -81,7 +81,7 @@ fn pose_losses(
         .f_ge(SINGLE)?
         .f_to_kind(Kind::Float)?;
     let noisy = schedule.add_noise(&poses, &noise, &steps)?;
-    let (denoiser, windows) = (network.denoiser(), Windows::Joint(&joint));
+    let (denoiser, windows) = (&network.denoiser, Windows::Joint(&joint));
     let velocity = denoiser.forward(&noisy, &steps, &features, windows)?;
     let error = schedule.poses(&noisy, &velocity, &steps)?.f_sub(&poses)?;
     let mean = error.f_abs()?.f_mean(Kind::Float)?;

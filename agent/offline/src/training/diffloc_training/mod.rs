@@ -79,8 +79,9 @@ pub fn train_diffloc(
     let image = config.network.image;
     let mut read = |folders: &[PathBuf], scale| {
         let list = Arc::new(SweepList::open(folders)?);
-        let mut imaging = |done, total| observe(&Progress::Encoding(done, total));
-        let images = SweepImages::read(&list, image, scale, run, &mut imaging)?;
+        let images = SweepImages::read(&list, image, scale, run, &mut |done, total| {
+            observe(&Progress::Encoding(done, total))
+        })?;
         Ok::<_, Error>((images, list.data()))
     };
     let (images, data) = read(&config.scenes, None)?;

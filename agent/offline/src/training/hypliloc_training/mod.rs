@@ -49,8 +49,9 @@ pub fn train_hypliloc(
 ) -> Result<Trained, Error> {
     let run = &config.run;
     run.start()?;
-    let mut sampling = |done, all| observe(&Progress::Encoding(done, all));
-    let (examples, scale, data) = Examples::read(&config.scenes, run, &mut sampling)?;
+    let (examples, scale, data) = Examples::read(&config.scenes, run, &mut |done, all| {
+        observe(&Progress::Encoding(done, all))
+    })?;
     observe(&Progress::Read(data.clone()));
     let variables = VarStore::new(run.device);
     let network = HypLiLoc::new(&variables.root());

@@ -19,7 +19,7 @@ pub(super) struct CellOrder {
     /// Cells that are used, in the order of this pass.
     order: Vec<i64>,
     place: usize,
-    passes: f64,
+    pub(super) passes: f64,
     passes_before: f64,
     /// Sweeps and errors of this pass's cells, while they are recorded.
     watched: Vec<(usize, f32)>,
@@ -48,11 +48,6 @@ impl CellOrder {
             watched: Vec::new(),
             rng: ChaCha8Rng::seed_from_u64(seed ^ steps),
         })
-    }
-
-    /// Number of passes done; one pass contains every cell that is used.
-    pub(super) fn passes(&self) -> f64 {
-        self.passes
     }
 
     /// Weights `[N]` of cells by their sweeps `[N]`.
@@ -149,8 +144,8 @@ mod tests {
         let redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 10]);
         let mut order = CellOrder::new(&cache(), Some(redundancy), 30, 1, 0).unwrap();
         let (mut steps, mut cells_of_pass) = (0, vec![0; 21]);
-        while order.passes() < 20.0 {
-            let share_done = order.passes() / 20.0;
+        while order.passes < 20.0 {
+            let share_done = order.passes / 20.0;
             let rows = order.next_batch(share_done).unwrap();
             let sweeps = order.sweep_of_cell.index_select(0, &rows);
             let errors: Vec<f32> = Vec::<i64>::try_from(&sweeps)
@@ -162,7 +157,7 @@ mod tests {
                 .watch(share_done, &sweeps, &Tensor::from_slice(&errors))
                 .unwrap();
             steps += 1;
-            cells_of_pass[order.passes().ceil() as usize] = order.order.len();
+            cells_of_pass[order.passes.ceil() as usize] = order.order.len();
         }
         // Windows end after passes 5 and 10; from 84 % on, after pass 17, all are used again.
         assert_eq!(
@@ -192,8 +187,8 @@ mod tests {
         )
         .unwrap();
         let mut cells = Vec::new();
-        while order.passes() < 4.0 {
-            let share_done = order.passes() / 4.0;
+        while order.passes < 4.0 {
+            let share_done = order.passes / 4.0;
             let rows = order.next_batch(share_done).unwrap();
             let sweeps = order.sweep_of_cell.index_select(0, &rows);
             order
@@ -203,6 +198,6 @@ mod tests {
         }
         assert_eq!((cells[19], cells[20], cells[30]), (100, 80, 80));
         assert_eq!(cells[31..], [100; 7]);
-        assert!(order.passes() < 4.1, "{}", order.passes());
+        assert!(order.passes < 4.1, "{}", order.passes);
     }
 }

@@ -9,7 +9,7 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::training::FeatureCache;
 use localization::pgc::SceneHead;
-use perception::train::{AdamW, AdamWConfig, OneCycle};
+use perception::train::{AdamW, AdamWConfig, one_cycle};
 
 /// Number of training steps.
 const STEPS: usize = 1500;
@@ -55,12 +55,7 @@ pub(super) fn train_classifier(
         let loss = -(hit * (1.0 - LABEL_SMOOTHING) + even * LABEL_SMOOTHING);
         optimizer.zero_grad();
         loss.f_backward()?;
-        optimizer.step(
-            OneCycle {
-                peak: LEARNING_RATE,
-            }
-            .at(share_done),
-        )?;
+        optimizer.step(one_cycle(LEARNING_RATE, share_done))?;
     }
     let found = no_grad(|| {
         head.classify(&cache.sweeps, false)?

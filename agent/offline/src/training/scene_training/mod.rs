@@ -127,6 +127,7 @@ impl<'a> Training<'a> {
             },
             None => head_config(config, &features)?,
         };
+        // Coordinates are relative to the origin of the head: f32 is exact enough near it only.
         let mut cache = features.training;
         cache.move_origin(head_config.origin_m)?;
         let variables = VarStore::new(run.device);
@@ -204,7 +205,7 @@ impl Task for Training<'_> {
     }
 
     fn epoch(&self, _: u64) -> f64 {
-        self.order.passes()
+        self.order.passes
     }
 
     fn share_done(&self, trainer: &Trainer) -> f64 {
@@ -214,7 +215,7 @@ impl Task for Training<'_> {
                 let limit = (limit.as_secs_f64() - self.preparing_seconds).max(1.0);
                 trainer.seconds_of_steps() / limit
             }
-            _ => trainer.share_done(self.order.passes()),
+            _ => trainer.share_done(self.order.passes),
         }
     }
 
@@ -223,6 +224,7 @@ impl Task for Training<'_> {
         let (head, cache) = (&self.head, &self.cache);
         let share_done = self.share_done(trainer);
         let rows = self.order.next_batch(share_done)?;
+        // Cells of a batch come from many sweeps; each needs the class of its own sweep.
         let sweeps = cache.sweep_of_cell.f_index_select(0, &rows)?;
         let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
         let logits = match self.logits.take() {
@@ -240,6 +242,7 @@ impl Task for Training<'_> {
         let (mut loss, error) = weighted_loss(&regression, &targets, &weights)?;
         loss += centre_loss(&log_shares, &targets, head.centres_m(), &weights)? * CENTRE_WEIGHT_M;
         let mut refined_m = 0.0;
+        // The refiner learns on coarse poses as wrong as those it will be given.
         if let Some(refiner) = head.refiner() {
             let (assumed, heading) = self.coarse_poses.draw(&targets, &sweeps)?;
             let answer = refiner.look(&cells, &assumed, &heading, kind)?;
@@ -267,7 +270,7 @@ impl Task for Training<'_> {
         self.reported = Some(means);
         let text = format!(
             "epoch {:.2} error {error_m:.2} m, predicted {epsilon_m:.2} m, refined {refined_m:.2} m",
-            self.order.passes()
+            self.order.passes
         );
         let report = trainer.step_report(self.share_done(trainer), means.into(), &text);
         (self.observe)(&report);

@@ -1,0 +1,248 @@
+//! Scale of covariances: how much larger the errors of poses are than their covariances, fitted to sweeps with known poses.
+
+use nalgebra::{Isometry3, Matrix2, Matrix6, Vector2, Vector6};
+use protocol::config::{FieldError, require, within};
+use serde::{Deserialize, Serialize};
+
+/// Metadata key of a head's or a surfel map's file that holds its [`CovarianceScale`], as JSON.
+pub const COVARIANCE_KEY: &str = "covariance";
+
+/// Largest variance, square metres or radians: that of a pose that nothing constrains.
+pub(crate) const MAX_VARIANCE: f64 = 1e6;
+/// Fewest poses to fit a scale on.
+const MIN_POSES: usize = 50;
+/// Share of the errors within the fitted limits, and that many standard deviations of a Gaussian: along one axis, and
+/// within an ellipse.
+const SHARE: f64 = 0.95;
+const SHARE_STD: [f64; 2] = [1.960, 2.448];
+/// Share of the errors within the bound of a position.
+const BOUND_SHARE: f64 = 0.999;
+/// Largest factor in a file.
+const MAX_FACTOR: f64 = 1e6;
+
+/// Factors on the standard deviations of poses, fitted to the errors of sweeps with known poses.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CovarianceScale {
+    /// Of x and y.
+    pub planar: f64,
+    /// Of z.
+    pub height: f64,
+    /// Of the rotations about x and y.
+    pub tilt: f64,
+    /// Of the rotation about z.
+    pub yaw: f64,
+    /// Largest standard deviations along the worst axis of the plane by which one of 1,000 positions is off; `None`
+    /// where it was fitted on too few.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bound: Option<f64>,
+}
+
+/// A pose estimated for a sweep, with its error.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseSample {
+    /// Error of x, y, z (metres) and rotations about the world's x, y, z (radians).
+    pub error: [f64; 6],
+    /// Covariance without a scale.
+    pub covariance: [[f64; 6]; 6],
+}
+
+impl PoseSample {
+    /// Sample of a pose of a sweep that was taken at `truth`.
+    pub fn of(pose: &Isometry3<f64>, covariance: [[f64; 6]; 6], truth: &Isometry3<f64>) -> Self {
+        let off = pose.translation.vector - truth.translation.vector;
+        let turned = (pose.rotation * truth.rotation.inverse()).scaled_axis();
+        Self {
+            error: [off.x, off.y, off.z, turned.x, turned.y, turned.z],
+            covariance,
+        }
+    }
+
+    /// Error along an axis, standard deviations.
+    fn deviations(&self, axis: usize) -> f64 {
+        self.error[axis].abs() / self.covariance[axis][axis].sqrt()
+    }
+
+    /// Mahalanobis distance of x and y.
+    fn planar_deviations(&self) -> f64 {
+        let off = Vector2::new(self.error[0], self.error[1]);
+        let inverse = planar(&self.covariance).try_inverse();
+        inverse.map_or(f64::NAN, |inverse| off.dot(&(inverse * off)).sqrt())
+    }
+}
+
+impl CovarianceScale {
+    /// Fits the factors so that 95 % of the errors lie within the ellipse in the plane and within 1.96 standard
+    /// deviations of every other axis, and 99.9 % of the positions within the bound; `None` of too few poses.
+    pub fn fit(samples: &[PoseSample]) -> Option<Self> {
+        let axes = |axes: &[usize]| {
+            let all = samples.iter();
+            limit(
+                all.flat_map(|sample| axes.iter().map(move |&axis| sample.deviations(axis))),
+                SHARE,
+            )
+            .map(|limit| limit / SHARE_STD[0])
+        };
+        let planar = limit(samples.iter().map(PoseSample::planar_deviations), SHARE)?;
+        let scale = Self {
+            planar: planar / SHARE_STD[1],
+            height: axes(&[2])?,
+            tilt: axes(&[3, 4])?,
+            yaw: axes(&[5])?,
+            bound: None,
+        };
+        let off_m = |sample: &PoseSample| sample.error[0].hypot(sample.error[1]);
+        let ratios = (samples.iter())
+            .map(|sample| off_m(sample) / worst_std_m(&scale.applied(&sample.covariance)));
+        let is_fitted = samples.len() >= MIN_POSES && scale.check().is_ok();
+        is_fitted.then_some(Self {
+            bound: limit(ratios, BOUND_SHARE),
+            ..scale
+        })
+    }
+
+    /// Checks values from a file.
+    ///
+    /// # Errors
+    /// [`FieldError`] of the first field that is wrong.
+    pub fn check(&self) -> Result<(), FieldError> {
+        for (field, factor) in [
+            ("covariance.planar", self.planar),
+            ("covariance.height", self.height),
+            ("covariance.tilt", self.tilt),
+            ("covariance.yaw", self.yaw),
+            ("covariance.bound", self.bound.unwrap_or(1.0)),
+        ] {
+            require(factor > 0.0, field, factor, "must be above 0")?;
+            within(field, factor, 0.0, MAX_FACTOR)?;
+        }
+        Ok(())
+    }
+
+    /// Distance in the plane that one of 1,000 poses of this unscaled covariance exceeds, metres; `None` where it was not
+    /// fitted.
+    pub fn bound_m(&self, covariance: &[[f64; 6]; 6]) -> Option<f64> {
+        Some(self.bound? * worst_std_m(&self.applied(covariance)))
+    }
+
+    /// The scaled covariance.
+    pub(crate) fn applied(&self, covariance: &[[f64; 6]; 6]) -> [[f64; 6]; 6] {
+        let Self {
+            planar,
+            height,
+            tilt,
+            yaw,
+            ..
+        } = *self;
+        let factors = [planar, planar, height, tilt, tilt, yaw];
+        scaled(covariance, &Vector6::from(factors))
+    }
+}
+
+/// Smallest value that a new one does not exceed with a probability of `share`, if it is of the same distribution;
+/// `None` of too few values.
+fn limit(values: impl Iterator<Item = f64>, share: f64) -> Option<f64> {
+    let mut sorted: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    sorted.sort_by(f64::total_cmp);
+    let rank = ((sorted.len() + 1) as f64 * share).ceil() as usize;
+    sorted.get(rank.checked_sub(1)?).copied()
+}
+
+/// A covariance with its standard deviations times these factors.
+pub(crate) fn scaled(covariance: &[[f64; 6]; 6], factors: &Vector6<f64>) -> [[f64; 6]; 6] {
+    let scale = Matrix6::from_diagonal(factors);
+    let matrix = Matrix6::from_fn(|row, column| covariance[row][column]);
+    let scaled = scale * matrix * scale;
+    std::array::from_fn(|row| {
+        std::array::from_fn(|column| scaled[(row, column)].clamp(-MAX_VARIANCE, MAX_VARIANCE))
+    })
+}
+
+fn planar(covariance: &[[f64; 6]; 6]) -> Matrix2<f64> {
+    Matrix2::from_fn(|row, column| covariance[row][column])
+}
+
+/// Standard deviation along the worst axis of the plane, metres.
+fn worst_std_m(covariance: &[[f64; 6]; 6]) -> f64 {
+    planar(covariance).symmetric_eigenvalues().max().sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    /// Poses whose errors are these factors times as large as their residuals say; x and y are correlated.
+    fn samples(count: usize, factors: [f64; 6], seed: u64) -> Vec<PoseSample> {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let root = Matrix6::from_fn(|row, column| match (row, column) {
+            (0, 1) => 0.02,
+            _ if row == column => 0.01 * (row + 1) as f64,
+            _ => 0.0,
+        });
+        let covariance = root * root.transpose();
+        let draw = |_| {
+            let normal = Vector6::from_fn(|_, _| StandardNormal.sample(&mut random));
+            PoseSample {
+                error: (root * normal)
+                    .component_mul(&Vector6::from(factors))
+                    .into(),
+                covariance: covariance.data.0,
+            }
+        };
+        (0..count).map(draw).collect()
+    }
+
+    #[test]
+    fn a_fitted_covariance_holds_on_other_poses() {
+        let factors = [3.0, 3.0, 7.0, 5.0, 5.0, 0.5];
+        let scale = CovarianceScale::fit(&samples(2000, factors, 1)).unwrap();
+        let fitted = [scale.planar, scale.height, scale.tilt, scale.yaw];
+        for (fitted, factor) in fitted.into_iter().zip([3.0, 7.0, 5.0, 0.5]) {
+            assert!((fitted / factor - 1.0).abs() < 0.1, "{fitted}, {factor}");
+        }
+        let (mut beyond, mut beyond_bound) = (0, 0);
+        let others = samples(4000, factors, 2);
+        for sample in &others {
+            let stated = PoseSample {
+                covariance: scale.applied(&sample.covariance),
+                ..*sample
+            };
+            beyond += usize::from(stated.planar_deviations() > SHARE_STD[1]);
+            let off_m = sample.error[0].hypot(sample.error[1]);
+            beyond_bound += usize::from(off_m > scale.bound_m(&sample.covariance).unwrap());
+        }
+        assert!((0.03..0.07).contains(&(beyond as f64 / 4000.0)), "{beyond}");
+        assert!(beyond_bound <= 12, "{beyond_bound}");
+    }
+
+    #[test]
+    fn few_poses_fit_nothing_and_a_thousand_are_needed_for_the_bound() {
+        let all = samples(999, [2.0; 6], 3);
+        let fit = |count| CovarianceScale::fit(&all[..count]);
+        assert_eq!(fit(MIN_POSES - 1), None);
+        assert_eq!(fit(998).unwrap().bound, None);
+        let scale = fit(999).unwrap();
+        let is_within = |sample: &PoseSample| {
+            let off_m = sample.error[0].hypot(sample.error[1]);
+            off_m <= scale.bound_m(&sample.covariance).unwrap() * (1.0 + 1e-9)
+        };
+        assert!(all.iter().all(is_within), "it is that of the worst of them");
+    }
+
+    #[test]
+    fn factors_that_no_fit_has_are_refused_by_name() {
+        let good = CovarianceScale::fit(&samples(100, [2.0; 6], 3)).unwrap();
+        assert_eq!(good.check(), Ok(()));
+        for factor in [0.0, -1.0, f64::NAN, 1e9] {
+            let bad = CovarianceScale {
+                tilt: factor,
+                ..good
+            };
+            assert!(bad.check().unwrap_err().to_string().contains("tilt"));
+        }
+    }
+}
