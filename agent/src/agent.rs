@@ -84,7 +84,6 @@ pub struct Agent {
 
 impl Agent {
     /// A vehicle with its pose source and its detector.
-    #[must_use]
     pub fn new(cav: CavId, pose_source: Box<dyn PoseSource>, detector: Detector) -> Self {
         let shares_encoder = pose_source.detector_encoder() == Some(detector.encoder_sha256());
         Self {
@@ -95,7 +94,6 @@ impl Agent {
     }
 
     /// A vehicle that localizes itself and perceives nothing.
-    #[must_use]
     pub fn without_detector(cav: CavId, pose_source: Box<dyn PoseSource>) -> Self {
         Self {
             cav,
@@ -126,7 +124,6 @@ impl Agent {
     }
 
     /// The points that the vehicle shares: those that are not on its own body, whose extent its detector knows.
-    #[must_use]
     pub fn share_points(&self, cloud: &PointCloud) -> PointCloud {
         self.detector.as_ref().map_or_else(
             || cloud.clone(),
@@ -135,13 +132,11 @@ impl Agent {
     }
 
     /// Id of the vehicle.
-    #[must_use]
     pub fn cav(&self) -> &CavId {
         &self.cav
     }
 
     /// Detector of the vehicle, if it has one.
-    #[must_use]
     pub fn detector(&self) -> Option<&Detector> {
         self.detector.as_ref()
     }
@@ -191,6 +186,7 @@ impl Agent {
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
         let encoded = encoded.map_or_else(|| detector.encode_sweep(cloud), Ok)?;
         let perception = self.perceive_map(&encoded.features)?;
+        // The encoder ran first, here or for the pose: its times belong to the sweep.
         let perception = Perception {
             times: [encoded.times.as_slice(), &perception.times].concat(),
             ..perception
@@ -270,7 +266,6 @@ impl Agent {
     }
 
     /// Number of poses so far that the vehicle cannot have reached from the previous ones.
-    #[must_use]
     pub(crate) fn pose_jumps(&self) -> u64 {
         self.pose_source.jumps()
     }
@@ -295,6 +290,7 @@ impl Agent {
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
         let detector = self.detector.as_ref().ok_or(DetectorError::Absent)?;
         let mut times = StageTimes::start();
+        // The own head sees what neighbours receive, so that both judge the same map.
         let sent = detector.compressed(map)?;
         let features = detector.to_message(&sent)?;
         times.lap("message");
@@ -354,19 +350,13 @@ fn pose_input<'a>(
     input: &AgentInput<'a>,
     levels: Option<&'a [BackboneLevel]>,
 ) -> PoseInput<'a> {
-    let AgentInput {
-        capture_nanos,
-        cloud,
-        measured_pose: measured,
-        motion,
-    } = *input;
     PoseInput {
         cav,
-        capture_nanos,
-        cloud,
+        capture_nanos: input.capture_nanos,
+        cloud: input.cloud,
         levels,
-        measured,
-        motion,
+        measured: input.measured_pose,
+        motion: input.motion,
     }
 }
 

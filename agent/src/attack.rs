@@ -73,7 +73,6 @@ fn one() -> usize {
 
 impl AttackConfig {
     /// The attack of the vehicle at `place` of its scenario, the ego being at 0; none if it is honest.
-    #[must_use]
     pub fn of(&self, place: usize, cav: &CavId) -> Option<Attack> {
         (1..=self.attackers)
             .contains(&place)
@@ -105,7 +104,6 @@ pub struct Attack {
 
 impl Attack {
     /// The attack of the vehicle `cav` under `seed`.
-    #[must_use]
     pub fn new(falsification: Falsification, cav: &CavId, seed: u64) -> Self {
         let letters: Vec<u64> = cav.as_str().bytes().map(u64::from).collect();
         let mut random = SplitMix64::derived(seed, &letters);
@@ -145,7 +143,6 @@ impl Attack {
     }
 
     /// The pose that is published instead of the vehicle's own.
-    #[must_use]
     pub fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
         let (Falsification::ShiftedPose, Some(own)) = (self.falsification, pose.world_from_cav())
         else {

@@ -63,7 +63,6 @@ impl Command {
 }
 
 /// Runs the subcommand on the command line.
-#[must_use]
 pub fn main() -> ExitCode {
     let command_line: CommandLine = parse_beside(&OFFLINE);
     exit_code(command_line.command.run(), BusError::is_behind)

@@ -15,7 +15,7 @@ use crate::attack::Falsification;
 use crate::node::NodeOptions;
 use crate::rate::RateConfig;
 use localization::pose_source::PoseSourceConfig;
-use perception::compute_device::{ComputeDevice, NoCuda};
+use perception::compute_device::ComputeDevice;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use perception::weights::{FileError, Weights};
@@ -126,10 +126,10 @@ impl ModelConfig {
     /// # Errors
     /// [`FieldError`] names what a device needs and this machine lacks.
     pub fn inference(&self) -> Result<Inference, FieldError> {
-        let missing =
-            |missing: NoCuda| FieldError::new("models.device", "cuda", missing.to_string());
         Ok(Inference::new(
-            self.device.open().map_err(missing)?,
+            self.device
+                .open()
+                .map_err(|missing| FieldError::new("models.device", "cuda", missing.to_string()))?,
             self.precision,
         ))
     }
@@ -297,13 +297,11 @@ impl ProcessConfig for AgentConfig {
 
 impl AgentConfig {
     /// True if the agent has no detector, since nothing that needs one is published.
-    #[must_use]
     pub fn gives_poses_only(&self) -> bool {
         self.publish.iter().all(|publish| *publish == Publish::None)
     }
 
     /// Options of the agent's node.
-    #[must_use]
     pub fn options(&self) -> NodeOptions {
         NodeOptions {
             of_loop: LoopOptions {

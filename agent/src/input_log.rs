@@ -51,7 +51,6 @@ type Writer<I, P> = Option<RecordWriter<Record<I, P>>>;
 impl<I: Serialize, P: Serialize> InputLog<I, P> {
     /// Creates a log of that kind; a process that was restarted gets a file with the next number. `None` if it cannot be
     /// written, which is logged.
-    #[must_use]
     pub fn create(file: &InputFile, kind: &str, detector: Option<&Detector>) -> Option<Self> {
         let (path, config) = file;
         let path = unused(path);

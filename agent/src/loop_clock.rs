@@ -14,7 +14,6 @@ pub struct LoopClock {
 
 impl LoopClock {
     /// A clock that begins now.
-    #[must_use]
     pub fn start() -> Self {
         Self {
             began: Instant::now(),
@@ -23,13 +22,11 @@ impl LoopClock {
     }
 
     /// Time now, nanoseconds.
-    #[must_use]
     pub fn now_nanos(&self) -> u64 {
         self.nanos(Instant::now())
     }
 
     /// A moment on this clock, nanoseconds.
-    #[must_use]
     pub fn nanos(&self, at: Instant) -> u64 {
         { self.began_nanos }
             .saturating_add(nanos::between(self.began, at))
@@ -37,7 +34,6 @@ impl LoopClock {
     }
 
     /// The moment of a time on this clock, at the earliest its beginning.
-    #[must_use]
     pub fn moment(&self, at_nanos: u64) -> Instant {
         self.began + Duration::from_nanos(at_nanos.saturating_sub(self.began_nanos))
     }

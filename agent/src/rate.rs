@@ -69,7 +69,6 @@ pub(crate) struct RateControl {
 
 impl RateControl {
     /// State before the first map.
-    #[must_use]
     pub(crate) fn new(config: RateConfig) -> Self {
         Self {
             config,
@@ -79,9 +78,6 @@ impl RateControl {
 
     /// Encodes a feature map as `codec` specifies, or smaller if a limit requires it; the message records format and
     /// reason. `turn` is known if there is a queue. Calls follow each other in the order of sending.
-    ///
-    /// # Errors
-    /// As [`encode_within`].
     pub(crate) fn encode(
         &mut self,
         features: BevFeatures,
@@ -133,6 +129,7 @@ impl RateControl {
             }
             None => None,
         };
+        // The tightest limit decides, and is named in the message.
         Ok([size, rate, queue]
             .into_iter()
             .flatten()
@@ -196,8 +193,8 @@ impl QueueWatch {
     }
 
     fn backed_off(&self, period: Duration, took: Duration) -> f64 {
-        let went_through = period.as_secs_f64() / took.as_secs_f64().max(1e-6);
-        BACK_OFF * self.last_bytes as f64 * went_through.min(1.0)
+        let sent_share = period.as_secs_f64() / took.as_secs_f64().max(1e-6);
+        BACK_OFF * self.last_bytes as f64 * sent_share.min(1.0)
     }
 }
 

@@ -48,7 +48,6 @@ pub(crate) struct SweepPairing<S> {
 
 impl<S> SweepPairing<S> {
     /// Pairing with at most `timeout_nanos` of waiting for the measurements of a sweep.
-    #[must_use]
     pub(crate) fn new(timeout_nanos: u64) -> Self {
         Self {
             timeout_nanos,
@@ -115,7 +114,6 @@ impl<S> SweepPairing<S> {
     }
 
     /// Time of the next call of [`Self::next`] if nothing arrives, nanoseconds; `None`: no sweep waits.
-    #[must_use]
     pub(crate) fn deadline_nanos(&self) -> Option<u64> {
         let (_, _, since_nanos) = self.waiting.as_ref()?;
         Some(since_nanos.saturating_add(self.timeout_nanos))

@@ -29,7 +29,6 @@ struct Followed {
 
 impl SweepSelection {
     /// Selection by the paces of `egos` only; of any ego if they are none.
-    #[must_use]
     pub(crate) fn of(egos: &[CavId]) -> Self {
         Self {
             egos: egos.iter().cloned().collect(),
@@ -71,11 +70,11 @@ impl SweepSelection {
     /// before the last one begins anew.
     pub(crate) fn admits(&mut self, capture_nanos: u64, now_nanos: u64) -> bool {
         self.paces.retain(|ego, followed| {
-            let is_heard = now_nanos.saturating_sub(followed.received_nanos) <= MAX_SILENCE_NANOS;
-            if !is_heard {
+            let is_active = now_nanos.saturating_sub(followed.received_nanos) <= MAX_SILENCE_NANOS;
+            if !is_active {
                 tracing::info!(%ego, "the ego is silent: its pace is forgotten");
             }
-            is_heard
+            is_active
         });
         let mut is_admitted = self.paces.is_empty();
         for Followed { pace, last, .. } in self.paces.values_mut() {
@@ -116,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn vehicles_that_hear_of_a_pace_at_different_times_compute_the_same_sweeps() {
+    fn vehicles_that_receive_a_pace_at_different_times_compute_the_same_sweeps() {
         let (ego, now) = (CavId::new("1").unwrap(), NOW);
         let (mut early, mut late) = (SweepSelection::default(), SweepSelection::default());
         assert_eq!(computed(&mut early, 0..3, now), [0, 1, 2]);

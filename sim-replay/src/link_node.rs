@@ -47,7 +47,6 @@ pub struct NodeOptions {
 
 impl NodeOptions {
     /// Until all agents of a run have ended, with at most 1 GiB in flight.
-    #[must_use]
     pub const fn new(ego: CavId, streams: Vec<Stream>) -> Self {
         Self {
             ego,
@@ -78,7 +77,6 @@ pub struct LinkReport {
 
 impl LinkReport {
     /// True if messages are still in flight only because the run has ended, and not because the link is stuck.
-    #[must_use]
     pub fn is_complete(&self) -> bool {
         self.longest_ms <= STUCK_MS
     }
@@ -122,6 +120,7 @@ pub fn run(
 }
 
 /// One agent, or the ego, of which only the position is used.
+#[derive(Default)]
 struct Vehicle {
     publishers: BTreeMap<Stream, Publisher>,
     /// Streams that have ended.
@@ -261,13 +260,12 @@ impl<'a> Node<'a> {
     /// Adds a new vehicle; if all slots are taken, it replaces one that has left.
     fn add(&mut self, cav: CavId) -> Result<(), BusError> {
         if self.vehicles.len() >= MAX_VEHICLES {
-            let has_kept = |cav: &CavId| {
+            let Some(gone) = place_to_free(&self.vehicles, &self.options.ego, |cav: &CavId| {
                 self.kept
                     .values()
                     .any(|arrival| arrival.header.stamp.cav == *cav)
-            };
-            let Some(gone) = place_to_free(&self.vehicles, &self.options.ego, has_kept).cloned()
-            else {
+            })
+            .cloned() else {
                 self.reject(cav);
                 return Ok(());
             };
@@ -287,15 +285,7 @@ impl<'a> Node<'a> {
     }
 
     fn attach(&self, cav: &CavId) -> Result<Vehicle, BusError> {
-        let subscribe = |stream| {
-            self.bus.subscribe(
-                Topic::Stream {
-                    cav: cav.clone(),
-                    stream,
-                },
-                &self.inbox,
-            )
-        };
+        let subscribe = |stream| self.bus.subscribe(Topic::stream(cav, stream), &self.inbox);
         let mut subscriptions = vec![subscribe(Stream::Gnss)?];
         let mut publishers = BTreeMap::new();
         // The link does not apply to the ego's own agent.
@@ -319,13 +309,10 @@ impl<'a> Node<'a> {
             // The emulator decides the losses; forwarding is lossless.
             publishers.insert(stream, self.bus.publisher(topic, how.waiting(PLACES))?);
         }
-        let (ended, position_m, has_left) = (BTreeSet::new(), None, false);
         Ok(Vehicle {
             publishers,
-            ended,
-            position_m,
-            has_left,
             _subscriptions: subscriptions,
+            ..Vehicle::default()
         })
     }
 
@@ -466,9 +453,10 @@ fn place_to_free<'v>(
     ego: &CavId,
     has_kept: impl Fn(&CavId) -> bool,
 ) -> Option<&'v CavId> {
-    let is_free =
-        |(cav, vehicle): &(&CavId, &Vehicle)| vehicle.has_left && *cav != ego && !has_kept(cav);
-    vehicles.iter().find(is_free).map(|(cav, _)| cav)
+    vehicles
+        .iter()
+        .find(|(cav, vehicle)| vehicle.has_left && *cav != ego && !has_kept(cav))
+        .map(|(cav, _)| cav)
 }
 
 #[cfg(test)]

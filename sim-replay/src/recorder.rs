@@ -50,6 +50,9 @@ pub struct RecordReport {
     /// Messages that the router did not hand on, as the recorder took earlier ones too slowly.
     #[serde(default)]
     pub undelivered: u64,
+    /// Time for which the recorder had no connection to the router, seconds.
+    #[serde(default)]
+    pub router_gone_s: f64,
     /// Messages that arrived after writing had failed, or were in the chunk that failed.
     pub not_written: u64,
     /// Reason of the failure.
@@ -58,7 +61,6 @@ pub struct RecordReport {
 
 impl RecordReport {
     /// True if all received messages are in the file.
-    #[must_use]
     pub fn is_complete(&self) -> bool {
         self.overwritten == 0
             && self.undelivered == 0
@@ -67,7 +69,6 @@ impl RecordReport {
     }
 
     /// Description of the missing messages; `None` if there are none.
-    #[must_use]
     pub fn loss_in_words(&self) -> Option<String> {
         let Self {
             file,
@@ -75,6 +76,7 @@ impl RecordReport {
             seconds,
             overwritten,
             undelivered,
+            router_gone_s,
             not_written,
             failure,
             ..
@@ -82,6 +84,9 @@ impl RecordReport {
         let missing = overwritten + undelivered + not_written;
         match failure {
             None if missing == 0 => None,
+            None if *undelivered == missing && *router_gone_s > 0.0 => Some(format!(
+                "recording with gaps: router gone for {router_gone_s:.1} s, {missing} messages missing"
+            )),
             None if *undelivered == missing => Some(format!(
                 "recording with gaps: the recorder was too slow for the router, {missing} messages missing"
             )),
@@ -133,7 +138,7 @@ pub fn record(
         }
         Err(error) => return Err(error.into()),
     };
-    let tap = bus.tap(&[KeyExpr::run(&bus.identity().run)], PLACES)?;
+    let subscriber = bus.tap(&[KeyExpr::run(&bus.identity().run)], PLACES)?;
     let presence = bus.announce(protocol::Role::Recorder)?;
     let mut recorder = Recorder {
         writer,
@@ -152,8 +157,9 @@ pub fn record(
     if recorder.report.failure.is_some() {
         (recorder.on_failure)(&recorder.report);
     }
-    recorder.listen(&tap, options.keeps_running, stop);
-    let report = recorder.finish(tap.overwritten(), tap.undelivered());
+    recorder.listen(&subscriber, options.keeps_running, stop);
+    recorder.report.router_gone_s = bus.router_lost().as_secs_f64();
+    let report = recorder.finish(subscriber.overwritten(), subscriber.undelivered());
     presence.withdraw()?;
     Ok(report)
 }
@@ -174,11 +180,11 @@ struct Recorder<'a> {
 }
 
 impl Recorder<'_> {
-    fn listen(&mut self, tap: &PassiveSubscriber, keeps_running: bool, stop: &Stop) {
+    fn listen(&mut self, subscriber: &PassiveSubscriber, keeps_running: bool, stop: &Stop) {
         let mut flush_at = Instant::now() + FLUSH_PERIOD;
         let (mut stopping, mut last_message) = (None, Instant::now());
         loop {
-            match tap.take(Some(flush_at.min(Instant::now() + SILENCE))) {
+            match subscriber.take(Some(flush_at.min(Instant::now() + SILENCE))) {
                 Pop::Item(topic, raw) => {
                     last_message = Instant::now();
                     if topic == Topic::Control(Verb::End) {

@@ -97,8 +97,12 @@ impl Axis {
         }
     }
 
+    fn scale(&self) -> Scale {
+        Scale::new(self.drawn_range(), self.is_logarithmic)
+    }
+
     /// The range, or a substitute that can be drawn if it is empty or infinite.
-    pub(super) fn drawn_range(&self) -> [f64; 2] {
+    fn drawn_range(&self) -> [f64; 2] {
         let [low, high] = self.range;
         let lowest = match self.is_logarithmic {
             true => f64::MIN_POSITIVE,
@@ -153,7 +157,7 @@ impl Chart {
             .caption(&self.title, font(18))
             .x_label_area_size(44)
             .y_label_area_size(60)
-            .build_cartesian_2d(Scale::from(&self.x), Scale::from(&self.y))?;
+            .build_cartesian_2d(self.x.scale(), self.y.scale())?;
         self.draw_grid(&mut context)?;
         for (series, &colour) in self.series.iter().zip(COLOURS.iter().cycle()) {
             self.draw_series(series, colour, &mut context)?;

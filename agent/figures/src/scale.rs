@@ -6,17 +6,14 @@ use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, Value
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::{IntoLogRange, LogCoord};
 
-use super::chart::Axis;
-
 pub(super) enum Scale {
     Linear(RangedCoordf64),
     Logarithmic(LogCoord<f64>),
 }
 
-impl From<&Axis> for Scale {
-    fn from(axis: &Axis) -> Self {
-        let [low, high] = axis.drawn_range();
-        if axis.is_logarithmic {
+impl Scale {
+    pub(super) fn new([low, high]: [f64; 2], is_logarithmic: bool) -> Self {
+        if is_logarithmic {
             Self::Logarithmic((low..high).log_scale().into())
         } else {
             Self::Linear((low..high).into())

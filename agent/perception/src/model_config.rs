@@ -228,8 +228,8 @@ impl DetectorConfig {
     /// Channels of the transmitted feature map: of the code, if there is a compressor.
     pub fn sent_channels(&self) -> i64 {
         let channels = self.feature_channels();
-        let code = |ratio: i64| (channels / ratio).max(1);
-        self.compress_ratio.map_or(channels, code)
+        self.compress_ratio
+            .map_or(channels, |ratio: i64| (channels / ratio).max(1))
     }
 
     /// BEV grid of the transmitted feature map.

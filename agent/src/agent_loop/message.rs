@@ -50,7 +50,6 @@ pub struct MessageEncoder {
 
 impl MessageEncoder {
     /// State before the first message.
-    #[must_use]
     pub fn new(options: &LoopOptions) -> Self {
         Self {
             codec: options.codec,

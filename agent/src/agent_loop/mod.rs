@@ -140,7 +140,6 @@ pub struct AgentLoop {
 
 impl AgentLoop {
     /// Loop of a vehicle before its first input. Its detector is warmed up.
-    #[must_use]
     pub fn new(agent: Agent, options: LoopOptions) -> Self {
         let mut agent = if options.needs_head() {
             agent
@@ -194,8 +193,8 @@ impl AgentLoop {
     }
 
     /// Time by which the loop has to be woken, 0 if at once, nanoseconds.
-    #[must_use]
     pub fn wakes_nanos(&self) -> u64 {
+        // The next step, or what is left of the run, needs no message.
         if self.is_computing() || self.has_ended {
             return 0;
         }
@@ -204,25 +203,21 @@ impl AgentLoop {
     }
 
     /// True between two steps of a sweep.
-    #[must_use]
     pub fn is_computing(&self) -> bool {
         !matches!(self.step, Step::Localize)
     }
 
     /// True after the end, when every sweep is computed.
-    #[must_use]
     pub fn is_finished(&self) -> bool {
         self.has_ended && !self.is_computing() && self.pairing.deadline_nanos().is_none()
     }
 
     /// The vehicle's pipeline.
-    #[must_use]
     pub fn agent(&self) -> &Agent {
         &self.agent
     }
 
     /// Summary so far.
-    #[must_use]
     pub fn report(&self) -> &LoopReport {
         &self.report
     }
@@ -332,6 +327,7 @@ impl AgentLoop {
 
     /// Counts a missing pose; no pose for three seconds is a problem.
     fn note_pose(&mut self, pose: &PoseEstimate, now_nanos: u64) {
+        // The first sweep starts the count: before it nothing was missing.
         let last_nanos = *self.last_pose_nanos.get_or_insert(now_nanos);
         let problem = match pose {
             PoseEstimate::Pose { .. } => {
@@ -353,6 +349,7 @@ impl AgentLoop {
     fn perceive(&mut self, paired: PairedSweep<Sweep>, pose: PoseEstimate, sweep: EncodedSweep) {
         let capture_nanos = paired.capture_nanos;
         let cloud = &paired.sweep.cloud;
+        // Without a network the sweep itself is all there is to send.
         let perceived = if self.options.needs_network() {
             let perceived = self.agent.perceive_encoded(cloud, sweep);
             perceived.map(|(perception, sweep)| (Some(perception), sweep))

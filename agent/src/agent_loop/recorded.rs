@@ -32,7 +32,6 @@ pub struct Published {
 
 impl Published {
     /// The record of a message; `None` for the bytes of one that could not be encoded.
-    #[must_use]
     pub fn new(stream: Stream, turn: Turn, stamp: &Stamp, encoded: Option<&Encoded>) -> Self {
         let pieces = encoded.map_or([&[][..]; 2], Encoded::pieces);
         let hash = pieces.iter().fold(Sha256::new(), Sha256::chain_update);

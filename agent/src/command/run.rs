@@ -24,9 +24,6 @@ pub(crate) struct Args {
 }
 
 /// Loads the models, joins the run and works until the replay ends.
-///
-/// # Errors
-/// Those of the configuration, the models and the bus.
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = args.config.validated()?;

@@ -1,42 +1,20 @@
 //! AttFuse (OPV2V): scaled dot-product self-attention over the agents at every cell, without projections.
 
 use perception::layers::agent_attention::attend_ego;
-use perception::model_config::{ConfigError, DetectorConfig};
-use serde::{Deserialize, Serialize};
-use tch::{TchError, Tensor, nn};
+use tch::{TchError, Tensor};
 
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
-use super::settings::FusionSettings;
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::settings::without_settings;
+use super::spec::MethodSpec;
 use crate::warp::WarpedMaps;
 
 /// AttFuse.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "attention",
-    summary: "feature maps, self-attention over agents at each cell (AttFuse)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<AttentionConfig>(),
-};
+pub static METHOD: MethodSpec = MethodSpec::of_features::<AttentionConfig>(
+    "feature maps, self-attention over agents at each cell (AttFuse)",
+);
 
-/// Settings of [`AttentionFusion`]: none.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct AttentionConfig {}
-
-impl FusionSettings for AttentionConfig {
-    const KIND: &'static str = "attention";
-
-    fn for_detector(_detector: &DetectorConfig) -> Self {
-        Self {}
-    }
-
-    fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        Ok(Box::new(AttentionFusion))
-    }
-}
+without_settings!(AttentionConfig, "attention", AttentionFusion);
 
 /// Per-cell attention of the ego to all agents.
 ///

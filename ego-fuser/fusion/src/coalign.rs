@@ -10,19 +10,14 @@ use tch::nn;
 
 use super::interface::Fusion;
 use super::settings::{FusionSettings, Requirements};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 use super::where2comm::{Aggregation, Missing, Where2comm, Where2commConfig};
 use crate::pose_graph::PoseGraphConfig;
 
 /// CoAlign.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "coalign",
-    summary: "feature maps, poses corrected by the boxes in common, attention (CoAlign)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<CoAlignConfig>(),
-};
+pub static METHOD: MethodSpec = MethodSpec::of_features::<CoAlignConfig>(
+    "feature maps, poses corrected by the boxes in common, attention (CoAlign)",
+);
 
 /// Settings of CoAlign.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -13,18 +13,13 @@ use super::interface::{Fusion, FusionOutput};
 use super::maps::{AlignedMaps, MapMetadata};
 use super::padding::Padding;
 use super::settings::{FusionSettings, of_size};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 use super::swap_fusion::{Slots, SwapFusion, SwapFusionConfig};
 
 /// CoBEVT.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "cobevt",
-    summary: "feature maps, attention over agents within windows and grids (CoBEVT)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<SwapFusionConfig>(),
-};
+pub static METHOD: MethodSpec = MethodSpec::of_features::<SwapFusionConfig>(
+    "feature maps, attention over agents within windows and grids (CoBEVT)",
+);
 
 impl FusionSettings for SwapFusionConfig {
     const KIND: &'static str = "cobevt";

@@ -1,7 +1,9 @@
 //! Convolution that can be applied to parts of its input channels, and a GRU built on it.
 
-use tch::nn::{self, Init};
+use tch::nn;
 use tch::{TchError, Tensor};
+
+use super::layers::uniform;
 
 /// A convolution with bias that keeps the size of the feature map.
 #[derive(Debug)]
@@ -28,14 +30,7 @@ impl Conv {
         let bound = 1.0 / (shape[1..].iter().product::<i64>() as f64).sqrt();
         Self {
             weight,
-            bias: path.var(
-                "bias",
-                &shape[..1],
-                Init::Uniform {
-                    lo: -bound,
-                    up: bound,
-                },
-            ),
+            bias: path.var("bias", &shape[..1], uniform(bound)),
         }
     }
 
@@ -95,16 +90,17 @@ impl ConvGru {
         kernel: i64,
         layers: usize,
     ) -> Self {
-        let cell = |layer: usize| {
-            let path = path / "cell_list" / layer;
-            let input = if layer == 0 { input } else { hidden } + hidden;
-            Cell {
-                gates: Conv::new(&(&path / "conv_gates"), [input, 2 * hidden], kernel),
-                candidate: Conv::new(&(&path / "conv_can"), [input, hidden], kernel),
-            }
-        };
         Self {
-            cells: (0..layers).map(cell).collect(),
+            cells: (0..layers)
+                .map(|layer| {
+                    let path = path / "cell_list" / layer;
+                    let input = if layer == 0 { input } else { hidden } + hidden;
+                    Cell {
+                        gates: Conv::new(&(&path / "conv_gates"), [input, 2 * hidden], kernel),
+                        candidate: Conv::new(&(&path / "conv_can"), [input, hidden], kernel),
+                    }
+                })
+                .collect(),
             hidden,
         }
     }

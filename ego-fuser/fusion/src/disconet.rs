@@ -14,17 +14,12 @@ use super::conv_gru::Conv;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
 use super::settings::FusionSettings;
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 
 /// DiscoNet.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "disconet",
-    summary: "feature maps, a learnt weight per agent and cell (DiscoNet)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<DiscoNetConfig>(),
-};
+pub static METHOD: MethodSpec = MethodSpec::of_features::<DiscoNetConfig>(
+    "feature maps, a learnt weight per agent and cell (DiscoNet)",
+);
 
 /// Sizes of [`DiscoNet`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

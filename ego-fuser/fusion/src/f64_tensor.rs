@@ -82,6 +82,14 @@ pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tenso
         .f_permute([0, 3, 1, 2])
 }
 
+/// Some rows of a tensor.
+pub(crate) fn picked(tensor: &Tensor, rows: &[i64]) -> Result<Tensor, TchError> {
+    tensor.f_index_select(
+        0,
+        &Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?,
+    )
+}
+
 /// `[C, H * W]` of a map `[C, H, W]`, without a copy in either memory order.
 pub(crate) fn flat(map: &Tensor) -> Result<Tensor, TchError> {
     map.f_flatten(1, 2)

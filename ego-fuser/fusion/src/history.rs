@@ -64,13 +64,12 @@ impl History {
 
     /// Maps of a vehicle from before the one that is fused now, newest first: at most one per time step.
     pub fn before(&self, cav: &CavId, capture_nanos: u64) -> impl Iterator<Item = &KeptMap> {
-        let earlier = move |kept: &&KeptMap| kept.capture_nanos < capture_nanos;
         self.kept
             .get(cav)
             .into_iter()
             .flatten()
             .rev()
-            .filter(earlier)
+            .filter(move |kept| kept.capture_nanos < capture_nanos)
             .take(self.frames.saturating_sub(1))
     }
 

@@ -11,10 +11,38 @@ const EPSILON: f64 = 1e-5;
 /// Standard deviation of the weights that lead back to the residual path: small, so that an untrained transformer
 /// passes on the features of a trained encoder, and yet not zero, so that all layers after them get gradients from the
 /// first step.
-const RESIDUAL: Init = Init::Randn {
+pub(crate) const SMALL: Init = Init::Randn {
     mean: 0.0,
     stdev: 0.02,
 };
+/// A layer that gives zero at the start.
+pub(crate) const ZERO: nn::LinearConfig = nn::LinearConfig {
+    ws_init: Init::Const(0.0),
+    bs_init: Some(Init::Const(0.0)),
+    bias: true,
+};
+/// A layer without offset.
+pub(crate) const BARE: nn::LinearConfig = nn::LinearConfig {
+    ws_init: nn::init::DEFAULT_KAIMING_UNIFORM,
+    bs_init: None,
+    bias: false,
+};
+
+/// Values between -`bound` and `bound`.
+pub(crate) fn uniform(bound: f64) -> Init {
+    Init::Uniform {
+        lo: -bound,
+        up: bound,
+    }
+}
+
+/// Settings of a convolution that keeps the size of its map with a kernel of 3 cells.
+pub(crate) fn around() -> nn::ConvConfig {
+    nn::ConvConfig {
+        padding: 1,
+        ..Default::default()
+    }
+}
 
 /// `x W^T + b` over the last dimension.
 #[derive(Debug)]
@@ -33,7 +61,7 @@ impl Linear {
 
     /// The last layer of a branch that is added to the residual path: nearly zero at the start.
     pub fn residual(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool) -> Self {
-        Self::with_init(path, from, to, has_bias, RESIDUAL)
+        Self::with_init(path, from, to, has_bias, SMALL)
     }
 
     /// Identity at the start; as many channels leave as enter.
@@ -140,9 +168,6 @@ pub fn dropout(x: Tensor, share: f64, train: bool) -> Result<Tensor, TchError> {
 /// - `query`: `[B, Q, M, D]`; `key`, `value`: `[B, K, M, D]`; the last dimension without gaps
 /// - `bias`: broadcastable to `[B, M, Q, K]`
 /// - returns: `[B, Q, M * D]`
-///
-/// # Errors
-/// [`TchError`] when shapes do not fit.
 pub(crate) fn attend(
     query: &Tensor,
     key: &Tensor,

@@ -64,7 +64,7 @@ pub mod where2comm;
 pub use attention::AttentionFusion;
 pub use block_order::BlockOrder;
 pub use interface::{Fusion, FusionOutput};
-pub use maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, regroup};
+pub use maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps};
 pub use max::MaxFusion;
 pub use method::Method;
 pub use settings::{FUSION_KEY, FusionConfig, FusionSettings, HistorySpec, Requirements};

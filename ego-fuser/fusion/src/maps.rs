@@ -214,32 +214,6 @@ pub(crate) fn reaching(mask: &Tensor, with_ego: bool) -> Result<Vec<i64>, TchErr
         .collect())
 }
 
-/// Splits agents of all samples into padded samples: `[sum(agents), ...]` to `[B, longest, ...]` and a mask
-/// `[B, longest]`.
-///
-/// # Errors
-/// [`TchError`] when the counts do not add up to the first size, or one is above `longest`.
-pub fn regroup(
-    features: &Tensor,
-    agents: &[i64],
-    longest: i64,
-) -> Result<(Tensor, Tensor), TchError> {
-    let mut samples = Vec::with_capacity(agents.len());
-    let mut masks = Vec::with_capacity(agents.len());
-    for (sample, &count) in features
-        .f_split_with_sizes(agents, 0)?
-        .into_iter()
-        .zip(agents)
-    {
-        let mut padding = sample.size();
-        padding[0] = longest - count;
-        let empty = Tensor::f_zeros(padding, (sample.kind(), sample.device()))?;
-        samples.push(Tensor::f_cat(&[sample, empty], 0)?);
-        masks.push(Tensor::f_arange(longest, (tch::Kind::Int64, features.device()))?.f_lt(count)?);
-    }
-    Ok((Tensor::f_stack(&samples, 0)?, Tensor::f_stack(&masks, 0)?))
-}
-
 #[cfg(test)]
 mod tests {
     use tch::{Device, Kind};
@@ -260,20 +234,5 @@ mod tests {
             larger_cells(&odd, 2).unwrap().double_value(&[0, 0, 0, 2]),
             7.0
         );
-    }
-
-    #[test]
-    fn regroup_pads_with_nothing() {
-        let features = Tensor::arange(3, FLOAT).view([3, 1]) + 1.0;
-        let (groups, mask) = regroup(&features, &[2, 1], 3).unwrap();
-        assert_eq!(
-            Vec::<f32>::try_from(groups.view(-1)).unwrap(),
-            [1.0, 2.0, 0.0, 3.0, 0.0, 0.0]
-        );
-        assert_eq!(
-            Vec::<bool>::try_from(mask.view(-1)).unwrap(),
-            [true, true, false, true, false, false]
-        );
-        assert!(regroup(&features, &[2, 2], 3).is_err());
     }
 }

@@ -1,41 +1,18 @@
 //! F-Cooper: element-wise maximum over the agents.
 
-use perception::model_config::{ConfigError, DetectorConfig};
-use serde::{Deserialize, Serialize};
-use tch::{TchError, Tensor, nn};
+use tch::{TchError, Tensor};
 
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
-use super::settings::FusionSettings;
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::settings::without_settings;
+use super::spec::MethodSpec;
 use crate::warp::WarpedMaps;
 
 /// F-Cooper.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "max",
-    summary: "feature maps, element-wise maximum (F-Cooper)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<MaxConfig>(),
-};
+pub static METHOD: MethodSpec =
+    MethodSpec::of_features::<MaxConfig>("feature maps, element-wise maximum (F-Cooper)");
 
-/// Settings of [`MaxFusion`]: none.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct MaxConfig {}
-
-impl FusionSettings for MaxConfig {
-    const KIND: &'static str = "max";
-
-    fn for_detector(_detector: &DetectorConfig) -> Self {
-        Self {}
-    }
-
-    fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        Ok(Box::new(MaxFusion))
-    }
-}
+without_settings!(MaxConfig, "max", MaxFusion);
 
 /// Element-wise maximum over the agents that reach a cell.
 #[derive(Debug, Clone, Copy, Default)]

@@ -5,10 +5,9 @@ mod stage;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nalgebra::Isometry3;
 use perception::boxes::anchors::Anchors;
 use perception::boxes::decode::{DecodeError, decode};
-use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::detector::DetectorError;
 use perception::layers::head::HeadOutput;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
@@ -69,7 +68,6 @@ pub enum ModelError {
 
 impl ModelError {
     /// True if one frame cannot be computed, and others may be, see [`DetectorError::is_of_frame`].
-    #[must_use]
     pub fn is_of_frame(&self) -> bool {
         matches!(self, Self::Detector(error) if error.is_of_frame())
     }
@@ -321,14 +319,7 @@ impl CooperativeModel {
                     &self.anchors,
                     limits.score_threshold,
                 )?;
-                let boxes = AgentBoxes {
-                    boxes: &decoded,
-                    output_from_agent: Isometry3::identity(),
-                };
-                Ok(postprocess(&[boxes], limits)
-                    .iter()
-                    .map(|candidate| candidate.detection(None))
-                    .collect())
+                Ok(detections(&decoded, limits))
             })
             .collect()
     }

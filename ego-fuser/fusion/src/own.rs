@@ -1,12 +1,10 @@
 //! Methods without fusion of feature maps: ego-only, late (boxes) and early (points).
 
-use perception::model_config::{ConfigError, DetectorConfig};
-use serde::{Deserialize, Serialize};
-use tch::{TchError, nn};
+use tch::TchError;
 
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
-use super::settings::FusionSettings;
+use super::settings::without_settings;
 use super::spec::{Exchange, FusionSpec, MethodSpec};
 
 /// Ego-only, no collaboration: the baseline of every method.
@@ -39,22 +37,7 @@ pub static EARLY: MethodSpec = MethodSpec {
     fusion: FusionSpec::of::<OwnConfig>(),
 };
 
-/// Settings of [`NoFusion`]: none.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct OwnConfig {}
-
-impl FusionSettings for OwnConfig {
-    const KIND: &'static str = "own";
-
-    fn for_detector(_detector: &DetectorConfig) -> Self {
-        Self {}
-    }
-
-    fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        Ok(Box::new(NoFusion))
-    }
-}
+without_settings!(OwnConfig, "own", NoFusion);
 
 /// The ego's own feature map, whatever the others send.
 #[derive(Debug, Clone, Copy, Default)]

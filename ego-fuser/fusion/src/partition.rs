@@ -39,14 +39,8 @@ impl Partition {
         let &[_, slots, _, channels] = &groups.size()[..] else {
             return Err(shape_error(groups));
         };
-        let groups = groups.f_view([
-            height / window,
-            width / window,
-            slots,
-            window,
-            window,
-            channels,
-        ])?;
+        let (rows, columns) = (height / window, width / window);
+        let groups = groups.f_view([rows, columns, slots, window, window, channels])?;
         let map = match self {
             Self::Window => groups.f_permute([2, 0, 3, 1, 4, 5])?,
             Self::Grid => groups.f_permute([2, 3, 0, 4, 1, 5])?,

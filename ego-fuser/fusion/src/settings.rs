@@ -192,3 +192,29 @@ impl<S: FusionSettings> AnySettings for S {
         other.as_any().downcast_ref::<S>() == Some(self)
     }
 }
+
+/// Declares the settings `$config` of the fusion `$fusion`, which has none; `$kind` is their tag in weights files.
+macro_rules! without_settings {
+    ($config:ident, $kind:literal, $fusion:ident) => {
+        #[doc = concat!("Settings of [`", stringify!($fusion), "`]: none.")]
+        #[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub(crate) struct $config {}
+
+        impl $crate::FusionSettings for $config {
+            const KIND: &'static str = $kind;
+
+            fn for_detector(_: &perception::model_config::DetectorConfig) -> Self {
+                Self {}
+            }
+
+            fn build(
+                &self,
+                _: &tch::nn::Path<'_>,
+            ) -> Result<Box<dyn $crate::Fusion>, perception::model_config::ConfigError> {
+                Ok(Box::new($fusion))
+            }
+        }
+    };
+}
+pub(crate) use without_settings;

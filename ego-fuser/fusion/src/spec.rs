@@ -38,6 +38,20 @@ pub struct MethodSpec {
     pub fusion: FusionSpec,
 }
 
+impl MethodSpec {
+    /// A method that fuses all cells of feature maps, with its own weights, and has the name of its settings' kind.
+    pub const fn of_features<S: FusionSettings>(summary: &'static str) -> Self {
+        Self {
+            name: S::KIND,
+            summary,
+            exchange: Exchange::Features,
+            gate: None,
+            runs_with_weights_of: &[],
+            fusion: FusionSpec::of::<S>(),
+        }
+    }
+}
+
 /// The fusion of a method as functions of its settings' type.
 #[derive(Debug, Clone, Copy)]
 pub struct FusionSpec {

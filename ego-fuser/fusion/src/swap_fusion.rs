@@ -7,10 +7,10 @@
 use perception::model_config::ConfigError;
 use protocol::config::{require, within};
 use serde::{Deserialize, Serialize};
-use tch::nn::{self, Init};
+use tch::nn;
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::layers::{FeedForward, LayerNorm, Linear, attend, dropout, unseen};
+use super::layers::{FeedForward, LayerNorm, Linear, SMALL, attend, dropout, unseen};
 use super::partition::{Partition, shape_error};
 
 /// Tokens that are computed at once outside training: intermediate results then stay in the cache.
@@ -108,14 +108,7 @@ impl OffsetTable {
             slots: config.slots,
             window: config.window,
             heads,
-            table: table.var(
-                "weight",
-                &[offsets, heads],
-                Init::Randn {
-                    mean: 0.0,
-                    stdev: 0.02,
-                },
-            ),
+            table: table.var("weight", &[offsets, heads], SMALL),
         }
     }
 
@@ -124,12 +117,12 @@ impl OffsetTable {
         let (span, last) = (2 * self.window - 1, self.slots - 1);
         let tokens = |slots: i64| {
             let window = self.window;
-            let cells = move |slot| {
+            (0..slots).flat_map(move |slot| {
                 (0..window * window).map(move |cell| [slot, cell / window, cell % window])
-            };
-            (0..slots).flat_map(cells)
+            })
         };
         let offset = |from: [i64; 3], to: [i64; 3]| {
+            // Agents beyond the slots of the weights share the offset of the last slot.
             let agent = (from[0] - to[0]).clamp(-last, last) + last;
             (agent * span + from[1] - to[1] + self.window - 1) * span + from[2] - to[2]
                 + self.window
@@ -140,11 +133,8 @@ impl OffsetTable {
             .collect();
         let cells = self.window * self.window;
         let index = Tensor::f_from_slice(&index)?.f_to_device(self.table.device())?;
-        let bias = self.table.f_index_select(0, &index)?.f_view([
-            asking * cells,
-            asked * cells,
-            self.heads,
-        ])?;
+        let shape = [asking * cells, asked * cells, self.heads];
+        let bias = self.table.f_index_select(0, &index)?.f_view(shape)?;
         bias.f_permute([2, 0, 1])?.f_contiguous()
     }
 }
@@ -161,21 +151,12 @@ struct GroupAttention {
 
 impl GroupAttention {
     fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
+        let channels = config.channels;
         Self {
-            heads: config.channels / config.head_channels,
-            to_qkv: Linear::new(
-                &(path / "to_qkv"),
-                config.channels,
-                3 * config.channels,
-                false,
-            ),
+            heads: channels / config.head_channels,
+            to_qkv: Linear::new(&(path / "to_qkv"), channels, 3 * channels, false),
             offsets: OffsetTable::new(path, config),
-            out: Linear::residual(
-                &(path / "to_out" / 0),
-                config.channels,
-                config.channels,
-                false,
-            ),
+            out: Linear::residual(&(path / "to_out" / 0), channels, channels, false),
             dropout: config.dropout,
         }
     }
@@ -233,17 +214,13 @@ impl HalfBlock {
         feed: &nn::Path<'_>,
         config: &SwapFusionConfig,
     ) -> Self {
+        let (channels, hidden) = (config.channels, config.hidden);
         Self {
             partition,
-            norm: LayerNorm::new(&(attention / "norm"), config.channels),
+            norm: LayerNorm::new(&(attention / "norm"), channels),
             attention: GroupAttention::new(&(attention / "fn"), config),
-            feed_norm: LayerNorm::new(&(feed / "norm"), config.channels),
-            feed_forward: FeedForward::new(
-                &(feed / "fn"),
-                config.channels,
-                config.hidden,
-                config.dropout,
-            ),
+            feed_norm: LayerNorm::new(&(feed / "norm"), channels),
+            feed_forward: FeedForward::new(&(feed / "fn"), channels, hidden, config.dropout),
         }
     }
 
@@ -307,12 +284,8 @@ impl Slots<'_> {
             return Ok(None);
         };
         let unseen = unseen(&reach.f_narrow(0, 0, self.asked)?.f_unsqueeze(3)?)?;
-        Ok(Some(partition.cut(&unseen, window)?.f_view([
-            -1,
-            1,
-            1,
-            self.asked * window * window,
-        ])?))
+        let shape = [-1, 1, 1, self.asked * window * window];
+        Ok(Some(partition.cut(&unseen, window)?.f_view(shape)?))
     }
 }
 
@@ -377,18 +350,10 @@ impl SwapFusion {
             } else {
                 [1, 2, 5, 6].map(|index| &path / "block" / index)
             };
-            halves.push(HalfBlock::new(
-                Partition::Window,
-                &names[0],
-                &names[1],
-                config,
-            ));
-            halves.push(HalfBlock::new(
-                Partition::Grid,
-                &names[2],
-                &names[3],
-                config,
-            ));
+            let [window, window_feed, grid, grid_feed] = &names;
+            let window = HalfBlock::new(Partition::Window, window, window_feed, config);
+            let grid = HalfBlock::new(Partition::Grid, grid, grid_feed, config);
+            halves.extend([window, grid]);
         }
         Self {
             halves,
@@ -444,6 +409,7 @@ impl SwapFusion {
         let map = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let size = [map.size()[1], map.size()[2]];
         let mut x = map;
+        // Between two halves the tokens stay in the order of their groups; the next partition rearranges them.
         let mut lies_in = None;
         for half in &self.halves[..halves.min(self.halves.len())] {
             x = if train {

@@ -17,18 +17,12 @@ use super::conv_gru::{Conv, ConvGru};
 use super::interface::{Fusion, FusionOutput};
 use super::maps::{AlignedMaps, MapMetadata, reaching};
 use super::settings::{FusionSettings, of_size};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, cav_from_ego_normalized};
 
 /// V2VNet.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "v2vnet",
-    summary: "feature maps, messages between the vehicles (V2VNet)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<V2vNetConfig>(),
-};
+pub static METHOD: MethodSpec =
+    MethodSpec::of_features::<V2vNetConfig>("feature maps, messages between the vehicles (V2VNet)");
 
 /// Aggregation of a node's messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -87,12 +81,8 @@ impl V2vNetConfig {
         within("fusion gru_layers", self.gru_layers as i64, 0, 8)?;
         within("fusion kernel", self.kernel, 1, 15)?;
         let is_odd = self.kernel % 2 == 1;
-        Ok(require(
-            is_odd,
-            "fusion kernel",
-            self.kernel,
-            "must be odd",
-        )?)
+        let (field, rule) = ("fusion kernel", "must be odd");
+        Ok(require(is_odd, field, self.kernel, rule)?)
     }
 }
 
@@ -256,24 +246,19 @@ impl Fusion for V2vNet {
     /// Agents whose map does not reach the ego at all are no nodes of the graph. Between two neighbours the complete
     /// map is used, cells that were not sent as zeros.
     fn fuse(&self, aligned: &AlignedMaps) -> Result<FusionOutput, TchError> {
-        let AlignedMaps {
-            warped,
-            received,
-            metadata,
-            grid,
-            ..
-        } = aligned;
+        let warped = &aligned.warped;
         let entries = reaching(&warped.mask, true)?;
         let nodes: Vec<MapMetadata> = entries
             .iter()
-            .map(|&entry| metadata[entry as usize])
+            .map(|&entry| aligned.metadata[entry as usize])
             .collect();
         let device = warped.features.device();
         let index = Tensor::f_from_slice(&entries)?.f_to_device(device)?;
         let (maps, mask) = (
-            received.maps.f_index_select(0, &index)?,
+            aligned.received.maps.f_index_select(0, &index)?,
             warped.mask.f_index_select(0, &index)?,
         );
+        // With a single round only the ego receives.
         let receivers = if self.config.rounds > 1 {
             nodes.len()
         } else {
@@ -281,7 +266,7 @@ impl Fusion for V2vNet {
         };
         let incoming = (0..receivers).map(|receiver| {
             let reach = (receiver == 0).then_some(&mask);
-            Incoming::between(receiver, &nodes, grid, reach, device)
+            Incoming::between(receiver, &nodes, &aligned.grid, reach, device)
         });
         Ok(self
             .propagate(&maps, &incoming.collect::<Result<Vec<_>, _>>()?)?

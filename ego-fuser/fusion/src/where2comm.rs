@@ -18,17 +18,15 @@ use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
 use super::max::maximum;
 use super::settings::{FusionSettings, Requirements};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 use crate::warp::WarpedMaps;
 
 /// Where2comm.
 pub static METHOD: MethodSpec = MethodSpec {
-    name: "where2comm",
-    summary: "feature maps, only the cells around which a vehicle is likely (Where2comm)",
-    exchange: Exchange::Features,
     gate: Some(GATE),
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<Where2commConfig>(),
+    ..MethodSpec::of_features::<Where2commConfig>(
+        "feature maps, only the cells around which a vehicle is likely (Where2comm)",
+    )
 };
 
 /// Twice the published threshold: `lean` heads score the background just above that one. On validation scenes a fifth

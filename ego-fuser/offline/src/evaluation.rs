@@ -11,6 +11,7 @@ mod sent;
 mod setup;
 pub mod stepped;
 mod sweeps;
+mod transmission;
 
 use std::ops::ControlFlow;
 
@@ -27,7 +28,7 @@ use perception::inference::Inference;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::message::Detections;
-use protocol::{Ledger, PoseEstimate, Stamp};
+use protocol::{Ledger, PoseEstimate, Stamp, Tracks};
 use tch::Device;
 
 use ego_fuser::ego::Ego;
@@ -48,6 +49,8 @@ pub struct EvaluatedFrame {
     pub stamp: Stamp,
     /// Detections that the ego would have published; without boxes if it has failed.
     pub result: Detections,
+    /// Tracks after them, if the ego tracks and has not failed.
+    pub tracks: Option<Tracks>,
     /// Reason why the ego has no result; counted in [`Evaluator::left_out`].
     pub failure: Option<String>,
     /// The frames of all vehicles that take part, the ego first: true poses and annotations.
@@ -83,7 +86,7 @@ impl Evaluator {
     pub fn new(setup: Setup) -> Result<Self, EvaluateError> {
         let weights = Weights::load(&setup.models.weights)?.with_precision(setup.models.precision);
         let ego = Ego::from_weights(&weights, setup.method, Device::Cpu)?;
-        let ego = ego.with_misbehaviour_detection(setup.ego.trust())?;
+        let ego = ego.with_misbehaviour_detection(setup.ego.trust)?;
         let area = ego.detector().config();
         let rule = setup.protocol.as_ref().map_or_else(
             || rule_for(area),
@@ -116,14 +119,12 @@ impl Evaluator {
     }
 
     /// The accounting of all messages on the link so far; empty without a link emulation.
-    #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
     }
 
     /// Bytes of all messages that neighbours handed to the link so far, poses and headers included; 0 without a link
     /// emulation.
-    #[must_use]
     pub fn sent_bytes(&self) -> u64 {
         self.sent_bytes
     }
@@ -139,7 +140,6 @@ impl Evaluator {
     }
 
     /// The ego's pipeline.
-    #[must_use]
     pub fn ego(&self) -> &Ego {
         &self.ego
     }
@@ -150,14 +150,12 @@ impl Evaluator {
     }
 
     /// The protocol with the ground-truth rule that applies to this network; absent where none was configured.
-    #[must_use]
     pub fn protocol(&self) -> Option<EvaluationProtocol> {
         let protocol = self.setup.protocol.as_ref()?;
         Some(protocol.within(self.ego.detector().config().lidar_range_m))
     }
 
     /// Rule for the objects that count.
-    #[must_use]
     pub fn rule(&self) -> &GroundTruthRule {
         &self.rule
     }
@@ -207,10 +205,8 @@ impl Evaluator {
     /// True if sweeps have to be read at all.
     fn needs_points(&self) -> bool {
         let shares_points = self.ego.method().own_content() == Exchange::Points;
-        let Setup {
-            agents, vehicles, ..
-        } = &self.setup;
-        let mut settings = std::iter::once(agents).chain(vehicles.values());
+        let own = std::iter::once(&self.setup.agents);
+        let mut settings = own.chain(self.setup.vehicles.values());
         self.remote.is_some()
             || self.maps.is_none()
             || shares_points

@@ -50,35 +50,6 @@ pub fn is_encoder(name: &str) -> bool {
         .any(|prefix| name.starts_with(prefix))
 }
 
-/// Name of the file: digests of the encoder's weights, of the data, and of all else that maps depend on.
-fn file_name(
-    kept: &KeptMaps,
-    weights: &Weights,
-    scenarios: &[Scenario],
-    digests: &FileDigests,
-) -> Result<String, Error> {
-    let program = digests.program_sha256().at(&kept.folder)?;
-    let scales = weights
-        .activation_scales()?
-        .map(|scales| scales.sha256_of(is_encoder));
-    let settings = format!(
-        "{:?} {:?} {} {scales:?} {program} {WIRE_VERSION}",
-        weights.detector_config()?,
-        kept.dtype,
-        kept.intensity_scale,
-    );
-    let parts = [
-        weights.sha256_of(is_encoder),
-        dataset::content_sha256(scenarios, None, digests),
-        hex(&Sha256::digest(settings)),
-    ];
-    let parts: Vec<String> = parts
-        .iter()
-        .map(|digest| digest.chars().take(HASH_DIGITS).collect())
-        .collect();
-    Ok(format!("{}.maps", parts.join("-")))
-}
-
 /// Maps of the sweeps of some scenarios, one after another in a file.
 #[derive(Debug)]
 pub struct FeatureStore {
@@ -105,7 +76,26 @@ impl FeatureStore {
         scenarios: &[Scenario],
         digests: &FileDigests,
     ) -> Result<PathBuf, Error> {
-        let name = file_name(kept, weights, scenarios, digests)?;
+        let program = digests.program_sha256().at(&kept.folder)?;
+        let scales = weights
+            .activation_scales()?
+            .map(|scales| scales.sha256_of(is_encoder));
+        let settings = format!(
+            "{:?} {:?} {} {scales:?} {program} {WIRE_VERSION}",
+            weights.detector_config()?,
+            kept.dtype,
+            kept.intensity_scale,
+        );
+        let parts = [
+            weights.sha256_of(is_encoder),
+            dataset::content_sha256(scenarios, None, digests),
+            hex(&Sha256::digest(settings)),
+        ];
+        let parts: Vec<String> = parts
+            .iter()
+            .map(|digest| digest.chars().take(HASH_DIGITS).collect())
+            .collect();
+        let name = format!("{}.maps", parts.join("-"));
         Ok(kept.folder.join(name))
     }
 
@@ -216,11 +206,6 @@ impl FeatureStore {
         Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))
     }
 
-    /// The index of a scenario.
-    pub fn index_of(&self, scenario: &str) -> Option<usize> {
-        self.names.iter().position(|name| name == scenario)
-    }
-
     /// Number of stored sweeps, and of all sweeps of the scenarios.
     pub fn sweeps(&self) -> (usize, usize) {
         (self.starts.len() - 1, self.first[self.first.len() - 1])
@@ -269,7 +254,8 @@ impl MapSource {
 
     /// The index of a scenario.
     pub fn index_of(&self, scenario: &str) -> Option<usize> {
-        self.store.index_of(scenario)
+        let mut names = self.store.names.iter();
+        names.position(|name| name == scenario)
     }
 
     /// The map of a sweep, `[1, C, H, W]`; `scenario` is the one of that index.

@@ -340,7 +340,7 @@ fn without_common_frame(
         ego.zip(stems(id))
             .is_some_and(|(ego, own)| ego.is_disjoint(own))
     });
-    let problem = |id: &CavId| {
+    strangers.map(|id| {
         let ego = ego
             .as_ref()
             .map(|ego| (ego.to_string(), first(ego)))
@@ -352,8 +352,7 @@ fn without_common_frame(
             ego.1
         );
         ReadError::malformed(&dir.join(id.as_str()), reason)
-    };
-    strangers.map(problem).collect::<Vec<_>>().into_iter()
+    }).collect::<Vec<_>>().into_iter()
 }
 
 /// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the

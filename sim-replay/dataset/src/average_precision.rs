@@ -98,7 +98,6 @@ pub struct Tally {
 
 impl Tally {
     /// An empty tally.
-    #[must_use]
     pub fn new(iou_threshold: f64) -> Self {
         Self {
             iou_threshold,
@@ -124,7 +123,6 @@ impl Tally {
     }
 
     /// The curve of everything matched so far.
-    #[must_use]
     pub fn curve(&self, ordering: Ordering) -> Curve {
         let mut order: Vec<&Matched> = self.matched.iter().collect();
         if ordering == Ordering::Global {
@@ -173,7 +171,6 @@ impl Default for Scorer {
 
 impl Scorer {
     /// A scorer at the given overlaps.
-    #[must_use]
     pub fn new(thresholds: &[f64]) -> Self {
         Self {
             tallies: thresholds.iter().copied().map(Tally::new).collect(),
@@ -219,19 +216,16 @@ impl Scorer {
     }
 
     /// The tallies of all objects, one per threshold.
-    #[must_use]
     pub fn tallies(&self) -> &[Tally] {
         &self.tallies
     }
 
     /// The tallies of parts of the objects, one per threshold.
-    #[must_use]
     pub fn parts(&self) -> &[(Breakdown, Vec<Tally>)] {
         &self.parts
     }
 
     /// AP at every threshold, in their order.
-    #[must_use]
     pub fn average_precisions(&self, ordering: Ordering) -> Vec<f64> {
         self.tallies
             .iter()

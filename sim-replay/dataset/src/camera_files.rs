@@ -47,10 +47,8 @@ pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf> {
     });
     let missing = || {
         let path = dir.join(format!("{stem}_{}{number}.{}", PREFIXES[0], ENDINGS[0]));
-        ReadError::malformed(
-            &path,
-            "there is no image of this camera, which has some of other frames",
-        )
+        let reason = "there is no image of this camera, which has some of other frames";
+        ReadError::malformed(&path, reason)
     };
     names
         .into_iter()
@@ -116,7 +114,6 @@ fn pinhole(field: &Field<'_>) -> Result<Pinhole> {
 }
 
 /// The optical frame, z ahead, x right, y down, in the frame of a camera that looks along x, with y left and z up.
-#[must_use]
 pub fn body_from_optical() -> Isometry3<f64> {
     let axes = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
@@ -135,7 +132,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn images_are_told_by_their_names() {
+    fn images_are_recognised_by_their_names() {
         let names = [
             "000069_camera0.png",
             "000069_camera3.JPG",

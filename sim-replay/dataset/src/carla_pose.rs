@@ -35,7 +35,6 @@ impl From<CarlaPose> for [f64; 6] {
 impl CarlaPose {
     /// The pose of a box from the actor it belongs to: `center_m`, the offset of the box's centre, is added to
     /// `location_m` without rotation, as OpenCOOD does (`opencood/utils/box_utils.py`).
-    #[must_use]
     pub fn of_box(location_m: [f64; 3], roll_yaw_pitch_deg: [f64; 3], center_m: [f64; 3]) -> Self {
         let ([x, y, z], [dx, dy, dz]) = (location_m, center_m);
         Self {
@@ -45,7 +44,6 @@ impl CarlaPose {
     }
 
     /// Local-to-world matrix, still left-handed.
-    #[must_use]
     pub fn left_handed_matrix(&self) -> Matrix4<f64> {
         let [(sr, cr), (sy, cy), (sp, cp)] = self
             .roll_yaw_pitch_deg
@@ -72,7 +70,6 @@ impl CarlaPose {
     }
 
     /// The same pose in our right-handed convention.
-    #[must_use]
     pub fn to_pose(&self) -> Pose {
         let rotation: Matrix3<f64> = self.left_handed_matrix().fixed_view::<3, 3>(0, 0).into();
         let rotation = Rotation3::from_matrix_unchecked(mirrored_rotation(&rotation));
@@ -81,7 +78,6 @@ impl CarlaPose {
     }
 
     /// Inverse conversion: the pose as CARLA would write it, angles within +-180 degrees (pitch within +-90).
-    #[must_use]
     pub fn from_pose(pose: &Pose) -> Self {
         let rotation = mirrored_rotation(pose.isometry().rotation.to_rotation_matrix().matrix());
         Self::from_parts(mirrored_point(pose.translation_m), &rotation)
@@ -89,7 +85,6 @@ impl CarlaPose {
 
     /// The numbers for which [`Self::left_handed_matrix`] is the matrix of a right-handed pose, without mirroring:
     /// V2V4Real and V2X-Real use the formula in right-handed axes.
-    #[must_use]
     pub fn from_right_handed(pose: &Pose) -> Self {
         Self::from_parts(
             pose.translation_m,
@@ -109,7 +104,6 @@ impl CarlaPose {
 }
 
 /// A point with y negated, which changes its handedness.
-#[must_use]
 pub fn mirrored_point([x, y, z]: [f64; 3]) -> [f64; 3] {
     [x, -y, z]
 }

@@ -32,16 +32,16 @@ impl ClassSet {
     #[must_use]
     pub fn names(self) -> Vec<String> {
         let has_vehicles = self.0 & Self::VEHICLES.0 == Self::VEHICLES.0;
-        let single = |class: &&ObjectClass| {
-            self.contains(**class) && !(has_vehicles && Self::VEHICLES.contains(**class))
-        };
         has_vehicles
             .then(|| VEHICLE.to_owned())
             .into_iter()
             .chain(
                 ObjectClass::ALL
                     .iter()
-                    .filter(single)
+                    .filter(|class| {
+                        self.contains(**class)
+                            && !(has_vehicles && Self::VEHICLES.contains(**class))
+                    })
                     .map(|class| class.name().to_owned()),
             )
             .collect()

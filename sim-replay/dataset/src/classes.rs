@@ -95,8 +95,9 @@ fn of_library(name: &str) -> Option<ObjectClass> {
             let mut blueprints = BLUEPRINTS.iter();
             let blueprint = blueprints.find(|(_, models)| models.contains(&model.as_str()));
             // `vehicle.bus.rigid` and `vehicle.emergency.police` of nuScenes, or make and model.
-            let category = || of_name(if kind == "emergency" { &model } else { kind });
-            let class = blueprint.map(|(class, _)| *class).or_else(category);
+            let class = blueprint
+                .map(|(class, _)| *class)
+                .or_else(|| of_name(if kind == "emergency" { &model } else { kind }));
             Some(class.unwrap_or(ObjectClass::Car))
         }
         _ => None,

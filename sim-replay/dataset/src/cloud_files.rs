@@ -6,13 +6,11 @@ use std::sync::Arc;
 
 use protocol::PointCloud;
 
-use super::points::{FileKind, SweepStorage, Sweeps};
+use super::points::{SweepStorage, Sweeps, clouds_in};
 use super::{
-    Layout, OpenOptions, Plausibility, ReadError, Result, Scenario, files, rosbag,
-    single_vehicle_id,
+    Layout, OpenOptions, Plausibility, ReadError, Result, Scenario, rosbag, single_vehicle_id,
 };
 use crate::findings::SweepFindings;
-use crate::pcd::PcdCloud;
 
 /// Folders of sweeps whose files are readable only with the rest of their data set: NCLT and Oxford.
 const SEQUENCE_FOLDERS: [&str; 2] = ["velodyne_sync", "velodyne_left"];
@@ -51,7 +49,6 @@ pub struct Cloud {
 
 /// Files at paths, each a file or a folder: of a folder its files of points in natural order, or all sweeps of the data
 /// set in it.
-#[must_use]
 pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile>> {
     let mut found = Vec::new();
     for path in paths {
@@ -65,14 +62,6 @@ pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile>> {
         .into_iter()
         .map(|listed| listed.map(|listed| folders.source_of(listed)))
         .collect()
-}
-
-/// Files of points directly in a folder, in natural order.
-pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>> {
-    let mut names = files::list(dir)?.files;
-    names.sort_by(|first, second| files::natural_order(first, second));
-    let paths = names.into_iter().map(|name| dir.join(name));
-    Ok(paths.filter(|path| FileKind::of(path).is_ok()).collect())
 }
 
 /// A listed file.
@@ -111,7 +100,7 @@ fn frames_of(scenario: Scenario) -> Vec<CloudFile> {
     let scenario = Arc::new(scenario);
     let all = (0..scenario.agents.len())
         .flat_map(|agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)));
-    let file = |(agent, tick)| {
+    all.filter_map(|(agent, tick)| {
         let path = scenario.points_path(agent, tick, None).ok()?;
         // Bags and recordings hold many sweeps in a file: the stem tells them apart.
         let has_many = [Layout::ROSBAG, Layout::RECORDING].contains(&scenario.layout);
@@ -125,8 +114,8 @@ fn frames_of(scenario: Scenario) -> Vec<CloudFile> {
                 tick,
             },
         })
-    };
-    all.filter_map(file).collect()
+    })
+    .collect()
 }
 
 /// Readers of the folders that hold single files.
@@ -215,7 +204,6 @@ fn scene_of(path: &Path) -> Option<PathBuf> {
 
 impl CloudFile {
     /// Path of the file.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -235,14 +223,10 @@ impl CloudFile {
             Source::File(sweeps) => sweeps.read(&single_vehicle_id(), &self.path)?,
         };
         let findings = SweepFindings::of(&cloud);
-        let PcdCloud {
-            mut points,
-            dropped,
-            ..
-        } = cloud;
+        let mut points = cloud.points;
         let before = points.len();
         points.xyzi.retain(|&[x, y, z, _]| [x, y, z] != [0.0; 3]);
-        let left_out = dropped + before - points.len();
+        let left_out = cloud.dropped + before - points.len();
         if let Some(fault) = Plausibility::of(&points).fault() {
             let reason = format!("{fault}; a cloud is in the LiDAR frame, in metres");
             return Err(ReadError::malformed(&self.path, reason));

@@ -108,7 +108,6 @@ impl ReadError {
     }
 
     /// The file or folder at fault, if the error concerns one.
-    #[must_use]
     pub fn path(&self) -> Option<&Path> {
         match self {
             Self::Io { path, .. } | Self::Layout { path, .. } | Self::Malformed { path, .. } => {
@@ -119,13 +118,11 @@ impl ReadError {
     }
 
     /// True if the only fault is that the agent has no frame at the tick.
-    #[must_use]
-    pub fn is_absence(&self) -> bool {
+    pub fn is_absent(&self) -> bool {
         matches!(self, Self::Absent { .. })
     }
 
     /// The line at fault, from 1.
-    #[must_use]
     pub fn line(&self) -> Option<u64> {
         match self {
             Self::Malformed { line, .. } => *line,
@@ -134,7 +131,6 @@ impl ReadError {
     }
 
     /// The field at fault.
-    #[must_use]
     pub fn field(&self) -> Option<&str> {
         match self {
             Self::Malformed { field, .. } => field.as_deref(),

@@ -81,14 +81,12 @@ pub enum ApOrder {
 
 impl EvaluationProtocol {
     /// The preset of that name.
-    #[must_use]
     pub fn preset(name: &str) -> Option<Self> {
         preset::preset(name)
     }
 
     /// The rule for a network that covers `area_m`: x, y, z low, then x, y, z high, metres in the ego's LiDAR frame. No
     /// network finds objects outside its area, so the ground-truth range ends there, unless `exact_range` is set.
-    #[must_use]
     pub fn rule_within(&self, area_m: [f64; 6]) -> GroundTruthRule {
         if self.exact_range {
             return self.ground_truth;
@@ -106,7 +104,6 @@ impl EvaluationProtocol {
     }
 
     /// The protocol with the ground-truth rule for a network that covers `area_m`, see [`Self::rule_within`].
-    #[must_use]
     pub fn within(&self, area_m: [f64; 6]) -> Self {
         Self {
             ground_truth: self.rule_within(area_m),
@@ -115,7 +112,6 @@ impl EvaluationProtocol {
     }
 
     /// The scenario with the agents that take part, the ego first; none if no agent is of the requested kind.
-    #[must_use]
     pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {
         let is_unit = |index: &usize| {
             scenario

@@ -101,20 +101,12 @@ pub struct Object {
 impl From<&TrueObject> for Object {
     /// An object of a message; a class of another version is [`ObjectClass::Other`].
     fn from(object: &TrueObject) -> Self {
-        let TrueObject {
-            id,
-            class,
-            world_from_object,
-            size_m,
-            speed_mps,
-        } = object;
-        let class = class.parse().unwrap_or(ObjectClass::Other);
         Self {
-            id: *id,
-            class,
-            world_from_object: *world_from_object,
-            size_m: *size_m,
-            speed_mps: *speed_mps,
+            id: object.id,
+            class: object.class.parse().unwrap_or(ObjectClass::Other),
+            world_from_object: object.world_from_object,
+            size_m: object.size_m,
+            speed_mps: object.speed_mps,
         }
     }
 }
@@ -157,7 +149,6 @@ pub struct Frame {
 
 impl Frame {
     /// Motion of the vehicle, as far as it is recorded.
-    #[must_use]
     pub fn motion(&self) -> EgoMotion {
         EgoMotion {
             speed_mps: self.speed_mps,
@@ -166,7 +157,6 @@ impl Frame {
     }
 
     /// An empty frame.
-    #[must_use]
     pub fn empty(cav: CavId, capture_nanos: u64, source_handedness: Handedness) -> Self {
         Self {
             cav,
@@ -188,7 +178,6 @@ impl Frame {
     }
 
     /// Pose and objects of a message of the ground truth.
-    #[must_use]
     pub fn of_truth(truth: &AgentTruth) -> Self {
         Self {
             world_from_lidar: Some(truth.world_from_lidar),
@@ -198,7 +187,6 @@ impl Frame {
     }
 
     /// The GNSS estimate carried over to the LiDAR by the true mount of the LiDAR on the vehicle.
-    #[must_use]
     pub fn gnss_world_from_lidar(&self) -> Option<Pose> {
         let gnss = self.gnss_world_from_vehicle?.isometry();
         let vehicle_from_lidar = self

@@ -44,7 +44,6 @@ pub struct GroundTruth {
 
 impl GroundTruth {
     /// The ground truth of a tick for an ego, see [`merge`].
-    #[must_use]
     pub fn of_tick(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule) -> Self {
         let ([x_low, x_high], [y_low, y_high]) = (rule.x_m, rule.y_m);
         let ignored = select(
@@ -61,7 +60,6 @@ impl GroundTruth {
     }
 
     /// Boxes of unknown class in an unlimited area: all detections count.
-    #[must_use]
     pub fn of_boxes(boxes: impl IntoIterator<Item = Box3d>) -> Self {
         let of_box = |(box3d, id)| TrueBox {
             id,
@@ -128,7 +126,6 @@ impl GroundTruthRule {
     };
 
     /// True if enough corners lie in range, and all of them in x and y.
-    #[must_use]
     pub fn keeps(&self, box3d: &Box3d) -> bool {
         let corners = box3d.corners();
         let within = |value: f64, [low, high]: [f64; 2]| low <= value && value <= high;
@@ -148,7 +145,6 @@ impl GroundTruthRule {
 ///
 /// `frames_of_tick` are the frames of all agents at the tick, `ego_index` is the ego's index among them. Without a pose
 /// of the ego the result is empty.
-#[must_use]
 pub fn merge(
     frames_of_tick: &[&Frame],
     ego_index: usize,
@@ -161,7 +157,6 @@ pub fn merge(
 }
 
 /// [`merge`] with the annotation that each box is of.
-#[must_use]
 pub fn merged_objects<'a>(
     frames_of_tick: &[&'a Frame],
     ego_index: usize,
@@ -214,26 +209,24 @@ fn select<'a>(
 
 /// The objects that each frame of a tick contributes to the ground truth: those its agent lists. If a frame holds the
 /// cooperative annotation of the tick, it contributes that one, and the others nothing.
-#[must_use]
 pub fn annotations<'a>(frames_of_tick: &[&'a Frame]) -> Vec<&'a [Object]> {
     let holder = frames_of_tick
         .iter()
         .position(|frame| frame.cooperative_objects.is_some());
-    let contribution =
-        |(index, frame): (usize, &&'a Frame)| match (holder, &frame.cooperative_objects) {
-            (None, _) => frame.objects.as_slice(),
-            (Some(holder), Some(objects)) if holder == index => objects.as_slice(),
-            _ => &[],
-        };
     frames_of_tick
         .iter()
         .enumerate()
-        .map(contribution)
+        .map(
+            |(index, frame)| match (holder, &frame.cooperative_objects) {
+                (None, _) => frame.objects.as_slice(),
+                (Some(holder), Some(objects)) if holder == index => objects.as_slice(),
+                _ => &[],
+            },
+        )
         .collect()
 }
 
 /// Indices of the agents whose annotations count: the ego first, then those within range of it.
-#[must_use]
 pub fn contributors(frames_of_tick: &[&Frame], ego_index: usize, comm_range_m: f64) -> Vec<usize> {
     let position = |index: usize| {
         frames_of_tick
@@ -243,15 +236,14 @@ pub fn contributors(frames_of_tick: &[&Frame], ego_index: usize, comm_range_m: f
     let Some(ego) = position(ego_index) else {
         return Vec::new();
     };
-    let in_range = |&index: &usize| {
-        let Some(other) = position(index).filter(|_| index != ego_index) else {
-            return false;
-        };
-        let ([x, y, _], [ego_x, ego_y, _]) = (other.translation_m, ego.translation_m);
-        (x - ego_x).hypot(y - ego_y) <= comm_range_m
-    };
     std::iter::once(ego_index)
-        .chain((0..frames_of_tick.len()).filter(in_range))
+        .chain((0..frames_of_tick.len()).filter(|&index| {
+            let Some(other) = position(index).filter(|_| index != ego_index) else {
+                return false;
+            };
+            let ([x, y, _], [ego_x, ego_y, _]) = (other.translation_m, ego.translation_m);
+            (x - ego_x).hypot(y - ego_y) <= comm_range_m
+        }))
         .collect()
 }
 
@@ -261,7 +253,6 @@ pub fn contributors(frames_of_tick: &[&Frame], ego_index: usize, comm_range_m: f
 /// and width, the height between the faces, and the direction of the four long edges. Those edges are parallel, so the
 /// means are taken here from the rotation directly, which also spares the heading the reference's average of angles
 /// without unwrapping near +-180 degrees.
-#[must_use]
 pub fn upright_box(object: &Object, target_from_world: &Isometry3<f64>) -> Box3d {
     let target_from_object = target_from_world * object.world_from_object.isometry();
     let [forward, left, up] =

@@ -114,8 +114,9 @@ impl<'a> Field<'a> {
             .value
             .as_object()
             .ok_or_else(|| self.expected("a map"))?;
-        let is_given = |value: &&Value| !value.is_null() && value.as_str() != Some("");
-        let found = map.get(key).filter(is_given);
+        let found = map
+            .get(key)
+            .filter(|value| !value.is_null() && value.as_str() != Some(""));
         Ok(found.map(|value| self.child(key, value)))
     }
 

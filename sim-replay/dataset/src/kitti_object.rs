@@ -10,7 +10,7 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
-use super::layouts::{LayoutRow, Reader};
+use super::layout::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::{
     FrameSource, Layout, OpenOptions, Problem, ReadError, Result, Scenario, Tick, classes, files,

@@ -11,7 +11,7 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::faults::Faults;
 use super::kitti_text::{self, Calibration};
-use super::layouts::{LayoutRow, Reader};
+use super::layout::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::{
     FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
@@ -58,18 +58,9 @@ pub(super) fn open(
     let mut scans = scans(&velodyne, problems)?;
     let times = or_without("times", times(dir, &scans, problems), problems);
     let poses = or_without("poses", poses(dir, &scans, problems), problems);
-    keep_those_with(
-        &mut scans,
-        &dir.join("times.txt"),
-        times.as_deref(),
-        problems,
-    );
-    keep_those_with(
-        &mut scans,
-        &poses_path(dir).unwrap_or_default(),
-        poses.as_deref(),
-        problems,
-    );
+    let (of_times, of_poses) = (dir.join("times.txt"), poses_path(dir).unwrap_or_default());
+    keep_those_with(&mut scans, &of_times, times.as_deref(), problems);
+    keep_those_with(&mut scans, &of_poses, poses.as_deref(), problems);
     let capture_nanos = |scan: usize| match &times {
         Some(times) => times.get(scan).copied().flatten().unwrap_or_default(),
         None => options.period_nanos.saturating_mul(scan as u64),
@@ -163,10 +154,8 @@ fn keep_those_with<T>(
     scans.retain(|(scan, _)| match rows.get(*scan) {
         Some(row) => row.is_some(),
         None => {
-            faults.push(ReadError::malformed(
-                path,
-                format!("no line for scan {scan}: there are {}", rows.len()),
-            ));
+            let reason = format!("no line for scan {scan}: there are {}", rows.len());
+            faults.push(ReadError::malformed(path, reason));
             false
         }
     });
@@ -212,17 +201,18 @@ fn poses_path(dir: &Path) -> Option<PathBuf> {
         .map(|name| dir.join(name))
         .into_iter()
         .find(|path| path.is_file());
-    let common = |dir: PathBuf| {
-        let name = dir.file_name()?.to_str()?;
-        Some(
-            dir.parent()?
-                .parent()?
-                .join("poses")
-                .join(format!("{name}.txt")),
-        )
-        .filter(|path| path.is_file())
-    };
-    beside.or_else(|| files::names_of(dir).find_map(common))
+    beside.or_else(|| {
+        files::names_of(dir).find_map(|dir| {
+            let name = dir.file_name()?.to_str()?;
+            Some(
+                dir.parent()?
+                    .parent()?
+                    .join("poses")
+                    .join(format!("{name}.txt")),
+            )
+            .filter(|path| path.is_file())
+        })
+    })
 }
 
 fn poses(
@@ -258,12 +248,8 @@ fn times(
     let times = of_lines(&path, scans, problems, |line, text| {
         let [seconds] = kitti_text::numbers(&path, line, None, text)?;
         if !(0.0..=1e9).contains(&seconds) {
-            return Err(kitti_text::malformed(
-                &path,
-                line,
-                None,
-                format!("{seconds} s, expected 0 to 1e9"),
-            ));
+            let reason = format!("{seconds} s, expected 0 to 1e9");
+            return Err(kitti_text::malformed(&path, line, None, reason));
         }
         Ok(rounding::to_u64(seconds * 1e9))
     })?;

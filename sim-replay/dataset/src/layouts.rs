@@ -1,51 +1,13 @@
 //! Table of the supported layouts: name, data sets, the files that identify them, and their readers. Messages and
 //! `--help` use it, and a folder is opened by it.
 
-use std::fmt;
 use std::fmt::Write;
-use std::path::Path;
 
-use serde::{Serialize, Serializer};
-
+use crate::layout::{Layout, LayoutRow};
 use crate::{
-    Dataset, OpenOptions, ReadError, Result, Scenario, cloud_sequence, dair, kitti_object,
-    kitti_odometry, localization, nuscenes, opv2v_family, recorded, rosbag,
+    cloud_sequence, dair, kitti_object, kitti_odometry, localization, nuscenes, opv2v_family,
+    recorded, rosbag,
 };
-
-/// A layout of files on disk: its row of the table.
-#[derive(Clone, Copy)]
-pub struct Layout(pub(crate) &'static LayoutRow);
-
-/// Row of a layout, in the file of its reader.
-#[derive(Debug)]
-pub struct LayoutRow {
-    /// Its name in files of results.
-    pub(crate) key: &'static str,
-    /// Its name in messages and tables.
-    pub name: &'static str,
-    /// The data sets that are published in it.
-    pub data_sets: &'static str,
-    /// The files that identify it, relative to a scenario's folder or the root of the data set.
-    pub files: &'static str,
-    /// Name of the evaluation protocol that is the default for it.
-    pub(crate) protocol: &'static str,
-    /// Its reader; `None`: that of the row before, which detects both.
-    pub(crate) reader: Option<Reader>,
-}
-
-/// Reader of one or several layouts.
-#[derive(Debug)]
-pub(crate) enum Reader {
-    /// Opens the data sets at or below a folder; `Ok(None)` where there are none.
-    DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>>),
-    /// Opens sequences of a single vehicle, one at a time.
-    Sequence {
-        /// True for the folder of a sequence.
-        is_one: fn(&Path) -> bool,
-        /// Opens it; its name is relative to the first path.
-        open: fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
-    },
-}
 
 /// All layouts, in the order in which they are tried on a folder: data sets before sequences.
 pub static LAYOUTS: [&LayoutRow; 15] = [
@@ -95,53 +57,20 @@ impl Layout {
     pub const RECORDING: Self = Self(&recorded::RECORDING);
     /// A bag of ROS 2.
     pub const ROSBAG: Self = Self(&rosbag::ROSBAG);
-
-    /// Its name in messages and tables.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        self.0.name
-    }
-}
-
-impl PartialEq for Layout {
-    fn eq(&self, other: &Self) -> bool {
-        self.0.key == other.0.key
-    }
-}
-
-impl Eq for Layout {}
-
-impl fmt::Debug for Layout {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.0.key)
-    }
-}
-
-impl Serialize for Layout {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(self.0.key)
-    }
 }
 
 /// One line per layout: name, data sets in brackets, and the files that identify it.
-#[must_use]
 pub fn layouts_text() -> String {
     text_of(&LAYOUTS)
 }
 
 pub(crate) fn text_of(layouts: &[&LayoutRow]) -> String {
     let mut text = String::new();
-    for LayoutRow {
-        name,
-        data_sets,
-        files,
-        ..
-    } in layouts
-    {
-        let data_sets = if name == data_sets {
-            String::new()
-        } else {
-            format!(" ({data_sets})")
+    for row in layouts {
+        let (name, files) = (row.name, row.files);
+        let data_sets = match row.data_sets {
+            own if own == name => String::new(),
+            data_sets => format!(" ({data_sets})"),
         };
         // Writing to a String does not fail.
         let _ = writeln!(text, "  {name}{data_sets}: {files}");

@@ -110,7 +110,6 @@ impl LeftOut {
     }
 
     /// True if nothing was lost. Absent agents are no loss.
-    #[must_use]
     pub fn is_nothing(&self) -> bool {
         self.ticks + self.frames + self.parts + self.failed + self.files == 0
     }
@@ -121,7 +120,6 @@ impl LeftOut {
     }
 
     /// [`reasons`] of the findings.
-    #[must_use]
     pub fn reasons(&self) -> String {
         reasons(&self.problems)
     }

@@ -49,6 +49,7 @@ mod json_table;
 mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
+mod layout;
 mod layouts;
 mod left_out;
 mod listing;
@@ -58,6 +59,7 @@ mod npy;
 mod numpy_tags;
 mod nuscenes;
 mod open;
+mod options;
 mod opv2v;
 mod opv2v_family;
 pub mod overlap;
@@ -88,10 +90,12 @@ use serde::Serialize;
 
 pub use error::ReadError;
 pub use generated_map::GeneratedMap;
-pub use layouts::{LAYOUTS, Layout, LayoutRow, layouts_text};
+pub use layout::{Layout, LayoutRow};
+pub use layouts::{LAYOUTS, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::{content_sha256, provenance};
-pub use open::{OpenOptions, open, open_with};
+pub use open::{open, open_with};
+pub use options::OpenOptions;
 pub use points::{
     IntensityOption, IntensityScale, IntensityScaleError, LiveIntensities, Plausibility,
 };
@@ -103,7 +107,7 @@ pub use unfinished::UNFINISHED;
 use crate::error::Result;
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
-use presence::Absences;
+use presence::AbsentFrames;
 
 /// A dataset, or the part of one that was opened.
 #[derive(Debug)]
@@ -180,7 +184,7 @@ pub struct Scenario {
     pub joins: Vec<String>,
     /// Agents whose recorded motion contradicts their recorded poses: it is not used.
     contradicted: BTreeSet<CavId>,
-    absences: Absences,
+    absent_at: AbsentFrames,
     source: Arc<dyn FrameSource>,
 }
 
@@ -208,7 +212,6 @@ impl Default for LoadOptions {
 
 impl LoadOptions {
     /// Poses, motion and objects only.
-    #[must_use]
     pub const fn without_points() -> Self {
         Self {
             lidar_variant: None,
@@ -294,7 +297,7 @@ impl Scenario {
             source_handedness: Handedness::Right,
             joins: Vec::new(),
             contradicted: BTreeSet::new(),
-            absences: Absences::default(),
+            absent_at: AbsentFrames::default(),
             source,
         }
     }

@@ -32,7 +32,6 @@ pub fn provenance<'a>(
 ///
 /// `variant` names the variant of the sweeps, see [`Scenario::lidar_variants`]. A file that cannot be read counts as
 /// such: its reader reports it. Every file is read once, on all cores: a gigabyte takes about a second.
-#[must_use]
 pub fn content_sha256<'a>(
     scenarios: impl IntoIterator<Item = &'a Scenario>,
     variant: Option<&str>,
@@ -129,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_went_missing_changes_the_hash() {
+    fn a_missing_file_changes_the_hash() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = scene(folder.path(), b"points");
         let whole = sha256(&dataset);

@@ -24,7 +24,7 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::hdf5_poses::{self, RowOrder};
 use super::kitti_text::{lines, numbers};
-use super::layouts::{LayoutRow, Reader};
+use super::layout::{LayoutRow, Reader};
 use super::nclt_ground_truth::{self, GroundTruth};
 use super::points::{SweepStorage, Sweeps};
 use super::{
@@ -122,10 +122,8 @@ pub(super) fn open(
             Ok(micros) => drop(stamps.insert(micros, stem.to_owned())),
             Err(_) => {
                 let path = points_dir.join(format!("{stem}.bin"));
-                problems.push(ReadError::malformed(
-                    &path,
-                    format!("{stem:?} is no time in microseconds: left out"),
-                ));
+                let reason = format!("{stem:?} is no time in microseconds: left out");
+                problems.push(ReadError::malformed(&path, reason));
             }
         }
     }
@@ -136,18 +134,14 @@ pub(super) fn open(
     if let Some(poses) = &poses {
         for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
             let path = points_dir.join(format!("{micros}.bin"));
-            problems.push(ReadError::malformed(
-                &path,
-                "does not exist, but there is a pose for it: left out",
-            ));
+            let reason = "does not exist, but there is a pose for it: left out";
+            problems.push(ReadError::malformed(&path, reason));
         }
         let before = stamps.len();
         stamps.retain(|micros, _| poses.contains_key(micros));
         if stamps.is_empty() && before > 0 {
-            problems.push(ReadError::malformed(
-                dir,
-                format!("none of {before} sweeps has a pose: all left out"),
-            ));
+            let reason = format!("none of {before} sweeps has a pose: all left out");
+            problems.push(ReadError::malformed(dir, reason));
         }
     }
     let tick = |(micros, stem): (u64, String)| Tick::new(stem, micros.saturating_mul(1000));
@@ -219,18 +213,14 @@ fn poses_as_stored(
     let is_nclt = storage != Storage::Oxford;
     let aligned = dir.join(ALIGNED_POSES);
     if aligned.is_file() {
-        return Ok(Some((
-            "QEOxford",
-            hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?,
-        )));
+        let poses = hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?;
+        return Ok(Some(("QEOxford", poses)));
     }
     let plain = dir.join(PLAIN_POSES);
     if plain.is_file() {
         let scene = if is_nclt { "NCLT" } else { "Oxford" };
-        return Ok(Some((
-            scene,
-            hdf5_poses::read(&plain, RowOrder::Matrix, problems)?,
-        )));
+        let poses = hdf5_poses::read(&plain, RowOrder::Matrix, problems)?;
+        return Ok(Some((scene, poses)));
     }
     let Some(path) = is_nclt
         .then(|| nclt_ground_truth::find(dir, &own_name(dir)))
@@ -282,12 +272,8 @@ fn first_row(path: &Path) -> Result<[f64; 3]> {
         }
         (first, _) => {
             let all: Vec<String> = lines.into_iter().map(|(_, text)| text).collect();
-            numbers(
-                path,
-                first.map_or(1, |(line, _)| line),
-                None,
-                &all.join(" "),
-            )
+            let line = first.map_or(1, |(line, _)| line);
+            numbers(path, line, None, &all.join(" "))
         }
     }
 }

@@ -180,8 +180,9 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
     let is_number = |(_, scalar): &(String, Scalar)| scalar.kind != ScalarKind::Padding;
     let find = |names: &[&str]| {
         let index = names.iter().find_map(|name| {
-            let is_it = |field| is_number(field) && field.0.eq_ignore_ascii_case(name);
-            fields.iter().position(is_it)
+            fields
+                .iter()
+                .position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name))
         })?;
         let (name, scalar) = fields.get(index)?;
         Some((name.clone(), (size_of(fields.get(..index)?), *scalar)))
@@ -218,12 +219,11 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
         _ => return Err(fault()),
     };
     let (column_step, point_step) = if is_planar { (count, 1) } else { (1, columns) };
-    let place = |column: usize| {
-        let first = column.checked_mul(column_step)?.checked_mul(scalar.size)?;
-        (column < columns).then_some((first, scalar))
-    };
     Ok(Columns {
-        places: [0, 1, 2, 3].map(place),
+        places: [0, 1, 2, 3].map(|column: usize| {
+            let first = column.checked_mul(column_step)?.checked_mul(scalar.size)?;
+            (column < columns).then_some((first, scalar))
+        }),
         step: point_step * scalar.size,
         points: count,
         intensity: None,

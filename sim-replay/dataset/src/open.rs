@@ -2,37 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use super::layouts::{LAYOUTS, LayoutRow, Reader};
-use super::points::IntensityScale;
-use super::problem::listed;
+use super::layout::{LayoutRow, Reader, opened};
+use super::layouts::LAYOUTS;
 use super::{
-    Dataset, ReadError, Result, Scenario, agent_folders, files, layouts_text, recorded_motion,
-    roots, unfinished,
+    Dataset, OpenOptions, ReadError, Result, Scenario, agent_folders, files, layouts_text,
+    recorded_motion, roots, unfinished,
 };
 
 /// Depth below the opened folder to which sequences of a single vehicle are searched.
 const SEQUENCE_DEPTH: usize = 2;
 /// Mount points of file systems that are not searched.
 const KERNEL_FOLDERS: [&str; 2] = ["/proc", "/sys"];
-
-/// Properties that a data set does not record itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct OpenOptions {
-    /// Time from one stored frame to the next if neither time stamps nor the length of a simulator's tick are recorded,
-    /// nanoseconds. The data sets of the OPV2V family store ten frames a second.
-    pub period_nanos: u64,
-    /// Divisor of the intensities of LiDAR sweeps.
-    pub intensity_scale: IntensityScale,
-}
-
-impl Default for OpenOptions {
-    fn default() -> Self {
-        Self {
-            period_nanos: 100_000_000,
-            intensity_scale: IntensityScale::AUTO,
-        }
-    }
-}
 
 /// Opens the data set, split, scenario or sequence in `dir`, or a recording; the layout is detected.
 ///
@@ -120,37 +100,6 @@ fn open_sequences(
         None => {}
     }
     Ok(())
-}
-
-/// The data set of some scenarios; `None` where there are neither these nor problems.
-///
-/// # Errors
-/// The problems, if they left no scenario.
-pub(super) fn opened(
-    dir: &Path,
-    scenarios: Vec<Scenario>,
-    problems: Vec<ReadError>,
-) -> Result<Option<Dataset>> {
-    match scenarios.first().map(|scenario| scenario.layout) {
-        Some(layout) => Ok(Some(Dataset {
-            layout,
-            scenarios,
-            problems,
-        })),
-        None if problems.is_empty() => Ok(None),
-        None => Err(nothing_opened(dir, problems)),
-    }
-}
-
-/// The only fault, or all of them, or an unknown layout.
-fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
-    match problems.len() {
-        1 => problems.swap_remove(0),
-        _ => ReadError::Layout {
-            path: dir.to_owned(),
-            reason: format!("nothing can be opened: {}", listed(&problems)),
-        },
-    }
 }
 
 fn unknown(dir: &Path) -> ReadError {

@@ -5,7 +5,7 @@
 
 use std::path::PathBuf;
 
-use protocol::{CavId, EgoMotion, Handedness, InvalidPose, Pose};
+use protocol::{CavId, Handedness, InvalidPose, Pose};
 
 use super::agent_folders::ScenarioFolder;
 use super::annotations::Annotations;
@@ -107,17 +107,14 @@ impl Opv2v {
             .map(|field| pose(&field))
             .transpose()?;
         let mut annotations = Annotations::new(root);
-        let EgoMotion {
-            speed_mps,
-            yaw_rate_rad_s,
-        } = annotations.motion(self.handedness);
+        let motion = annotations.motion(self.handedness);
         Ok(Frame {
             world_from_lidar,
             world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
             gnss_world_from_vehicle: annotations
                 .optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
-            speed_mps,
-            yaw_rate_rad_s,
+            speed_mps: motion.speed_mps,
+            yaw_rate_rad_s: motion.yaw_rate_rad_s,
             objects: annotations.objects(|id, _| Ok(id), |place| self.world_from(place)),
             problems: annotations.into_problems(),
             ..Frame::empty(agent.clone(), tick.capture_nanos, self.handedness)

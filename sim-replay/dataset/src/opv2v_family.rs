@@ -7,10 +7,10 @@ use std::sync::Arc;
 use protocol::Handedness;
 
 use super::agent_folders::{self, ScenarioFolder};
-use super::layouts::{LayoutRow, Reader};
-use super::open::{OpenOptions, opened};
+use super::layout::{LayoutRow, Reader, opened};
+use super::options::OpenOptions;
 use super::opv2v::Opv2v;
-use super::presence::Absences;
+use super::presence::AbsentFrames;
 use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
@@ -98,7 +98,7 @@ fn agent_folder_scenario(
     };
     let ticks = moments.iter().filter(|tick| !ego_lacks(tick));
     let ticks: Vec<Tick> = ticks.cloned().collect();
-    let absences = Absences::new(&agents, &ticks, &missing).among(moments);
+    let absent_at = AbsentFrames::new(&agents, &ticks, &missing).among(moments);
     let name = files::name_below(root, &folder.dir);
     let (lidar_variants, has_radar) = (folder.variants.clone(), folder.has_radar);
     let (cameras, source): (_, Arc<dyn FrameSource>) = match layout == Layout::V2V4REAL {
@@ -114,7 +114,7 @@ fn agent_folder_scenario(
         }
     };
     Scenario {
-        absences,
+        absent_at,
         missing,
         lidar_variants,
         has_radar,

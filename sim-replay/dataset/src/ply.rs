@@ -111,8 +111,9 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
         match *words {
             ["format", name, _] => storage = Some((name.to_owned(), number)),
             ["element", name, count] => {
-                let no_count = |_| fault(format!("{count:?} is no number of elements"));
-                let count = count.parse().map_err(no_count)?;
+                let count = count
+                    .parse()
+                    .map_err(|_| fault(format!("{count:?} is no number of elements")))?;
                 elements.push(Element {
                     name: name.to_owned(),
                     count,
@@ -125,8 +126,8 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
                 element.list.get_or_insert_with(|| name.to_owned());
             }
             ["property", kind, name] => {
-                let no_type = || fault(format!("{kind:?} is no type of a number"));
-                let scalar = scalar_of(kind).ok_or_else(no_type)?;
+                let scalar = scalar_of(kind)
+                    .ok_or_else(|| fault(format!("{kind:?} is no type of a number")))?;
                 let element = elements.last_mut().ok_or_else(too_early)?;
                 if element.properties.len() >= MAX_PROPERTIES {
                     return Err(fault(format!("more than {MAX_PROPERTIES} properties")));

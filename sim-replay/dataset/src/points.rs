@@ -51,7 +51,7 @@ struct AgentSweeps {
     form: OnceLock<Result<FloatForm, String>>,
     divisor: OnceLock<f32>,
     /// Set once the missing intensities have been reported.
-    is_told: OnceLock<()>,
+    is_reported: OnceLock<()>,
 }
 
 impl Sweeps {
@@ -108,7 +108,7 @@ impl Sweeps {
         let agent = self.agents.get(agent).unwrap_or(&unknown);
         let mut cloud = agent.read_stored(self.storage, path)?;
         if cloud.intensity.is_none() {
-            agent.is_told.get_or_init(|| {
+            agent.is_reported.get_or_init(|| {
                 tracing::warn!("{} (possibly others too): {NO_INTENSITY}", path.display())
             });
         }
@@ -206,6 +206,14 @@ impl FileKind {
     }
 }
 
+/// Files of points directly in a folder, in natural order.
+pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>> {
+    let mut names = files::list(dir)?.files;
+    names.sort_by(|first, second| files::natural_order(first, second));
+    let paths = names.into_iter().map(|name| dir.join(name));
+    Ok(paths.filter(|path| FileKind::of(path).is_ok()).collect())
+}
+
 fn read_described(
     path: &Path,
     decode: impl FnOnce(&[u8]) -> Result<PcdCloud, String>,
@@ -248,9 +256,9 @@ fn nclt_raw(bytes: &[u8]) -> Result<PcdCloud, String> {
     const OFFSET_M: f64 = -100.0;
     check_whole_points(bytes.len(), 8)?;
     let (points, _) = bytes.as_chunks::<8>();
-    let metres = |bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32;
     let point = |&[x0, x1, y0, y1, z0, z1, intensity, _laser]: &[u8; 8]| {
-        let [x, y, z] = [[x0, x1], [y0, y1], [z0, z1]].map(metres);
+        let [x, y, z] = [[x0, x1], [y0, y1], [z0, z1]]
+            .map(|bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32);
         [x, y, z, f32::from(intensity)]
     };
     let origin = IntensityOrigin::stored("7th byte", IntensityKind::Byte);

@@ -7,7 +7,6 @@ const FRAMES_TO_TRY: usize = 10;
 
 impl Scenario {
     /// True if the recording gives the pose of an agent's LiDAR, according to the first readable frame from `tick` on.
-    #[must_use]
     pub fn has_poses(&self, agent: usize, tick: usize) -> bool {
         let blind = LoadOptions::without_points();
         let ticks = (tick..self.ticks.len()).take(FRAMES_TO_TRY);

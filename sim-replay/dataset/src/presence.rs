@@ -10,14 +10,14 @@ use crate::frame::Frame;
 
 /// Absent agents by tick, and the capture times of all agents.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Absences {
+pub(super) struct AbsentFrames {
     /// Pairs of agent and tick, by their indices, that have no frame.
     pairs: Arc<HashSet<(usize, usize)>>,
     /// Capture times at which any agent has a frame, in order; none if they are the ticks.
     moments: Option<Arc<Vec<Tick>>>,
 }
 
-impl Absences {
+impl AbsentFrames {
     /// The missing frames of `agents` at `ticks`; other missing frames are ignored.
     pub(super) fn new(agents: &[CavId], ticks: &[Tick], missing: &[MissingFrame]) -> Self {
         let agents: HashMap<&CavId, usize> = agents
@@ -62,9 +62,8 @@ pub struct LoadedTick {
 
 impl Scenario {
     /// True if an agent has a frame at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
-    #[must_use]
     pub fn is_present(&self, agent_index: usize, tick_index: usize) -> bool {
-        !self.absences.pairs.contains(&(agent_index, tick_index))
+        !self.absent_at.pairs.contains(&(agent_index, tick_index))
     }
 
     /// Indices of the agents that have a frame at a tick, the ego first.
@@ -74,7 +73,6 @@ impl Scenario {
 
     /// The scenario with some of its agents (indices), the first as the ego: its ticks are those at which that one has
     /// a frame.
-    #[must_use]
     pub(crate) fn arranged(&self, order: &[usize]) -> Self {
         let agents: Vec<CavId> = order
             .iter()
@@ -86,12 +84,12 @@ impl Scenario {
             .filter(|frame| Some(&frame.agent) == agents.first())
             .map(|frame| frame.stem.as_str())
             .collect();
-        let moments = self.absences.moments.as_deref().unwrap_or(&self.ticks);
+        let moments = self.absent_at.moments.as_deref().unwrap_or(&self.ticks);
         let is_tick = |tick: &&Tick| !lacking.contains(tick.stem.as_str());
         let ticks: Vec<Tick> = moments.iter().filter(is_tick).cloned().collect();
-        let absences = Absences {
-            moments: self.absences.moments.clone(),
-            ..Absences::new(&agents, &ticks, &missing)
+        let absent_at = AbsentFrames {
+            moments: self.absent_at.moments.clone(),
+            ..AbsentFrames::new(&agents, &ticks, &missing)
         };
         let roadside_units = self
             .roadside_units
@@ -103,16 +101,15 @@ impl Scenario {
             agents,
             ticks,
             missing,
-            absences,
+            absent_at,
             roadside_units,
             ..self.clone()
         }
     }
 
     /// Number of missing frames of agents other than the ego at its ticks.
-    #[must_use]
     pub fn absent_frames(&self) -> usize {
-        self.absences
+        self.absent_at
             .pairs
             .iter()
             .filter(|(_, tick)| *tick < self.ticks.len())
@@ -130,7 +127,7 @@ impl Scenario {
         for agent in agents {
             match self.load(agent, tick_index, options) {
                 Ok(frame) => loaded.frames.push((agent, frame)),
-                Err(error) if error.is_absence() => loaded.absent += 1,
+                Err(error) if error.is_absent() => loaded.absent += 1,
                 Err(error) => loaded.unreadable.push((agent, Problem::from(&error))),
             }
         }
@@ -183,7 +180,7 @@ mod tests {
         );
         assert!(loaded.unreadable.is_empty());
         let error = scenario.load(1, 9, &LoadOptions::default()).unwrap_err();
-        assert!(error.is_absence());
+        assert!(error.is_absent());
         assert!(
             error
                 .to_string()

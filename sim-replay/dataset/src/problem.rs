@@ -38,7 +38,6 @@ pub(crate) fn listed<P: Display>(problems: impl IntoIterator<Item = P>) -> Strin
 }
 
 /// The first faults in brackets, for an error about data of which nothing is left; empty without any.
-#[must_use]
 pub fn reasons<P: Display>(problems: impl IntoIterator<Item = P>) -> String {
     match listed(problems) {
         text if text.is_empty() => text,

@@ -5,12 +5,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use protocol::{
-    CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth,
-    wire,
+    CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stream, Topic, Truth, wire,
 };
 
-use super::layouts::{LayoutRow, Reader};
-use super::presence::Absences;
+use super::layout::{LayoutRow, Reader};
+use super::presence::AbsentFrames;
 use super::{
     CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result,
     Scenario, Tick,
@@ -33,7 +32,6 @@ pub(crate) static RECORDING: LayoutRow = LayoutRow {
 const IN_RUN_FOLDER: &str = "recording.mcap";
 
 /// The recording that `path` names: the file itself, or that of a run folder. A file of another program looks alike.
-#[must_use]
 pub fn recording_of(path: &Path) -> Option<PathBuf> {
     let is_recording =
         |file: &Path| file.is_file() && file.extension().is_some_and(|kind| kind == "mcap");
@@ -69,7 +67,7 @@ fn open(file: &Path, recording: Recording) -> Result<Dataset> {
     let (ticks, missing) = source.ticks();
     let mut streams = source.sensors.keys().map(|(_, _, stream)| *stream);
     let scenario = Scenario {
-        absences: Absences::new(&agents, &ticks, &missing),
+        absent_at: AbsentFrames::new(&agents, &ticks, &missing),
         cameras: source.cameras(),
         has_radar: streams.any(|stream| stream == Stream::Radar),
         missing,
@@ -98,11 +96,8 @@ impl Recorded {
         let mut sensors = BTreeMap::new();
         let (mut truth, mut first_epochs, mut duplicates) = (BTreeMap::new(), BTreeMap::new(), 0);
         for entry in recording.entries() {
-            let Stamp {
-                capture_nanos,
-                epoch,
-                ..
-            } = entry.header.stamp;
+            let stamp = &entry.header.stamp;
+            let (capture_nanos, epoch) = (stamp.capture_nanos, stamp.epoch);
             match &entry.key.topic {
                 Topic::Stream {
                     cav,

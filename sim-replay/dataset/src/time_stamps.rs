@@ -37,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_numbers_of_a_file_tell_the_unit() {
+    fn the_numbers_of_a_file_determine_the_unit() {
         let read = |stamps: &[f64]| {
             let unit = micros_per_unit(stamps.iter().copied());
             stamps

@@ -17,11 +17,8 @@ pub(super) fn report(dir: &Path, dataset: &mut Dataset) {
         .chain(scenarios)
         .filter(|mark| mark.is_file())
         .collect();
-    let problem = |mark: PathBuf| {
-        ReadError::malformed(
-            &mark,
-            "the run that wrote this folder did not end: frames may be missing or cut off",
-        )
-    };
-    dataset.problems.extend(marks.into_iter().map(problem));
+    dataset.problems.extend(marks.into_iter().map(|mark| {
+        let reason = "the run that wrote this folder did not end: frames may be missing or cut off";
+        ReadError::malformed(&mark, reason)
+    }));
 }

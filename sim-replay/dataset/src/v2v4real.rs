@@ -5,7 +5,7 @@
 
 use std::path::PathBuf;
 
-use protocol::{CavId, EgoMotion, Handedness, Pose};
+use protocol::{CavId, Handedness, Pose};
 
 use super::agent_folders::ScenarioFolder;
 use super::annotations::Annotations;
@@ -66,17 +66,14 @@ impl V2v4Real {
                 pose.validate().map(|()| pose)
             },
         );
-        let EgoMotion {
-            speed_mps,
-            yaw_rate_rad_s,
-        } = annotations.motion(Handedness::Right);
+        let motion = annotations.motion(Handedness::Right);
         Ok(Frame {
             world_from_lidar: Some(world_from_lidar),
             world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
             gnss_world_from_vehicle: annotations
                 .optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
-            speed_mps,
-            yaw_rate_rad_s,
+            speed_mps: motion.speed_mps,
+            yaw_rate_rad_s: motion.yaw_rate_rad_s,
             objects,
             problems: annotations.into_problems(),
             ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right)

@@ -21,10 +21,8 @@ pub(super) struct Chance {
 
 impl Chance {
     pub(super) fn new(seed: u64, from: &CavId, to: &CavId) -> Self {
-        let letters =
-            |cav: &CavId| derive_seed(0, &cav.as_str().bytes().map(u64::from).collect::<Vec<_>>());
         Self {
-            seed: derive_seed(seed, &[letters(from), letters(to)]),
+            seed: derive_seed(seed, &[from, to].map(|cav| label(cav.as_str()))),
         }
     }
 
@@ -32,4 +30,9 @@ impl Chance {
     pub(super) fn of(self, purpose: Purpose, stream: u64, sequence: u64) -> SplitMix64 {
         SplitMix64::derived(self.seed, &[purpose as u64, stream, sequence])
     }
+}
+
+/// A number for a name that does not depend on the order in which names are listed.
+pub(super) fn label(name: &str) -> u64 {
+    derive_seed(0, &name.bytes().map(u64::from).collect::<Vec<_>>())
 }

@@ -69,7 +69,6 @@ pub enum CapacityConfig {
 
 impl CapacityConfig {
     /// A rate without bursts, Mbit/s; infinite: unlimited.
-    #[must_use]
     pub fn of_mbps(bandwidth_mbps: f64) -> Self {
         match bandwidth_mbps == f64::INFINITY {
             true => Self::Unlimited,

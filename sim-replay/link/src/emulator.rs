@@ -1,41 +1,19 @@
 //! Link emulator: all links of a scene.
 
-use std::cmp::Reverse;
-use std::collections::{BTreeMap, BinaryHeap};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use protocol::{CavId, DropReason, Stream};
 
 use super::capacity::Capacity;
-use super::chance::{Chance, Purpose};
+use super::chance::{Chance, Purpose, label};
 use super::config::{CapacityConfig, LinkConfig, LinkError, Medium};
 use super::device_clock::DeviceClock;
 use super::loss::{LossState, SentMessage};
+use super::packet::Packet;
 use super::queue_server::{Departure, QueueServer, Rules};
 use super::trace::Trace;
 use support::nanos;
-use support::random::derive_seed;
-
-/// A message as seen by the link.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Packet {
-    /// The caller's id; not used by the emulator.
-    pub id: u64,
-    /// Sender.
-    pub from: CavId,
-    /// Receiver.
-    pub to: CavId,
-    /// Stream of the sender.
-    pub stream: Stream,
-    /// Sequence number in the stream.
-    pub sequence: u64,
-    /// Bytes on the wire, headers included.
-    pub bytes: u64,
-    /// Time at which it is submitted, nanoseconds since the beginning of the scene.
-    pub submitted_nanos: u64,
-    /// Distance between sender and receiver at that time, metres.
-    pub distance_m: f64,
-}
 
 /// Result for a packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,7 +49,8 @@ pub struct LinkEmulator {
     seed: u64,
     lines: BTreeMap<Option<(CavId, CavId)>, QueueServer>,
     directions: BTreeMap<(CavId, CavId), Direction>,
-    under_way: BinaryHeap<Reverse<UnderWay>>,
+    /// Future outcomes, by time and number.
+    under_way: BTreeMap<(u64, u64), Outcome>,
     outcomes: Vec<Outcome>,
     now_nanos: u64,
     /// Number of the next outcome, which orders outcomes of the same time.
@@ -85,35 +64,6 @@ struct Direction {
     loss: LossState,
     /// Latest arrival by stream, nanoseconds.
     latest_nanos: BTreeMap<Stream, u64>,
-}
-
-/// A future outcome.
-#[derive(Debug)]
-struct UnderWay {
-    nanos: u64,
-    number: u64,
-    packet: Packet,
-    delivery: Delivery,
-}
-
-impl PartialEq for UnderWay {
-    fn eq(&self, other: &Self) -> bool {
-        (self.nanos, self.number) == (other.nanos, other.number)
-    }
-}
-
-impl Eq for UnderWay {}
-
-impl PartialOrd for UnderWay {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl Ord for UnderWay {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        (self.nanos, self.number).cmp(&(other.nanos, other.number))
-    }
 }
 
 impl LinkEmulator {
@@ -141,7 +91,7 @@ impl LinkEmulator {
             seed,
             lines: BTreeMap::new(),
             directions: BTreeMap::new(),
-            under_way: BinaryHeap::new(),
+            under_way: BTreeMap::new(),
             outcomes: Vec::new(),
             now_nanos: 0,
             next: 0,
@@ -185,10 +135,7 @@ impl LinkEmulator {
             .values()
             .filter_map(|line| line.next_nanos(&rules));
         let known = self.outcomes.first().map(|outcome| outcome.nanos);
-        let ahead = self
-            .under_way
-            .peek()
-            .map(|Reverse(under_way)| under_way.nanos);
+        let ahead = self.under_way.keys().next().map(|(nanos, _)| *nanos);
         sent.chain(known).chain(ahead).min()
     }
 
@@ -215,25 +162,10 @@ impl LinkEmulator {
     }
 
     fn collect(&mut self, until_nanos: u64) {
-        while self
-            .under_way
-            .peek()
-            .is_some_and(|Reverse(under_way)| under_way.nanos <= until_nanos)
+        while let Some(first) = self.under_way.first_entry()
+            && first.get().nanos <= until_nanos
         {
-            let Some(Reverse(UnderWay {
-                nanos,
-                packet,
-                delivery,
-                ..
-            })) = self.under_way.pop()
-            else {
-                return;
-            };
-            self.outcomes.push(Outcome {
-                nanos,
-                packet,
-                delivery,
-            });
+            self.outcomes.push(first.remove());
         }
     }
 
@@ -268,7 +200,7 @@ impl LinkEmulator {
                 loss: LossState::default(),
                 latest_nanos: BTreeMap::new(),
             });
-        let stream = label(packet.stream);
+        let stream = label(&packet.stream.to_string());
         let random = |purpose| direction.chance.of(purpose, stream, packet.sequence);
         let message = SentMessage {
             bytes: packet.bytes,
@@ -307,44 +239,30 @@ impl LinkEmulator {
             arrival_nanos = arrival_nanos.saturating_add(nanos::of_ms(reorder.extra_ms));
         }
         let mut twice = random(Purpose::Duplicate);
-        if config.duplicate > 0.0 && twice.chance(config.duplicate) {
-            let again_nanos = config.latency.draw(&mut twice, trace.as_ref(), &message);
-            let copy_nanos = arrival_nanos.saturating_add(again_nanos);
-            self.schedule(
-                arrival_nanos,
-                packet.clone(),
-                Delivery::Arrived {
-                    is_copy: false,
-                    is_repeated: true,
-                },
-            );
-            self.schedule(
-                copy_nanos,
-                packet,
-                Delivery::Arrived {
-                    is_copy: true,
-                    is_repeated: false,
-                },
-            );
-            return;
-        }
-        self.schedule(
-            arrival_nanos,
-            packet,
-            Delivery::Arrived {
-                is_copy: false,
+        let is_repeated = config.duplicate > 0.0 && twice.chance(config.duplicate);
+        let again_nanos =
+            is_repeated.then(|| config.latency.draw(&mut twice, trace.as_ref(), &message));
+        let first = Delivery::Arrived {
+            is_copy: false,
+            is_repeated,
+        };
+        self.schedule(arrival_nanos, packet.clone(), first);
+        if let Some(again_nanos) = again_nanos {
+            let copy = Delivery::Arrived {
+                is_copy: true,
                 is_repeated: false,
-            },
-        );
+            };
+            self.schedule(arrival_nanos.saturating_add(again_nanos), packet, copy);
+        }
     }
 
     fn schedule(&mut self, nanos: u64, packet: Packet, delivery: Delivery) {
-        self.under_way.push(Reverse(UnderWay {
+        let outcome = Outcome {
             nanos,
-            number: self.next,
             packet,
             delivery,
-        }));
+        };
+        self.under_way.insert((nanos, self.next), outcome);
         self.next += 1;
     }
 }
@@ -378,18 +296,6 @@ fn rules<'a>(config: &'a LinkConfig, capacity: &'a Capacity) -> Rules<'a> {
         burst_bytes,
         queue: &config.queue,
     }
-}
-
-/// A number for a stream that does not depend on the order in which the streams are listed.
-fn label(stream: Stream) -> u64 {
-    derive_seed(
-        0,
-        &stream
-            .to_string()
-            .bytes()
-            .map(u64::from)
-            .collect::<Vec<_>>(),
-    )
 }
 
 #[cfg(test)]

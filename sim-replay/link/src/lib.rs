@@ -44,6 +44,7 @@ mod device_clock;
 mod emulator;
 mod latency;
 mod loss;
+mod packet;
 mod preset;
 mod queue_server;
 mod trace;
@@ -54,7 +55,8 @@ pub use config::{
     QueueConfig, QueueDrop, ReorderConfig,
 };
 pub use device_clock::{ClockStep, DeviceClock};
-pub use emulator::{Delivery, LinkEmulator, Outcome, Packet};
+pub use emulator::{Delivery, LinkEmulator, Outcome};
+pub use packet::Packet;
 pub use preset::PRESETS;
 pub use trace::{Step, Trace};
 pub use trace_config::TraceConfig;

@@ -6,7 +6,7 @@ use protocol::DropReason;
 
 use super::capacity::{Capacity, work};
 use super::config::{QueueConfig, QueueDrop};
-use super::emulator::Packet;
+use super::packet::Packet;
 
 /// A queue and its sender.
 #[derive(Debug, Clone, Default)]
@@ -84,18 +84,10 @@ impl QueueServer {
                 break;
             };
             self.waiting_bytes -= oldest.bytes;
-            left.push(Departure::Dropped {
-                packet: oldest,
-                reason: DropReason::LinkQueue,
-                nanos,
-            });
+            left.push(dropped(oldest, DropReason::LinkQueue, nanos));
         }
         if is_full(self) {
-            left.push(Departure::Dropped {
-                packet,
-                reason: DropReason::LinkQueue,
-                nanos,
-            });
+            left.push(dropped(packet, DropReason::LinkQueue, nanos));
             return;
         }
         self.waiting_bytes += packet.bytes;
@@ -189,20 +181,23 @@ impl QueueServer {
     }
 
     fn supersede(&mut self, newer: &Packet, left: &mut Vec<Departure>) {
-        let is_same = |other: &Packet| {
+        while let Some(place) = self.waiting.iter().position(|other| {
             (&other.from, &other.to, other.stream) == (&newer.from, &newer.to, newer.stream)
-        };
-        while let Some(place) = self.waiting.iter().position(is_same) {
+        }) {
             let Some(older) = self.waiting.remove(place) else {
                 return;
             };
             self.waiting_bytes -= older.bytes;
             let nanos = newer.submitted_nanos;
-            left.push(Departure::Dropped {
-                packet: older,
-                reason: DropReason::Superseded,
-                nanos,
-            });
+            left.push(dropped(older, DropReason::Superseded, nanos));
         }
+    }
+}
+
+fn dropped(packet: Packet, reason: DropReason, nanos: u64) -> Departure {
+    Departure::Dropped {
+        packet,
+        reason,
+        nanos,
     }
 }

@@ -4,8 +4,10 @@ use std::path::{Path, PathBuf};
 
 use dataset::{self, IntensityOption, OpenOptions};
 use simulator::generate::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
-use support::{output, progress};
+use support::output;
+use terminal::progress;
 
+use super::refuse;
 use support::cli::Outcome;
 
 /// Problems that are printed; all are counted, and included in the JSON summary.
@@ -42,17 +44,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     };
     let input = match dataset::open_with(&args.from, &open) {
         Ok(input) => input,
-        Err(error) => {
-            output::note(format_args!("error: {error}"));
-            return Ok(Outcome::BadInput);
-        }
+        Err(error) => return refuse(&error),
     };
     if overlap(&args.from, &args.out) {
-        output::note(format_args!(
-            "error: {}: the input is in this folder; choose another folder for --out",
+        return refuse(&format_args!(
+            "{}: the input is in this folder; choose another folder for --out",
             args.out.display()
         ));
-        return Ok(Outcome::BadInput);
     }
     let bar = progress::bar(0, "frames");
     let options = ConvertOptions {
@@ -71,10 +69,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             Ok(Outcome::of(!converted.left_out.is_nothing()))
         }
         Err(error @ SynthError::Write(_)) => Err(error.into()),
-        Err(error) => {
-            output::note(format_args!("error: {error}"));
-            Ok(Outcome::BadInput)
-        }
+        Err(error) => refuse(&error),
     }
 }
 

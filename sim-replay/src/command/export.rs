@@ -9,7 +9,7 @@ use ros2::Mount;
 use support::cli::Outcome;
 use support::output;
 
-/// Write a recording as a bag of ROS 2: clouds, poses, odometry, detections, transforms and diagnoses, without the
+/// Write a recording as a bag of ROS 2: clouds, poses, odometry, detections, tracks, transforms and diagnoses, without the
 /// messages that ROS 2 has no types for.
 ///
 /// `ros2 bag play --clock` and every reader of ROS 2 bags accept the file. Exit code 3: parts of the recording could not

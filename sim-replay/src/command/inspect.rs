@@ -7,8 +7,10 @@ use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::{IntensityScale, OpenOptions, layouts_text};
 use serde::Serialize;
 use sim_replay::inspect::{Report, inspect, inspect_map};
-use support::{output, progress};
+use support::output;
+use terminal::progress;
 
+use super::refuse;
 use support::cli::Outcome;
 
 /// Report the contents of a dataset (agents, frames, points, rates, boxes, merged ground truth) and its faults.
@@ -64,10 +66,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
     let report = match inspect_map(path) {
         Ok(report) => report,
-        Err(error) => {
-            output::note(format_args!("error: {error}"));
-            return Ok(Outcome::BadInput);
-        }
+        Err(error) => return refuse(&error),
     };
     print(&report, json)?;
     Ok(Outcome::Done)

@@ -9,13 +9,22 @@ pub(crate) mod recover;
 pub(crate) mod stream;
 pub(crate) mod synth;
 
+use std::fmt::Display;
+
 use bus::{Bus, STOP_LIMIT};
 use serde::Serialize;
+use support::cli::Outcome;
 use support::output;
 
 /// Prints a report as one line of JSON.
 fn print_json(report: &impl Serialize) -> anyhow::Result<()> {
     Ok(output::line(serde_json::to_string(report)?)?)
+}
+
+/// Says what is wrong with the input, unless only errors are wanted.
+fn refuse(error: &dyn Display) -> anyhow::Result<Outcome> {
+    output::note(format_args!("error: {error}"));
+    Ok(Outcome::BadInput)
 }
 
 /// Leaves the bus; a process ends even if the router does not answer.

@@ -6,7 +6,7 @@ use bus::log_to_stderr;
 use recording::{Contents, RecordingOptions, recover};
 use support::output;
 
-use super::print_json;
+use super::{print_json, refuse};
 use support::cli::Outcome;
 
 /// Copy the readable part of a truncated (power, disk, kill) or damaged recording into a new, indexed file.
@@ -41,10 +41,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     };
     let report = match recover(&args.from, &args.out, options) {
         Ok(report) => report,
-        Err(error) => {
-            output::note(format_args!("error: {error}"));
-            return Ok(Outcome::BadInput);
-        }
+        Err(error) => return refuse(&error),
     };
     if args.json {
         print_json(&report)?;

@@ -117,18 +117,14 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
             by_reason(dropped)
         ))?;
     }
-    if report.absent_frames > 0 {
-        output::line(format_args!(
-            "{} frames do not exist: their vehicles joined later or have left",
-            report.absent_frames
-        ))?;
-    }
-    if report.left_out_parts > 0 {
-        output::line(format_args!(
-            "{} objects or other parts of frames were left out, see the log",
-            report.left_out_parts
-        ))?;
-    }
+    counted(
+        report.absent_frames,
+        "frames do not exist: their vehicles joined later or have left",
+    )?;
+    counted(
+        report.left_out_parts,
+        "objects or other parts of frames were left out, see the log",
+    )?;
     if !report.unsent.is_empty() {
         let unsent: u64 = report.unsent.values().sum();
         output::line(format_args!(
@@ -137,19 +133,16 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
         ))?;
     }
     // The losses of the run are printed last.
-    if report.unreadable_frames > 0 {
-        output::line(format_args!(
-            "{} frames could not be read",
-            report.unreadable_frames
-        ))?;
+    counted(report.unreadable_frames, "frames could not be read")?;
+    counted(report.unanswered, "ticks were not answered")
+}
+
+/// A line for what there is.
+fn counted(count: u64, what: &str) -> anyhow::Result<()> {
+    match count {
+        0 => Ok(()),
+        count => Ok(output::line(format_args!("{count} {what}"))?),
     }
-    if report.unanswered > 0 {
-        output::line(format_args!(
-            "{} ticks were not answered",
-            report.unanswered
-        ))?;
-    }
-    Ok(())
 }
 
 fn by_reason(dropped: &BTreeMap<DropReason, u64>) -> String {

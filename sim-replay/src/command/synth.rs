@@ -10,8 +10,10 @@ use simulator::generate::{
     self, ImageSize, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather,
 };
 use simulator::map::RoadMapSource;
-use support::{output, progress};
+use support::output;
+use terminal::progress;
 
+use super::refuse;
 use support::cli::{BadInput, Outcome};
 
 /// Findings of a map that are printed one by one.
@@ -92,10 +94,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Err(error @ (SynthError::Write(_) | SynthError::TooFewCompanions { .. })) => {
             Err(error.into())
         }
-        Err(error) => {
-            output::note(format_args!("error: {error}"));
-            Ok(Outcome::BadInput)
-        }
+        Err(error) => refuse(&error),
     }
 }
 

@@ -75,7 +75,6 @@ fn link_help() -> String {
 
 impl LinkSelection {
     /// True if the model is a preset, and no file.
-    #[must_use]
     pub fn is_preset(&self) -> bool {
         PRESETS.iter().any(|(name, _)| *name == self.model)
     }

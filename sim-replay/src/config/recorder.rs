@@ -76,7 +76,6 @@ impl ProcessConfig for RecorderConfig {
 
 impl RecorderConfig {
     /// The options of the recorder.
-    #[must_use]
     pub fn options(&self) -> RecorderOptions {
         let RecordingConfig {
             without,

@@ -109,7 +109,6 @@ pub struct SensorLinkConfig {
 
 impl SensorLinkConfig {
     /// The stages of the link; `None` if nothing is set.
-    #[must_use]
     pub fn stages(&self) -> Option<LinkConfig> {
         let Self {
             latency_ms,
@@ -182,7 +181,6 @@ impl ProcessConfig for ReplayConfig {
 
 impl ReplayConfig {
     /// The options of the replay.
-    #[must_use]
     pub fn options(&self) -> StreamOptions {
         let Self { scene, wait, .. } = self;
         let seconds = |seconds| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);

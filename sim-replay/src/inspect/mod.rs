@@ -19,7 +19,7 @@ pub use dataset::findings::SweepReport;
 use dataset::{Layout, MissingFrame};
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Default, Serialize)]
 pub struct Report {
     /// The folder, as given.
     pub path: String,
@@ -100,7 +100,6 @@ pub struct Summary {
 
 impl Summary {
     /// Summary of counts, one per frame; `None` if there is none.
-    #[must_use]
     pub fn of(counts: &[usize]) -> Option<Self> {
         let (min, max) = (*counts.iter().min()?, *counts.iter().max()?);
         Some(Self {

@@ -38,7 +38,6 @@ struct TickFindings {
 
 /// Reads all of the data set in `dir`, its ground truth by the protocol. `progress` receives the number of completed
 /// ticks and their total.
-#[must_use]
 pub fn inspect(
     dir: &Path,
     open: &OpenOptions,
@@ -47,11 +46,7 @@ pub fn inspect(
 ) -> Report {
     let mut report = Report {
         path: dir.display().to_string(),
-        layout: None,
-        protocol: None,
-        scenarios: vec![],
-        ticks: vec![],
-        problems: vec![],
+        ..Report::default()
     };
     let dataset = match dataset::open_with(dir, open) {
         Ok(dataset) => dataset,

@@ -24,7 +24,6 @@ enum State {
 
 impl ReplayClock {
     /// A running clock.
-    #[must_use]
     pub(crate) fn new(rate: f64) -> Self {
         Self {
             rate,
@@ -67,7 +66,6 @@ impl ReplayClock {
     }
 
     /// Time at which the tick captured at `capture_nanos` is due; `None` while the clock is halted.
-    #[must_use]
     pub(crate) fn due(&self, capture_nanos: u64, now: Instant) -> Option<Instant> {
         match (self.state, self.anchor) {
             (State::Halted { steps: 0 }, _) => None,

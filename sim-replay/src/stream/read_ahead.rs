@@ -76,7 +76,6 @@ impl ReadAhead {
     }
 
     /// The frames of a requested tick, as soon as they are read; empty if the reading thread has ended.
-    #[must_use]
     pub(crate) fn take(&self, tick: usize) -> TickFrames {
         let mut state = lock(&self.shared);
         loop {

@@ -151,7 +151,7 @@ pub struct Replay<'a> {
     /// Agents whose frames of the last tick were published.
     present: BTreeSet<CavId>,
     clock: ReplayClock,
-    outlet: SensorPublisher,
+    publisher: SensorPublisher,
     sensor_link: Option<SensorLink>,
     inbox: Arc<Inbox>,
     stop: Stop,
@@ -206,10 +206,8 @@ impl<'a> Replay<'a> {
             Verb::Seek,
         ]
         .map(Topic::Control);
-        let answers = options.lockstep.iter().map(|ego| Topic::Stream {
-            cav: ego.clone(),
-            stream: Stream::Detections,
-        });
+        let answers = options.lockstep.iter();
+        let answers = answers.map(|ego| Topic::stream(ego, Stream::Detections));
         let subscriptions = verbs
             .into_iter()
             .chain(answers)
@@ -234,7 +232,7 @@ impl<'a> Replay<'a> {
             schedule,
             present: BTreeSet::new(),
             clock,
-            outlet: SensorPublisher::open(
+            publisher: SensorPublisher::open(
                 bus,
                 &options.agents,
                 &options.load,
@@ -296,7 +294,7 @@ impl<'a> Replay<'a> {
         drop(working);
         let Self {
             bus,
-            outlet,
+            publisher,
             sensor_link,
             mut report,
             ..
@@ -304,7 +302,7 @@ impl<'a> Replay<'a> {
         report.sensor_link = sensor_link.map(|link| link.report().clone());
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
-        report.sent = outlet.finish();
+        report.sent = publisher.finish();
         report.count_unsent(&bus.stats().ledger());
         bus.publish_control(
             Control::End {
@@ -317,20 +315,8 @@ impl<'a> Replay<'a> {
     }
 
     fn expected_routes(&self) -> Vec<Route> {
-        let sensors = |cav: &CavId| {
-            [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Route {
-                topic: Topic::Stream {
-                    cav: cav.clone(),
-                    stream,
-                },
-                receiver: process_id(Role::Agent, cav),
-            })
-        };
         let answers = self.options.lockstep.iter().map(|ego| Route {
-            topic: Topic::Stream {
-                cav: ego.clone(),
-                stream: Stream::Detections,
-            },
+            topic: Topic::stream(ego, Stream::Detections),
             receiver: self.bus.identity().process.clone(),
         });
         let agents = self
@@ -339,7 +325,12 @@ impl<'a> Replay<'a> {
             .iter()
             .filter(|_| self.options.await_agents);
         agents
-            .flat_map(sensors)
+            .flat_map(|cav| {
+                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Route {
+                    topic: Topic::stream(cav, stream),
+                    receiver: process_id(Role::Agent, cav),
+                })
+            })
             .chain(answers)
             .chain(self.options.expect.iter().cloned())
             .collect()
@@ -391,7 +382,7 @@ impl<'a> Replay<'a> {
             frame,
         } in link.arrived(Instant::now())
         {
-            self.outlet.submit(agent, capture_nanos, frame);
+            self.publisher.submit(agent, capture_nanos, frame);
         }
     }
 
@@ -467,7 +458,7 @@ impl<'a> Replay<'a> {
                 Ok(frame) => {
                     self.report.parts_left_out(&frame);
                     match &mut self.sensor_link {
-                        None => self.outlet.submit(agent, capture_nanos, frame),
+                        None => self.publisher.submit(agent, capture_nanos, frame),
                         Some(link) => {
                             let sweep = DelayedSweep {
                                 agent,
@@ -478,13 +469,13 @@ impl<'a> Replay<'a> {
                         }
                     }
                 }
-                Err(error) if error.is_absence() => self.report.absent_frames += 1,
+                Err(error) if error.is_absent() => self.report.absent_frames += 1,
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
         let tick = tick_index as u64;
         let truth = Truth { tick, agents };
-        self.outlet.submit_truth(capture_nanos, truth);
+        self.publisher.submit_truth(capture_nanos, truth);
         self.deliver();
         self.report.ticks += 1;
         self.clock.published(capture_nanos, due);
@@ -578,7 +569,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_patience_may_have_no_end() {
+    fn unlimited_timeout_waits_for_the_subscribers() {
         assert_eq!(end_of(Duration::MAX), None);
         assert!(end_of(Duration::from_secs(60)).unwrap() > Instant::now());
     }

@@ -101,7 +101,6 @@ impl StreamReport {
 
     /// True if every frame was read completely and every tick was answered as required. Replaced messages
     /// ([`Self::unsent`]) are no failure.
-    #[must_use]
     pub fn is_complete(&self) -> bool {
         self.unreadable_frames == 0 && self.left_out_parts == 0 && self.unanswered == 0
     }

@@ -40,69 +40,42 @@ pub struct Position {
 #[derive(Debug, Clone)]
 pub struct Schedule {
     captures: Arc<[u64]>,
-    next_index: usize,
-    left: Option<usize>,
     repeats: bool,
-    shift_nanos: u64,
-    last_nanos: Option<u64>,
+    position: Position,
 }
 
 impl Schedule {
     /// Begins at tick `first`; ends after `frames` ticks, or, unless it `repeats`, with the scene.
-    #[must_use]
     pub fn new(ticks: &[Tick], first: usize, frames: Option<usize>, repeats: bool) -> Self {
         Self {
             captures: ticks.iter().map(|tick| tick.capture_nanos).collect(),
-            next_index: first,
-            left: frames,
             repeats,
-            shift_nanos: 0,
-            last_nanos: None,
+            position: Position {
+                next_tick: first,
+                left: frames,
+                shift_nanos: 0,
+                last_nanos: None,
+            },
         }
     }
 
     /// Resumes at the state of the previous process instance, with its capture times.
     #[must_use]
     pub fn resumed(self, position: Position) -> Self {
-        let Position {
-            next_tick,
-            left,
-            shift_nanos,
-            last_nanos,
-        } = position;
-        Self {
-            next_index: next_tick,
-            left,
-            shift_nanos,
-            last_nanos,
-            ..self
-        }
+        Self { position, ..self }
     }
 
     /// Its state.
     pub(super) fn position(&self) -> Position {
-        let Self {
-            next_index: next_tick,
-            left,
-            shift_nanos,
-            last_nanos,
-            ..
-        } = *self;
-        Position {
-            next_tick,
-            left,
-            shift_nanos,
-            last_nanos,
-        }
+        self.position
     }
 
     /// Continues from tick `index` instead.
     pub fn seek(&mut self, index: usize) {
-        self.next_index = index;
+        self.position.next_tick = index;
     }
 
     /// The next ticks, at most `count`.
-    #[must_use]
     pub fn ahead(&self, count: usize) -> Vec<usize> {
         self.clone()
             .take(count)
@@ -129,25 +102,25 @@ impl Iterator for Schedule {
     type Item = Planned;
 
     fn next(&mut self) -> Option<Planned> {
-        if self.left == Some(0) {
+        if self.position.left == Some(0) {
             return None;
         }
-        if self.next_index >= self.captures.len() && self.repeats {
-            self.next_index = 0;
+        if self.position.next_tick >= self.captures.len() && self.repeats {
+            self.position.next_tick = 0;
         }
-        let tick_index = self.next_index;
+        let tick_index = self.position.next_tick;
         let recorded = *self.captures.get(tick_index)?;
-        if let Some(last) = self.last_nanos
-            && recorded.saturating_add(self.shift_nanos) <= last
+        if let Some(last) = self.position.last_nanos
+            && recorded.saturating_add(self.position.shift_nanos) <= last
         {
-            self.shift_nanos = last
+            self.position.shift_nanos = last
                 .saturating_add(self.period_nanos())
                 .saturating_sub(recorded);
         }
-        let capture_nanos = recorded.saturating_add(self.shift_nanos);
-        self.next_index += 1;
-        self.left = self.left.map(|left| left - 1);
-        self.last_nanos = Some(capture_nanos);
+        let capture_nanos = recorded.saturating_add(self.position.shift_nanos);
+        self.position.next_tick += 1;
+        self.position.left = self.position.left.map(|left| left - 1);
+        self.position.last_nanos = Some(capture_nanos);
         Some(Planned {
             tick_index,
             capture_nanos,

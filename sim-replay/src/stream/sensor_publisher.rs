@@ -1,7 +1,7 @@
 //! Publishers of a replayed scene: each vehicle's sensors, and the ground truth.
 
 use protocol::message::{AgentTruth, TrueObject};
-use protocol::{Camera, CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount, Truth};
+use protocol::{CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount, Truth};
 
 use bus::{Bus, BusError, Publisher, PublisherOptions};
 use dataset::LoadOptions;
@@ -48,15 +48,8 @@ impl SensorPublisher {
             }
         };
         let sensors = agents.iter().map(|cav| {
-            let publisher = |stream, options| {
-                bus.publisher(
-                    Topic::Stream {
-                        cav: cav.clone(),
-                        stream,
-                    },
-                    paced(options),
-                )
-            };
+            let publisher =
+                |stream, options| bus.publisher(Topic::stream(cav, stream), paced(options));
             Ok(Sensors {
                 // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
                 lidar: publisher(Stream::Lidar, PublisherOptions::SENSOR)?,
@@ -77,10 +70,7 @@ impl SensorPublisher {
                     })
                     .collect::<Result<_, BusError>>()?,
                 preview: bus.publisher(
-                    Topic::Stream {
-                        cav: cav.clone(),
-                        stream: Stream::Preview,
-                    },
+                    Topic::stream(cav, Stream::Preview),
                     PublisherOptions::PREVIEW,
                 )?,
             })
@@ -117,35 +107,19 @@ impl SensorPublisher {
         sensors.imu.submit(capture_nanos, frame.motion());
         count(&mut self.sent, sensors.imu.topic());
         if sensors.preview.is_wanted() {
-            sensors.preview.submit(
-                capture_nanos,
-                Lidar {
-                    points: frame.points.decimate(PREVIEW_POINTS),
-                },
-            );
+            let points = frame.points.decimate(PREVIEW_POINTS);
+            sensors.preview.submit(capture_nanos, Lidar { points });
         }
-        sensors.lidar.submit(
-            capture_nanos,
-            Lidar {
-                points: frame.points,
-            },
-        );
+        let points = frame.points;
+        sensors.lidar.submit(capture_nanos, Lidar { points });
         count(&mut self.sent, sensors.lidar.topic());
         if let (Some(publisher), Some(points)) = (&sensors.radar, frame.radar) {
             publisher.submit(capture_nanos, Radar { points });
             count(&mut self.sent, publisher.topic());
         }
-        self.submit_images(agent, capture_nanos, frame.cameras);
-    }
-
-    /// Submits the images of one vehicle.
-    fn submit_images(&mut self, agent: usize, capture_nanos: u64, images: Vec<(u8, Camera)>) {
-        let Some(sensors) = self.sensors.get(agent) else {
-            return;
-        };
-        for (number, image) in images {
-            if let Some((_, publisher)) = sensors.cameras.iter().find(|(known, _)| *known == number)
-            {
+        for (number, image) in frame.cameras {
+            let mut cameras = sensors.cameras.iter();
+            if let Some((_, publisher)) = cameras.find(|(known, _)| *known == number) {
                 publisher.submit(capture_nanos, image);
                 count(&mut self.sent, publisher.topic());
             }
@@ -193,19 +167,18 @@ fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
 /// The ground truth of the frames of a tick: poses of the vehicles, and the objects that each of them contributes.
 /// Vehicles without a recorded pose are left out.
 pub(super) fn truth_of(frames_of_tick: &[&Frame]) -> Vec<AgentTruth> {
-    let truth = |(frame, objects): (&&Frame, &[Object])| {
-        let world_from_lidar = frame.world_from_lidar?;
-        let objects = objects.iter().map(true_object).collect();
-        Some(AgentTruth {
-            cav: frame.cav.clone(),
-            world_from_lidar,
-            objects,
-        })
-    };
     frames_of_tick
         .iter()
         .zip(annotations(frames_of_tick))
-        .filter_map(truth)
+        .filter_map(|(frame, objects)| {
+            let world_from_lidar = frame.world_from_lidar?;
+            let objects = objects.iter().map(true_object).collect();
+            Some(AgentTruth {
+                cav: frame.cav.clone(),
+                world_from_lidar,
+                objects,
+            })
+        })
         .collect()
 }
 

@@ -85,6 +85,16 @@ pub struct AgentBoxes<'a> {
     pub output_from_agent: Isometry3<f64>,
 }
 
+/// Detections of one agent in its own frame, by descending score.
+pub fn detections(boxes: &[Decoded], config: &PostprocessConfig) -> Vec<Detection> {
+    let own = AgentBoxes {
+        boxes,
+        output_from_agent: Isometry3::identity(),
+    };
+    let found = postprocess(&[own], config).into_iter();
+    found.map(|candidate| candidate.detection(None)).collect()
+}
+
 /// The whole chain: projects, removes boxes of implausible size, suppresses, removes boxes out of range.
 ///
 /// Returns the detections by descending score.

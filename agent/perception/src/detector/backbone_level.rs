@@ -52,9 +52,6 @@ impl BackboneLevel {
 
     /// True if most of its values above zero are the largest that 8 bits hold: a scale of its network is far too small.
     /// Some of the cells tell as much as all of them.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn is_saturated(&self) -> Result<bool, TchError> {
         if !self.is_quantised() {
             return Ok(false);

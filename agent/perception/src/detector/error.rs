@@ -71,7 +71,6 @@ pub enum DetectorError {
 
 impl DetectorError {
     /// True if one frame cannot be computed, and others may be: its data or values are not usable.
-    #[must_use]
     pub fn is_of_frame(&self) -> bool {
         matches!(
             self,

@@ -54,8 +54,8 @@ impl Int8Backbone {
         }
         let mut input = upsampled;
         let mut shrunk = Vec::new();
-        let count = shrink.layers().len();
-        for (position, layer) in shrink.layers().iter().enumerate() {
+        let count = shrink.layers.len();
+        for (position, layer) in shrink.layers.iter().enumerate() {
             let is_last = position + 1 == count;
             let output = if is_last {
                 None
@@ -138,7 +138,7 @@ pub(super) fn observe_backbone(
     }
     let wide = Tensor::f_cat(&upsampled, 1)?;
     let hidden = shrink
-        .layers()
+        .layers
         .split_last()
         .map_or(&[][..], |(_, hidden)| hidden);
     let _ = observed(hidden, &wide, &shrink_activation)?;

@@ -36,11 +36,10 @@ impl ActivationScales {
     /// # Errors
     /// [`MissingScale`] if it was not observed.
     pub fn get(&self, name: &str) -> Result<Quantisation, MissingScale> {
-        let missing = || MissingScale {
+        self.0.get(name).copied().ok_or_else(|| MissingScale {
             name: name.to_owned(),
             known: self.0.keys().cloned().collect(),
-        };
-        self.0.get(name).copied().ok_or_else(missing)
+        })
     }
 
     /// SHA-256 over the scales of the activations whose name is `wanted`.

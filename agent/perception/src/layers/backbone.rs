@@ -96,11 +96,12 @@ impl BevBackbone {
     /// Outputs of all levels for a canvas `[N, C, H, W]`, each the input of the next.
     pub fn levels_of(&self, canvas: &Tensor, train: bool) -> Vec<Tensor> {
         let mut x = canvas.shallow_clone();
-        let level = |level| {
-            x = self.level(level, &x, train);
-            x.shallow_clone()
-        };
-        (0..self.levels()).map(level).collect()
+        (0..self.levels())
+            .map(|level| {
+                x = self.level(level, &x, train);
+                x.shallow_clone()
+            })
+            .collect()
     }
 
     /// Output of one level for the output of the level above it, or for the canvas.

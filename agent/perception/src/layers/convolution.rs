@@ -173,10 +173,7 @@ impl ConvLayer {
     /// The same with a batch norm after the convolution.
     #[must_use]
     pub(crate) fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
-        Self {
-            norm: Some(Norm::new(norm, channels)),
-            ..self
-        }
+        self.with_norm_of(norm, channels, (NORM_EPS, NORM_MOMENTUM))
     }
 
     /// The same with a batch norm of another epsilon and momentum.

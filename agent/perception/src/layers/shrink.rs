@@ -8,7 +8,7 @@ use crate::model_config::ShrinkConfig;
 /// Reduces the concatenated backbone levels.
 #[derive(Debug)]
 pub struct Shrink {
-    layers: Vec<ConvLayer>,
+    pub(crate) layers: Vec<ConvLayer>,
 }
 
 impl Shrink {
@@ -36,11 +36,6 @@ impl Shrink {
             }
         };
         Self { layers }
-    }
-
-    /// Its layers, in order.
-    pub(crate) fn layers(&self) -> &[ConvLayer] {
-        &self.layers
     }
 
     /// `[N, C_in, H, W]` to `[N, C, H', W']`.

@@ -43,9 +43,7 @@ impl SparseConv {
             .to_kind(x.kind())
             .f_addmm(&columns, &self.weight.to_kind(x.kind()))
     }
-}
 
-impl SparseConv {
     /// The same in integers, see [`Int8SparseConv`].
     ///
     /// # Errors

@@ -67,11 +67,6 @@ impl Rulebook {
         }
     }
 
-    /// Number of input rows.
-    pub fn inputs(&self) -> usize {
-        self.inputs
-    }
-
     /// Number of output rows.
     pub fn outputs(&self) -> usize {
         self.rows.len() / KERNEL_VOLUME
@@ -171,7 +166,7 @@ mod tests {
     #[test]
     fn two_neighbours_are_inputs_of_each_other() {
         let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0], [0, 0, 1], [5, 5, 5]]).0);
-        assert_eq!((book.inputs(), book.outputs(), book.pairs()), (3, 3, 5));
+        assert_eq!((book.inputs, book.outputs(), book.pairs()), (3, 3, 5));
         assert_eq!(book.rows[index([0, 0, 1])], 1);
         assert_eq!(book.rows[KERNEL_VOLUME + index([0, 0, -1])], 0);
     }

@@ -3,7 +3,6 @@
 pub mod checkpoint;
 
 mod adamw;
-mod bar;
 mod card;
 mod curve;
 mod data_listing;
@@ -17,7 +16,6 @@ mod task;
 mod trainer;
 
 pub use adamw::{AdamW, AdamWConfig, Step};
-pub use bar::TrainingBar;
 pub use card::ModelCard;
 pub use curve::Curve;
 pub use data_listing::DataListing;
@@ -26,6 +24,6 @@ pub use interruption::Interruption;
 pub use options::{OptionsError, TrainingOptions, check_out};
 pub use prefetch::Prefetch;
 pub use run_config::{ComputePrecision, Length, RunConfig};
-pub use schedule::OneCycle;
+pub use schedule::one_cycle;
 pub use task::{Means, Observe, Progress, SaveEvery, StepReport, Task};
 pub use trainer::{Trained, Trainer};

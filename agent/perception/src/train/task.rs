@@ -70,15 +70,9 @@ pub trait Task {
     }
 
     /// Loss of the next step.
-    ///
-    /// # Errors
-    /// Those of its data and of the tensor library.
     fn loss(&mut self, trainer: &Trainer) -> Result<Tensor, Self::Error>;
 
     /// Called after each step; `is_taken` is false if the gradient was not finite.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     fn stepped(&mut self, _trainer: &Trainer, _is_taken: bool) -> Result<(), Self::Error> {
         Ok(())
     }
@@ -89,15 +83,9 @@ pub trait Task {
     }
 
     /// Reports the steps since the last report.
-    ///
-    /// # Errors
-    /// Those of the files and of the tensor library.
     fn report(&mut self, trainer: &Trainer) -> Result<(), Self::Error>;
 
     /// Validates, before a checkpoint.
-    ///
-    /// # Errors
-    /// Those of the files, the data and the tensor library.
     fn validate(&mut self, _trainer: &Trainer) -> Result<(), Self::Error> {
         Ok(())
     }

@@ -300,8 +300,7 @@ fn read_values(
         }
     };
     check_finite(path, name, &values)?;
-    let is_negative = |value: &f32| *value < 0.0;
-    match values.iter().position(is_negative) {
+    match values.iter().position(|value| *value < 0.0) {
         // The square root of a negative variance is NaN.
         Some(index) if name.ends_with(VARIANCE_NAME) => {
             let holds = holds(name, &values, index);

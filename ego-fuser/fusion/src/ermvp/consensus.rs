@@ -158,12 +158,8 @@ impl Motion {
         let theta = Tensor::f_stack(&entries, 0)?.f_view([1, 2, 3])?;
         let sampling_grid =
             Tensor::f_affine_grid_generator(&theta, [1, channels, height, width], false)?;
-        let maps = map.f_permute([2, 0, 1])?.f_unsqueeze(0)?.f_grid_sampler(
-            &sampling_grid,
-            BILINEAR,
-            PADDING_ZEROS,
-            false,
-        )?;
+        let maps = map.f_permute([2, 0, 1])?.f_unsqueeze(0)?;
+        let maps = maps.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)?;
         let mask = mask.f_view([1, 1, height, width])?;
         let mask = mask
             .f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?

@@ -79,7 +79,7 @@ impl GlobalHalf {
     pub(super) fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
         let (attention, feed) = (path / "WindowAttentionGlobal", path / "windowGlobal_ffd");
         let inner = &attention / "fn";
-        let channels = config.channels;
+        let (channels, hidden) = (config.channels, config.hidden);
         Self {
             norm: LayerNorm::new(&(&attention / "norm"), channels),
             extract: std::array::from_fn(|index| {
@@ -89,12 +89,7 @@ impl GlobalHalf {
             offsets: OffsetTable::new(&inner, config),
             out: Linear::residual(&(&inner / "to_out" / 0), channels, channels, false),
             feed_norm: LayerNorm::new(&(&feed / "norm"), channels),
-            feed_forward: FeedForward::new(
-                &(&feed / "fn"),
-                channels,
-                config.hidden,
-                config.dropout,
-            ),
+            feed_forward: FeedForward::new(&(&feed / "fn"), channels, hidden, config.dropout),
             heads: channels / config.head_channels,
             window: config.window,
             dropout: config.dropout,

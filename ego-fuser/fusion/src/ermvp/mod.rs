@@ -36,18 +36,13 @@ use super::maps::AlignedMaps;
 use super::padding::Padding;
 use super::partition::Partition;
 use super::settings::{FusionSettings, of_size};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 use super::swap_fusion::{HalfBlock, MeanHead, Slots, SwapFusionConfig};
 
 /// ERMVP.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "ermvp",
-    summary: "feature maps, the cells worth sending, poses corrected by consensus among them (ERMVP)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<ErmvpConfig>(),
-};
+pub static METHOD: MethodSpec = MethodSpec::of_features::<ErmvpConfig>(
+    "feature maps, the cells worth sending, poses corrected by consensus among them (ERMVP)",
+);
 
 /// Sizes of ERMVP.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -139,15 +134,6 @@ impl Ermvp {
     pub fn new(path: &nn::Path<'_>, config: &ErmvpConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         let sizes = &config.layers;
-        let layer = |index: usize| {
-            let path = path / "layers" / index;
-            let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
-            let local = HalfBlock::new(Partition::Window, &attention, &feed, sizes);
-            Layer {
-                local,
-                global: GlobalHalf::new(&path, sizes),
-            }
-        };
         Ok(Self {
             sampler: Sampler::new(&(path / "sampler"), sizes.channels, config.kept),
             consensus: Consensus::new(
@@ -156,7 +142,17 @@ impl Ermvp {
                 config.compared,
                 config.search,
             ),
-            layers: (0..sizes.depth).map(layer).collect(),
+            layers: (0..sizes.depth)
+                .map(|index| {
+                    let path = path / "layers" / index;
+                    let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
+                    let local = HalfBlock::new(Partition::Window, &attention, &feed, sizes);
+                    Layer {
+                        local,
+                        global: GlobalHalf::new(&path, sizes),
+                    }
+                })
+                .collect(),
             head: MeanHead::new(&(path / "mlp_head"), sizes.channels),
             window: sizes.window,
         })
@@ -187,16 +183,9 @@ impl Ermvp {
 }
 
 impl Fusion for Ermvp {
-    fn fuse(
-        &self,
-        AlignedMaps {
-            warped,
-            metadata,
-            is_training,
-            ..
-        }: &AlignedMaps,
-    ) -> Result<FusionOutput, TchError> {
-        let order = nearest_first(metadata).to_device(warped.features.device());
+    fn fuse(&self, aligned: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let (warped, is_training) = (&aligned.warped, aligned.is_training);
+        let order = nearest_first(&aligned.metadata).to_device(warped.features.device());
         let features = warped.features.f_index_select(0, &order)?;
         let mask = warped.mask.f_index_select(0, &order)?;
         let padding = Padding::to_multiples(&features, self.window * REDUCTION)?;
@@ -212,9 +201,9 @@ impl Fusion for Ermvp {
         };
         let mut x = maps;
         for layer in &self.layers {
-            let groups = layer.local.whole(&x, slots, self.window, *is_training)?;
+            let groups = layer.local.whole(&x, slots, self.window, is_training)?;
             x = Partition::Window.map(&groups, padding.size(), self.window)?;
-            x = layer.global.forward(&x, slots, *is_training)?;
+            x = layer.global.forward(&x, slots, is_training)?;
         }
         Ok(padding.crop(&self.head.forward(&x, slots)?)?.into())
     }

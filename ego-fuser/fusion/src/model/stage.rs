@@ -118,9 +118,10 @@ impl FusionStage {
         let variables = VarStore::new(device);
         let config = stored_config(weights, method, detector)?;
         let mut stage = Self::new(&variables.root(), &config, method, detector)?;
-        let is_needed = |name: &str| name != channel_mixing::WEIGHT || weights.contains(name);
         weights
-            .copy_some_into(&variables, is_needed)
+            .copy_some_into(&variables, |name: &str| {
+                name != channel_mixing::WEIGHT || weights.contains(name)
+            })
             .map_err(|error| of_method(error, weights, method))?;
         if !weights.contains(channel_mixing::WEIGHT) {
             stage.mixing = None;
@@ -375,11 +376,12 @@ impl FusionStage {
 fn full_resolution(
     ReceivedMaps { maps, sent, .. }: &ReceivedMaps,
 ) -> Result<Vec<FullResolutionMap>, TchError> {
-    let of_map = |map: i64| {
-        let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
-        FullResolutionMap::of(&of(maps)?, sent.as_ref().map(of).transpose()?.as_ref())
-    };
-    (0..maps.size4()?.0).map(of_map).collect()
+    (0..maps.size4()?.0)
+        .map(|map| {
+            let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
+            FullResolutionMap::of(&of(maps)?, sent.as_ref().map(of).transpose()?.as_ref())
+        })
+        .collect()
 }
 
 /// Number of leading entries that are the newest of their agents.
@@ -404,14 +406,15 @@ fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
     let ego_of = |wanted: usize| {
         (0..facts.len()).find(|&entry| facts[entry].agent == 0 && step(entry) == wanted)
     };
-    let of_entry = |entry: usize| {
-        if facts[entry].agent == 0 {
-            return Pose::IDENTITY;
-        }
-        let ego = ego_of(step(entry)).map_or(Pose::IDENTITY, |ego| facts[ego].ego_from_cav);
-        ego.from_world(&facts[entry].ego_from_cav)
-    };
-    (newest..facts.len()).map(of_entry).collect()
+    (newest..facts.len())
+        .map(|entry| {
+            if facts[entry].agent == 0 {
+                return Pose::IDENTITY;
+            }
+            let ego = ego_of(step(entry)).map_or(Pose::IDENTITY, |ego| facts[ego].ego_from_cav);
+            ego.from_world(&facts[entry].ego_from_cav)
+        })
+        .collect()
 }
 
 /// Names the method of the weights beside an error, if it is another one.

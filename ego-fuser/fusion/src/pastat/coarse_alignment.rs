@@ -66,13 +66,7 @@ impl CoarseAlignment {
 
     /// The entries of `maps` that reach any cell; the ego's newest is always one.
     pub(super) fn pick(&self, maps: &AlignedMaps) -> Result<CoarseMaps, TchError> {
-        let AlignedMaps {
-            warped,
-            received,
-            metadata,
-            earlier,
-            ..
-        } = maps;
+        let (warped, received, earlier) = (&maps.warped, &maps.received, &maps.earlier);
         let newest = reaching(&warped.mask, true)?;
         let sent = match &received.sent {
             Some(sent) => sent.shallow_clone(),
@@ -82,8 +76,9 @@ impl CoarseAlignment {
             Some(earlier) => reaching(&earlier.warped.mask, false)?,
             None => Vec::new(),
         };
-        let first = metadata.len() as i64;
-        let metadata: Vec<MapMetadata> = metadata
+        let first = maps.metadata.len() as i64;
+        let metadata: Vec<MapMetadata> = maps
+            .metadata
             .iter()
             .chain(earlier.iter().flat_map(|earlier| &earlier.metadata))
             .copied()
@@ -104,10 +99,9 @@ impl CoarseAlignment {
             )?,
             received: rows_of(&received.maps, &sent, &newest)?,
             received_cells: {
-                let of_entry = |&entry: &i64| received.full_resolution.get(entry as usize);
                 newest
                     .iter()
-                    .filter_map(of_entry)
+                    .filter_map(|&entry| received.full_resolution.get(entry as usize))
                     .map(FullResolutionMap::shallow_clone)
                     .collect()
             },

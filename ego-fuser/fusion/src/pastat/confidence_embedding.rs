@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use tch::nn::{self, Init};
+use tch::nn;
 use tch::{Device, TchError, Tensor};
 
 use super::coarse_alignment::Origins;
 use super::config::PastatConfig;
+use crate::layers::uniform;
 
 /// Values of each entry that FSA gets: its share, its confidence and the ego's. Shares alone do not distinguish all
 /// poses good from all poses bad.
@@ -38,13 +39,9 @@ impl ConfidenceEmbedding {
         let deviation = ((config.channels * config.patch * config.patch) as f64)
             .sqrt()
             .recip();
-        let random = Init::Uniform {
-            lo: -deviation,
-            up: deviation,
-        };
         let weight = config
             .ce
-            .then(|| (path / "ce").var("weight", &[config.dim], random));
+            .then(|| (path / "ce").var("weight", &[config.dim], uniform(deviation)));
         Self {
             weight,
             device: path.device(),
@@ -52,15 +49,9 @@ impl ConfidenceEmbedding {
     }
 
     /// Eq. 7 for every entry.
-    pub(super) fn embed(
-        &self,
-        Origins {
-            confidence,
-            steps_back,
-            ..
-        }: &Origins,
-    ) -> Result<Confidences, TchError> {
-        let shares = shares(confidence, steps_back);
+    pub(super) fn embed(&self, origins: &Origins) -> Result<Confidences, TchError> {
+        let confidence = &origins.confidence;
+        let shares = shares(confidence, &origins.steps_back);
         let of_entry = |(share, &own): (&f32, &f64)| [*share, own as f32, confidence[0] as f32];
         let of_maps: Vec<f32> = shares.iter().zip(confidence).flat_map(of_entry).collect();
         let of_maps = Tensor::f_from_slice(&of_maps)?

@@ -34,17 +34,12 @@ use self::transformer::Transformer;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
 use super::settings::{FusionSettings, HistorySpec, Requirements, of_size};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 
 /// PASTAT.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "pastat",
-    summary: "feature maps with history, aligned by confidence and content, transformer (PASTAT)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<PastatConfig>(),
-};
+pub static METHOD: MethodSpec = MethodSpec::of_features::<PastatConfig>(
+    "feature maps with history, aligned by confidence and content, transformer (PASTAT)",
+);
 
 impl FusionSettings for PastatConfig {
     const KIND: &'static str = "pastat";
@@ -149,6 +144,7 @@ impl Pastat {
 impl Fusion for Pastat {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let (fused, corrections) = self.unrefined(maps)?;
+        // The refinement sees the map as the detection head will, after everything else.
         let refined = match &self.map_refinement {
             Some(refinement) => {
                 let likely = likely(&fused, maps)?;

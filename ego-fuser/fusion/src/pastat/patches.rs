@@ -27,13 +27,7 @@ pub(super) struct PatchTokens {
 impl Patches {
     /// Its variables are `patches.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let PastatConfig {
-            channels,
-            dim,
-            patch,
-            earlier_cells,
-            ..
-        } = *config;
+        let (channels, dim, patch) = (config.channels, config.dim, config.patch);
         let stride = nn::ConvConfig {
             stride: patch,
             ..Default::default()
@@ -41,22 +35,18 @@ impl Patches {
         Self {
             convolution: nn::conv2d(path / "patches", channels, dim, patch, stride),
             patch,
-            earlier_cells,
+            earlier_cells: config.earlier_cells,
         }
     }
 
     /// Tokens of the newest maps, then of the earlier ones.
-    pub(super) fn flatten(
-        &self,
-        CoarseMaps {
-            newest, earlier, ..
-        }: &CoarseMaps,
-    ) -> Result<PatchTokens, TchError> {
+    pub(super) fn flatten(&self, maps: &CoarseMaps) -> Result<PatchTokens, TchError> {
+        let newest = &maps.newest;
         let (mut values, mut valid) = (
             self.values(&newest.features, 1)?,
             self.valid(&newest.mask, 1)?,
         );
-        if let Some(WarpedMaps { features, mask }) = earlier {
+        if let Some(WarpedMaps { features, mask }) = &maps.earlier {
             values = Tensor::f_cat(&[values, self.values(features, self.earlier_cells)?], 0)?;
             valid = Tensor::f_cat(&[valid, self.valid(mask, self.earlier_cells)?], 0)?;
         }

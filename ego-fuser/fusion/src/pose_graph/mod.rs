@@ -269,20 +269,19 @@ impl Assembly {
             observations: shared,
         };
         graph.optimise();
-        let Graph {
-            agents,
-            observations,
-            ..
-        } = graph;
-        self.joined.into_iter().zip(agents).enumerate().skip(1).map(
-            move |(place, ((agent, _), solved))| {
+        let observations = graph.observations;
+        self.joined
+            .into_iter()
+            .zip(graph.agents)
+            .enumerate()
+            .skip(1)
+            .map(move |(place, ((agent, _), solved))| {
                 let shared = observations
                     .iter()
                     .filter(|observation| observation.agent == place)
                     .count();
                 (agent, planar(&solved), shared)
-            },
-        )
+            })
     }
 }
 

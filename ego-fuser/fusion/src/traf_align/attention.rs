@@ -1,10 +1,10 @@
 //! Deformable attention of every token to the points along its trajectory.
 
-use tch::nn::{self, Init};
+use tch::nn;
 use tch::{TchError, Tensor};
 
 use super::config::TrafAlignConfig;
-use crate::layers::{LayerNorm, Linear};
+use crate::layers::{LayerNorm, Linear, uniform};
 use crate::warp::{BILINEAR, PADDING_ZEROS};
 
 /// Multi-head attention to points between tokens, then an MLP, each with a residual and a norm after it.
@@ -45,12 +45,8 @@ impl TrajectoryAttention {
             .f_permute([0, 3, 1, 2])?
             .f_contiguous()?;
         let query = projected.f_narrow(1, 0, dim)?;
-        let read = projected.f_narrow(1, dim, 2 * dim)?.f_grid_sampler(
-            points,
-            BILINEAR,
-            PADDING_ZEROS,
-            false,
-        )?;
+        let read = projected.f_narrow(1, dim, 2 * dim)?;
+        let read = read.f_grid_sampler(points, BILINEAR, PADDING_ZEROS, false)?;
         let per_head = dim / self.heads;
         let count = points.size()[1] / height;
         let split = |first: i64| {
@@ -85,13 +81,6 @@ fn linear(path: &nn::Path<'_>, [input, output]: [i64; 2]) -> Linear {
             &[output, input],
             nn::init::DEFAULT_KAIMING_UNIFORM,
         ),
-        bias: Some(path.var(
-            "bias",
-            &[output],
-            Init::Uniform {
-                lo: -bound,
-                up: bound,
-            },
-        )),
+        bias: Some(path.var("bias", &[output], uniform(bound))),
     }
 }

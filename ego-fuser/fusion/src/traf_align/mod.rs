@@ -31,20 +31,16 @@ pub(crate) use config::TrafAlignConfig;
 use self::attention::TrajectoryAttention;
 use self::field::Trajectories;
 use super::interface::{Fusion, FusionOutput};
+use super::layers::SMALL;
 use super::maps::{AlignedMaps, MapMetadata, reaching};
 use super::padding::Padding;
 use super::settings::{FusionSettings, HistorySpec, Requirements, of_size};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 
 /// TraF-Align.
-pub(crate) static METHOD: MethodSpec = MethodSpec {
-    name: "traf_align",
-    summary: "feature maps with history, attention along trajectories (TraF-Align)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<TrafAlignConfig>(),
-};
+pub(crate) static METHOD: MethodSpec = MethodSpec::of_features::<TrafAlignConfig>(
+    "feature maps with history, attention along trajectories (TraF-Align)",
+);
 
 impl FusionSettings for TrafAlignConfig {
     const KIND: &'static str = "traf_align";
@@ -92,13 +88,7 @@ impl TrafAlign {
     /// [`ConfigError`] names the field that no network can be built from.
     pub(crate) fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let TrafAlignConfig {
-            channels,
-            patch,
-            dim,
-            ..
-        } = *config;
-        let layer = |index: usize| TrajectoryAttention::new(&(path / "layers" / index), config);
+        let (channels, patch, dim) = (config.channels, config.patch, config.dim);
         Ok(Self {
             tokeniser: ConvLayer::patches(
                 &(path / "tokens"),
@@ -106,16 +96,11 @@ impl TrafAlign {
                 [channels, dim],
                 patch,
             ),
-            age: path.var(
-                "age",
-                &[2 * WAVES, dim],
-                Init::Randn {
-                    mean: 0.0,
-                    stdev: 0.02,
-                },
-            ),
+            age: path.var("age", &[2 * WAVES, dim], SMALL),
             trajectories: Trajectories::new(&(path / "trajectories"), config),
-            layers: (0..config.layers).map(layer).collect(),
+            layers: (0..config.layers)
+                .map(|index| TrajectoryAttention::new(&(path / "layers" / index), config))
+                .collect(),
             decoder: path.var("decoder", &[dim, channels, patch, patch], Init::Const(0.0)),
             config: config.clone(),
         })
@@ -233,24 +218,17 @@ impl Agents {
 }
 
 impl Fusion for TrafAlign {
-    fn fuse(
-        &self,
-        AlignedMaps {
-            warped,
-            metadata,
-            is_training,
-            ..
-        }: &AlignedMaps,
-    ) -> Result<FusionOutput, TchError> {
+    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let warped = &maps.warped;
         let entries = reaching(&warped.mask, true)?;
-        let agents = Agents::new(metadata, &entries);
+        let agents = Agents::new(&maps.metadata, &entries);
         let index = Tensor::f_from_slice(&entries)?.f_to_device(warped.features.device())?;
         let pick = |tensor: &Tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float);
         let fused = self.fuse_present(
             &pick(&warped.features)?,
             &pick(&warped.mask)?,
             &agents,
-            *is_training,
+            maps.is_training,
         )?;
         Ok(fused.f_to_kind(warped.features.kind())?.into())
     }

@@ -1,9 +1,9 @@
 //! HMSA: heterogeneous multi-agent self-attention, across the agents at every cell.
 
-use tch::nn::{self, Init};
+use tch::nn;
 use tch::{TchError, Tensor};
 
-use crate::layers::{Linear, attend, dropout};
+use crate::layers::{Linear, SMALL, attend, dropout};
 
 /// Types of agents with separate projections: vehicles and infrastructure.
 pub(crate) const AGENT_TYPES: usize = 2;
@@ -56,14 +56,7 @@ impl AgentAttention {
                 head_channels,
             ];
             // Near the identity: typed attention starts as ordinary attention.
-            let relation = path.var(
-                name,
-                &shape,
-                Init::Randn {
-                    mean: 0.0,
-                    stdev: 0.02,
-                },
-            );
+            let relation = path.var(name, &shape, SMALL);
             let identity = Tensor::eye(head_channels, (relation.kind(), relation.device()));
             let _ = tch::no_grad(|| relation.shallow_clone().g_add_(&identity));
             relation
@@ -110,6 +103,7 @@ impl AgentAttention {
             )));
         }
         let chunk = if train { cells } else { CHUNK };
+        // Projections depend on the type only: one set serves all agents of a type.
         let mut kinds = types[..queries].to_vec();
         kinds.sort_unstable();
         kinds.dedup();
@@ -150,6 +144,7 @@ impl AgentAttention {
             let askers: Vec<usize> = (0..queries)
                 .filter(|&agent| types[agent] == *kind)
                 .collect();
+            // Usually all agents are of one type and all ask: then nothing is copied.
             let query = if askers.len() == types.len() {
                 x.shallow_clone()
             } else {
@@ -158,6 +153,7 @@ impl AgentAttention {
             };
             let answer = self.answer(&query, x, types, asked, bias.as_ref())?;
             let answer = self.out[*kind].forward(&answer)?.f_transpose(0, 1)?;
+            // One type asks for all: its answers already have the order of the agents.
             if askers.len() == queries {
                 return Ok(answer);
             }
@@ -190,6 +186,7 @@ impl AgentAttention {
             return x.f_linear(&weight, Some(&offset))?.f_transpose(0, 1);
         }
         let query = query.f_linear(&asked.query.0, Some(&asked.query.1))?;
+        // One product over all agents is faster than one for each.
         let key_value = if types.iter().all(|&kind| kind == first) {
             let (weight, offset) = &asked.key_value[first];
             x.f_linear(weight, Some(offset))?

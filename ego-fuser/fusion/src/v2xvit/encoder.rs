@@ -104,25 +104,27 @@ pub struct Encoder {
 impl Encoder {
     /// Variables `layers` and `rte` below `path`. `config` is valid and its order is `order`.
     pub fn new(path: &nn::Path<'_>, config: &V2xVitConfig, order: &BlockOrder) -> Self {
-        let layer = |index: usize| {
-            let path = path / "layers" / index;
-            let block = |block: usize| Block::new(&(&path / 0 / "layers" / block), config, order);
-            Layer {
-                blocks: (0..config.blocks).map(block).collect(),
-                norm: LayerNorm::new(&(&path / 1 / "norm"), config.channels),
-                feed_forward: FeedForward::new(
-                    &(&path / 1 / "fn"),
-                    config.channels,
-                    config.hidden,
-                    config.dropout,
-                ),
-            }
-        };
         let temporal = config
             .temporal_encoding
             .then(|| TemporalEncoding::new(&(path / "rte"), config.channels));
         Self {
-            layers: (0..config.depth).map(layer).collect(),
+            layers: (0..config.depth)
+                .map(|index| {
+                    let path = path / "layers" / index;
+                    Layer {
+                        blocks: (0..config.blocks)
+                            .map(|block| Block::new(&(&path / 0 / "layers" / block), config, order))
+                            .collect(),
+                        norm: LayerNorm::new(&(&path / 1 / "norm"), config.channels),
+                        feed_forward: FeedForward::new(
+                            &(&path / 1 / "fn"),
+                            config.channels,
+                            config.hidden,
+                            config.dropout,
+                        ),
+                    }
+                })
+                .collect(),
             temporal,
         }
     }
@@ -162,6 +164,7 @@ impl Encoder {
         for layer in &self.layers {
             for (index, block) in layer.blocks.iter().enumerate() {
                 done += 1;
+                // Nothing reads the neighbours' tokens after the last attention between agents.
                 let queries = if done == attentions { 1 } else { types.len() };
                 x = block.across_agents(&x, unseen, types, queries, train)?;
                 let is_last = index + 1 == layer.blocks.len();

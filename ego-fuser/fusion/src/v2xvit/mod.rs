@@ -27,17 +27,12 @@ use super::layers::unseen;
 use super::maps::AlignedMaps;
 use super::padding::Padding;
 use super::settings::{FusionSettings, of_size};
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::MethodSpec;
 
 /// V2X-ViT.
-pub static METHOD: MethodSpec = MethodSpec {
-    name: "v2xvit",
-    summary: "feature maps, attention over agents and windows of several sizes (V2X-ViT)",
-    exchange: Exchange::Features,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<V2xVitConfig>(),
-};
+pub static METHOD: MethodSpec = MethodSpec::of_features::<V2xVitConfig>(
+    "feature maps, attention over agents and windows of several sizes (V2X-ViT)",
+);
 
 /// All agents are vehicles; the second type of the reference is infrastructure.
 const VEHICLE: usize = 0;
@@ -76,16 +71,14 @@ impl V2xVit {
     }
 
     /// The features with the code of each map's age where the map reaches.
-    fn with_age(
-        &self,
-        AlignedMaps {
-            warped, metadata, ..
-        }: &AlignedMaps,
-    ) -> Result<Tensor, TchError> {
+    fn with_age(&self, maps: &AlignedMaps) -> Result<Tensor, TchError> {
+        let warped = &maps.warped;
         let Some(temporal) = self.encoder.temporal() else {
             return Ok(warped.features.shallow_clone());
         };
-        let rows: Vec<f64> = metadata.iter().map(|map| map.age_secs / ROW_SECS).collect();
+        let rows: Vec<f64> = (maps.metadata.iter())
+            .map(|map| map.age_secs / ROW_SECS)
+            .collect();
         let code = temporal.encode(&rows)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
         // The reference adds it before the warp, which leaves zeros where a map does not reach.
         warped.features.f_addcmul(&code, &warped.mask)

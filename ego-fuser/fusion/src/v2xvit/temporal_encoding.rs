@@ -3,6 +3,7 @@
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
+use crate::f64_tensor::picked;
 use crate::layers::Linear;
 
 /// Rows of the table.
@@ -52,12 +53,7 @@ impl TemporalEncoding {
         let lower: Vec<i64> = rows.iter().map(|row| row.floor() as i64).collect();
         let upper: Vec<i64> = rows.iter().map(|row| row.ceil() as i64).collect();
         let share: Vec<f32> = rows.iter().map(|row| row.fract() as f32).collect();
-        let row = |index: &[i64]| {
-            self.table.f_index_select(
-                0,
-                &Tensor::f_from_slice(index)?.f_to_device(self.table.device())?,
-            )
-        };
+        let row = |index: &[i64]| picked(&self.table, index);
         let share = Tensor::f_from_slice(&share)?
             .f_view([-1, 1])?
             .f_to_device(self.table.device())?;

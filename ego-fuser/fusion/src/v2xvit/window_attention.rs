@@ -1,11 +1,11 @@
 //! MSwin: attention within windows of several sizes, for every agent separately.
 
-use tch::nn::{self, Init};
+use tch::nn;
 use tch::{Kind, TchError, Tensor};
 
 use super::config::{Merge, WindowConfig};
 use crate::block_order::BlockOrder;
-use crate::layers::{LayerNorm, Linear, attend, dropout};
+use crate::layers::{LayerNorm, Linear, SMALL, attend, dropout};
 
 /// Tokens that are computed at once outside training: intermediate results then stay in the cache.
 const CHUNK: i64 = 1024;
@@ -39,14 +39,7 @@ impl WindowBranch {
             tokens: edge * edge,
             heads: config.heads,
             to_qkv: Linear::new(&(path / "to_qkv"), channels, 3 * inner, false),
-            pos_embedding: path.var(
-                "pos_embedding",
-                &[span, span],
-                Init::Randn {
-                    mean: 0.0,
-                    stdev: 0.02,
-                },
-            ),
+            pos_embedding: path.var("pos_embedding", &[span, span], SMALL),
             offsets: Tensor::from_slice(&offsets).to_device(path.device()),
             out: Linear::residual(&(path / "to_out" / 0), inner, channels, true),
         }
@@ -119,16 +112,11 @@ impl WindowAttention {
     ) -> Self {
         let branch =
             |(index, config)| WindowBranch::new(&(path / "pwmsa" / index), channels, config, order);
-        let gate = path / "split_attn";
+        let (gate, wide) = (path / "split_attn", windows.len() as i64 * channels);
         let gate = (merge == Merge::SplitAttention).then(|| Gate {
             fc1: Linear::new(&(&gate / "fc1"), channels, channels, false),
             bn1: LayerNorm::new(&(&gate / "bn1"), channels),
-            fc2: Linear::new(
-                &(&gate / "fc2"),
-                channels,
-                windows.len() as i64 * channels,
-                false,
-            ),
+            fc2: Linear::new(&(&gate / "fc2"), channels, wide, false),
         });
         let largest = order.largest() * order.largest();
         Self {
@@ -153,6 +141,7 @@ impl WindowAttention {
         let chunk = if train {
             tokens
         } else {
+            // Complete windows of the largest size are complete windows of every size.
             (CHUNK / self.largest).max(1) * self.largest
         };
         let biases = self
@@ -174,6 +163,7 @@ impl WindowAttention {
             .iter()
             .map(|seen| project(seen, &weights, &bias))
             .collect::<Result<_, _>>()?;
+        // A single chunk is not copied.
         let output = if let [only] = &outputs[..] {
             only.shallow_clone()
         } else {
@@ -199,43 +189,36 @@ impl WindowAttention {
         let shares = match &self.gate {
             None => biases.f_ones_like()? / self.branches.len() as f64,
             Some(gate) => {
-                let mut parts =
-                    vec![biases.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?];
+                let mut parts = vec![total(&biases)?];
                 for (index, branch) in self.branches.iter().enumerate() {
-                    let sums = seen.iter().map(|seen| {
-                        seen[index].f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)
-                    });
+                    let sums = seen.iter().map(|seen| total(&seen[index]));
                     let sums = Tensor::f_stack(&sums.collect::<Result<Vec<_>, _>>()?, 0)?;
-                    let sum = sums.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?
-                        / tokens as f64;
+                    let sum = total(&sums)? / tokens as f64;
                     parts.push(branch.out.weight.f_mv(&sum)?);
                 }
-                let mean = Tensor::f_stack(&parts, 0)?.f_sum_dim_intlist(
-                    [0i64].as_slice(),
-                    false,
-                    None::<Kind>,
-                )?;
+                let mean = total(&Tensor::f_stack(&parts, 0)?)?;
                 gate.shares(&mean)?
             }
-        };
-        let weight = |(index, branch): (usize, &WindowBranch)| {
-            branch
-                .out
-                .weight
-                .f_transpose(0, 1)?
-                .f_mul(&shares.f_get(index as i64)?)
         };
         let weights = self
             .branches
             .iter()
             .enumerate()
-            .map(weight)
+            .map(|(index, branch)| {
+                branch
+                    .out
+                    .weight
+                    .f_transpose(0, 1)?
+                    .f_mul(&shares.f_get(index as i64)?)
+            })
             .collect::<Result<Vec<_>, _>>()?;
-        Ok((
-            weights,
-            (&biases * &shares).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?,
-        ))
+        Ok((weights, total(&(&biases * &shares))?))
     }
+}
+
+/// The sum over the first dimension.
+fn total(rows: &Tensor) -> Result<Tensor, TchError> {
+    rows.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)
 }
 
 /// The sum over the branches of `seen W`, and `bias`.

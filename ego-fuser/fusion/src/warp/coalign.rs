@@ -44,12 +44,8 @@ pub fn normalized(
 pub fn warp_affine(source: &Tensor, matrix: &Tensor) -> Result<Tensor, TchError> {
     let sampling_grid =
         Tensor::f_affine_grid_generator(&matrix.f_to_kind(Kind::Float)?, source.size(), false)?;
-    source.f_grid_sampler(
-        &sampling_grid.f_to_kind(source.kind())?,
-        BILINEAR,
-        PADDING_ZEROS,
-        false,
-    )
+    let sampling_grid = sampling_grid.f_to_kind(source.kind())?;
+    source.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)
 }
 
 #[cfg(test)]

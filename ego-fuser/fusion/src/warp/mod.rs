@@ -1,12 +1,10 @@
 //! Warp: resamples a neighbour's BEV feature map onto the BEV grid of the ego.
 //!
 //! Only x, y and yaw of a pose are used: feature maps have no height. Each public reference code has its own
-//! convention. [`opencood`] has those of OpenCOOD, only for the tests that compare with it; [`coalign`] has that of
-//! CoAlign, for networks that fuse at every level. All other weights run on the warp of this module, wherever they were
-//! trained.
+//! convention. [`coalign`] has that of CoAlign, for networks that fuse at every level. All other weights run on the warp
+//! of this module, wherever they were trained.
 
 pub mod coalign;
-pub mod opencood;
 mod sampling;
 
 use protocol::{BevGrid, Pose};

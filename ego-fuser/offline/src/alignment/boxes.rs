@@ -9,7 +9,7 @@ use super::free_align::{self, FreeAlignConfig};
 use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
 /// No pose is known: these methods do not need one.
-const NO_POSE: PoseEstimate = PoseEstimate::NoPose {
+pub(super) const NO_POSE: PoseEstimate = PoseEstimate::NoPose {
     reason: NoPoseReason::NoSource,
     inlier_count: 0,
 };
@@ -23,7 +23,6 @@ pub struct FreeAlign {
 
 impl FreeAlign {
     /// The method with some settings.
-    #[must_use]
     pub fn spec(config: FreeAlignConfig) -> AlignmentSpec {
         AlignmentSpec::new("free-align", true, move || Self {
             config: config.clone(),
@@ -55,7 +54,6 @@ pub struct BoxIcp;
 
 impl BoxIcp {
     /// The method, which has no settings.
-    #[must_use]
     pub fn spec() -> AlignmentSpec {
         AlignmentSpec::new("box-icp", true, || Self)
     }

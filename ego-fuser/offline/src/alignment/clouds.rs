@@ -3,8 +3,9 @@
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
 use nalgebra::Isometry3;
 use protocol::message::{Message, Points};
-use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use protocol::{PointCloud, PoseEstimate};
 
+use super::boxes::NO_POSE;
 use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
 /// Registers the neighbour's decimated sweep against the ego's own.
@@ -16,7 +17,6 @@ pub struct CloudIcp {
 
 impl CloudIcp {
     /// Starts at the identity, or (`starts_at_gnss`) at the difference of both receivers' poses.
-    #[must_use]
     pub fn spec(config: IcpConfig, starts_at_gnss: bool) -> AlignmentSpec {
         let name = if starts_at_gnss { "icp-gnss" } else { "icp" };
         AlignmentSpec::new(name, false, move || Self {
@@ -52,11 +52,7 @@ impl AlignmentMethod for CloudIcp {
             .frame
             .gnss_world_from_lidar()
             .filter(|_| self.starts_at_gnss);
-        let no_pose = PoseEstimate::NoPose {
-            reason: NoPoseReason::NoSource,
-            inlier_count: 0,
-        };
-        let pose = measured.map_or(no_pose, |pose| PoseEstimate::new(pose, 1.0));
+        let pose = measured.map_or(NO_POSE, |pose| PoseEstimate::new(pose, 1.0));
         Ok(Message::Points(Points {
             pose,
             points: PointCloud { xyzi },

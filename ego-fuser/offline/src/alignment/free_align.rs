@@ -138,16 +138,16 @@ pub fn align(
         .first()
         .filter(|best| best.matches.len() >= required)
         .ok_or(too_few)?;
-    let is_other = |other: &&BoxAlignment| {
-        !same_motion(
-            &other.ego_from_neighbour,
-            &best.ego_from_neighbour,
-            config.fit_tolerance_m,
-        )
-    };
+    // Repetitive scenes have several motions with many inliers: then none can be trusted.
     let rival = finalists
         .iter()
-        .find(is_other)
+        .find(|other| {
+            !same_motion(
+                &other.ego_from_neighbour,
+                &best.ego_from_neighbour,
+                config.fit_tolerance_m,
+            )
+        })
         .map_or(0, |rival| rival.matches.len());
     if rival + config.min_lead > best.matches.len() {
         return Err(NoAlignment::Ambiguous {
@@ -231,6 +231,7 @@ impl Search<'_> {
         for a in 0..self.ego.len() {
             for b in 0..self.neighbour.len() {
                 let candidates = self.agreeing_with((a, b));
+                // The other order of the two anchors is the same pair.
                 for &(_, second) in candidates.iter().filter(|(_, second)| second.0 > a) {
                     let matches = self.grown((a, b), second, &candidates);
                     self.largest = self.largest.max(matches.len());
@@ -247,6 +248,7 @@ impl Search<'_> {
         let mut found = Vec::new();
         for k in 0..self.ego.len() {
             let length = self.ego.edge(anchor.0, k);
+            // Short edges have about the same length everywhere.
             if length < self.config.min_edge_m {
                 continue;
             }
@@ -266,15 +268,15 @@ impl Search<'_> {
         let tolerance = self.config.edge_tolerance_m;
         let mut matches = vec![first, second];
         for &(_, (k, l)) in candidates {
-            let agrees = |&(a, b): &Match| {
-                a != k
-                    && b != l
-                    && (self.ego.edge(a, k) - self.neighbour.edge(b, l)).abs() < tolerance
-            };
             // A mirror image has the same distances and the other sign.
             let sides = self.ego.left_of((first.0, second.0), k)
                 - self.neighbour.left_of((first.1, second.1), l);
-            if matches.iter().all(agrees) && sides.abs() < 2.0 * tolerance {
+            if matches.iter().all(|&(a, b)| {
+                a != k
+                    && b != l
+                    && (self.ego.edge(a, k) - self.neighbour.edge(b, l)).abs() < tolerance
+            }) && sides.abs() < 2.0 * tolerance
+            {
                 matches.push((k, l));
             }
         }
@@ -285,10 +287,11 @@ impl Search<'_> {
         let Some(motion) = self.fit(matches) else {
             return;
         };
-        let same = |(_, known): &&mut (usize, Isometry3<f64>)| {
-            same_motion(known, &motion, self.config.fit_tolerance_m)
-        };
-        match self.motions.iter_mut().find(same) {
+        match self
+            .motions
+            .iter_mut()
+            .find(|(_, known)| same_motion(known, &motion, self.config.fit_tolerance_m))
+        {
             Some(known) if known.0 < matches.len() => *known = (matches.len(), motion),
             Some(_) => {}
             None => self.motions.push((matches.len(), motion)),

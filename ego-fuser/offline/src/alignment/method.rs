@@ -62,7 +62,6 @@ impl AlignmentSpec {
     }
 
     /// The method at the beginning of a scene.
-    #[must_use]
     pub fn for_scene(&self) -> Box<dyn AlignmentMethod> {
         (self.construct)()
     }
@@ -95,7 +94,6 @@ pub enum NotAligned {
 
 impl NotAligned {
     /// One word for counting.
-    #[must_use]
     pub fn reason(&self) -> &'static str {
         use localization::registration::icp::NoIcpFit;
         match self {

@@ -20,8 +20,9 @@ use perception::detector::Detector;
 use perception::inference::Inference;
 use protocol::CavId;
 use support::file_error::AtFile;
-use support::{output, progress};
+use support::output;
 use tch::Device;
+use terminal::progress;
 
 use super::{DataSets, print_left_out, rows_with_provenance};
 use support::cli::{BadInput, Outcome};
@@ -195,8 +196,9 @@ impl Arguments {
             read_map(&self.icp_map, self.map_spacing_m, &config, left_out).map_err(BadInput::of)?;
         tracing::info!(planes = map.planes(), "map");
         let source = IcpMapPose::new(Arc::new(map), config);
-        let build = move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>);
-        Ok(Poses::spec("icp-map", Measured::Gnss, build))
+        Ok(Poses::spec("icp-map", Measured::Gnss, move || {
+            Ok(Box::new(source.clone()) as Box<dyn PoseSource>)
+        }))
     }
 
     fn box_source(&self, boxes: Boxes, methods: &[AlignmentSpec]) -> Result<BoxSource> {

@@ -17,8 +17,9 @@ use perception::int8::InferencePrecision;
 use perception::weights::{KIND_KEY, Weights};
 use serde_json::{Value, json};
 use support::cli::{BadInput, Outcome};
+use support::output;
 use support::provenance::Provenance;
-use support::{output, progress};
+use terminal::progress;
 
 /// A data set with its evaluation protocol.
 struct Data {
@@ -59,7 +60,8 @@ impl Arguments {
         tch::set_num_threads(i32::from(self.threads.max(1)));
         let mut left_out = LeftOut::default();
         let data = self.open(&mut left_out)?;
-        if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
+        let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
+        if weights.metadata(KIND_KEY) == Some(MULTI_SCALE_KIND) {
             self.run_multi_scale(&data, &mut left_out)?;
             return Ok(print_left_out(&left_out));
         }
@@ -79,7 +81,8 @@ impl Arguments {
             left_out.merge(&lost);
             rows.push(row);
         }
-        self.print_json(rows, &data, &protocols(&data, &self.weights)?)?;
+        let area_m = weights.detector_config()?.lidar_range_m;
+        self.print_json(rows, &data, &protocols(&data, area_m))?;
         Ok(print_left_out(&left_out))
     }
 }
@@ -151,11 +154,7 @@ impl Arguments {
             print_row(&row)?;
         }
         let area_m = detector.config().lidar_range_m;
-        let protocols: Vec<_> = data
-            .iter()
-            .map(|data| data.protocol.within(area_m))
-            .collect();
-        self.print_json(vec![row], data, &protocols)
+        self.print_json(vec![row], data, &protocols(data, area_m))
     }
 
     /// Command, and digests of the program, the weights, the scripts and the evaluated data.
@@ -191,19 +190,9 @@ impl Arguments {
 }
 
 /// The protocol of each data set, as it applies to the area of the network.
-fn protocols(data: &[Data], weights: &Path) -> Result<Vec<EvaluationProtocol>> {
-    let weights = Weights::load(weights).map_err(BadInput::of)?;
-    let area_m = weights.detector_config()?.lidar_range_m;
-    Ok(data
-        .iter()
-        .map(|data| data.protocol.within(area_m))
-        .collect())
-}
-
-/// Kind of network in a weights file's metadata, if it has one.
-fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
-    let weights = Weights::load(weights).map_err(BadInput::of)?;
-    Ok(weights.metadata(KIND_KEY).map(ToOwned::to_owned))
+fn protocols(data: &[Data], area_m: [f64; 6]) -> Vec<EvaluationProtocol> {
+    let protocols = data.iter().map(|data| data.protocol.within(area_m));
+    protocols.collect()
 }
 
 /// Results of one method over all data, and the data that were left out.
@@ -301,7 +290,8 @@ mod tests {
 
     #[test]
     fn weights_that_are_not_there_are_bad_input() {
-        let error = anyhow::Error::from(kind_of(Path::new("no/such.safetensors")).unwrap_err());
+        let loaded = Weights::load(Path::new("no/such.safetensors"));
+        let error = anyhow::Error::from(loaded.map_err(BadInput::of).unwrap_err());
         assert!(error.to_string().contains("no/such.safetensors"), "{error}");
         assert_eq!(exit_code(Err(error), |_| false), ExitCode::from(2));
     }

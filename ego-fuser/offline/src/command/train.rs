@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use agent_offline::TrainingBar;
 use anyhow::{Context, Result};
 use clap::ArgGroup;
 use dataset::Layout;
@@ -12,7 +13,7 @@ use fusion::pastat::{Part, ablated};
 use fusion::{Exchange, FusionConfig, Method};
 use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseTable};
 use perception::model_config::DetectorConfig;
-use perception::train::{AdamWConfig, DataListing, RunConfig, TrainingBar, TrainingOptions};
+use perception::train::{AdamWConfig, DataListing, RunConfig, TrainingOptions};
 use perception::weights::Weights;
 use protocol::Dtype;
 use training::Error;

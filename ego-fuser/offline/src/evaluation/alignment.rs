@@ -11,8 +11,9 @@ use dataset::frame::Frame;
 use dataset::{LeftOut, LoadOptions, Scenario, ground_truth};
 use nalgebra::Isometry3;
 use protocol::message::Message;
-use protocol::{Box3d, HEADER_LEN, Stamp, wire};
+use protocol::{Box3d, HEADER_LEN, wire};
 
+use super::transmission::stamp;
 use crate::alignment::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 use ego_fuser::ego::Ego;
 
@@ -169,16 +170,7 @@ fn prepare(
     let start = Instant::now();
     let message = method.prepare(vehicle)?;
     let time = start.elapsed();
-    let Frame {
-        cav, capture_nanos, ..
-    } = vehicle.frame;
-    let stamp = Stamp {
-        cav: cav.clone(),
-        epoch: 0,
-        sequence: 0,
-        capture_nanos: *capture_nanos,
-        publish_nanos: *capture_nanos,
-    };
+    let stamp = stamp(&vehicle.frame.cav, vehicle.frame.capture_nanos);
     let bytes = wire::encode_any(&stamp, message.clone())?.wire_bytes() - HEADER_LEN;
     Ok(Prepared {
         message,

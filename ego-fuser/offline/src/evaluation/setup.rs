@@ -94,21 +94,16 @@ impl EmulatedLink {
 impl Setup {
     /// The link of a scenario.
     pub(super) fn emulator(&self, scenario: &Scenario) -> Result<LinkEmulator, LinkError> {
-        let Some(EmulatedLink {
-            config,
-            folder,
-            seed,
-        }) = &self.link
-        else {
-            let latency = LatencyModel::ConstantMs(self.delay_ms as f64);
+        let Some(link) = &self.link else {
             let config = LinkConfig {
-                latency,
+                latency: LatencyModel::ConstantMs(self.delay_ms as f64),
                 ..LinkConfig::default()
             };
             return LinkEmulator::new(config, Path::new("."), 0);
         };
         let seed_words: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
-        LinkEmulator::new(config.clone(), folder, derive_seed(*seed, &seed_words))
+        let seed = derive_seed(link.seed, &seed_words);
+        LinkEmulator::new(link.config.clone(), &link.folder, seed)
     }
 
     /// Options of an ego's loop in a scenario.

@@ -14,14 +14,15 @@ use std::time::Duration;
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
-use protocol::{CavId, Detections, PoseEstimate, StageTiming};
+use protocol::{CavId, Detections, PoseEstimate, StageTiming, Tracks};
 
 pub use compute::{ComputeTimes, EstimatedTimes};
 pub use remote::{RemoteError, RemotePool};
 
 use super::participant::Participant;
-use super::sent::{Sent, stamp, view};
+use super::sent::Sent;
 use super::sweeps::Sweep;
+use super::transmission::{stamp, view};
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
@@ -62,6 +63,9 @@ struct Computed {
     poses: Vec<PoseEstimate>,
 }
 
+/// Result and tracks of a tick, or the reason of its failure.
+type Fused = Result<(Detections, Option<Tracks>), String>;
+
 struct Run<'a> {
     evaluator: &'a mut Evaluator,
     compute: ComputeTimes,
@@ -85,7 +89,7 @@ struct Run<'a> {
     own: VecDeque<Message>,
     ego_loop: EgoLoop,
     /// Results that are not reported yet, each with the time of its decision, nanoseconds, or the reason of a failure.
-    decided: VecDeque<(u64, Result<Detections, String>)>,
+    decided: VecDeque<(u64, Fused)>,
     /// Time at which the ego finishes its current fusion, nanoseconds.
     ego_free_nanos: u64,
 }
@@ -158,10 +162,11 @@ impl<'a> Run<'a> {
         let is_needed =
             |place: usize| Some(place) == ego_place || method.exchange() != Exchange::Nothing;
         let is_here = self.evaluator.remote.is_none();
-        let with_maps = |place| is_here && is_needed(place);
         let sweeps = self
             .evaluator
-            .sweeps(self.scenario, tick, places, &load, with_maps)?;
+            .sweeps(self.scenario, tick, places, &load, |place| {
+                is_here && is_needed(place)
+            })?;
         if sweeps.first().map(|ego| ego.place) != ego_place {
             self.computed.push_back(None);
             return Ok(());
@@ -241,6 +246,7 @@ impl<'a> Run<'a> {
             let exchange = is_needed.then(|| method.own_content());
             let index = self.places.iter().position(|it| it == place);
             if let Some(participant) = index.and_then(|index| self.participants.get_mut(index)) {
+                // A replaying attacker repeats the message of the vehicle before it.
                 participant.capture(all.last());
                 all.push(view(participant, frame, map.as_ref(), exchange)?);
             }
@@ -295,9 +301,11 @@ impl<'a> Run<'a> {
                 self.ego_loop.wakes_nanos(),
             ];
             let next = moments.into_iter().flatten().min().unwrap_or(u64::MAX);
+            // While it fuses, the ego takes nothing in.
             let now_nanos = next.max(self.ego_free_nanos);
             let next_tick = self.scenario.ticks.get(self.next);
             let captured = next_tick.filter(|_| self.next < self.end);
+            // A sweep that is captured before the next event may cause an earlier one.
             if captured.is_some_and(|tick| tick.capture_nanos <= now_nanos) {
                 self.compute()?;
                 continue;
@@ -349,7 +357,7 @@ impl<'a> Run<'a> {
         let ego = &mut self.evaluator.ego;
         for output in self.ego_loop.handle(ego, input, now_nanos) {
             let fused = match output {
-                Output::Publish { result, .. } => Ok(*result),
+                Output::Publish { result, tracks, .. } => Ok((*result, tracks)),
                 Output::Failed { error, .. } if error.is_of_frame() => Err(error.to_string()),
                 Output::Failed { error, .. } => return Err(error.into()),
                 Output::Received(cav) => {
@@ -375,7 +383,7 @@ impl<'a> Run<'a> {
         tick: usize,
         decided_nanos: u64,
         computed: Computed,
-        fused: Result<Detections, String>,
+        fused: Fused,
     ) -> EvaluatedFrame {
         let Computed { frames, poses, .. } = computed;
         let compute = self.compute;
@@ -383,9 +391,9 @@ impl<'a> Run<'a> {
         let ready_nanos = self.ready_nanos(tick);
         let done_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
         let ego = &frames[0].cav;
-        let (mut result, failure) = match fused {
-            Ok(result) => (result, None),
-            Err(reason) => (self.empty(tick, ego, poses[0]), Some(reason)),
+        let (mut result, tracks, failure) = match fused {
+            Ok((result, tracks)) => (result, tracks, None),
+            Err(reason) => (self.empty(tick, ego, poses[0]), None, Some(reason)),
         };
         if self.evaluator.setup.link.is_some() {
             // Measured times would differ in every run.
@@ -410,6 +418,7 @@ impl<'a> Run<'a> {
                 ..stamp(ego, capture_nanos)
             },
             result,
+            tracks,
             failure,
             truth: GroundTruth::of_tick(&views, 0, &self.evaluator.rule),
             frames,

@@ -77,7 +77,6 @@ impl Evaluator {
     }
 
     /// Data that were left out so far.
-    #[must_use]
     pub fn left_out(&self) -> &LeftOut {
         &self.left_out
     }

@@ -118,13 +118,11 @@ impl MultiScaleNetwork {
     }
 
     /// The detector.
-    #[must_use]
     pub fn network(&self) -> &PointPillars {
         &self.network
     }
 
     /// Its configuration besides the detector.
-    #[must_use]
     pub fn config(&self) -> &MultiScaleConfig {
         &self.config
     }

@@ -3,10 +3,9 @@
 use std::path::Path;
 
 use dataset::frame::Frame;
-use nalgebra::Isometry3;
 use perception::boxes::anchors::Anchors;
 use perception::boxes::decode::decode;
-use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::crop::Crop;
 use perception::detector::Heads;
 use perception::model_config::{DetectorConfig, YAxis};
@@ -15,7 +14,7 @@ use perception::pillars::voxels::{Pillars, Voxeliser};
 use protocol::{Detection, PointCloud, Pose};
 use tch::{Device, no_grad};
 
-use super::{MultiScaleNetwork, MultiScaleOutput, Placement};
+use super::{MultiScaleNetwork, Placement};
 use ego_fuser::ego::Ego;
 use fusion::model::ModelError;
 use fusion::points::merge_points;
@@ -48,13 +47,11 @@ impl OfflineDetector {
     }
 
     /// The network.
-    #[must_use]
     pub fn network(&self) -> &MultiScaleNetwork {
         &self.network
     }
 
     /// Configuration of its encoder and head.
-    #[must_use]
     pub fn config(&self) -> &DetectorConfig {
         &self.network.network().config
     }
@@ -121,10 +118,8 @@ impl OfflineDetector {
         } else {
             Placement::of_poses(poses, &network.config.feature_grid())?
         };
-        let MultiScaleOutput {
-            heads, sent_bytes, ..
-        } = no_grad(|| self.network.forward(&batch, &[placement]))?;
-        let heads = Heads::new(&heads)?;
+        let output = no_grad(|| self.network.forward(&batch, &[placement]))?;
+        let heads = Heads::new(&output.heads)?;
         let mut boxes = decode(
             &heads.scores,
             &heads.offsets,
@@ -136,19 +131,8 @@ impl OfflineDetector {
                 found.box3d = found.box3d.mirrored_y();
             }
         }
-        let own = AgentBoxes {
-            boxes: &boxes,
-            output_from_agent: Isometry3::identity(),
-        };
-        let found = postprocess(&[own], &self.limits);
         // The ego's own map is not transmitted.
-        let sent_bytes = sent_bytes.into_iter().skip(1).collect();
-        Ok((
-            found
-                .iter()
-                .map(|candidate| candidate.detection(None))
-                .collect(),
-            sent_bytes,
-        ))
+        let sent_bytes = output.sent_bytes.into_iter().skip(1).collect();
+        Ok((detections(&boxes, &self.limits), sent_bytes))
     }
 }

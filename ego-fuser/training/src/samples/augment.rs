@@ -28,14 +28,16 @@ impl Augmentation {
         scale: 0.0,
     };
 
-    /// Draws the common changes of a scene.
-    pub fn scene(&self, rng: &mut impl Rng) -> SceneAugment {
+    /// Draws the changes of the views of a scene's vehicles.
+    pub fn views(&self, vehicles: usize, rng: &mut impl Rng) -> Vec<ViewAugment> {
         let mirrored = rng.random_bool(self.mirror);
-        SceneAugment {
+        let scale = 1.0 + self.scale * (2.0 * rng.random::<f64>() - 1.0);
+        let view = |_| ViewAugment {
             mirrored,
-            scale: 1.0 + self.scale * (2.0 * rng.random::<f64>() - 1.0),
-            turn_rad: self.turn_rad,
-        }
+            scale,
+            turn_rad: self.turn_rad * (2.0 * rng.random::<f64>() - 1.0),
+        };
+        (0..vehicles).map(view).collect()
     }
 }
 
@@ -45,25 +47,6 @@ impl Default for Augmentation {
             mirror: 0.5,
             turn_rad: PI / 4.0,
             scale: 0.05,
-        }
-    }
-}
-
-/// Changes common to all vehicles of a scene.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SceneAugment {
-    mirrored: bool,
-    scale: f64,
-    turn_rad: f64,
-}
-
-impl SceneAugment {
-    /// Draws the change of one vehicle's frame.
-    pub fn view(&self, rng: &mut impl Rng) -> ViewAugment {
-        ViewAugment {
-            mirrored: self.mirrored,
-            scale: self.scale,
-            turn_rad: self.turn_rad * (2.0 * rng.random::<f64>() - 1.0),
         }
     }
 }
@@ -148,8 +131,8 @@ mod tests {
         let in_cav = [3.0f32, -2.0, 0.5, 0.0];
         let in_ego = ego_from_cav.isometry() * Point3::new(3.0, -2.0, 0.5);
         for _ in 0..20 {
-            let scene = Augmentation::default().scene(&mut rng);
-            let (ego, cav) = (scene.view(&mut rng), scene.view(&mut rng));
+            let views = Augmentation::default().views(2, &mut rng);
+            let (ego, cav) = (views[0], views[1]);
             let mut points = [in_cav];
             cav.points(&mut points);
             let pose = ego.pose(&ego_from_cav, &cav);
@@ -172,7 +155,7 @@ mod tests {
             heading_rad: 0.7,
         };
         for _ in 0..20 {
-            let view = Augmentation::default().scene(&mut rng).view(&mut rng);
+            let view = Augmentation::default().views(1, &mut rng)[0];
             let mut moved: Vec<[f32; 4]> = car
                 .corners()
                 .iter()
@@ -194,7 +177,7 @@ mod tests {
     #[test]
     fn off_changes_nothing() {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let view = Augmentation::OFF.scene(&mut rng).view(&mut rng);
+        let view = Augmentation::OFF.views(1, &mut rng)[0];
         let mut points = [[1.5f32, -2.5, 0.25, 0.5]];
         view.points(&mut points);
         assert_eq!(points, [[1.5, -2.5, 0.25, 0.5]]);

@@ -111,7 +111,8 @@ pub struct SampleBuilder {
     assigner: Arc<TargetAssigner>,
     crop: Crop,
     voxeliser: Voxeliser,
-    maps: Option<MapSource>,
+    /// Maps of a frozen encoder, in place of pillars.
+    pub(crate) maps: Option<MapSource>,
 }
 
 /// One view on its way into a sample.
@@ -149,15 +150,6 @@ impl SampleBuilder {
         }
     }
 
-    /// The same with maps of a frozen encoder, in place of pillars.
-    #[must_use]
-    pub fn with_maps(self, maps: MapSource) -> Self {
-        Self {
-            maps: Some(maps),
-            ..self
-        }
-    }
-
     /// The scenes it draws from.
     pub fn scenes(&self) -> &SceneSet {
         &self.scenes
@@ -185,8 +177,7 @@ impl SampleBuilder {
             false => viewers,
         };
         let entries = self.entries(tick, viewers, rng)?;
-        let scene = self.config.augmentation.scene(rng);
-        let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
+        let changes = self.config.augmentation.views(entries.len(), rng);
         let truth = self.truth(&frames, annotators, &changes[0]);
         let objects: Vec<Box3d> = truth.boxes().collect();
         let (mut facts, offsets) = metadata(&entries, &changes);
@@ -223,7 +214,7 @@ impl SampleBuilder {
         rng: &mut impl Rng,
     ) -> Result<Vec<Entry>, Error> {
         let ticks = &self.scenes.scenario(now).ticks;
-        let gap = self.config.moments.draw_gap(rng);
+        let gap = rng.random_range(1..=self.config.moments.gap.max(1));
         let error = self.config.poses.draw(rng)?;
         let (mut newest, mut older) = (Vec::new(), Vec::new());
         for (index, &agent) in agents.iter().enumerate() {

@@ -118,7 +118,7 @@ pub fn batches(
 }
 
 /// Every tick once per epoch, in an order that depends on the seed and the epoch only.
-#[derive(Clone)]
+#[derive(Clone, Default)]
 struct Order {
     ticks: Vec<TickRef>,
     shuffled: Vec<TickRef>,
@@ -130,9 +130,8 @@ impl Order {
     fn new(ticks: Vec<TickRef>, seed: u64) -> Self {
         Self {
             ticks,
-            shuffled: Vec::new(),
-            epoch: None,
             seed,
+            ..Self::default()
         }
     }
 

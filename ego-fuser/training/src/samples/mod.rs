@@ -10,7 +10,7 @@ mod moments;
 mod poses;
 mod scenes;
 
-pub use augment::{Augmentation, SceneAugment, ViewAugment};
+pub use augment::{Augmentation, ViewAugment};
 pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews};
 pub use loader::{Batch, BatchViews, batches};
 pub use moments::Moments;

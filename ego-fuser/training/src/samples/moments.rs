@@ -29,11 +29,6 @@ impl Default for Moments {
 }
 
 impl Moments {
-    /// Draws the ticks between two time steps of a sample.
-    pub(super) fn draw_gap(&self, rng: &mut impl Rng) -> usize {
-        rng.random_range(1..=self.gap.max(1))
-    }
-
     /// Draws the newest tick that has arrived from a neighbour when the ego is at tick `now`.
     pub(super) fn draw_newest(&self, ticks: &[Tick], now: usize, rng: &mut impl Rng) -> usize {
         let is_young =

@@ -39,15 +39,6 @@ impl SamplePoses {
         Ok(())
     }
 
-    /// The same without an added error.
-    pub(crate) fn without_noise(&self) -> Self {
-        Self {
-            noise: None,
-            lost_share: 0.0,
-            ..self.clone()
-        }
-    }
-
     /// Draws the error of one sample.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, Error> {
         // One draw fewer where the share is all or nothing: earlier samples stay the same.

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
@@ -10,6 +10,7 @@ use dataset::{self, LoadOptions, OpenOptions, Scenario, findings};
 use perception::train::DataListing;
 use protocol::PointCloud;
 use support::file_digests::FileDigests;
+use support::sync::lock;
 
 use crate::Error;
 
@@ -26,7 +27,7 @@ pub struct TickRef {
 ///
 /// Poses and annotations of a tick are read once and kept (some kilobytes each); points are read whenever they are
 /// needed, and the operating system's page cache keeps them.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct SceneSet {
     scenarios: Vec<Scenario>,
     ticks: Vec<TickRef>,
@@ -84,10 +85,7 @@ impl SceneSet {
         Self {
             scenarios,
             ticks,
-            problems: Vec::new(),
-            known: Mutex::default(),
-            unreadable: Mutex::default(),
-            sha256: OnceLock::new(),
+            ..Self::default()
         }
     }
 
@@ -152,8 +150,4 @@ impl SceneSet {
             without_pose: 0,
         }
     }
-}
-
-fn lock<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
-    shared.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -9,7 +9,7 @@ use super::config::TrainConfig;
 use super::observer::Observer;
 use crate::Error;
 use crate::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
-use crate::samples::{Augmentation, SampleConfig, SceneSet};
+use crate::samples::{Augmentation, SampleBuilder, SampleConfig};
 use fusion::model::{CooperativeModel, ModelError};
 use support::file_digests::FileDigests;
 
@@ -45,22 +45,24 @@ impl<'a> FrozenEncoder<'a> {
         }))
     }
 
-    /// The maps of all sweeps of some scenes; missing ones are encoded now.
-    pub(super) fn maps(
+    /// Gives a builder the maps of all sweeps of its scenes; missing ones are encoded now.
+    pub(super) fn give_maps(
         &self,
-        scenes: &SceneSet,
+        builder: &mut SampleBuilder,
         observer: &mut dyn Observer,
-    ) -> Result<MapSource, Error> {
+    ) -> Result<(), Error> {
         let on_sweep = &mut |done, all| observer.encoded(done, all);
         let store = FeatureStore::open(
             self.kept,
             &self.weights,
-            scenes.scenarios(),
+            builder.scenes().scenarios(),
             &FileDigests::default(),
             self.threads,
             on_sweep,
         )?;
-        Ok(MapSource::new(Arc::new(store), Arc::clone(&self.weights)))
+        let maps = MapSource::new(Arc::new(store), Arc::clone(&self.weights));
+        builder.maps = Some(maps);
+        Ok(())
     }
 }
 

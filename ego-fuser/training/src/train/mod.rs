@@ -111,9 +111,9 @@ impl<'a> Training<'a> {
             validator = Some(Validator::open(scenes, &samples, &model, frames)?);
         }
         if let Some(frozen) = &frozen {
-            builder = builder.with_maps(frozen.maps(&scenes, observer)?);
+            frozen.give_maps(&mut builder, observer)?;
             if let Some(validator) = &mut validator {
-                validator.use_maps(frozen.maps(validator.scenes(), observer)?);
+                frozen.give_maps(&mut validator.builder, observer)?;
             }
         }
         let method = Some(config.method.name());

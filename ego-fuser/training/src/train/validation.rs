@@ -12,16 +12,15 @@ use tch::no_grad;
 
 use super::accuracy::Accuracy;
 use crate::Error;
-use crate::feature_store::MapSource;
 use crate::samples::{
-    Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SceneSet, TickRef,
+    Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SamplePoses, SceneSet, TickRef,
 };
 
 /// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
 /// error.
 #[derive(Debug)]
 pub(crate) struct Validator {
-    builder: SampleBuilder,
+    pub(super) builder: SampleBuilder,
     ticks: Vec<TickRef>,
 }
 
@@ -42,7 +41,11 @@ impl Validator {
         let samples = SampleConfig {
             augmentation: Augmentation::OFF,
             drop_neighbour: 0.0,
-            poses: samples.poses.without_noise(),
+            poses: SamplePoses {
+                noise: None,
+                lost_share: 0.0,
+                ..samples.poses.clone()
+            },
             moments: Moments {
                 max_delay_nanos: 0,
                 gap: 1,
@@ -54,16 +57,6 @@ impl Validator {
         let assigner = Arc::new(model.assigner()?);
         let builder = SampleBuilder::new(scenes, samples, model.config().clone(), assigner);
         Ok(Self { builder, ticks })
-    }
-
-    /// The scenes that frames are chosen from.
-    pub(super) fn scenes(&self) -> &SceneSet {
-        self.builder.scenes()
-    }
-
-    /// Uses stored maps for samples from now on.
-    pub(super) fn use_maps(&mut self, maps: MapSource) {
-        self.builder = self.builder.clone().with_maps(maps);
     }
 
     /// AP of `model` now.

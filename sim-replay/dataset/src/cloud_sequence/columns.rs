@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn headers_that_do_not_say_all_are_refused() {
+    fn incomplete_headers_are_refused() {
         for (names, expected) in [
             ("t,x,y,z,roll,pitch,yaw", "no column qx"),
             ("t,x,y,z,q0,q1,q2,q3", "no column qx"),

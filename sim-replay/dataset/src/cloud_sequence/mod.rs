@@ -19,10 +19,9 @@ use protocol::{CavId, Handedness, Pose};
 use self::join::join;
 use self::keys::Keys;
 use self::pose_file::PoseFile;
-use super::cloud_files::clouds_in;
 use super::faults::Faults;
-use super::layouts::{LayoutRow, Reader};
-use super::points::{SweepStorage, Sweeps};
+use super::layout::{LayoutRow, Reader};
+use super::points::{SweepStorage, Sweeps, clouds_in};
 use super::{
     FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
 };

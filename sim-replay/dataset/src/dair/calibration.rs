@@ -5,7 +5,7 @@ use std::path::Path;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
 use super::Sides;
-use super::index::{Kind, Pair};
+use super::index::{Kind, Pair, offset_m};
 use crate::Result;
 use crate::json::{self, Field};
 
@@ -65,27 +65,17 @@ pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64
 fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2])> {
     let value = json::read(path)?;
     let root = Field::root(path, &value);
-    let offset_m = root
+    let own_offset_m = root
         .optional("relative_error")?
-        .map(|offset| self::offset_m(&offset))
+        .map(|offset| offset_m(&offset))
         .transpose()?;
     let transform = root.optional("transform")?.unwrap_or(root);
     let rotation = nearest_rotation(&transform.required("rotation")?)?;
     let translation = Translation3::from(transform.required("translation")?.numbers::<3>()?);
     Ok((
         Isometry3::from_parts(translation, rotation),
-        offset_m.unwrap_or_default(),
+        own_offset_m.unwrap_or_default(),
     ))
-}
-
-/// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.
-pub(super) fn offset_m(offset: &Field<'_>) -> Result<[f64; 2]> {
-    let delta = |key| {
-        offset
-            .optional(key)?
-            .map_or(Ok(0.0), |delta| delta.number())
-    };
-    Ok([delta("delta_x")?, delta("delta_y")?])
 }
 
 /// The rotation nearest to a 3x3 matrix, row by row.

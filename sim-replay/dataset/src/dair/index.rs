@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::Path;
 
-use super::calibration::offset_m;
 use crate::faults::Faults;
 use crate::json::Field;
 use crate::{Layout, ReadError, Result, Tick, json_table, time_stamps};
@@ -246,4 +245,14 @@ fn frame_and_group(entry: &Field<'_>, kind: Kind) -> Result<(String, Option<Stri
     let (_, group_key) = kind.group();
     let group = entry.optional(group_key)?;
     Ok((id, group.map(|group| frame_id(&group)).transpose()?))
+}
+
+/// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.
+pub(super) fn offset_m(offset: &Field<'_>) -> Result<[f64; 2]> {
+    let delta = |key| {
+        offset
+            .optional(key)?
+            .map_or(Ok(0.0), |delta| delta.number())
+    };
+    Ok([delta("delta_x")?, delta("delta_y")?])
 }

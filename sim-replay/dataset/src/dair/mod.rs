@@ -23,10 +23,9 @@ use protocol::{CavId, Handedness};
 
 use self::index::{Index, Kind, Pair};
 use self::labels::{Block, Objects};
-use super::layouts::{LayoutRow, Reader};
-use super::open::opened;
+use super::layout::{LayoutRow, Reader, opened};
 use super::points::{SweepStorage, Sweeps};
-use super::presence::Absences;
+use super::presence::AbsentFrames;
 use super::{
     Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Result, Scenario, Tick,
     files, roots,
@@ -152,7 +151,7 @@ fn scenario(
         sweeps,
     });
     Scenario {
-        absences: Absences::new(&agents, &ticks, &missing).among(moments),
+        absent_at: AbsentFrames::new(&agents, &ticks, &missing).among(moments),
         roadside_units: vec![agents[1].clone()],
         missing,
         ..Scenario::new(name, layout, agents.to_vec(), ticks, source)
@@ -248,11 +247,10 @@ struct Source {
 
 impl Source {
     fn pair(&self, tick: &Tick) -> Result<&Pair> {
-        let unknown = || {
+        self.pairs.get(&tick.stem).ok_or_else(|| {
             let reason = format!("no pair of vehicle frame {}", tick.stem);
             ReadError::malformed(&self.sides.root, reason)
-        };
-        self.pairs.get(&tick.stem).ok_or_else(unknown)
+        })
     }
 
     fn vehicle_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {

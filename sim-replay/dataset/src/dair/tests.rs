@@ -394,7 +394,7 @@ fn missing_files_are_absent_and_reported() {
         scenario
             .load(1, 0, &LoadOptions::default())
             .unwrap_err()
-            .is_absence()
+            .is_absent()
     );
     let (frame, problems) = set.problems_of(0);
     assert!(

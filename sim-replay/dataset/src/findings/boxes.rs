@@ -13,7 +13,6 @@ const MAX_EMPTY_SHARE: f64 = 0.5;
 const HINT: &str = "frames (axes, order of the pose's numbers) or units of the boxes may be wrong";
 
 /// The finding that agents list `targets` objects of the protocol's classes, and none is ground truth of any ego.
-#[must_use]
 pub fn without_ground_truth(scenario: &str, targets: usize, merged: usize) -> Option<Problem> {
     let reason = format!(
         "ground truth 0 for every ego and tick, though agents list {targets} objects of its classes: {HINT}"

@@ -43,7 +43,6 @@ pub struct FrameFindings {
 
 impl FrameFindings {
     /// Findings of a frame and its plain sweep, as far as they could be read.
-    #[must_use]
     pub fn of(frame: Option<&Frame>, sweep: Option<&PcdCloud>) -> Self {
         let mut findings = Self {
             sweep: sweep.map(SweepFindings::of),
@@ -61,7 +60,6 @@ impl FrameFindings {
     }
 
     /// True if there are objects whose place relative to the LiDAR is unknown.
-    #[must_use]
     pub fn is_without_pose(&self) -> bool {
         self.boxes > Some(0) && self.world_from_lidar.is_none()
     }
@@ -69,7 +67,6 @@ impl FrameFindings {
 
 /// Findings of the frames of a scenario together: `frames` are those of each agent, in the order of
 /// [`Scenario::agents`], with their ticks. Intensities were divided by `scale`.
-#[must_use]
 pub fn of_scenario(
     scenario: &Scenario,
     frames: &[Vec<(usize, &FrameFindings)>],
@@ -105,7 +102,6 @@ pub fn of_scenario(
 }
 
 /// Findings of single clouds of a folder together.
-#[must_use]
 pub fn of_clouds(folder: &Path, sweeps: &[&SweepFindings], scale: IntensityScale) -> Vec<Problem> {
     sweeps::problems(folder, "", sweeps, scale)
 }
@@ -143,7 +139,6 @@ fn without_pose(
 
 /// Findings of some frames, evenly spread over the scenarios. Frames that cannot be read are left out: their reader
 /// reports them.
-#[must_use]
 pub fn sampled(scenarios: &[Scenario], scale: IntensityScale) -> Vec<Problem> {
     let scenarios: Vec<&Scenario> = evenly(scenarios.len(), MOST_SCENARIOS)
         .filter_map(|index| scenarios.get(index))

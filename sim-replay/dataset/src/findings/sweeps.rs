@@ -45,7 +45,6 @@ pub struct SweepFindings {
 
 impl SweepFindings {
     /// Findings of a sweep with intensities from 0 to 1.
-    #[must_use]
     pub fn of(cloud: &PcdCloud) -> Self {
         let values = || cloud.points.xyzi.iter().map(|point| point[3]);
         let step = cloud.points.len().div_ceil(MEDIAN_OF).max(1);
@@ -77,7 +76,6 @@ fn median(values: &[f32]) -> Option<f32> {
 
 impl SweepReport {
     /// The sweeps of an agent together, in order; `None` if no sweep has a point.
-    #[must_use]
     pub fn of(sweeps: &[&SweepFindings]) -> Option<Self> {
         let first = sweeps.iter().find(|sweep| sweep.range.is_some())?;
         let ranges = || sweeps.iter().filter_map(|sweep| sweep.range);
@@ -128,11 +126,7 @@ fn intensity_fault(
     let Some(origin) = &report.intensity else {
         return Some(NO_INTENSITY.to_owned());
     };
-    let SweepReport {
-        min_intensity: min,
-        max_intensity: max,
-        ..
-    } = *report;
+    let (min, max) = (report.min_intensity, report.max_intensity);
     let points: usize = sweeps.iter().map(|sweep| sweep.points).sum();
     let from = format!("field {} divided by {}", origin.field, origin.divisor);
     let above: usize = sweeps.iter().map(|sweep| sweep.above_one).sum();

@@ -89,14 +89,13 @@ fn function(field: &Field<'_>) -> Result<Function> {
         .tag
         .as_deref()
         .and_then(|tag| tag.strip_prefix(APPLY));
-    let in_package = |call: &str| {
+    let name = call.and_then(|call| {
         PACKAGES.iter().find_map(|package| {
             call.strip_prefix(package)?
                 .strip_prefix('.')
                 .map(str::to_owned)
         })
-    };
-    let name = call.and_then(in_package);
+    });
     let known = name.and_then(|name| KNOWN.iter().find(|(known, _)| *known == name));
     known.map(|(_, function)| *function).ok_or_else(|| {
         let tag = shown(field.node().tag.as_deref());

@@ -6,7 +6,7 @@ use std::path::Path;
 use nalgebra::{Isometry3, Point3};
 use protocol::{PointCloud, Pose};
 
-use super::tables::{read_all, referred, transform};
+use super::rows::{read_all, referred, transform};
 use crate::frame::{Object, ObjectClass};
 use crate::json::Field;
 use crate::{ReadError, Result, classes};
@@ -69,8 +69,9 @@ fn read_instances(
     let mut instances = HashMap::new();
     read_all(version, "instance.json", problems, |row| {
         let category = row.required("category_token")?;
-        let no_name = || category.error("no row of category.json has this token");
-        let name = names.get(&category.id()?).ok_or_else(no_name)?;
+        let name = names
+            .get(&category.id()?)
+            .ok_or_else(|| category.error("no row of category.json has this token"))?;
         let class = classes::of_name(name).unwrap_or(ObjectClass::Other);
         let id = instances.len() as i64;
         instances.insert(row.required("token")?.id()?, Instance { id, class });
@@ -88,8 +89,9 @@ fn unknown_type(name: &Field<'_>) -> ReadError {
 
 fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object> {
     let token = row.required("instance_token")?;
-    let no_instance = || token.error("no row of instance.json has this token");
-    let Instance { id, class } = instances.get(&token.id()?).ok_or_else(no_instance)?;
+    let Instance { id, class } = instances
+        .get(&token.id()?)
+        .ok_or_else(|| token.error("no row of instance.json has this token"))?;
     let size = row.required("size")?;
     let edges = size.numbers::<3>()?;
     if !edges.iter().all(|edge| *edge > 0.0 && *edge <= MAX_SIZE_M) {

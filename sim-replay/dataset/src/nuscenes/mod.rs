@@ -7,6 +7,7 @@
 
 mod annotations;
 mod rig;
+mod rows;
 mod tables;
 #[cfg(test)]
 mod tests;
@@ -20,10 +21,9 @@ use protocol::{CavId, Handedness};
 
 use self::rig::QuarterTurns;
 use self::tables::{Sample, Scene, Sweep, Tables};
-use super::layouts::{LayoutRow, Reader};
-use super::open::opened;
+use super::layout::{LayoutRow, Reader, opened};
 use super::points::{SweepStorage, Sweeps};
-use super::presence::Absences;
+use super::presence::AbsentFrames;
 use super::{
     Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
     files, roots,
@@ -211,12 +211,8 @@ impl Builder<'_> {
     }
 
     fn scenario(self, agents: Vec<CavId>, parts: Parts, options: &OpenOptions) -> Scenario {
-        let Parts {
-            ticks,
-            moments,
-            missing,
-            contents,
-        } = parts;
+        let (ticks, moments) = (parts.ticks, parts.moments);
+        let (missing, contents) = (parts.missing, parts.contents);
         let is_unit = |agent: &&CavId| rig::is_roadside_unit(self.layout, agent.as_str());
         let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
         for agent in &agents {
@@ -234,7 +230,7 @@ impl Builder<'_> {
             sweeps,
         });
         Scenario {
-            absences: Absences::new(&agents, &ticks, &missing).among(moments),
+            absent_at: AbsentFrames::new(&agents, &ticks, &missing).among(moments),
             roadside_units: agents.iter().filter(is_unit).cloned().collect(),
             missing,
             ..Scenario::new(self.name, self.layout, agents, ticks, source)

@@ -5,13 +5,11 @@ use std::collections::HashMap;
 use std::path::{Component, Path};
 
 use nalgebra::Isometry3;
-use protocol::Pose;
-use protocol::text::excerpt;
 
 use super::annotations;
+use super::rows::{Indices, read_all, read_rows, referred, transform};
 use crate::frame::Object;
-use crate::json::Field;
-use crate::json_table::{self, Keys};
+use crate::json_table::Keys;
 use crate::time_stamps;
 use crate::{ReadError, Result};
 
@@ -27,10 +25,6 @@ pub(super) const NAMES: [&str; 9] = [
     "category.json",
     "instance.json",
 ];
-/// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
-const MAX_BYTES: u64 = 4 << 30;
-/// Largest deviation of a published quaternion's length from 1; it is normalized.
-const QUATERNION_TOLERANCE: f64 = 0.01;
 
 /// A drive.
 #[derive(Debug)]
@@ -100,27 +94,6 @@ pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tabl
     })
 }
 
-/// Reads the rows of a table that are needed.
-fn read_rows(
-    version: &Path,
-    name: &str,
-    problems: &mut Vec<ReadError>,
-    is_needed: impl Fn(&Keys<'_>) -> bool,
-    row: impl FnMut(&Field<'_>) -> Result<()>,
-) -> Result<usize> {
-    json_table::read(&version.join(name), MAX_BYTES, problems, is_needed, row)
-}
-
-/// The same with all rows.
-pub(super) fn read_all(
-    version: &Path,
-    name: &str,
-    problems: &mut Vec<ReadError>,
-    row: impl FnMut(&Field<'_>) -> Result<()>,
-) -> Result<usize> {
-    read_rows(version, name, problems, |_| true, row)
-}
-
 /// LiDARs by the token of their calibration.
 fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<String, Mount>> {
     let mut channels = HashMap::new();
@@ -148,8 +121,6 @@ fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<
     })?;
     Ok(mounts)
 }
-
-type Indices = HashMap<String, usize>;
 
 fn read_scenes(version: &Path, problems: &mut Vec<ReadError>) -> Result<(Vec<Scene>, Indices)> {
     let (mut scenes, mut indices) = (Vec::new(), Indices::new());
@@ -206,8 +177,9 @@ fn read_sweeps(
     };
     read_rows(version, "sample_data.json", problems, is_needed, |row| {
         let token = row.required("calibrated_sensor_token")?;
-        let no_mount = || token.error("no row of calibrated_sensor.json has it");
-        let mount = mounts.get(&token.id()?).ok_or_else(no_mount)?;
+        let mount = mounts
+            .get(&token.id()?)
+            .ok_or_else(|| token.error("no row of calibrated_sensor.json has it"))?;
         let file = row.required("filename")?;
         let name = file.text()?;
         let mut parts = Path::new(name).components();
@@ -257,32 +229,4 @@ fn place(
         problems.push(ReadError::malformed(&version.join("ego_pose.json"), reason));
     }
     Ok(())
-}
-
-/// The index of the row that a token refers to.
-pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize> {
-    let token = row.required(key)?;
-    let text = token.id()?;
-    let unknown = || token.error(format!("no row has the token {:?}", excerpt(&text, 40)));
-    indices.get(&text).copied().ok_or_else(unknown)
-}
-
-/// `translation` in metres and `rotation` as quaternion w, x, y, z.
-pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>> {
-    let translation_m = row.required("translation")?.numbers::<3>()?;
-    let rotation = row.required("rotation")?;
-    let rotation_wxyz = rotation.numbers::<4>()?;
-    let squares = rotation_wxyz.iter().map(|part| part * part);
-    let length = squares.sum::<f64>().sqrt();
-    let is_unit = (length - 1.0).abs() <= QUATERNION_TOLERANCE;
-    if !is_unit {
-        return Err(rotation.error(format!("a quaternion of length {length}, expected 1")));
-    }
-    let pose = Pose {
-        translation_m,
-        rotation_wxyz: rotation_wxyz.map(|part| part / length),
-    };
-    let valid = pose.validate();
-    valid.map_err(|error| row.error(error.to_string()))?;
-    Ok(pose.isometry())
 }

@@ -365,12 +365,13 @@ fn a_vehicle_measures_its_motion() {
         )
         .unwrap();
         let message = &frame.problems[0].message;
-        let told =
+        let stated =
             message.contains("000070.yaml:3: imu.") && message.ends_with("the field is left out");
         assert!(
-            told && message
-                .to_lowercase()
-                .contains(value.trim_start_matches('.')),
+            stated
+                && message
+                    .to_lowercase()
+                    .contains(value.trim_start_matches('.')),
             "{message}"
         );
         assert_eq!(frame.problems[0].field, Some(format!("imu.{field}")));

@@ -54,7 +54,6 @@ struct Contradiction {
 
 /// One problem for each agent of a scenario whose sweeps contradict its poses. Reads ten sweeps of each agent at most.
 /// Agents that stand, sweeps without structure and unreadable frames give none.
-#[must_use]
 pub fn pose_problems(scenario: &Scenario) -> Vec<Problem> {
     let agents = scenario.agents.iter().enumerate();
     agents

@@ -25,7 +25,6 @@ pub enum IntensityField<'a> {
 }
 
 /// A PCD file of these points, in their frame and handedness.
-#[must_use]
 pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<'_>) -> Vec<u8> {
     let (data, bytes_per_point) = match encoding {
         Encoding::Ascii => ("ascii", 48),

@@ -124,9 +124,6 @@ pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
 }
 
 /// [`decode`] with the red byte of a colour as stored: 0 to 255.
-///
-/// # Errors
-/// As [`decode`].
 pub(crate) fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let (header, body) = Header::parse(bytes)?;
     let cloud = match header.data {

@@ -57,12 +57,12 @@ impl FloatForm {
         let votes = samples.iter().filter_map(|bytes| Self::of_sample(bytes));
         let votes: Vec<Result<Self, String>> = votes.collect();
         let count = |form| votes.iter().filter(|vote| **vote == Ok(form)).count();
-        let fits = |form: &Self| {
-            (samples.first()).is_some_and(|bytes| bytes.len().is_multiple_of(4 * form.numbers()))
-        };
         match (count(Self::Four), count(Self::Five)) {
             (0, 0) if votes.is_empty() => {
-                let fitting = [Self::Four, Self::Five].into_iter().find(fits);
+                let fitting = [Self::Four, Self::Five].into_iter().find(|form| {
+                    (samples.first())
+                        .is_some_and(|bytes| bytes.len().is_multiple_of(4 * form.numbers()))
+                });
                 Ok(fitting.unwrap_or(Self::Four))
             }
             (0, 0) => votes.into_iter().next().unwrap_or(Ok(Self::Four)),
@@ -136,9 +136,9 @@ fn absurd(numbers: &[f32]) -> Option<String> {
     let share =
         numbers.iter().filter(|&&number| is_absurd(number)).count() as f64 / numbers.len() as f64;
     let percent = 100.0 * share;
-    let fault =
-        || format!("{percent:.1} % of the numbers are beyond 1e7 or below 1e-30, usual is none");
-    (share > ABSURD_SHARE).then(fault)
+    (share > ABSURD_SHARE).then(|| {
+        format!("{percent:.1} % of the numbers are beyond 1e7 or below 1e-30, usual is none")
+    })
 }
 
 /// Mean entropy of the columns of points of `step` numbers, nats, by sign and octave of each number. Corrected for the

@@ -146,7 +146,6 @@ pub struct LiveIntensities {
 
 impl LiveIntensities {
     /// A LiDAR before its first sweep.
-    #[must_use]
     pub fn new(scale: IntensityScale) -> Self {
         Self {
             scale,
@@ -173,14 +172,13 @@ impl LiveIntensities {
                 }
                 let divisor = self.scale.divisor(kind, || intensity_divisor(self.largest));
                 divide(points, divisor);
-                let above_one = || {
+                (self.scale.unusual(divisor, self.largest))
+                    .or_else(|| (largest > divisor).then(|| {
                     format!(
                         "field {name} reaches {largest}, {} divided by {divisor}: networks are trained on 0 to 1",
                         largest / divisor
                     )
-                };
-                (self.scale.unusual(divisor, self.largest))
-                    .or_else(|| (largest > divisor).then(above_one))
+                }))
             }
         };
         finding.filter(|_| !std::mem::replace(&mut self.has_finding, true))
@@ -228,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn live_sweeps_have_the_scale_of_files_and_findings_are_told_once() {
+    fn live_sweeps_have_the_scale_of_files_and_findings_are_reported_once() {
         let cloud = |intensity: f32| PointCloud {
             xyzi: vec![[1.0, 2.0, 3.0, intensity]],
         };

@@ -26,7 +26,6 @@ pub struct Plausibility {
 
 impl Plausibility {
     /// Counts of one sweep.
-    #[must_use]
     pub fn of(cloud: &PointCloud) -> Self {
         let mut counted = Self::default();
         counted.add(cloud);
@@ -34,7 +33,6 @@ impl Plausibility {
     }
 
     /// The fault that no point is a return of a sensor: there is none, or all are too far away or at the origin.
-    #[must_use]
     pub fn nothing_in_range(&self) -> Option<String> {
         let points = self.points;
         (points == self.beyond_range + self.at_origin).then(|| match points {
@@ -85,19 +83,17 @@ impl Plausibility {
             ));
         }
         let at_origin = of(self.at_origin, self.points);
-        let fault = || {
+        (at_origin > AT_ORIGIN).then(|| {
             format!(
                 "{} of the points lie exactly at the origin, usual is none",
                 percent(at_origin)
             )
-        };
-        (at_origin > AT_ORIGIN).then(fault)
+        })
     }
 }
 
 impl PcdCloud {
     /// The fault that no point of a sweep is a return, with the number of points that are not finite.
-    #[must_use]
     pub fn without_returns(&self) -> Option<String> {
         let fault = Plausibility::of(&self.points).nothing_in_range()?;
         Some(match self.dropped {

@@ -124,11 +124,7 @@ impl Attempt {
     }
 
     fn finish(self, path: &Path, contents: &Contents, problems: &mut Vec<ReadError>) -> Joined {
-        let Self {
-            sweeps,
-            sources,
-            chosen,
-        } = self;
+        let (sweeps, sources, chosen) = (self.sweeps, self.sources, self.chosen);
         let fault = |reason: String| ReadError::malformed(path, reason);
         let source = chosen
             .as_ref()

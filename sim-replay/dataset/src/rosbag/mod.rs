@@ -29,7 +29,7 @@ use self::contents::Contents;
 use self::join::{JoinedSweep, join};
 use self::storage::Storage;
 use super::files::name_below;
-use super::layouts::{LayoutRow, Reader};
+use super::layout::{LayoutRow, Reader};
 use super::points::{IntensityScale, Sweeps, divisor_of_first};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, single_vehicle};
 use crate::frame::Frame;
@@ -108,8 +108,9 @@ fn open(
 
 impl Bag {
     fn sweep(&self, tick: &Tick) -> Result<&JoinedSweep> {
-        let lacks = || ReadError::malformed(Path::new(""), format!("no sweep at {}", tick.stem));
-        self.sweeps.get(&tick.capture_nanos).ok_or_else(lacks)
+        self.sweeps.get(&tick.capture_nanos).ok_or_else(|| {
+            ReadError::malformed(Path::new(""), format!("no sweep at {}", tick.stem))
+        })
     }
 
     /// A sweep with the intensities as stored.
@@ -155,7 +156,8 @@ impl FrameSource for Bag {
     }
 
     fn points_path(&self, _: &CavId, tick: &Tick, _: Option<&str>) -> PathBuf {
-        let path = |sweep: &JoinedSweep| self.storage.path(sweep.place).to_owned();
-        self.sweep(tick).map(path).unwrap_or_default()
+        self.sweep(tick)
+            .map(|sweep| self.storage.path(sweep.place).to_owned())
+            .unwrap_or_default()
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::clock::{SteadyPart, longest_steady};
+use super::clock::longest_steady;
 use super::contents::CloudStamp;
 use crate::ReadError;
 
@@ -45,29 +45,24 @@ impl SweepTopic {
             format!("are not in frame {frame}, as most are"),
         );
         let stamps: Vec<u64> = of_frame.iter().map(|cloud| cloud.nanos).collect();
-        let SteadyPart {
-            kept,
-            strays,
-            of_other_parts,
-            bounds,
-        } = longest_steady(&stamps);
+        let steady = longest_steady(&stamps);
         left_out(
-            strays,
+            steady.strays,
             "have a stamp that is not between those around it".into(),
         );
         left_out(
-            of_other_parts,
+            steady.of_other_parts,
             "are before or after the clock of their stamps was set back".into(),
         );
         let recorded = |index: Option<usize>| Some(of_frame.get(index?)?.recorded_nanos);
         Self {
             topic: topic.to_owned(),
             frame,
-            sweeps: kept
+            sweeps: (steady.kept)
                 .iter()
                 .filter_map(|&index| of_frame.get(index).map(|cloud| (*cloud).clone()))
                 .collect(),
-            recorded_nanos: (recorded(bounds.0), recorded(bounds.1)),
+            recorded_nanos: (recorded(steady.bounds.0), recorded(steady.bounds.1)),
             problems,
         }
     }

@@ -45,10 +45,8 @@ fn number(text: &str) -> Option<Value> {
         return i64::from_str_radix(digits, 8).map(Value::Integer).ok();
     }
     // Letters other than the exponent are rejected: Rust would parse `infinity` too. It parses no `1_0`.
-    let is_decimal =
-        |byte: u8| byte.is_ascii_digit() || matches!(byte, b'+' | b'-' | b'.' | b'e' | b'E');
     text.bytes()
-        .all(is_decimal)
+        .all(|byte| byte.is_ascii_digit() || matches!(byte, b'+' | b'-' | b'.' | b'e' | b'E'))
         .then(|| text.parse().map(Value::Float).ok())
         .flatten()
 }

@@ -70,9 +70,10 @@ pub fn convert(
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
         let holds_images = options.layout == SceneLayout::Opv2v;
-        let count = || progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
         let losses = (&omitted, &left_out);
-        let frames = write_moments(scenario, writer.as_ref(), holds_images, losses, &count)?;
+        let frames = write_moments(scenario, writer.as_ref(), holds_images, losses, &|| {
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1, total)
+        })?;
         writer.end()?;
         converted.scenarios += 1;
         converted.agent_frames += frames;
@@ -87,8 +88,9 @@ pub fn convert(
 fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthError> {
     let capture_nanos = scenario.ticks.iter().map(|tick| tick.capture_nanos);
     let capture_nanos: Vec<u64> = capture_nanos.collect();
-    let divides = |tick: &u64| capture_nanos.iter().all(|nanos| nanos % tick == 0);
-    let tick_nanos = TICKS_NANOS.into_iter().find(divides);
+    let tick_nanos = TICKS_NANOS
+        .into_iter()
+        .find(|tick| capture_nanos.iter().all(|nanos| nanos % tick == 0));
     let tick_nanos = tick_nanos.unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
     let mut pairs = capture_nanos.windows(2);
     if let Some(pair) = pairs.find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos) {
@@ -181,8 +183,9 @@ fn variants(
     let read = |name: &String| {
         let cloud = scenario.load_points(agent, index, Some(name));
         // Counted as a file, since a copy is part of its frame.
-        let count = |error| locked(left_out).add_files([&error]);
-        let cloud = cloud.map_err(count).ok()?;
+        let cloud = cloud
+            .map_err(|error| locked(left_out).add_files([&error]))
+            .ok()?;
         let labels = cloud.labels.unwrap_or_else(|| vec![0; cloud.points.len()]);
         Some(SweepVariant {
             name: name.clone(),

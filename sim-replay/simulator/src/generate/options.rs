@@ -135,10 +135,11 @@ impl SynthOptions {
         let images = self
             .cameras
             .map_or("none".to_owned(), |size| size.to_string());
-        let is_small = |edge: &u32| (16..=4096).contains(edge);
-        let are_small = self
-            .cameras
-            .is_none_or(|size| size.edges_px().iter().all(is_small));
+        let are_small = self.cameras.is_none_or(|size| {
+            size.edges_px()
+                .iter()
+                .all(|edge| (16..=4096).contains(edge))
+        });
         let rule = "must be 16 to 4096 pixels along each edge";
         require(are_small, "--cameras", &images, rule)?;
         let rule = "must be none, as images are written in the layout opv2v alone";

@@ -60,10 +60,9 @@ pub(crate) fn park(map_model: &MapModel, lanes: &LaneIndex, seed: u64) -> Vec<Pa
 }
 
 fn fitting(spot: &ParkingSpot, random: &mut SplitMix64) -> Option<Vehicle> {
-    let fits = |vehicle: &Vehicle| {
-        vehicle.size_m[0] + 0.3 < spot.length_m && vehicle.size_m[1] < spot.width_m
-    };
-    (0..8).map(|_| Vehicle::random_parked(random)).find(fits)
+    (0..8)
+        .map(|_| Vehicle::random_parked(random))
+        .find(|vehicle| vehicle.size_m[0] + 0.3 < spot.length_m && vehicle.size_m[1] < spot.width_m)
 }
 
 fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Placement {

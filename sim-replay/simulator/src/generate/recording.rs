@@ -100,8 +100,8 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, S
             break;
         }
     }
-    let no_road = || SynthError::NoRoad(world.map_model.name.clone());
-    let (_, vehicles, frames, agents) = best.ok_or_else(no_road)?;
+    let (_, vehicles, frames, agents) =
+        best.ok_or_else(|| SynthError::NoRoad(world.map_model.name.clone()))?;
     if agents.len() < spec.agents {
         return Err(SynthError::TooFewCompanions {
             scenario: spec.name.clone(),

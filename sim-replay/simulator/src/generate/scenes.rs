@@ -15,17 +15,13 @@ use super::layout::{
     make_folder,
 };
 use super::options::{Subset, SynthOptions};
-use super::positioning::{Fix, Positioning};
-use super::recording::{RecordedFrame, Recording, SceneSpec, record};
-use super::sensing::Bench;
-use super::traffic::STEP_S;
+use super::positioning::Positioning;
+use super::recording::{Recording, SceneSpec, record};
+use super::sensing::{Agent, Bench, STEP_NANOS, Scene, capture_nanos};
 use super::world::World;
 use crate::map::{self, Finding, MapModel, RoadMapSource};
 use dataset::frame::Frame;
 use support::random::derive_seed;
-
-/// Length of a step of the simulation, nanoseconds.
-const STEP_NANOS: u64 = (STEP_S * 1e9) as u64;
 
 /// Summary of generation.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -84,8 +80,9 @@ pub fn generate(
                 world: &world,
                 spec: spec(options, &map_model, number),
             };
-            let progress = |thousandths| progress(before + thousandths);
-            total.add(&scene.write(writer.as_mut(), &omitted, &progress)?);
+            total.add(&scene.write(writer.as_mut(), &omitted, &|thousandths| {
+                progress(before + thousandths)
+            })?);
         }
     }
     writer.finish()?;
@@ -129,23 +126,6 @@ pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), Syn
         return Err(SynthError::NotEmpty(out.to_owned()));
     }
     Ok(())
-}
-
-/// One scenario to be written.
-pub(super) struct Scene<'a, 't> {
-    pub(super) options: &'a SynthOptions,
-    pub(super) world: &'a World<'t>,
-    pub(super) spec: SceneSpec,
-}
-
-/// One agent over the whole scene.
-pub(super) struct Agent {
-    /// Index among the recording's vehicles.
-    pub(super) vehicle: usize,
-    pub(super) id: i64,
-    pub(super) cav: CavId,
-    /// One fix for each capture time.
-    pub(super) fixes: Vec<Fix>,
 }
 
 impl Scene<'_, '_> {
@@ -245,11 +225,6 @@ impl Scene<'_, '_> {
         });
         total.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// End of the sweeps of a capture time, on the clock of the scene.
-pub(super) fn capture_nanos(frame: &RecordedFrame) -> u64 {
-    frame.tick * STEP_NANOS
 }
 
 fn counts(moment: &Moment) -> Summary {

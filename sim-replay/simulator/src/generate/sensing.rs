@@ -1,21 +1,24 @@
 //! Sensor simulation: the frames of all agents at one capture time.
 
 use nalgebra::Vector3;
-use protocol::{Camera, Handedness, PointCloud, Pose};
+use protocol::{Camera, CavId, Handedness, PointCloud, Pose};
 
 use super::camera::{self, CameraRig, GroundPaint, ImageSize, Surroundings};
 use super::layout::{AgentFrame, BoxAnchor, Moment, SceneLayout, Simulated, SweepVariant};
 use super::lidar::{LIDAR_MOUNT_M, Lidar, lidar_motion};
+use super::options::SynthOptions;
+use super::positioning::Fix;
 use super::radar::{Radar, velocity_to_red};
 use super::raycast::{Body, Placement, Sweep};
-use super::recording::{Moving, RecordedFrame, Recording};
-use super::scenes::{Agent, Scene, capture_nanos};
+use super::recording::{Moving, RecordedFrame, Recording, SceneSpec};
 use super::traffic::STEP_S;
 use super::vehicle::{Vehicle, VehicleKind};
 use super::world::World;
 use dataset::frame::{Frame, Object, ObjectClass};
 use support::random::derive_seed;
 
+/// Length of a step of the simulation, nanoseconds.
+pub(super) const STEP_NANOS: u64 = (STEP_S * 1e9) as u64;
 /// Largest range of any sensor, metres.
 const SIGHT_M: f64 = 152.0;
 
@@ -26,6 +29,28 @@ struct Annotation<'a> {
     vehicle: &'a Vehicle,
     placement: Placement,
     speed_mps: f64,
+}
+
+/// One scenario to be written.
+pub(super) struct Scene<'a, 't> {
+    pub(super) options: &'a SynthOptions,
+    pub(super) world: &'a World<'t>,
+    pub(super) spec: SceneSpec,
+}
+
+/// One agent over the whole scene.
+pub(super) struct Agent {
+    /// Index among the recording's vehicles.
+    pub(super) vehicle: usize,
+    pub(super) id: i64,
+    pub(super) cav: CavId,
+    /// One fix for each capture time.
+    pub(super) fixes: Vec<Fix>,
+}
+
+/// End of the sweeps of a capture time, on the clock of the scene.
+pub(super) fn capture_nanos(frame: &RecordedFrame) -> u64 {
+    frame.tick * STEP_NANOS
 }
 
 /// The sensors and buffers of one thread.

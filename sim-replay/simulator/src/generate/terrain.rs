@@ -116,6 +116,7 @@ impl TerrainSurface {
                 f64::MAX
             }
         };
+        // The ray visits cell after cell; the nearer border gives the next one.
         let mut leaves = [leave(0, cell[0]), leave(1, cell[1])];
         let mut at = from_m;
         loop {
@@ -164,6 +165,7 @@ impl TerrainSurface {
             })
         };
         let (u, v) = local(from);
+        // The diagonal of a cell separates its two triangles.
         let diagonal = from + (v - u) / off_zero(ray.slope[0] - ray.slope[1]);
         if diagonal > from && diagonal < to {
             return meet(from, diagonal).or_else(|| meet(diagonal, to));
@@ -261,6 +263,7 @@ impl<'a> Strip<'a> {
     /// The distance up to which a ray is clear of the ground; `None` if it is clear over its whole length, and then the
     /// rays above it are too. `flat` is the share of the distance along the ground.
     fn clear_m(&mut self, ray: &GridRay, flat: f64) -> Option<f64> {
+        // Rays that leave the strip could meet ground that the strip does not know.
         if !self.is_narrow || flat < 1e-3 {
             return Some(0.0);
         }

@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn grid_reproduces_an_inclined_plane_and_goes_on_level() {
+    fn grid_reproduces_an_inclined_plane_and_is_level_beyond_it() {
         let heights_m = (0..4)
             .flat_map(|row| (0..5).map(move |column| (column * 2 + row * 3) as f32))
             .collect();

@@ -3,7 +3,8 @@
 use super::conflicts;
 use super::lane::{JunctionId, Lane, LaneGraph, LaneId, Turn, wrap_angle};
 use super::lane_links::{LinkCounts, Linker};
-use super::road::{Contact, LaneKind, Road, RoadNetwork};
+use super::lane_table::{LaneTable, Origin};
+use super::road::{LaneKind, Road, RoadNetwork};
 
 /// Distance between the points taken from the curves before they are spread evenly, metres.
 const FINE_STEP_M: f64 = 0.25;
@@ -13,33 +14,6 @@ const STEP_M: f64 = 1.0;
 const DEFAULT_LIMIT_MPS: f64 = 13.9;
 /// Lanes that change heading by more than this through a junction turn off, radians.
 const TURN_RAD: f64 = 0.52;
-
-/// Lane ids by road, section and lane id of the network.
-pub(super) struct LaneTable {
-    /// First section of each road in `ids`.
-    first_section: Vec<usize>,
-    /// By section: lowest lane id, and the graph's id of each lane from there on.
-    ids: Vec<(i32, Vec<Option<LaneId>>)>,
-}
-
-/// Origin of a lane of the graph in the road network.
-#[derive(Clone, Copy)]
-pub(super) struct Origin {
-    pub(super) road: usize,
-    pub(super) section: usize,
-    pub(super) lane: i32,
-}
-
-impl Origin {
-    /// The section that follows along the road, or against it.
-    pub(super) fn next_section(self, forward: bool) -> Option<usize> {
-        if forward {
-            Some(self.section + 1)
-        } else {
-            self.section.checked_sub(1)
-        }
-    }
-}
 
 /// Builds the driving lanes of `network` and their links. `Road::leads_along` gives the direction of each lane:
 /// traffic keeps right or left, road by road.
@@ -81,32 +55,6 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
     let counts = linker.link_successors(&mut graph);
     conflicts::find(&mut graph);
     (graph, counts)
-}
-
-impl LaneTable {
-    pub(super) fn get(&self, road: usize, section: usize, lane: i32) -> Option<LaneId> {
-        let (lowest, ids) = &self.ids[self.first_section[road] + section];
-        // Ids run from the lowest upwards and leave out 0.
-        let place = lane - lowest - i32::from(lane > 0);
-        if lane == 0 || place < 0 {
-            None
-        } else {
-            ids.get(place as usize).copied().flatten()
-        }
-    }
-
-    fn section_count(&self, road: usize) -> usize {
-        let next = self.first_section.get(road + 1).copied();
-        next.unwrap_or(self.ids.len()) - self.first_section[road]
-    }
-
-    /// The section of a road at one of its ends.
-    pub(super) fn end_section(&self, road: usize, contact: Contact) -> usize {
-        match contact {
-            Contact::Start => 0,
-            Contact::End => self.section_count(road) - 1,
-        }
-    }
 }
 
 fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {

@@ -4,7 +4,7 @@ use std::fmt;
 
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
-use super::lane_builder::{LaneTable, Origin};
+use super::lane_table::{LaneTable, Origin};
 use super::road::{Connection, Contact, RoadLink, RoadNetwork};
 
 /// A link whose lanes are farther apart than this is refused, metres.
@@ -234,15 +234,10 @@ impl Joint {
 
 impl fmt::Display for Joint {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            beside_m,
-            step_m,
-            turn_rad,
-            ..
-        } = self;
         write!(
             f,
-            "{beside_m:.2} m away, {step_m:.2} m in height, turned by {turn_rad:.2} rad"
+            "{:.2} m away, {:.2} m in height, turned by {:.2} rad",
+            self.beside_m, self.step_m, self.turn_rad
         )
     }
 }

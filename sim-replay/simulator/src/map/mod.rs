@@ -18,6 +18,7 @@ mod lane;
 pub mod lane_builder;
 pub(crate) mod lane_links;
 mod lane_queries;
+mod lane_table;
 pub mod lateral;
 mod layout;
 mod noise;

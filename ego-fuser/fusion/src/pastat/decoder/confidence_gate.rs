@@ -1,8 +1,9 @@
 //! Confidence gate: weight of a neighbour's feature map, token by token.
 
-use tch::nn::{self, Init, Module};
+use tch::nn::{self, Module};
 use tch::{TchError, Tensor};
 
+use crate::layers::ZERO;
 use crate::pastat::config::PastatConfig;
 
 /// Predicts the weight of a neighbour's newest map, token by token: 1 before training, 0 to 2 after.
@@ -15,11 +16,6 @@ pub(super) struct ConfidenceGate {
 
 impl ConfidenceGate {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let neutral = nn::LinearConfig {
-            ws_init: Init::Const(0.0),
-            bs_init: Some(Init::Const(0.0)),
-            bias: true,
-        };
         Self {
             hidden: nn::linear(
                 path / "hidden",
@@ -27,7 +23,7 @@ impl ConfidenceGate {
                 config.dim,
                 nn::LinearConfig::default(),
             ),
-            out: nn::linear(path / "out", config.dim, 1, neutral),
+            out: nn::linear(path / "out", config.dim, 1, ZERO),
             patch: config.patch,
         }
     }

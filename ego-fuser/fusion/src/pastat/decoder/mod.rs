@@ -3,7 +3,7 @@
 
 mod confidence_gate;
 
-use tch::nn::{self, Init, Module};
+use tch::nn::{self, Module};
 use tch::{Kind, TchError, Tensor};
 
 use self::confidence_gate::ConfidenceGate;
@@ -12,6 +12,7 @@ use super::patches::channels_last;
 use super::spatial_alignment::FineMaps;
 use super::temporal_encoding::Tokens;
 use crate::f64_tensor::{self, are_numbers};
+use crate::layers::ZERO;
 
 /// Tokens back to cells. The context of the transformer is used in two ways: as a weight of each neighbour's newest
 /// map, of which the maximum is taken, and as an additive change of that; neutral before training.
@@ -27,23 +28,13 @@ pub(super) struct Decoder {
 impl Decoder {
     /// Its variables are `gate.*` and `decoder.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let PastatConfig {
-            channels,
-            dim,
-            patch,
-            ..
-        } = *config;
-        let neutral = nn::LinearConfig {
-            ws_init: Init::Const(0.0),
-            bs_init: Some(Init::Const(0.0)),
-            bias: true,
-        };
+        let (channels, dim, patch) = (config.channels, config.dim, config.patch);
         let gate = ConfidenceGate::new(&(path / "gate"), config);
         let path = path / "decoder";
         Self {
             gate,
             norm: nn::layer_norm(&path / "norm", vec![dim], nn::LayerNormConfig::default()),
-            cells: nn::linear(&path / "cells", dim, channels * patch * patch, neutral),
+            cells: nn::linear(&path / "cells", dim, channels * patch * patch, ZERO),
             channels,
             patch,
         }
@@ -60,9 +51,7 @@ impl Decoder {
         tokens: &Tokens,
         context: &Tensor,
     ) -> Result<Tensor, TchError> {
-        let FineMaps {
-            own, neighbours, ..
-        } = maps;
+        let (own, neighbours) = (&maps.own, &maps.neighbours);
         let count = neighbours.count()?;
         if count == 0 {
             return f64_tensor::by_cell(own);
@@ -78,9 +67,7 @@ impl Decoder {
     /// contiguous in memory. Without a gradient `fused` is overwritten if its channels are last in memory.
     pub(super) fn changed(&self, fused: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
         let (_, rows, columns, dim) = ego.size4()?;
-        let Self {
-            channels, patch, ..
-        } = *self;
+        let (channels, patch) = (self.channels, self.patch);
         // Weights are stored by channel and then by cell; transposing these few is cheaper than transposing the result.
         let by_cell = |weights: &Tensor, each: i64| {
             weights

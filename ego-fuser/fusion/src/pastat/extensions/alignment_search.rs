@@ -10,11 +10,12 @@
 use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
 
+use crate::f64_tensor::picked;
 use crate::pastat::config::SearchConfig;
 use crate::pastat::spatial_alignment::area::{Area, sampling_grid};
 use crate::pastat::spatial_alignment::correlation::{Shifted, shifts};
 use crate::pastat::spatial_alignment::network::AlignmentNetwork;
-use crate::pastat::spatial_alignment::pairs::{Displacements, Pairs, picked, rows_where};
+use crate::pastat::spatial_alignment::pairs::{Displacements, Pairs, rows_where};
 use crate::warp::{BILINEAR, PADDING_ZEROS};
 
 /// A map is moved to the position of the search when its correlation with the ego's, in the fine comparison, is
@@ -132,30 +133,22 @@ fn large_only(deltas: &Tensor) -> Result<Tensor, TchError> {
 fn offsets(
     pairs: &Pairs,
     area: &Area,
-    SearchConfig {
-        cells,
-        radius,
-        margin,
-    }: SearchConfig,
+    config: SearchConfig,
     train: bool,
 ) -> Result<Tensor, TchError> {
-    let cells = cells / area.cells();
-    let none: [i64; 2] = [0, 0];
+    let (cells, radius) = (config.cells / area.cells(), config.radius);
+    let (edges, none): ([i64; 2], [i64; 2]) = ([cells; 2], [0; 2]);
     let large = |maps: &Tensor| {
-        maps.f_detach()?.f_avg_pool2d(
-            [cells, cells],
-            [cells, cells],
-            none,
-            false,
-            true,
-            None::<i64>,
-        )
+        let maps = maps.f_detach()?;
+        maps.f_avg_pool2d(edges, edges, none, false, true, None::<i64>)
     };
     let maps = [&large(&pairs.ego)?, &large(&pairs.shown)?];
     let cell_m = area.cell_m() * cells as f64;
     let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
     if train {
-        let _ = fit.f_select(1, fit.size2()?.1 / 2)?.f_add_scalar_(margin)?;
+        let _ = fit
+            .f_select(1, fit.size2()?.1 / 2)?
+            .f_add_scalar_(config.margin)?;
     }
     let mut tries = vec![(fit, (shifts(radius)? * cell_m).f_constant_pad_nd([0, 1])?)];
     if !train {
@@ -190,11 +183,10 @@ fn turned_tries(
         .f_sub_scalar(TURN_MARGIN)?;
     let shifts_m = shifts(radius)? * cell_m;
     let offsets = |turn_rad: f64| shifts_m.f_pad([0, 1], "constant", turn_rad);
-    let of_turn = |(fit, turn_rad)| Ok((fit, offsets(turn_rad)?));
     fit.f_split(others.size4()?.0, 0)?
         .into_iter()
         .zip(TURNS_RAD)
-        .map(of_turn)
+        .map(|(fit, turn_rad)| Ok((fit, offsets(turn_rad)?)))
         .collect()
 }
 
@@ -218,12 +210,8 @@ fn turned(
         [rows, columns],
     )?;
     let maps = maps.f_repeat([turns_rad.len() as i64, 1, 1, 1])?;
-    maps.f_grid_sampler(
-        &places.f_to_device(maps.device())?,
-        BILINEAR,
-        PADDING_ZEROS,
-        false,
-    )
+    let places = places.f_to_device(maps.device())?;
+    maps.f_grid_sampler(&places, BILINEAR, PADDING_ZEROS, false)
 }
 
 #[cfg(test)]

@@ -15,13 +15,14 @@ use tch::{TchError, Tensor, nn};
 use self::area::{Area, own_sampling_grid, resample, sampling_grid};
 use self::neighbour_maps::NeighbourMaps;
 use self::network::AlignmentNetwork;
-use self::pairs::{Displacements, picked};
+use self::pairs::Displacements;
 use super::coarse_alignment::{CoarseMaps, Origins};
 use super::confidence_embedding::Confidences;
 use super::config::PastatConfig;
 use super::extensions::alignment_search::displacements;
 use super::extensions::pooled_history::pooled;
 use super::patches::PatchTokens;
+use crate::f64_tensor::picked;
 use crate::full_resolution::FullResolutionMap;
 
 /// Feature Spatial Alignment.
@@ -112,21 +113,13 @@ impl SpatialAlignment {
     fn compare(
         &self,
         network: &AlignmentNetwork,
-        CoarseMaps {
-            newest,
-            earlier,
-            origins,
-            ..
-        }: &CoarseMaps,
+        coarse: &CoarseMaps,
         confidences: &Tensor,
         area: &Area,
         is_training: bool,
     ) -> Result<Displacements, TchError> {
-        let (newest, agents, poses) = (
-            network.reduced(newest)?,
-            newest.count()?,
-            &origins.ego_from_cav,
-        );
+        let (newest, agents) = (network.reduced(&coarse.newest)?, coarse.newest.count()?);
+        let (origins, poses) = (&coarse.origins, &coarse.origins.ego_from_cav);
         let ego = newest.only(0, 1)?;
         let mut found = Vec::with_capacity(2);
         if agents > 1 {
@@ -138,7 +131,7 @@ impl SpatialAlignment {
             )?;
             found.push(displacements(network, &pairs, area, None, is_training)?);
         }
-        if let Some(earlier) = earlier {
+        if let Some(earlier) = &coarse.earlier {
             // Means of reduced maps are reduced means of maps.
             let (ego, area) = (
                 pooled(&ego, self.earlier_cells)?,

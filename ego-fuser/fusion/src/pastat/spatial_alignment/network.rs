@@ -10,6 +10,7 @@ use super::area::{Area, resample, sampling_grid};
 use super::correlation::{PARTS, Shifted, peaks, shifts};
 use super::pairs::{Displacements, Pairs};
 use crate::f64_tensor::pointwise;
+use crate::layers::{ZERO, around};
 use crate::pastat::confidence_embedding::CONFIDENCES;
 use crate::pastat::config::{FsaConfig, SearchConfig};
 use crate::warp::WarpedMaps;
@@ -40,18 +41,7 @@ pub(crate) struct AlignmentNetwork {
 impl AlignmentNetwork {
     /// Before training it moves nothing and adds nothing to tokens of `dim` channels.
     pub(crate) fn new(path: &nn::Path<'_>, [channels, dim]: [i64; 2], config: &FsaConfig) -> Self {
-        let FsaConfig {
-            matching, hidden, ..
-        } = *config;
-        let still = nn::LinearConfig {
-            ws_init: Init::Const(0.0),
-            bs_init: Some(Init::Const(0.0)),
-            bias: true,
-        };
-        let around = nn::ConvConfig {
-            padding: 1,
-            ..Default::default()
-        };
+        let (matching, hidden) = (config.matching, config.hidden);
         // For each part the shift along x and y and its quality; the same for the whole; the motion; the confidences.
         let inputs = 3 * (PARTS * PARTS + 1) + 3 + CONFIDENCES;
         Self {
@@ -63,12 +53,12 @@ impl AlignmentNetwork {
                     1,
                     nn::ConvConfig::default(),
                 ),
-                nn::conv2d(path / "matching1", matching, matching, 3, around),
+                nn::conv2d(path / "matching1", matching, matching, 3, around()),
             ],
             sharpness: path.var("sharpness", &[], Init::Const(SHARPNESS.ln())),
             hidden: nn::linear(path / "hidden", inputs, hidden, nn::LinearConfig::default()),
-            delta: nn::linear(path / "delta", hidden, 6, still),
-            fit: nn::linear(path / "fit", hidden, dim, still),
+            delta: nn::linear(path / "delta", hidden, 6, ZERO),
+            fit: nn::linear(path / "fit", hidden, dim, ZERO),
             config: config.clone(),
         }
     }
@@ -125,14 +115,9 @@ impl AlignmentNetwork {
         deltas: &Tensor,
         area: &Area,
     ) -> Result<Displacements, TchError> {
-        let Pairs {
-            own,
-            confidences,
-            ego_from_cav,
-            ..
-        } = pairs;
+        let ego_from_cav = &pairs.ego_from_cav;
         let device = deltas.device();
-        let found = own.correlate(&moved(pairs, deltas, area)?)?;
+        let found = pairs.own.correlate(&moved(pairs, deltas, area)?)?;
         let shifts = (shifts(area.radius())? * area.cell_m()).f_to_device(device)?;
         let sharpness = self.sharpness.f_exp()?;
         let parts = peaks(&found.parts, &sharpness, &shifts)?;
@@ -155,7 +140,7 @@ impl AlignmentNetwork {
             whole,
             similarity.f_unsqueeze(1)?,
             motion.shallow_clone(),
-            confidences.shallow_clone(),
+            pairs.confidences.shallow_clone(),
         ];
         let hidden = self.hidden.forward(&Tensor::f_cat(&inputs, 1)?).f_relu()?;
         let near = self.bounded(&self.delta.forward(&hidden), motion)?;
@@ -169,13 +154,8 @@ impl AlignmentNetwork {
     /// `[K, 3]` from the network's output `learnt` `[K, 6]`, an addition and the share of the `motion` `[K, 3]`, within
     /// bounds.
     fn bounded(&self, learnt: &Tensor, motion: Tensor) -> Result<Tensor, TchError> {
-        let FsaConfig {
-            max_shift_m,
-            max_turn_rad,
-            ..
-        } = self.config;
-        let bounds =
-            Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
+        let shift_m = self.config.max_shift_m as f32;
+        let bounds = Tensor::f_from_slice(&[shift_m, shift_m, self.config.max_turn_rad as f32])?;
         let bounds = bounds.f_to_device(motion.device())?;
         let raw = learnt.f_narrow(1, 0, 3)? + motion / &bounds * learnt.f_narrow(1, 3, 3)?;
         Ok(raw.f_tanh()? * bounds)
@@ -192,22 +172,14 @@ impl AlignmentNetwork {
 }
 
 /// Compared form of others, moved by `deltas` `[K, 3]`.
-fn moved(
-    Pairs {
-        shown,
-        mask,
-        ego_from_cav,
-        ..
-    }: &Pairs,
-    deltas: &Tensor,
-    area: &Area,
-) -> Result<Tensor, TchError> {
+fn moved(pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor, TchError> {
+    let shown = &pairs.shown;
     if deltas.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
         return Ok(shown.shallow_clone());
     }
     let (.., height, width) = shown.size4()?;
-    let places = sampling_grid(deltas, ego_from_cav, area, [height, width])?;
-    let (moved, valid) = resample(shown, mask, &places)?;
+    let places = sampling_grid(deltas, &pairs.ego_from_cav, area, [height, width])?;
+    let (moved, valid) = resample(shown, &pairs.mask, &places)?;
     moved.f_mul(&valid)
 }
 

@@ -6,6 +6,7 @@ use protocol::Pose;
 use tch::{TchError, Tensor};
 
 use super::correlation::Shifted;
+use crate::f64_tensor::picked;
 
 /// The ego's map and `K` others, prepared for comparison.
 #[derive(Debug)]
@@ -84,14 +85,6 @@ impl Displacements {
             similarity: with(|each| &each.similarity)?,
         })
     }
-}
-
-/// Some rows of a tensor.
-pub(crate) fn picked(tensor: &Tensor, rows: &[i64]) -> Result<Tensor, TchError> {
-    tensor.f_index_select(
-        0,
-        &Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?,
-    )
 }
 
 /// The rows of `[K]` that are true.

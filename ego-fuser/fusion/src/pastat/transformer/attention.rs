@@ -4,6 +4,7 @@ use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
 use crate::f64_tensor::numbers;
+use crate::layers::BARE;
 use crate::pastat::extensions::ego_queries::Others;
 
 /// Score of masked tokens: low enough for zero weight, and finite, so that rows without valid tokens stay finite.
@@ -24,14 +25,10 @@ pub(super) struct AgentAttention {
 
 impl AgentAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64) -> Self {
-        let bare = nn::LinearConfig {
-            bias: false,
-            ..Default::default()
-        };
         Self {
-            query: nn::linear(path / "query", dim, dim, bare),
-            key: nn::linear(path / "key", dim, dim, bare),
-            value: nn::linear(path / "value", dim, dim, bare),
+            query: nn::linear(path / "query", dim, dim, BARE),
+            key: nn::linear(path / "key", dim, dim, BARE),
+            value: nn::linear(path / "value", dim, dim, BARE),
             out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
             members: Tensor::eye(heads, (Kind::Float, path.device())).repeat_interleave_self_int(
                 dim / heads,
@@ -55,6 +52,7 @@ impl AgentAttention {
         let query = self.query.forward(&tokens.f_narrow(0, 0, 1)?) / (each as f64).sqrt();
         let [query, key, value] = [query, self.key.forward(tokens), self.value.forward(tokens)]
             .map(|tensor| tensor.f_view([-1, cells, dim]));
+        // Masked tokens get no weight, whatever they contain.
         let hidden = valid.f_eq(0.0)?.f_view([entries, cells, 1])?;
         let scores = (query? * key?).f_matmul(&self.members)?;
         let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(0, None)?;
@@ -125,10 +123,6 @@ struct WindowSize {
 
 impl WindowAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64, edges: &[i64]) -> Self {
-        let bare = nn::LinearConfig {
-            bias: false,
-            ..Default::default()
-        };
         let heads = heads / edges.len() as i64;
         let size = |(index, &edge): (usize, &i64)| WindowSize {
             edge,
@@ -140,7 +134,7 @@ impl WindowAttention {
             places: relative_places(edge),
         };
         Self {
-            query_key_value: nn::linear(path / "query_key_value", dim, 3 * dim, bare),
+            query_key_value: nn::linear(path / "query_key_value", dim, 3 * dim, BARE),
             out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
             sizes: edges.iter().enumerate().map(size).collect(),
             heads,
@@ -181,6 +175,7 @@ impl WindowAttention {
                 .f_permute([0, 1, 3, 5, 2, 4, 6])?
                 .f_reshape([entries * down * across, self.heads, edge * edge, each])
         };
+        // One row for each window and head: one batched product computes them all.
         let [query, key, value] = [
             windows(&parts[0])?,
             windows(&parts[1])?,
@@ -189,6 +184,7 @@ impl WindowAttention {
         let mut scores = (query / (each as f64).sqrt()).f_matmul(&key.f_transpose(2, 3)?)?;
         scores = scores.f_add_(&self.preference(size)?)?;
         let hidden = valid.f_eq(0.0)?;
+        // Few maps have masked tokens; without any, a pass over all scores is saved.
         if hidden.f_any()?.f_int64_value(&[])? != 0 {
             let hidden = hidden
                 .f_view([entries, down, edge, across, edge])?

@@ -18,12 +18,8 @@ pub(super) struct Block {
 
 impl Block {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let PastatConfig {
-            dim,
-            heads,
-            mlp_ratio,
-            ..
-        } = *config;
+        let (dim, heads) = (config.dim, config.heads);
+        let wide = config.mlp_ratio * dim;
         let norm =
             |name: &str| nn::layer_norm(path / name, vec![dim], nn::LayerNormConfig::default());
         let linear =
@@ -32,10 +28,7 @@ impl Block {
             norms: [norm("norm_agents"), norm("norm_windows"), norm("norm_mlp")],
             agents: AgentAttention::new(&(path / "agents"), dim, heads),
             windows: WindowAttention::new(&(path / "windows"), dim, heads, &config.windows),
-            mlp: [
-                linear("mlp0", dim, mlp_ratio * dim),
-                linear("mlp1", mlp_ratio * dim, dim),
-            ],
+            mlp: [linear("mlp0", dim, wide), linear("mlp1", wide, dim)],
         }
     }
 

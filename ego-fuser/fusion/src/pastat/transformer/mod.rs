@@ -24,14 +24,16 @@ pub(super) struct Transformer {
 impl Transformer {
     /// Its variables are `blocks.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let block = |index: usize| Block::new(&(path / "blocks" / index), config);
         Self {
-            blocks: (0..config.depth).map(block).collect(),
+            blocks: (0..config.depth)
+                .map(|index| Block::new(&(path / "blocks" / index), config))
+                .collect(),
         }
     }
 
     /// Context of the ego: its tokens `[1, h, w, D]` after all blocks.
     pub(super) fn forward(&self, Tokens { values, valid }: &Tokens) -> Result<Tensor, TchError> {
+        // Only the ego's tokens change from block to block: the others are prepared once and never projected.
         if values.device() == Device::Cpu && !values.requires_grad() {
             let (others, valid) = (Others::of(values, valid)?, valid.f_narrow(0, 0, 1)?);
             let ego = channels_last(&values.f_narrow(0, 0, 1)?)?;

@@ -60,7 +60,6 @@ impl Tally {
     }
 
     /// The row; shares of nothing are zero.
-    #[must_use]
     pub fn row(&self, method: &str) -> Row {
         let failed: usize = self.reasons.values().sum();
         let pairs = failed + self.errors.len();
@@ -98,7 +97,6 @@ impl Tally {
 }
 
 /// The rows as a markdown table.
-#[must_use]
 pub fn markdown(rows: &[Row]) -> String {
     let mut text = String::from(
         "| method | time, s | bytes, log2 | under 3 m, % | under 1 m, % | mean / median, m | mean / median, deg | no alignment, % | pairs |\n\

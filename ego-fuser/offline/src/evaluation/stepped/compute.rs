@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use support::nanos;
 use support::statistics::median;
 
-use super::super::sent::view;
+use super::super::transmission::view;
 use super::super::{EvaluateError, Evaluator};
 
 /// Ticks that times are measured over.
@@ -160,13 +160,12 @@ impl Evaluator {
         budget: Duration,
     ) -> Result<EstimatedTimes, EvaluateError> {
         let began = Instant::now();
-        let goes_on = |ticks| {
-            ticks < ESTIMATED_TICKS || (ticks < MOST_ESTIMATED_TICKS && began.elapsed() < budget)
-        };
         // Few sweeps are timed, so each of them is measured.
         let source = self.setup.agents.pose.clone();
         self.setup.agents.pose = source.clone().measuring_every_sweep();
-        let samples = self.samples(scenario, vehicles, &goes_on);
+        let samples = self.samples(scenario, vehicles, &|ticks| {
+            ticks < ESTIMATED_TICKS || (ticks < MOST_ESTIMATED_TICKS && began.elapsed() < budget)
+        });
         self.setup.agents.pose = source;
         let samples = samples?;
         let warm = |sample: &[f64]| median(&sample[sample.len() / 2..]).unwrap_or(0.0);
@@ -184,12 +183,12 @@ impl Evaluator {
         Ok(EstimatedTimes { steps, stages })
     }
 
-    /// Durations while `goes_on` with the number of ticks so far.
+    /// Durations while `is_needed` with the number of ticks so far.
     fn samples(
         &mut self,
         scenario: &Scenario,
         vehicles: usize,
-        goes_on: &dyn Fn(usize) -> bool,
+        is_needed: &dyn Fn(usize) -> bool,
     ) -> Result<Samples, EvaluateError> {
         let exchange = self.ego.method().own_content();
         let mut participants = (0..scenario.agents.len().min(MEASURED_VEHICLES))
@@ -197,7 +196,7 @@ impl Evaluator {
             .collect::<Result<Vec<_>, EvaluateError>>()?;
         let mut samples = Samples::default();
         self.ego.forget();
-        for tick in (0..scenario.ticks.len()).take_while(|tick| goes_on(*tick)) {
+        for tick in (0..scenario.ticks.len()).take_while(|tick| is_needed(*tick)) {
             let mut sent = Vec::with_capacity(participants.len());
             for (place, participant) in participants.iter_mut().enumerate() {
                 if !scenario.is_present(place, tick) {

@@ -63,8 +63,9 @@ impl<'a> Shader<'a> {
             if self.weather == Weather::Snow && random.chance(FLAKES) {
                 colour = mix(colour, SNOW, 0.7);
             }
-            let byte = |part: f32| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8;
-            rgb.extend(colour.map(byte));
+            rgb.extend(
+                colour.map(|part| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8),
+            );
         }
         rgb
     }

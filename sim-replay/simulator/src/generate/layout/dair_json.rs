@@ -3,30 +3,23 @@
 use protocol::{Box3d, Pose};
 use serde_json::{Value, json};
 
-use super::boxes::world_corners;
+use super::boxes::{real_type, world_corners};
 use dataset::frame::{Object, ObjectClass};
 
 /// The type of an object as one side labels it; `None` where the data sets have none.
 pub(super) fn side_type(class: ObjectClass) -> Option<&'static str> {
     match class {
         ObjectClass::TwoWheeler => Some("Cyclist"),
-        ObjectClass::Pedestrian => Some("Pedestrian"),
-        ObjectClass::Car | ObjectClass::Van | ObjectClass::Truck | ObjectClass::Bus => {
-            cooperative_type(class)
-        }
         ObjectClass::Other => None,
+        _ => Some(real_type(class)),
     }
 }
 
 /// The type of an object as both sides together label it: vehicles alone.
 pub(super) fn cooperative_type(class: ObjectClass) -> Option<&'static str> {
-    match class {
-        ObjectClass::Car => Some("Car"),
-        ObjectClass::Van => Some("Van"),
-        ObjectClass::Truck => Some("Truck"),
-        ObjectClass::Bus => Some("Bus"),
-        ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other => None,
-    }
+    ObjectClass::VEHICLES
+        .contains(&class)
+        .then(|| real_type(class))
 }
 
 /// Rotation as 3 rows and translation as 3 rows of one number.

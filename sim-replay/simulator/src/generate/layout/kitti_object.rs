@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::Point3;
 
-use super::boxes::{float_bytes, upright_in};
+use super::boxes::{float_bytes, real_type, upright_in};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
 use super::kitti_odometry::camera_from_lidar;
 use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
@@ -103,13 +103,10 @@ fn labels(frame: &AgentFrame) -> String {
 
 fn kind(class: ObjectClass) -> &'static str {
     match class {
-        ObjectClass::Car => "Car",
-        ObjectClass::Van => "Van",
-        ObjectClass::Truck => "Truck",
         // KITTI has no buses.
         ObjectClass::Bus => "Tram",
         ObjectClass::TwoWheeler => "Cyclist",
-        ObjectClass::Pedestrian => "Pedestrian",
         ObjectClass::Other => "Misc",
+        _ => real_type(class),
     }
 }

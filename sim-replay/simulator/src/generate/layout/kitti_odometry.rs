@@ -8,7 +8,6 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-use super::Omissions;
 use super::boxes::float_bytes;
 use super::disk::{make_folder, write_file};
 use super::sequences::{Sequence, Style};
@@ -23,10 +22,6 @@ P3: 7.188560e+02 0 6.071928e+02 0 0 7.188560e+02 1.852157e+02 0 0 0 1 0
 Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0
 ";
 
-/// The style.
-#[derive(Debug)]
-pub(super) struct KittiOdometry;
-
 /// `camera_from_lidar` of [`CALIBRATION`].
 pub(super) fn camera_from_lidar() -> Isometry3<f64> {
     let axes = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
@@ -34,36 +29,24 @@ pub(super) fn camera_from_lidar() -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::identity(), rotation)
 }
 
-impl Style for KittiOdometry {
-    fn epoch_micros(&self) -> u64 {
-        0
-    }
+/// The style.
+pub(super) static STYLE: Style = Style {
+    epoch_micros: 0,
+    folder: |sequence| format!("sequences/{sequence:02}"),
+    sweeps_folder: "velodyne",
+    file_name: |moment, _| format!("{moment:06}.bin"),
+    points: |points, _| float_bytes(points.iter().copied()),
+    write_poses,
+};
 
-    fn folder(&self, sequence: usize) -> String {
-        format!("sequences/{sequence:02}")
-    }
-
-    fn sweeps_folder(&self) -> &'static str {
-        "velodyne"
-    }
-
-    fn file_name(&self, moment: usize, _: u64) -> String {
-        format!("{moment:06}.bin")
-    }
-
-    fn points(&self, points: &[[f32; 4]], _: &Omissions) -> Vec<u8> {
-        float_bytes(points.iter().copied())
-    }
-
-    fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
-        let folder = root.join(&sequence.folder);
-        write_file(&folder.join("calib.txt"), CALIBRATION)?;
-        write_file(&folder.join("times.txt"), times(sequence.capture_nanos))?;
-        let poses = root.join("poses");
-        make_folder(&poses)?;
-        let file = poses.join(format!("{:02}.txt", sequence.number));
-        write_file(&file, pose_lines(sequence))
-    }
+fn write_poses(root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
+    let folder = root.join(&sequence.folder);
+    write_file(&folder.join("calib.txt"), CALIBRATION)?;
+    write_file(&folder.join("times.txt"), times(sequence.capture_nanos))?;
+    let poses = root.join("poses");
+    make_folder(&poses)?;
+    let file = poses.join(format!("{:02}.txt", sequence.number));
+    write_file(&file, pose_lines(sequence))
 }
 
 /// Seconds from the first moment, one a line.

@@ -37,31 +37,26 @@ use super::error::SynthError;
 use super::positioning::Fix;
 use dataset::frame::{Frame, Object};
 
+use agent_folders::AgentFolderWriter;
 pub(crate) use disk::{Unfinished, make_folder, remove_folder};
 use sequences::Sequences;
 
 /// The layouts that scenes are written in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum)]
-#[value(rename_all = "kebab-case")]
 pub enum SceneLayout {
     /// OPV2V, V2XSet: a folder per agent with PCD and YAML, left-handed. The only layout with radar, GNSS and copies in
     /// other weather.
     #[default]
-    #[value(name = "opv2v")]
     Opv2v,
     /// V2V4Real: the same folders, right-handed, pose matrices pickled by NumPy, boxes in the frame of the LiDAR.
-    #[value(name = "v2v4real")]
     V2v4real,
     /// DAIR-V2X-C: the ego as the vehicle, the second agent as the roadside unit; others are left out.
     Dair,
     /// V2X-Seq SPD: the same two, in sequences with track ids.
-    #[value(name = "v2xseq")]
     V2xseq,
     /// V2X-Real, V2XPnP: folders as OPV2V, right-handed, `.bin` sweeps, types of objects.
-    #[value(name = "v2xreal")]
     V2xreal,
     /// V2X-Sim 2.0: tables of nuScenes, one sample for all agents, boxes in the world.
-    #[value(name = "v2xsim")]
     V2xsim,
     /// Open MARS: tables of nuScenes, a channel per vehicle. The released set has no boxes; scenes written here have.
     Mars,
@@ -102,16 +97,16 @@ impl SceneLayout {
     /// A writer of data sets below `root`, which exists.
     pub(crate) fn writer(self, root: &Path) -> Box<dyn SceneWriter> {
         match self {
-            Self::Opv2v => Box::new(opv2v::writer(root)),
-            Self::V2v4real => Box::new(v2v4real::writer(root)),
+            Self::Opv2v => Box::new(AgentFolderWriter::new(root, opv2v::write_files)),
+            Self::V2v4real => Box::new(AgentFolderWriter::new(root, v2v4real::write_files)),
             Self::Dair => Box::new(dair::Dair::new(root, dair::Edition::Dair)),
             Self::V2xseq => Box::new(dair::Dair::new(root, dair::Edition::V2xSeq)),
-            Self::V2xreal => Box::new(v2xreal::writer(root)),
-            Self::V2xsim => Box::new(nuscenes::NuScenes::new(root, &v2xsim::V2xSim)),
-            Self::Mars => Box::new(nuscenes::NuScenes::new(root, &mars::Mars)),
-            Self::Nclt => Box::new(Sequences::new(root, &nclt::Nclt)),
-            Self::Oxford => Box::new(Sequences::new(root, &oxford::Oxford)),
-            Self::KittiOdometry => Box::new(Sequences::new(root, &kitti_odometry::KittiOdometry)),
+            Self::V2xreal => Box::new(AgentFolderWriter::new(root, v2xreal::write_files)),
+            Self::V2xsim => Box::new(nuscenes::NuScenes::new(root, &v2xsim::STYLE)),
+            Self::Mars => Box::new(nuscenes::NuScenes::new(root, &mars::STYLE)),
+            Self::Nclt => Box::new(Sequences::new(root, &nclt::STYLE)),
+            Self::Oxford => Box::new(Sequences::new(root, &oxford::STYLE)),
+            Self::KittiOdometry => Box::new(Sequences::new(root, &kitti_odometry::STYLE)),
             Self::KittiObject => Box::new(kitti_object::KittiObject::new(root)),
         }
     }

@@ -16,65 +16,51 @@ const STEP_M: f64 = 0.005;
 const LEAST_M: f64 = -100.0;
 
 /// The style.
-#[derive(Debug)]
-pub(super) struct Nclt;
+pub(super) static STYLE: Style = Style {
+    epoch_micros: 1_326_030_000_000_000,
+    folder: day,
+    sweeps_folder: "velodyne_sync",
+    file_name: |_, micros| format!("{micros}.bin"),
+    points,
+    write_poses,
+};
 
-impl Nclt {
-    fn day(sequence: usize) -> String {
-        let [year, month, day] = date(2012, sequence);
-        format!("{year}-{month:02}-{day:02}")
-    }
+fn day(sequence: usize) -> String {
+    let [year, month, day] = date(2012, sequence);
+    format!("{year}-{month:02}-{day:02}")
 }
 
-impl Style for Nclt {
-    fn epoch_micros(&self) -> u64 {
-        1_326_030_000_000_000
+fn points(points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(8 * points.len());
+    let mut outside = 0;
+    for &point in points {
+        let [x, y, z, intensity] = z_down(point);
+        let [Some(x), Some(y), Some(z)] = [x, y, z].map(steps) else {
+            outside += 1;
+            continue;
+        };
+        bytes.extend([x, y, z].into_iter().flat_map(u16::to_le_bytes));
+        bytes.extend([byte(intensity), ring(point)]);
     }
+    let what = "points beyond the coordinates that can be written (-100 m to 227 m)";
+    omitted.add(what, outside);
+    bytes
+}
 
-    fn folder(&self, sequence: usize) -> String {
-        Self::day(sequence)
+fn write_poses(root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
+    let folder = root.join("ground_truth");
+    make_folder(&folder)?;
+    let mut rows = String::with_capacity(160 * sequence.sweeps.len());
+    for sweep in sequence.sweeps {
+        let pose = pose_z_down(&sweep.world_from_lidar);
+        let [x, y, z] = pose.translation_m;
+        let (roll, pitch, heading) = pose.isometry().rotation.euler_angles();
+        // Writing to a String does not fail.
+        let micros = sweep.micros;
+        let _ = writeln!(rows, "{micros},{x},{y},{z},{roll},{pitch},{heading}");
     }
-
-    fn sweeps_folder(&self) -> &'static str {
-        "velodyne_sync"
-    }
-
-    fn file_name(&self, _: usize, micros: u64) -> String {
-        format!("{micros}.bin")
-    }
-
-    fn points(&self, points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(8 * points.len());
-        let mut outside = 0;
-        for &point in points {
-            let [x, y, z, intensity] = z_down(point);
-            let [Some(x), Some(y), Some(z)] = [x, y, z].map(steps) else {
-                outside += 1;
-                continue;
-            };
-            bytes.extend([x, y, z].into_iter().flat_map(u16::to_le_bytes));
-            bytes.extend([byte(intensity), ring(point)]);
-        }
-        let what = "points beyond the coordinates that can be written (-100 m to 227 m)";
-        omitted.add(what, outside);
-        bytes
-    }
-
-    fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
-        let folder = root.join("ground_truth");
-        make_folder(&folder)?;
-        let mut rows = String::with_capacity(160 * sequence.sweeps.len());
-        for sweep in sequence.sweeps {
-            let pose = pose_z_down(&sweep.world_from_lidar);
-            let [x, y, z] = pose.translation_m;
-            let (roll, pitch, heading) = pose.isometry().rotation.euler_angles();
-            // Writing to a String does not fail.
-            let micros = sweep.micros;
-            let _ = writeln!(rows, "{micros},{x},{y},{z},{roll},{pitch},{heading}");
-        }
-        let name = format!("groundtruth_{}.csv", Self::day(sequence.number));
-        write_file(&folder.join(name), rows)
-    }
+    let name = format!("groundtruth_{}.csv", day(sequence.number));
+    write_file(&folder.join(name), rows)
 }
 
 /// A coordinate as a number of steps, if it is in range.
@@ -91,7 +77,7 @@ mod tests {
     #[test]
     fn points_are_rounded_and_those_outside_are_counted() {
         let omitted = Omissions::default();
-        let bytes = Nclt.points(
+        let bytes = points(
             &[[1.0024, -2.0026, 0.5, 0.2], [-100.5, 0.0, 0.0, 0.5]],
             &omitted,
         );

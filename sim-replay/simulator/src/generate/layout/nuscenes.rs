@@ -2,7 +2,6 @@
 //!
 //! A sample holds the sweeps of all agents at one capture time. Its annotations are those of any agent, in the world.
 
-use std::fmt::Debug;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
@@ -21,28 +20,25 @@ const DAY_MICROS: u64 = 86_400_000_000;
 const SWEEPS: &str = "sweeps";
 
 /// Differences between data sets with these tables.
-pub(super) trait Style: Debug + Send + Sync {
+#[derive(Debug)]
+pub(super) struct Style {
     /// The folder of the tables.
-    fn version(&self) -> &'static str;
-
+    pub(super) version: &'static str,
     /// The channel of each agent's LiDAR.
-    fn channels(&self, scene: &SceneHeader) -> Vec<String>;
-
+    pub(super) channels: fn(&SceneHeader) -> Vec<String>,
     /// The file of a sweep in the folder of its channel, by number of scene and capture time and time in microseconds.
-    fn file_name(&self, scene: usize, moment: usize, micros: u64) -> String;
-
+    pub(super) file_name: fn(usize, usize, u64) -> String,
     /// Value in the file for an intensity of 0 to 1.
-    fn intensity(&self, intensity: f32) -> f32;
-
+    pub(super) intensity: fn(f32) -> f32,
     /// Fields of a row of scenes that only this data set has.
-    fn scene_fields(&self, scene: &SceneHeader) -> Map<String, Value>;
+    pub(super) scene_fields: fn(&SceneHeader) -> Map<String, Value>,
 }
 
 /// The writer.
 #[derive(Debug)]
 pub(super) struct NuScenes {
     root: PathBuf,
-    style: &'static dyn Style,
+    style: &'static Style,
     scenes: usize,
     scene: Option<Current>,
     samples: Mutex<Vec<Sample>>,
@@ -58,7 +54,7 @@ struct Current {
 }
 
 impl NuScenes {
-    pub(super) fn new(root: &Path, style: &'static dyn Style) -> Self {
+    pub(super) fn new(root: &Path, style: &'static Style) -> Self {
         Self {
             root: root.to_owned(),
             style,
@@ -70,12 +66,11 @@ impl NuScenes {
     }
 
     fn sweep_bytes(&self, frame: &AgentFrame) -> Vec<u8> {
-        let row = |&point: &[f32; 4]| {
+        float_bytes(frame.frame.points.xyzi.iter().map(|&point| {
             let [x, y, z, intensity] = point;
-            let intensity = self.style.intensity(intensity);
+            let intensity = (self.style.intensity)(intensity);
             [x, y, z, intensity, f32::from(ring(point))]
-        };
-        float_bytes(frame.frame.points.xyzi.iter().map(row))
+        }))
     }
 }
 
@@ -83,10 +78,10 @@ impl SceneWriter for NuScenes {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
         if self.scenes == 0 {
             make_fresh_folder(&self.root.join(SWEEPS))?;
-            make_fresh_folder(&self.root.join(self.style.version()))?;
+            make_fresh_folder(&self.root.join(self.style.version))?;
         }
         write_origin(&self.root, scene)?;
-        let channels = self.style.channels(scene);
+        let channels = (self.style.channels)(scene);
         channels
             .iter()
             .try_for_each(|channel| make_folder(&self.root.join(SWEEPS).join(channel)))?;
@@ -105,7 +100,7 @@ impl SceneWriter for NuScenes {
         };
         let offset = EPOCH_MICROS + scene.number as u64 * DAY_MICROS;
         let micros = offset + scene.header.capture_nanos[moment.index] / 1000;
-        let name = self.style.file_name(scene.number, moment.index, micros);
+        let name = (self.style.file_name)(scene.number, moment.index, micros);
         let mut sweeps = Vec::with_capacity(moment.frames.len());
         for frame in &moment.frames {
             let file = format!("{SWEEPS}/{}/{name}", scene.channels[frame.agent]);
@@ -142,7 +137,7 @@ impl SceneWriter for NuScenes {
                 number: scene.number,
                 name: &scene.header.name,
                 channels: &scene.channels,
-                fields: self.style.scene_fields(&scene.header),
+                fields: (self.style.scene_fields)(&scene.header),
                 samples: &samples,
             });
         }
@@ -150,7 +145,7 @@ impl SceneWriter for NuScenes {
     }
 
     fn finish(&mut self) -> Result<(), SynthError> {
-        let folder = self.root.join(self.style.version());
+        let folder = self.root.join(self.style.version);
         let tables = std::mem::take(&mut self.tables).into_tables();
         tables.into_iter().try_for_each(|(name, rows)| {
             let rows = Value::Array(rows).to_string();

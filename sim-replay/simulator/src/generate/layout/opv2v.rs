@@ -3,12 +3,11 @@
 //! The world of the files is CARLA's: left-handed, degrees, half extents. This is the only writer that mirrors.
 
 use std::fmt::Write as _;
-use std::path::Path;
 
 use dataset::camera_files::body_from_optical;
-use protocol::{Camera, CameraMetadata, EgoMotion, PointCloud, Pose};
+use protocol::{Camera, EgoMotion, PointCloud, Pose};
 
-use super::agent_folders::{AgentFolderWriter, FrameFiles};
+use super::agent_folders::FrameFiles;
 use super::boxes::real_type;
 use super::yaml_text::{ObjectEntry, write_list, write_speed, write_vehicles};
 use super::{AgentFrame, BoxAnchor};
@@ -18,11 +17,7 @@ use dataset::carla_pose::{CarlaPose, mirrored_point};
 use dataset::frame::{Object, ObjectClass};
 use dataset::pcd::{self, Encoding, IntensityField};
 
-pub(super) fn writer(root: &Path) -> AgentFolderWriter {
-    AgentFolderWriter::new(root, write_files)
-}
-
-fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
+pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
     let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);
     files.write(".pcd", points)?;
     for copy in &frame.variants {
@@ -83,14 +78,12 @@ fn write_camera(
     camera: &Camera,
     world_from_lidar: Option<&Pose>,
 ) -> std::fmt::Result {
-    let CameraMetadata {
-        pinhole,
-        lidar_from_camera,
-        ..
-    } = camera.metadata;
-    let (Some(pinhole), Some(lidar_from_camera), Some(world_from_lidar)) =
-        (pinhole, lidar_from_camera, world_from_lidar)
-    else {
+    let metadata = &camera.metadata;
+    let (Some(pinhole), Some(lidar_from_camera), Some(world_from_lidar)) = (
+        metadata.pinhole,
+        metadata.lidar_from_camera,
+        world_from_lidar,
+    ) else {
         return Ok(());
     };
     let lidar_from_body = lidar_from_camera.isometry() * body_from_optical().inverse();

@@ -14,46 +14,37 @@ use dataset::hdf5_file::poses_file;
 const TRIMMED: usize = 5;
 
 /// The style.
-#[derive(Debug)]
-pub(super) struct Oxford;
+pub(super) static STYLE: Style = Style {
+    epoch_micros: 1_547_120_000_000_000,
+    folder,
+    sweeps_folder: "velodyne_left",
+    file_name: |_, micros| format!("{micros}.bin"),
+    points,
+    write_poses,
+};
 
-impl Style for Oxford {
-    fn epoch_micros(&self) -> u64 {
-        1_547_120_000_000_000
-    }
+fn folder(sequence: usize) -> String {
+    let [year, month, day] = date(2019, sequence);
+    format!("{year}-{month:02}-{day:02}-12-00-00-radar-oxford-10k")
+}
 
-    fn folder(&self, sequence: usize) -> String {
-        let [year, month, day] = date(2019, sequence);
-        format!("{year}-{month:02}-{day:02}-12-00-00-radar-oxford-10k")
-    }
+fn points(points: &[[f32; 4]], _: &Omissions) -> Vec<u8> {
+    let numbers = (0..4).flat_map(|index| {
+        points.iter().map(move |&point| {
+            let [x, y, z, intensity] = z_down(point);
+            [x, y, z, of_255(intensity)][index]
+        })
+    });
+    numbers.flat_map(f32::to_le_bytes).collect()
+}
 
-    fn sweeps_folder(&self) -> &'static str {
-        "velodyne_left"
-    }
-
-    fn file_name(&self, _: usize, micros: u64) -> String {
-        format!("{micros}.bin")
-    }
-
-    fn points(&self, points: &[[f32; 4]], _: &Omissions) -> Vec<u8> {
-        let component = |index: usize| {
-            points.iter().map(move |&point| {
-                let [x, y, z, intensity] = z_down(point);
-                [x, y, z, of_255(intensity)][index]
-            })
-        };
-        let numbers = (0..4).flat_map(component);
-        numbers.flat_map(f32::to_le_bytes).collect()
-    }
-
-    fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
-        let (Some(first), Some(last)) = (sequence.sweeps.first(), sequence.sweeps.last()) else {
-            return Ok(());
-        };
-        let (stamps, rows) = padded(first, sequence.sweeps, last);
-        let file = root.join(&sequence.folder).join("velodyne_left_False.h5");
-        write_file(&file, poses_file(&stamps, &rows))
-    }
+fn write_poses(root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
+    let (Some(first), Some(last)) = (sequence.sweeps.first(), sequence.sweeps.last()) else {
+        return Ok(());
+    };
+    let (stamps, rows) = padded(first, sequence.sweeps, last);
+    let file = root.join(&sequence.folder).join("velodyne_left_False.h5");
+    write_file(&file, poses_file(&stamps, &rows))
 }
 
 /// Time stamps and rows of 3x4 matrices. The entries that readers drop are copies of the first and of the last pose.

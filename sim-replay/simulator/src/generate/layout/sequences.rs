@@ -1,6 +1,5 @@
 //! Layouts of one vehicle: each agent of each scene is a sequence, with a file per sweep and common pose files.
 
-use std::fmt::Debug;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
@@ -14,24 +13,20 @@ use crate::generate::error::SynthError;
 const DAY_MICROS: u64 = 86_400_000_000;
 
 /// Differences between these layouts.
-pub(super) trait Style: Debug + Send + Sync {
+#[derive(Debug)]
+pub(super) struct Style {
     /// Time stamps of the first scene start here, microseconds.
-    fn epoch_micros(&self) -> u64;
-
-    /// The folder of a sequence below the root.
-    fn folder(&self, sequence: usize) -> String;
-
+    pub(super) epoch_micros: u64,
+    /// The folder of a sequence below the root, by its number.
+    pub(super) folder: fn(usize) -> String,
     /// The folder of the sweeps below that of the sequence.
-    fn sweeps_folder(&self) -> &'static str;
-
+    pub(super) sweeps_folder: &'static str,
     /// The name of a sweep's file, by index of its capture time and its time stamp.
-    fn file_name(&self, moment: usize, micros: u64) -> String;
-
+    pub(super) file_name: fn(usize, u64) -> String,
     /// The bytes of a sweep.
-    fn points(&self, points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8>;
-
-    /// Writes the data common to all sweeps of a sequence.
-    fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError>;
+    pub(super) points: fn(&[[f32; 4]], &Omissions) -> Vec<u8>,
+    /// Writes the data common to all sweeps of a sequence, below the root.
+    pub(super) write_poses: fn(&Path, &Sequence<'_>) -> Result<(), SynthError>,
 }
 
 /// A sequence whose sweeps are written.
@@ -58,7 +53,7 @@ pub(super) struct SweepPose {
 #[derive(Debug)]
 pub(super) struct Sequences {
     root: PathBuf,
-    style: &'static dyn Style,
+    style: &'static Style,
     scenes: usize,
     /// Number of the first sequence of the next scene.
     next_sequence: usize,
@@ -77,7 +72,7 @@ struct Current {
 }
 
 impl Sequences {
-    pub(super) fn new(root: &Path, style: &'static dyn Style) -> Self {
+    pub(super) fn new(root: &Path, style: &'static Style) -> Self {
         Self {
             root: root.to_owned(),
             style,
@@ -89,7 +84,7 @@ impl Sequences {
     }
 
     fn folder(&self, sequence: usize) -> PathBuf {
-        self.root.join(self.style.folder(sequence))
+        self.root.join((self.style.folder)(sequence))
     }
 }
 
@@ -101,11 +96,11 @@ impl SceneWriter for Sequences {
             make_fresh_folder(&folder)?;
             marks.push(Unfinished::mark(&folder)?);
             write_origin(&folder, scene)?;
-            make_folder(&folder.join(self.style.sweeps_folder()))?;
+            make_folder(&folder.join(self.style.sweeps_folder))?;
         }
         self.scene = Some(Current {
             first_sequence: self.next_sequence,
-            offset_micros: self.style.epoch_micros() + self.scenes as u64 * DAY_MICROS,
+            offset_micros: self.style.epoch_micros + self.scenes as u64 * DAY_MICROS,
             capture_nanos: scene.capture_nanos.clone(),
             marks,
         });
@@ -121,9 +116,10 @@ impl SceneWriter for Sequences {
         let micros = scene.offset_micros + scene.capture_nanos[moment.index] / 1000;
         for frame in &moment.frames {
             let folder = self.folder(scene.first_sequence + frame.agent);
-            let folder = folder.join(self.style.sweeps_folder());
-            let file = folder.join(self.style.file_name(moment.index, micros));
-            write_file(&file, self.style.points(&frame.frame.points.xyzi, omitted))?;
+            let folder = folder.join(self.style.sweeps_folder);
+            let file = folder.join((self.style.file_name)(moment.index, micros));
+            let points = (self.style.points)(&frame.frame.points.xyzi, omitted);
+            write_file(&file, points)?;
             let boxes = frame.frame.objects.len();
             omitted.add("boxes, which the layout does not have", boxes);
             let sweep = SweepPose {
@@ -147,12 +143,12 @@ impl SceneWriter for Sequences {
             let own = sweeps.iter().filter(|(of, _)| *of == agent);
             let own: Vec<SweepPose> = own.map(|(_, sweep)| *sweep).collect();
             let sequence = Sequence {
-                folder: self.style.folder(number),
+                folder: (self.style.folder)(number),
                 number,
                 capture_nanos: &scene.capture_nanos,
                 sweeps: &own,
             };
-            self.style.write_poses(&self.root, &sequence)?;
+            (self.style.write_poses)(&self.root, &sequence)?;
             mark.clear()?;
         }
         Ok(())

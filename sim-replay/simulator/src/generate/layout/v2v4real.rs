@@ -2,14 +2,13 @@
 //! in the frame of the agent's own LiDAR, and `ass_id` is the id that agents share.
 
 use std::fmt::Write as _;
-use std::path::Path;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use protocol::Pose;
 
 use super::AgentFrame;
-use super::agent_folders::{AgentFolderWriter, FrameFiles};
+use super::agent_folders::FrameFiles;
 use super::boxes::real_type;
 use super::yaml_text::{ObjectEntry, write_speed, write_vehicles};
 use crate::generate::error::SynthError;
@@ -50,11 +49,7 @@ const MATRIX_HEAD: &str = "!!python/object/apply:numpy.core.multiarray._reconstr
 /// Characters in a line of base64, as PyYAML breaks them.
 const BASE64_LINE: usize = 76;
 
-pub(super) fn writer(root: &Path) -> AgentFolderWriter {
-    AgentFolderWriter::new(root, write_files)
-}
-
-fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
+pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
     let points = &frame.frame.points;
     let points = pcd::encode(points, Encoding::Binary, IntensityField::Intensity);
     files.write(".pcd", points)?;

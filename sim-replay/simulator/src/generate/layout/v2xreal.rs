@@ -1,21 +1,15 @@
 //! V2X-Real and V2XPnP: the folders of OPV2V with `.bin` sweeps, right-handed; objects in the world, with their type.
 
-use std::path::Path;
-
 use protocol::Pose;
 
 use super::AgentFrame;
-use super::agent_folders::{AgentFolderWriter, FrameFiles};
+use super::agent_folders::FrameFiles;
 use super::boxes::{float_bytes, real_type};
 use super::yaml_text::{ObjectEntry, write_list, write_speed, write_vehicles};
 use crate::generate::error::SynthError;
 use dataset::carla_pose::CarlaPose;
 
-pub(super) fn writer(root: &Path) -> AgentFolderWriter {
-    AgentFolderWriter::new(root, write_files)
-}
-
-fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
+pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
     let points = float_bytes(frame.frame.points.xyzi.iter().copied());
     files.write(".bin", points)?;
     files.write_yaml(frame, |yaml| write_frame(yaml, frame))

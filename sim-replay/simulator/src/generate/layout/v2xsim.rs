@@ -6,37 +6,28 @@ use super::SceneHeader;
 use super::nuscenes::Style;
 
 /// The style.
-#[derive(Debug)]
-pub(super) struct V2xSim;
+pub(super) static STYLE: Style = Style {
+    version: "v1.0-mini",
+    channels,
+    file_name: |scene, moment, _| format!("scene_{scene}_{moment:06}.pcd.bin"),
+    // CARLA's intensities are 0 to 1.
+    intensity: |intensity| intensity,
+    scene_fields,
+};
 
-impl Style for V2xSim {
-    fn version(&self) -> &'static str {
-        "v1.0-mini"
-    }
+fn channels(scene: &SceneHeader) -> Vec<String> {
+    let unit = scene.agents.iter().position(|agent| agent.is_roadside);
+    let mut numbers = 1..;
+    let mut number = |agent: usize| match Some(agent) == unit {
+        true => 0,
+        false => numbers.next().unwrap_or_default(),
+    };
+    (0..scene.agents.len())
+        .map(|agent| format!("LIDAR_TOP_id_{}", number(agent)))
+        .collect()
+}
 
-    fn channels(&self, scene: &SceneHeader) -> Vec<String> {
-        let unit = scene.agents.iter().position(|agent| agent.is_roadside);
-        let mut numbers = 1..;
-        let mut number = |agent: usize| match Some(agent) == unit {
-            true => 0,
-            false => numbers.next().unwrap_or_default(),
-        };
-        (0..scene.agents.len())
-            .map(|agent| format!("LIDAR_TOP_id_{}", number(agent)))
-            .collect()
-    }
-
-    fn file_name(&self, scene: usize, moment: usize, _: u64) -> String {
-        format!("scene_{scene}_{moment:06}.pcd.bin")
-    }
-
-    /// CARLA's intensities are 0 to 1.
-    fn intensity(&self, intensity: f32) -> f32 {
-        intensity
-    }
-
-    fn scene_fields(&self, scene: &SceneHeader) -> Map<String, Value> {
-        let description = format!("{} agents", scene.agents.len());
-        Map::from_iter([("description".to_owned(), json!(description))])
-    }
+fn scene_fields(scene: &SceneHeader) -> Map<String, Value> {
+    let description = format!("{} agents", scene.agents.len());
+    Map::from_iter([("description".to_owned(), json!(description))])
 }

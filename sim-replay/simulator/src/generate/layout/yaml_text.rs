@@ -46,22 +46,21 @@ impl ObjectEntry<'_> {
             let mut between = more.filter(|(key, _)| after < *key && *key < until);
             between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))
         };
-        let Object {
-            id,
-            size_m,
-            speed_mps,
-            ..
-        } = self.object;
-        writeln!(yaml, "  {id}:")?;
+        writeln!(yaml, "  {}:", self.object.id)?;
         write_list(yaml, "    ", "angle", &self.angle_deg)?;
         more(yaml, "angle", "center")?;
         write_list(yaml, "    ", "center", &self.center_m)?;
         more(yaml, "center", "extent")?;
-        write_list(yaml, "    ", "extent", &size_m.map(|size| size / 2.0))?;
+        write_list(
+            yaml,
+            "    ",
+            "extent",
+            &self.object.size_m.map(|size| size / 2.0),
+        )?;
         more(yaml, "extent", "location")?;
         write_list(yaml, "    ", "location", &self.location_m)?;
         more(yaml, "location", "speed")?;
-        match speed_mps {
+        match self.object.speed_mps {
             Some(speed_mps) => writeln!(yaml, "    speed: {}", KMH_PER_MPS * speed_mps),
             None => Ok(()),
         }
@@ -114,12 +113,11 @@ fn bottom_anchor(object: &Object) -> BoxAnchor {
 pub(super) fn agent_folders(scene: &SceneHeader) -> Vec<String> {
     let agents = &scene.agents;
     let own: Vec<String> = agents.iter().map(|agent| agent.id.to_string()).collect();
-    let is_number = |agent: &SceneAgent| {
+    if scene.agents.iter().all(|agent| {
         let number = agent.id.as_str().parse::<i64>();
         number.is_ok_and(|number| (number < 0) == agent.is_roadside)
-    };
-    let key = |name: &String| (name.starts_with('-'), name.clone());
-    if scene.agents.iter().all(is_number) && own.is_sorted_by_key(key) {
+    }) && own.is_sorted_by_key(|name: &String| (name.starts_with('-'), name.clone()))
+    {
         return own;
     }
     let (mut vehicles, mut units) = (FIRST_VEHICLE.., 1..);

@@ -6,7 +6,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::column::RayPattern;
-use super::placement::{Placement, Sweep};
+use super::placement::Sweep;
 use super::{Body, Bounds};
 
 /// Closer than this, metres, a body may be seen in every direction.
@@ -32,9 +32,9 @@ pub(super) struct SensorFrames {
 
 impl SensorFrames {
     pub(super) fn new(sensor: &Sweep) -> Self {
-        let frame = |end: &Placement| (end.rotation().transpose(), end.position_m);
         Self {
-            ends: [&sensor.start, &sensor.end].map(frame),
+            ends: [&sensor.start, &sensor.end]
+                .map(|end| (end.rotation().transpose(), end.position_m)),
         }
     }
 
@@ -106,14 +106,13 @@ impl SensorFrames {
         let closest = closest.unwrap_or(center);
         let (x, y) = (axes.column(0).xy(), axes.column(1).xy());
         let directions = [x, -x, y, -y, *center, *closest];
-        let parting = |direction: &Vector2<f32>| {
-            let direction = direction.try_normalize(1e-6)?;
-            let along = flat.iter().map(|corner| corner.dot(&direction));
-            along.min_by(f32::total_cmp)
-        };
         directions
             .iter()
-            .filter_map(parting)
+            .filter_map(|direction| {
+                let direction = direction.try_normalize(1e-6)?;
+                let along = flat.iter().map(|corner| corner.dot(&direction));
+                along.min_by(f32::total_cmp)
+            })
             .fold(f32::MIN, f32::max)
     }
 }

@@ -1,13 +1,13 @@
 //! One vehicle in traffic.
 
 use super::driver::{Driver, Obstacle};
-use super::lane_change::LaneChangeState;
 use super::path::Path;
 use super::rectangle::Rectangle;
 use super::roads::Roads;
 use crate::generate::raycast::{Placement, Sweep};
 use crate::generate::vehicle::Vehicle;
-use crate::map::LaneId;
+use crate::map::{Lane, LaneId};
+use support::random::SplitMix64;
 
 /// One vehicle in traffic.
 #[derive(Debug, Clone)]
@@ -57,5 +57,49 @@ impl Car {
     /// Its position in the plane now, metres.
     pub(crate) fn point_m(&self) -> [f64; 2] {
         self.motion.end.position_m.xy().into()
+    }
+}
+
+/// A side, seen in driving direction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Side {
+    Left,
+    Right,
+}
+
+impl Side {
+    pub(super) fn of(self, lane: &Lane) -> Option<LaneId> {
+        match self {
+            Self::Left => lane.left,
+            Self::Right => lane.right,
+        }
+    }
+
+    pub(super) fn opposite(self) -> Self {
+        match self {
+            Self::Left => Self::Right,
+            Self::Right => Self::Left,
+        }
+    }
+}
+
+/// State of a driver's wish to change lanes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct LaneChangeState {
+    /// Time behind a slower vehicle ahead, seconds.
+    pub(super) held_up_s: f64,
+    /// Side of a random change.
+    pub(super) random_change: Option<Side>,
+    /// Time until the random change expires, or until the next one may start, seconds.
+    pub(super) random_change_timer_s: f64,
+}
+
+impl LaneChangeState {
+    pub(crate) fn random(random: &mut SplitMix64) -> Self {
+        Self {
+            held_up_s: 0.0,
+            random_change: None,
+            random_change_timer_s: random.between(0.0, 50.0),
+        }
     }
 }

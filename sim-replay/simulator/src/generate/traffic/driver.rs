@@ -72,6 +72,7 @@ impl Driver {
         let braking = 2.0 * (self.acceleration_mps2 * self.comfort_mps2).sqrt();
         let wanted_gap =
             self.jam_gap_m + (speed_mps * self.headway_s + speed_mps * closing / braking).max(0.0);
+        // Overlapping vehicles have a gap below zero and must brake too.
         (wanted_gap / obstacle.gap_m.max(0.1)).powi(2)
     }
 }

@@ -3,7 +3,7 @@
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-use super::lane_change::Side;
+use super::car::Side;
 use super::roads::Roads;
 use crate::map::LaneId;
 

@@ -28,11 +28,10 @@ impl RightOfWay {
         if car.held.contains(&lane) {
             return true;
         }
-        let taken = |other: &LaneId| {
+        if roads.graph.lane(lane).conflicts.iter().any(|other| {
             let mut holders = self.holders[other.0 as usize].iter();
             holders.any(|&holder| holder != index)
-        };
-        if roads.graph.lane(lane).conflicts.iter().any(taken) {
+        }) {
             return false;
         }
         self.holders[lane.0 as usize].push(index);
@@ -47,6 +46,7 @@ impl RightOfWay {
         }
         let mut needed: Vec<LaneId> = Vec::new();
         if car.is_present {
+            // The rear may still be on a lane that the front has left.
             needed.extend(car.path.lanes_under(roads.graph, car.half_length_m() + 0.5));
             needed.extend(car.path.ahead(roads.graph).map(|(lane, _)| lane));
         }

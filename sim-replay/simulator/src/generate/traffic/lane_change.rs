@@ -1,13 +1,12 @@
 //! Lane changes: incentive, gain and safety criterion of MOBIL (Kesting, Treiber and Helbing 2007).
 
-use super::car::Car;
+use super::car::{Car, LaneChangeState, Side};
 use super::driver::Obstacle;
 use super::path::{Beside, Path};
 use super::rectangle::Rectangle;
 use super::roads::Roads;
 use super::{STEP_S, Traffic};
-use crate::map::{Lane, LaneId};
-use support::random::SplitMix64;
+use crate::map::LaneId;
 
 /// Duration of a change at an even speed, seconds.
 const CHANGE_S: f64 = 4.5;
@@ -16,7 +15,7 @@ const CHANGE_LEAST_M: f64 = 22.0;
 /// Lowest speed at which a change begins, metres per second.
 const LEAST_SPEED_MPS: f64 = 2.5;
 /// Time behind a slower vehicle after which a driver wants to overtake, seconds.
-const PATIENCE_S: f64 = 3.0;
+const FOLLOWING_S: f64 = 3.0;
 /// After a change the time behind a slower vehicle starts this much below zero, seconds.
 const REST_S: f64 = 8.0;
 /// A vehicle ahead is slower if it drives less than this share of the driver's desired speed.
@@ -37,50 +36,6 @@ const RANDOM_CHANGE_SHARE: f64 = 0.25;
 const LENGTH_SHARE: f64 = 0.04;
 /// Narrower lanes are not changed to, metres.
 const LEAST_WIDTH_M: f64 = 2.6;
-
-/// A side, seen in driving direction.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Side {
-    Left,
-    Right,
-}
-
-impl Side {
-    pub(super) fn of(self, lane: &Lane) -> Option<LaneId> {
-        match self {
-            Self::Left => lane.left,
-            Self::Right => lane.right,
-        }
-    }
-
-    fn opposite(self) -> Self {
-        match self {
-            Self::Left => Self::Right,
-            Self::Right => Self::Left,
-        }
-    }
-}
-
-/// State of a driver's wish to change lanes.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct LaneChangeState {
-    /// Time behind a slower vehicle ahead, seconds.
-    held_up_s: f64,
-    /// Side of a random change.
-    random_change: Option<Side>,
-    /// Time until the random change expires, or until the next one may start, seconds.
-    random_change_timer_s: f64,
-}
-
-impl LaneChangeState {
-    pub(crate) fn random(random: &mut SplitMix64) -> Self {
-        Self {
-            held_up_s: 0.0,
-            random_change: None,
-            random_change_timer_s: random.between(0.0, 50.0),
-        }
-    }
-}
 
 /// Reason of a change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -170,6 +125,7 @@ impl Traffic<'_> {
         [Side::Left, Side::Right].into_iter().find_map(|side| {
             let reason = self.reason(car, side)?;
             let path = path_beside(car, side, self.roads)?;
+            // Only overtaking must pay off; a lane that ends has to be left.
             let gains = reason != Reason::HeldUp || self.gain_mps2(index, &path) > GAIN_MPS2;
             (gains && self.is_safe(index, &path, near)).then_some(path)
         })
@@ -181,7 +137,7 @@ impl Traffic<'_> {
         if !self.roads.is_endless(own) && self.roads.is_endless(other) {
             return Some(Reason::LaneEnds);
         }
-        if car.lane_change.held_up_s > PATIENCE_S {
+        if car.lane_change.held_up_s > FOLLOWING_S {
             return Some(Reason::HeldUp);
         }
         (car.lane_change.random_change == Some(side)).then_some(Reason::Random)
@@ -201,12 +157,11 @@ impl Traffic<'_> {
     /// True if a change is safe: the driver's own path past the vehicle ahead, and the gaps on the new lane.
     fn is_safe(&self, index: usize, path: &Path, near: &mut Vec<u32>) -> bool {
         let car = &self.cars[index];
-        let is_clear_of = |leader: Obstacle| {
+        if !car.leader.is_none_or(|leader| {
             // Halfway the vehicle is past the one ahead, which moves on in the meantime.
             let closing_share = (1.0 - leader.speed_mps / car.speed_mps).max(0.0);
             leader.gap_m > 0.55 * change_m(car) * closing_share + SAFE_GAP_M
-        };
-        if !car.leader.is_none_or(is_clear_of) {
+        }) {
             return false;
         }
         let brakes_softly = |car: &Car, ahead: Obstacle| {
@@ -219,13 +174,12 @@ impl Traffic<'_> {
             return false;
         }
         let follower = self.follower_on(index, path.lane(), path.s_m());
-        let is_let_in = |(follower, apart_m): (usize, f64)| {
+        if !follower.is_none_or(|(follower, apart_m)| {
             let follower = &self.cars[follower];
             let gap_m = apart_m - car.half_length_m() - follower.half_length_m();
             let speed_mps = car.speed_mps;
             brakes_softly(follower, Obstacle { gap_m, speed_mps })
-        };
-        if !follower.is_none_or(is_let_in) {
+        }) {
             return false;
         }
         // Vehicles that are not in the list of the lane: those that cross it, or have nearly left it.
@@ -297,9 +251,9 @@ fn free_speed_mps(car: &Car, roads: &Roads<'_>) -> f64 {
 
 fn is_held_up(car: &Car, roads: &Roads<'_>) -> bool {
     let slow_mps = SLOW_SHARE * free_speed_mps(car, roads);
-    let is_slow =
-        |leader: &Obstacle| leader.speed_mps < slow_mps && leader.gap_m < 8.0 + 2.5 * car.speed_mps;
-    car.leader.as_ref().is_some_and(is_slow) && car.speed_mps < slow_mps
+    car.leader.as_ref().is_some_and(|leader| {
+        leader.speed_mps < slow_mps && leader.gap_m < 8.0 + 2.5 * car.speed_mps
+    }) && car.speed_mps < slow_mps
 }
 
 /// Length of a change, metres.
@@ -310,9 +264,8 @@ fn change_m(car: &Car) -> f64 {
 /// The path beside the present one, if the two lie side by side for as long as the change takes.
 fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     let graph = roads.graph;
-    let is_in_junction = |lane: LaneId| graph.lane(lane).in_junction;
     let mut under = car.path.lanes_under(graph, car.half_length_m());
-    if under.any(is_in_junction) {
+    if under.any(|lane| graph.lane(lane).in_junction) {
         return None;
     }
     let mut left = car.path.lane();

@@ -7,7 +7,7 @@ use crate::generate::raycast::wrapped;
 use crate::map::LaneId;
 
 /// Vehicles that stand longer than this stop giving way to those beside them, seconds.
-const PATIENCE_S: f64 = 6.0;
+const MOST_STANDING_S: f64 = 6.0;
 /// Free space required beside the swept path, metres.
 const SIDE_ROOM_M: f64 = 0.25;
 /// Distance between the samples along the swept path, metres.
@@ -27,7 +27,7 @@ impl Traffic<'_> {
         self.cars[index].leader = leader;
         obstacles.extend(leader);
         obstacles.extend(self.stop_line(index));
-        obstacles.extend(self.on_the_swept_way(index, near));
+        obstacles.extend(self.in_own_path(index, near));
         obstacles.extend(self.end_of_the_way(index));
         let wanted = self.wanted_speed_mps(index);
         let car = &self.cars[index];
@@ -49,6 +49,7 @@ impl Traffic<'_> {
             let mut at_m = start_m.max(0.0);
             while at_m <= end_m {
                 let bend = car.driver.pace * self.roads.speed_mps(lane, at_m - start_m);
+                // The speed from which comfortable braking reaches the bend's speed in time.
                 wanted = wanted.min((bend * bend + 2.0 * braking * at_m).sqrt());
                 at_m += 2.0;
             }
@@ -125,9 +126,10 @@ impl Traffic<'_> {
 
     /// The nearest vehicle that stands or drives the same way in the strip that the vehicle will sweep: merging lanes,
     /// tails in bends.
-    fn on_the_swept_way(&self, index: usize, near: &mut Vec<u32>) -> Option<Obstacle> {
+    fn in_own_path(&self, index: usize, near: &mut Vec<u32>) -> Option<Obstacle> {
         let car = &self.cars[index];
-        if car.standing_s > PATIENCE_S {
+        // Two vehicles that give way to each other would stand forever.
+        if car.standing_s > MOST_STANDING_S {
             return None;
         }
         let reach_m = (6.0 + 2.5 * car.speed_mps).min(30.0);
@@ -159,6 +161,7 @@ impl Traffic<'_> {
                 let turned = wrapped(other.motion.end.yaw_rad - here.yaw_rad);
                 return Some(Obstacle {
                     gap_m: ahead_m - car.half_length_m(),
+                    // Only the speed along the own heading opens the gap.
                     speed_mps: (other.speed_mps * turned.cos()).max(0.0),
                 });
             }

@@ -72,6 +72,7 @@ impl<'t> Traffic<'t> {
         let mut near = Vec::new();
         self.list_occupants();
         self.change_lanes(&mut near);
+        // The look-ahead of this step needs the next lanes of every vehicle.
         self.decide_ways();
         for index in self.present() {
             let acceleration = self.acceleration_mps2(index, &mut near);
@@ -100,6 +101,7 @@ impl<'t> Traffic<'t> {
         let (start, from) = (car.motion.end, car.point_m());
         let end = car.placement_after(self.roads, distance_m);
         let footprint = Rectangle::new(&end, &car.vehicle.size_m).grown(CLEARANCE_M);
+        // A vehicle that would touch another one stops where it is, whatever its driver wanted.
         let is_free = speed_mps == 0.0 || self.is_free(index, &footprint, near);
         let car = &mut self.cars[index];
         if is_free {
@@ -150,6 +152,7 @@ impl<'t> Traffic<'t> {
             }
         }
         for lane in &mut self.occupants {
+            // Ties are broken by index, so that the order does not depend on earlier steps.
             lane.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         }
     }

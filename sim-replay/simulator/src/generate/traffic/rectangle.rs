@@ -54,9 +54,8 @@ impl Rectangle {
         }
         let side = |axis: [f64; 2]| [-axis[1], axis[0]];
         let axes = [self.axis, side(self.axis), other.axis, side(other.axis)];
-        let meet =
-            |axis: &[f64; 2]| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis);
-        axes.iter().all(meet)
+        axes.iter()
+            .all(|axis| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis))
     }
 
     /// Distance of a point from the rectangle, 0 inside, metres.

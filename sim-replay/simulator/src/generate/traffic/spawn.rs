@@ -1,10 +1,9 @@
 //! Spawning and removal of vehicles.
 
-use super::car::Car;
+use super::car::{Car, LaneChangeState};
 use super::driver::Driver;
 use super::explorer::Explorer;
 use super::junction::RightOfWay;
-use super::lane_change::LaneChangeState;
 use super::path::Path;
 use super::rectangle::{NeighbourIndex, Rectangle};
 use super::roads::{Roads, Spawn};

@@ -28,16 +28,17 @@ pub(super) fn spread(
     rng: &mut ChaCha8Rng,
 ) -> Vec<f64> {
     let step = (high - low) / (count - 1) as f64;
-    let value = |place: usize| {
-        let is_end = place == 0 || place + 1 == count;
-        let shift = if is_end {
-            0.0
-        } else {
-            rng.random_range(-share..share)
-        };
-        low + (place as f64 + shift) * step
-    };
-    (0..count).map(value).collect()
+    (0..count)
+        .map(|place| {
+            let is_end = place == 0 || place + 1 == count;
+            let shift = if is_end {
+                0.0
+            } else {
+                rng.random_range(-share..share)
+            };
+            low + (place as f64 + shift) * step
+        })
+        .collect()
 }
 
 /// A grid whose column at `x` reaches over `y_range(x)`. Every street can be left at both ends: every node has at least

@@ -87,7 +87,7 @@ impl Motorway {
     /// Lets `ramp` leave between two carriageways: all lanes continue, the outermost one also into the ramp.
     pub(super) fn diverge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
         let junction = builder.junction();
-        self.go_on(builder, junction, before, after);
+        self.extend(builder, junction, before, after);
         let outer = RoadEnd::end(before).lane(-(self.lanes as i32));
         let ramp = RoadEnd::start(ramp).lane(-1);
         builder.connect(junction, outer, ramp, LIMIT_MPS);
@@ -96,7 +96,7 @@ impl Motorway {
     /// Lets `ramp` join between two carriageways.
     pub(super) fn merge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
         let junction = builder.junction();
-        self.go_on(builder, junction, before, after);
+        self.extend(builder, junction, before, after);
         let ramp = RoadEnd::end(ramp).lane(-1);
         let outer = RoadEnd::start(after).lane(-(self.lanes as i32));
         builder.connect(junction, ramp, outer, LIMIT_MPS);
@@ -167,7 +167,7 @@ impl Motorway {
             .moved(0.0, -outer - RAMP_OFFSET_M, turn_rad)
     }
 
-    fn go_on(&self, builder: &mut Builder, junction: usize, before: usize, after: usize) {
+    fn extend(&self, builder: &mut Builder, junction: usize, before: usize, after: usize) {
         for lane in 1..=self.lanes as i32 {
             let (from, to) = (RoadEnd::end(before), RoadEnd::start(after));
             builder.connect(junction, from.lane(-lane), to.lane(-lane), LIMIT_MPS);

@@ -9,13 +9,20 @@ use super::super::finding::FindingLog;
 use super::super::profile::Profile;
 use super::super::road::{MAX_OFFSET_M, RoadLane};
 use super::element::{Element, Result};
-use super::lanes::Stretch;
 use super::profile::read_profile;
 
 /// Samples along a section at which widths below zero are searched.
 const LOOKS: u32 = 20;
 /// A border this far inside the inner border is rounding, metres.
 const ROUNDING_M: f64 = 0.01;
+
+/// Position of a section along its road.
+pub(super) struct Stretch<'a> {
+    pub(super) s_m: f64,
+    pub(super) length_m: f64,
+    /// Of the whole road, over `s` of the road.
+    pub(super) lane_offset: &'a Profile,
+}
 
 /// Fills the widths of the lanes of one side, inner lanes first, that have a border and no width.
 pub(super) fn widths_from_borders(

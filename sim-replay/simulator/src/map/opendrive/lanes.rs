@@ -4,7 +4,7 @@ use super::super::finding::FindingLog;
 use super::super::profile::Profile;
 use super::super::road::{LaneKind, LaneSection, MAX_WIDTH_M, RoadLane};
 
-use super::border::widths_from_borders;
+use super::border::{Stretch, widths_from_borders};
 use super::element::{Element, MAX_LANES, Result, children};
 use super::profile::read_profile;
 use super::speed::read_speed;
@@ -52,14 +52,6 @@ pub(super) fn read_sections(
         sections.push(section);
     }
     Ok(sections)
-}
-
-/// Position of a section along its road.
-pub(super) struct Stretch<'a> {
-    pub(super) s_m: f64,
-    pub(super) length_m: f64,
-    /// Of the whole road, over `s` of the road.
-    pub(super) lane_offset: &'a Profile,
 }
 
 /// Refuses sections whose width polynomials exceed the limits of a road.

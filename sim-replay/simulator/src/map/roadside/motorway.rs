@@ -50,10 +50,10 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     }
     let (a, b, beam) = (cut.at(low), cut.at(high), [z + clear, z + clear + 0.6]);
     parts.push(wall(SolidKind::Pole, a, b, beam, 0.5, 0.5));
-    let boards = rng.random_range(1..=3);
-    for board in 0..boards {
+    let panels = rng.random_range(1..=3);
+    for panel in 0..panels {
         let t = low
-            + (high - low) * (f64::from(board) + 0.5) / f64::from(boards)
+            + (high - low) * (f64::from(panel) + 0.5) / f64::from(panels)
             + rng.random_range(-0.5..0.5);
         let foot = PartFootprint::new(cut.pose.moved(0.0, t, 0.0), z);
         let size = [0.15, rng.random_range(2.0..4.0), rng.random_range(1.2..2.6)];
@@ -118,7 +118,7 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     }
 }
 
-/// Posts, boards, emergency telephones and cabinets at the edge.
+/// Posts, panels, emergency telephones and cabinets at the edge.
 fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..40.0);
     while s < side.length_m - 2.0 {
@@ -131,8 +131,8 @@ fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
                     let (at, post) = ([0.1, v * size[1], -0.2], [0.07, 2.0 + size[2]]);
                     foot.cylinder(SolidKind::Pole, at, post, 0.5)
                 };
-                let board = foot.standing(SolidKind::Sign, 1.8, size, 0.95);
-                vec![post(-0.4), post(0.4), board]
+                let panel = foot.standing(SolidKind::Sign, 1.8, size, 0.95);
+                vec![post(-0.4), post(0.4), panel]
             }
             1 => {
                 let size = [0.5, 1.2, rng.random_range(1.2..2.0)];

@@ -15,6 +15,7 @@ use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
 use self::tiles::Tiles;
+use crate::layers::around;
 
 /// Refines the fused map from its own cells and their neighbours: the warp blurs maps, and 1x1 heads cannot correct
 /// that. Changes nothing before it is trained.
@@ -42,18 +43,14 @@ impl MapRefinement {
     /// Its variables are `refine.*` below `path`; `hidden` are the channels between its two convolutions.
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64) -> Self {
         let path = path / "refine";
-        let around = nn::ConvConfig {
-            padding: 1,
-            ..Default::default()
-        };
         let neutral = nn::ConvConfig {
             ws_init: Init::Const(0.0),
             bs_init: Init::Const(0.0),
-            ..around
+            ..around()
         };
         Self {
             convolutions: [
-                nn::conv2d(&path / "conv0", channels, hidden, 3, around),
+                nn::conv2d(&path / "conv0", channels, hidden, 3, around()),
                 nn::conv2d(&path / "conv1", hidden, channels, 3, neutral),
             ],
             int8: None,

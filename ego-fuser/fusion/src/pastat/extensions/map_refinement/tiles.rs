@@ -59,12 +59,10 @@ impl Tiles {
             .f_permute([0, 2, 3, 1])?
             .f_squeeze_dim(0)?;
         let edge = EDGE + 2 * MARGIN;
-        let tile =
-            |&[row, column]: &[i64; 2]| padded.f_narrow(0, row, edge)?.f_narrow(1, column, edge);
         let tiles: Vec<Tensor> = self
             .first_cells
             .iter()
-            .map(tile)
+            .map(|&[row, column]| padded.f_narrow(0, row, edge)?.f_narrow(1, column, edge))
             .collect::<Result<_, TchError>>()?;
         Tensor::f_stack(&tiles, 0)?.f_permute([0, 3, 1, 2])
     }

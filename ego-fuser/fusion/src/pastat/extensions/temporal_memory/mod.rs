@@ -16,6 +16,7 @@ use tch::{Device, Kind, TchError, Tensor};
 use self::selection::{AROUND, Selection};
 use crate::f64_tensor::are_numbers;
 use crate::full_resolution::{CellSamples, FullResolutionMap};
+use crate::layers::{BARE, around};
 use crate::maps::AlignedMaps;
 use crate::pastat::coarse_alignment::{CoarseMaps, Origins};
 use crate::pastat::config::{MemoryConfig, PastatConfig};
@@ -54,18 +55,9 @@ pub(crate) struct TemporalMemory {
 impl TemporalMemory {
     /// Its variables are `recall.*` below `path`.
     pub(crate) fn new(path: &nn::Path<'_>, config: &PastatConfig, memory: &MemoryConfig) -> Self {
-        let PastatConfig {
-            channels,
-            dim,
-            patch,
-            frames,
-            ..
-        } = *config;
-        Self::of_size(
-            &(path / "recall"),
-            [channels, dim, patch, frames as i64 - 1],
-            memory,
-        )
+        let steps = config.frames as i64 - 1;
+        let sizes = [config.channels, config.dim, config.patch, steps];
+        Self::of_size(&(path / "recall"), sizes, memory)
     }
 
     /// `fused` `[1, C, H, W]`, the maximum of all agents' newest maps, with the ego's own and earlier maps blended in
@@ -105,35 +97,32 @@ impl TemporalMemory {
     fn placed<'a>(
         &self,
         maps: &'a [FullResolutionMap],
-        CoarseMaps {
-            origins,
-            earlier_entries,
-            ..
-        }: &CoarseMaps,
+        coarse: &CoarseMaps,
         corrections: Option<&Tensor>,
     ) -> Result<Vec<(usize, Pose, &'a FullResolutionMap)>, TchError> {
         let steps = self.step.size()[0] as usize - 1;
-        let first = origins.count() - earlier_entries.len();
+        let origins = &coarse.origins;
+        let first = origins.count() - coarse.earlier_entries.len();
         let corrections = corrections
             .map(|corrections| settled(origins, corrections, first))
             .transpose()?;
-        let place = |(index, &entry): (usize, &usize)| {
-            let step = origins.steps_back[first + index]
-                .checked_sub(1)
-                .filter(|step| *step < steps)?;
-            let (pose, map) = (&origins.ego_from_cav[first + index], maps.get(entry)?);
-            Some((
-                step,
-                corrections
-                    .as_ref()
-                    .map_or(*pose, |corrections| moved(pose, &corrections[index])),
-                map,
-            ))
-        };
-        Ok(earlier_entries
+        Ok(coarse
+            .earlier_entries
             .iter()
             .enumerate()
-            .filter_map(place)
+            .filter_map(|(index, &entry)| {
+                let step = origins.steps_back[first + index]
+                    .checked_sub(1)
+                    .filter(|step| *step < steps)?;
+                let (pose, map) = (&origins.ego_from_cav[first + index], maps.get(entry)?);
+                Some((
+                    step,
+                    corrections
+                        .as_ref()
+                        .map_or(*pose, |corrections| moved(pose, &corrections[index])),
+                    map,
+                ))
+            })
             .collect())
     }
 
@@ -145,13 +134,9 @@ impl TemporalMemory {
         config: &MemoryConfig,
     ) -> Self {
         let MemoryConfig { hidden, share } = *config;
-        let around = nn::ConvConfig {
-            padding: 1,
-            ..Default::default()
-        };
         let bare = nn::ConvConfig {
             bias: false,
-            ..around
+            ..around()
         };
         let neutral = nn::ConvConfig {
             ws_init: Init::Const(0.0),
@@ -159,17 +144,9 @@ impl TemporalMemory {
             ..Default::default()
         };
         Self {
-            now: nn::conv2d(path / "now", channels, hidden, 3, around),
+            now: nn::conv2d(path / "now", channels, hidden, 3, around()),
             past: nn::conv2d(path / "past", channels, hidden, 3, bare),
-            token: nn::linear(
-                path / "token",
-                dim,
-                hidden,
-                nn::LinearConfig {
-                    bias: false,
-                    ..Default::default()
-                },
-            ),
+            token: nn::linear(path / "token", dim, hidden, BARE),
             step: path.var("step", &[1 + steps, hidden], Init::Const(0.0)),
             gate: nn::conv2d(path / "gate", hidden, channels, 1, neutral),
             patch,
@@ -271,15 +248,17 @@ fn settled(
                 .map(|found| [found[0], found[1], found[2]]),
         )
         .collect();
-    let settle = |entry: usize| {
-        let is_same_agent = |newest: &usize| origins.agent[*newest] == origins.agent[entry];
-        let newest = (0..first).find(is_same_agent).map(|newest| all[newest]);
-        let is_near = |newest: &[f64; 3]| {
-            (newest[0] - all[entry][0]).hypot(newest[1] - all[entry][1]) < SAME_PLACE_M
-        };
-        newest.filter(is_near).unwrap_or(all[entry])
-    };
-    Ok((first..all.len()).map(settle).collect())
+    Ok((first..all.len())
+        .map(|entry| {
+            let is_same_agent = |newest: &usize| origins.agent[*newest] == origins.agent[entry];
+            let newest = (0..first).find(is_same_agent).map(|newest| all[newest]);
+            newest
+                .filter(|newest| {
+                    (newest[0] - all[entry][0]).hypot(newest[1] - all[entry][1]) < SAME_PLACE_M
+                })
+                .unwrap_or(all[entry])
+        })
+        .collect())
 }
 
 /// [`Selection`] cells as indices.
@@ -340,14 +319,7 @@ impl Around {
 ///
 /// Each cell is multiplied with all nine weights first: the nine results that a cell needs are fewer numbers than the
 /// features of nine cells.
-fn beside(
-    convolution: &nn::Conv2D,
-    shown: &Tensor,
-    Around {
-        results: rows,
-        first,
-    }: &Around,
-) -> Result<Tensor, TchError> {
+fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<Tensor, TchError> {
     let hidden = convolution.ws.size4()?.0;
     let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?;
     let shown = shown.f_constant_pad_nd([0, 0, 0, 1])?;
@@ -356,8 +328,8 @@ fn beside(
         .f_view([-1, hidden])?;
     let (sums, ..) = Tensor::f_embedding_bag(
         &results,
-        rows,
-        first,
+        &around.results,
+        &around.first,
         false,
         SUM,
         false,

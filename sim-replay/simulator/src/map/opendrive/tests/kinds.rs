@@ -310,8 +310,8 @@ fn parts_that_are_not_built_are_reported() {
 }
 
 #[test]
-fn sections_without_lane_links_go_on_where_they_are_one_lane_and_links_that_do_not_meet_are_named()
-{
+fn sections_without_lane_links_continue_where_they_are_one_lane_and_links_that_do_not_meet_are_named()
+ {
     let counts = |text: &str| lane_builder::lane_graph(&read(text).unwrap()).1;
     let unlinked = |text: &str| {
         ["<successor id=\"-2\"/>", "<predecessor id=\"-2\"/>"]

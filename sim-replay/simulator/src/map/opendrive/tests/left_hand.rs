@@ -54,7 +54,7 @@ fn starting(graph: &LaneGraph, x: f64, y: f64) -> &Lane {
 }
 
 #[test]
-fn lanes_on_the_left_lead_along_and_go_on_through_the_junction() {
+fn lanes_on_the_left_lead_along_and_continue_through_the_junction() {
     let graph = graph(TEE);
     assert_eq!(graph.lanes.len(), 7);
     // Eastwards on the left of the line, where y is positive; westwards on the other side.

@@ -1,0 +1,102 @@
+//! Layout of files on disk: its row in the table of layouts, and its reader.
+
+use std::fmt;
+use std::path::Path;
+
+use serde::{Serialize, Serializer};
+
+use super::problem::listed;
+use crate::{Dataset, OpenOptions, ReadError, Result, Scenario};
+
+/// A layout of files on disk: its row of the table.
+#[derive(Clone, Copy)]
+pub struct Layout(pub(crate) &'static LayoutRow);
+
+/// Row of a layout, in the file of its reader.
+#[derive(Debug)]
+pub struct LayoutRow {
+    /// Its name in files of results.
+    pub(crate) key: &'static str,
+    /// Its name in messages and tables.
+    pub name: &'static str,
+    /// The data sets that are published in it.
+    pub data_sets: &'static str,
+    /// The files that identify it, relative to a scenario's folder or the root of the data set.
+    pub files: &'static str,
+    /// Name of the evaluation protocol that is the default for it.
+    pub(crate) protocol: &'static str,
+    /// Its reader; `None`: that of the row before, which detects both.
+    pub(crate) reader: Option<Reader>,
+}
+
+/// Reader of one or several layouts.
+#[derive(Debug)]
+pub(crate) enum Reader {
+    /// Opens the data sets at or below a folder; `Ok(None)` where there are none.
+    DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>>),
+    /// Opens sequences of a single vehicle, one at a time.
+    Sequence {
+        /// True for the folder of a sequence.
+        is_one: fn(&Path) -> bool,
+        /// Opens it; its name is relative to the first path.
+        open: fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
+    },
+}
+
+impl Layout {
+    /// Its name in messages and tables.
+    pub fn name(self) -> &'static str {
+        self.0.name
+    }
+}
+
+impl PartialEq for Layout {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.key == other.0.key
+    }
+}
+
+impl Eq for Layout {}
+
+impl fmt::Debug for Layout {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.0.key)
+    }
+}
+
+impl Serialize for Layout {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.0.key)
+    }
+}
+
+/// The data set of some scenarios; `None` where there are neither these nor problems.
+///
+/// # Errors
+/// The problems, if they left no scenario.
+pub(super) fn opened(
+    dir: &Path,
+    scenarios: Vec<Scenario>,
+    problems: Vec<ReadError>,
+) -> Result<Option<Dataset>> {
+    match scenarios.first().map(|scenario| scenario.layout) {
+        Some(layout) => Ok(Some(Dataset {
+            layout,
+            scenarios,
+            problems,
+        })),
+        None if problems.is_empty() => Ok(None),
+        None => Err(nothing_opened(dir, problems)),
+    }
+}
+
+/// The only fault, or all of them, or an unknown layout.
+fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
+    match problems.len() {
+        1 => problems.swap_remove(0),
+        _ => ReadError::Layout {
+            path: dir.to_owned(),
+            reason: format!("nothing can be opened: {}", listed(&problems)),
+        },
+    }
+}

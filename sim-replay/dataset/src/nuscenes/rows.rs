@@ -1,0 +1,69 @@
+//! Rows of the tables of nuScenes: reading a table, references between tables, transforms.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use nalgebra::Isometry3;
+use protocol::Pose;
+use protocol::text::excerpt;
+
+use crate::json::Field;
+use crate::json_table::{self, Keys};
+use crate::{ReadError, Result};
+
+/// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
+const MAX_BYTES: u64 = 4 << 30;
+/// Largest deviation of a published quaternion's length from 1; it is normalized.
+const QUATERNION_TOLERANCE: f64 = 0.01;
+
+/// Indices of rows by their tokens.
+pub(super) type Indices = HashMap<String, usize>;
+
+/// Reads the rows of a table that are needed.
+pub(super) fn read_rows(
+    version: &Path,
+    name: &str,
+    problems: &mut Vec<ReadError>,
+    is_needed: impl Fn(&Keys<'_>) -> bool,
+    row: impl FnMut(&Field<'_>) -> Result<()>,
+) -> Result<usize> {
+    json_table::read(&version.join(name), MAX_BYTES, problems, is_needed, row)
+}
+
+/// The same with all rows.
+pub(super) fn read_all(
+    version: &Path,
+    name: &str,
+    problems: &mut Vec<ReadError>,
+    row: impl FnMut(&Field<'_>) -> Result<()>,
+) -> Result<usize> {
+    read_rows(version, name, problems, |_| true, row)
+}
+
+/// The index of the row that a token refers to.
+pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize> {
+    let token = row.required(key)?;
+    let text = token.id()?;
+    let unknown = || token.error(format!("no row has the token {:?}", excerpt(&text, 40)));
+    indices.get(&text).copied().ok_or_else(unknown)
+}
+
+/// `translation` in metres and `rotation` as quaternion w, x, y, z.
+pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>> {
+    let translation_m = row.required("translation")?.numbers::<3>()?;
+    let rotation = row.required("rotation")?;
+    let rotation_wxyz = rotation.numbers::<4>()?;
+    let squares = rotation_wxyz.iter().map(|part| part * part);
+    let length = squares.sum::<f64>().sqrt();
+    let is_unit = (length - 1.0).abs() <= QUATERNION_TOLERANCE;
+    if !is_unit {
+        return Err(rotation.error(format!("a quaternion of length {length}, expected 1")));
+    }
+    let pose = Pose {
+        translation_m,
+        rotation_wxyz: rotation_wxyz.map(|part| part / length),
+    };
+    let valid = pose.validate();
+    valid.map_err(|error| row.error(error.to_string()))?;
+    Ok(pose.isometry())
+}

@@ -1,0 +1,57 @@
+//! Lane table: the lane of the graph that a lane of the road network became, and back.
+
+use super::LaneId;
+use super::road::Contact;
+
+/// Lane ids by road, section and lane id of the network.
+pub(super) struct LaneTable {
+    /// First section of each road in `ids`.
+    pub(super) first_section: Vec<usize>,
+    /// By section: lowest lane id, and the graph's id of each lane from there on.
+    pub(super) ids: Vec<(i32, Vec<Option<LaneId>>)>,
+}
+
+impl LaneTable {
+    pub(super) fn get(&self, road: usize, section: usize, lane: i32) -> Option<LaneId> {
+        let (lowest, ids) = &self.ids[self.first_section[road] + section];
+        // Ids run from the lowest upwards and leave out 0.
+        let place = lane - lowest - i32::from(lane > 0);
+        if lane == 0 || place < 0 {
+            None
+        } else {
+            ids.get(place as usize).copied().flatten()
+        }
+    }
+
+    fn section_count(&self, road: usize) -> usize {
+        let next = self.first_section.get(road + 1).copied();
+        next.unwrap_or(self.ids.len()) - self.first_section[road]
+    }
+
+    /// The section of a road at one of its ends.
+    pub(super) fn end_section(&self, road: usize, contact: Contact) -> usize {
+        match contact {
+            Contact::Start => 0,
+            Contact::End => self.section_count(road) - 1,
+        }
+    }
+}
+
+/// Origin of a lane of the graph in the road network.
+#[derive(Clone, Copy)]
+pub(super) struct Origin {
+    pub(super) road: usize,
+    pub(super) section: usize,
+    pub(super) lane: i32,
+}
+
+impl Origin {
+    /// The section that follows along the road, or against it.
+    pub(super) fn next_section(self, forward: bool) -> Option<usize> {
+        if forward {
+            Some(self.section + 1)
+        } else {
+            self.section.checked_sub(1)
+        }
+    }
+}
