@@ -181,6 +181,8 @@ def check_graph(types, port, cav):
         f"/cav_{cav}/odometry": ("nav_msgs/msg/Odometry", "::,10:,:,:,,"),
         f"/cav_{cav}/detections": ("vision_msgs/msg/Detection3DArray", "::,10:,:,:,,"),
         f"/cav_{cav}/markers": ("visualization_msgs/msg/MarkerArray", "::,10:,:,:,,"),
+        f"/cav_{cav}/tracks": ("vision_msgs/msg/Detection3DArray", "::,10:,:,:,,"),
+        f"/cav_{cav}/track_markers": ("visualization_msgs/msg/MarkerArray", "::,10:,:,:,,"),
         "/tf": ("tf2_msgs/msg/TFMessage", "::,100:,:,:,,"),
         "/tf_static": ("tf2_msgs/msg/TFMessage", ":1:,1:,:,:,,"),
         "/clock": ("rosgraph_msgs/msg/Clock", "2::,1:,:,:,,"),

@@ -111,6 +111,7 @@ class RecordedPage(Checks):
         self.navigation()
         self.judgement()
         self.links()
+        self.tracks()
         self.feature_map(pictures)
         self.skipped_tick(pictures)
         self.selection()
@@ -178,6 +179,18 @@ class RecordedPage(Checks):
         self.becomes("rate, time and backlog of the links", "#serieshead", mbps)
         dark = self.tab.value("probe.strokes('series')")
         self.true("a line for each link in every strip", dark >= 3, f"{dark} lines")
+
+    def tracks(self) -> None:
+        tab, index = self.tab, self.answered[-1]
+        self.goes_to(index)
+        expected = [len(track["trail_m"]) for track in frame_of(self.address, index)["tracks"]]
+        self.true("tracks with a path", max(expected, default=0) > 1, f"paths {expected}")
+        self.same("every track is drawn, with its number", tab.value("probe.tracks()"), {"paths": expected, "numbers": len(expected)})
+        self.open_legend(True)
+        tab.value("probe.layer('track')")
+        self.same("and can be hidden", tab.value("probe.tracks()"), {"paths": [], "numbers": 0})
+        tab.value("probe.layer('track')")
+        self.open_legend(False)
 
     def feature_map(self, pictures) -> None:
         tab = self.tab

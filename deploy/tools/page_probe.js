@@ -86,6 +86,13 @@ probe.detections = () => {
   return probe.scene().filter(({ name, colour, path }) => name === "stroke" && path.length === 6 && colours.includes(colour));
 };
 
+/// Paths and numbers of tracks: points of each path, and the texts.
+probe.tracks = () => {
+  const drawn = probe.scene().filter(({ colour }) => colour === probe.spelt("--track"));
+  const paths = drawn.filter(({ name }) => name === "stroke").map(({ path }) => path.length);
+  return { paths, numbers: drawn.filter(({ name }) => name === "fillText").length };
+};
+
 /// Marks of vehicles.
 probe.marks = () => probe.scene().filter(({ name, path }) => name === "stroke" && path.length === 1 && path[0][2] === 5);
 

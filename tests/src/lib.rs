@@ -11,6 +11,7 @@ pub mod locks;
 pub mod machine;
 pub mod mutation;
 pub mod networks;
+pub mod opencood;
 pub mod scene;
 pub mod sequences;
 pub mod tensors;

@@ -6,7 +6,7 @@ use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::CavId;
 
 /// Scores a frame; if compute times are emulated, its stamp is the time of publication.
-pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
+pub(crate) fn judge(scores: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
     let (stamp, frames) = (frame.stamp, frame.frames);
     let cavs = frames.iter().map(|frame| frame.cav.clone());
     let poses: Vec<_> = cavs.zip(frame.poses).collect();
@@ -14,7 +14,7 @@ pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bo
         .filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?)))
         .collect();
     let latency_ms = is_timed.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
-    board.judge_whole(
+    scores.judge_whole(
         (frame.tick as u64, stamp.capture_nanos),
         latency_ms,
         frame.failure.is_none().then_some(frame.result),
@@ -26,14 +26,14 @@ pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bo
 
 /// Metrics of an evaluation that took so many seconds on its clock, with the data that it left out.
 pub(crate) fn metrics(
-    board: &FrameScores,
+    scores: &FrameScores,
     evaluator: &Evaluator,
     clock: &str,
     pose_source: &str,
     seconds: f64,
 ) -> Metrics {
     let metrics = Metrics::of(
-        board,
+        scores,
         clock,
         [evaluator.ego().method().name(), pose_source],
         seconds,

@@ -194,19 +194,10 @@ impl Fleet {
 
     /// Principal of every process that the run may have, for its keys.
     pub(crate) fn parties(&self) -> Vec<Principal> {
-        let agents = self
-            .agents
-            .iter()
-            .map(|cav| Principal::new(Role::Agent, cav));
-        let egos = [Role::Ego, Role::Link].map(|role| Principal::new(role, &self.ego));
-        let others = [
-            Role::Replay,
-            Role::Scorer,
-            Role::Recorder,
-            Role::Viewer,
-            Role::Ros2,
-        ]
-        .map(Principal::of_role);
+        use Role::{Agent, Ego, Link, Recorder, Replay, Ros2, Scorer, Viewer};
+        let agents = self.agents.iter().map(|cav| Principal::new(Agent, cav));
+        let egos = [Ego, Link].map(|role| Principal::new(role, &self.ego));
+        let others = [Replay, Scorer, Recorder, Viewer, Ros2].map(Principal::of_role);
         agents.chain(egos).chain(others).collect()
     }
 

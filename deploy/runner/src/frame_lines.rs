@@ -1,18 +1,22 @@
-//! Frame lines: `detections.jsonl` and `truth.jsonl` of frames that are evaluated offline or in simulation time.
+//! Frame lines: `detections.jsonl`, `tracks.jsonl` and `truth.jsonl` of frames that are evaluated offline or in simulation
+//! time.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use deploy::score::TruthLine;
+use deploy::score::{TRACKS, TruthLine};
 use ego_fuser_offline::evaluation::EvaluatedFrame;
-use protocol::{CavId, DetectionsReport};
+use protocol::{CavId, FrameReport};
 use serde::Serialize;
 
-/// The two files; the first error of writing is kept.
+/// The files; the first error of writing is kept.
 pub(crate) struct FrameLines {
+    folder: PathBuf,
     detections: BufWriter<File>,
     truth: BufWriter<File>,
+    /// Created with the first tracks.
+    tracks: Option<BufWriter<File>>,
     written: io::Result<()>,
 }
 
@@ -31,10 +35,11 @@ impl FrameLines {
     /// # Errors
     /// Those of the operating system.
     pub(crate) fn create(folder: &Path) -> io::Result<Self> {
-        let create = |name: &str| File::create(folder.join(name)).map(BufWriter::new);
         Ok(Self {
-            detections: create("detections.jsonl")?,
-            truth: create("truth.jsonl")?,
+            folder: folder.to_owned(),
+            detections: create(folder, "detections.jsonl")?,
+            truth: create(folder, "truth.jsonl")?,
+            tracks: None,
             written: Ok(()),
         })
     }
@@ -48,10 +53,18 @@ impl FrameLines {
     }
 
     fn write(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> io::Result<()> {
+        let tick = Some(frame.tick as u64);
         if frame.failure.is_none() {
-            let line =
-                DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
+            let line = FrameReport::new(&frame.stamp, tick, &frame.result);
             write_line(&mut self.detections, &OfScenario { scenario, line })?;
+        }
+        if let Some(tracks) = &frame.tracks {
+            let out = match &mut self.tracks {
+                Some(out) => out,
+                absent => absent.insert(create(&self.folder, TRACKS)?),
+            };
+            let line = FrameReport::new(&frame.stamp, tick, tracks);
+            write_line(out, &OfScenario { scenario, line })?;
         }
         let line = truth_line(&frame.result.ego, frame);
         write_line(&mut self.truth, &OfScenario { scenario, line })
@@ -65,7 +78,17 @@ impl FrameLines {
         self.written
             .and_then(|()| self.detections.flush())
             .and_then(|()| self.truth.flush())
+            .and_then(|()| self.detections.get_ref().sync_all())
+            .and_then(|()| self.truth.get_ref().sync_all())
+            .and_then(|()| match self.tracks {
+                Some(mut tracks) => tracks.flush().and_then(|()| tracks.get_ref().sync_all()),
+                None => Ok(()),
+            })
     }
+}
+
+fn create(folder: &Path, name: &str) -> io::Result<BufWriter<File>> {
+    File::create(folder.join(name)).map(BufWriter::new)
 }
 
 fn write_line(out: &mut impl Write, value: &impl Serialize) -> io::Result<()> {

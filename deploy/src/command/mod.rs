@@ -68,7 +68,7 @@ pub(crate) enum Command {
     /// Make a test authority and certificates for the processes of a fleet.
     #[command(display_order = 24)]
     Keys(keys::Arguments),
-    /// Connect a run with a ROS 2 network through rmw_zenoh: poses, odometry, detections, clouds, transforms and
+    /// Connect a run with a ROS 2 network through rmw_zenoh: poses, odometry, detections, tracks, clouds, transforms and
     /// diagnoses; and LiDARs of the network with the agents of the run.
     #[command(display_order = 25)]
     Ros2(Box<ros2::Arguments>),

@@ -1,6 +1,6 @@
 //! `v2vloc report`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::operate::status::RunStatus;
 use crate::report::{Comparison, RunReport, TrackReport, TrackTable};
@@ -28,17 +28,19 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Prints the report of the run, or a comparison of several.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        match self.named.as_slice() {
-            named if self.tracks => self.track(named),
-            [] => self.print(None),
-            [run] => self.print(Some(run.clone())),
+        let folder = |run| RunStatus::folder(run, &self.runs).map_err(BadInput::of);
+        let named = self.named.iter().cloned().map(Some);
+        let newest = self.named.is_empty().then_some(None);
+        let folders = named.chain(newest).map(folder);
+        match folders.collect::<Result<Vec<_>, _>>()?.as_slice() {
+            folders if self.tracks => self.track(folders),
+            [folder] => self.print(folder),
             several => self.compare(several),
         }
     }
 
-    fn print(&self, run: Option<PathBuf>) -> anyhow::Result<Outcome> {
-        let folder = RunStatus::folder(run, &self.runs).map_err(BadInput::of)?;
-        let report = RunReport::read(&folder).map_err(BadInput::of)?;
+    fn print(&self, folder: &Path) -> anyhow::Result<Outcome> {
+        let report = RunReport::read(folder).map_err(BadInput::of)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&report)?)?;
         } else {
@@ -50,14 +52,9 @@ impl Arguments {
         Ok(Outcome::Done)
     }
 
-    fn track(&self, named: &[PathBuf]) -> anyhow::Result<Outcome> {
-        let runs = match named {
-            [] => vec![None],
-            named => named.iter().cloned().map(Some).collect(),
-        };
-        let folder = |run| RunStatus::folder(run, &self.runs).map_err(BadInput::of);
-        let read = |run| TrackReport::read(&folder(run)?).map_err(BadInput::of);
-        let reports = runs.into_iter().map(read).collect::<Result<Vec<_>, _>>()?;
+    fn track(&self, folders: &[PathBuf]) -> anyhow::Result<Outcome> {
+        let read = |folder: &PathBuf| TrackReport::read(folder).map_err(BadInput::of);
+        let reports = folders.iter().map(read).collect::<Result<Vec<_>, _>>()?;
         match reports.as_slice() {
             [report] if self.json => output::line(serde_json::to_string_pretty(report)?)?,
             reports if self.json => output::line(serde_json::to_string_pretty(reports)?)?,
@@ -66,10 +63,7 @@ impl Arguments {
         Ok(Outcome::Done)
     }
 
-    fn compare(&self, several: &[PathBuf]) -> anyhow::Result<Outcome> {
-        let folder = |run: &PathBuf| RunStatus::folder(Some(run.clone()), &self.runs);
-        let folders = several.iter().map(folder).collect::<Result<Vec<_>, _>>();
-        let folders = folders.map_err(BadInput::of)?;
+    fn compare(&self, folders: &[PathBuf]) -> anyhow::Result<Outcome> {
         if self.json {
             let reports = folders.iter().map(|folder| RunReport::read(folder));
             let reports = reports
@@ -77,7 +71,7 @@ impl Arguments {
                 .map_err(BadInput::of)?;
             output::line(serde_json::to_string_pretty(&reports)?)?;
         } else {
-            output::text(Comparison::read(&folders).map_err(BadInput::of)?)?;
+            output::text(Comparison::read(folders).map_err(BadInput::of)?)?;
         }
         Ok(Outcome::Done)
     }

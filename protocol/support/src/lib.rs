@@ -1,6 +1,6 @@
 //! Program support: common functions of all programs that no crate of the field offers.
 //!
-//! - [`command_line`]: parsing, verbosity; [`cli`]: errors and exit codes; [`output`], [`progress`]: standard output and error;
+//! - [`command_line`]: parsing, verbosity; [`cli`]: errors and exit codes; [`output`]: standard output and error;
 //!   [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files that come with the programs.
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`], [`file_digests`]: reads with a limit on their size, atomic writes,
 //!   CSV, SHA-256 of whole files; errors name the file ([`file_error`]).
@@ -41,7 +41,6 @@ pub mod file_error;
 mod list_values;
 pub mod nanos;
 pub mod output;
-pub mod progress;
 pub mod provenance;
 pub mod random;
 pub mod record_log;

@@ -285,6 +285,7 @@ pub fn ego_inputs(scratch: &Path) -> Vec<u8> {
         version: "0.1.0".into(),
     });
     let published = Record::Published(Published {
+        stream: Stream::Detections,
         stamp: stamp.clone(),
         stages: Vec::new(),
     });
@@ -320,7 +321,7 @@ pub fn surfel_map(scratch: &Path) -> Vec<u8> {
     );
     target.fit();
     let path = scratch.join("seed-surfels.safetensors");
-    SurfelMap::write(&path, &target).expect("a writable folder");
+    SurfelMap::write(&path, "yard", &target).expect("a writable folder");
     std::fs::read(&path).expect("it was written")
 }
 

@@ -213,7 +213,7 @@ fn a_script_gives_the_precision_of_the_built_in_method_live() {
 }
 
 #[test]
-fn a_script_runs_live_and_what_is_wrong_with_it_is_said_before_the_start() {
+fn a_script_runs_live_and_its_faults_are_reported_before_the_start() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", "");

@@ -357,6 +357,35 @@ fn a_map_of_a_drive_finds_its_sweeps_and_reports_where_it_was_driven() {
         String::from_utf8_lossy(&located.stdout)
     );
     assert!(!String::from_utf8_lossy(&located.stderr).contains("another LiDAR"));
+    let cloud = whole.to_str().unwrap();
+    let least = |least: &str| {
+        let with_map = [
+            "locate",
+            cloud,
+            "--head",
+            out_text,
+            "--surfel-map",
+            out_text,
+        ];
+        agent(&[&with_map[..], &["--min-confidence", least]].concat())
+    };
+    assert_eq!(least("0").status.code(), Some(0));
+    let strict = least("1");
+    let text = String::from_utf8_lossy(&strict.stdout);
+    assert!(
+        strict.status.code() == Some(3) && text.contains("low confidence"),
+        "{text}"
+    );
+    assert_eq!(least("1.5").status.code(), Some(2));
+    // The planes of this place are of no use to the head of another.
+    let town1 = weights("pgc-town1.safetensors");
+    let other = agent(&["locate", cloud, "--head", &town1, "--surfel-map", out_text]);
+    let err = String::from_utf8_lossy(&other.stderr);
+    assert!(
+        other.status.code() == Some(2)
+            && err.contains("a surfel map of \"my place\", the head is of \"town1\""),
+        "{err}"
+    );
     // One of fewer lasers.
     let frame = dataset::open(&scene).unwrap().scenarios[0]
         .load(0, 3, &LoadOptions::default())

@@ -3,13 +3,13 @@
 use ::training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
 use dataset::average_precision::{Curve, Ordering, Scorer};
 use fusion::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
-use fusion::warp::opencood::{self, Interpolation};
 use fusion::warp::{coalign, warp_to_ego};
-use fusion::{AlignedMaps, AttentionFusion, Fusion, MapMetadata, MaxFusion, regroup};
+use fusion::{AlignedMaps, AttentionFusion, Fusion, MapMetadata, MaxFusion};
 use protocol::rotated_iou::Polygon;
 use protocol::{BevGrid, Box3d, Pose};
 use tch::{Device, Kind, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};
+use tests::opencood::{self, Interpolation, regroup};
 
 #[test]
 fn golden_c3_targets() {

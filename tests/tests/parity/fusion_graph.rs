@@ -5,7 +5,7 @@ use ego_fuser_offline::multi_scale::{
 };
 use fusion::disconet::{DiscoNet, DiscoNetConfig};
 use fusion::v2vnet::{self, Incoming, V2vNet, V2vNetConfig};
-use fusion::warp::{coalign, opencood};
+use fusion::warp::coalign;
 use fusion::where2comm::{
     Aggregation, Communication, CommunicationConfig, Missing, Where2comm, Where2commConfig,
 };
@@ -21,6 +21,7 @@ use serde_json::Value;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 use tests::fixtures::{Golden, assert_close, golden};
+use tests::opencood;
 use tests::tensors::{detector_config, integer, integers, load, number, pillars, tensor, values};
 
 const ATOL: f64 = 2e-4;

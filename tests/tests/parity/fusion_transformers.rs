@@ -2,12 +2,13 @@
 
 use fusion::swap_fusion::{Slots, SwapFusion, SwapFusionConfig};
 use fusion::v2xvit::{AgentAttention, Encoder, Merge, V2xVitConfig, WindowAttention, WindowConfig};
-use fusion::warp::{coalign, opencood};
+use fusion::warp::coalign;
 use fusion::{BlockOrder, layers::unseen};
 use serde_json::Value;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 use tests::fixtures::{Golden, assert_close, golden};
+use tests::opencood;
 use tests::tensors::{integer, integers, number, tensor, values};
 
 /// Tolerance of the V2X-ViT fixtures.

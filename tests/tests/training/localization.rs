@@ -354,7 +354,7 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
 }
 
 #[test]
-fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
+fn interrupted_trainings_resume_and_refuse_foreign_files() {
     let _generator = random_generator_lock();
     let dir = tempfile::tempdir().unwrap();
     let scenes = drives(dir.path());

@@ -375,7 +375,7 @@ impl TableObserver for Cells {
 }
 
 #[test]
-fn a_table_is_filled_cell_by_cell_and_goes_on_where_it_was() {
+fn an_interrupted_table_resumes_at_the_next_cell() {
     let _generator = random_generator_lock();
     let folder = tempfile::tempdir().unwrap();
     let (data, init) = begin(folder.path());

@@ -13,7 +13,8 @@ use runner::experiment::report;
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
-use support::{output, progress, shared_files};
+use support::{output, shared_files};
+use terminal::progress;
 
 use super::programs;
 use support::cli::{BadInput, Interrupted, Outcome};

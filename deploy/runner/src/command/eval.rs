@@ -17,13 +17,14 @@ use link::{CapacityConfig, LatencyModel};
 use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
 use protocol::CodecConfig;
-use protocol::config::{FieldError, Section};
+use protocol::config::Section;
 use runner::experiment::evaluation::{OpenedData, Trial, evaluate};
 use runner::experiment::report;
 use runner::experiment::spec::Experiment;
 use runner::experiment::table::{self, TableObserver};
 use support::file_error::FileError;
-use support::{output, progress};
+use support::output;
+use terminal::progress;
 use training::feature_store::KeptMaps;
 
 use super::left_out;
@@ -73,7 +74,7 @@ pub(crate) struct Arguments {
     table: Option<PathBuf>,
     #[command(flatten)]
     slices: SliceArgs,
-    /// Folder for metrics.json, detections.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with
+    /// Folder for metrics.json, detections.jsonl, tracks.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with
     /// --table, of the tables [default: nothing is written].
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -167,7 +168,7 @@ impl Arguments {
     /// Evaluates every method and prints the metrics.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let threads = self.threads.unwrap_or_default();
-        threads.validate().map_err(bad)?;
+        threads.validate().map_err(BadInput::of)?;
         threads.apply();
         if let (Some(spec), Some(out)) = (&self.table, &self.out) {
             return tables(spec, out, &self.slices);
@@ -201,8 +202,8 @@ impl Arguments {
     }
 
     fn trial(&self) -> Result<Trial, BadInput> {
-        self.pose.0.validate().map_err(bad)?;
-        self.codec.0.validate().map_err(bad)?;
+        self.pose.0.validate().map_err(BadInput::of)?;
+        self.codec.0.validate().map_err(BadInput::of)?;
         self.check_methods()?;
         if self.rate.0.watch_queue && !self.emulates_link() {
             let reason = "--watch-queue: without --link there is no queue to watch";
@@ -302,7 +303,7 @@ impl Arguments {
             map_ms,
             fuse_ms,
         };
-        compute.validate("--compute-ms").map_err(bad)?;
+        compute.validate("--compute-ms").map_err(BadInput::of)?;
         Ok(compute)
     }
 
@@ -314,13 +315,9 @@ impl Arguments {
             trust: self.trust,
             ..defaults
         };
-        ego.validate().map_err(bad)?;
+        ego.validate().map_err(BadInput::of)?;
         Ok(ego)
     }
-}
-
-fn bad(error: FieldError) -> BadInput {
-    BadInput::new(error.to_string())
 }
 
 /// Fills tables and prints them.

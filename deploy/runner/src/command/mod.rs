@@ -43,11 +43,8 @@ pub(crate) enum Command {
 impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let settings = [
-            malloc_settings::KEPT_MEMORY.as_slice(),
-            &[malloc_settings::ROUTER_THREADS],
-        ]
-        .concat();
+        use malloc_settings::{KEPT_MEMORY, ROUTER_THREADS};
+        let settings = [KEPT_MEMORY.as_slice(), &[ROUTER_THREADS]].concat();
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {
             Self::Bench(arguments) => arguments.run(),

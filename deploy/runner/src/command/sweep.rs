@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use figures::FigureError;
-use runner::experiment::sweep::{self, Sweep, SweepOptions, WorkerError};
+use runner::experiment::sweep::{self, Sweep, WorkerError};
 use support::output;
 
 use super::left_out;
@@ -69,14 +69,10 @@ impl Arguments {
             ));
             return Ok(Outcome::Done);
         }
-        let options = SweepOptions {
-            jobs,
-            keep_maps: self.keep_feature_maps,
-        };
-        let swept = sweep.run(&options).map_err(blamed)?;
+        let computed = sweep.run(jobs, self.keep_feature_maps).map_err(blamed)?;
         match self.json {
-            true => output::line(serde_json::to_string_pretty(&swept.runs)?)?,
-            false => output::text(&swept.table)?,
+            true => output::line(serde_json::to_string_pretty(&computed.runs)?)?,
+            false => output::text(&computed.table)?,
         }
         note_maps(&out.join("maps"));
         output::note(format_args!(
@@ -84,7 +80,7 @@ impl Arguments {
             out.display()
         ));
         Ok(left_out(
-            swept.runs.iter().map(|run| &run.cell.metrics.left_out),
+            computed.runs.iter().map(|run| &run.cell.metrics.left_out),
         ))
     }
 }

@@ -42,7 +42,6 @@ pub struct Cell {
 
 impl CellKey {
     /// Cache file of the cell.
-    #[must_use]
     fn file(&self, folder: &Path) -> PathBuf {
         let digits: String = self.sha256.chars().take(NAME_DIGITS).collect();
         folder.join(format!("{}-{digits}.json", file_name(self.method)))

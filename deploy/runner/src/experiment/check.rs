@@ -8,7 +8,7 @@ use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::Exchange;
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 
-use super::spec::{CodecSpec, Column, Experiment, Grid};
+use super::spec::{CodecSpec, Experiment, Grid};
 use super::sweep::grid::{count, sizes};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
@@ -67,8 +67,7 @@ fn tables(experiment: &Experiment) -> Result<(), String> {
         if table.rows.is_empty() || table.columns.is_empty() {
             return Err(format!("table {:?} has no rows or no columns", table.name));
         }
-        let delays = |column: &Column| column.delay_ms > 0;
-        if experiment.link.is_some() && table.columns.iter().any(delays) {
+        if experiment.link.is_some() && table.columns.iter().any(|column| column.delay_ms > 0) {
             let name = &table.name;
             return Err(format!(
                 "table {name:?}: delay_ms and link contradict each other"
@@ -139,18 +138,10 @@ fn axes(grid: &Grid) -> Result<(), String> {
     )?;
     numbers("grid.loss", &grid.loss, 0.0, 1.0)?;
     values("grid.pose_noise", grid.pose_noise.as_ref(), |noise| {
-        number(
-            "grid.pose_noise: position_std_m",
-            noise.position_std_m,
-            0.0,
-            1000.0,
-        )?;
-        number(
-            "grid.pose_noise: heading_std_deg",
-            noise.heading_std_deg,
-            0.0,
-            360.0,
-        )
+        let (position_std_m, heading_std_deg) = (noise.position_std_m, noise.heading_std_deg);
+        let field = |name: &str| format!("grid.pose_noise: {name}");
+        number(&field("position_std_m"), position_std_m, 0.0, 1000.0)?;
+        number(&field("heading_std_deg"), heading_std_deg, 0.0, 360.0)
     })?;
     values("grid.vehicles", grid.vehicles.as_ref(), |count| {
         number("grid.vehicles", *count as f64, 1.0, 64.0)
@@ -193,32 +184,21 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     if experiment.noise_mode == NoiseMode::Replayed {
         return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
     }
-    for (axis, is_varied, field, is_set) in [
-        (
-            "latency_ms",
-            grid.latency_ms.is_some(),
-            "latency",
-            link.latency != LatencyModel::None,
-        ),
-        (
-            "bandwidth_mbps",
-            grid.bandwidth_mbps.is_some(),
-            "capacity",
-            link.capacity != CapacityConfig::Unlimited,
-        ),
-        (
-            "loss",
-            grid.loss.is_some(),
-            "loss",
-            link.loss != LossModel::None,
-        ),
-    ] {
-        if is_varied && is_set {
-            let name = experiment.link.as_deref().unwrap_or_default();
-            return Err(format!(
-                "grid.{axis} and the {field} of link {name} contradict each other"
-            ));
-        }
+    let has_latency = link.latency != LatencyModel::None;
+    let has_capacity = link.capacity != CapacityConfig::Unlimited;
+    let twice = if grid.latency_ms.is_some() && has_latency {
+        Some(["latency_ms", "latency"])
+    } else if grid.bandwidth_mbps.is_some() && has_capacity {
+        Some(["bandwidth_mbps", "capacity"])
+    } else {
+        let is_twice = grid.loss.is_some() && link.loss != LossModel::None;
+        is_twice.then_some(["loss", "loss"])
+    };
+    if let Some([axis, field]) = twice {
+        let name = experiment.link.as_deref().unwrap_or_default();
+        return Err(format!(
+            "grid.{axis} and the {field} of link {name} contradict each other"
+        ));
     }
     if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
         return Err("grid.jitter_ms is the deviation of grid.latency_ms, which is left out".into());

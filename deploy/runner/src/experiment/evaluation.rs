@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, ensure};
@@ -22,6 +22,7 @@ use support::cli::NotWritten;
 use support::file_digests::FileDigests;
 use support::provenance::Provenance;
 use support::sampling::evenly_spread;
+use support::sync::lock;
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::evaluated_frame::{judge, metrics};
@@ -108,7 +109,6 @@ impl OpenedData {
     }
 
     /// Number of frames of so many scenarios.
-    #[must_use]
     pub fn frame_count(&self, scenarios: Option<usize>) -> usize {
         let chosen = self.chosen(scenarios);
         chosen.map(|scenario| scenario.ticks.len()).sum()
@@ -116,7 +116,7 @@ impl OpenedData {
 
     /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once.
     fn sha256(&self, scenarios: Option<usize>, variant: Option<&str>) -> String {
-        let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut parts = lock(&self.parts);
         let place = (scenarios, variant.map(str::to_owned));
         let sha256 = parts.entry(place).or_insert_with(|| {
             dataset::content_sha256(self.chosen(scenarios), variant, &self.digests)
@@ -128,17 +128,17 @@ impl OpenedData {
 impl Trial {
     fn metrics(
         &self,
-        board: &FrameScores,
+        scores: &FrameScores,
         evaluator: &Evaluator,
         provenance: Provenance,
         began: Instant,
     ) -> Metrics {
         let (clock, seconds) = match self.setup.link {
-            Some(_) => ("stepped", board.seconds()),
+            Some(_) => ("stepped", scores.seconds()),
             None => ("offline", began.elapsed().as_secs_f64()),
         };
         let poses = self.setup.agents.pose.name();
-        let metrics = metrics(board, evaluator, clock, poses, seconds);
+        let metrics = metrics(scores, evaluator, clock, poses, seconds);
         Metrics {
             provenance: Some(provenance.with_command()),
             ..metrics
@@ -204,9 +204,9 @@ pub fn evaluate(
     on_frame: &mut dyn FnMut(),
 ) -> Result<Metrics> {
     let began = Instant::now();
-    let (board, evaluator) = judged(trial, data, method, on_frame)?;
+    let (scores, evaluator) = judged(trial, data, method, on_frame)?;
     let provenance = trial.provenance(data, method)?;
-    let metrics = trial.metrics(&board, &evaluator, provenance, began);
+    let metrics = trial.metrics(&scores, &evaluator, provenance, began);
     if let Some(out) = &trial.out {
         frame_files::write_metrics(out, method, &metrics)?;
     }
@@ -224,7 +224,7 @@ pub fn compute(
     on_frame: &mut dyn FnMut(),
 ) -> Result<Cell> {
     let began = Instant::now();
-    let (board, evaluator) = judged(trial, data, key.method, on_frame)?;
+    let (scores, evaluator) = judged(trial, data, key.method, on_frame)?;
     let mut messages = Counts::default();
     for (account, counts) in evaluator.ledger().iter() {
         match account.topic {
@@ -235,11 +235,11 @@ pub fn compute(
             _ => messages.add(counts),
         }
     }
-    let used = board.records().iter().map(|record| record.fused as u64);
+    let used = scores.records().iter().map(|record| record.fused as u64);
     let provenance = key.provenance.clone();
     Ok(Cell {
         key,
-        metrics: trial.metrics(&board, &evaluator, provenance, began),
+        metrics: trial.metrics(&scores, &evaluator, provenance, began),
         used: used.sum(),
         messages: Messages::of(&messages),
         wall_seconds: began.elapsed().as_secs_f64(),
@@ -273,7 +273,7 @@ fn judged(
     // Without a compute time, a result is as old as its sweep by definition, which is no latency.
     let Setup { link, compute, .. } = &trial.setup;
     let is_timed = link.is_some() && *compute != ComputeTimes::default();
-    let mut board: Option<FrameScores> = None;
+    let mut scores: Option<FrameScores> = None;
     let out = trial.out.as_ref();
     let mut files = out.map(|out| FrameFiles::create(out, method)).transpose()?;
     for scenario in data.chosen(trial.scenarios) {
@@ -285,13 +285,13 @@ fn judged(
             "scenario {} has no true poses of the ego {ego}: its results cannot be evaluated",
             scenario.name
         );
-        let board = board
+        let scores = scores
             .get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
-        board.change_ego(ego);
+        scores.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
             let mut files = files.iter_mut();
             let is_written = files.all(|files| files.add(&scenario.name, &frame));
-            judge(board, frame, is_timed);
+            judge(scores, frame, is_timed);
             on_frame();
             match is_written {
                 true => ControlFlow::Continue(()),
@@ -302,13 +302,13 @@ fn judged(
             break;
         }
     }
-    let board = board.filter(|board| !board.records().is_empty());
-    let board = board.with_context(|| {
+    let scores = scores.filter(|scores| !scores.records().is_empty());
+    let scores = scores.with_context(|| {
         let (path, reasons) = (trial.dataset.display(), evaluator.left_out().reasons());
         format!("{path}: there is no frame in it that can be evaluated{reasons}")
     })?;
-    files.map(|files| files.finish(&board)).transpose()?;
-    Ok((board, evaluator))
+    files.map(|files| files.finish(&scores)).transpose()?;
+    Ok((scores, evaluator))
 }
 
 /// Feature maps of all sweeps, from the cache or encoded now.

@@ -18,8 +18,8 @@ use support::cli::NotWritten;
 use crate::experiment::cell::file_name;
 use crate::frame_lines::FrameLines;
 
-/// Files of one method in a folder of its own: `detections.jsonl`, `truth.jsonl`, `frames.csv`, `precision_recall.csv`
-/// and, at the end, `metrics.json`. The first two are those of a run, with the name of the scenario.
+/// Files of one method in a folder of its own: `detections.jsonl`, `tracks.jsonl`, `truth.jsonl`, `frames.csv`,
+/// `precision_recall.csv` and, at the end, `metrics.json`. The first three are those of a run, with the name of the scenario.
 pub(crate) struct FrameFiles {
     folder: PathBuf,
     lines: FrameLines,
@@ -55,10 +55,10 @@ impl FrameFiles {
     ///
     /// # Errors
     /// An error with the first error of the operating system.
-    pub(crate) fn finish(self, board: &FrameScores) -> Result<()> {
+    pub(crate) fn finish(self, scores: &FrameScores) -> Result<()> {
         let folder = self.folder;
-        let frames = frames_csv(board.records(), &BTreeMap::new(), Some(&self.scenarios));
-        let curve = board.precision_recall_csv();
+        let frames = frames_csv(scores.records(), &BTreeMap::new(), Some(&self.scenarios));
+        let curve = scores.precision_recall_csv();
         { self.lines.finish() }
             .and_then(|()| atomic_file::write(&folder.join("frames.csv"), frames))
             .and_then(|()| atomic_file::write(&folder.join("precision_recall.csv"), curve))

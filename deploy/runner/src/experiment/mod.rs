@@ -4,6 +4,7 @@ pub mod cell;
 mod check;
 pub mod evaluation;
 mod frame_files;
+mod load;
 pub mod report;
 pub mod slices;
 pub mod spec;

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use deploy::operate::progress::bytes;
-use deploy::score::metrics::{ByIou, Contribution, Metrics, PartPrecision, Percentiles};
+use deploy::score::metrics::{Contribution, Metrics, PartPrecision, Percentiles};
 use fusion::{Exchange, Method};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::PoseSourceConfig;
@@ -16,13 +16,11 @@ use crate::run::loss;
 use crate::run::run_fleet::RunResult;
 
 /// Table and report of a run: detections, latency, bytes, then pace, stages and resources.
-#[must_use]
 pub fn run_table(result: &RunResult) -> String {
     table(std::slice::from_ref(&result.metrics)) + &run_report(result) + &run_notes(result)
 }
 
 /// Pace, stages, CPU, memory and bytes of a run, under its method.
-#[must_use]
 pub fn run_report(result: &RunResult) -> String {
     format!(
         "\n{} in {}\n{}",
@@ -66,7 +64,6 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
 }
 
 /// Lines about one run below its row of the table.
-#[must_use]
 pub fn run_notes(result: &RunResult) -> String {
     let mut text = String::new();
     let messages = &result.metrics.messages;
@@ -122,59 +119,55 @@ pub fn run_notes(result: &RunResult) -> String {
 }
 
 /// One line per run or evaluation, and the facts that are needed to compare the lines.
-#[must_use]
 pub fn table(all: &[Metrics]) -> String {
+    use Side::{Left, Right};
+    let column = |name: &'static str, side: Side, cell: &dyn Fn(&Metrics) -> String| {
+        (name, side, all.iter().map(cell).collect::<Vec<String>>())
+    };
     let mut columns = vec![
-        Column::left("method", all, |metrics| metrics.method.clone()),
-        Column::left("poses", all, |metrics| metrics.pose_source.clone()),
+        column("method", Left, &|metrics| metrics.method.clone()),
+        column("poses", Left, &|metrics| metrics.pose_source.clone()),
     ];
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
     let name = if is_live { "answered" } else { "frames" };
-    columns.push(Column::right(name, all, frames));
-    for (name, of) in BY_IOU {
-        columns.push(Column::right(&format!("AP@{name}"), all, |metrics| {
-            number(of(&metrics.ap_global), 3)
-        }));
+    columns.push(column(name, Right, &frames));
+    for (index, name) in ["AP@0.3", "AP@0.5", "AP@0.7"].into_iter().enumerate() {
+        let precision = |metrics: &Metrics| number(metrics.ap_global.values()[index], 3);
+        columns.push(column(name, Right, &precision));
     }
     if is_live {
         let all_ticks = |metrics: &Metrics| number(metrics.ap_unanswered_empty.at_50, 3);
-        let streaming = |metrics: &Metrics| number(metrics.ap_streaming.and_then(|ap| ap.at_50), 3);
-        columns.push(Column::right("AP@0.5 all", all, all_ticks));
-        columns.push(Column::right("sAP@0.5", all, streaming));
+        let streaming = |of: &Metrics| number(of.ap_streaming.and_then(|ap| ap.at_50), 3);
+        columns.push(column("AP@0.5 all", Right, &all_ticks));
+        columns.push(column("sAP@0.5", Right, &streaming));
     } else {
-        columns.push(Column::right("frame order 0.5", all, |metrics| {
-            number(metrics.ap_frame_order.at_50, 3)
-        }));
+        let frame_order = |metrics: &Metrics| number(metrics.ap_frame_order.at_50, 3);
+        columns.push(column("frame order 0.5", Right, &frame_order));
     }
     if all.iter().any(|metrics| metrics.contribution.sent > 0) {
         let fused = |metrics: &Metrics| number(metrics.contribution.fused_per_frame, 2);
-        columns.push(Column::right("fused", all, fused));
+        columns.push(column("fused", Right, &fused));
     }
-    columns.push(Column::right("pose m", all, |metrics| {
-        number(metrics.pose.mean_m, 2)
-    }));
-    columns.push(Column::right("latency ms", all, latency));
-    columns.push(Column::right("bytes", all, wire_bytes));
-    lines(&columns, all.len()) + &comparison(all)
+    let pose_error = |metrics: &Metrics| number(metrics.pose.mean_m, 2);
+    columns.push(column("pose m", Right, &pose_error));
+    columns.push(column("latency ms", Right, &latency));
+    columns.push(column("bytes", Right, &wire_bytes));
+    let mut table = TextTable::new(columns.iter().map(|(name, side, _)| (*name, *side)));
+    for row in 0..all.len() {
+        table.row(columns.iter().map(|(_, _, cells)| cells[row].clone()));
+    }
+    table.to_string() + &comparison(all)
 }
 
 /// AP by distance and by class, a line for each part of each method.
-#[must_use]
 pub fn breakdown(all: &[Metrics]) -> String {
-    let (left, right) = (
-        ["method", "part"],
-        ["objects", "AP@0.3", "AP@0.5", "AP@0.7"],
-    );
-    let left = left.map(|name| (name, Side::Left));
-    let mut table = TextTable::new(
-        left.into_iter()
-            .chain(right.map(|name| (name, Side::Right))),
-    );
+    let numbers = ["objects", "AP@0.3", "AP@0.5", "AP@0.7"];
+    let mut table = TextTable::of(&["method", "part"], &numbers);
     for metrics in all {
         let parts = [(" m", &metrics.ap_by_distance), ("", &metrics.ap_by_class)];
         for (unit, parts) in parts {
             for (part, PartPrecision { objects, ap }) in parts {
-                let values = BY_IOU.map(|(_, of)| number(of(ap), 3));
+                let values = ap.values().map(|value| number(value, 3));
                 let head = [
                     metrics.method.clone(),
                     format!("{part}{unit}"),
@@ -186,14 +179,6 @@ pub fn breakdown(all: &[Metrics]) -> String {
     }
     table.to_string()
 }
-
-/// Name of an IoU threshold, and its AP.
-type AtOverlap = (&'static str, fn(&ByIou) -> Option<f64>);
-const BY_IOU: [AtOverlap; 3] = [
-    ("0.3", |ap| ap.at_30),
-    ("0.5", |ap| ap.at_50),
-    ("0.7", |ap| ap.at_70),
-];
 
 /// Notes for a comparison: the protocols, differences between runs, and messages that did not reach an ego.
 fn comparison(all: &[Metrics]) -> String {
@@ -260,44 +245,10 @@ fn wire_bytes(metrics: &Metrics) -> String {
         .map_or("-".into(), bytes)
 }
 
-/// Column of the table.
-struct Column {
-    name: String,
-    side: Side,
-    cells: Vec<String>,
-}
-
-impl Column {
-    fn left(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
-        Self {
-            name: name.to_owned(),
-            side: Side::Left,
-            cells: all.iter().map(cell).collect(),
-        }
-    }
-
-    fn right(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
-        Self {
-            side: Side::Right,
-            ..Self::left(name, all, cell)
-        }
-    }
-}
-
-/// Header and rows.
-fn lines(columns: &[Column], rows: usize) -> String {
-    let heads = columns
-        .iter()
-        .map(|column| (column.name.as_str(), column.side));
-    let mut table = TextTable::new(heads);
-    (0..rows).for_each(|row| table.row(columns.iter().map(|column| column.cells[row].clone())));
-    table.to_string()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use deploy::score::metrics::Latencies;
+    use deploy::score::metrics::{ByIou, Latencies};
 
     fn metrics(method: &str, at_50: Option<f64>) -> Metrics {
         Metrics {

@@ -5,23 +5,20 @@ use std::path::{Path, PathBuf};
 
 use agent::attack::AttackConfig;
 use anyhow::{Result, bail};
-use bus::config_file;
 use dataset::IntensityScale;
 use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{EmulatedLink, Setup};
 use fusion::Method;
-use link::{LinkConfig, LinkError};
+use link::LinkError;
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 use perception::int8::InferencePrecision;
 use protocol::Dtype;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use support::file_error::FileError;
 use training::feature_store::KeptMaps;
 
-use super::check;
 use super::evaluation::Trial;
 use crate::scenario::weights_choice::weights_of;
 
@@ -105,7 +102,6 @@ pub struct Generate {
 
 impl Generate {
     /// Smallest to largest number of vehicles.
-    #[must_use]
     pub fn vehicles(&self) -> RangeInclusive<usize> {
         self.vehicles[0]..=self.vehicles[1]
     }
@@ -174,7 +170,6 @@ impl Default for CodecSpec {
 
 impl CodecSpec {
     /// Label in tables and charts: the number format, and the fraction of the link's rate.
-    #[must_use]
     pub fn name(&self) -> String {
         let fitted = self
             .fit
@@ -254,49 +249,6 @@ fn gigabytes() -> f64 {
 }
 
 impl Experiment {
-    /// Reads and checks an experiment.
-    ///
-    /// # Errors
-    /// [`FileError`] names the file and the field.
-    pub fn read(path: &Path) -> Result<Self, FileError> {
-        let mut experiment: Self = config_file::read(path)?;
-        if experiment.tables.is_empty() {
-            experiment.resolve(path.parent().unwrap_or(Path::new(".")));
-        }
-        let checked = experiment.find_networks();
-        checked
-            .and_then(|()| check::check(&experiment))
-            .map_err(|problem| FileError::new(path, problem))?;
-        Ok(experiment)
-    }
-
-    fn resolve(&mut self, folder: &Path) {
-        for place in std::iter::once(&mut self.dataset).chain(&mut self.weights) {
-            *place = folder.join(&place);
-        }
-        let is_file = |link: &&mut String| LinkConfig::preset(link).is_err();
-        if let Some(link) = self.link.as_mut().filter(is_file) {
-            *link = folder.join(&link).to_string_lossy().into_owned();
-        }
-    }
-
-    fn find_networks(&mut self) -> Result<(), String> {
-        let mut all = vec![&mut self.poses];
-        for Table { rows, columns, .. } in &mut self.tables {
-            all.extend(rows.iter_mut().filter_map(|row| row.poses.as_mut()));
-            all.extend(
-                columns
-                    .iter_mut()
-                    .filter_map(|column| column.poses.as_mut()),
-            );
-        }
-        for poses in all {
-            let found = std::mem::take(poses).with_networks();
-            *poses = found.map_err(|error| format!("poses: {error}"))?;
-        }
-        Ok(())
-    }
-
     /// The cell of the fixed settings; every cell of the experiment varies some of them.
     ///
     /// # Errors
@@ -363,7 +315,6 @@ impl Experiment {
 
 impl Row {
     /// First column of the row.
-    #[must_use]
     pub fn label(&self) -> String {
         self.name
             .clone()
@@ -374,6 +325,7 @@ impl Row {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use support::file_error::FileError;
 
     const SPEC: &str = "\
 dataset: scenes/test

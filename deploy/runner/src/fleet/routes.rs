@@ -16,10 +16,7 @@ impl Fleet {
         let ego = process_id(Role::Ego, &self.ego);
         let scorer = process_id(Role::Scorer, &scorer_cav());
         let route = |cav: &CavId, stream, receiver: &ProcessId| Route {
-            topic: Topic::Stream {
-                cav: cav.clone(),
-                stream,
-            },
+            topic: Topic::stream(cav, stream),
             receiver: receiver.clone(),
         };
         let mut routes = vec![
@@ -29,6 +26,9 @@ impl Fleet {
             },
             route(&self.ego, Stream::Detections, &scorer),
         ];
+        if self.scenario.ego.tracks {
+            routes.push(route(&self.ego, Stream::Tracks, &scorer));
+        }
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
         }
@@ -67,10 +67,7 @@ impl Fleet {
         if self.scenario.record.is_some() {
             let receiver = process_id(Role::Recorder, &recorder_cav());
             let sensors = self.agents.iter().flat_map(|cav| {
-                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Topic::Stream {
-                    cav: cav.clone(),
-                    stream,
-                })
+                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Topic::stream(cav, stream))
             });
             let topics = routes.iter().map(|route| route.topic.clone());
             let topics: BTreeSet<Topic> = topics.chain(sensors).collect();

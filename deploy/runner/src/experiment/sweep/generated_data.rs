@@ -6,7 +6,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use simulator::generate::{self, Subset, SynthOptions};
-use support::{output, progress};
+use support::output;
+use terminal::progress;
 
 use crate::experiment::spec::Experiment;
 

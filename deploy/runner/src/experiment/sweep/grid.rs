@@ -65,7 +65,6 @@ pub(in crate::experiment) fn count(grid: &Grid) -> usize {
 }
 
 /// Every point of an experiment's grid; the last field varies fastest.
-#[must_use]
 pub fn points(experiment: &Experiment) -> Vec<Point> {
     let grid = &experiment.grid;
     let codec = CodecSpec {

@@ -30,7 +30,8 @@ use serde::Serialize;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::cli::NotWritten;
 use support::file_error::FileError;
-use support::{atomic_file, output, progress};
+use support::{atomic_file, output};
+use terminal::progress;
 use training::feature_store::{FeatureStore, KeptMaps};
 
 pub use grid::{Point, points};
@@ -50,7 +51,7 @@ const PROBED_TICKS: usize = 4;
 
 /// Result of a sweep.
 #[derive(Debug, Default)]
-pub struct Swept {
+pub struct SweepResult {
     /// Columns that vary between the runs, as printed on a terminal.
     pub table: String,
     /// The runs, in the order of the grid.
@@ -61,15 +62,6 @@ pub struct Swept {
 #[derive(Debug, thiserror::Error)]
 #[error("a worker has failed: {0}")]
 pub struct WorkerError(pub String);
-
-/// Settings of a sweep.
-#[derive(Debug, Clone)]
-pub struct SweepOptions {
-    /// Number of compute processes.
-    pub jobs: usize,
-    /// True to keep the feature maps, for further runs of other settings.
-    pub keep_maps: bool,
-}
 
 /// A computed run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -193,19 +185,19 @@ impl Sweep {
     ///
     /// # Errors
     /// An error at the first run that cannot be computed; earlier runs are cached.
-    pub fn run(&self, options: &SweepOptions) -> Result<Swept> {
+    pub fn run(&self, jobs: usize, keep_maps: bool) -> Result<SweepResult> {
         let keys = self.keys()?;
-        self.compute_missing(&keys, 0..keys.len(), options.jobs)?;
+        self.compute_missing(&keys, 0..keys.len(), jobs)?;
         let cells: Option<Vec<Cell>> = self.known(&keys)?.into_iter().collect();
         let cells = cells.ok_or_else(|| WorkerError("a run that was done is not there".into()))?;
         let runs: Vec<Run> = (self.points.iter().cloned().zip(cells))
             .map(|(point, cell)| Run { point, cell })
             .collect();
         let table = self.write(&runs)?;
-        if !options.keep_maps {
+        if !keep_maps {
             self.remove_maps()?;
         }
-        Ok(Swept { table, runs })
+        Ok(SweepResult { table, runs })
     }
 
     /// Computes the runs of `part` that are not cached.

@@ -1,6 +1,6 @@
 //! Runs of a sweep as one CSV, a line each, in the order of the grid.
 
-use deploy::score::metrics::ByIou;
+use deploy::operate::run_folder::{fixed, plain};
 use fusion::Exchange;
 use protocol::DropReason;
 use support::csv_file::CsvText;
@@ -9,15 +9,12 @@ use super::Run;
 use crate::experiment::spec::Experiment;
 
 /// Reasons with a column of their own; the last column is the sum of the others.
-const REASONS: [DropReason; 7] = [
-    DropReason::LinkLoss,
-    DropReason::LinkQueue,
-    DropReason::Superseded,
-    DropReason::Stale,
-    DropReason::Duplicate,
-    DropReason::NoPose,
-    DropReason::OutOfRange,
-];
+const REASONS: [DropReason; 7] = {
+    use DropReason::{Duplicate, LinkLoss, LinkQueue, NoPose, OutOfRange, Stale, Superseded};
+    [
+        LinkLoss, LinkQueue, Superseded, Stale, Duplicate, NoPose, OutOfRange,
+    ]
+};
 
 /// Names of the columns.
 const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbps,loss,noise_t,noise_r,vehicles,seed,frames,\
@@ -77,7 +74,6 @@ pub(super) const NOTES: &[(&str, &str)] = &[
 ];
 
 /// The whole table.
-#[must_use]
 pub fn csv(experiment: &Experiment, runs: &[Run]) -> String {
     let mut text = CsvText::new(COLUMNS);
     runs.iter().for_each(|run| text.row(line(experiment, run)));
@@ -115,13 +111,8 @@ fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
         point.seed.to_string(),
         metrics.frames.to_string(),
     ];
-    for ByIou {
-        at_30,
-        at_50,
-        at_70,
-    } in [metrics.ap_global, metrics.ap_frame_order]
-    {
-        fields.extend([at_30, at_50, at_70].map(|precision| fixed(precision, 4)));
+    for ap in [metrics.ap_global, metrics.ap_frame_order] {
+        fields.extend(ap.values().map(|precision| fixed(precision, 4)));
     }
     let comm = &metrics.comm;
     fields.extend([
@@ -155,12 +146,4 @@ fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
     counts.push(all - REASONS.iter().map(count).sum::<u64>());
     fields.extend(counts.iter().map(ToString::to_string));
     fields
-}
-
-fn plain(value: Option<impl ToString>) -> String {
-    value.map_or(String::new(), |value| value.to_string())
-}
-
-fn fixed(value: Option<f64>, digits: usize) -> String {
-    value.map_or(String::new(), |value| format!("{value:.digits$}"))
 }

@@ -146,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_the_same_in_all_runs_is_said_once_and_the_best_run_is_named() {
+    fn common_settings_are_printed_once_and_the_best_run_is_named() {
         let columns = [
             "method",
             "zstd",

@@ -9,6 +9,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::{Context, Result};
+use support::sync::lock;
 
 use super::WorkerError;
 use crate::experiment::cell::CellKey;
@@ -38,8 +39,7 @@ pub(super) fn run(
         for _ in 0..jobs.min(missing.len()) {
             scope.spawn(|| {
                 if let Err(error) = serve(file, out, &queue, &failure, on_frame, on_done) {
-                    let mut first = failure.lock().unwrap_or_else(PoisonError::into_inner);
-                    first.get_or_insert(error);
+                    lock(&failure).get_or_insert(error);
                 }
             });
         }
@@ -62,10 +62,8 @@ fn serve<'r>(
     let mut input = worker.0.stdin.take().ok_or_else(silent)?;
     let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
     loop {
-        let has_failed = { failure.lock() }
-            .unwrap_or_else(PoisonError::into_inner)
-            .is_some();
-        let request = queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+        let has_failed = lock(failure).is_some();
+        let request = lock(queue).next();
         let Some(request) = request.filter(|_| !has_failed) else {
             return Ok(());
         };

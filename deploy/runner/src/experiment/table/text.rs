@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+use deploy::operate::run_folder::fixed;
 use deploy::score::metrics::ByIou;
 use support::csv_file::CsvText;
 
@@ -11,7 +12,6 @@ use crate::experiment::cell::Cell;
 
 /// Markdown table: AP@0.3/0.5/0.7 in per cent. A single column of conditions is expanded into both orderings and bytes;
 /// several show the global ordering only. The provenance follows below.
-#[must_use]
 pub fn markdown(table: &FilledTable) -> String {
     let mut text = format!("# {}\n\n", table.name);
     let single = table.columns.len() == 1;
@@ -82,7 +82,6 @@ fn joined(values: BTreeSet<String>) -> String {
 }
 
 /// CSV: a line per cell and training.
-#[must_use]
 pub fn csv(table: &FilledTable) -> String {
     let mut text = CsvText::new(
         "table,row,column,training,method,poses,delay_ms,frames,ap_global_30,ap_global_50,ap_global_70,ap_frame_30,\
@@ -111,13 +110,8 @@ pub fn csv(table: &FilledTable) -> String {
 fn cell_fields(cell: &Cell) -> Vec<String> {
     let Cell { key, metrics, .. } = cell;
     let mut fields = vec![metrics.frames.to_string()];
-    for ByIou {
-        at_30,
-        at_50,
-        at_70,
-    } in [metrics.ap_global, metrics.ap_frame_order]
-    {
-        fields.extend([at_30, at_50, at_70].map(plain));
+    for ap in [metrics.ap_global, metrics.ap_frame_order] {
+        fields.extend(ap.values().map(|value| fixed(value, 6)));
     }
     let (comm, pose, of) = (&metrics.comm, &metrics.pose, &key.provenance);
     let numbers = [
@@ -126,7 +120,7 @@ fn cell_fields(cell: &Cell) -> Vec<String> {
         pose.mean_m,
         pose.p95_m,
     ];
-    fields.extend(numbers.map(plain));
+    fields.extend(numbers.map(|value| fixed(value, 6)));
     let files: Vec<&str> = of.files_sha256.values().map(String::as_str).collect();
     fields.extend([
         pose.no_pose.to_string(),
@@ -161,15 +155,11 @@ fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {
 
 /// Three precisions in per cent.
 fn precision(cells: &[Cell], of: impl Fn(&Cell) -> ByIou) -> String {
-    let at = |pick: fn(ByIou) -> Option<f64>| {
-        let percent = |cell: &Cell| pick(of(cell)).map(|value| 100.0 * value);
+    let at = |index: usize| {
+        let percent = |cell: &Cell| of(cell).values()[index].map(|value| 100.0 * value);
         number(&mean(cells, &percent), 2)
     };
-    [at(|ap| ap.at_30), at(|ap| ap.at_50), at(|ap| ap.at_70)].join(" / ")
-}
-
-fn plain(value: Option<f64>) -> String {
-    value.map_or(String::new(), |value| format!("{value:.6}"))
+    [0, 1, 2].map(at).join(" / ")
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use std::io::{IsTerminal, stderr};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::output::{Verbosity, verbosity};
+use support::output::{Verbosity, verbosity};
 
 /// A bar over `total` steps with the name `unit`, for example `frames`; its message, if any, is behind it.
 pub fn bar(total: usize, unit: &str) -> ProgressBar {
