@@ -32,10 +32,21 @@ pub struct CovarianceScale {
     pub tilt: f64,
     /// Of the rotation about z.
     pub yaw: f64,
-    /// Largest standard deviations along the worst axis of the plane by which one of 1,000 positions is off; `None`
-    /// where it was fitted on too few.
+    /// Number of standard deviations along the worst axis of the plane that the error of one position in 1,000 exceeds;
+    /// `None` if it was fitted on fewer than 999 poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<f64>,
+}
+
+/// Reason why no scale can be fitted.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum NoScale {
+    /// There are too few poses.
+    #[error("covariances are fitted on {MIN_POSES} poses or more, there are {0}")]
+    TooFew(usize),
+    /// More than one error in twenty is beyond any multiple of its covariance.
+    #[error("the errors exceed any multiple of their covariances: {0}")]
+    Unbounded(#[from] FieldError),
 }
 
 /// A pose estimated for a sweep, with its error.
@@ -63,6 +74,22 @@ impl PoseSample {
         self.error[axis].abs() / self.covariance[axis][axis].sqrt()
     }
 
+    /// Whether the error lies beyond the 95 % ellipse in the plane, and beyond 1.96 standard deviations of z, roll, pitch
+    /// and yaw.
+    pub fn beyond_95(&self) -> [(&'static str, bool); 5] {
+        let [axis, ellipse] = SHARE_STD;
+        // A singular covariance is exceeded by any error.
+        let exceeds = |deviations: f64, limit: f64| deviations.is_nan() || deviations > limit;
+        let along = |of: usize| exceeds(self.deviations(of), axis);
+        [
+            ("plane", exceeds(self.planar_deviations(), ellipse)),
+            ("z", along(2)),
+            ("roll", along(3)),
+            ("pitch", along(4)),
+            ("yaw", along(5)),
+        ]
+    }
+
     /// Mahalanobis distance of x and y.
     fn planar_deviations(&self) -> f64 {
         let off = Vector2::new(self.error[0], self.error[1]);
@@ -73,30 +100,33 @@ impl PoseSample {
 
 impl CovarianceScale {
     /// Fits the factors so that 95 % of the errors lie within the ellipse in the plane and within 1.96 standard
-    /// deviations of every other axis, and 99.9 % of the positions within the bound; `None` of too few poses.
-    pub fn fit(samples: &[PoseSample]) -> Option<Self> {
+    /// deviations of every other axis, and 99.9 % of the positions within the bound.
+    ///
+    /// # Errors
+    /// [`NoScale`] of too few poses, and where errors exceed any multiple of their covariances.
+    pub fn fit(samples: &[PoseSample]) -> Result<Self, NoScale> {
+        if samples.len() < MIN_POSES {
+            return Err(NoScale::TooFew(samples.len()));
+        }
         let axes = |axes: &[usize]| {
             let all = samples.iter();
-            limit(
-                all.flat_map(|sample| axes.iter().map(move |&axis| sample.deviations(axis))),
-                SHARE,
-            )
-            .map(|limit| limit / SHARE_STD[0])
+            let all = all.flat_map(|sample| axes.iter().map(move |&axis| sample.deviations(axis)));
+            limit(all, SHARE).unwrap_or(f64::INFINITY) / SHARE_STD[0]
         };
-        let planar = limit(samples.iter().map(PoseSample::planar_deviations), SHARE)?;
+        let planar = limit(samples.iter().map(PoseSample::planar_deviations), SHARE);
         let scale = Self {
-            planar: planar / SHARE_STD[1],
-            height: axes(&[2])?,
-            tilt: axes(&[3, 4])?,
-            yaw: axes(&[5])?,
+            planar: planar.unwrap_or(f64::INFINITY) / SHARE_STD[1],
+            height: axes(&[2]),
+            tilt: axes(&[3, 4]),
+            yaw: axes(&[5]),
             bound: None,
         };
+        scale.check()?;
         let off_m = |sample: &PoseSample| sample.error[0].hypot(sample.error[1]);
         let ratios = (samples.iter())
             .map(|sample| off_m(sample) / worst_std_m(&scale.applied(&sample.covariance)));
-        let is_fitted = samples.len() >= MIN_POSES && scale.check().is_ok();
-        is_fitted.then_some(Self {
-            bound: limit(ratios, BOUND_SHARE),
+        Ok(Self {
+            bound: limit(ratios, BOUND_SHARE).filter(|bound| *bound <= MAX_FACTOR),
             ..scale
         })
     }
@@ -107,11 +137,11 @@ impl CovarianceScale {
     /// [`FieldError`] of the first field that is wrong.
     pub fn check(&self) -> Result<(), FieldError> {
         for (field, factor) in [
-            ("covariance.planar", self.planar),
-            ("covariance.height", self.height),
-            ("covariance.tilt", self.tilt),
-            ("covariance.yaw", self.yaw),
-            ("covariance.bound", self.bound.unwrap_or(1.0)),
+            ("planar", self.planar),
+            ("height", self.height),
+            ("tilt", self.tilt),
+            ("yaw", self.yaw),
+            ("bound", self.bound.unwrap_or(1.0)),
         ] {
             require(factor > 0.0, field, factor, "must be above 0")?;
             within(field, factor, 0.0, MAX_FACTOR)?;
@@ -142,7 +172,9 @@ impl CovarianceScale {
 /// Smallest value that a new one does not exceed with a probability of `share`, if it is of the same distribution;
 /// `None` of too few values.
 fn limit(values: impl Iterator<Item = f64>, share: f64) -> Option<f64> {
-    let mut sorted: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    // A singular covariance states that there is no error: any error is beyond it.
+    let beyond = |value: f64| if value.is_nan() { f64::INFINITY } else { value };
+    let mut sorted: Vec<f64> = values.map(beyond).collect();
     sorted.sort_by(f64::total_cmp);
     let rank = ((sorted.len() + 1) as f64 * share).ceil() as usize;
     sorted.get(rank.checked_sub(1)?).copied()
@@ -223,7 +255,7 @@ mod tests {
     fn few_poses_fit_nothing_and_a_thousand_are_needed_for_the_bound() {
         let all = samples(999, [2.0; 6], 3);
         let fit = |count| CovarianceScale::fit(&all[..count]);
-        assert_eq!(fit(MIN_POSES - 1), None);
+        assert_eq!(fit(MIN_POSES - 1), Err(NoScale::TooFew(49)));
         assert_eq!(fit(998).unwrap().bound, None);
         let scale = fit(999).unwrap();
         let is_within = |sample: &PoseSample| {
@@ -231,6 +263,17 @@ mod tests {
             off_m <= scale.bound_m(&sample.covariance).unwrap() * (1.0 + 1e-9)
         };
         assert!(all.iter().all(is_within), "it is that of the worst of them");
+        // Singular covariances count as exceeded: a few do not matter, more than one in twenty cannot be fitted.
+        let mut singular = samples(100, [2.0; 6], 3);
+        singular[..4]
+            .iter_mut()
+            .for_each(|sample| sample.covariance = [[0.0; 6]; 6]);
+        assert!(CovarianceScale::fit(&singular).unwrap().planar >= fit(100).unwrap().planar);
+        singular[..9]
+            .iter_mut()
+            .for_each(|sample| sample.covariance = [[0.0; 6]; 6]);
+        let refused = CovarianceScale::fit(&singular).unwrap_err();
+        assert!(matches!(refused, NoScale::Unbounded(_)), "{refused}");
     }
 
     #[test]

@@ -183,11 +183,11 @@ mod tests {
         }
     }
 
-    /// The yard with points in the air above it that have no partner on its map.
-    fn sweep(strangers: u32) -> PointCloud {
+    /// A sweep of the yard, with points above it that are on no plane of its map.
+    fn sweep(unmapped: u32) -> PointCloud {
         let mut xyzi = yard();
         let place = |step: u32| step as f32 * 0.6 - 7.8;
-        let stranger = |k: u32| {
+        let point = |k: u32| {
             [
                 place(k % 27),
                 place(k / 27 % 27),
@@ -195,7 +195,7 @@ mod tests {
                 0.1,
             ]
         };
-        xyzi.extend((0..strangers).map(stranger));
+        xyzi.extend((0..unmapped).map(point));
         PointCloud { xyzi }
     }
 
@@ -227,8 +227,8 @@ mod tests {
         let (_folder, _, truth) = stored();
         let start = truth * Isometry3::new(Vector3::new(0.3, -0.2, 0.0), Vector3::z() * 0.01);
         let (mut registration, found) = registration(start);
-        let mut localize = |strangers| {
-            let cloud = sweep(strangers);
+        let mut localize = |unmapped| {
+            let cloud = sweep(unmapped);
             registration.localize(LocalizerInput::of(&cloud)).unwrap()
         };
         let taken = localize(0);

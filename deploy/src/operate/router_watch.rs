@@ -9,7 +9,7 @@ use crate::score::ScorerNode;
 /// Longest time without a message through the router.
 pub(crate) const LIMIT: Duration = Duration::from_secs(2);
 
-/// What the watch has found at one look.
+/// A change of the state of the router or of the run.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Finding {
     /// A line for the terminal: the router is gone, or back, or the run was suspended.

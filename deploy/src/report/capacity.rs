@@ -48,7 +48,8 @@ pub struct Capacity {
     #[serde(default)]
     pub stages: [Vec<(String, f64)>; 2],
     /// Share of a core that other programs leave, 0..=1.
-    pub shared_speed: f64,
+    #[serde(alias = "shared_speed")]
+    pub free_share: f64,
     /// CPU time per frame of all processes on this machine, milliseconds.
     pub needed_ms: f64,
     /// CPU time that the cores give per frame, milliseconds.

@@ -209,7 +209,7 @@ fn a_report_reads_back_and_is_a_table_for_people() {
         period_ms: 100.0,
         unit_ms: 20.0,
         stages: Default::default(),
-        shared_speed: 1.0,
+        free_share: 1.0,
         needed_ms: 326.0,
         available_ms: 200.0,
         expected_share: 0.6,

@@ -397,13 +397,20 @@ mod tests {
         TrackReport::read(&run)
     }
 
+    /// The ego drives 1 m a tick beside a vehicle, and passes a standing one.
+    fn boxes(tick: u64) -> [Box3d; 2] {
+        [car(5.0, 3.5), car(30.0 - tick as f64, -4.0)]
+    }
+
+    /// The ground truth of 20 ticks of it.
+    fn street() -> Vec<String> {
+        let line = |tick| truth(tick, &[(7, boxes(tick)[0]), (9, boxes(tick)[1])], &[]);
+        (0..20).map(line).collect()
+    }
+
     #[test]
     fn right_detections_of_a_driving_ego_give_right_tracks() {
-        // The ego drives 1 m a tick beside a vehicle, and passes a standing one.
-        let boxes = |tick: u64| [car(5.0, 3.5), car(30.0 - tick as f64, -4.0)];
-        let truths: Vec<String> = (0..20)
-            .map(|tick| truth(tick, &[(7, boxes(tick)[0]), (9, boxes(tick)[1])], &[]))
-            .collect();
+        let truths = street();
         let results: Vec<String> = (0..20)
             .map(|tick| result(tick, posed(tick as f64), &boxes(tick)))
             .collect();
@@ -420,10 +427,7 @@ mod tests {
 
     #[test]
     fn recorded_tracks_are_judged_as_those_made_from_the_detections() {
-        let boxes = |tick: u64| [car(5.0, 3.5), car(30.0 - tick as f64, -4.0)];
-        let truths: Vec<String> = (0..20)
-            .map(|tick| truth(tick, &[(7, boxes(tick)[0]), (9, boxes(tick)[1])], &[]))
-            .collect();
+        let truths = street();
         let results: Vec<String> = (0..20)
             .map(|tick| {
                 result(

@@ -2,8 +2,8 @@
 
 /// Values above this multiple of the largest that the own maps have had are none of the network.
 const ANY: f32 = 4.0;
-/// Values above this multiple of the largest of their channel: an honest neighbour reaches 1.48 (two vehicles, 8 frames
-/// of seed 1000) while the range is that of a single map.
+/// Values above this multiple of the largest of their channel are counted; a neighbour that is not attacked has few of
+/// them even while the range is that of a single map.
 const CHANNEL: f32 = 1.5;
 /// Share of such values that no honest map has: what only one of the two vehicles has around it fills few cells.
 const SHARE: f64 = 0.05;

@@ -19,11 +19,13 @@ pub enum LocalizerError {
     /// The parts of a localizer do not fit together.
     #[error("localizer: {0}")]
     Config(String),
-    /// The confidence model in a head's file is not valid.
-    #[error("{head}: confidence: {reason}")]
-    Confidence {
+    /// Fitted numbers in a head's file are not valid.
+    #[error("{head}: {key}: {reason}")]
+    Fitted {
         /// Path of the head.
         head: String,
+        /// Their key in the file's metadata.
+        key: &'static str,
         /// Field and value that are wrong.
         reason: FieldError,
     },

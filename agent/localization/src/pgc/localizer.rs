@@ -272,10 +272,10 @@ pub fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError
     Ok(model.map_or(Confidence::Plain, Confidence::Calibrated))
 }
 
-/// What was fitted and stored in a head's file under `key`, checked.
+/// Fitted numbers in the metadata `key` of a head's file, checked; `None` if it has none.
 fn fitted<T: DeserializeOwned>(
     weights: &Weights,
-    key: &str,
+    key: &'static str,
     check: impl Fn(&T) -> Result<(), FieldError>,
 ) -> Result<Option<T>, LocalizerError> {
     if weights.metadata(key).is_none() {
@@ -283,7 +283,7 @@ fn fitted<T: DeserializeOwned>(
     }
     let fitted = weights.metadata_json(key)?;
     let head = weights.path().display().to_string();
-    check(&fitted).map_err(|reason| LocalizerError::Confidence { head, reason })?;
+    check(&fitted).map_err(|reason| LocalizerError::Fitted { head, key, reason })?;
     Ok(Some(fitted))
 }
 

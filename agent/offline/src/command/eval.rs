@@ -403,28 +403,36 @@ impl Args {
 
     /// Fits confidence, threshold and covariance, as far as the options ask for, and writes them.
     fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<()> {
+        let mut fitted = None;
         if self.fit_confidence || self.max_wrong.is_some() {
             let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
             let (model, report) = self.fit_confidence(head, &labelled)?;
-            write_fit(head, CONFIDENCE_KEY, &model)?;
-            output::note(report_line(&report));
-            let confidence = Confidence::Calibrated(model);
+            let confidence = Confidence::Calibrated(model.clone());
             for sweep in &mut *sweeps {
                 sweep.judge_again(&confidence);
             }
+            fitted = Some((model, report));
         }
         let samples: Vec<_> = (sweeps.iter())
             .filter_map(EvaluatedSweep::pose_sample)
             .collect();
-        let Some(scale) = CovarianceScale::fit(&samples) else {
-            let count = samples.len();
-            let reason = format!("a covariance is fitted on 50 poses or more, there are {count}");
-            return Err(BadInput::new(reason).into());
-        };
+        let scale = CovarianceScale::fit(&samples);
+        // Nothing is written unless all that was asked for can be.
+        if let (true, Err(reason)) = (self.fit_covariance, &scale) {
+            return Err(BadInput::of(reason.clone()).into());
+        }
+        if let Some((model, report)) = fitted {
+            write_fit(head, CONFIDENCE_KEY, &model)?;
+            output::note(report_line(&report));
+        }
         let map = self.surfel_map_file()?;
-        match self.surfel_map.is_some() {
-            true => write_fit(&map, COVARIANCE_KEY, &scale),
-            false => write_fit(head, COVARIANCE_KEY, &scale),
+        match (scale, self.surfel_map.is_some()) {
+            (Ok(scale), true) => write_fit(&map, COVARIANCE_KEY, &scale),
+            (Ok(scale), false) => write_fit(head, COVARIANCE_KEY, &scale),
+            (Err(reason), _) => {
+                output::note(format_args!("the covariances are not fitted: {reason}"));
+                Ok(())
+            }
         }
     }
 
@@ -550,6 +558,13 @@ fn table(summary: &LocalizationSummary) -> String {
             stages.join(", ")
         ),
     ];
+    let beyond = (!summary.beyond_95.is_empty()).then(|| {
+        let shares = summary.beyond_95.iter();
+        let shares: Vec<String> = shares
+            .map(|(axis, share)| format!("{axis} {}", percent(*share)))
+            .collect();
+        format!("covariance {} of the errors beyond 95 %", shares.join(", "))
+    });
     let integrity = summary.integrity.map(|integrity| {
         format!(
             "integrity  {} of the errors exceed their bound of 95 % (median {:.2} m)",
@@ -557,6 +572,6 @@ fn table(summary: &LocalizationSummary) -> String {
             integrity.p50_bound_m
         )
     });
-    let lines = lines.into_iter().chain(integrity);
+    let lines = lines.into_iter().chain(beyond).chain(integrity);
     lines.map(|line| line + "\n").collect()
 }

@@ -19,7 +19,7 @@ pub use table::{write_csv, write_error_table};
 use localization::covariance_scale::PoseSample;
 use localization::pgc::confidence::{Confidence, Labelled};
 use localization::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
-use localization::pose_covariance::unscaled_covariance;
+use localization::pose_covariance::{pose_covariance, unscaled_covariance};
 use localization::pose_source::{PoseInput, PoseSource};
 use support::sampling::evenly_spread;
 
@@ -82,6 +82,16 @@ impl EvaluatedSweep {
         let found = self.localization.found.filter(|found| !found.is_rejected)?;
         let (pose, truth) = (&found.world_from_sensor, self.truth.isometry());
         Some(PoseSample::of(pose, unscaled_covariance(&found), &truth))
+    }
+
+    /// The same with the covariance that is published.
+    fn published_sample(&self) -> Option<PoseSample> {
+        let covariance = pose_covariance(&self.localization.found?);
+        let sample = self.pose_sample()?;
+        Some(PoseSample {
+            covariance,
+            ..sample
+        })
     }
 
     /// Applies another confidence model to the estimated pose.

@@ -56,6 +56,9 @@ pub struct LocalizationSummary {
     pub calibration: Vec<CalibrationBin>,
     /// Rejected poses, and the good ones among them.
     pub rejected: RejectionSummary,
+    /// Share of the localizer's published poses whose error lies beyond the 95 % ellipse in the plane, and beyond 1.96
+    /// standard deviations of z, roll, pitch and yaw, 0..=1; empty without such poses.
+    pub beyond_95: BTreeMap<&'static str, f64>,
     /// Integrity of the covariances of published poses; absent if they have none.
     pub integrity: Option<IntegritySummary>,
     /// Median milliseconds by stage; `total` is that of all stages of a sweep.
@@ -161,6 +164,7 @@ impl LocalizationSummary {
             calibration_error: mean(&gaps),
             calibration,
             rejected: rejected(&judged),
+            beyond_95: beyond_95(sweeps),
             integrity: integrity(sweeps),
             ms: median_times(sweeps),
             mean_ms: mean(&total_ms).unwrap_or(0.0),
@@ -213,6 +217,18 @@ fn rejected(judged: &[Judged]) -> RejectionSummary {
         bad_share: share(&bad),
         good_share: share(&good),
     }
+}
+
+fn beyond_95(sweeps: &[EvaluatedSweep]) -> BTreeMap<&'static str, f64> {
+    let samples = sweeps.iter().filter_map(EvaluatedSweep::published_sample);
+    let mut by_axis: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+    for (axis, is_beyond) in samples.flat_map(|sample| sample.beyond_95()) {
+        by_axis.entry(axis).or_default().push(f64::from(is_beyond));
+    }
+    let shares = by_axis.into_iter();
+    shares
+        .filter_map(|(axis, all)| Some((axis, mean(&all)?)))
+        .collect()
 }
 
 fn integrity(sweeps: &[EvaluatedSweep]) -> Option<IntegritySummary> {

@@ -422,14 +422,13 @@ impl Map<'_> {
                 let all = checked.sweeps.iter().chain(&checked.copies);
                 let samples: Vec<_> = all.filter_map(EvaluatedSweep::pose_sample).collect();
                 match CovarianceScale::fit(&samples) {
-                    Some(scale) => {
+                    Ok(scale) => {
                         let text = serde_json::to_string(&scale).expect("a scale is numbers");
                         sha256 = annotate(weights, COVARIANCE_KEY, &text)?;
                     }
-                    None => self.note(format!(
-                        "the covariance is not fitted: {} held-out poses are too few",
-                        samples.len()
-                    )),
+                    Err(reason) => {
+                        self.note(format!("the covariances are not fitted: {reason}"));
+                    }
                 }
                 Ok((Some(report), Some(sha256)))
             }

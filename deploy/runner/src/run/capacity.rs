@@ -38,7 +38,7 @@ pub struct Measured {
     /// Medians of the stages of an agent, then of the ego, milliseconds.
     stages: [Vec<(String, f64)>; 2],
     /// Share of a core that other programs leave, 0..=1.
-    left: f64,
+    free_share: f64,
 }
 
 /// Estimates the pace of a fleet from [`measure`] in short-lived processes of their own, so that models and their memory
@@ -61,20 +61,23 @@ pub fn estimate(fleet: &Fleet, programs: &Path, budget: Duration) -> io::Result<
     let children: Vec<Child> = (0..beside)
         .map(|_| start(&program, fleet, budget))
         .collect::<io::Result<_>>()?;
-    let measured = children
+    // All have ended before the first error is returned: none computes beside the run.
+    let ended: Vec<_> = children.into_iter().map(Child::wait_with_output).collect();
+    let measured = ended
         .into_iter()
-        .map(|child| answer(child.wait_with_output()?))
+        .map(|output| answer(output?))
         .collect::<io::Result<Vec<Measured>>>()?;
-    let vehicle_mb = vehicle_mb(fleet).map_err(io::Error::other)?;
-    let capacity = capacity_of(
+    Ok(Some(capacity_of(
         machine,
         &measured,
-        (fleet.agents.len(), local_vehicles(fleet)),
-        vehicle_mb,
+        (
+            fleet.scenario.method.to_string(),
+            fleet.agents.len(),
+            local_vehicles(fleet),
+        ),
+        vehicle_mb(fleet).map_err(io::Error::other)?,
         (period_ms, answer(unit)?),
-    );
-    let method = fleet.scenario.method.to_string();
-    Ok(Some(Capacity { method, ..capacity }))
+    )))
 }
 
 /// Starts a process that measures.
@@ -91,7 +94,7 @@ fn start(program: &Path, fleet: &Fleet, budget: Duration) -> io::Result<Child> {
     Ok(child)
 }
 
-/// What a process printed as JSON.
+/// The JSON that a process printed; its last line on standard error if it failed.
 fn answer<T: DeserializeOwned>(output: Output) -> io::Result<T> {
     if output.status.success() {
         return Ok(serde_json::from_slice(&output.stdout)?);
@@ -110,18 +113,19 @@ pub fn measure(fleet: &Fleet, budget: Duration) -> Result<Measured, RunError> {
     let mut evaluator = Evaluator::new(setup(fleet)?)?;
     let (began, before_s) = (Instant::now(), process_cpu_s());
     let estimated = evaluator.estimate(&fleet.recorded, fleet.agents.len(), budget)?;
-    let left = ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
+    let free_share =
+        ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
     let steps = estimated.steps;
     Ok(Measured {
-        agent_ms: (steps.pose_ms + steps.map_ms) * left,
-        fuse_ms: steps.fuse_ms * left,
+        agent_ms: (steps.pose_ms + steps.map_ms) * free_share,
+        fuse_ms: steps.fuse_ms * free_share,
         stages: estimated.stages.map(|stages| {
             stages
                 .into_iter()
-                .map(|(stage, ms)| (stage, ms * left))
+                .map(|(stage, ms)| (stage, ms * free_share))
                 .collect()
         }),
-        left,
+        free_share,
     })
 }
 
@@ -165,7 +169,7 @@ fn vehicle_mb(fleet: &Fleet) -> Result<f64, RunError> {
 fn capacity_of(
     machine: Machine,
     measured: &[Measured],
-    (vehicles, local_vehicles): (usize, usize),
+    (method, vehicles, local_vehicles): (String, usize, usize),
     vehicle_mb: f64,
     (period_ms, unit_ms): (f64, f64),
 ) -> Capacity {
@@ -173,18 +177,18 @@ fn capacity_of(
         measured.iter().map(value).sum::<f64>() / measured.len().max(1) as f64
     };
     let (agent_ms, fuse_ms) = (mean(|one| one.agent_ms), mean(|one| one.fuse_ms));
-    let shared_speed = mean(|one| one.left);
+    let free_share = mean(|one| one.free_share);
     let messages_ms = vehicles as f64 * vehicle_mb * UNITS_PER_MB * unit_ms;
     let needed_ms = local_vehicles as f64 * agent_ms + fuse_ms + messages_ms;
-    let available_ms = machine.cores as f64 * shared_speed * period_ms;
+    let available_ms = machine.cores as f64 * free_share * period_ms;
     // Neither an agent nor the ego computes two frames at once.
-    let longest_ms = agent_ms.max(fuse_ms) / shared_speed;
+    let longest_ms = agent_ms.max(fuse_ms) / free_share;
     let expected_share = (available_ms / needed_ms)
         .min(period_ms / longest_ms)
         .min(1.0);
     Capacity {
         machine,
-        method: String::new(),
+        method,
         vehicles,
         local_vehicles,
         agent_ms,
@@ -196,7 +200,7 @@ fn capacity_of(
             .first()
             .map(|one| one.stages.clone())
             .unwrap_or_default(),
-        shared_speed,
+        free_share,
         needed_ms,
         available_ms,
         expected_share,
@@ -246,13 +250,18 @@ mod tests {
     use super::*;
 
     /// Capacity of a machine with 10 ms for the messages of a frame of two vehicles.
-    fn capacity(cores: usize, agent_ms: f64, fuse_ms: f64, left: f64) -> Capacity {
-        capacity_with(cores, [agent_ms, fuse_ms, left], 0.5 / UNITS_PER_MB, 10.0)
+    fn capacity(cores: usize, agent_ms: f64, fuse_ms: f64, free_share: f64) -> Capacity {
+        capacity_with(
+            cores,
+            [agent_ms, fuse_ms, free_share],
+            0.5 / UNITS_PER_MB,
+            10.0,
+        )
     }
 
     fn capacity_with(
         cores: usize,
-        [agent_ms, fuse_ms, left]: [f64; 3],
+        [agent_ms, fuse_ms, free_share]: [f64; 3],
         vehicle_mb: f64,
         unit_ms: f64,
     ) -> Capacity {
@@ -260,18 +269,15 @@ mod tests {
             agent_ms,
             fuse_ms,
             stages: Default::default(),
-            left,
+            free_share,
         };
         let machine = Machine {
             cores,
             instructions: "AVX2".into(),
         };
         let all = [measured.clone(), measured];
-        let pace = (100.0, unit_ms);
-        Capacity {
-            method: "pastat".into(),
-            ..capacity_of(machine, &all, (2, 2), vehicle_mb, pace)
-        }
+        let fleet = ("pastat".to_owned(), 2, 2);
+        capacity_of(machine, &all, fleet, vehicle_mb, (100.0, unit_ms))
     }
 
     /// Measured on two cores of an EPYC 7003, AVX2, while both compute: an agent takes 42 ms and the ego 89; a run took
