@@ -148,6 +148,9 @@ pub struct AgentSettings {
     /// Rate control of feature maps: a size, a byte rate, the vehicle's own queue.
     #[command(flatten)]
     pub rate: RateConfig,
+    /// Send detections in place of feature maps: a kilobyte, of any network. The ego needs weights with a box input.
+    #[arg(long)]
+    pub boxes_only: bool,
     /// Falsification of the vehicle's messages, to measure its effect on the ego. Absent: none.
     #[arg(long, value_enum, help_heading = "Attack")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -259,6 +262,7 @@ impl AgentSettings {
                 ..codec
             },
             rate: RateConfig::default(),
+            boxes_only: false,
             ..self
         }
     }
@@ -307,6 +311,10 @@ impl AgentConfig {
             of_loop: LoopOptions {
                 publish: { self.publish.iter() }
                     .filter_map(|publish| publish.stream())
+                    .map(|stream| match stream {
+                        Stream::Bev if self.settings.boxes_only => Stream::Boxes,
+                        stream => stream,
+                    })
                     .collect(),
                 codec: self.settings.codec,
                 rate: self.settings.rate,

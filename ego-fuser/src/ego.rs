@@ -5,7 +5,9 @@
 
 mod box_correction;
 mod error;
+mod latency_compensation;
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use nalgebra::Isometry3;
@@ -19,7 +21,9 @@ use protocol::{
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
+use self::latency_compensation::LatencyCompensation;
 use crate::misbehaviour::{Assessment, MisbehaviourDetector};
+use fusion::box_input::{PlacedBox, placed};
 use fusion::f64_tensor;
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
@@ -62,6 +66,8 @@ pub struct Ego {
     fusion: FusionStage,
     history: History,
     trust: Option<MisbehaviourDetector>,
+    /// Absent: boxes stay where they were detected.
+    compensation: Option<LatencyCompensation>,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -116,6 +122,7 @@ impl Ego {
             fusion,
             history,
             trust: None,
+            compensation: None,
             limits,
             comm_range_m: Self::COMM_RANGE_M,
         }
@@ -142,10 +149,24 @@ impl Ego {
         Ok(self)
     }
 
+    /// The same with latency compensation, if it is enabled: boxes of neighbours are carried to the time of the ego's frame
+    /// by their velocities.
+    #[must_use]
+    pub fn with_latency_compensation(mut self, is_enabled: bool) -> Self {
+        self.compensation = (is_enabled || self.reads_boxes()).then(LatencyCompensation::default);
+        self
+    }
+
     /// Its method.
     #[must_use]
     pub fn method(&self) -> Method {
         self.method
+    }
+
+    /// True if neighbours may send boxes in place of maps.
+    #[must_use]
+    pub fn reads_boxes(&self) -> bool {
+        self.method.own_content() == Exchange::Features && self.fusion.reads_boxes()
     }
 
     /// Its detector.
@@ -163,6 +184,7 @@ impl Ego {
     pub fn forget(&mut self) {
         self.history.clear();
         self.trust.iter_mut().for_each(MisbehaviourDetector::clear);
+        { self.compensation.iter_mut() }.for_each(LatencyCompensation::clear);
     }
 
     /// Detects once without real data, so that the first frame does not wait for the tensor library's preparations.
@@ -227,9 +249,15 @@ impl Ego {
             view: own,
             ego_from_cav: Pose::IDENTITY,
         }];
+        let carried: Vec<Cow<'_, View>> = { neighbours.iter() }
+            .map(|view| match &mut self.compensation {
+                Some(compensation) => compensation.carried(view, own.capture_nanos),
+                None => Cow::Borrowed(view),
+            })
+            .collect();
         let mut fused = Vec::new();
         let mut skipped = Vec::new();
-        for (index, view) in neighbours.iter().enumerate() {
+        for (index, view) in carried.iter().map(Cow::as_ref).enumerate() {
             match self.align(own, view) {
                 Ok(ego_from_cav) => {
                     aligned.push(Aligned { view, ego_from_cav });
@@ -298,7 +326,11 @@ impl Ego {
             Content::Features(map) => self.is_own_shape(map),
             Content::Boxes(_) | Content::Points(_) => true,
         };
-        if view.content.exchange() != own.content.exchange() || !fits {
+        let is_read = match (own.content.exchange(), view.content.exchange()) {
+            (Exchange::Features, Exchange::Boxes) => self.fusion.reads_boxes(),
+            (own, other) => own == other,
+        };
+        if !is_read || !fits {
             return Err(Skipped::Unusable(DropReason::Shape));
         }
         Ok(world_from_ego.from_world(world_from_cav))
@@ -315,12 +347,19 @@ impl Ego {
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
 
-    /// Intermediate fusion, and ego-only detection.
+    /// Intermediate fusion, and ego-only detection; boxes of neighbours without a map are an input of the fused map.
     fn merge_features(
         &mut self,
-        aligned: &[Aligned<'_>],
+        all: &[Aligned<'_>],
         stages: &mut StageTimes,
     ) -> Result<Vec<Detection>, EgoError> {
+        let boxes: Vec<PlacedBox> = all[1..]
+            .iter()
+            .flat_map(|view| view.boxes(all[0].view))
+            .collect();
+        let has_map = |view: &&Aligned<'_>| matches!(view.view.content, Content::Features(_));
+        let aligned: Vec<Aligned<'_>> = all.iter().filter(has_map).copied().collect();
+        let aligned = aligned.as_slice();
         let (mut maps, mut sent) = (
             Vec::with_capacity(aligned.len()),
             Vec::with_capacity(aligned.len()),
@@ -359,7 +398,8 @@ impl Ego {
             .transpose()?;
         let on_grid = self.fusion.align_with(&newest, earlier, &metadata)?;
         stages.lap("align");
-        let fused = f64_tensor::as_batch(&self.fusion.fuse(&on_grid)?.map)?;
+        let fused = self.fusion.fuse(&on_grid)?.map;
+        let fused = f64_tensor::as_batch(&self.fusion.with_boxes(fused, &boxes)?)?;
         check_values("the fused feature map", &fused)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, stages)?;
@@ -515,12 +555,27 @@ fn keep<T>(items: Vec<T>, is_out: &[bool]) -> Vec<T> {
 }
 
 /// A view and its pose.
+#[derive(Clone, Copy)]
 struct Aligned<'a> {
     view: &'a View,
     ego_from_cav: Pose,
 }
 
 impl Aligned<'_> {
+    /// Its boxes, if it has sent boxes.
+    fn boxes(&self, ego: &View) -> Vec<PlacedBox> {
+        let Content::Boxes(found) = &self.view.content else {
+            return Vec::new();
+        };
+        let MapMetadata {
+            ego_from_cav,
+            confidence,
+            age_secs,
+            ..
+        } = self.metadata(0, ego);
+        placed(found, &ego_from_cav, age_secs, confidence)
+    }
+
     fn metadata(&self, agent: usize, ego: &View) -> MapMetadata {
         let confidence = f64::from(self.view.pose.confidence());
         let age_secs = self.view.age_nanos(ego) as f64 * 1e-9;

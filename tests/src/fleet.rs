@@ -80,14 +80,7 @@ pub fn programs() -> &'static Path {
 /// # Panics
 /// When a file cannot be written.
 pub fn write_weights(path: &Path) {
-    let model = tiny();
-    weights::save(
-        path,
-        &model.variables,
-        &model.about(),
-        weights::Precision::Single,
-    )
-    .expect("a writable folder");
+    write(path, &tiny());
 }
 
 /// The same with a head that detects vehicles everywhere: where boxes are compared there have to be some.
@@ -95,19 +88,34 @@ pub fn write_weights(path: &Path) {
 /// # Panics
 /// When a file cannot be written.
 pub fn write_sighted_weights(path: &Path) {
+    write(path, &sighted());
+}
+
+/// The same with a box input, which changes the map.
+///
+/// # Panics
+/// When a file cannot be written.
+pub fn write_weights_with_box_input(path: &Path) {
+    let mut model = sighted();
+    model.train_box_input_only().expect("a box input");
+    set(&model, "box_input.out.weight", 0.1);
+    write(path, &model);
+}
+
+fn write(path: &Path, model: &CooperativeModel) {
+    let precision = weights::Precision::Single;
+    weights::save(path, &model.variables, &model.about(), precision).expect("a writable folder");
+}
+
+fn sighted() -> CooperativeModel {
     let model = tiny();
-    let _ = tch::no_grad(|| {
-        model.variables.variables()["cls_head.bias"]
-            .shallow_clone()
-            .fill_(0.5)
-    });
-    weights::save(
-        path,
-        &model.variables,
-        &model.about(),
-        weights::Precision::Single,
-    )
-    .expect("a writable folder");
+    set(&model, "cls_head.bias", 0.5);
+    model
+}
+
+fn set(model: &CooperativeModel, name: &str, value: f64) {
+    let mut variable = model.variables.variables()[name].shallow_clone();
+    let _ = tch::no_grad(|| variable.fill_(value));
 }
 
 fn tiny() -> CooperativeModel {

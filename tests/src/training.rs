@@ -60,6 +60,7 @@ pub fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfi
         init: None,
         fusion: None,
         frozen_encoder: None,
+        box_input: false,
         run: RunConfig {
             learning_rate: 2e-3,
             seed: 3,

@@ -84,7 +84,7 @@ impl Fleet {
             .and_then(|weights| weights.detector_config())
             .context("weights")?;
         // As the ego-fuser does: weights of another method are refused before any process starts.
-        Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
+        let pipeline = Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
         let loaded = scenario.poses().iter().try_for_each(load_networks);
         loaded.context("localizer")?;
         if let Some(link) = &scenario.link {
@@ -126,6 +126,16 @@ impl Fleet {
                     pose.name()
                 );
             }
+        }
+        let sends_boxes = |cav: &&CavId| **cav != ego && scenario.settings_of(cav).boxes_only;
+        if let Some(cav) = agents.iter().find(sends_boxes)
+            && scenario.method.exchange() == Exchange::Features
+            && !pipeline.reads_boxes()
+        {
+            bail!(
+                "vehicle {cav}: boxes_only: the ego's weights, {}, have no box input and would leave its boxes out",
+                scenario.models.weights.display()
+            );
         }
         let scene = &mut scenario.scene;
         let left = recorded.ticks.len() - scene.seek;
@@ -255,10 +265,13 @@ impl Fleet {
         self.agents.iter().filter(|cav| **cav != self.ego)
     }
 
-    /// Messages that every vehicle publishes in addition to its pose, those that the method needs, and their stream; the
+    /// Messages that a vehicle publishes in addition to its pose, those that the method needs, and their stream; the
     /// ego's own agent sends its feature map even where no other counts.
-    pub(crate) fn publish(&self) -> (Publish, Stream) {
+    pub(crate) fn publish(&self, cav: &CavId) -> (Publish, Stream) {
         match self.scenario.method.exchange() {
+            Exchange::Features if self.settings_of(cav).boxes_only => {
+                (Publish::Boxes, Stream::Boxes)
+            }
             Exchange::Nothing | Exchange::Features => (Publish::Bev, Stream::Bev),
             Exchange::Boxes => (Publish::Boxes, Stream::Boxes),
             Exchange::Points => (Publish::Points, Stream::Points),

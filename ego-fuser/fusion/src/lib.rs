@@ -25,6 +25,7 @@
 
 pub mod attention;
 mod block_order;
+pub mod box_input;
 pub(crate) mod channel_mixing;
 pub(crate) mod classes;
 pub mod coalign;

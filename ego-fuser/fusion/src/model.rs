@@ -20,6 +20,7 @@ use protocol::{Box3d, Detection};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
+use crate::box_input::{self, PlacedBox};
 use crate::method::{Method, UnknownMethod};
 use crate::own::OwnConfig;
 use crate::targets::{AnchorGridError, TargetAssigner, TargetRule};
@@ -162,7 +163,10 @@ impl CooperativeModel {
             Some(fusion) => fusion.clone(),
             None => stored_config(weights, method, &config)?,
         };
-        let model = Self::with_fusion(&config, method, &fusion, device)?;
+        let mut model = Self::with_fusion(&config, method, &fusion, device)?;
+        if weights.contains(box_input::WEIGHT) {
+            model.add_box_input();
+        }
         // A single-vehicle network becomes a cooperative one whose fusion is untrained.
         let is_fusion =
             |name: &str| name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
@@ -170,6 +174,26 @@ impl CooperativeModel {
             !is_fusion(name) || weights.contains(name)
         })?;
         Ok(model)
+    }
+
+    fn add_box_input(&mut self) {
+        let root = self.variables.root();
+        self.fusion.add_box_input(&root, &self.network.config);
+    }
+
+    /// Freezes everything but the box input, which is made if there is none.
+    ///
+    /// # Errors
+    /// [`TchError`] from the tensor library.
+    pub fn train_box_input_only(&mut self) -> Result<(), TchError> {
+        if !self.fusion.reads_boxes() {
+            self.add_box_input();
+        }
+        for (name, variable) in self.variables.variables() {
+            let is_trained = name.starts_with(box_input::PREFIX);
+            let _ = variable.f_set_requires_grad(is_trained)?;
+        }
+        Ok(())
     }
 
     /// Metadata for the header of its weights file: configuration, method and fusion.
@@ -261,19 +285,10 @@ impl CooperativeModel {
         for facts in facts {
             let maps = features.f_narrow(0, first, facts.len() as i64)?;
             first += facts.len() as i64;
-            let sent = if train {
-                self.sent_in_training(&maps)?
-            } else {
-                None
-            };
-            let aligned = self.fusion.align(&ReceivedMaps::new(maps, sent), facts)?;
             let FusionOutput {
                 map,
                 corrections: shifts,
-            } = self.fusion.fuse(&AlignedMaps {
-                is_training: train,
-                ..aligned
-            })?;
+            } = self.fuse(maps, facts, train)?;
             fused.push(map);
             corrections.push(shifts);
         }
@@ -281,6 +296,42 @@ impl CooperativeModel {
             head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?,
             corrections,
         })
+    }
+
+    /// The fused map of one sample's maps `[N, C, H, W]`, each in its own frame.
+    fn fuse(
+        &self,
+        maps: Tensor,
+        facts: &[MapMetadata],
+        train: bool,
+    ) -> Result<FusionOutput, ModelError> {
+        let sent = if train {
+            self.sent_in_training(&maps)?
+        } else {
+            None
+        };
+        let aligned = self.fusion.align(&ReceivedMaps::new(maps, sent), facts)?;
+        Ok(self.fusion.fuse(&AlignedMaps {
+            is_training: train,
+            ..aligned
+        })?)
+    }
+
+    /// Output for samples of maps `[N, C, H, W]`, their metadata and boxes of neighbours without a map: the method runs
+    /// as in inference, gradients flow through the box input only.
+    ///
+    /// # Errors
+    /// [`ModelError`] when maps or metadata do not fit.
+    pub fn detect_with_boxes(
+        &self,
+        samples: &[(Tensor, Vec<MapMetadata>, Vec<PlacedBox>)],
+    ) -> Result<HeadOutput, ModelError> {
+        let fused = samples.iter().map(|(maps, facts, boxes)| {
+            let fused = tch::no_grad(|| self.fuse(maps.shallow_clone(), facts, false))?;
+            Ok(self.fusion.read_boxes(fused.map, boxes)?)
+        });
+        let fused = fused.collect::<Result<Vec<_>, ModelError>>()?;
+        Ok(self.network.heads(&Tensor::f_stack(&fused, 0)?)?)
     }
 
     /// Mask of the cells of maps `[N, C, H, W]` that agents would have sent, for a method in which they select: in

@@ -86,7 +86,9 @@ impl Evaluator {
     pub fn new(setup: Setup) -> Result<Self, EvaluateError> {
         let weights = Weights::load(&setup.models.weights)?.with_precision(setup.models.precision);
         let ego = Ego::from_weights(&weights, setup.method, Device::Cpu)?;
-        let ego = ego.with_misbehaviour_detection(setup.ego.trust)?;
+        let ego = ego
+            .with_latency_compensation(setup.ego.latency_compensation)
+            .with_misbehaviour_detection(setup.ego.trust)?;
         let area = ego.detector().config();
         let rule = setup.protocol.as_ref().map_or_else(
             || rule_for(area),
@@ -199,7 +201,7 @@ impl Evaluator {
         let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
         let agent = agent.within(settings.rate);
-        Ok(Participant::new(agent, attack, settings.codec))
+        Ok(Participant::new(agent, attack, &settings))
     }
 
     /// True if sweeps have to be read at all.

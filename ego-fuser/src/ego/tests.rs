@@ -2,6 +2,7 @@ use agent::agent::{Agent, AgentInput};
 use localization::pose_source::RecordedPose;
 use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
+use perception::weights::{Precision, save};
 use protocol::{
     CavId, CodecConfig, ConfidenceGate, EgoMotion, Limits, NoPoseReason, PointCloud, PoseEstimate,
     encode_features,
@@ -12,6 +13,7 @@ use tch::nn::VarStore;
 use super::*;
 use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::GroundTruth;
+use fusion::model::CooperativeModel;
 
 /// Capture time of all sweeps unless stated otherwise.
 const NOW: u64 = 5_000_000_000;
@@ -42,14 +44,20 @@ fn detector_of(compress_ratio: Option<i64>, logit: f64, weight: f64) -> Detector
     };
     let network = VarStore::new(Device::Cpu);
     let pillars = PointPillars::new(&network.root(), &config).unwrap();
+    fill(&network, logit, weight);
+    Detector::from_network(pillars)
+}
+
+/// Sets values from the shapes only: tests that run at the same time share torch's generator.
+fn fill(network: &VarStore, logit: f64, weight: f64) {
     for (name, mut variable) in network.variables() {
-        // Values from the shape only: tests that run at the same time share torch's generator.
         let count = variable.numel() as i64;
         let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7)
             .sin()
             .view(variable.size().as_slice());
         let new = match name.as_str() {
             name if name.contains("running") || name.ends_with("norm.weight") => continue,
+            "box_input.out.weight" => wave * 0.0 + 0.5,
             "cls_head.bias" => wave * 0.1 + logit,
             "cls_head.weight" => wave * weight,
             // Boxes are the anchors themselves, which post-processing accepts as vehicles.
@@ -61,7 +69,6 @@ fn detector_of(compress_ratio: Option<i64>, logit: f64, weight: f64) -> Detector
         };
         no_grad(|| variable.copy_(&new));
     }
-    Detector::from_network(pillars)
 }
 
 fn cloud(phase: f32) -> PointCloud {
@@ -603,4 +610,70 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
     assert!(ego.earlier(&aligned(&lost, &later)).is_empty());
     ego.forget();
     assert!(ego.earlier(&aligned(&third, &later)).is_empty());
+}
+
+/// Egos of `method` from files of the same weights, without and with a box input.
+fn egos_of_files(method: Method) -> [Ego; 2] {
+    let config = detector().config().clone();
+    let new = || CooperativeModel::new(&config, method, Device::Cpu).unwrap();
+    let (without, mut with) = (new(), new());
+    with.train_box_input_only().unwrap();
+    fill(&with.variables, 0.3, 1e-4);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("weights.safetensors");
+    let ego = |model: &CooperativeModel| {
+        save(&path, &model.variables, &model.about(), Precision::Single).unwrap();
+        Ego::load(&path, None, Device::Cpu).unwrap()
+    };
+    let with = ego(&with);
+    let weights = Weights::load(&path).unwrap();
+    weights
+        .copy_some_into(&without.variables, |_| true)
+        .unwrap();
+    [ego(&without), with]
+}
+
+#[test]
+fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_else() {
+    for method in [Method::MAX, Method::PASTAT] {
+        let [own, map] = [("a", HERE, 0.0), ("b", near(), 0.15)]
+            .map(|(name, pose, phase)| view(name, pose, method, phase));
+        let boxes = View {
+            content: Content::Boxes(vec![Detection {
+                box3d: protocol::Box3d {
+                    center_m: [2.0, 1.0, -1.0],
+                    size_m: [4.0, 1.8, 1.6],
+                    heading_rad: 0.4,
+                },
+                score: 0.9,
+                source: None,
+            }]),
+            ..view("c", near(), method, 0.0)
+        };
+        let mut egos = egos_of_files(method);
+        let mut detect = |reads_boxes, neighbours: &[&View]| {
+            let neighbours: Vec<View> = neighbours.iter().copied().cloned().collect();
+            let ego = &mut egos[usize::from(reads_boxes)];
+            ego.forget();
+            ego.detect(&own, &neighbours).unwrap()
+        };
+        for neighbours in [&[][..], &[&map]] {
+            let [with, without] = [true, false].map(|reads| detect(reads, neighbours));
+            assert_eq!(with.detections, without.detections, "{method}");
+        }
+        let refused = detect(false, &[&boxes]);
+        let shape = Skipped::Unusable(DropReason::Shape);
+        assert_eq!((refused.fused, refused.skipped), (vec![], vec![(0, shape)]));
+        let read = detect(true, &[&boxes, &map]);
+        assert_eq!(read.fused, [0, 1], "{method}");
+        assert_ne!(
+            read.detections,
+            detect(true, &[&map]).detections,
+            "{method}"
+        );
+        assert_ne!(
+            detect(true, &[&boxes]).detections,
+            detect(true, &[]).detections
+        );
+    }
 }

@@ -2,7 +2,8 @@
 
 use protocol::message::{Bev, Boxes, Descriptor, Payload, Points};
 use protocol::{
-    CavId, DropReason, HEADER_LEN, Header, Limits, PoseEstimate, Stamp, Stream, WireError, wire,
+    CavId, DropReason, HEADER_LEN, Header, Kind, Limits, PoseEstimate, Stamp, Stream, WireError,
+    wire,
 };
 
 use super::{EgoLoop, Message, Output, OwnFrame, Reception};
@@ -44,8 +45,9 @@ impl EgoLoop {
             self.dated(cav, header.stamp.capture_nanos)
                 .map_err(Refusal::Unneeded)?;
         }
+        let is_boxes = header.kind == Kind::Boxes && self.reads_boxes && *cav != self.cav;
         let (pose, content) = match self.stream {
-            Stream::Boxes => {
+            stream if stream == Stream::Boxes || is_boxes => {
                 let Boxes { pose, detections } = payload(pieces, limits)?;
                 (pose, Content::Boxes(detections))
             }
@@ -86,6 +88,12 @@ impl EgoLoop {
         if cav == self.cav {
             return self.begin(ego, message, now_nanos);
         }
+        match message.view.content {
+            Content::Boxes(_) if self.stream != Stream::Boxes => {
+                self.box_senders.insert(cav.clone())
+            }
+            _ => self.box_senders.remove(&cav),
+        };
         match self.dated(&cav, stated_nanos) {
             Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,
             Err(reason) => return self.drop_message(&cav, reason),
@@ -163,7 +171,9 @@ impl EgoLoop {
     /// Compares an agent's network with the ego's. Maps of another network are left out from then on.
     pub(super) fn compare_models(&mut self, cav: &CavId, descriptor: &Descriptor) {
         // Boxes and points belong to no network.
-        if self.stream != Stream::Bev {
+        let sends_maps = descriptor.streams.contains(&Stream::Bev);
+        if self.stream != Stream::Bev || (self.reads_boxes && !sends_maps) {
+            self.models.forget(cav);
             return;
         }
         let Some(other) = self.models.update(cav, descriptor) else {
@@ -199,6 +209,7 @@ impl EgoLoop {
         self.members.remove(cav);
         self.silence.reset(cav);
         self.models.forget(cav);
+        self.box_senders.remove(cav);
         self.clocks.forget(cav);
         self.clock_offsets_s.remove(cav);
         self.ended.remove(cav);

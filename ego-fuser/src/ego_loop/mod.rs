@@ -95,6 +95,10 @@ struct OwnFrame {
 pub struct EgoLoop {
     cav: CavId,
     stream: Stream,
+    /// True if neighbours may send boxes in place of that stream.
+    reads_boxes: bool,
+    /// Neighbours whose last message had boxes in place of it.
+    box_senders: BTreeSet<CavId>,
     options: LoopOptions,
     members: BTreeSet<CavId>,
     silence: Silence,
@@ -124,7 +128,9 @@ impl EgoLoop {
         Self {
             cav: cav.clone(),
             stream,
-            waits: Waits::new(cav, ego.method().name(), stream),
+            reads_boxes: ego.reads_boxes(),
+            box_senders: BTreeSet::new(),
+            waits: Waits::new(cav, ego.method().name(), stream, ego.reads_boxes()),
             options,
             members: BTreeSet::new(),
             silence: Silence::default(),
@@ -187,6 +193,21 @@ impl EgoLoop {
     /// Stream of the vehicles' perception that the method fuses.
     pub fn stream(&self) -> Stream {
         self.stream
+    }
+
+    /// Streams of which a neighbour may publish either.
+    pub fn neighbour_streams(&self) -> impl Iterator<Item = Stream> + use<> {
+        [self.stream]
+            .into_iter()
+            .chain(self.reads_boxes.then_some(Stream::Boxes))
+    }
+
+    /// Stream of a vehicle's last message.
+    pub fn stream_of(&self, cav: &CavId) -> Stream {
+        match self.box_senders.contains(cav) {
+            true => Stream::Boxes,
+            false => self.stream,
+        }
     }
 
     /// Problems of the ego: missing messages and streams, each with the time of its beginning, nanoseconds.

@@ -16,6 +16,8 @@ pub(super) struct Waits {
     /// Method and the stream that it needs.
     method: String,
     stream: Stream,
+    /// True if boxes of a neighbour do in place of that stream.
+    reads_boxes: bool,
     /// Last message of its own agent, or the first report of a sweep that it has.
     own_nanos: Option<u64>,
     /// Vehicles that do not publish the stream, with those that they publish.
@@ -25,11 +27,12 @@ pub(super) struct Waits {
 }
 
 impl Waits {
-    pub(super) fn new(ego: &CavId, method: &str, stream: Stream) -> Self {
+    pub(super) fn new(ego: &CavId, method: &str, stream: Stream, reads_boxes: bool) -> Self {
         Self {
             ego: ego.clone(),
             method: method.to_owned(),
             stream,
+            reads_boxes,
             own_nanos: None,
             without: BTreeMap::new(),
             gone: BTreeMap::new(),
@@ -52,7 +55,8 @@ impl Waits {
         if *cav == self.ego && !descriptor.sweeps.is_empty() {
             self.own_nanos.get_or_insert(now_nanos);
         }
-        if streams.contains(&self.stream) {
+        let sends_boxes = streams.contains(&Stream::Boxes) && *cav != self.ego;
+        if streams.contains(&self.stream) || (self.reads_boxes && sends_boxes) {
             self.without.remove(cav);
         } else if self.without.len() < MAX_VEHICLES {
             let names: Vec<String> = streams.iter().map(ToString::to_string).collect();
@@ -100,7 +104,7 @@ mod tests {
     #[test]
     fn a_missing_stream_a_silent_agent_and_a_vehicle_that_is_gone_are_named() {
         let [own, other] = ["1", "2"].map(|name| CavId::new(name).unwrap());
-        let mut waits = Waits::new(&own, "late", Stream::Boxes);
+        let mut waits = Waits::new(&own, "late", Stream::Boxes, false);
         let mut descriptor = Descriptor {
             model_hash: ModelHash([7; 32]),
             grid: BevGrid {
@@ -131,5 +135,16 @@ mod tests {
         waits.received(&own, 8 * SECOND);
         waits.received(&other, 8 * SECOND);
         assert_eq!(waits.problems(8 * SECOND), []);
+
+        let mut waits = Waits::new(&own, "max", Stream::Bev, true);
+        for cav in [&own, &other] {
+            waits.described(cav, &descriptor, SECOND);
+        }
+        let needs = "max needs bev, agent 1 publishes boxes".to_owned();
+        assert_eq!(
+            waits.problems(SECOND),
+            [(needs, SECOND)],
+            "a neighbour's boxes do"
+        );
     }
 }

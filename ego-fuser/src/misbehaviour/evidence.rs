@@ -83,7 +83,7 @@ impl Evidence {
             ego_sees_it: own.sure_at(ego_from_cav.translation.vector.into(), radius_m),
             it_sees_ego: theirs.sure_at(cav_from_ego.translation.vector.into(), radius_m),
             distance_m: ego_from_cav.translation.vector.norm(),
-            boxes_only: own.is_boxes(),
+            boxes_only: own.is_boxes() || theirs.is_boxes(),
             is_blind: theirs.is_blind && !own.vehicles.is_empty(),
             ..Self::default()
         };

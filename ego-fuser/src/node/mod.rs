@@ -33,8 +33,8 @@ use fusion::method::Exchange;
 const PLACES: usize = 2;
 /// Results that may wait to be sent.
 const RESULTS: usize = 4;
-/// Largest number of subscribed topics: of 65 vehicles, their stream and their descriptor.
-const MAX_TOPICS: usize = 130;
+/// Largest number of subscribed topics: of 65 vehicles, maps, boxes and descriptor.
+const MAX_TOPICS: usize = 195;
 /// Interval of checks for new agents while no message arrives.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
 
@@ -218,10 +218,9 @@ impl<'a> Node<'a> {
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let streams = vec![Stream::Descriptor, ego_loop.stream()];
-        let own = streams
-            .iter()
-            .map(|&stream| bus.subscribe(Topic::stream(cav, stream), &inbox))
+        let own = [Stream::Descriptor, ego_loop.stream()]
+            .into_iter()
+            .map(|stream| bus.subscribe(Topic::stream(cav, stream), &inbox))
             .collect::<Result<_, _>>()?;
         // An ego-only method needs no messages of others.
         let neighbourhood = (ego.method().exchange() != Exchange::Nothing)
@@ -229,7 +228,9 @@ impl<'a> Node<'a> {
                 Neighbourhood::watch(
                     bus,
                     cav,
-                    streams,
+                    { ego_loop.neighbour_streams() }
+                        .chain([Stream::Descriptor])
+                        .collect(),
                     options.over_link,
                     options.neighbours.clone(),
                 )
@@ -274,7 +275,7 @@ impl<'a> Node<'a> {
     fn end(&mut self, topic: &Topic) {
         // The own agent may come again.
         if let Some((cav, stream)) = sender_of(topic)
-            && stream == self.ego_loop.stream()
+            && stream != Stream::Descriptor
             && !(self.options.keeps_running && *cav == self.cav)
         {
             self.handle(Input::Ended(cav.clone()));
@@ -368,7 +369,7 @@ impl<'a> Node<'a> {
     }
 
     fn topic(&self, cav: &CavId) -> Topic {
-        let stream = self.ego_loop.stream();
+        let stream = self.ego_loop.stream_of(cav);
         topic_of(&self.cav, cav, stream, self.options.over_link)
     }
 

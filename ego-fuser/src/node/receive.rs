@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use bus::{Arrival, LINK_TRANSIT_S, NETWORK_TRANSIT_S};
-use protocol::CavId;
 use protocol::message::Descriptor;
+use protocol::{CavId, Stream};
 
 use super::Node;
 use crate::capture_clock::SweepTime;
@@ -18,7 +18,7 @@ impl Node<'_> {
         let Some((cav, stream)) = sender_of(&arrival.topic) else {
             return;
         };
-        if stream != self.ego_loop.stream() {
+        if stream == Stream::Descriptor {
             return self.admit_descriptor(cav, arrival);
         }
         let (stats, began) = (self.bus.stats(), Instant::now());
@@ -40,7 +40,7 @@ impl Node<'_> {
         };
         stats.timed("decode", began.elapsed());
         if let Some(transport) = transport {
-            let stage = format!("{} transport", self.ego_loop.stream());
+            let stage = format!("{stream} transport");
             stats.timed(&stage, transport);
         }
         let now_nanos = self.clock.now_nanos();

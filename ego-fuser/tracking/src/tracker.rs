@@ -113,33 +113,38 @@ impl Tracker {
     /// Takes the result of an ego and returns its tracks, none without a usable pose. Where time does not advance the
     /// scene begins again: all tracks end.
     pub fn follow(&mut self, capture_nanos: u64, result: &Detections) -> Tracks {
-        if self.last_nanos.is_some_and(|last| capture_nanos <= last) {
-            (self.tracks, self.last_nanos) = (Vec::new(), None);
-        }
-        let (before, pose) = (self.left_out, result.pose);
-        let tracks = match &pose {
-            PoseEstimate::Pose {
-                world_from_cav,
-                covariance,
-                ..
-            } => {
-                let covariance = covariance.as_ref();
-                self.update(
-                    capture_nanos,
-                    world_from_cav,
-                    covariance,
-                    &result.detections,
-                )
-            }
-            PoseEstimate::NoPose { .. } => Ok(Vec::new()),
-        };
+        let before = self.left_out;
+        let tracks = self.tracks_of(capture_nanos, &result.pose, &result.detections);
         Tracks {
             ego: result.ego.clone(),
             agent_frame: result.agent_frame,
-            pose,
-            tracks: tracks.unwrap_or_default(),
+            pose: result.pose,
+            tracks,
             left_out: u32::try_from(self.left_out - before).unwrap_or(u32::MAX),
         }
+    }
+
+    /// The same of a vehicle's pose and its detections in its own LiDAR frame.
+    pub fn tracks_of(
+        &mut self,
+        capture_nanos: u64,
+        pose: &PoseEstimate,
+        detections: &[Detection],
+    ) -> Vec<Track> {
+        if self.last_nanos.is_some_and(|last| capture_nanos <= last) {
+            (self.tracks, self.last_nanos) = (Vec::new(), None);
+        }
+        let PoseEstimate::Pose {
+            world_from_cav,
+            covariance,
+            ..
+        } = pose
+        else {
+            return Vec::new();
+        };
+        let covariance = covariance.as_ref();
+        self.update(capture_nanos, world_from_cav, covariance, detections)
+            .unwrap_or_default()
     }
 
     /// Takes a frame and returns the tracks at its capture time in the ego's LiDAR frame, ordered by id.

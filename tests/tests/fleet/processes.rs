@@ -14,7 +14,7 @@ use serde_json::Value;
 use support::file_digests::FileDigests;
 use tests::fleet::{
     TIMEOUT, Up, check_origin, fused, is_running, programs, results, signal, write_scenario,
-    write_sighted_weights,
+    write_sighted_weights, write_weights_with_box_input,
 };
 use tests::locks::exclusive_lock;
 
@@ -185,6 +185,31 @@ fn a_fleet_runs_over_an_emulated_link() {
         "{latency_ms} ms are less than the link takes"
     );
     assert!(run.join("log/link-4279.log").exists());
+}
+
+#[test]
+fn a_neighbour_that_sends_boxes_is_fused_where_the_weights_read_them() {
+    let _exclusive = exclusive_lock();
+    let folder = tempfile::tempdir().unwrap();
+    let link = "capacity: {token_bucket: {bandwidth_mbps: 1}}\nlatency: {constant_ms: 10}\n";
+    fs::write(folder.path().join("link.yaml"), link).unwrap();
+    let rest = "link: {model: link.yaml}\nego: {deadline_ms: 5000}\nvehicles: {\"4288\": {boxes_only: true}}";
+    let scenario = write_scenario(folder.path(), 4, "lockstep: true", rest);
+    let weights = folder.path().join("weights.safetensors");
+    write_weights_with_box_input(&weights);
+    let mut up = Up::start(folder.path(), &scenario);
+    let status = up.wait();
+    let ledger = json(&up.folder.join("ledger.json"));
+    assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
+    assert_eq!(status.code(), Some(0), "{}", ledger["total"]);
+    let results = results(&up.folder);
+    let counts: Vec<usize> = results.iter().map(fused).collect();
+    assert_eq!(counts, [1; 4]);
+
+    write_sighted_weights(&weights);
+    let mut up = Up::start(folder.path(), &scenario);
+    up.wait_for_line("vehicle 4288: boxes_only: the ego's weights");
+    assert_eq!(up.wait().code(), Some(2));
 }
 
 #[test]

@@ -17,7 +17,10 @@ use protocol::{DropReason, Dtype};
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
 use serde_json::Value;
-use tests::fleet::{check_origin, programs, results, write_scenario, write_sighted_weights};
+use tests::fleet::{
+    check_origin, fused, programs, results, write_scenario, write_sighted_weights,
+    write_weights_with_box_input,
+};
 use tests::locks::exclusive_lock;
 
 const TICKS: usize = 8;
@@ -499,6 +502,7 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
     write_sighted_weights(&folder.path().join("weights.safetensors"));
+    write_weights_with_box_input(&folder.path().join("boxes.safetensors"));
     let link = "capacity: {token_bucket: {bandwidth_mbps: 20}}\nlatency: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
     // All settings that an agent's process needs: noise, codec, limits, one vehicle with settings of its own.
@@ -511,24 +515,33 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             "late",
             "agents: {pose: {noisy: {position_std_m: 0.3, heading_std_deg: 1, mode: independent}}}",
         ),
+        ("max", "vehicles: {\"4288\": {boxes_only: true}}"),
         ("none", ""),
     ] {
+        let weights = match rest.contains("boxes_only") {
+            true => "boxes.safetensors",
+            false => "weights.safetensors",
+        };
         let run = |processes| {
             let text = format!(
-                "run: test\nscene: {{dir: scene}}\nmodels: {{weights: weights.safetensors}}\nmethod: {method}\nclock: stepped\n\
+                "run: test\nscene: {{dir: scene}}\nmodels: {{weights: {weights}}}\nmethod: {method}\nclock: stepped\n\
                  stepped: {{compute: {{pose_ms: 10, map_ms: 40, fuse_ms: 20}}, processes: {processes}}}\n\
                  link: {{model: link.yaml, seed: 5}}\nego: {{max_age_ms: 500}}\n{rest}\n"
             );
             let path = folder.path().join("scenario.yaml");
             fs::write(&path, text).unwrap();
-            run_up(folder.path(), &path, &format!("{method}-{processes}"))
+            let name = format!("{method}-{}-{processes}", rest.contains("boxes_only"));
+            run_up(folder.path(), &path, &name)
         };
         let (one, many) = (run(false), run(true));
         assert_same_bytes(&one, &many);
+        let decided = results(one.folder.path());
+        let is_found = |result: &Value| !result["detections"].as_array().unwrap().is_empty();
+        assert!(decided.iter().any(is_found), "{method} {rest}");
+        let takes_both = |result: &Value| fused(result) == 2;
         assert!(
-            results(one.folder.path())
-                .iter()
-                .any(|result| !result["detections"].as_array().unwrap().is_empty())
+            method == "none" || decided.iter().any(takes_both),
+            "{method} {rest}"
         );
         let logs = fs::read_dir(many.folder.log_dir()).unwrap().count();
         assert_eq!((logs, many.killed.len()), (3, 0), "one process a vehicle");

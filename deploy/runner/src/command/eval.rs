@@ -32,7 +32,7 @@ use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options, beside those of pose sources, that a file of tables states itself.
-const OF_ONE_TABLE: [&str; 17] = [
+const OF_ONE_TABLE: [&str; 19] = [
     "dataset",
     "method",
     "weights",
@@ -44,6 +44,8 @@ const OF_ONE_TABLE: [&str; 17] = [
     "delay_ms",
     "attack",
     "trust",
+    "boxes_only",
+    "latency_compensation",
     "feature_maps",
     "frames",
     "scenarios",
@@ -84,6 +86,9 @@ pub(crate) struct Arguments {
     codec: Section<CodecConfig>,
     #[command(flatten)]
     rate: Section<RateConfig>,
+    /// Neighbours send their detections in place of feature maps.
+    #[arg(long)]
+    boxes_only: bool,
     /// Delay of the messages of neighbours, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
     delay_ms: u64,
@@ -129,6 +134,9 @@ pub(crate) struct Arguments {
     /// Misbehaviour detection: excludes neighbours whose messages contradict the ego's own detections.
     #[arg(long)]
     trust: bool,
+    /// Latency compensation: the ego carries neighbours' boxes to the time of its frame.
+    #[arg(long)]
+    latency_compensation: bool,
     /// Keep the feature maps of the encoder in this folder, so that each is computed once for many evaluations.
     #[arg(long, value_name = "DIR")]
     feature_maps: Option<PathBuf>,
@@ -230,6 +238,7 @@ impl Arguments {
                     pose: self.pose.0.clone().with_networks().map_err(BadInput::of)?,
                     codec: self.codec.0,
                     rate: self.rate.0,
+                    boxes_only: self.boxes_only,
                     falsification: None,
                 },
                 attack: self.attack.map(attack),
@@ -313,6 +322,7 @@ impl Arguments {
             deadline_ms: self.deadline_ms.unwrap_or(defaults.deadline_ms),
             max_age_ms: self.max_age_ms.unwrap_or(defaults.max_age_ms),
             trust: self.trust,
+            latency_compensation: self.latency_compensation,
             ..defaults
         };
         ego.validate().map_err(BadInput::of)?;

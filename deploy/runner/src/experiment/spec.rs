@@ -218,6 +218,12 @@ pub struct Row {
     /// Pose source of this row, in place of that of the columns.
     #[serde(default)]
     pub poses: Option<PoseSourceConfig>,
+    /// Neighbours send their detections in place of feature maps.
+    #[serde(default)]
+    pub boxes_only: bool,
+    /// Latency compensation of the ego.
+    #[serde(default)]
+    pub latency_compensation: bool,
 }
 
 /// Conditions of a column.

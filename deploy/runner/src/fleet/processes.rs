@@ -1,5 +1,6 @@
 //! Processes of a fleet: one resolved configuration each, written into the run folder.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
@@ -141,7 +142,7 @@ impl Fleet {
             cav: cav.clone(),
             models: self.scenario.models.clone(),
             settings,
-            publish: vec![self.publish().0],
+            publish: vec![self.publish(cav).0],
             egos: vec![self.ego.clone()],
             keep_running: false,
             sweep_log: notes_sweeps.then(|| context.folder.file(SWEEP_LOG)),
@@ -173,11 +174,17 @@ impl Fleet {
     }
 
     fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
+        let contents: BTreeSet<Stream> = { self.neighbours() }
+            .map(|cav| self.publish(cav).1)
+            .collect();
         LinkProcessConfig {
             run: context.run.clone(),
             ego: self.ego.clone(),
             link: self.scenario.link.clone().unwrap_or_default(),
-            streams: vec![Stream::Pose, self.publish().1, Stream::Descriptor],
+            streams: { [Stream::Pose].into_iter() }
+                .chain(contents)
+                .chain([Stream::Descriptor])
+                .collect(),
             keep_running: false,
             inbox: self.scenario.ego.inbox,
             bus,

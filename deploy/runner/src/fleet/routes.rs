@@ -32,8 +32,7 @@ impl Fleet {
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
         }
-        let (_, stream) = self.publish();
-        routes.push(route(&self.ego, stream, &ego));
+        routes.push(route(&self.ego, self.publish(&self.ego).1, &ego));
         // Ego-only: the ego subscribes to its own agent and to no other.
         if self.scenario.method.exchange() == Exchange::Nothing {
             return routes;
@@ -44,6 +43,7 @@ impl Fleet {
             routes.push(route(&self.ego, Stream::Gnss, &link));
         }
         for cav in self.neighbours() {
+            let (_, stream) = self.publish(cav);
             if self.is_over_link() {
                 routes.push(route(cav, stream, &link));
                 routes.push(Route {

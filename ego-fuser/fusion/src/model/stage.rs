@@ -11,6 +11,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
 use tch::{Device, TchError, Tensor};
 
+use crate::box_input::{self, BoxInput, PlacedBox};
 use crate::channel_mixing::{self, ChannelMixing};
 use crate::classes::Classes;
 use crate::f64_tensor::{Order, are_numbers};
@@ -57,6 +58,8 @@ pub struct FusionStage {
     requirements: Requirements,
     fusion: Box<dyn Fusion>,
     mixing: Option<ChannelMixing>,
+    /// Reads neighbours' boxes, where the weights have it.
+    box_input: Option<BoxInput>,
     /// For a fusion that needs earlier maps at full resolution.
     classes: Option<Classes>,
     grid: BevGrid,
@@ -97,6 +100,7 @@ impl FusionStage {
             requirements,
             fusion,
             mixing,
+            box_input: None,
             classes,
             grid,
             y_axis,
@@ -118,6 +122,9 @@ impl FusionStage {
         let variables = VarStore::new(device);
         let config = stored_config(weights, method, detector)?;
         let mut stage = Self::new(&variables.root(), &config, method, detector)?;
+        if weights.contains(box_input::WEIGHT) {
+            stage.add_box_input(&variables.root(), detector);
+        }
         weights
             .copy_some_into(&variables, |name: &str| {
                 name != channel_mixing::WEIGHT || weights.contains(name)
@@ -152,6 +159,47 @@ impl FusionStage {
             mixing: None,
             ..Self::new(&variables.root(), &config, method, detector)?
         })
+    }
+
+    /// Reads boxes beside maps from here on; the variables are below `path`.
+    pub(crate) fn add_box_input(&mut self, path: &nn::Path<'_>, detector: &DetectorConfig) {
+        self.box_input = Some(BoxInput::new(path, detector.feature_channels()));
+    }
+
+    /// True if it reads boxes of neighbours without a map.
+    #[must_use]
+    pub fn reads_boxes(&self) -> bool {
+        self.box_input.is_some()
+    }
+
+    /// The fused map `[C, H, W]` with what `boxes` say. Without boxes, or a box input, it is the same map.
+    ///
+    /// # Errors
+    /// [`TchError`] when the map is of another shape.
+    pub fn with_boxes(&self, fused: Tensor, boxes: &[PlacedBox]) -> Result<Tensor, TchError> {
+        match boxes {
+            [] => Ok(fused),
+            boxes => self.read_boxes(fused, boxes),
+        }
+    }
+
+    /// The same, computed without boxes too: in training every sample has a gradient.
+    pub(super) fn read_boxes(
+        &self,
+        fused: Tensor,
+        boxes: &[PlacedBox],
+    ) -> Result<Tensor, TchError> {
+        match (&self.box_input, self.y_axis) {
+            (None, _) => Ok(fused),
+            (Some(input), YAxis::Left) => input.add(&fused, boxes, &self.grid),
+            (Some(input), YAxis::Right) => {
+                let mirrored = boxes.iter().map(|placed| PlacedBox {
+                    box3d: placed.box3d.mirrored_y(),
+                    ..*placed
+                });
+                input.add(&fused, &mirrored.collect::<Vec<_>>(), &self.grid)
+            }
+        }
     }
 
     /// Settings that the fusion was built from.

@@ -95,6 +95,10 @@ pub(crate) struct Arguments {
     /// Freeze the encoder of --init and train the fusion and the head only: fast, as maps are computed once.
     #[arg(long, requires = "init")]
     freeze_encoder: bool,
+    /// Freeze the method and the head of --init too, and train a box input behind it: a part that reads the boxes of
+    /// neighbours that send no map.
+    #[arg(long, requires = "freeze_encoder")]
+    box_input: bool,
     /// Folder of such maps.
     #[arg(
         long,
@@ -248,6 +252,7 @@ impl Arguments {
                 limit_bytes: (self.feature_maps_limit_gb.max(0.0) * 1e9) as u64,
                 intensity_scale: self.data.intensity.scale,
             }),
+            box_input: self.box_input,
             run: RunConfig {
                 optimizer: AdamWConfig {
                     weight_decay: self.weight_decay,

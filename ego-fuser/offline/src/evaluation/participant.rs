@@ -4,7 +4,9 @@ use std::time::{Duration, Instant};
 
 use agent::agent::{Agent, AgentInput, Perception};
 use agent::attack::Attack;
+use agent::config::AgentSettings;
 use dataset::frame::Frame;
+use fusion::method::Exchange;
 use perception::detector::DetectorError;
 use protocol::{
     CavId, CodecConfig, EncodedFeatures, PointCloud, PoseEstimate, StageTiming, WireError,
@@ -19,6 +21,8 @@ pub(super) struct Participant {
     attack: Option<Attack>,
     /// Encoding of its maps.
     codec: CodecConfig,
+    /// True if it sends detections in place of maps.
+    boxes_only: bool,
     times: PoseTimes,
     /// Stages of the last sweep's perception.
     stages: Vec<StageTiming>,
@@ -34,11 +38,12 @@ pub(super) struct PoseTimes {
 }
 
 impl Participant {
-    pub(super) fn new(agent: Agent, attack: Option<Attack>, codec: CodecConfig) -> Self {
+    pub(super) fn new(agent: Agent, attack: Option<Attack>, settings: &AgentSettings) -> Self {
         Self {
             agent,
             attack,
-            codec,
+            codec: settings.codec,
+            boxes_only: settings.boxes_only,
             times: PoseTimes::default(),
             stages: Vec::new(),
         }
@@ -46,6 +51,14 @@ impl Participant {
 
     pub(super) fn cav(&self) -> &CavId {
         self.agent.cav()
+    }
+
+    /// What it sends where a method needs `needed`.
+    pub(super) fn exchange(&self, needed: Exchange) -> Exchange {
+        match needed {
+            Exchange::Features if self.boxes_only => Exchange::Boxes,
+            needed => needed,
+        }
     }
 
     /// Passes on the last messages of another participant, which an attack may replay.

@@ -248,6 +248,7 @@ impl<'a> Run<'a> {
             if let Some(participant) = index.and_then(|index| self.participants.get_mut(index)) {
                 // A replaying attacker repeats the message of the vehicle before it.
                 participant.capture(all.last());
+                let exchange = exchange.map(|needed| participant.exchange(needed));
                 all.push(view(participant, frame, map.as_ref(), exchange)?);
             }
         }

@@ -7,6 +7,7 @@ mod augment;
 mod builder;
 mod loader;
 mod moments;
+mod neighbour_boxes;
 mod poses;
 mod scenes;
 

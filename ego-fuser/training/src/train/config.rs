@@ -34,6 +34,8 @@ pub struct TrainConfig {
     pub fusion: Option<FusionConfig>,
     /// Store of the encoder's maps if the encoder of `init` is frozen; absent: it is trained.
     pub frozen_encoder: Option<KeptMaps>,
+    /// True to freeze all of `init` and train its box input, which is made if it has none.
+    pub box_input: bool,
     /// Training loop; a batch are samples.
     pub run: RunConfig,
     /// Steps between two validations.

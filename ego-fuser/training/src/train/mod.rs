@@ -10,13 +10,17 @@ mod frozen;
 mod observer;
 mod validation;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use perception::int8::SCALES_KEY;
 use perception::train::{ComputePrecision, Prefetch, SaveEvery, Task, Trainer};
 use perception::weights::Weights;
-use tch::Tensor;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use tch::nn::VarStore;
+use tch::{Device, Kind, Tensor};
 
 pub use accuracy::Accuracy;
 pub use config::TrainConfig;
@@ -65,6 +69,12 @@ fn first_model(config: &TrainConfig) -> Result<CooperativeModel, Error> {
     })
 }
 
+/// A seed from the generator of the tensor library, which the training's own seed has set.
+fn random_seed() -> Result<u64, Error> {
+    let drawn = Tensor::f_randint(i64::MAX, [1], (Kind::Int64, Device::Cpu))?;
+    Ok(drawn.f_int64_value(&[0])?.unsigned_abs())
+}
+
 struct Training<'a> {
     config: &'a TrainConfig,
     observer: &'a mut dyn Observer,
@@ -93,6 +103,9 @@ impl<'a> Training<'a> {
         run.start()?;
         let mut model = first_model(config)?;
         let frozen = frozen::FrozenEncoder::of(config, &model)?;
+        if config.box_input {
+            model.train_box_input_only()?;
+        }
         let samples = SampleConfig {
             kind,
             ..frozen::sample_config(config, &model)
@@ -144,11 +157,22 @@ impl<'a> Training<'a> {
         ))
     }
 
+    /// Metadata of the weights. Where all but the box input is frozen, scales of activations stay what they were.
+    fn about(&self) -> Result<BTreeMap<String, String>, Error> {
+        let mut about = self.model.about();
+        if let Some(init) = self.config.init.as_ref().filter(|_| self.config.box_input) {
+            let weights = Weights::load(init).map_err(ModelError::from)?;
+            let scales = weights.metadata(SCALES_KEY);
+            about.extend(scales.map(|scales| (SCALES_KEY.to_owned(), scales.to_owned())));
+        }
+        Ok(about)
+    }
+
     fn finish(self, trainer: &Trainer) -> Result<Summary, Error> {
         self.draw_curve()?;
         let (config, model, scenes) = (self.config, &self.model, &self.scenes);
         let summary = Summary {
-            trained: trainer.save_weights(&model.variables, model.about(), scenes.data())?,
+            trained: trainer.save_weights(&model.variables, self.about()?, scenes.data())?,
             accuracy: self.accuracy,
         };
         card::card(config, model, scenes, &summary).write(&config.run.out)?;
@@ -176,6 +200,15 @@ impl Task for Training<'_> {
         let config = &self.config.loss;
         let device = self.config.run.device;
         let labels = LabelTensors::gather(&batch.labels, config.unassigned, device);
+        if self.config.box_input {
+            let mut rng = ChaCha8Rng::seed_from_u64(random_seed()?);
+            let samples = batch.with_boxes(&self.model, Some(&mut rng))?;
+            let head = self.model.detect_with_boxes(&samples)?;
+            let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
+            let total = terms.total();
+            self.terms = Some(terms);
+            return Ok(total);
+        }
         let output = batch.output(&self.model, true)?;
         let head = &output.head;
         let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
@@ -229,7 +262,7 @@ impl Task for Training<'_> {
             return Ok(());
         };
         self.model.set_precision(ComputePrecision::F32);
-        let accuracy = validator.measure(&self.model);
+        let accuracy = validator.measure(&self.model, self.config.box_input);
         self.model.set_precision(self.config.run.precision);
         let (accuracy, step) = (accuracy?, trainer.steps());
         self.curve.validation(step, trainer.seconds(), &accuracy)?;

@@ -59,11 +59,15 @@ impl Validator {
         Ok(Self { builder, ticks })
     }
 
-    /// AP of `model` now.
+    /// AP of `model` now; `with_boxes`: neighbours send boxes in place of maps.
     ///
     /// # Errors
     /// [`Error`] when a frame cannot be read or does not fit the model.
-    pub(crate) fn measure(&mut self, model: &CooperativeModel) -> Result<Accuracy, Error> {
+    pub(crate) fn measure(
+        &mut self,
+        model: &CooperativeModel,
+        with_boxes: bool,
+    ) -> Result<Accuracy, Error> {
         let mut scorer = Scorer::default();
         let limits = model.limits();
         for (number, &tick) in self.ticks.iter().enumerate() {
@@ -76,8 +80,14 @@ impl Validator {
                 .objects
                 .retain(|object| corners_within(&object.box3d.corners(), area_m));
             let batch = Batch::collate(vec![sample], model.network().pillar_grid())?;
-            let output = no_grad(|| batch.output(model, false))?;
-            for detections in model.detections(&output.head, &limits)? {
+            let head = no_grad(|| match with_boxes {
+                true => {
+                    let samples = batch.with_boxes(model, None::<&mut ChaCha8Rng>)?;
+                    Ok::<_, Error>(model.detect_with_boxes(&samples)?)
+                }
+                false => Ok(batch.output(model, false)?.head),
+            })?;
+            for detections in model.detections(&head, &limits)? {
                 scorer.add(&detections, &truth);
             }
         }

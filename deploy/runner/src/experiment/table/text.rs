@@ -229,6 +229,8 @@ mod tests {
                 method,
                 weights: vec![],
                 poses: None,
+                boxes_only: false,
+                latency_compensation: false,
             },
             cells: columns
                 .iter()

@@ -1,0 +1,257 @@
+//! Neighbours' boxes in samples: some neighbours send what their own network detects in place of their map, and not all of
+//! it is true.
+
+use std::f64::consts::TAU;
+
+use fusion::MapMetadata;
+use fusion::box_input::{PlacedBox, placed};
+use fusion::model::CooperativeModel;
+use perception::boxes::postprocess::PostprocessConfig;
+use protocol::{Box3d, Detection, Pose};
+use rand::Rng;
+use tch::Tensor;
+
+use super::loader::{Batch, BatchViews};
+use crate::Error;
+
+/// Share of the neighbours in training that send boxes only; the others send their map.
+const BOXES_ONLY: f64 = 0.7;
+/// Share of the boxes that are lost.
+const LOST: f64 = 0.1;
+/// Shares of the samples with a wrong pose of each neighbour, and with the same error of all.
+const SHIFTED: [f64; 2] = [0.3, 0.3];
+/// Largest errors of such a pose: metres in the plane, metres in height, degrees.
+const LARGEST_SHIFT: [f64; 3] = [2.5, 1.0, 5.0];
+/// Share of these whose sender is overconfident.
+const OVERCONFIDENT: f64 = 0.2;
+/// Share of the neighbours that invent boxes, and the largest number of these.
+const INVENTING: (f64, usize) = (0.1, 4);
+
+/// A sample's maps, their metadata, and the boxes of neighbours without a map.
+pub(crate) type SampleWithBoxes = (Tensor, Vec<MapMetadata>, Vec<PlacedBox>);
+
+impl Batch {
+    /// The samples with boxes. With `rng`, some neighbours send boxes, with all errors; without, all do, as detected.
+    pub(crate) fn with_boxes(
+        &self,
+        model: &CooperativeModel,
+        mut rng: Option<&mut impl Rng>,
+    ) -> Result<Vec<SampleWithBoxes>, Error> {
+        let BatchViews::Maps(maps) = &self.views else {
+            return Err(Error::NothingToFreeze);
+        };
+        let maps = maps.f_to_device(model.device())?;
+        let maps = model.network().through_compressor(&maps, false);
+        let mut first = 0;
+        let mut samples = Vec::with_capacity(self.facts.len());
+        for facts in &self.facts {
+            let of_sample = maps.f_narrow(0, first, facts.len() as i64)?;
+            first += facts.len() as i64;
+            samples.push(sample(model, &of_sample, facts, rng.as_deref_mut())?);
+        }
+        Ok(samples)
+    }
+}
+
+fn sample(
+    model: &CooperativeModel,
+    maps: &Tensor,
+    facts: &[MapMetadata],
+    mut rng: Option<&mut impl Rng>,
+) -> Result<SampleWithBoxes, Error> {
+    let agents = facts.iter().map(|fact| fact.agent + 1).max().unwrap_or(0);
+    let sends_boxes: Vec<bool> = (0..agents)
+        .map(|agent| {
+            agent > 0 && { rng.as_deref_mut() }.is_none_or(|rng| rng.random_bool(BOXES_ONLY))
+        })
+        .collect();
+    let shifts: Vec<Shift> = match rng.as_deref_mut() {
+        Some(rng) => Shift::draw_all(agents, rng),
+        None => vec![Shift::default(); agents],
+    };
+    let mut boxes = Vec::new();
+    for (agent, shift) in (0..agents).zip(&shifts) {
+        let newest = facts.iter().position(|fact| fact.agent == agent);
+        let Some(index) = newest.filter(|_| sends_boxes[agent]) else {
+            continue;
+        };
+        let found = detections(model, &maps.f_narrow(0, index as i64, 1)?)?;
+        boxes.append(&mut shift.placed(&found, &facts[index]));
+        if let Some(rng) = rng.as_deref_mut() {
+            boxes.retain(|_| !rng.random_bool(LOST));
+            if rng.random_bool(INVENTING.0) {
+                boxes.append(&mut invented(model, facts[index].age_secs, rng));
+            }
+        }
+    }
+    // The others, numbered without gaps.
+    let number = |agent: usize| sends_boxes[..agent].iter().filter(|boxes| !**boxes).count();
+    let kept: Vec<usize> = (0..facts.len())
+        .filter(|&index| !sends_boxes[facts[index].agent])
+        .collect();
+    let indices: Vec<i64> = kept.iter().map(|&index| index as i64).collect();
+    let maps = maps.f_index_select(
+        0,
+        &Tensor::f_from_slice(&indices)?.f_to_device(maps.device())?,
+    )?;
+    let facts = kept.into_iter().map(|index| MapMetadata {
+        agent: number(facts[index].agent),
+        ..facts[index]
+    });
+    Ok((maps, facts.collect(), boxes))
+}
+
+/// What a neighbour detects in its own map, in its own frame.
+fn detections(model: &CooperativeModel, map: &Tensor) -> Result<Vec<Detection>, Error> {
+    let limits = PostprocessConfig::for_late_fusion(model.config());
+    let heads = tch::no_grad(|| model.network().heads(map))?;
+    Ok(model.detections(&heads, &limits)?.pop().unwrap_or_default())
+}
+
+/// Boxes anywhere in the area, in the frame of the ego.
+fn invented(model: &CooperativeModel, age_secs: f64, rng: &mut impl Rng) -> Vec<PlacedBox> {
+    let [x0, y0, _, x1, y1, _] = model.config().lidar_range_m;
+    let count = rng.random_range(1..=INVENTING.1);
+    let one = |_| PlacedBox {
+        box3d: Box3d {
+            center_m: [
+                rng.random_range(x0..x1),
+                rng.random_range(y0..y1),
+                rng.random_range(-1.5..-0.5),
+            ],
+            size_m: [rng.random_range(3.5..5.0), rng.random_range(1.5..2.1), 1.6],
+            heading_rad: rng.random_range(0.0..TAU),
+        },
+        age_secs,
+        score: rng.random_range(0.2..1.0),
+        pose_confidence: 1.0,
+    };
+    (0..count).map(one).collect()
+}
+
+/// Error of a sender's pose that is not in its metadata, and what is left of its confidence.
+#[derive(Debug, Clone, Copy)]
+struct Shift {
+    by_m: [f64; 3],
+    turn_rad: f64,
+    confidence: f64,
+}
+
+impl Default for Shift {
+    fn default() -> Self {
+        Self {
+            by_m: [0.0; 3],
+            turn_rad: 0.0,
+            confidence: 1.0,
+        }
+    }
+}
+
+impl Shift {
+    /// The errors of all vehicles of a sample.
+    fn draw_all(agents: usize, rng: &mut impl Rng) -> Vec<Self> {
+        let [of_each, of_all] = SHIFTED;
+        let draw: f64 = rng.random();
+        if draw < of_each {
+            return (0..agents).map(|_| Self::draw(rng)).collect();
+        }
+        let common = match draw < of_each + of_all {
+            true => Self::draw(rng),
+            false => Self::default(),
+        };
+        vec![common; agents]
+    }
+
+    fn draw(rng: &mut impl Rng) -> Self {
+        let [plane_m, height_m, turn_deg] = LARGEST_SHIFT;
+        let distance_m = rng.random_range(0.0..plane_m);
+        let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
+        let up_m = rng.random_range(-height_m..height_m);
+        let confidence = match rng.random_bool(OVERCONFIDENT) {
+            true => 1.0,
+            // As a noisy pose source states it.
+            false => 1.0 / (1.0 + distance_m.powi(2) + up_m.powi(2)),
+        };
+        Self {
+            by_m: [distance_m * cos, distance_m * sin, up_m],
+            turn_rad: rng.random_range(-turn_deg..turn_deg).to_radians(),
+            confidence,
+        }
+    }
+
+    /// The boxes of a sender whose pose has this error.
+    fn placed(&self, found: &[Detection], fact: &MapMetadata) -> Vec<PlacedBox> {
+        let pose = &fact.ego_from_cav;
+        let translation_m = std::array::from_fn(|axis| pose.translation_m[axis] + self.by_m[axis]);
+        let moved = match self.turn_rad == 0.0 {
+            true => Pose {
+                translation_m,
+                ..*pose
+            },
+            false => Pose::from_xyz_yaw(translation_m, pose.yaw_rad() + self.turn_rad),
+        };
+        placed(
+            found,
+            &moved,
+            fact.age_secs,
+            fact.confidence * self.confidence,
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    #[test]
+    fn errors_of_poses_are_of_each_of_all_or_of_none() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let (mut none, mut same, mut own) = (0, 0, 0);
+        for _ in 0..500 {
+            let drawn = Shift::draw_all(3, &mut rng);
+            match (drawn[0].by_m == [0.0; 3], drawn[0].by_m == drawn[1].by_m) {
+                (true, _) => none += 1,
+                (_, true) => same += 1,
+                _ => own += 1,
+            }
+            let [x, y, z] = drawn[0].by_m;
+            assert!(x.hypot(y) <= 2.5 && z.abs() <= 1.0 && drawn[0].turn_rad.abs() < 0.09);
+            assert!((0.0..=1.0).contains(&drawn[0].confidence));
+        }
+        assert!(
+            [none, same, own].iter().all(|count| *count > 100),
+            "{none} {same} {own}"
+        );
+    }
+
+    #[test]
+    fn a_shift_moves_boxes_and_lowers_the_confidence() {
+        let fact = MapMetadata {
+            age_secs: 0.3,
+            confidence: 0.8,
+            ..MapMetadata::fresh(1, Pose::from_xyz_yaw([10.0, 0.0, 0.0], 0.0))
+        };
+        let found = Detection {
+            box3d: Box3d {
+                center_m: [5.0, 0.0, -1.0],
+                size_m: [4.0, 2.0, 1.5],
+                heading_rad: 0.0,
+            },
+            score: 0.5,
+            source: None,
+        };
+        let shift = Shift {
+            by_m: [1.0, -2.0, 0.5],
+            turn_rad: 0.0,
+            confidence: 0.5,
+        };
+        let [placed] = shift.placed(&[found], &fact)[..] else {
+            panic!("one box");
+        };
+        assert_eq!(placed.box3d.center_m, [16.0, -2.0, -0.5]);
+        assert_eq!((placed.age_secs, placed.pose_confidence), (0.3, 0.4));
+    }
+}
