@@ -116,13 +116,14 @@ impl Ego {
     fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
         let history = History::new(fusion.requirements().history.frames);
+        let reads_boxes = method.own_content() == Exchange::Features && fusion.reads_boxes();
         Self {
             method,
             detector,
             fusion,
             history,
             trust: None,
-            compensation: None,
+            compensation: reads_boxes.then(LatencyCompensation::default),
             limits,
             comm_range_m: Self::COMM_RANGE_M,
         }
@@ -150,10 +151,12 @@ impl Ego {
     }
 
     /// The same with latency compensation, if it is enabled: boxes of neighbours are carried to the time of the ego's frame
-    /// by their velocities.
+    /// by their velocities. Where the weights have a box input they always are.
     #[must_use]
     pub fn with_latency_compensation(mut self, is_enabled: bool) -> Self {
-        self.compensation = (is_enabled || self.reads_boxes()).then(LatencyCompensation::default);
+        if is_enabled {
+            self.compensation = Some(LatencyCompensation::default());
+        }
         self
     }
 

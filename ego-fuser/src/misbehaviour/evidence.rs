@@ -291,6 +291,26 @@ mod tests {
     }
 
     #[test]
+    fn boxes_of_a_neighbour_are_judged_as_boxes_beside_an_own_map() {
+        let grid = protocol::BevGrid {
+            x_min_m: -40.0,
+            y_min_m: -40.0,
+            cell_m: 1.0,
+            width: 80,
+            height: 80,
+        };
+        let own = Observation::of_cells(grid, vec![0.0; grid.cells()]);
+        let theirs = seen(&boxes(&WORLD, WORLD[1]));
+        let mut evidence =
+            Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
+        assert!(evidence.boxes_only && evidence.contradicted > 2);
+        // Lists of boxes differ from frame to frame, in their length alone: that is no noise in a map.
+        let before = evidence.judgement();
+        evidence.like_before = Some(0.0);
+        assert_eq!(evidence.judgement(), before);
+    }
+
+    #[test]
     fn vehicles_that_only_the_neighbour_sees_count_against_it() {
         let own = seen(&boxes(&WORLD, WORLD[0]));
         let mut more = WORLD.to_vec();

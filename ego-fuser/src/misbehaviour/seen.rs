@@ -89,6 +89,14 @@ impl Observation {
         }
     }
 
+    #[cfg(test)]
+    pub(super) fn of_cells(grid: BevGrid, sure: Vec<f32>) -> Self {
+        Self {
+            sure: Sure::Cells(grid, sure),
+            ..Self::of_boxes(Vec::new())
+        }
+    }
+
     /// From a map `[1, C, H, W]`, of which the `sent` cells were received; all where absent.
     fn in_map(
         map: &Tensor,
@@ -219,13 +227,7 @@ mod tests {
         assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
         let mut sure = vec![0.0; 128];
         sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
-        let seen = Observation {
-            vehicles: vec![],
-            sure: Sure::Cells(grid, sure),
-            fingerprint: vec![],
-            map: vec![],
-            is_blind: false,
-        };
+        let seen = Observation::of_cells(grid, sure);
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
