@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig, HypLiLocLocalizer};
+use localization::baselines::PoseRegressorConfig;
+use localization::baselines::hypliloc::HypLiLocLocalizer;
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{SceneEncoder, SceneEncoderConfig, SceneHead, SceneHeadConfig};
 use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
@@ -97,17 +98,18 @@ pub fn write_sgloc(folder: &Path, seed: i64) -> PathBuf {
 /// # Panics
 /// When a file cannot be written.
 pub fn write_hypliloc(folder: &Path, seed: i64) -> PathBuf {
-    let config = HypLiLocConfig {
+    let config = PoseRegressorConfig {
         scene_name: "nowhere".into(),
         origin_m: [0.0; 3],
-        scale_m: [100.0; 3],
+        classes: 3,
+        encoder: tiny(),
     };
     write_baseline(
         &folder.join("hypliloc.safetensors"),
         seed,
         &metadata(HypLiLocLocalizer::KIND, &config),
         |root| {
-            let _ = HypLiLoc::new(root);
+            HypLiLocLocalizer::new(root, &config).expect("a configuration that fits");
         },
     )
 }

@@ -5,10 +5,11 @@ use std::path::Path;
 
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use localization::baselines::{DescribedSweep, SweepDatabase};
-use localization::pgc::{Localizer, stopwatch};
+use localization::pgc::{Localizer, LocalizerError, stopwatch};
+use nalgebra::Isometry3;
+use protocol::PointCloud;
 
-/// Describes every sweep of the drives; `progress` gets the number of sweeps done and of all. Sweeps that cannot be
-/// read or have no pose are left out and counted in `left_out`.
+/// Describes every sweep of the drives by the features of a localizer's encoder, as [`described_sweeps`].
 ///
 /// # Errors
 /// [`Error`] names the file.
@@ -18,6 +19,28 @@ pub fn read_database(
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<SweepDatabase, Error> {
+    let mut describe = |cloud: &PointCloud| localizer.sweep_features(cloud, &mut stopwatch());
+    let sweeps = described_sweeps(folders, &mut describe, left_out, progress)?;
+    let sweeps = sweeps.into_iter();
+    let sweeps = sweeps.map(|(descriptor, world_from_sensor)| DescribedSweep {
+        descriptor,
+        world_from_sensor,
+    });
+    let sweeps: Vec<_> = sweeps.collect();
+    SweepDatabase::new(&sweeps).ok_or_else(|| no_sweeps(folders, left_out))
+}
+
+/// What describes a sweep of the drives and its pose, for all of them that `describe` describes; `progress` gets the
+/// number of sweeps done and of all. Sweeps that cannot be read or have no pose are left out and counted in `left_out`.
+///
+/// # Errors
+/// [`Error`] names the file, or the folders where no sweep is described.
+pub fn described_sweeps<D, E: Into<LocalizerError>>(
+    folders: &[impl AsRef<Path>],
+    describe: &mut dyn FnMut(&PointCloud) -> Result<Option<D>, E>,
+    left_out: &mut LeftOut,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<(D, Isometry3<f64>)>, Error> {
     let datasets = folders.iter().map(|folder| dataset::open(folder.as_ref()));
     let datasets: Vec<_> = datasets.collect::<Result<_, _>>()?;
     for dataset in &datasets {
@@ -30,16 +53,24 @@ pub fn read_database(
     let mut sweeps = Vec::new();
     for (place, &(scenario, (agent, tick))) in all.iter().enumerate() {
         progress(place + 1, all.len());
-        match described(scenario, agent, tick, localizer) {
-            Ok(sweep) => sweeps.extend(sweep),
+        match posed(scenario, agent, tick) {
+            Ok((cloud, pose)) => {
+                let described = describe(&cloud).map_err(Into::into)?;
+                sweeps.extend(described.map(|described| (described, pose)));
+            }
             Err(Error::Read(error)) => left_out.add_unreadable(agent, Problem::from(&error)),
             Err(error) => return Err(error),
         }
     }
-    SweepDatabase::new(&sweeps).ok_or_else(|| {
-        let folders = folders.iter().map(|folder| folder.as_ref().to_owned());
-        Error::NoSweeps(folders.collect(), left_out.reasons())
-    })
+    match sweeps.is_empty() {
+        true => Err(no_sweeps(folders, left_out)),
+        false => Ok(sweeps),
+    }
+}
+
+fn no_sweeps(folders: &[impl AsRef<Path>], left_out: &LeftOut) -> Error {
+    let folders = folders.iter().map(|folder| folder.as_ref().to_owned());
+    Error::NoSweeps(folders.collect(), left_out.reasons())
 }
 
 /// Agent and tick of all sweeps of a scenario, vehicle by vehicle, in the order of time.
@@ -49,21 +80,16 @@ pub(crate) fn present_sweeps(scenario: &Scenario) -> impl Iterator<Item = (usize
     all.filter(move |&(agent, tick)| scenario.is_present(agent, tick))
 }
 
-/// Features and pose of a sweep; `None` for a sweep without cells.
-fn described(
+/// Points and true pose of a sweep.
+fn posed(
     scenario: &Scenario,
     agent: usize,
     tick: usize,
-    localizer: &Localizer,
-) -> Result<Option<DescribedSweep>, Error> {
+) -> Result<(PointCloud, Isometry3<f64>), Error> {
     let frame = scenario.load(agent, tick, &LoadOptions::default())?;
     let Some(pose) = frame.world_from_lidar else {
         let path = scenario.points_path(agent, tick, None)?;
         return Err(ReadError::malformed(&path, "there is no pose for this sweep").into());
     };
-    let features = localizer.sweep_features(&frame.points, &mut stopwatch())?;
-    Ok(features.map(|descriptor| DescribedSweep {
-        descriptor,
-        world_from_sensor: pose.isometry(),
-    }))
+    Ok((frame.points, pose.isometry()))
 }

@@ -5,19 +5,19 @@ use std::time::Duration;
 
 use agent_offline::Error;
 use agent_offline::training::{
-    DiffLocTrainConfig, EncoderTrainConfig, RedundancyConfig, SceneTrainConfig, SgLocTrainConfig,
-    SweepAugmentation, train_diffloc, train_encoder, train_scene, train_sgloc,
+    EncoderTrainConfig, PoseRegressionConfig, PoseRegressionSummary, RedundancyConfig,
+    SceneTrainConfig, SgLocTrainConfig, SweepAugmentation, train_diffloc, train_encoder,
+    train_hypliloc, train_scene, train_sgloc,
 };
 use dataset::{self, LoadOptions};
-use localization::baselines::diffloc::{DiffLocConfig, RangeImageConfig};
 use localization::baselines::load_baseline;
 use localization::baselines::sgloc::SgLocConfig;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localize, Localizer, LocalizerError, LocalizerInput, SceneEncoder};
 use perception::inference::Inference;
-use perception::train::{Length, Progress, RunConfig, TrainingError};
+use perception::train::{Length, Observe, Progress, RunConfig, TrainingError};
 use perception::weights::Weights;
-use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use protocol::{NoPoseReason, PointCloud, PoseError, PoseEstimate};
 use simulator::generate::{Subset, SynthOptions, generate};
 use tch::Device;
 use tch::nn::VarStore;
@@ -264,72 +264,68 @@ fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
     assert_eq!(train_sgloc(&resumed, &mut |_| ()).unwrap().steps, 160);
 }
 
-#[test]
-fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
+/// Trains a network that regresses poses, localizes a sweep of its drives, and goes on with it.
+fn pose_regression_learns(
+    train: fn(&PoseRegressionConfig, &mut Observe<'_>) -> Result<PoseRegressionSummary, Error>,
+    steps: u64,
+) {
     let _generator = random_generator_lock();
     let dir = tempfile::tempdir().unwrap();
     let scenes = drives(dir.path());
-    let config = |steps| DiffLocTrainConfig {
+    let encoder = train_encoder(
+        &encoder_config(&scenes, &dir.path().join("encoder"), 1),
+        &mut |_| (),
+    );
+    let encoder = encoder.unwrap().trained.weights;
+    let config = |steps| PoseRegressionConfig {
         scenes: vec![scenes.clone()],
         validation: vec![scenes.clone()],
-        network: DiffLocConfig {
-            image: RangeImageConfig {
-                rows: 8,
-                columns: 64,
-                ..RangeImageConfig::default()
-            },
-            patch: [2, 8],
-            stem: [4, 8],
-            width: 32,
-            heads: 2,
-            layers: 1,
-            denoiser_width: 32,
-            denoiser_layers: 1,
-            ..DiffLocConfig::small()
-        },
-        turn_rad: 0.5,
-        shift_m: 0.5,
+        scene_name: "small".into(),
+        encoder: encoder.clone(),
+        turn_rad: 0.2,
         run: RunConfig {
             batch: 24,
-            learning_rate: 5e-3,
-            ..run(&dir.path().join("diffloc"), steps)
+            learning_rate: 2e-3,
+            ..run(&dir.path().join("regression"), steps)
         },
     };
-    let (mut poses_l1, mut found_m) = (Vec::new(), Vec::new());
-    let summary = train_diffloc(&config(200), &mut |progress| {
+    let (mut poses_l1, mut places) = (Vec::new(), Vec::new());
+    let summary = train(&config(steps), &mut |progress| {
         if let Progress::Stepped(report) = progress {
             poses_l1.push(report.means[0]);
-            found_m.push(report.means[2]);
+            places.push(report.means[1]);
         }
     })
     .unwrap();
-    assert_eq!(summary.sweeps, 48);
+    assert_eq!((summary.sweeps, summary.network.classes), (48, 48));
+    assert_eq!(summary.network.encoder, small_encoder());
     assert!(
-        poses_l1.last().unwrap() < &(0.7 * poses_l1[0]),
-        "{poses_l1:?} {found_m:?} {:?}",
-        summary.validation
+        poses_l1.last().unwrap() < &(0.7 * poses_l1[0])
+            && places.last().unwrap() < &(0.7 * places[0]),
+        "{poses_l1:?} {places:?}"
     );
-    // Far too short to find places: the error is only measured.
-    assert!(summary.validation.unwrap().p50_m.is_finite());
+    let validation = summary.validation.unwrap();
+    assert!(validation.p50_m < 20.0, "drives of 100 m: {validation}");
 
-    let mut localizer =
-        load_baseline(&summary.trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+    let weights = &summary.trained.weights;
+    let mut localizer = load_baseline(weights, Device::Cpu, PoseSolver::default()).unwrap();
     let dataset = dataset::open(&scenes).unwrap();
-    let frame = dataset.scenarios[0]
-        .load(0, 3, &LoadOptions::default())
-        .unwrap();
-    let first = localizer
-        .localize(LocalizerInput::of(&frame.points))
-        .unwrap()
-        .estimate;
-    assert_eq!(
+    let frame = dataset.scenarios[0].load(0, 3, &LoadOptions::default());
+    let frame = frame.unwrap();
+    let mut estimate = |cloud: &PointCloud| {
         localizer
-            .localize(LocalizerInput::of(&frame.points))
+            .localize(LocalizerInput::of(cloud))
             .unwrap()
-            .estimate,
-        first,
-        "same sweep, same answer"
+            .estimate
+    };
+    let first = estimate(&frame.points);
+    assert_eq!(estimate(&frame.points), first, "same sweep, same answer");
+    let (found, truth) = (
+        first.world_from_cav().unwrap(),
+        frame.world_from_lidar.unwrap(),
     );
+    let off = PoseError::between(found, &truth);
+    assert!(off.distance_m < 40.0, "{off:?}");
     let nan = PointCloud {
         xyzi: vec![[f32::NAN; 4]; 5000],
     };
@@ -337,20 +333,22 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
         reason: NoPoseReason::TooFewPoints,
         inlier_count: 0,
     };
-    assert_eq!(
-        localizer
-            .localize(LocalizerInput::of(&nan))
-            .unwrap()
-            .estimate,
-        none
-    );
+    assert_eq!(estimate(&nan), none);
 
-    let mut resumed = config(203);
+    let mut resumed = config(steps + 3);
     resumed.run.resume = true;
-    assert_eq!(
-        train_diffloc(&resumed, &mut |_| ()).unwrap().trained.steps,
-        203
-    );
+    let resumed = train(&resumed, &mut |_| ()).unwrap();
+    assert_eq!(resumed.trained.steps, steps + 3);
+}
+
+#[test]
+fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
+    pose_regression_learns(train_diffloc, 150);
+}
+
+#[test]
+fn hypliloc_learns_poses_and_answers_alike_for_the_same_sweep() {
+    pose_regression_learns(train_hypliloc, 150);
 }
 
 #[test]

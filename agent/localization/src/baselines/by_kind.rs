@@ -7,6 +7,7 @@ use tch::Device;
 
 use super::diffloc::DiffLocLocalizer;
 use super::hypliloc::HypLiLocLocalizer;
+use super::polar_retrieval::DescribePolar;
 use super::sgloc::SgLocLocalizer;
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, LocalizerError};
@@ -25,5 +26,19 @@ pub fn load_baseline(
         Some(DiffLocLocalizer::KIND) => Ok(Box::new(DiffLocLocalizer::load(path, device)?)),
         Some(HypLiLocLocalizer::KIND) => Ok(Box::new(HypLiLocLocalizer::load(path, device)?)),
         _ => Ok(Box::new(SgLocLocalizer::load(path, device, solver)?)),
+    }
+}
+
+/// Reads the weights of a baseline that regresses poses, whose tokens describe a sweep.
+///
+/// # Errors
+/// As [`load_baseline`], and for other baselines.
+pub fn load_descriptor(
+    path: &Path,
+    device: Device,
+) -> Result<Box<dyn DescribePolar>, LocalizerError> {
+    match Weights::load(path)?.metadata(KIND_KEY) {
+        Some(DiffLocLocalizer::KIND) => Ok(Box::new(DiffLocLocalizer::load(path, device)?)),
+        _ => Ok(Box::new(HypLiLocLocalizer::load(path, device)?)),
     }
 }

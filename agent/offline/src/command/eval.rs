@@ -5,15 +5,14 @@ use std::sync::Arc;
 
 use agent_offline::Error;
 use agent_offline::evaluation::{
-    Evaluated, EvaluatedSweep, LocalizationSummary, SweepSelection, evaluate, evaluate_source,
-    reliability_charts, write_csv, write_error_table,
+    Evaluated, EvaluatedSweep, LocalizationSummary, SweepSelection, evaluate, evaluate_nearest,
+    evaluate_source, reliability_charts, write_csv, write_error_table,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
-use agent_offline::sweep_database::read_database;
 use anyhow::Context;
 use clap::{ArgGroup, ValueEnum};
 use dataset::{self, LeftOut};
-use localization::baselines::{LightLoc, Retrieval, load_baseline};
+use localization::baselines::{LightLoc, ScanContext, load_baseline, load_descriptor};
 use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 use localization::map_registration::MapRegistration;
 use localization::pgc::confidence::{
@@ -27,6 +26,7 @@ use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::ransac::RansacConfig;
 use localization::registration::sc2pcr::Sc2PcrConfig;
+use nalgebra::Isometry3;
 use perception::compute_device::ComputeDevice;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
@@ -38,6 +38,7 @@ use support::output;
 use support::provenance::Provenance;
 use terminal::progress;
 
+use super::retrieval::{self, RetrievalBy};
 use super::scene_heads::{SceneHeadFile, by_head, with_files};
 use support::cli::{BadInput, Outcome};
 
@@ -75,15 +76,17 @@ pub(crate) struct Args {
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence.
     #[arg(long, conflicts_with_all = ["baseline", "fit_confidence", "tracked"])]
     lightloc: bool,
-    /// Answer with the pose of the sweep of these drives that the encoder's features find most alike, the floor of
-    /// every regression.
+    /// Answer with the pose of the sweep of these drives that looks most alike (--by), the floor of every regression.
     #[arg(
         long,
         value_name = "DIR",
         num_args = 1..,
-        conflicts_with_all = ["baseline", "lightloc", "fit_confidence", "tracked", "solver"]
+        conflicts_with_all = ["lightloc", "fit_confidence", "tracked", "solver"]
     )]
     retrieval: Vec<PathBuf>,
+    /// What --retrieval compares sweeps by.
+    #[arg(long, value_enum, default_value_t, requires = "retrieval")]
+    by: RetrievalBy,
     /// Register every sweep against a point-cloud map of these drives through the same scene (ICP), starting at the
     /// pose of the GNSS receiver, instead of networks.
     #[arg(
@@ -178,6 +181,8 @@ enum Subject {
     Localizer(Box<dyn Localize>),
     /// Pose source: also gets the pose of the GNSS receiver.
     Source(Box<dyn PoseSource>),
+    /// The nearest of these poses, which needs the true one.
+    Nearest(Vec<Isometry3<f64>>),
 }
 
 /// Localizes, fits, writes and prints.
@@ -247,6 +252,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 impl Args {
     fn subject(&self, head: &Path, left_out: &mut LeftOut) -> Result<Subject, BadInput> {
+        if self.by == RetrievalBy::Position {
+            let poses = retrieval::positions(&self.retrieval, left_out)?;
+            return Ok(Subject::Nearest(poses));
+        }
         if self.icp_map.is_empty() {
             let localizer = self.localizer(head, self.inference()?, left_out)?;
             return Ok(Subject::Localizer(localizer));
@@ -278,7 +287,8 @@ impl Args {
 
     /// True unless another method takes the place of the head.
     fn uses_head(&self) -> bool {
-        self.icp_map.is_empty() && self.baseline.is_none()
+        let has_none = self.baseline.is_some() || self.by != RetrievalBy::Encoder;
+        self.icp_map.is_empty() && !has_none
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
@@ -316,6 +326,14 @@ impl Args {
             solver: solver.clone(),
             ..PoseSolver::default()
         };
+        let drives = &self.retrieval;
+        if self.by == RetrievalBy::ScanContext {
+            return retrieval::by_descriptor(drives, Box::new(ScanContext), left_out);
+        }
+        if let (Some(weights), false) = (&self.baseline, drives.is_empty()) {
+            let tokens = load_descriptor(weights, inference.device).map_err(BadInput::of)?;
+            return retrieval::by_descriptor(drives, tokens, left_out);
+        }
         if let Some(weights) = &self.baseline {
             return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
         }
@@ -327,8 +345,8 @@ impl Args {
         if self.lightloc {
             return Ok(Box::new(LightLoc::new(localizer, plain)));
         }
-        if !self.retrieval.is_empty() {
-            return self.retrieval(localizer, left_out);
+        if !drives.is_empty() {
+            return retrieval::by_encoder(drives, localizer, left_out);
         }
         localizer.set_solver(solver);
         self.registered(Box::new(localizer))
@@ -343,21 +361,6 @@ impl Args {
     /// The localizer behind the surfel map, if there is one.
     fn registered(&self, localizer: Box<dyn Localize>) -> Result<Box<dyn Localize>, BadInput> {
         MapRegistration::of(localizer, &self.surfel_map_file()?).map_err(BadInput::of)
-    }
-
-    fn retrieval(
-        &self,
-        localizer: Localizer,
-        left_out: &mut LeftOut,
-    ) -> Result<Box<dyn Localize>, BadInput> {
-        let bar = progress::bar(0, "sweeps described");
-        let database = read_database(&self.retrieval, &localizer, left_out, &mut |done, all| {
-            bar.set_length(all as u64);
-            bar.set_position(done as u64);
-        });
-        bar.finish_and_clear();
-        let database = database.map_err(BadInput::of)?;
-        Ok(Box::new(Retrieval::new(localizer, database)))
     }
 
     fn encoder(&self, head: &Path) -> Result<PathBuf, BadInput> {
@@ -380,6 +383,7 @@ impl Args {
         let evaluated = match subject {
             Subject::Localizer(mut localizer) => evaluate(&mut *localizer, &options, &mut on_sweep),
             Subject::Source(mut source) => evaluate_source(&mut *source, &options, &mut on_sweep),
+            Subject::Nearest(poses) => evaluate_nearest(&poses, &options, &mut on_sweep),
         };
         bar.finish_and_clear();
         match evaluated {

@@ -5,5 +5,6 @@ pub(crate) mod localize;
 pub(crate) mod locate;
 pub(crate) mod map;
 pub(crate) mod quantise;
+mod retrieval;
 mod scene_heads;
 pub(crate) mod train;

@@ -20,7 +20,8 @@ use localization::covariance_scale::PoseSample;
 use localization::pgc::confidence::{Confidence, Labelled};
 use localization::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use localization::pose_covariance::{pose_covariance, unscaled_covariance};
-use localization::pose_source::{PoseInput, PoseSource};
+use localization::pose_source::{NO_SOURCE, PoseInput, PoseSource};
+use nalgebra::Isometry3;
 use support::sampling::evenly_spread;
 
 /// Selection of sweeps.
@@ -153,6 +154,32 @@ pub fn evaluate_source(
         source.observe(&input);
         times.lap("pose solve");
         Ok(Localization::from_estimate(estimate, times))
+    };
+    evaluate_with(&mut ask, options, on_sweep)
+}
+
+/// The same for an oracle: the pose of the nearest of some sweeps, the most that retrieval among them can give.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn evaluate_nearest(
+    world_from_sensor: &[Isometry3<f64>],
+    options: &SweepSelection,
+    on_sweep: &mut dyn FnMut(usize, usize),
+) -> Result<Evaluated, Error> {
+    let mut ask = |frame: &Frame| {
+        let truth = frame
+            .world_from_lidar
+            .map(|pose| pose.isometry().translation.vector);
+        let distance = |pose: &Isometry3<f64>| {
+            truth.map_or(0.0, |truth| {
+                (pose.translation.vector - truth).norm_squared()
+            })
+        };
+        let nearest = world_from_sensor.iter();
+        let nearest = nearest.min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        let estimate = nearest.map_or(NO_SOURCE, |&pose| PoseEstimate::new(pose.into(), 1.0));
+        Ok(Localization::from_estimate(estimate, stopwatch()))
     };
     evaluate_with(&mut ask, options, on_sweep)
 }

@@ -2,14 +2,11 @@
 //! only a head on the frozen encoder's features.
 
 mod contrast;
-mod diffloc_training;
 mod encoder_training;
 mod feature_cache;
-mod hypliloc_training;
 mod kmeans;
 mod pairs;
-mod place_classes;
-mod pose_scale;
+mod pose_regression;
 mod redundancy;
 mod scene_training;
 mod scene_validation;
@@ -17,13 +14,14 @@ mod sgloc_training;
 mod sweep_store;
 mod turned_sweep;
 
-pub use diffloc_training::{DiffLocAccuracy, DiffLocSummary, DiffLocTrainConfig, train_diffloc};
 pub use encoder_training::{EncoderAccuracy, EncoderSummary, EncoderTrainConfig, train_encoder};
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
-pub use hypliloc_training::{HypLiLocTrainConfig, train_hypliloc};
 pub(crate) use kmeans::kmeans;
 pub use pairs::Pair;
+pub use pose_regression::{
+    PoseRegressionConfig, PoseRegressionSummary, RegressionAccuracy, train_diffloc, train_hypliloc,
+};
 pub(crate) use redundancy::Redundancy;
 pub use redundancy::{LeaveOut, RedundancyConfig};
 pub use scene_training::{SceneSummary, SceneTrainConfig, train_scene};

@@ -136,7 +136,7 @@ fn drawn_rows(
 }
 
 /// Gives the encoder below `variables` the weights of a file and freezes it.
-fn adopt_encoder(
+pub(super) fn adopt_encoder(
     variables: &VarStore,
     path: &Path,
     config: &SceneEncoderConfig,

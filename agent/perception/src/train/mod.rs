@@ -24,6 +24,6 @@ pub use interruption::Interruption;
 pub use options::{OptionsError, TrainingOptions, check_out};
 pub use prefetch::Prefetch;
 pub use run_config::{ComputePrecision, Length, RunConfig};
-pub use schedule::one_cycle;
+pub use schedule::{Schedule, one_cycle};
 pub use task::{Means, Observe, Progress, SaveEvery, StepReport, Task};
 pub use trainer::{Trained, Trainer};

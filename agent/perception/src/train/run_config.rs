@@ -9,6 +9,7 @@ use tch::{Device, Kind};
 use super::adamw::AdamWConfig;
 use super::checkpoint::CHECKPOINT_FILE;
 use super::interruption::Interruption;
+use super::schedule::Schedule;
 
 /// Configuration of a training run, for any network.
 #[derive(Debug, Clone)]
@@ -19,6 +20,8 @@ pub struct RunConfig {
     pub batch: usize,
     /// Highest learning rate.
     pub learning_rate: f64,
+    /// Course of the learning rate.
+    pub schedule: Schedule,
     /// Constants of the optimizer.
     pub optimizer: AdamWConfig,
     /// Seed of parameters, order and augmentation.
@@ -46,6 +49,7 @@ impl RunConfig {
             length,
             batch: 1,
             learning_rate: 1e-3,
+            schedule: Schedule::default(),
             optimizer: AdamWConfig::default(),
             seed: 0,
             device: Device::Cpu,

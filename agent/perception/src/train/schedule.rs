@@ -1,4 +1,4 @@
-//! Learning-rate schedule: one cycle (Smith), up and down along a cosine.
+//! Learning-rate schedules: one cycle (Smith), up and down along a cosine; or a held rate that falls at the end.
 
 use std::f64::consts::PI;
 
@@ -8,6 +8,35 @@ const RISE: f64 = 0.1;
 const START: f64 = 0.04;
 /// Final learning rate, relative to its peak.
 const END: f64 = 1e-3;
+
+/// Share of the training after which a held rate falls.
+const HELD: f64 = 0.8;
+/// Share of the training in which a held rate rises.
+const HELD_RISE: f64 = 0.02;
+
+/// Course of the learning rate over a training.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Schedule {
+    /// Up in a tenth of the training, then down.
+    #[default]
+    OneCycle,
+    /// At its peak for four fifths of the training, then down.
+    HeldRate,
+}
+
+impl Schedule {
+    /// The learning rate with this peak when a share of the training is done, 0..1.
+    pub fn rate(self, peak: f64, progress: f64) -> f64 {
+        match self {
+            Self::OneCycle => one_cycle(peak, progress),
+            Self::HeldRate if progress < HELD => peak * (progress / HELD_RISE).clamp(START, 1.0),
+            Self::HeldRate => {
+                let share = ((progress - HELD) / (1.0 - HELD)).min(1.0);
+                peak * (END + (1.0 - END) * (1.0 + (PI * share).cos()) / 2.0)
+            }
+        }
+    }
+}
 
 /// The learning rate of one cycle up to `peak` when a share of the training is done, 0..1.
 pub fn one_cycle(peak: f64, progress: f64) -> f64 {
@@ -34,5 +63,13 @@ mod tests {
         assert!((at(7.0) - at(1.0)).abs() < 1e-12);
         let falling: Vec<f64> = (2..=20).map(|step| at(f64::from(step) / 20.0)).collect();
         assert!(falling.is_sorted_by(|a, b| a > b));
+    }
+
+    #[test]
+    fn a_held_rate_stays_at_the_peak_for_four_fifths() {
+        let at = |share: f64| Schedule::HeldRate.rate(2e-3, share);
+        assert_eq!((at(0.0), at(0.1), at(0.79)), (8e-5, 2e-3, 2e-3));
+        assert!((at(0.9) - 1e-3).abs() < 1e-5);
+        assert!((at(1.0) - 2e-6).abs() < 1e-12 && at(2.0) == at(1.0));
     }
 }

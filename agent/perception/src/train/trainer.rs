@@ -18,7 +18,6 @@ use super::data_listing::DataListing;
 use super::error::TrainingError;
 use super::interruption::Steps;
 use super::run_config::RunConfig;
-use super::schedule::one_cycle;
 use crate::weights::{self, CONFIG_KEY, KIND_KEY};
 
 /// Number of gradients in a row that are not finite after which a training fails.
@@ -169,7 +168,7 @@ impl Trainer {
 
     /// The learning rate when a share is done.
     pub fn learning_rate(&self, share_done: f64) -> f64 {
-        one_cycle(self.run.learning_rate, share_done)
+        self.run.schedule.rate(self.run.learning_rate, share_done)
     }
 
     /// Descends along the gradient of `loss`, or skips the step if that is not finite. True if the step was taken.

@@ -3,14 +3,17 @@
 use tch::nn;
 use tch::{Kind, TchError, Tensor};
 
-use super::config::DiffLocConfig;
+use super::network::{HEADS, WIDTH as FEATURES};
 use super::transformer::{NORM_EPS, TransformerLayer};
 use crate::baselines::layers::LayerNorm;
+use crate::baselines::place_classes::POSE;
 use crate::pgc::dense::Dense;
 use perception::tensor_values::tensor;
 
-/// Numbers of a pose: position in units of the training positions' deviation, cosine and sine of the heading.
-pub(super) const POSE: i64 = 5;
+/// Channels.
+const WIDTH: i64 = 192;
+/// Layers.
+const LAYERS: usize = 2;
 /// Frequencies of the harmonic embedding of a pose.
 const HARMONICS: i64 = 10;
 /// Channels of the embedding of the step.
@@ -51,23 +54,22 @@ impl PoseDenoiser {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Result<Self, TchError> {
-        let width = config.denoiser_width;
-        let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + config.width + 1;
+    pub fn new(path: &nn::Path<'_>) -> Result<Self, TchError> {
+        let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + FEATURES + 1;
         let layer = |number: usize| {
             let path = path / "layers" / number;
-            TransformerLayer::new(&path, width, config.heads, EXPANSION, 0.0)
+            TransformerLayer::new(&path, WIDTH, HEADS, EXPANSION, 0.0)
         };
         let half = STEP_CHANNELS / 2;
         let harmonics = (0..HARMONICS).map(|power| (1_u32 << power) as f32);
         let of_step = (0..half).map(|k| LONGEST.powf(-(k as f64) / half as f64) as f32);
         let table = |values: &[f32]| tensor(values, &[-1], path.device());
         Ok(Self {
-            inward: Dense::new(&(path / "inward"), inputs, width, 0.7),
-            layers: (0..config.denoiser_layers).map(layer).collect(),
-            norm: LayerNorm::new(&(path / "norm"), width, NORM_EPS),
+            inward: Dense::new(&(path / "inward"), inputs, WIDTH, 0.7),
+            layers: (0..LAYERS).map(layer).collect(),
+            norm: LayerNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
             outward: [
-                Dense::new(&(path / "outward" / 0), width, LAST, 1.0),
+                Dense::new(&(path / "outward" / 0), WIDTH, LAST, 1.0),
                 Dense::new(&(path / "outward" / 1), LAST, POSE, 0.1),
             ],
             frequencies: table(&harmonics.collect::<Vec<_>>())?,
@@ -75,7 +77,7 @@ impl PoseDenoiser {
         })
     }
 
-    /// Velocity `[W, F, POSE]` of noisy `poses` of the same shape at steps `[W]`, from the features `[W, F, width]` of
+    /// Velocity `[W, F, POSE]` of noisy `poses` of the same shape at steps `[W]`, from the features `[W, F, C]` of
     /// their sweeps, oldest first; single precision throughout.
     ///
     /// # Errors

@@ -1,31 +1,22 @@
-//! DiffLoc (Li et al. 2024), small: pose regression of a sweep by denoising diffusion, on features of its range image.
+//! DiffLoc (Li et al. 2024), small: pose regression of a sweep by denoising diffusion, on tokens of PGC's frozen encoder.
 //!
-//! A range image ([`RangeImageConfig`]) becomes tokens, a transformer describes them, and a mask weighs the tokens of
-//! static objects twice ([`SweepEncoder`]). The denoiser ([`PoseDenoiser`]) removes the noise from the poses of up
-//! to three sweeps by their features, and a pose is found from noise in ten steps ([`NoiseSchedule::denoise`]).
+//! A transformer describes the tokens of a sweep, and a mask weighs those of static objects twice. The denoiser
+//! ([`PoseDenoiser`]) removes the noise from the poses of up to three sweeps by their features, and a pose is found
+//! from noise in ten steps ([`NoiseSchedule::denoise`]).
 //!
-//! Departures from the paper: a transformer of four layers of 128 channels with random weights at the start, where the
-//! paper has a foundation model of 21 million parameters; a denoiser of three layers; cosine and sine of the heading in
-//! place of a quaternion's logarithm, since vehicles head in all directions and stand upright; batch norm of the pooled
-//! features, which are nearly the same for all sweeps otherwise; the denoiser predicts the velocity instead of the
-//! noise, whose errors are amplified twelve times in the pose at the last step, and its loss is the error of the pose;
-//! noise is drawn sixteen times for each window, strong noise more often; place classification as an auxiliary loss;
-//! augmentation by turns of 20 degrees and shifts of 1 m instead of 45 degrees and up to 5 m.
+//! Departures from the paper: a transformer of two layers of 128 channels on 64 tokens of PGC's encoder, where the paper
+//! has a foundation model of images; a pose is relative to the likeliest of some hundred place classes, the true one in
+//! training, and only that is diffused; a map for each token's position in place of the mean of tokens, which would
+//! forget where they lie; cosine and sine of the heading in place of a quaternion's logarithm, since vehicles head in
+//! all directions and stand upright; the denoiser predicts the velocity instead of the noise, whose errors are
+//! amplified twelve times in the pose at the last step, and its loss is the error of the pose; noise is drawn several
+//! times for each window, strong noise more often; augmentation turns by whole sectors.
 
-mod config;
-mod context_stem;
 mod denoiser;
-mod localizer;
 mod network;
 mod noise_schedule;
-mod range_image;
-mod sweep_encoder;
 mod transformer;
 
-pub use config::DiffLocConfig;
 pub use denoiser::{PoseDenoiser, Windows};
-pub use localizer::DiffLocLocalizer;
-pub use network::DiffLoc;
+pub use network::{DescribedTokens, DiffLoc, DiffLocLocalizer};
 pub use noise_schedule::NoiseSchedule;
-pub use range_image::{CHANNELS, RangeImageConfig, UNITS};
-pub use sweep_encoder::{EncodedSweeps, SweepEncoder};

@@ -1,64 +1,114 @@
-//! The network of DiffLoc: encoder of sweeps, denoiser of poses, and the way from one to the other.
+//! The network of DiffLoc: transformer over the tokens of a sweep, denoiser of poses, and the way from one to the other.
 
+use perception::layers::convolution::Norm;
+use perception::tensor_values::tensor;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use tch::{Kind, TchError, Tensor, nn, no_grad};
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor, no_grad};
 
-use super::config::DiffLocConfig;
-use super::denoiser::{POSE, PoseDenoiser, Windows};
+use super::denoiser::{PoseDenoiser, Windows};
 use super::noise_schedule::NoiseSchedule;
-use super::sweep_encoder::SweepEncoder;
-use crate::pgc::LocalizerError;
-use perception::tensor_values::tensor;
+use super::transformer::{NORM_EPS, TransformerLayer};
+use crate::baselines::layers::LayerNorm;
+use crate::baselines::place_classes::{POSE, PlaceClasses, PlaceHead};
+use crate::baselines::regressed_pose::{PoseRegressor, RegressPose};
+use crate::baselines::tokens::TOKENS;
+use crate::pgc::dense::Dense;
 
+/// Channels of a token.
+const TOKEN_WIDTH: i64 = 128;
+/// Layers over tokens.
+const LAYERS: usize = 2;
+/// Attention heads.
+pub(super) const HEADS: i64 = 4;
+/// Channels of the perceptrons, relative to those of a token.
+const EXPANSION: i64 = 4;
+/// Share of samples for which the last layer is skipped in training.
+const DROP_PATH: f64 = 0.1;
+/// Channels of a sweep.
+pub(super) const WIDTH: i64 = 256;
 /// Steps from noise to poses.
 const DENOISING_STEPS: usize = 10;
 /// Seed of the noise that every search starts from.
 const START_SEED: u64 = 7;
 
-/// Encoder and denoiser of one scene.
+/// A DiffLoc network of one scene, for single sweeps, output of `agent train diffloc`.
+pub type DiffLocLocalizer = PoseRegressor<DiffLoc>;
+
+/// Transformer and denoiser of one scene.
 #[derive(Debug)]
 pub struct DiffLoc {
-    config: DiffLocConfig,
-    encoder: SweepEncoder,
+    inward: Dense,
+    positions: Tensor,
+    layers: Vec<TransformerLayer>,
+    norm: LayerNorm,
+    mask: Dense,
+    outward: Dense,
+    sweep_norm: Norm,
+    head: PlaceHead,
     /// Denoiser of poses.
     pub denoiser: PoseDenoiser,
     /// Noise schedule.
     pub schedule: NoiseSchedule,
 }
 
+/// Described sweeps, single precision.
+#[derive(Debug)]
+pub struct DescribedTokens {
+    /// `[N, WIDTH]`.
+    pub features: Tensor,
+    /// `[N, K]`: logits of the place classes.
+    pub places: Tensor,
+    /// `[N, TOKENS]`: logit that a token shows static objects.
+    pub static_logits: Tensor,
+}
+
 impl DiffLoc {
-    /// Builds the layers below `path`.
-    ///
-    /// # Errors
-    /// [`LocalizerError::Config`] names the field that is wrong; those of the tensor library.
-    pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Result<Self, LocalizerError> {
-        config.validate()?;
-        Ok(Self {
-            config: config.clone(),
-            encoder: SweepEncoder::new(&(path / "encoder"), config),
-            denoiser: PoseDenoiser::new(&(path / "denoiser"), config)?,
-            schedule: NoiseSchedule::new(path.device())?,
-        })
-    }
-
-    /// Configuration that it was built from.
-    pub fn config(&self) -> &DiffLocConfig {
-        &self.config
-    }
-
-    /// Encoder of range images.
-    pub fn encoder(&self) -> &SweepEncoder {
-        &self.encoder
-    }
-
-    /// Normalised poses `[W, F, 5]` (position in deviations from the mean, cosine and sine of the heading) of sweeps
-    /// with features `[W, F, width]`, oldest first; without gradients. The same features give the same poses.
+    /// Describes sweeps with tokens `[N, TOKENS, channels]`; products are computed in `kind`.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn poses(&self, features: &Tensor, windows: Windows<'_>) -> Result<Tensor, TchError> {
+    pub fn describe(
+        &self,
+        tokens: &Tensor,
+        kind: Kind,
+        train: bool,
+    ) -> Result<DescribedTokens, TchError> {
+        let x = self.inward.forward(&tokens.f_to_kind(kind)?)?;
+        let x = x.f_add(&self.positions.f_to_kind(kind)?)?;
+        let mut layers = self.layers.iter();
+        let x = layers.try_fold(x, |x, layer| layer.forward(&x, None, train))?;
+        let x = self.norm.forward(&x)?;
+        let logits = self.mask.forward(&x)?;
+        let weighted = x.f_add(&x.f_mul(&logits.f_sigmoid()?)?)?;
+        let features = self.outward.forward(&weighted.f_flatten(1, 2)?)?;
+        let features = self
+            .sweep_norm
+            .forward(&features.f_to_kind(Kind::Float)?, train);
+        let features = features.f_relu()?;
+        Ok(DescribedTokens {
+            places: self.head.classify(&features)?,
+            static_logits: logits.f_squeeze_dim(2)?.f_to_kind(Kind::Float)?,
+            features,
+        })
+    }
+
+    /// What the denoiser sees of sweeps with `features` `[N, WIDTH]` in `classes` `[N]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn of_class(&self, features: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+        self.head.of_class(features, classes)
+    }
+
+    /// Poses `[W, F, 5]` relative to their classes of sweeps with features [of their classes](Self::of_class)
+    /// `[W, F, WIDTH]`, oldest first; without gradients. The same features give the same poses.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn denoised(&self, features: &Tensor, windows: Windows<'_>) -> Result<Tensor, TchError> {
         let (count, frames, _) = features.size3()?;
         let device = features.device();
         let mut random = ChaCha8Rng::seed_from_u64(START_SEED);
@@ -70,5 +120,46 @@ impl DiffLoc {
             self.denoiser.forward(noisy, &steps, features, windows)
         };
         no_grad(|| self.schedule.denoise(&start, DENOISING_STEPS, velocity))
+    }
+}
+
+impl RegressPose for DiffLoc {
+    const KIND: &'static str = "DiffLoc";
+
+    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> Result<Self, TchError> {
+        let layer = |number: usize| {
+            let drop_path = DROP_PATH * number as f64 / (LAYERS - 1) as f64;
+            let path = path / "layers" / number;
+            TransformerLayer::new(&path, TOKEN_WIDTH, HEADS, EXPANSION, drop_path)
+        };
+        let (mean, stdev) = (0.0, 0.02);
+        let (size, random) = ([TOKENS, TOKEN_WIDTH], Init::Randn { mean, stdev });
+        let all = TOKENS * TOKEN_WIDTH;
+        Ok(Self {
+            inward: Dense::new(&(path / "inward"), channels, TOKEN_WIDTH, 0.7),
+            positions: path.var("positions", &size, random),
+            layers: (0..LAYERS).map(layer).collect(),
+            norm: LayerNorm::new(&(path / "norm"), TOKEN_WIDTH, NORM_EPS),
+            mask: Dense::new(&(path / "mask"), TOKEN_WIDTH, 1, 0.1),
+            outward: Dense::new(&(path / "outward"), all, WIDTH, 0.7),
+            sweep_norm: Norm::with_defaults(&(path / "sweep_norm"), WIDTH),
+            head: PlaceHead::new(&(path / "head"), WIDTH, classes),
+            denoiser: PoseDenoiser::new(&(path / "denoiser"))?,
+            schedule: NoiseSchedule::new(path.device())?,
+        })
+    }
+
+    /// Each sweep is alone in its window.
+    fn poses(
+        &self,
+        tokens: &Tensor,
+        places: &PlaceClasses,
+        kind: Kind,
+    ) -> Result<Tensor, TchError> {
+        let described = self.describe(tokens, kind, false)?;
+        let classes = described.places.f_argmax(1, false)?;
+        let features = self.of_class(&described.features, &classes)?;
+        let found = self.denoised(&features.f_unsqueeze(1)?, Windows::Single)?;
+        places.absolute(&found.f_squeeze_dim(1)?, &classes)
     }
 }

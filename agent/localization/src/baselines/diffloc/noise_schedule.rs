@@ -7,7 +7,7 @@ use tch::{Device, TchError, Tensor};
 const STEPS: usize = 100;
 /// Variance that the first and the last step add; it grows linearly between them.
 const BETAS: [f64; 2] = [1e-4, 0.1];
-/// Largest magnitude of a predicted pose, in deviations of the training poses.
+/// Largest magnitude of a predicted pose, in the units of a pose relative to its class.
 const LIMIT: f64 = 4.0;
 
 /// Shares of signal and noise at each step.

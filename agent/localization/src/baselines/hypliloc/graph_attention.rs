@@ -3,8 +3,8 @@
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor, no_grad};
 
-use super::dense_norm::TokenLayer;
 use super::poincare::{expmap0, logmap0};
+use super::token_layer::TokenLayer;
 
 /// Heads of the attention.
 const HEADS: i64 = 8;
@@ -31,7 +31,7 @@ impl GraphAttention {
     pub(super) fn plain(path: &nn::Path<'_>, channels: i64) -> Self {
         Self {
             metric: None,
-            layer: TokenLayer::new(path, channels),
+            layer: TokenLayer::new(path, [channels; 2]),
             space: Space::Euclidean,
         }
     }

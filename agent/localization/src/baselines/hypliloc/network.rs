@@ -1,106 +1,129 @@
-//! Network: two branches, two fusions with blocks of each modality between them, three heads.
+//! Network: two branches, two fusions with blocks of each modality between them, three poses.
 
-use perception::layers::residual::ResidualBlock;
-use tch::{Kind, TchError, Tensor, nn};
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor, no_grad};
 
-use super::dense_norm::TokenLayer;
+use super::branch::Branch;
 use super::fusion::{Fusion, normalise};
 use super::graph_attention::{GraphAttention, Space};
-use super::image_branch::ImageBranch;
-use super::point_branch::PointBranch;
-use super::pose_head::{NormalisedPoses, PoseHead};
-use super::sweep_input::InputBatch;
+use super::panorama::{CircularLayer, panorama};
+use super::token_layer::TokenLayer;
+use crate::baselines::place_classes::PlaceClasses;
+use crate::baselines::regressed_pose::{PoseRegressor, RegressPose};
+use crate::baselines::tokens::{RINGS, SECTORS, TOKENS};
 
 /// Channels of a token.
-pub const WIDTH: i64 = 256;
+pub(super) const WIDTH: i64 = 128;
 
-/// Poses from the tokens of each branch.
-#[derive(Debug)]
-pub struct BranchPoses {
-    /// Each `[S, WIDTH]`: features from which the poses of points, image and fusion come.
-    pub features: [Tensor; 3],
-    /// From points alone.
-    pub points: NormalisedPoses,
-    /// From the image alone.
-    pub image: NormalisedPoses,
-    /// From both, the result.
-    pub fusion: NormalisedPoses,
-}
+/// A HypLiLoc network of one scene, output of `agent train hypliloc`.
+pub type HypLiLocLocalizer = PoseRegressor<HypLiLoc>;
 
 /// The network of one scene.
 #[derive(Debug)]
 pub struct HypLiLoc {
-    points: PointBranch,
-    image: ImageBranch,
+    inward: TokenLayer,
+    positions: Tensor,
+    attention: GraphAttention,
+    panorama: [CircularLayer; 2],
     first: Fusion,
     /// Block of the tokens of points.
     point_block: (TokenLayer, GraphAttention, TokenLayer),
-    /// Block of the tokens of the image.
-    image_block: Vec<ResidualBlock>,
+    /// Block of the columns of the panorama.
+    panorama_block: CircularLayer,
     second: Fusion,
-    heads: [PoseHead; 3],
+    /// From points, panorama and fusion, the result.
+    pub branches: [Branch; 3],
+    /// `[3, 2]`: logarithms of the variances of position and heading of each branch, the weights of their losses.
+    pub log_variances: Tensor,
 }
 
 impl HypLiLoc {
-    /// Builds the layers below `path`.
-    pub fn new(path: &nn::Path<'_>) -> Self {
-        let block = path / "point_block";
-        Self {
-            points: PointBranch::new(&(path / "points")),
-            image: ImageBranch::new(&(path / "image")),
-            first: Fusion::new(&(path / "first_fusion")),
-            point_block: (
-                TokenLayer::new(&(&block / 0), WIDTH),
-                GraphAttention::with_metric(&(&block / 1), WIDTH, Space::Euclidean),
-                TokenLayer::new(&(&block / 2), WIDTH),
-            ),
-            image_block: ResidualBlock::chain(&(path / "image_block"), [WIDTH, WIDTH], 1, 1),
-            second: Fusion::new(&(path / "second_fusion")),
-            heads: ["points", "image", "fusion"]
-                .map(|name| PoseHead::new(&(path / "heads" / name))),
-        }
-    }
+    /// Logarithms of the variances at the start: an error of the heading counts as ten of the position.
+    pub const START: [f32; 2] = [0.0, -std::f32::consts::LN_10];
 
-    /// Poses of a batch; layers of points and image compute in `kind`, `train` as in batch normalisation.
+    /// Features of sweeps with tokens `[S, TOKENS, channels]` for each branch; layers of tokens compute in `kind`.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn forward(
+    pub fn features(
         &self,
-        batch: &InputBatch,
+        tokens: &Tensor,
         kind: Kind,
         train: bool,
-    ) -> Result<BranchPoses, TchError> {
-        let points = self.points.forward(batch, kind, train)?;
-        let map = self.image.forward(&batch.ranges_m, kind, train)?;
-        let tokens_of = |map: &Tensor| map.f_flatten(2, 3)?.f_transpose(1, 2);
-        let image = tokens_of(&map)?;
-        let (count, cells) = (points.size()[1], image.size()[1]);
+    ) -> Result<[Tensor; 3], TchError> {
+        let tokens = tokens.f_to_kind(kind)?;
+        let single = |of: Tensor| of.f_to_kind(Kind::Float);
+        let points = single(self.inward.forward(&tokens)?)?.f_add(&self.positions)?;
+        let points = self.attention.forward(&points)?;
+        let mut layers = self.panorama.iter();
+        let columns = layers.try_fold(panorama(&tokens)?, |x, layer| layer.forward(&x))?;
+        let columns = single(columns)?;
 
-        let fused = self
-            .first
-            .forward(&normalise(&points)?, &normalise(&image)?)?;
+        let fused = (self.first).forward(&normalise(&points)?, &normalise(&columns)?)?;
         let (inward, attention, outward) = &self.point_block;
-        let fused_points = inward.forward(&fused.f_narrow(1, 0, count)?)?;
-        let fused_points = outward.forward(&attention.forward(&fused_points)?)?;
-        let fused_map = fused.f_narrow(1, count, cells)?.f_transpose(1, 2)?;
-        let fused_map = fused_map.f_reshape(map.size().as_slice())?;
-        let fused_map = ResidualBlock::through(&self.image_block, fused_map, train);
-        let fused = self
-            .second
-            .forward(&fused_points, &tokens_of(&fused_map)?)?;
+        let of_points = inward.forward(&fused.f_narrow(1, 0, TOKENS)?)?;
+        let of_points = outward.forward(&attention.forward(&of_points)?)?;
+        let of_columns = self
+            .panorama_block
+            .forward(&fused.f_narrow(1, TOKENS, SECTORS)?)?;
+        let fused = self.second.forward(&of_points, &of_columns)?;
 
-        let [point_head, image_head, fusion_head] = &self.heads;
-        let features = [
-            point_head.features(&points, train)?,
-            image_head.features(&image, train)?,
-            fusion_head.features(&fused, train)?,
-        ];
-        Ok(BranchPoses {
-            points: point_head.forward(&features[0])?,
-            image: image_head.forward(&features[1])?,
-            fusion: fusion_head.forward(&features[2])?,
-            features,
+        let [of_points, of_columns, of_both] = &self.branches;
+        Ok([
+            of_points.features(&points.f_to_kind(kind)?, train)?,
+            of_columns.features(&columns.f_to_kind(kind)?, train)?,
+            of_both.features(&fused.f_to_kind(kind)?, train)?,
+        ])
+    }
+}
+
+impl RegressPose for HypLiLoc {
+    const KIND: &'static str = "HypLiLoc";
+
+    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> Result<Self, TchError> {
+        let block = path / "point_block";
+        let layer = |number: usize| TokenLayer::new(&(&block / number), [WIDTH; 2]);
+        let circular = |name: &str, inputs| CircularLayer::new(&(path / name), [inputs, WIDTH]);
+        let branch = |name: &str, tokens| Branch::new(&(path / "branches" / name), tokens, classes);
+        let mut log_variances = path.var("log_variances", &[3, 2], Init::Const(0.0));
+        let start = Tensor::from_slice(&Self::START);
+        no_grad(|| log_variances.f_copy_(&start))?;
+        let (mean, stdev) = (0.0, 0.1);
+        Ok(Self {
+            inward: TokenLayer::new(&(path / "inward"), [channels, WIDTH]),
+            positions: path.var("positions", &[TOKENS, WIDTH], Init::Randn { mean, stdev }),
+            attention: GraphAttention::plain(&(path / "attention"), WIDTH),
+            panorama: [
+                circular("panorama0", RINGS * channels),
+                circular("panorama1", WIDTH),
+            ],
+            first: Fusion::new(&(path / "first_fusion")),
+            point_block: (
+                layer(0),
+                GraphAttention::with_metric(&(&block / 1), WIDTH, Space::Euclidean),
+                layer(2),
+            ),
+            panorama_block: circular("panorama_block", WIDTH),
+            second: Fusion::new(&(path / "second_fusion")),
+            branches: [
+                branch("points", TOKENS),
+                branch("panorama", SECTORS),
+                branch("fusion", TOKENS + SECTORS + 2),
+            ],
+            log_variances,
         })
+    }
+
+    /// The class and the pose of the fusion.
+    fn poses(
+        &self,
+        tokens: &Tensor,
+        places: &PlaceClasses,
+        kind: Kind,
+    ) -> Result<Tensor, TchError> {
+        let [.., features] = self.features(tokens, kind, false)?;
+        let [.., fusion] = &self.branches;
+        let classes = fusion.classify(&features)?.f_argmax(1, false)?;
+        places.absolute(&fusion.poses(&features, &classes)?, &classes)
     }
 }

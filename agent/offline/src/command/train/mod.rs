@@ -1,12 +1,12 @@
 //! `agent train`: the two stages of PGC, and the baselines.
 
-mod diffloc;
 mod encoder;
-mod hypliloc;
 pub(super) mod options;
+mod pose_regression;
 mod scene;
 mod sgloc;
 
+use agent_offline::training::{train_diffloc, train_hypliloc};
 use anyhow::Context;
 use bus::malloc_settings;
 use clap::Subcommand;
@@ -24,10 +24,18 @@ enum Stage {
     Scene(scene::Args),
     #[command(name = "sgloc")]
     SgLoc(sgloc::Args),
+    /// Train DiffLoc, a baseline of the localizer, on one scene, on a frozen encoder; writes checkpoint, curve.csv,
+    /// weights.safetensors and model-card.md.
+    ///
+    /// Tokens of all sweeps lie on the device: 18 kB for each. A length in minutes begins when they are computed.
     #[command(name = "diffloc")]
-    DiffLoc(diffloc::Args),
+    DiffLoc(pose_regression::Args),
+    /// Train HypLiLoc, a baseline of the localizer, on one scene, on a frozen encoder; writes checkpoint, curve.csv,
+    /// weights.safetensors and model-card.md.
+    ///
+    /// Tokens of all sweeps lie on the device: 18 kB for each. A length in minutes begins when they are computed.
     #[command(name = "hypliloc")]
-    HypLiLoc(hypliloc::Args),
+    HypLiLoc(pose_regression::Args),
 }
 
 /// Runs the chosen stage.
@@ -38,7 +46,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),
         Stage::SgLoc(args) => sgloc::run(args),
-        Stage::DiffLoc(args) => diffloc::run(args),
-        Stage::HypLiLoc(args) => hypliloc::run(args),
+        Stage::DiffLoc(args) => pose_regression::run(args, "DiffLoc", train_diffloc),
+        Stage::HypLiLoc(args) => pose_regression::run(args, "HypLiLoc", train_hypliloc),
     }
 }

@@ -19,27 +19,6 @@ pub(crate) struct SceneSweeps {
     pub(crate) scene_name: String,
 }
 
-/// Random turns of the sensor.
-#[derive(Debug, clap::Args)]
-pub(crate) struct SensorTurns {
-    /// Largest random turn of the sensor to either side, degrees; vehicles in lanes head as those of the training.
-    #[arg(long, value_name = "DEG", default_value_t = 20.0)]
-    pub(crate) turn_deg: f64,
-}
-
-impl SensorTurns {
-    /// The largest turn, radians; an impossible one is a usage error.
-    pub(crate) fn largest_rad(&self) -> anyhow::Result<f64> {
-        let turn_deg = self.turn_deg;
-        if !(0.0..=180.0).contains(&turn_deg) {
-            return Err(bad(&format!(
-                "--turn-deg is {turn_deg}, must be 0 to 180 degrees"
-            )));
-        }
-        Ok(turn_deg.to_radians())
-    }
-}
-
 /// Error with exit code 2.
 pub(crate) fn bad(reason: &str) -> anyhow::Error {
     BadInput::new(reason.to_owned()).into()

@@ -1,0 +1,34 @@
+//! Panorama: the tokens of a sweep as a circular image of one row, its rings as channels.
+
+use tch::nn;
+use tch::{TchError, Tensor};
+
+use super::token_layer::TokenLayer;
+use crate::baselines::tokens::{RINGS, SECTORS};
+
+/// `[S, SECTORS, RINGS * C]` of tokens `[S, TOKENS, C]`.
+pub(super) fn panorama(tokens: &Tensor) -> Result<Tensor, TchError> {
+    let (sweeps, _, channels) = tokens.size3()?;
+    tokens
+        .f_view([sweeps, RINGS, SECTORS, channels])?
+        .f_transpose(1, 2)?
+        .f_reshape([sweeps, SECTORS, RINGS * channels])
+}
+
+/// Circular convolution over three columns, layer norm and ReLU.
+#[derive(Debug)]
+pub(super) struct CircularLayer(TokenLayer);
+
+impl CircularLayer {
+    /// Builds the layer below `path`.
+    pub(super) fn new(path: &nn::Path<'_>, [inputs, outputs]: [i64; 2]) -> Self {
+        Self(TokenLayer::new(path, [3 * inputs, outputs]))
+    }
+
+    /// `[S, SECTORS, C]` to `[S, SECTORS, C']`, in the precision of the columns.
+    pub(super) fn forward(&self, columns: &Tensor) -> Result<Tensor, TchError> {
+        let beside = |shift: i64| columns.f_roll(shift, 1);
+        let three = [beside(1)?, columns.shallow_clone(), beside(-1)?];
+        self.0.forward(&Tensor::f_cat(&three, 2)?)
+    }
+}

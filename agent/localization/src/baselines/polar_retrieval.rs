@@ -1,0 +1,181 @@
+//! Retrieval by polar descriptors: the pose of the training sweep that looks most alike in any direction of the sensor.
+
+use std::f64::consts::TAU;
+use std::fmt::Debug;
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use protocol::{NoPoseReason, PointCloud};
+use support::stage_times::StageTimes;
+use tch::{Kind, TchError, Tensor};
+
+use super::regressed_pose::{PoseRegressor, RegressPose, localization, no_pose};
+use super::tokens::{RINGS, SECTORS};
+use crate::pgc::localization::{ENCODE, SOLVE};
+use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
+use perception::tensor_values::tensor;
+
+/// Describes sweeps by direction.
+pub trait DescribePolar: Debug + Send {
+    /// `[sectors, D]`, counter-clockwise from the rear; `None` for a sweep that shows too little.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    fn polar(&self, cloud: &PointCloud, times: &mut StageTimes)
+    -> Result<Option<Tensor>, TchError>;
+}
+
+/// Scan Context (Kim and Kim 2018): the greatest height of points in 20 rings and 60 sectors.
+#[derive(Debug, Clone, Copy)]
+pub struct ScanContext;
+
+impl ScanContext {
+    const SECTORS: usize = 60;
+    const RINGS: usize = 20;
+    const RANGE_M: f32 = 80.0;
+    /// Height of the sensor, metres: the ground is near 0.
+    const SENSOR_M: f32 = 2.0;
+
+    fn heights(cloud: &PointCloud) -> Vec<f32> {
+        let mut heights = vec![0_f32; Self::SECTORS * Self::RINGS];
+        for &[x, y, z, _] in &cloud.xyzi {
+            let ring = (x.hypot(y) / Self::RANGE_M * Self::RINGS as f32) as usize;
+            let turn = f64::from(y.atan2(x)) / TAU + 0.5;
+            let sector = ((turn * Self::SECTORS as f64) as usize).min(Self::SECTORS - 1);
+            if ring < Self::RINGS && z.is_finite() {
+                let height = &mut heights[sector * Self::RINGS + ring];
+                *height = height.max(z + Self::SENSOR_M);
+            }
+        }
+        heights
+    }
+}
+
+impl DescribePolar for ScanContext {
+    fn polar(
+        &self,
+        cloud: &PointCloud,
+        times: &mut StageTimes,
+    ) -> Result<Option<Tensor>, TchError> {
+        let heights = Self::heights(cloud);
+        let device = tch::Device::Cpu;
+        let described = heights.iter().any(|&height| height > 0.0);
+        times.lap(ENCODE);
+        described
+            .then(|| tensor(&heights, &[-1, Self::RINGS as i64], device))
+            .transpose()
+    }
+}
+
+impl<N: RegressPose> DescribePolar for PoseRegressor<N> {
+    /// Tokens, ring beside ring.
+    fn polar(
+        &self,
+        cloud: &PointCloud,
+        times: &mut StageTimes,
+    ) -> Result<Option<Tensor>, TchError> {
+        let by_sector = |tokens: Tensor| {
+            let rings = tokens.f_view([RINGS, SECTORS, -1])?;
+            rings.f_transpose(0, 1)?.f_reshape([SECTORS, -1])
+        };
+        self.tokens(cloud, times)?.map(by_sector).transpose()
+    }
+}
+
+/// Sweeps with poses, described by direction.
+#[derive(Debug)]
+pub struct PolarRetrieval {
+    describe: Box<dyn DescribePolar>,
+    /// `[N, sectors * D]`: each sector of length 1, or 0 if nothing is there.
+    descriptors: Tensor,
+    world_from_sensor: Vec<Isometry3<f64>>,
+}
+
+impl PolarRetrieval {
+    /// Retrieval from sweeps `[sectors, D]` that were described alike.
+    ///
+    /// # Errors
+    /// Those of the tensor library, also where there is none.
+    pub fn new(
+        describe: Box<dyn DescribePolar>,
+        sweeps: Vec<(Tensor, Isometry3<f64>)>,
+    ) -> Result<Self, TchError> {
+        let (descriptors, world_from_sensor): (Vec<_>, Vec<_>) = sweeps.into_iter().unzip();
+        let rows = descriptors.iter().map(|of| normalised(of)?.f_view([-1]));
+        let rows: Vec<Tensor> = rows.collect::<Result<_, _>>()?;
+        Ok(Self {
+            describe,
+            descriptors: Tensor::f_stack(&rows, 0)?,
+            world_from_sensor,
+        })
+    }
+
+    /// Pose of a sensor whose sweep is described so: that of the sweep with the greatest mean cosine of sectors, turned.
+    fn nearest(&self, descriptor: &Tensor) -> Result<Isometry3<f64>, TchError> {
+        let descriptor = normalised(descriptor)?;
+        let sectors = descriptor.size()[0];
+        let turned = (0..sectors).map(|turn| descriptor.f_roll(turn, 0)?.f_view([-1]));
+        let turned: Vec<Tensor> = turned.collect::<Result<_, _>>()?;
+        let alike = self.descriptors.f_matmul(&Tensor::f_stack(&turned, 1)?)?;
+        let best = alike.f_argmax(None, false)?.f_int64_value(&[])?;
+        let (row, turn) = (best / sectors, best % sectors);
+        let angle = turn as f64 / sectors as f64 * TAU;
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle);
+        Ok(self.world_from_sensor[row as usize] * turn)
+    }
+}
+
+fn normalised(descriptor: &Tensor) -> Result<Tensor, TchError> {
+    let length = descriptor
+        .f_square()?
+        .f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+    descriptor.f_div(&length.f_sqrt()?.f_clamp_min(1e-6)?)
+}
+
+impl Localize for PolarRetrieval {
+    /// Every pose has full confidence: nothing tells a good one from a bad one.
+    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        let mut times = stopwatch();
+        let Some(descriptor) = self.describe.polar(sweep.cloud, &mut times)? else {
+            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+        };
+        let pose = self.nearest(&descriptor)?;
+        times.lap(SOLVE);
+        Ok(localization(Some(pose), times))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Posts of several heights, each before a low wall, around a sensor that has turned by an angle.
+    fn sweep(heights: [f32; 3], turn: f64) -> PointCloud {
+        let post = |(number, height): (usize, f32)| {
+            let (sin, cos) = (number as f64 * 1.9 + 0.25 - turn).sin_cos();
+            let range = 11.0 + 9.0 * number as f64;
+            let at = |range: f64, z| [(range * cos) as f32, (range * sin) as f32, z, 0.1];
+            [at(range, height), at(range + 20.0, 0.5)]
+        };
+        PointCloud {
+            xyzi: heights.into_iter().enumerate().flat_map(post).collect(),
+        }
+    }
+
+    #[test]
+    fn a_sweep_is_found_in_another_direction() {
+        let described = |cloud: &PointCloud| ScanContext.polar(cloud, &mut stopwatch()).unwrap();
+        let place = |x: f64| Isometry3::translation(x, 0.0, 0.0);
+        let known = [[0.0, 2.0, 0.5], [3.0, 1.0, 4.0]].map(|heights| sweep(heights, 0.0));
+        let known = known.iter().zip([20.0, 10.0]);
+        let known = known.map(|(cloud, x)| (described(cloud).unwrap(), place(x)));
+        let mut database = PolarRetrieval::new(Box::new(ScanContext), known.collect()).unwrap();
+        let angle = TAU / 12.0;
+        let turned = sweep([3.1, 1.0, 3.9], angle);
+        let found = database.localize(LocalizerInput::of(&turned)).unwrap();
+        let pose = found.estimate.world_from_cav().unwrap();
+        assert!((pose.translation_m[0] - 10.0).abs() < 1e-9);
+        assert!((pose.yaw_rad() - angle).abs() < 1e-6, "{}", pose.yaw_rad());
+        let empty = PolarRetrieval::new(Box::new(ScanContext), Vec::new());
+        assert!(empty.is_err() && described(&PointCloud::default()).is_none());
+    }
+}
