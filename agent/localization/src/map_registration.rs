@@ -2,9 +2,9 @@
 //!
 //! A pose that the localizer finds is registered to the planes of the place (ICP, point to plane). Points above the
 //! ground decide: at a wrong pose the ground fits too. Where enough of them have a partner the registered pose takes the
-//! place of the localizer's; where next to none has, the pose is rejected; between the two the localizer's pose stays,
-//! as where the map has no planes. A sweep with a predicted pose is registered to it first, and the localizer is asked
-//! only if that fails.
+//! place of the localizer's. Where too few have, or the map has no planes, a pose of which the localizer is sure stays
+//! and another one is rejected: fog leaves as few partners at a right pose as at a wrong one. A sweep with a predicted
+//! pose is registered to it first, and the localizer is asked only if that fails.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -23,8 +23,8 @@ use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, register};
 pub(crate) const REGISTER: &str = "pose register";
 /// Least share of the points above the ground with a partner, with which a registered pose is taken.
 const CONFIRMED: f64 = 0.2;
-/// Share below which a pose is rejected.
-const CONTRADICTED: f64 = 0.1;
+/// Confidence of the localizer with which a pose stays that the map does not confirm.
+const SURE: f64 = 0.8;
 /// Largest distance of a registered pose from its start, metres: a step beyond is no refinement.
 const MOST_MOVED_M: f64 = 1.5;
 /// Factor on the standard deviations of a registration: distances of neighbouring points to the planes are correlated,
@@ -92,10 +92,10 @@ impl Localize for MapRegistration {
         localization.times.add(REGISTER, registering);
         let published = localization.found.filter(|found| !found.is_rejected);
         if let Some(found) = published {
-            if let Some(fit) = self.fit(&source, &found.world_from_sensor) {
-                let registered = registered(&fit, self.map.covariance_scale());
-                localization = judged(localization, &found, &fit, registered);
-            }
+            let fit = self.fit(&source, &found.world_from_sensor);
+            let confirmed = fit.filter(|fit| fit.overlap_above_ground >= CONFIRMED);
+            let registered = confirmed.map(|fit| registered(&fit, self.map.covariance_scale()));
+            localization = judged(localization, &found, registered);
             localization.times.lap(REGISTER);
         }
         Ok(localization)
@@ -110,20 +110,19 @@ impl Localize for MapRegistration {
     }
 }
 
-/// A localization whose pose was registered.
+/// A localization of a pose that was registered if the map confirms it.
 fn judged(
     localization: Localization,
     found: &FoundPose,
-    fit: &IcpFit,
-    registered: FoundPose,
+    registered: Option<FoundPose>,
 ) -> Localization {
-    let judged = match fit.overlap_above_ground {
-        CONFIRMED.. => FoundPose {
+    let judged = match registered {
+        Some(registered) => FoundPose {
             evidence: found.evidence,
             ..registered
         },
-        CONTRADICTED.. => return localization,
-        _ => FoundPose {
+        None if found.sigma >= SURE => return localization,
+        None => FoundPose {
             is_rejected: true,
             ..*found
         },
@@ -200,7 +199,7 @@ mod tests {
     }
 
     /// The localizer that finds `start`, behind the map of the yard.
-    fn registration(start: Isometry3<f64>) -> (Box<dyn Localize>, FoundPose) {
+    fn registration(start: Isometry3<f64>, sigma: f64) -> (Box<dyn Localize>, FoundPose) {
         let (_folder, file, _) = stored();
         let found = FoundPose {
             world_from_sensor: start,
@@ -208,7 +207,7 @@ mod tests {
             cell_covariance: rows(&Matrix6::identity()),
             is_registered: false,
             covariance_scale: None,
-            sigma: 0.9,
+            sigma,
             is_rejected: false,
         };
         let place = "yard";
@@ -226,20 +225,21 @@ mod tests {
     fn points_above_the_ground_decide_whether_a_pose_is_taken_kept_or_rejected() {
         let (_folder, _, truth) = stored();
         let start = truth * Isometry3::new(Vector3::new(0.3, -0.2, 0.0), Vector3::z() * 0.01);
-        let (mut registration, found) = registration(start);
-        let mut localize = |unmapped| {
+        let localize = |sigma, unmapped| {
+            let (mut registration, found) = registration(start, sigma);
             let cloud = sweep(unmapped);
-            registration.localize(LocalizerInput::of(&cloud)).unwrap()
+            let localized = registration.localize(LocalizerInput::of(&cloud));
+            (localized.unwrap(), found)
         };
-        let taken = localize(0);
+        let (taken, _) = localize(0.5, 0);
         let pose = taken.found.unwrap();
         assert!(pose.is_registered && !pose.is_rejected && off_m(&pose, &truth) < 5e-3);
         assert!(pose.sigma > 0.999 && taken.estimate.world_from_cav().is_some());
-        // Between the thresholds the localizer's pose stays as it was.
-        let kept = localize(9_500);
+        // Of too few points with a partner a sure pose stays as it was.
+        let (kept, found) = localize(SURE, 19_000);
         assert_eq!(kept.found, Some(found));
-        assert_eq!(kept.estimate, PoseEstimate::new(start.into(), 0.9));
-        let rejected = localize(19_000);
+        assert_eq!(kept.estimate, PoseEstimate::new(start.into(), SURE as f32));
+        let (rejected, _) = localize(SURE - 0.01, 9_500);
         assert!(rejected.found.unwrap().is_rejected);
         let PoseEstimate::NoPose { reason, .. } = rejected.estimate else {
             panic!("{:?}", rejected.estimate);
@@ -251,7 +251,7 @@ mod tests {
     fn a_predicted_pose_that_the_map_confirms_needs_no_localizer() {
         let (_folder, _, truth) = stored();
         let elsewhere = Isometry3::translation(90.0, 0.0, 0.0) * truth;
-        let (mut registration, found) = registration(elsewhere);
+        let (mut registration, found) = registration(elsewhere, SURE);
         let cloud = sweep(0);
         let mut localize = |predicted: Isometry3<f64>| {
             let sweep = LocalizerInput {
@@ -273,7 +273,7 @@ mod tests {
     #[test]
     fn a_map_of_another_place_is_refused_with_both_names() {
         let (_folder, file, truth) = stored();
-        let (_, found) = registration(truth);
+        let (_, found) = registration(truth, 0.9);
         let place = "town1";
         let refused = MapRegistration::of(Box::new(Fixed { found, place }), &file).unwrap_err();
         let message = refused.to_string();

@@ -314,7 +314,7 @@ pub fn surfel_map(scratch: &Path) -> Vec<u8> {
             0.1,
         ]
     });
-    let mut target = IcpTarget::new(&SurfelMap::building());
+    let mut target = IcpTarget::new(&SurfelMap::building(0.5));
     target.add(
         &square.collect::<Vec<_>>(),
         &Isometry3::translation(100.0, 200.0, 2.0),

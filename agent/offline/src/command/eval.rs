@@ -417,7 +417,10 @@ impl Args {
             }
             fitted = Some((model, report));
         }
+        // Behind a map, the head's own poses keep the head's factors.
+        let registered = self.surfel_map.is_some();
         let samples: Vec<_> = (sweeps.iter())
+            .filter(|sweep| sweep.is_registered() == registered)
             .filter_map(EvaluatedSweep::pose_sample)
             .collect();
         let scale = CovarianceScale::fit(&samples);
@@ -576,6 +579,14 @@ fn table(summary: &LocalizationSummary) -> String {
             integrity.p50_bound_m
         )
     });
-    let lines = lines.into_iter().chain(beyond).chain(integrity);
+    let bound = summary.bound.map(|bound| {
+        let (exceeded, poses, p50_m) = (bound.exceeded, bound.poses, bound.p50_bound_m);
+        format!("bound      {exceeded} of {poses} errors exceed their bound of one in 1,000 (median {p50_m:.2} m)")
+    });
+    let lines = lines
+        .into_iter()
+        .chain(beyond)
+        .chain(integrity)
+        .chain(bound);
     lines.map(|line| line + "\n").collect()
 }

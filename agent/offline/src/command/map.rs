@@ -11,7 +11,7 @@ use bus::malloc_settings;
 use dataset::LeftOut;
 use localization::pgc::confidence::Rejection;
 use localization::pgc::head_files::{ENCODER_FILE, SURFELS_FILE, released_encoder};
-use localization::registration::icp::surfel_map::SurfelMap;
+use localization::registration::icp::surfel_map::{SurfelMap, check_voxel};
 use perception::compute_device::ComputeDevice;
 use perception::train::{ComputePrecision, Interruption, Length, ModelCard, RunConfig, check_out};
 use support::cli::{BadInput, Outcome};
@@ -53,6 +53,9 @@ pub(crate) struct Args {
     /// Distance between two sweeps of a drive in the surfel map, metres.
     #[arg(long, value_name = "M", default_value_t = 5.0)]
     surfel_spacing_m: f64,
+    /// Side of the surfel map's voxels, each of which has one plane, metres: 0.7 halves the file.
+    #[arg(long, value_name = "M", default_value_t = 0.5)]
+    surfel_voxel_m: f64,
     /// Reject as few poses as leave at most this share of wrong ones, by its upper 95 % confidence limit on held-out sweeps
     /// and their mirror images; of too few sweeps for that, as leave the smallest limit [default: reject 1 % of the right
     /// ones].
@@ -86,6 +89,7 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     check_spacing(args.surfel_spacing_m).map_err(BadInput::of)?;
+    check_voxel(args.surfel_voxel_m).map_err(BadInput::of)?;
     if args.surfels_only {
         check_folders(&args.drives)?;
         check_out(&args.out, false, args.force).map_err(BadInput::of)?;
@@ -126,7 +130,7 @@ impl Args {
     /// Writes the planes of the place beside the head.
     fn write_surfels(&self) -> anyhow::Result<LeftOut> {
         let mut left_out = LeftOut::default();
-        let config = SurfelMap::building();
+        let config = SurfelMap::building(self.surfel_voxel_m);
         let target = read_map(&self.drives, self.surfel_spacing_m, &config, &mut left_out);
         let target = target.map_err(BadInput::of)?;
         let path = self.out.join(SURFELS_FILE);

@@ -19,7 +19,7 @@ pub use table::{write_csv, write_error_table};
 use localization::covariance_scale::PoseSample;
 use localization::pgc::confidence::{Confidence, Labelled};
 use localization::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
-use localization::pose_covariance::{pose_covariance, unscaled_covariance};
+use localization::pose_covariance::{pose_covariance, position_bound_m, unscaled_covariance};
 use localization::pose_source::{NO_SOURCE, PoseInput, PoseSource};
 use nalgebra::Isometry3;
 use support::sampling::evenly_spread;
@@ -77,6 +77,13 @@ impl EvaluatedSweep {
         })
     }
 
+    /// Whether its pose was registered to a map.
+    #[must_use]
+    pub fn is_registered(&self) -> bool {
+        let found = self.localization.found;
+        found.is_some_and(|found| found.is_registered)
+    }
+
     /// Sample for the fit of a covariance: a pose that is published.
     #[must_use]
     pub fn pose_sample(&self) -> Option<PoseSample> {
@@ -93,6 +100,13 @@ impl EvaluatedSweep {
             covariance,
             ..sample
         })
+    }
+
+    /// Error in the plane of the localizer's published pose and its bound of one in 1,000, metres, if it has one.
+    fn bounded_error(&self) -> Option<(f64, f64)> {
+        let bound_m = position_bound_m(&self.localization.found?)?;
+        let [x, y, ..] = self.pose_sample()?.error;
+        Some((x.hypot(y), bound_m))
     }
 
     /// Applies another confidence model to the estimated pose.

@@ -59,22 +59,26 @@ pub struct LocalizationSummary {
     /// Share of the localizer's published poses whose error lies beyond the 95 % ellipse in the plane, and beyond 1.96
     /// standard deviations of z, roll, pitch and yaw, 0..=1; empty without such poses.
     pub beyond_95: BTreeMap<&'static str, f64>,
-    /// Integrity of the covariances of published poses; absent if they have none.
+    /// Integrity of the covariances of published poses, whose bounds are of 95 %; absent if they have none.
     pub integrity: Option<IntegritySummary>,
+    /// Integrity of the bound that one position in 1,000 exceeds; absent without a fitted bound.
+    pub bound: Option<IntegritySummary>,
     /// Median milliseconds by stage; `total` is that of all stages of a sweep.
     pub ms: BTreeMap<String, f64>,
     /// Mean milliseconds of all stages of a sweep.
     pub mean_ms: f64,
 }
 
-/// Errors of published poses against the bounds that were published with them.
+/// Planar errors of published poses against the bounds that were published with them.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct IntegritySummary {
-    /// Number of poses with a covariance.
+    /// Number of poses with a bound.
     pub poses: usize,
-    /// Share of them whose planar error exceeds the bound of 95 %, 0..=1.
+    /// Number of them whose error exceeds it.
+    pub exceeded: usize,
+    /// The same as a share, 0..=1.
     pub exceeded_share: f64,
-    /// Median of that bound, metres.
+    /// Median bound, metres.
     pub p50_bound_m: f64,
 }
 
@@ -165,7 +169,8 @@ impl LocalizationSummary {
             calibration,
             rejected: rejected(&judged),
             beyond_95: beyond_95(sweeps),
-            integrity: integrity(sweeps),
+            integrity: integrity(sweeps.iter().filter_map(covariance_bound)),
+            bound: integrity(sweeps.iter().filter_map(EvaluatedSweep::bounded_error)),
             ms: median_times(sweeps),
             mean_ms: mean(&total_ms).unwrap_or(0.0),
         }
@@ -231,26 +236,30 @@ fn beyond_95(sweeps: &[EvaluatedSweep]) -> BTreeMap<&'static str, f64> {
         .collect()
 }
 
-fn integrity(sweeps: &[EvaluatedSweep]) -> Option<IntegritySummary> {
-    let judged = |sweep: &EvaluatedSweep| {
-        let PoseEstimate::Pose {
-            world_from_cav,
-            covariance: Some(covariance),
-            ..
-        } = &sweep.localization.estimate
-        else {
-            return None;
-        };
-        let [x, y] =
-            [0, 1].map(|axis| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis]);
-        Some((x.hypot(y), covariance.bound_95_m()))
+/// Error in the plane of a published pose with a covariance, and its bound of 95 %, metres.
+fn covariance_bound(sweep: &EvaluatedSweep) -> Option<(f64, f64)> {
+    let PoseEstimate::Pose {
+        world_from_cav,
+        covariance: Some(covariance),
+        ..
+    } = &sweep.localization.estimate
+    else {
+        return None;
     };
-    let judged: Vec<(f64, f64)> = sweeps.iter().filter_map(judged).collect();
+    let [x, y] =
+        [0, 1].map(|axis| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis]);
+    Some((x.hypot(y), covariance.bound_95_m()))
+}
+
+/// Integrity of errors with their bounds; `None` without any.
+fn integrity(judged: impl Iterator<Item = (f64, f64)>) -> Option<IntegritySummary> {
+    let judged: Vec<(f64, f64)> = judged.collect();
     let exceeded = judged.iter().filter(|(error_m, bound_m)| error_m > bound_m);
     let exceeded = exceeded.count();
     let bounds: Vec<f64> = judged.iter().map(|(_, bound_m)| *bound_m).collect();
     Some(IntegritySummary {
         poses: judged.len(),
+        exceeded,
         exceeded_share: exceeded as f64 / judged.len() as f64,
         p50_bound_m: median(&bounds)?,
     })

@@ -9,6 +9,7 @@ use std::path::Path;
 
 use nalgebra::Vector3;
 use perception::weights::{CONFIG_KEY, FileError, KIND_KEY, with_header};
+use protocol::config::{FieldError, within};
 use protocol::text::hex;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
 use serde::{Deserialize, Serialize};
@@ -67,11 +68,12 @@ impl SurfelMap {
         }
     }
 
-    /// Settings of a target that [`Self::write`] takes.
+    /// Settings of a target that [`Self::write`] takes, of planes in voxels of this side, metres.
     #[must_use]
-    pub fn building() -> IcpConfig {
+    pub fn building(voxel_m: f64) -> IcpConfig {
         let mut config = Self::registration();
         config.levels.truncate(1);
+        config.levels[0].voxel_m = voxel_m;
         config
     }
 
@@ -237,9 +239,7 @@ impl Config {
             range_m,
             ..
         } = self;
-        if !(0.05..=10.0).contains(voxel_m) {
-            return Err(format!("voxel_m is {voxel_m}, must be 0.05 to 10"));
-        }
+        check_voxel(*voxel_m).map_err(|error| error.to_string())?;
         let is_finite = origin_m
             .iter()
             .chain(range_m)
@@ -248,6 +248,14 @@ impl Config {
             .then_some(())
             .ok_or_else(|| format!("origin_m {origin_m:?} and range_m {range_m:?} must be finite"))
     }
+}
+
+/// Checks the side of the voxels, metres.
+///
+/// # Errors
+/// [`FieldError`] outside 5 cm to 10 m.
+pub fn check_voxel(voxel_m: f64) -> Result<(), FieldError> {
+    within("voxel_m", voxel_m, 0.05, 10.0)
 }
 
 /// Bytes of a tensor `[N, 3]`.
@@ -300,7 +308,7 @@ pub(crate) mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("yard.safetensors");
         let pose = Isometry3::new(Vector3::new(1200.0, -340.0, 20.0), Vector3::z() * 0.8);
-        let mut target = IcpTarget::new(&SurfelMap::building());
+        let mut target = IcpTarget::new(&SurfelMap::building(VOXEL_M));
         target.add(&yard(), &pose);
         target.fit();
         let sha256 = SurfelMap::write(&path, "yard", &target).unwrap();
