@@ -1,5 +1,7 @@
 //! Tensor conversion: tensors as slices of floats, for loops whose memory order the tensor library does not offer.
 
+use std::cmp::Ordering;
+
 use tch::{Device, Kind, TchError, Tensor, nn};
 
 /// Memory order of feature maps `[N, C, H, W]`; the values are the same.
@@ -19,9 +21,20 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     Vec::try_from(tensor.f_reshape(-1)?)
 }
 
-/// Indices of the highest numbers, a `share` of all and at least one, in ascending order.
-pub(crate) fn largest(numbers: &[f32], share: f64) -> Vec<usize> {
-    let wanted = ((numbers.len() as f64 * share).ceil() as usize).clamp(1, numbers.len());
+/// How many numbers are not below `least`, rounded up to a multiple of `step`.
+pub(crate) fn above(numbers: &[f32], least: f32, step: usize) -> usize {
+    let is_above = |number: &&f32| number.partial_cmp(&&least) != Some(Ordering::Less);
+    numbers
+        .iter()
+        .filter(is_above)
+        .count()
+        .next_multiple_of(step)
+}
+
+/// Indices of the highest numbers, `wanted` but at most a `share` of all, and at least one, in ascending order.
+pub(crate) fn largest(numbers: &[f32], share: f64, wanted: usize) -> Vec<usize> {
+    let most = (numbers.len() as f64 * share).ceil() as usize;
+    let wanted = most.min(wanted).clamp(1, numbers.len());
     let mut order: Vec<usize> = (0..numbers.len()).collect();
     order.sort_by(|a, b| numbers[*b].total_cmp(&numbers[*a]));
     order.truncate(wanted);

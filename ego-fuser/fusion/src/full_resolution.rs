@@ -7,15 +7,17 @@ use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
 
 use crate::f64_tensor::{are_numbers, numbers};
-use crate::warp::{BILINEAR, Cells, NEAREST, PADDING_ZEROS, places_of};
+use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, Samples, places_of};
 
 /// A feature map on the BEV grid of its sender, in axes of the ego.
 #[derive(Debug)]
 pub(crate) enum FullResolutionMap {
-    /// Plain floats, where no gradient flows: a map is kept for several frames and converted once.
+    /// Cell by cell, where no gradient flows.
     Numbers {
-        /// Features.
-        cells: Arc<Cells>,
+        /// `[H * W, C]`: features, the channels of a cell contiguous.
+        cells: Tensor,
+        /// Rows and columns.
+        size: [usize; 2],
         /// `[H * W]`, 1 where a cell was sent.
         sent: Arc<[f32]>,
     },
@@ -45,9 +47,11 @@ impl FullResolutionMap {
             Some(sent) => sent.f_to_kind(Kind::Float)?,
             None => map.f_narrow(1, 0, 1)?.f_ones_like()?,
         };
+        let (_, channels, height, width) = map.size4()?;
         Ok(match are_numbers(map) {
             true => Self::Numbers {
-                cells: Arc::new(Cells::of(&map.f_squeeze_dim(0)?)?),
+                cells: (map.f_permute([0, 2, 3, 1])?.f_contiguous()?).f_view([-1, channels])?,
+                size: [height, width].map(|cells| cells as usize),
                 sent: numbers(&sent)?.into(),
             },
             false => Self::Tensors {
@@ -57,10 +61,10 @@ impl FullResolutionMap {
         })
     }
 
-    /// Features and sent cells in plain floats, where no gradient flows.
-    pub(crate) fn numbers(&self) -> Option<(&Cells, &[f32])> {
+    /// Sent cells in plain floats, where no gradient flows.
+    pub(crate) fn sent(&self) -> Option<&[f32]> {
         match self {
-            Self::Numbers { cells, sent } => Some((cells, sent)),
+            Self::Numbers { sent, .. } => Some(sent),
             Self::Tensors { .. } => None,
         }
     }
@@ -68,8 +72,9 @@ impl FullResolutionMap {
     /// The same map; nothing is copied.
     pub(crate) fn shallow_clone(&self) -> Self {
         match self {
-            Self::Numbers { cells, sent } => Self::Numbers {
-                cells: Arc::clone(cells),
+            Self::Numbers { cells, size, sent } => Self::Numbers {
+                cells: cells.shallow_clone(),
+                size: *size,
                 sent: Arc::clone(sent),
             },
             Self::Tensors { map, sent } => Self::Tensors {
@@ -88,7 +93,7 @@ impl FullResolutionMap {
     ) -> Result<BTreeMap<usize, CellSamples>, TchError> {
         maps.iter()
             .try_fold(BTreeMap::new(), |mut by_step, (step, pose, map)| {
-                let seen = map.at(&places_of(cells, pose, grid))?;
+                let seen = map.at(&places_of(cells, pose, grid), None)?;
                 let most = match by_step.get(step) {
                     Some(before) => seen.or(before)?,
                     None => seen,
@@ -98,21 +103,20 @@ impl FullResolutionMap {
             })
     }
 
-    /// Features at positions in `grid_sampler`'s coordinates, two for each: `[R, C]`, and their validity, `[R, 1]`.
-    fn at(&self, places: &[f32]) -> Result<CellSamples, TchError> {
-        let count = places.len() / 2;
+    /// Features at positions in `grid_sampler`'s coordinates, two for each: `[R, C]`, and their validity, `[R, 1]`; those
+    /// in plain floats times their `shares` `[R]`, if there are such.
+    pub(crate) fn at(
+        &self,
+        places: &[f32],
+        shares: Option<&[f32]>,
+    ) -> Result<CellSamples, TchError> {
         match self {
-            Self::Numbers { cells, sent } => {
-                let channels = cells.channels();
-                let (mut features, mut mask) = (vec![0.0; count * channels], vec![0.0; count]);
-                cells.for_each_valid(sent, places, |place, shown| {
-                    features[place * channels..][..channels].copy_from_slice(shown);
-                    mask[place] = 1.0;
-                });
-                let of = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([count as i64, -1]);
+            Self::Numbers { cells, size, sent } => {
+                let mut samples = Samples::default();
+                samples.add((0, *size), sent, places, shares);
                 Ok(CellSamples {
-                    features: of(&features)?,
-                    mask: of(&mask)?,
+                    features: samples.read(cells)?,
+                    mask: Tensor::f_from_slice(samples.valid())?.f_unsqueeze(1)?,
                 })
             }
             Self::Tensors { map, sent } => {

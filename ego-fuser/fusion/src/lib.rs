@@ -59,6 +59,7 @@ pub(crate) mod test_data;
 pub(crate) mod traf_align;
 pub mod v2vnet;
 pub mod v2xvit;
+mod vector_loops;
 pub mod warp;
 pub mod where2comm;
 

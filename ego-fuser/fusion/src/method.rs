@@ -63,37 +63,31 @@ impl Method {
     }
 
     /// Its specification.
-    #[must_use]
     pub const fn spec(self) -> &'static MethodSpec {
         self.0
     }
 
     /// The name on the command line and in result files.
-    #[must_use]
     pub const fn name(self) -> &'static str {
         self.0.name
     }
 
     /// The TorchScript file of a method `script:FILE.pt`.
-    #[must_use]
     pub fn script_file(self) -> Option<&'static Path> {
         self.name().strip_prefix(script::PREFIX).map(Path::new)
     }
 
     /// One line for `--help` and tables.
-    #[must_use]
     pub const fn summary(self) -> &'static str {
         self.0.summary
     }
 
     /// Content of its messages.
-    #[must_use]
     pub const fn exchange(self) -> Exchange {
         self.0.exchange
     }
 
     /// Content that the ego needs of its own sweep: that of its messages, and its feature map for ego-only operation.
-    #[must_use]
     pub const fn own_content(self) -> Exchange {
         match self.exchange() {
             Exchange::Nothing => Exchange::Features,
@@ -102,13 +96,11 @@ impl Method {
     }
 
     /// Selection of the cells that agents send unless configured otherwise; absent: all cells.
-    #[must_use]
     pub const fn gate(self) -> Option<ConfidenceGate> {
         self.0.gate
     }
 
     /// Names of the methods whose weights it runs with, best first.
-    #[must_use]
     pub fn weights_names(self) -> Vec<&'static str> {
         match self.0.runs_with_weights_of {
             [] => vec![self.name()],
@@ -117,13 +109,11 @@ impl Method {
     }
 
     /// Default settings of its fusion behind a detector; methods that exchange no feature maps fuse none.
-    #[must_use]
     pub fn default_fusion(self, detector: &DetectorConfig) -> FusionConfig {
         (self.0.fusion.default_config)(self.0, detector)
     }
 
     /// True if the settings of a weights file are to be used for its fusion. A script's file is that of its name.
-    #[must_use]
     pub(crate) fn has_fusion(self, config: &FusionConfig) -> bool {
         self.0.fusion.kind == config.kind() && config.kind() != script::FUSION.kind
     }

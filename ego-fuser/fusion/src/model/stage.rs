@@ -167,7 +167,6 @@ impl FusionStage {
     }
 
     /// True if it reads boxes of neighbours without a map.
-    #[must_use]
     pub fn reads_boxes(&self) -> bool {
         self.box_input.is_some()
     }
@@ -377,12 +376,9 @@ impl FusionStage {
             return Ok((turned, warped));
         }
         turned.full_resolution = full_resolution(&turned)?;
-        let cells: Vec<_> = turned
-            .full_resolution
-            .iter()
-            .filter_map(FullResolutionMap::numbers)
-            .collect();
-        let warped = warp_cells(&cells, &poses, grid)?;
+        let sent = turned.full_resolution.iter();
+        let sent: Vec<&[f32]> = sent.filter_map(FullResolutionMap::sent).collect();
+        let warped = warp_cells(&turned.maps, &sent, &poses, grid)?;
         Ok((turned, warped))
     }
 

@@ -10,7 +10,8 @@ mod sampling;
 use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
 
-pub(crate) use self::sampling::Cells;
+use self::sampling::Cells;
+pub(crate) use self::sampling::{SUM, Samples};
 use crate::f64_tensor::{are_numbers, as_batch};
 
 /// `grid_sampler` reads zeros outside of the map.
@@ -132,33 +133,33 @@ pub fn warp_to_ego(
     })
 }
 
-/// [`warp_to_ego`] of maps in plain floats, each with its sent cells `[H * W]`: the channels of each cell are contiguous
-/// in the result too.
+/// [`warp_to_ego`] of maps `[N, C, H, W]` whose channels of each cell are contiguous, as in the result, each with its
+/// sent cells `[H * W]`.
 pub(crate) fn warp_cells(
-    maps: &[(&Cells, &[f32])],
+    maps: &Tensor,
+    sent: &[&[f32]],
     ego_from_cav: &[Pose],
     grid: &BevGrid,
 ) -> Result<WarpedMaps, WarpError> {
-    let count = maps.len() as i64;
-    let cells = (grid.height * grid.width) as usize;
-    let (mut features, mut mask) = (Vec::new(), Vec::with_capacity(maps.len() * cells));
-    for ((map, sent), pose) in maps.iter().zip(ego_from_cav) {
-        features.reserve(maps.len() * map.values().len() - features.len());
+    let (count, channels, height, width) = maps.size4()?;
+    let size = [grid.height, grid.width].map(|cells| cells as usize);
+    let mut samples = Samples::default();
+    for ((map, sent), pose) in sent.iter().enumerate().zip(ego_from_cav) {
+        let first = map * size[0] * size[1];
         let affine = cav_from_ego_normalized(pose, grid);
-        if affine == UNMOVED {
-            features.extend_from_slice(map.values());
-            mask.extend_from_slice(sent);
-        } else {
-            map.append(sent, &places(affine, grid), [&mut features, &mut mask]);
+        match affine == UNMOVED {
+            true => samples.add_all(first, sent),
+            false => samples.add((first, size), sent, &places(affine, grid), None),
         }
     }
-    let [height, width] = [grid.height, grid.width].map(i64::from);
-    let features = Tensor::f_from_slice(&features)?
-        .f_view([count, height, width, -1])?
-        .f_permute([0, 3, 1, 2])?;
+    let cells = maps.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])?;
+    let features = samples
+        .read(&cells)?
+        .f_view([count, height, width, channels])?;
+    let mask = Tensor::f_from_slice(samples.valid())?.f_view([count, 1, height, width])?;
     Ok(WarpedMaps {
-        features,
-        mask: Tensor::f_from_slice(&mask)?.f_view([count, 1, height, width])?,
+        features: features.f_permute([0, 3, 1, 2])?,
+        mask,
     })
 }
 
@@ -352,11 +353,14 @@ mod tests {
         let maps = uniform(5, &[2, 3, 16, 32]);
         let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([1.3, -0.4, 0.0], 0.2)];
         let planes = warp_to_ego(&maps, None, &poses, &GRID).unwrap();
-        let cells = [0, 1].map(|map| Cells::of(&maps.get(map)).unwrap());
+        let cells = maps
+            .permute([0, 2, 3, 1])
+            .contiguous()
+            .permute([0, 3, 1, 2]);
         let sent = [1.0; 16 * 32];
-        let cells =
-            warp_cells(&cells.each_ref().map(|map| (map, &sent[..])), &poses, &GRID).unwrap();
-        assert_eq!(planes.features, cells.features);
+        let cells = warp_cells(&cells, &[&sent[..]; 2], &poses, &GRID).unwrap();
+        assert_eq!(planes.features.get(0), cells.features.get(0));
+        assert!(planes.features.allclose(&cells.features, 0.0, 1e-6, false));
         assert_eq!(planes.mask, cells.mask);
     }
 

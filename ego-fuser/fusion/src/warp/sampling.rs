@@ -9,13 +9,16 @@ use crate::f64_tensor::{self, BLOCK, numbers};
 
 /// A map with the channels of each cell contiguous.
 #[derive(Debug)]
-pub(crate) struct Cells {
+pub(super) struct Cells {
     /// `[height * width, channels]`.
     values: Vec<f32>,
     channels: usize,
     height: usize,
     width: usize,
 }
+
+/// `embedding_bag` adds rows.
+pub(crate) const SUM: i64 = 0;
 
 /// A position on a map: the four cells around it with their weights, which are zero beyond the edges.
 #[derive(Clone, Copy)]
@@ -28,7 +31,7 @@ struct Place {
 
 impl Cells {
     /// Of a map `[C, H, W]` that is not empty.
-    pub(crate) fn of(map: &Tensor) -> Result<Self, TchError> {
+    pub(super) fn of(map: &Tensor) -> Result<Self, TchError> {
         let (channels, height, width) = map.size3()?;
         let [channels, height, width] = [channels, height, width].map(|size| size as usize);
         Ok(Self {
@@ -77,64 +80,10 @@ impl Cells {
         ))
     }
 
-    /// Appends the same cell after cell: the values to `read`, the validity to `reached`.
-    pub(super) fn append(
-        &self,
-        valid: &[f32],
-        sampling_grid: &[f32],
-        [read, reached]: [&mut Vec<f32>; 2],
-    ) {
-        let mut values = vec![0.0; self.channels];
-        for at in sampling_grid.chunks_exact(2) {
-            reached.push(self.read_at([at[0], at[1]], valid, &mut values));
-            read.extend_from_slice(&values);
-        }
-    }
-
-    /// Values, cell after cell.
-    pub(crate) fn values(&self) -> &[f32] {
-        &self.values
-    }
-
-    /// Raises `strongest` `[h * w, C]` to the map's values at `sampling_grid` (two per position), times `shares` `[h * w]`,
-    /// where those are larger, and where the nearest cell of `valid` `[H, W]` is valid.
-    pub(crate) fn raise(&self, strongest: &mut [f32], [valid, sampling_grid, shares]: [&[f32]; 3]) {
-        self.for_each_valid(valid, sampling_grid, |cell, shown| {
-            let strongest = &mut strongest[cell * self.channels..][..self.channels];
-            let share = shares[cell];
-            strongest
-                .iter_mut()
-                .zip(shown)
-                .for_each(|(most, shown)| *most = larger(*most, share * shown));
-        });
-    }
-
-    /// Channels of each cell.
-    pub(crate) fn channels(&self) -> usize {
-        self.channels
-    }
-
-    /// Calls `see` with the features at each position of `sampling_grid` (`grid_sampler`'s coordinates, two per
-    /// position) where the nearest cell of `valid` `[H, W]` is valid.
-    #[inline]
-    pub(crate) fn for_each_valid(
-        &self,
-        valid: &[f32],
-        sampling_grid: &[f32],
-        mut see: impl FnMut(usize, &[f32]),
-    ) {
-        let mut shown = vec![0.0; self.channels];
-        for (cell, at) in sampling_grid.chunks_exact(2).enumerate() {
-            if self.read_at([at[0], at[1]], valid, &mut shown) != 0.0 {
-                see(cell, &shown);
-            }
-        }
-    }
-
     /// The channels at a position, and the validity there.
     #[inline]
     fn read_at(&self, at: [f32; 2], valid: &[f32], values: &mut [f32]) -> f32 {
-        let place = self.place(at);
+        let place = place(at, [self.height, self.width]);
         let valid = place.nearest.map_or(0.0, |nearest| valid[nearest]);
         match valid == 0.0 {
             true => values.fill(0.0),
@@ -153,38 +102,105 @@ impl Cells {
             *value = of_a * a + of_b * b + of_c * c + of_d * d;
         }
     }
+}
 
-    /// From -1..1 over the whole extent of the map, edges of the outer cells included.
-    #[inline]
-    fn place(&self, [x, y]: [f32; 2]) -> Place {
-        let ([columns, rows], [width, height]) = (
-            [along(x, self.width), along(y, self.height)],
-            [self.width, self.height],
-        );
-        let (columns, rows) = (Pair::around(columns, width), Pair::around(rows, height));
-        let cell = |row: usize, column: usize| row * self.width + column;
-        let ([top, bottom], [left, right]) = (rows.places, columns.places);
-        let ([up, down], [before, behind]) = (rows.weights, columns.weights);
-        Place {
-            cells: [
-                cell(top, left),
-                cell(top, right),
-                cell(bottom, left),
-                cell(bottom, right),
-            ],
-            weights: [up * before, up * behind, down * before, down * behind],
-            nearest: rows
-                .nearest
-                .zip(columns.nearest)
-                .map(|(row, column)| cell(row, column)),
-        }
+/// From -1..1 over the whole extent of a map, edges of the outer cells included.
+#[inline]
+fn place([x, y]: [f32; 2], [height, width]: [usize; 2]) -> Place {
+    let columns = Pair::around(along(x, width), width);
+    let rows = Pair::around(along(y, height), height);
+    let cell = |row: usize, column: usize| row * width + column;
+    let ([top, bottom], [left, right]) = (rows.places, columns.places);
+    let ([up, down], [before, behind]) = (rows.weights, columns.weights);
+    Place {
+        cells: [
+            cell(top, left),
+            cell(top, right),
+            cell(bottom, left),
+            cell(bottom, right),
+        ],
+        weights: [up * before, up * behind, down * before, down * behind],
+        nearest: rows
+            .nearest
+            .zip(columns.nearest)
+            .map(|(row, column)| cell(row, column)),
     }
 }
 
-/// The larger of two numbers. `f32::max` considers NaN, which costs several instructions.
-#[inline]
-fn larger(a: f32, b: f32) -> f32 {
-    if a < b { b } else { a }
+/// Positions on maps whose channels are contiguous, as weighted sums of their cells: read in one pass, without a copy.
+#[derive(Debug, Default)]
+pub(crate) struct Samples {
+    /// The cells of all sums, one sum after another.
+    cells: Vec<i32>,
+    weights: Vec<f32>,
+    /// Index in `cells` at which each sum begins.
+    first: Vec<i32>,
+    /// Validity of each position by its nearest cell.
+    valid: Vec<f32>,
+}
+
+impl Samples {
+    /// Adds positions (two numbers each, `grid_sampler`'s coordinates) on a map of `size` whose cells begin at `first`,
+    /// each times its share; absent: 1. They are valid as their nearest cell of `valid` `[H * W]`; others are zeros.
+    pub(crate) fn add(
+        &mut self,
+        (first, size): (usize, [usize; 2]),
+        valid: &[f32],
+        places: &[f32],
+        shares: Option<&[f32]>,
+    ) {
+        self.reserve(places.len() / 2);
+        for (position, at) in places.chunks_exact(2).enumerate() {
+            let place = place([at[0], at[1]], size);
+            let valid = place.nearest.map_or(0.0, |nearest| valid[nearest]);
+            let share = valid * shares.map_or(1.0, |shares| shares[position]);
+            self.first.push(self.cells.len() as i32);
+            self.valid.push(valid);
+            for (cell, weight) in place.cells.into_iter().zip(place.weights) {
+                if valid * weight != 0.0 {
+                    self.cells.push((first + cell) as i32);
+                    self.weights.push(weight * share);
+                }
+            }
+        }
+    }
+
+    /// Adds all cells from `first` on as they are.
+    pub(super) fn add_all(&mut self, first: usize, valid: &[f32]) {
+        self.reserve(valid.len());
+        for (cell, &valid) in (first..).zip(valid) {
+            self.add_cell(Some(cell));
+            self.valid.push(valid);
+        }
+    }
+
+    /// Adds a cell as it is, without validity, or zeros.
+    pub(crate) fn add_cell(&mut self, cell: Option<usize>) {
+        self.first.push(self.cells.len() as i32);
+        self.cells.extend(cell.map(|cell| cell as i32));
+        self.weights.extend(cell.map(|_| 1.0));
+    }
+
+    fn reserve(&mut self, positions: usize) {
+        self.cells.reserve(4 * positions);
+        self.weights.reserve(4 * positions);
+        self.first.reserve(positions);
+        self.valid.reserve(positions);
+    }
+
+    /// Validity of each position.
+    pub(crate) fn valid(&self) -> &[f32] {
+        &self.valid
+    }
+
+    /// `[positions, C]` of `cells` `[.., C]`.
+    pub(crate) fn read(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+        let [places, first] = [&self.cells, &self.first].map(|rows| Tensor::f_from_slice(rows));
+        let weights = Some(Tensor::f_from_slice(&self.weights)?);
+        let (places, first) = (places?, first?);
+        Tensor::f_embedding_bag(cells, &places, &first, false, SUM, false, weights, false)
+            .map(|(sums, ..)| sums)
+    }
 }
 
 /// Cells from the first one's centre, of -1..1 over all `size` of them.

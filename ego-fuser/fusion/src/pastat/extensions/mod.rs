@@ -14,3 +14,7 @@ pub(super) mod ego_queries;
 pub(super) mod map_refinement;
 pub(super) mod pooled_history;
 pub(super) mod temporal_memory;
+
+/// Where the logit of the detector's class head is below this, a likelihood of 1 %, nothing is detected after the temporal
+/// memory and the refinement either: without gradients neither looks there.
+const LEAST_LIKELY: f32 = -4.6;

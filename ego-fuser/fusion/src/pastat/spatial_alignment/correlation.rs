@@ -2,9 +2,11 @@
 
 use std::cell::OnceCell;
 
+use multiversion::multiversion;
 use tch::{Kind, TchError, Tensor};
 
 use crate::f64_tensor::{are_numbers, numbers};
+use crate::vector_loops::{LANES, add_products};
 
 /// Parts of the grid along each edge: enough to distinguish a rotation from a shift.
 pub(crate) const PARTS: i64 = 4;
@@ -13,8 +15,6 @@ const EPSILON: f64 = 1e-6;
 /// Up to this number of maps, sums in plain floats are faster than a matrix product with the map at every shift, which
 /// has to be written out first.
 const FEW_MAPS: i64 = 4;
-/// Products that are summed side by side.
-const LANES: usize = 8;
 
 /// Similarity of maps, by shift.
 pub(crate) struct Correlation {
@@ -142,9 +142,7 @@ impl Shifted {
                         let row =
                             (channel * (height + 2 * radius) + row + down) * (width + 2 * radius);
                         let own = &own[row + left..][..columns + 2 * radius];
-                        sums.iter_mut()
-                            .zip(own.windows(columns))
-                            .for_each(|(sum, own)| add_products(sum, shown, own));
+                        add_shifted(sums, shown, own);
                     }
                 }
                 all.extend(sums.iter().map(|lanes| lanes.iter().sum::<f32>()));
@@ -154,21 +152,11 @@ impl Shifted {
     }
 }
 
-/// Adds the products of two rows of equal length to sums side by side.
-#[inline]
-fn add_products(sums: &mut [f32; LANES], a: &[f32], b: &[f32]) {
-    let (a_chunks, b_chunks) = (a.chunks_exact(LANES), b.chunks_exact(LANES));
-    let rest = a_chunks
-        .remainder()
-        .iter()
-        .zip(b_chunks.remainder())
-        .zip(sums.iter_mut());
-    rest.for_each(|((a, b), sum)| *sum += a * b);
-    for (a, b) in a_chunks.zip(b_chunks) {
-        sums.iter_mut()
-            .zip(a)
-            .zip(b)
-            .for_each(|((sum, a), b)| *sum += a * b);
+/// Adds the products of a row with another, `shown.len() - 1 + sums.len()` cells wide, at every shift.
+#[multiversion(targets("x86_64+avx2+fma"))]
+fn add_shifted(sums: &mut [[f32; LANES]], shown: &[f32], own: &[f32]) {
+    for (sum, own) in sums.iter_mut().zip(own.windows(shown.len())) {
+        add_products(sum, shown, own);
     }
 }
 

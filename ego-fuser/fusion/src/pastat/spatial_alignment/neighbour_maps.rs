@@ -4,7 +4,7 @@ use tch::{TchError, Tensor};
 
 use super::area::resample;
 use crate::f64_tensor::{self, are_numbers, numbers};
-use crate::full_resolution::FullResolutionMap;
+use crate::full_resolution::{CellSamples, FullResolutionMap};
 use crate::warp::WarpedMaps;
 
 /// Maps on the ego's grid. Maps with corrected poses are resampled from the maps as received: a second resampling would
@@ -61,15 +61,20 @@ impl NeighbourMaps {
     /// valid.
     pub(crate) fn maximum_with(&self, own: &Tensor, weight: &Tensor) -> Result<Tensor, TchError> {
         if let Some(places) = &self.places {
-            let mut maximum = f64_tensor::cells(own)?;
-            for (map, cells) in (0..).zip(&self.cells) {
-                let [places, shares] = [places, weight].map(|tensor| numbers(&tensor.f_get(map)?));
-                if let FullResolutionMap::Numbers { cells, sent } = cells {
-                    cells.raise(&mut maximum, [sent, &places?, &shares?]);
-                }
-            }
             let (channels, height, width) = own.size3()?;
-            return Tensor::f_from_slice(&maximum)?
+            let cells = own.f_permute([1, 2, 0])?.f_reshape([-1, channels])?;
+            let maximum = (0..)
+                .zip(&self.cells)
+                .try_fold(cells, |maximum, (map, cells)| {
+                    let [places, shares] =
+                        [places, weight].map(|tensor| numbers(&tensor.f_get(map)?));
+                    let CellSamples { mut features, mask } = cells.at(&places?, Some(&shares?))?;
+                    let out_of_reach = mask.f_squeeze_dim(1)?.f_eq(0.0)?.f_nonzero()?;
+                    features
+                        .f_index_fill_(0, &out_of_reach.f_squeeze_dim(1)?, f64::NEG_INFINITY)?
+                        .f_maximum(&maximum)
+                })?;
+            return maximum
                 .f_view([1, height, width, channels])?
                 .f_permute([0, 3, 1, 2]);
         }

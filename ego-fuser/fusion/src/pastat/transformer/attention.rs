@@ -3,7 +3,8 @@
 use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
-use crate::f64_tensor::numbers;
+use super::window_loops::{Windows, attend};
+use crate::f64_tensor::{are_numbers, numbers};
 use crate::layers::BARE;
 use crate::pastat::extensions::ego_queries::Others;
 
@@ -148,9 +149,26 @@ impl WindowAttention {
     /// - `valid`: `[N, h, w]`, 1 for valid tokens
     /// - returns: `[N, h, w, D]`
     pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
-        let (.., dim) = tokens.size4()?;
+        let (entries, height, width, dim) = tokens.size4()?;
         let share = dim / self.sizes.len() as i64;
         let projected = self.query_key_value.forward(tokens);
+        let hides = valid.f_eq(0.0)?.f_any()?.f_int64_value(&[])? != 0;
+        if entries == 1 && are_numbers(&projected) && !hides {
+            let (projected, mut seen) = (numbers(&projected)?, vec![0.0; tokens.numel()]);
+            let sizes = |sizes: &[i64]| sizes.iter().map(|size| *size as usize).collect::<Vec<_>>();
+            let all = sizes(&[height, width, dim, share, share / self.heads]);
+            for (index, size) in self.sizes.iter().enumerate() {
+                let windows = Windows {
+                    size: [all[0], all[1]],
+                    edge: size.edge as usize,
+                    channels: [all[2], index * all[3], all[4]],
+                    preference: numbers(&self.preference(size)?)?,
+                };
+                attend(&windows, &projected, &mut seen);
+            }
+            let seen = Tensor::f_from_slice(&seen)?.f_view([1, height, width, dim])?;
+            return Ok(self.out.forward(&seen));
+        }
         let mut parts = Vec::with_capacity(self.sizes.len());
         for (index, size) in self.sizes.iter().enumerate() {
             let of_size =
@@ -292,6 +310,19 @@ mod tests {
             difference.isfinite().all().int64_value(&[]) == 1,
             "a window with nothing valid is a number too"
         );
+    }
+
+    #[test]
+    fn numbers_and_tensors_attend_alike() {
+        let variables = VarStore::new(Device::Cpu);
+        // Windows of 9 tokens are no whole number of vectors.
+        let windows = WindowAttention::new(&variables.root(), 12, 2, &[3, 6]);
+        redraw(&variables, &["weight", "bias"], 0.8);
+        let tokens = uniform(1, &[1, 12, 18, 12]) * 3.0;
+        let valid = Tensor::ones([1, 12, 18], FLOAT);
+        let tensors = windows.forward(&tokens, &valid).unwrap();
+        let numbers = tch::no_grad(|| windows.forward(&tokens, &valid)).unwrap();
+        assert!(tensors.requires_grad() && numbers.allclose(&tensors, 1e-4, 1e-5, false));
     }
 
     #[test]

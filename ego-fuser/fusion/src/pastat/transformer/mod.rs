@@ -6,6 +6,7 @@
 
 mod attention;
 mod block;
+mod window_loops;
 
 use tch::{Device, TchError, Tensor, nn};
 

@@ -115,21 +115,21 @@ fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError>
 }
 
 impl Int8Refinement {
-    /// The refined map.
+    /// The refined map; `fused` may be overwritten.
     fn forward(&self, fused: Tensor, likely: Option<&Tensor>) -> Result<Tensor, TchError> {
-        let (_, _, height, width) = fused.size4()?;
+        let (_, channels, height, width) = fused.size4()?;
         let tiles = match likely {
             Some(likely) => Tiles::most_likely(likely, SHARE)?,
             None => Tiles::all([height, width]),
         };
+        let cells = fused.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let [first, second] = &self.convolutions;
-        let input = tiles.cut(
-            &self.input.quantise(&fused)?,
-            f64::from(self.input.zero_point),
-        )?;
-        let hidden = first.forward(&input)?.f_mul(&tiles.hidden_mask()?)?;
-        tiles.add_to(&fused, &second.forward(&hidden)?)?;
-        Ok(fused)
+        let cut = tiles.cut(&cells.f_view([-1, channels])?)?;
+        let hidden = first.forward(&self.input.quantise(&cut)?)?;
+        let hidden = hidden.f_mul(&tiles.hidden_mask()?)?;
+        let refined = cells.f_permute([0, 3, 1, 2])?;
+        tiles.add_to(&refined, &second.forward(&hidden)?)?;
+        Ok(refined)
     }
 }
 

@@ -2,7 +2,9 @@
 
 use tch::{Kind, TchError, Tensor};
 
-use crate::f64_tensor::largest;
+use crate::f64_tensor::{above, largest};
+use crate::pastat::extensions::LEAST_LIKELY;
+use crate::warp::Samples;
 
 /// Edge of a tile, cells.
 pub(super) const EDGE: i64 = 8;
@@ -12,6 +14,8 @@ const MARGIN: i64 = 2;
 const HIDDEN_MARGIN: i64 = 1;
 /// Cells around a tile whose likelihood counts as its own.
 const NEAR: i64 = 2;
+/// Numbers of tiles are multiples of this: the tensor library generates code for each number.
+const STEP: usize = 4;
 
 /// Tiles of a map, by row and column of their first cells.
 #[derive(Debug, PartialEq)]
@@ -22,15 +26,16 @@ pub(super) struct Tiles {
 }
 
 impl Tiles {
-    /// A `share` of all tiles, at least one: those in or near which a vehicle is most likely by `likely`
-    /// `[1, 1, H, W]`.
+    /// Up to a `share` of all tiles, at least one: those in or near which a vehicle is most likely by `likely`
+    /// `[1, 1, H, W]`, and at least [`LEAST_LIKELY`].
     pub(super) fn most_likely(likely: &Tensor, share: f64) -> Result<Self, TchError> {
         let (_, _, height, width) = likely.size4()?;
         let window = EDGE + 2 * NEAR;
         let by_tile = likely.f_max_pool2d([window; 2], [EDGE; 2], [NEAR; 2], [1, 1], false)?;
         let by_tile: Vec<f32> = Vec::try_from(by_tile.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
         let all = Self::all([height, width]).first_cells;
-        let chosen = largest(&by_tile, share);
+        let wanted = above(&by_tile, LEAST_LIKELY, STEP);
+        let chosen = largest(&by_tile, share, wanted);
         Ok(Self {
             first_cells: chosen.into_iter().map(|tile| all[tile]).collect(),
             size: [height, width],
@@ -51,35 +56,39 @@ impl Tiles {
         size.iter().all(|cells| *cells > 0 && cells % EDGE == 0)
     }
 
-    /// The tiles of a map `[1, C, H, W]` with the cells around them, channels innermost in memory:
-    /// `[K, C, EDGE + 4, EDGE + 4]`; `outside` beyond the edges of the map.
-    pub(super) fn cut(&self, map: &Tensor, outside: f64) -> Result<Tensor, TchError> {
-        let padded = map
-            .f_pad([MARGIN; 4], "constant", outside)?
-            .f_permute([0, 2, 3, 1])?
-            .f_squeeze_dim(0)?;
+    /// The tiles of a map `[H * W, C]` with the cells around them, channels innermost in memory:
+    /// `[K, C, EDGE + 4, EDGE + 4]`; zeros beyond the edges of the map.
+    pub(super) fn cut(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+        let mut samples = Samples::default();
+        (self.cells(MARGIN)).for_each(|cell| samples.add_cell(cell.map(|cell| cell as usize)));
         let edge = EDGE + 2 * MARGIN;
-        let tiles: Vec<Tensor> = self
-            .first_cells
-            .iter()
-            .map(|&[row, column]| padded.f_narrow(0, row, edge)?.f_narrow(1, column, edge))
-            .collect::<Result<_, TchError>>()?;
-        Tensor::f_stack(&tiles, 0)?.f_permute([0, 3, 1, 2])
+        let tiles = samples
+            .read(cells)?
+            .f_view([-1, edge, edge, cells.size2()?.1])?;
+        tiles.f_permute([0, 3, 1, 2])
+    }
+
+    /// Indices of the cells of all tiles and of so many cells around them; `None` beyond the edges of the map.
+    fn cells(&self, margin: i64) -> impl Iterator<Item = Option<i64>> {
+        let [height, width] = self.size;
+        let along = move |first: i64| first - margin..first + EDGE + margin;
+        self.first_cells.iter().flat_map(move |&[row, column]| {
+            along(row).flat_map(move |row| {
+                let is_row = (0..height).contains(&row);
+                along(column).map(move |column| {
+                    (is_row && (0..width).contains(&column)).then_some(row * width + column)
+                })
+            })
+        })
     }
 
     /// `[K, 1, EDGE + 2, EDGE + 2]`, `u8`: 1 on the map and 0 beyond its edges, where the second convolution is padded.
     pub(super) fn hidden_mask(&self) -> Result<Tensor, TchError> {
-        let on_map = |first: i64, cells: i64| {
-            (-HIDDEN_MARGIN..EDGE + HIDDEN_MARGIN)
-                .map(move |step| u8::from((0..cells).contains(&(first + step))))
-        };
         let edge = EDGE + 2 * HIDDEN_MARGIN;
-        let masks: Vec<u8> = (self.first_cells.iter())
-            .flat_map(|&[row, column]| {
-                on_map(row, self.size[0])
-                    .flat_map(move |row| on_map(column, self.size[1]).map(move |on| row * on))
-            })
-            .collect();
+        let masks = self
+            .cells(HIDDEN_MARGIN)
+            .map(|cell| u8::from(cell.is_some()));
+        let masks: Vec<u8> = masks.collect();
         Tensor::f_from_slice(&masks)?.f_view([-1, 1, edge, edge])
     }
 
@@ -117,14 +126,15 @@ mod tests {
     fn what_is_cut_and_added_is_in_its_place() {
         let map = Tensor::arange(16 * 16, (Kind::Float, Device::Cpu)).view([1, 1, 16, 16]);
         let tiles = Tiles::all([16, 16]);
-        let cut = tiles.cut(&map, -1.0).unwrap();
+        let sum = &map + 1.0;
+        let cut = tiles.cut(&sum.view([-1, 1])).unwrap();
         assert_eq!(cut.size(), [4, 1, 12, 12]);
         assert_eq!(
             (
                 cut.double_value(&[0, 0, 1, 1]),
                 cut.double_value(&[3, 0, 2, 2])
             ),
-            (-1.0, 8.0 * 16.0 + 8.0)
+            (0.0, 8.0 * 16.0 + 8.0 + 1.0)
         );
         let mask = tiles.hidden_mask().unwrap();
         assert_eq!(
@@ -141,10 +151,9 @@ mod tests {
             ],
             [1, 0]
         );
-        let sum = map.copy();
         tiles
             .add_to(&sum, &cut.narrow(2, 2, 8).narrow(3, 2, 8))
             .unwrap();
-        assert_eq!(sum, &map * 2.0);
+        assert_eq!(sum, (&map + 1.0) * 2.0);
     }
 }

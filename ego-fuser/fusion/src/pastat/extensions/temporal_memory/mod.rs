@@ -14,6 +14,7 @@ use tch::nn::{self, Init, Module};
 use tch::{Device, Kind, TchError, Tensor};
 
 use self::selection::{AROUND, Selection};
+use super::LEAST_LIKELY;
 use crate::f64_tensor::are_numbers;
 use crate::full_resolution::{CellSamples, FullResolutionMap};
 use crate::layers::{BARE, around};
@@ -23,12 +24,11 @@ use crate::pastat::config::{MemoryConfig, PastatConfig};
 use crate::pastat::patches::channels_last;
 use crate::pastat::spatial_alignment::FineMaps;
 use crate::pastat::spatial_alignment::area::moved;
+use crate::warp::SUM;
 
 /// FSA compares earlier maps with larger cells than the newest, so the correction of a well-placed one errs by a few
 /// tenths of a metre. A correction within this distance of that of its agent's newest map is replaced by the latter.
 const SAME_PLACE_M: f64 = 0.6;
-/// `embedding_bag` adds rows.
-const SUM: i64 = 0;
 
 /// Maps from before their agents' newest.
 struct Earlier<'a> {
@@ -168,7 +168,12 @@ impl TemporalMemory {
         likely: &Tensor,
     ) -> Result<Tensor, TchError> {
         let (_, channels, height, width) = now.size4()?;
-        let selection = Selection::most_likely(likely, self.patch, self.share)?;
+        let least = if are_numbers(now) {
+            LEAST_LIKELY
+        } else {
+            f32::NEG_INFINITY
+        };
+        let selection = Selection::most_likely(likely, self.patch, self.share, least)?;
         let at = Places::of(&selection, width, now.device())?;
         let mut cells = channels_last(now)?.f_flatten(0, 2)?;
         let own = channels_last(&own.f_unsqueeze(0)?)?
@@ -365,7 +370,8 @@ mod tests {
             .flatten(2, 3)
             .squeeze_dim(0)
             .transpose(0, 1);
-        let selection = Selection::most_likely(&uniform(5, &[1, 1, 4, 6]), 2, 0.5).unwrap();
+        let likely = uniform(5, &[1, 1, 4, 6]);
+        let selection = Selection::most_likely(&likely, 2, 0.5, 0.0).unwrap();
         let of = |places: &[i64]| Tensor::from_slice(places);
         let near: Vec<i64> = selection
             .near

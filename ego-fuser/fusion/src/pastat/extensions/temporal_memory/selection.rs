@@ -2,7 +2,7 @@
 
 use tch::{Kind, TchError, Tensor};
 
-use crate::f64_tensor::largest;
+use crate::f64_tensor::{above, largest};
 
 /// A cell and its eight neighbours.
 pub(super) const AROUND: i64 = 9;
@@ -37,9 +37,14 @@ pub(super) struct Selection {
 }
 
 impl Selection {
-    /// A `share` of all patches of `patch` cells along each edge, at least one: those with the highest likelihood of a
-    /// vehicle in or close to them by `likely` `[1, 1, H, W]`. H and W are multiples of `patch`.
-    pub(super) fn most_likely(likely: &Tensor, patch: i64, share: f64) -> Result<Self, TchError> {
+    /// Up to a `share` of all patches of `patch` cells along each edge, at least one: those with the highest likelihood
+    /// of a vehicle in or close to them by `likely` `[1, 1, H, W]`, and `least`. H and W are multiples of `patch`.
+    pub(super) fn most_likely(
+        likely: &Tensor,
+        patch: i64,
+        share: f64,
+        least: f32,
+    ) -> Result<Self, TchError> {
         let (_, _, height, width) = likely.size4()?;
         let window = patch + 2 * MARGIN_CELLS;
         let margin = [MARGIN_CELLS; 2];
@@ -47,7 +52,7 @@ impl Selection {
             likely.f_max_pool2d([window, window], [patch, patch], margin, [1, 1], false)?;
         let by_patch: Vec<f32> = Vec::try_from(by_patch.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
         Ok(Self::of(
-            &largest(&by_patch, share),
+            &largest(&by_patch, share, above(&by_patch, least, 1)),
             patch as usize,
             [height as usize, width as usize],
         ))
@@ -111,7 +116,8 @@ mod tests {
         let likely = Tensor::zeros([1, 1, 16, 24], (Kind::Float, Device::Cpu));
         let _ = likely.get(0).get(0).get(7).get(11).fill_(1.0);
         // Four cells along each edge: within two cells of it lie the patches in rows 1 and 2, columns 2 and 3.
-        let selection = Selection::most_likely(&likely, 4, 4.0 / 24.0).unwrap();
+        let all = f32::NEG_INFINITY;
+        let selection = Selection::most_likely(&likely, 4, 4.0 / 24.0, all).unwrap();
         assert_eq!(selection.patches, [8, 9, 14, 15]);
         assert_eq!(
             (selection.cells.len(), selection.around.len()),
@@ -154,7 +160,7 @@ mod tests {
         let likely = Tensor::full([1, 1, 4, 4], f64::NAN, (Kind::Float, Device::Cpu));
         for (share, count) in [(0.0, 1), (0.3, 2), (1.0, 4), (9.0, 4), (f64::NAN, 1)] {
             assert_eq!(
-                Selection::most_likely(&likely, 2, share)
+                Selection::most_likely(&likely, 2, share, f32::NEG_INFINITY)
                     .unwrap()
                     .patches
                     .len(),
