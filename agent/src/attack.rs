@@ -42,7 +42,6 @@ impl Falsification {
     pub const ALL: [Self; 4] = [Self::ShiftedPose, Self::Noise, Self::Copied, Self::Invented];
 
     /// Name in settings and tables.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::ShiftedPose => "shifted_pose",
@@ -160,7 +159,6 @@ impl Attack {
     }
 
     /// The perception that is published instead of the true one.
-    #[must_use]
     pub fn perception(&mut self, truth: Perception) -> Perception {
         let mut falsified = truth;
         match self.falsification {
@@ -199,7 +197,6 @@ impl Attack {
     }
 
     /// The points that are published instead of the measured ones.
-    #[must_use]
     pub fn points(&mut self, truth: PointCloud) -> PointCloud {
         match self.falsification {
             Falsification::ShiftedPose => truth,

@@ -144,7 +144,6 @@ impl<I: DeserializeOwned, P: DeserializeOwned> RecordedInputs<I, P> {
     }
 
     /// [`Outcome::DataLost`] if the file was damaged.
-    #[must_use]
     pub fn outcome(&self) -> Outcome {
         Outcome::of(!self.is_whole)
     }

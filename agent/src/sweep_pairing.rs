@@ -61,21 +61,18 @@ impl<S> SweepPairing<S> {
 
     /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
     /// Poses arrive in order, so a later one is left over from before the scene restarted.
-    #[must_use]
     pub(crate) fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
         self.expects_pose = true;
         self.poses.add(capture_nanos, pose)
     }
 
     /// Adds a motion. Returns as [`Self::add_pose`].
-    #[must_use]
     pub(crate) fn add_motion(&mut self, capture_nanos: u64, motion: EgoMotion) -> usize {
         self.expects_motion = true;
         self.motions.add(capture_nanos, motion)
     }
 
     /// Adds a sweep. Returns the one that it replaces.
-    #[must_use]
     pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now_nanos: u64) -> Option<S> {
         // The wait goes on: with a period shorter than the time-out, none would ever be over if each sweep began anew.
         let since = self

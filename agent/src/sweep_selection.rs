@@ -37,7 +37,6 @@ impl SweepSelection {
     }
 
     /// Follows the pace of an ego from now on. False if the ego is not of the run, or there are too many already.
-    #[must_use]
     pub(crate) fn follow(&mut self, ego: &CavId, pace: Pace, now_nanos: u64) -> bool {
         if !self.egos.is_empty() && !self.egos.contains(ego) {
             return false;

@@ -147,7 +147,6 @@ impl EgoSettings {
     }
 
     /// Pairing of messages with a frame.
-    #[must_use]
     pub fn pairing(&self) -> PairingConfig {
         PairingConfig::with_max_age_nanos(self.max_age_ms.saturating_mul(1_000_000))
     }

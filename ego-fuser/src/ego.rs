@@ -161,19 +161,16 @@ impl Ego {
     }
 
     /// Its method.
-    #[must_use]
     pub fn method(&self) -> Method {
         self.method
     }
 
     /// True if neighbours may send boxes in place of maps.
-    #[must_use]
     pub fn reads_boxes(&self) -> bool {
         self.method.own_content() == Exchange::Features && self.fusion.reads_boxes()
     }
 
     /// Its detector.
-    #[must_use]
     pub fn detector(&self) -> &Detector {
         &self.detector
     }

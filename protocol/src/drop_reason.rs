@@ -53,7 +53,6 @@ named! {
 impl DropReason {
     /// True if data were lost that should have been used: not by the emulated link, and not because they were rightly
     /// rejected.
-    #[must_use]
     pub fn is_loss(self) -> bool {
         !matches!(
             self,

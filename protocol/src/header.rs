@@ -66,7 +66,6 @@ pub struct Header {
 
 impl Header {
     /// The header as it is transmitted.
-    #[must_use]
     #[expect(
         clippy::indexing_slicing,
         clippy::cast_possible_truncation,

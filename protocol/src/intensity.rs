@@ -31,7 +31,6 @@ pub enum IntensityKind {
 
 /// Divisor that brings intensities of up to `largest` to 0..1: 1 for 1 and less, else the smallest 2^n - 1 from 255 on
 /// that is not less.
-#[must_use]
 pub fn intensity_divisor(largest: f32) -> f32 {
     if largest <= 1.0 {
         return 1.0;

@@ -140,7 +140,6 @@ streams! {
 
 impl Stream {
     /// The kind of the messages on this stream; `None` if they do not have this wire format.
-    #[must_use]
     pub fn kind(self) -> Option<Kind> {
         self.row().kind
     }

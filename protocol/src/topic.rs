@@ -91,14 +91,12 @@ pub enum Topic {
 
 impl Topic {
     /// Topic of a vehicle's stream.
-    #[must_use]
     pub fn stream(cav: &CavId, stream: Stream) -> Self {
         let cav = cav.clone();
         Self::Stream { cav, stream }
     }
 
     /// The key of this topic in `run`.
-    #[must_use]
     pub fn in_run(self, run: &RunId) -> Key {
         Key {
             run: run.clone(),

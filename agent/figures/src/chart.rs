@@ -79,7 +79,6 @@ type Drawn<DB> = Result<(), DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorTy
 
 impl Axis {
     /// Linear axis.
-    #[must_use]
     pub fn linear(label: &str, range: [f64; 2]) -> Self {
         Self {
             label: label.into(),
@@ -89,7 +88,6 @@ impl Axis {
     }
 
     /// Logarithmic axis.
-    #[must_use]
     pub fn logarithmic(label: &str, range: [f64; 2]) -> Self {
         Self {
             is_logarithmic: true,

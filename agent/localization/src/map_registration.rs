@@ -61,7 +61,6 @@ impl MapRegistration {
     }
 
     /// Poses of `localizer`, registered to `map`.
-    #[must_use]
     pub fn new(localizer: Box<dyn Localize>, map: Arc<SurfelMap>) -> Self {
         Self {
             localizer,

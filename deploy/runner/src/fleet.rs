@@ -188,7 +188,6 @@ impl Fleet {
     }
 
     /// Name of the pose source that all vehicles share, or `mixed`.
-    #[must_use]
     pub fn pose_source(&self) -> &'static str {
         let mut names = self
             .agents
@@ -253,7 +252,6 @@ impl Fleet {
     }
 
     /// Executables of a fleet.
-    #[must_use]
     pub fn programs(programs: &Path) -> Vec<PathBuf> {
         ["agent", "ego-fuser", "sim-replay", RUNNER]
             .iter()

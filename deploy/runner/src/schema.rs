@@ -27,7 +27,6 @@ impl SchemaOf {
     ];
 
     /// The schema as indented JSON with a line end.
-    #[must_use]
     pub fn json(self) -> String {
         let text = match self {
             Self::Scenario => text_of::<Scenario>(),

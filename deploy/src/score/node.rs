@@ -241,7 +241,6 @@ impl ScorerNode {
     ///
     /// # Panics
     /// When the scorer's own thread has panicked.
-    #[must_use]
     pub fn finish(self) -> Scored {
         let (scored, connection) = self.scored();
         drop((
@@ -259,7 +258,6 @@ impl ScorerNode {
     ///
     /// # Panics
     /// As [`Self::finish`].
-    #[must_use]
     pub fn abandon(self) -> Scored {
         let (scored, connection) = self.scored();
         mem::forget(connection);

@@ -58,7 +58,6 @@ pub enum EgoError {
 
 impl EgoError {
     /// True if one frame cannot be computed, and others may be, see [`DetectorError::is_of_frame`].
-    #[must_use]
     pub fn is_of_frame(&self) -> bool {
         matches!(self, Self::Detector(error) if error.is_of_frame())
     }

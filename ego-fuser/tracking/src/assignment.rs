@@ -9,7 +9,6 @@ use nalgebra::DMatrix;
 ///
 /// Costs that are not finite give pairs of an unspecified total, never a panic; see [`of_allowed`] for pairs that must
 /// not be made.
-#[must_use]
 pub fn of_lowest_cost(costs: &DMatrix<f64>) -> Vec<(usize, usize)> {
     if costs.nrows() <= costs.ncols() {
         return Solver::new(costs).solve();
@@ -25,7 +24,6 @@ pub fn of_lowest_cost(costs: &DMatrix<f64>) -> Vec<(usize, usize)> {
 
 /// As many allowed pairs as possible, and among these sets the one of the lowest total cost. `None` and costs that are
 /// not finite are pairs that must not be made.
-#[must_use]
 pub fn of_allowed(
     rows: usize,
     columns: usize,

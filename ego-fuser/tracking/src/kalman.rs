@@ -24,7 +24,6 @@ pub struct Innovation {
 
 impl Innovation {
     /// Squared Mahalanobis distance, chi-square distributed with two degrees of freedom.
-    #[must_use]
     pub fn mahalanobis_squared(&self) -> f64 {
         self.residual_m.dot(&(self.information * self.residual_m))
     }
@@ -32,7 +31,6 @@ impl Innovation {
 
 impl ConstantVelocity {
     /// An object at a measured position, of unknown velocity with this standard deviation in each direction.
-    #[must_use]
     pub fn at(position_m: Vector2<f64>, noise_m2: &Matrix2<f64>, sigma_mps: f64) -> Self {
         let mut covariance = Matrix4::zeros();
         covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(noise_m2);
@@ -46,13 +44,11 @@ impl ConstantVelocity {
     }
 
     /// Position, metres.
-    #[must_use]
     pub fn position_m(&self) -> Vector2<f64> {
         self.state.fixed_rows::<2>(0).into()
     }
 
     /// Velocity, metres per second.
-    #[must_use]
     pub fn velocity_mps(&self) -> Vector2<f64> {
         self.state.fixed_rows::<2>(2).into()
     }
@@ -80,7 +76,6 @@ impl ConstantVelocity {
     }
 
     /// A measured position compared with the state; `None` if the covariance of the difference has no inverse.
-    #[must_use]
     pub fn innovation(
         &self,
         position_m: Vector2<f64>,

@@ -95,7 +95,6 @@ pub struct Tracker {
 
 impl Tracker {
     /// A tracker without tracks.
-    #[must_use]
     pub fn new(config: TrackerConfig) -> Self {
         Self {
             config,
@@ -105,7 +104,6 @@ impl Tracker {
 
     /// Number of detections so far that were left out: a number is not finite, a size negative, the score not within
     /// 0..=1, or there were more than [`TrackerConfig`] allows.
-    #[must_use]
     pub fn left_out(&self) -> u64 {
         self.left_out
     }

@@ -46,7 +46,6 @@ pub enum SharedMemoryUse {
 
 impl SharedMemoryUse {
     /// Its name in metrics.
-    #[must_use]
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Carried => "carried",

@@ -61,7 +61,6 @@ pub enum SharedMemory {
 
 impl SharedMemory {
     /// Bytes of the pool; 0: none.
-    #[must_use]
     pub fn pool_bytes(self) -> usize {
         match self {
             Self::Pool(bytes) => bytes,

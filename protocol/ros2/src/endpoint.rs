@@ -53,7 +53,6 @@ pub struct NodeName {
 
 impl NodeName {
     /// Reads a token; `None` if it is of another form.
-    #[must_use]
     pub fn of_token(token: &str) -> Option<Self> {
         let mut chunks = token.split('/');
         let (root, _domain, zid) = (chunks.next()?, chunks.next()?, chunks.next()?);
@@ -90,7 +89,6 @@ pub struct Endpoint {
 
 impl Node {
     /// Liveliness token of the node.
-    #[must_use]
     pub fn token(&self) -> String {
         format!(
             "{TOKEN_ROOT}/{}/{}/0/0/NN/{}",
@@ -101,7 +99,6 @@ impl Node {
     }
 
     /// The node as others see it.
-    #[must_use]
     pub fn name_in_network(&self) -> NodeName {
         NodeName {
             zid: self.zid.clone(),
@@ -115,21 +112,18 @@ impl Node {
     }
 
     /// Selector of the tokens of all nodes of this name in the domain, its own among them.
-    #[must_use]
     pub fn namesakes(&self) -> String {
         let (domain, name) = (self.domain_id, mangled(&self.name));
         format!("{TOKEN_ROOT}/{domain}/*/*/*/NN/*/*/{name}")
     }
 
     /// Selector of the tokens of all publishers of a topic in the domain.
-    #[must_use]
     pub fn publishers_of(&self, topic: &RosName) -> String {
         let (domain, topic) = (self.domain_id, mangled(topic.as_str()));
         format!("{TOKEN_ROOT}/{domain}/*/*/*/MP/*/*/*/{topic}/**")
     }
 
     /// Liveliness token of one of its endpoints.
-    #[must_use]
     pub fn endpoint_token(&self, endpoint: &Endpoint) -> String {
         let Endpoint {
             id,
@@ -155,7 +149,6 @@ impl Node {
     }
 
     /// Key on which messages of a topic are published.
-    #[must_use]
     pub fn key(&self, topic: &RosName, ros_type: RosType) -> String {
         format!(
             "{}/{}",
@@ -165,7 +158,6 @@ impl Node {
     }
 
     /// Key expression of a topic's messages, whatever the hash: publishers of every distribution match.
-    #[must_use]
     pub fn any_hash(&self, topic: &RosName, ros_type: RosType) -> String {
         format!("{}/*", self.keys_of_any_hash(topic, ros_type))
     }
@@ -188,7 +180,6 @@ fn mangled(name: &str) -> String {
 }
 
 /// Identifier of an endpoint: the hash of its token.
-#[must_use]
 pub fn gid(token: &str) -> Gid {
     // Low half first, both little-endian: the whole in little-endian.
     XxHash3_128::oneshot(token.as_bytes()).to_le_bytes()
@@ -207,7 +198,6 @@ pub struct Attachment {
 
 impl Attachment {
     /// The bytes on the wire.
-    #[must_use]
     pub fn to_bytes(&self) -> [u8; ATTACHMENT_LEN] {
         let Self {
             sequence,
@@ -228,7 +218,6 @@ impl Attachment {
     }
 
     /// Reads the bytes of an attachment; `None` if they have another length or layout.
-    #[must_use]
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (sequence, rest) = bytes.split_first_chunk()?;
         let (source_nanos, rest) = rest.split_first_chunk()?;

@@ -61,7 +61,6 @@ pub enum MotionError {
 
 impl MotionType {
     /// The type of the message.
-    #[must_use]
     pub fn ros_type(self) -> RosType {
         match self {
             Self::Odometry => RosType::Odometry,

@@ -57,7 +57,6 @@ impl RosName {
     }
 
     /// The name, with its leading slash.
-    #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -80,7 +79,6 @@ impl FromStr for RosName {
 /// Name of a vehicle in topics and frames: `cav_1000`. A part of a ROS name begins with no digit, has no hyphen and no
 /// two underscores in a row: `-` becomes `M` (`-1` is `cav_M1`), an underscore after another one `U`. Ids have no
 /// capitals, so different vehicles have different names.
-#[must_use]
 pub fn vehicle(cav: &CavId) -> String {
     let mut name = String::from("cav_");
     for letter in cav.as_str().chars() {
@@ -103,7 +101,6 @@ pub struct FrameNames {
 
 impl FrameNames {
     /// Frames of a node in `namespace`.
-    #[must_use]
     pub fn within(namespace: Option<&RosName>) -> Self {
         // Unlike topics, frames begin with no slash.
         let prefix = namespace.map(|name| format!("{}/", &name.as_str().trim_start_matches('/')));
@@ -113,25 +110,21 @@ impl FrameNames {
     }
 
     /// Frame of a vehicle's LiDAR, at its estimated pose.
-    #[must_use]
     pub fn lidar(&self, cav: &CavId) -> String {
         self.of(cav, "lidar")
     }
 
     /// Optical frame of a vehicle's camera: z ahead, x right, y down.
-    #[must_use]
     pub fn camera(&self, cav: &CavId, number: u8) -> String {
         self.of(cav, &format!("camera_{number}"))
     }
 
     /// Frame of a vehicle's body, fixed to its LiDAR.
-    #[must_use]
     pub fn base(&self, cav: &CavId) -> String {
         self.of(cav, "base_link")
     }
 
     /// Frame of a vehicle's LiDAR at its true pose.
-    #[must_use]
     pub fn truth(&self, cav: &CavId) -> String {
         self.of(cav, "truth")
     }

@@ -37,7 +37,6 @@ impl Qos {
     }
 
     /// As `offered_qos_profiles` of a channel, in the numbers that rosbag2 of every distribution reads.
-    #[must_use]
     pub fn offered_profiles(self) -> String {
         let (reliability, durability) = self.policies();
         let forever = "    sec: 9223372036\n    nsec: 854775807\n";

@@ -43,21 +43,18 @@ ros_types! {
 
 impl RosType {
     /// Name in ROS 2: `sensor_msgs/msg/PointCloud2`.
-    #[must_use]
     pub fn name(self) -> String {
         let (package, name) = self.parts();
         format!("{package}/msg/{name}")
     }
 
     /// Name on the wire: `sensor_msgs::msg::dds_::PointCloud2_`.
-    #[must_use]
     pub fn dds_name(self) -> String {
         let (package, name) = self.parts();
         format!("{package}::msg::dds_::{name}_")
     }
 
     /// Type hash as distributions write it in keys: `RIHS01_...`.
-    #[must_use]
     pub fn hash(self, distribution: Distribution) -> String {
         match distribution {
             Distribution::Humble => Distribution::NO_HASH.into(),
@@ -70,7 +67,6 @@ impl RosType {
 
     /// Definition with those of all contained types, for schemas of encoding `ros2msg`: the fields of the type, then
     /// those of the others, each after a line of 80 `=` and a line `MSG: package/Type`.
-    #[must_use]
     pub fn schema(self) -> String {
         let (_, own) = self.definition();
         let separator = "=".repeat(80);

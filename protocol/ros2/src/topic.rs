@@ -100,7 +100,6 @@ impl RosTopic {
     }
 
     /// Its name below `namespace`; topics that a ROS network has once are never in a namespace.
-    #[must_use]
     pub fn name(&self, namespace: Option<&RosName>) -> RosName {
         let namespace = match self {
             Self::Vehicle(..) => namespace.map_or("", RosName::as_str),
@@ -110,13 +109,11 @@ impl RosTopic {
     }
 
     /// Type of its messages.
-    #[must_use]
     pub fn ros_type(&self) -> RosType {
         self.row().1
     }
 
     /// Quality of service that ROS users expect on it.
-    #[must_use]
     pub fn qos(&self) -> Qos {
         self.row().2
     }

@@ -36,7 +36,6 @@ pub struct Transform {
 
 impl PoseType {
     /// The type of this name, `nav_msgs/msg/Odometry` for example.
-    #[must_use]
     pub fn of_name(name: &str) -> Option<Self> {
         match name {
             "nav_msgs/msg/Odometry" => Some(Self::Odometry),

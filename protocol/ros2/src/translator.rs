@@ -25,7 +25,6 @@ pub struct RosMessage {
 
 impl RosMessage {
     /// `cdr` for `topic`.
-    #[must_use]
     pub fn new(topic: RosTopic, cdr: Vec<u8>) -> Self {
         Self { topic, cdr }
     }
@@ -47,7 +46,6 @@ pub struct Translator {
 
 impl Translator {
     /// A translator for `run`.
-    #[must_use]
     pub fn new(run: &RunId) -> Self {
         Self {
             run: run.clone(),
@@ -71,7 +69,6 @@ impl Translator {
     }
 
     /// True if messages of `topic` have to be passed to [`Self::translate`].
-    #[must_use]
     pub fn wants(topic: &Topic) -> bool {
         match topic {
             Topic::Truth | Topic::Stats(_) => true,

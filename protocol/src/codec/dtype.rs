@@ -32,7 +32,6 @@ pub enum Dtype {
 
 impl Dtype {
     /// Bytes of a value.
-    #[must_use]
     pub fn size(self) -> u64 {
         match self {
             Self::F32 => 4,

@@ -20,7 +20,6 @@ pub enum ImageFormat {
 
 impl ImageFormat {
     /// Its name in `sensor_msgs/CompressedImage` and in file names.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Png => "png",

@@ -78,7 +78,6 @@ pub struct NeighbourState {
 
 impl NeighbourState {
     /// A vehicle of which nothing is known.
-    #[must_use]
     pub fn new(cav: CavId) -> Self {
         Self {
             cav,

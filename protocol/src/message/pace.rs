@@ -54,7 +54,6 @@ impl Pace {
     }
 
     /// Mean time between two computed sweeps; zero for every sweep.
-    #[must_use]
     pub fn mean_interval(&self) -> Duration {
         let sweeps = u128::from(self.period_nanos) * u128::from(self.of);
         let nanos = sweeps / u128::from(self.computed.max(1));

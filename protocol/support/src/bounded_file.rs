@@ -10,7 +10,6 @@ pub const MAX_TEXT_BYTES: u64 = 64 << 20;
 
 /// Largest number of bytes that a compressed file may unpack to: recorded data shrink to a tenth, constant ones to some
 /// hundredth.
-#[must_use]
 pub fn most_unpacked(packed_bytes: u64) -> u64 {
     packed_bytes.saturating_mul(300).saturating_add(64 << 20)
 }

@@ -174,7 +174,6 @@ impl CsvText {
     }
 
     /// The whole text.
-    #[must_use]
     pub fn finish(self) -> String {
         let bytes = self.0.into_inner().unwrap_or_default();
         String::from_utf8_lossy(&bytes).into_owned()

@@ -71,7 +71,6 @@ impl Provenance {
     }
 
     /// Digest of the settings, written as text, and of all that they were applied to; the command does not count.
-    #[must_use]
     pub fn key(&self, settings: &str) -> String {
         let mut hash = Sha256::new();
         for part in [&self.program_sha256, &self.data_sha256] {

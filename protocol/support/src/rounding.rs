@@ -1,7 +1,6 @@
 //! Rounding: floats to integers, with defined results outside the range.
 
 /// The nearest integer; 0 for negative values and for NaN, the largest integer for values beyond it.
-#[must_use]
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

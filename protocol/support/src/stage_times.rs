@@ -50,7 +50,6 @@ impl StageTimes {
     }
 
     /// All stages so far.
-    #[must_use]
     pub fn into_timings(self) -> Vec<StageTiming> {
         self.timings
     }

@@ -17,7 +17,6 @@ pub fn sorted(values: &[f64]) -> Vec<f64> {
 ///
 /// Every p50, p95 and p99 of a report is computed here. Order statistics that a fitted model takes as its input are not
 /// percentiles of a report and keep the rule with which the model was fitted.
-#[must_use]
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

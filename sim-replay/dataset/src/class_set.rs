@@ -23,13 +23,11 @@ impl ClassSet {
     pub(crate) const ALL_BUT_PEDESTRIANS: Self = Self(0b101_1111);
 
     /// True if a class is in the set.
-    #[must_use]
     pub fn contains(self, class: ObjectClass) -> bool {
         self.0 & bit(class) != 0
     }
 
     /// Their names; `vehicle` if all four kinds of vehicles are in the set.
-    #[must_use]
     pub fn names(self) -> Vec<String> {
         let has_vehicles = self.0 & Self::VEHICLES.0 == Self::VEHICLES.0;
         has_vehicles

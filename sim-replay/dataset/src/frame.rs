@@ -44,13 +44,11 @@ impl ObjectClass {
     pub const VEHICLES: [Self; 4] = [Self::Car, Self::Van, Self::Truck, Self::Bus];
 
     /// True for [`Self::VEHICLES`]. An object of unknown type is not a vehicle.
-    #[must_use]
     pub(crate) fn is_vehicle(self) -> bool {
         Self::VEHICLES.contains(&self)
     }
 
     /// Its name in files and options: `car`, `two_wheeler`.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Car => "car",

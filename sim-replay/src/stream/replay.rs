@@ -274,7 +274,6 @@ impl<'a> Replay<'a> {
 
     /// Plays the scene to its end, or until a stop is requested. Sends the end markers, and returns when all messages
     /// have left the process.
-    #[must_use]
     pub fn play(mut self) -> StreamReport {
         let began = Instant::now();
         let mut last = began;

@@ -1,5 +1,6 @@
 //! The detector against the reference implementation: encoder and voxelisation.
 
+use perception::layers::agent_attention::attend_ego;
 use perception::layers::backbone::BevBackbone;
 use perception::layers::head::DetectionHead;
 use perception::layers::shrink::{Compressor, Shrink};
@@ -82,8 +83,16 @@ fn golden_c1_intermediate_attfuse() {
     );
     for backbone in [None, Some(case.backbone.folded())] {
         let backbone = backbone.as_ref().unwrap_or(&case.backbone);
-        let features =
-            tch::no_grad(|| backbone.forward_fused(&canvas, &record_len, false)).unwrap();
+        // After every level the agents of a sample are fused; each agent's own features continue to the next level.
+        let attend = |level: Tensor| {
+            let samples = level.split_with_sizes(&record_len, 0);
+            let fused = samples.iter().map(|maps| attend_ego(maps, None).unwrap());
+            Tensor::stack(&fused.collect::<Vec<_>>(), 0)
+        };
+        let features = tch::no_grad(|| {
+            let levels = backbone.levels_of(&canvas, false).into_iter();
+            backbone.upsampled(&levels.map(attend).collect::<Vec<_>>(), false)
+        });
         case.check_from_2d(&golden, &features);
     }
 }

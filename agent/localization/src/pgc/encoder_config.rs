@@ -25,7 +25,6 @@ pub enum VoxelInput {
 
 impl VoxelInput {
     /// Channels of a voxel.
-    #[must_use]
     pub fn channels(self) -> i64 {
         match self {
             Self::Coordinates => 3,

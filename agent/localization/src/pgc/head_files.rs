@@ -102,7 +102,6 @@ pub fn encoder_or_named(encoder: Option<&Path>, head: &Path) -> Result<PathBuf, 
 }
 
 /// True for a word that may name a released head: a single component without an ending.
-#[must_use]
 pub fn is_name(head: &Path) -> bool {
     head.components().count() == 1 && head.extension().is_none()
 }
@@ -128,7 +127,6 @@ fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>, FileError> {
 }
 
 /// The released encoder, for a new head.
-#[must_use]
 pub fn released_encoder() -> Option<PathBuf> {
     let folders = weights_folders().into_iter();
     let mut files = folders.map(|folder| folder.join(ENCODER_FILE));

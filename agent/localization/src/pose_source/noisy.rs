@@ -152,7 +152,6 @@ impl NoiseMode {
 
     /// True if the ego's pose has no error, as in OpenCOOD's code: with one offset on all vehicles the relative poses
     /// would hardly change.
-    #[must_use]
     pub fn spares_ego(self) -> bool {
         self == Self::Fixed
     }

@@ -78,14 +78,12 @@ impl EvaluatedSweep {
     }
 
     /// Whether its pose was registered to a map.
-    #[must_use]
     pub fn is_registered(&self) -> bool {
         let found = self.localization.found;
         found.is_some_and(|found| found.is_registered)
     }
 
     /// Sample for the fit of a covariance: a pose that is published.
-    #[must_use]
     pub fn pose_sample(&self) -> Option<PoseSample> {
         let found = self.localization.found.filter(|found| !found.is_rejected)?;
         let (pose, truth) = (&found.world_from_sensor, self.truth.isometry());

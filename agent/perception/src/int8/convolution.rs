@@ -19,17 +19,6 @@ pub struct ConvGeometry {
     pub upsampling: i64,
 }
 
-impl ConvGeometry {
-    /// Keeps the size of a map, for an odd kernel.
-    pub const fn size_preserving(kernel: i64) -> Self {
-        Self {
-            stride: 1,
-            padding: kernel / 2,
-            upsampling: 1,
-        }
-    }
-}
-
 /// Convolution of `u8` maps, channels innermost in memory, to `u8` or `f32`.
 #[derive(Debug)]
 pub struct Int8Convolution {
@@ -193,7 +182,11 @@ mod tests {
         let convolution = Int8Convolution::new(
             &weight,
             Some(&bias),
-            ConvGeometry::size_preserving(3),
+            ConvGeometry {
+                stride: 1,
+                padding: 1,
+                upsampling: 1,
+            },
             format,
         )
         .unwrap();

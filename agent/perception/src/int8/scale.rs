@@ -32,7 +32,6 @@ impl Scale {
     }
 
     /// Value of one step.
-    #[must_use]
     pub fn step(self) -> f64 {
         f64::from(self.exponent).exp2()
     }

@@ -27,20 +27,6 @@ pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchEr
     (maps * weights).f_sum_dim_intlist([0_i64].as_slice(), false, Kind::Float)
 }
 
-/// [`attend_ego`] for several samples whose agents follow each other along dimension 0.
-///
-/// # Shapes
-/// - `maps`: `[sum of record_len, C, H, W]`
-/// - returns: `[B, C, H, W]`
-pub(crate) fn attend_samples(maps: &Tensor, record_len: &[i64]) -> Result<Tensor, TchError> {
-    let samples = maps.f_split_with_sizes(record_len, 0)?;
-    let fused: Result<Vec<_>, _> = samples
-        .iter()
-        .map(|sample| attend_ego(sample, None))
-        .collect();
-    Tensor::f_stack(&fused?, 0)
-}
-
 #[cfg(test)]
 mod tests {
     use tch::Device;
@@ -68,12 +54,5 @@ mod tests {
                 .unwrap()
                 .allclose(&ego, 1e-3, 1e-3, false)
         );
-    }
-
-    #[test]
-    fn wrong_sample_lengths_are_an_error() {
-        let maps = Tensor::zeros([3, 4, 2, 2], (Kind::Float, Device::Cpu));
-        assert!(attend_samples(&maps, &[2, 2]).is_err());
-        assert_eq!(attend_samples(&maps, &[2, 1]).unwrap().size(), [2, 4, 2, 2]);
     }
 }

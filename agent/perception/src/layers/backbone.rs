@@ -1,8 +1,7 @@
 //! 2D backbone: blocks that halve the feature map, each up-sampled to one BEV grid and concatenated.
 
-use tch::{TchError, Tensor, nn};
+use tch::{Tensor, nn};
 
-use crate::layers::agent_attention::attend_samples;
 use crate::layers::convolution::ConvLayer;
 use crate::layers::residual::ResidualBlock;
 use crate::model_config::{BlockKind, DetectorConfig};
@@ -66,26 +65,6 @@ impl BevBackbone {
     /// `[N, C, H, W]` to the concatenated levels `[N, sum of C_up, H', W']`.
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         self.upsampled(&self.levels_of(x, train), train)
-    }
-
-    /// AttFuse's backbone: after every level the agents of a sample are fused before the up-sampling branch, while each
-    /// agent's own features continue to the next level.
-    ///
-    /// # Shapes
-    /// - `x`: `[sum of record_len, C, H, W]`, all agents on their ego's BEV grid, ego first in each sample
-    /// - returns: `[B, sum of C_up, H', W']`
-    ///
-    /// # Errors
-    /// Those of the tensor library, when `record_len` does not add up to the number of maps.
-    pub fn forward_fused(
-        &self,
-        x: &Tensor,
-        record_len: &[i64],
-        train: bool,
-    ) -> Result<Tensor, TchError> {
-        let levels = self.levels_of(x, train);
-        let fused = levels.iter().map(|level| attend_samples(level, record_len));
-        Ok(self.upsampled(&fused.collect::<Result<Vec<_>, _>>()?, train))
     }
 
     /// Number of levels.

@@ -94,7 +94,6 @@ pub enum ComputePrecision {
 
 impl ComputePrecision {
     /// The corresponding type of the tensor library.
-    #[must_use]
     pub fn kind(self) -> Kind {
         match self {
             Self::F32 => Kind::Float,
@@ -116,7 +115,6 @@ pub enum Length {
 
 impl Length {
     /// Share of the training that is done, 0 at the start, 1 or more at the end.
-    #[must_use]
     pub fn share_done(self, step: u64, epoch: f64, seconds: f64) -> f64 {
         match self {
             Self::Steps(steps) => step as f64 / steps.max(1) as f64,

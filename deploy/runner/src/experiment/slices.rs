@@ -43,7 +43,6 @@ impl Slice {
 
     /// Places of the cells of this slice, of `cells` in the order of the experiment. Cells of one encoder are
     /// neighbours in that order, so that most are in one slice.
-    #[must_use]
     pub fn part(self, cells: usize) -> Range<usize> {
         cells * (self.number - 1) / self.count..cells * self.number / self.count
     }
@@ -86,7 +85,6 @@ impl Engine {
     /// The file with which the engine runs `count` slices of `command`, and `command` itself when all have ended.
     ///
     /// `result` is a file that `command` writes at its end.
-    #[must_use]
     pub fn file(self, command: &[&str], count: usize, result: &Path) -> String {
         let command: Vec<String> = command.iter().map(|word| quoted(word)).collect();
         let command = command.join(" ");

@@ -208,7 +208,6 @@ fn capacity_of(
 }
 
 /// Changes that let a fleet answer more ticks, the mildest first, as text: `tracked poses, method max or clock: stepped`.
-#[must_use]
 pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
     let scenario = &fleet.scenario;
     let mut all = Vec::new();

@@ -79,7 +79,6 @@ fn has_amx() -> bool {
 }
 
 /// The unit of compute times: the shortest of some convolutions on one thread of this process, milliseconds.
-#[must_use]
 pub fn unit_ms() -> f64 {
     tch::set_num_threads(1);
     let options = (Kind::Float, Device::Cpu);

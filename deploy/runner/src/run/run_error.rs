@@ -64,7 +64,6 @@ pub enum RunError {
 
 impl RunError {
     /// True if the input is at fault, and not the run.
-    #[must_use]
     pub fn is_bad_input(&self) -> bool {
         match self {
             Self::Network(error) | Self::Scorer(ScorerError::Bus(error)) => error.is_bad_input(),

@@ -91,7 +91,6 @@ pub struct RunResult {
 
 impl RunResult {
     /// True if data were lost beyond the drops of the link.
-    #[must_use]
     pub fn lost_data(&self) -> bool {
         loss::sentence(self).is_some()
     }

@@ -128,7 +128,6 @@ impl Scenario {
     }
 
     /// Pose sources of the vehicles, each once.
-    #[must_use]
     pub fn poses(&self) -> Vec<PoseSourceConfig> {
         let mut poses: Vec<PoseSourceConfig> = Vec::new();
         for AgentSettings { pose, .. } in self.settings() {

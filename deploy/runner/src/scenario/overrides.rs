@@ -38,7 +38,6 @@ impl JsonSchema for AgentOverrides {
 
 impl AgentOverrides {
     /// `settings` with the fields of this vehicle.
-    #[must_use]
     pub fn over(&self, settings: &AgentSettings) -> AgentSettings {
         let Ok(Value::Object(mut all)) = serde_json::to_value(settings) else {
             return settings.clone();

@@ -36,7 +36,6 @@ pub struct OperatingPoint {
 
 impl Amota {
     /// Averages over all sequences; `None` without true objects.
-    #[must_use]
     pub fn of(sequences: &[Sequence]) -> Option<Self> {
         let sequences: Vec<Sequence> = sequences.iter().map(Sequence::with_mean_scores).collect();
         let at_all = ClearMot::of(&sequences, MATCH_DISTANCE_M);

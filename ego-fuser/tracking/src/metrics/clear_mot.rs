@@ -51,7 +51,6 @@ struct History {
 
 impl ClearMot {
     /// Counts over all sequences of pairs at less than `max_distance_m`.
-    #[must_use]
     pub fn of(sequences: &[Sequence], max_distance_m: f64) -> Self {
         let mut counts = Self::default();
         for sequence in sequences {
@@ -65,21 +64,18 @@ impl ClearMot {
     }
 
     /// MOTA, at most 1; `None` without objects.
-    #[must_use]
     pub fn mota(&self) -> Option<f64> {
         let errors = self.misses + self.false_positives + self.switches;
         (self.objects > 0).then(|| 1.0 - errors as f64 / self.objects as f64)
     }
 
     /// MOTP: mean distance of matches and switches, metres; `None` without them.
-    #[must_use]
     pub fn motp_m(&self) -> Option<f64> {
         let detected = self.matches + self.switches;
         (detected > 0).then(|| self.distance_sum_m / detected as f64)
     }
 
     /// Share of the object points that a track matches, switches included; `None` without objects.
-    #[must_use]
     pub fn recall(&self) -> Option<f64> {
         let detected = (self.matches + self.switches) as f64;
         (self.objects > 0).then(|| detected / self.objects as f64)

@@ -38,7 +38,6 @@ type Pairs = BTreeMap<(i64, u64), f64>;
 
 impl Hota {
     /// HOTA over all sequences; `None` without objects and tracks.
-    #[must_use]
     pub fn of(sequences: &[Sequence]) -> Option<Self> {
         let mut sums = [Sums::default(); THRESHOLDS];
         for sequence in sequences {

@@ -20,7 +20,6 @@ pub struct Identity {
 
 impl Identity {
     /// Points over all sequences; pairs at less than `max_distance_m` can match. The mapping is made for each sequence.
-    #[must_use]
     pub fn of(sequences: &[Sequence], max_distance_m: f64) -> Self {
         let mut points = Self::default();
         for sequence in sequences {
@@ -30,7 +29,6 @@ impl Identity {
     }
 
     /// IDF1; `None` without points.
-    #[must_use]
     pub fn f1(&self) -> Option<f64> {
         let all = self.objects + self.tracks;
         (all > 0).then(|| 2.0 * self.matches as f64 / all as f64)

@@ -49,7 +49,6 @@ pub struct TrackQuality {
 
 impl TrackQuality {
     /// Quality of the tracks of all sequences.
-    #[must_use]
     pub fn of(sequences: &[Sequence]) -> Self {
         let Some(Amota {
             amota,

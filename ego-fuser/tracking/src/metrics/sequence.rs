@@ -58,7 +58,6 @@ impl Sequence {
     }
 
     /// The frames.
-    #[must_use]
     pub fn frames(&self) -> &[TrackedFrame] {
         &self.frames
     }

@@ -15,7 +15,6 @@ const SPEED_VARIANCE: f64 = 1e-2;
 const YAW_RATE_VARIANCE: f64 = 1e-4;
 
 /// `geometry_msgs/PoseWithCovarianceStamped`: a pose in the world, `world_from_lidar` of a vehicle for example.
-#[must_use]
 pub fn pose(nanos: u64, world_from_lidar: &Pose, covariance: Option<&PlanarCovariance>) -> Vec<u8> {
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, MAP_FRAME);
@@ -81,14 +80,12 @@ fn diagonal(variances: [f64; 6]) -> [[f64; 6]; 6] {
 pub type FrameInParent = (String, String, Pose);
 
 /// The body of a vehicle, fixed to its LiDAR. The LiDAR is the parent, as its pose is the one that is estimated.
-#[must_use]
 pub fn body_in_lidar(names: &FrameNames, cav: &CavId, mount: &Mount) -> FrameInParent {
     let lidar_from_base = mount.base_from_lidar.isometry().inverse().into();
     (names.lidar(cav), names.base(cav), lidar_from_base)
 }
 
 /// `tf2_msgs/TFMessage` for `/tf_static`: the bodies of vehicles.
-#[must_use]
 pub fn static_transforms<'a>(
     nanos: u64,
     vehicles: impl Iterator<Item = &'a CavId>,
@@ -102,7 +99,6 @@ pub fn static_transforms<'a>(
 }
 
 /// `tf2_msgs/TFMessage`.
-#[must_use]
 pub fn transforms(nanos: u64, frames: &[FrameInParent]) -> Vec<u8> {
     cdr::message(|cdr| {
         cdr.write_sequence_length(frames.len());
@@ -115,7 +111,6 @@ pub fn transforms(nanos: u64, frames: &[FrameInParent]) -> Vec<u8> {
 }
 
 /// `rosgraph_msgs/Clock`.
-#[must_use]
 pub fn clock(nanos: u64) -> Vec<u8> {
     cdr::message(|cdr| cdr::time(cdr, nanos))
 }

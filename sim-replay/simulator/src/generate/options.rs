@@ -25,7 +25,6 @@ pub enum Subset {
 
 impl Subset {
     /// The name in files and on the command line.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Town1loc => "town1loc",

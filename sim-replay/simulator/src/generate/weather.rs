@@ -45,7 +45,6 @@ pub(crate) enum Echo {
 
 impl Weather {
     /// The name in files and on the command line.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Sunny => "sunny",
@@ -56,7 +55,6 @@ impl Weather {
 
     /// The name of a sweep in this weather beside the clear one, as in V2X-R: with the extinction of fog per metre, or
     /// with the rate of the snow in millimetres per hour and the speed of its flakes. Clear air has none.
-    #[must_use]
     pub fn variant(self) -> Option<&'static str> {
         match self {
             Self::Sunny => None,

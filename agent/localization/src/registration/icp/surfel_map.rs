@@ -54,7 +54,6 @@ pub struct SurfelMap {
 
 impl SurfelMap {
     /// Settings of registrations to a map: one grid, first with a wide kernel, then with a narrow one.
-    #[must_use]
     pub fn registration() -> IcpConfig {
         let level = |scale_m, max_steps| IcpLevel {
             voxel_m: VOXEL_M,
@@ -69,7 +68,6 @@ impl SurfelMap {
     }
 
     /// Settings of a target that [`Self::write`] takes, of planes in voxels of this side, metres.
-    #[must_use]
     pub fn building(voxel_m: f64) -> IcpConfig {
         let mut config = Self::registration();
         config.levels.truncate(1);
@@ -78,25 +76,21 @@ impl SurfelMap {
     }
 
     /// Planes of the place.
-    #[must_use]
     pub fn target(&self) -> &IcpTarget {
         &self.target
     }
 
     /// Name of the place, as of its head; empty if it is not known.
-    #[must_use]
     pub fn place(&self) -> &str {
         &self.place
     }
 
     /// Scale of the covariance of registered poses, if it was fitted.
-    #[must_use]
     pub fn covariance_scale(&self) -> Option<CovarianceScale> {
         self.covariance_scale
     }
 
     /// SHA-256 of the file.
-    #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
@@ -356,6 +350,6 @@ pub(crate) mod tests {
             place: String::new(),
         };
         let one = encode(&config, 1, [&[0; 6], &[0; 3], &[0; 3]]).unwrap();
-        assert!(message(&one).contains("voxel_m is 0, must be 0.05 to 10"));
+        assert!(message(&one).contains("voxel_m is 0: must be "));
     }
 }

@@ -72,7 +72,6 @@ pub enum SceneLayout {
 
 impl SceneLayout {
     /// The name on the command line.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Opv2v => "opv2v",
