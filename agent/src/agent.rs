@@ -106,7 +106,6 @@ impl Agent {
     }
 
     /// The same with feature maps that keep within `rate`, applied by [`Self::write_map`].
-    #[must_use]
     pub fn within(self, rate: RateConfig) -> Self {
         Self {
             rate: RateControl::new(rate),
@@ -115,7 +114,6 @@ impl Agent {
     }
 
     /// An agent that computes neither confidence nor detections, for maps that are sent whole.
-    #[must_use]
     pub(crate) fn without_head(self) -> Self {
         Self {
             has_head: false,

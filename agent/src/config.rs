@@ -241,7 +241,6 @@ impl AgentSettings {
     ///
     /// Tracked vehicles measure in turn. Some pose errors spare the ego ([`PoseSourceConfig::for_ego`]). Its own agent
     /// sends over no link: its map is neither restricted nor adapted.
-    #[must_use]
     pub fn in_fleet(self, place: FleetPlace<'_>) -> Self {
         let turn = u32::try_from(place.index).unwrap_or(u32::MAX);
         let pose = self.pose.for_scenario(place.scenario).with_turn(turn);
@@ -299,6 +298,16 @@ impl ProcessConfig for AgentConfig {
     }
 }
 
+impl AgentSettings {
+    /// Stream that the vehicle publishes where a method needs `needed`.
+    pub fn sent_for(&self, needed: Stream) -> Stream {
+        match needed {
+            Stream::Bev if self.boxes_only => Stream::Boxes,
+            needed => needed,
+        }
+    }
+}
+
 impl AgentConfig {
     /// True if the agent has no detector, since nothing that needs one is published.
     pub fn gives_poses_only(&self) -> bool {
@@ -311,10 +320,7 @@ impl AgentConfig {
             of_loop: LoopOptions {
                 publish: { self.publish.iter() }
                     .filter_map(|publish| publish.stream())
-                    .map(|stream| match stream {
-                        Stream::Bev if self.settings.boxes_only => Stream::Boxes,
-                        stream => stream,
-                    })
+                    .map(|stream| self.settings.sent_for(stream))
                     .collect(),
                 codec: self.settings.codec,
                 rate: self.settings.rate,

@@ -130,7 +130,6 @@ impl Ego {
     }
 
     /// The same with another communication range: neighbours farther away, metres in the plane, are ignored.
-    #[must_use]
     pub fn with_comm_range(self, comm_range_m: f64) -> Self {
         Self {
             comm_range_m,
@@ -152,7 +151,6 @@ impl Ego {
 
     /// The same with latency compensation, if it is enabled: boxes of neighbours are carried to the time of the ego's frame
     /// by their velocities. Where the weights have a box input they always are.
-    #[must_use]
     pub fn with_latency_compensation(mut self, is_enabled: bool) -> Self {
         if is_enabled {
             self.compensation = Some(LatencyCompensation::default());
@@ -249,6 +247,9 @@ impl Ego {
             view: own,
             ego_from_cav: Pose::IDENTITY,
         }];
+        if let Some(compensation) = &mut self.compensation {
+            compensation.forget_absent(own.capture_nanos);
+        }
         let carried: Vec<Cow<'_, View>> = { neighbours.iter() }
             .map(|view| match &mut self.compensation {
                 Some(compensation) => compensation.carried(view, own.capture_nanos),

@@ -30,8 +30,8 @@ pub fn read_database(
     SweepDatabase::new(&sweeps).ok_or_else(|| no_sweeps(folders, left_out))
 }
 
-/// What describes a sweep of the drives and its pose, for all of them that `describe` describes; `progress` gets the
-/// number of sweeps done and of all. Sweeps that cannot be read or have no pose are left out and counted in `left_out`.
+/// Descriptor and pose of each sweep of the drives that `describe` gives a descriptor; `progress` gets the number of
+/// sweeps done and of all. Sweeps that cannot be read or have no pose are left out and counted in `left_out`.
 ///
 /// # Errors
 /// [`Error`] names the file, or the folders where no sweep is described.

@@ -21,7 +21,7 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     Vec::try_from(tensor.f_reshape(-1)?)
 }
 
-/// How many numbers are not below `least`, rounded up to a multiple of `step`.
+/// Count of the numbers that are not below `least`, rounded up to a multiple of `step`.
 pub(crate) fn above(numbers: &[f32], least: f32, step: usize) -> usize {
     let is_above = |number: &&f32| number.partial_cmp(&&least) != Some(Ordering::Less);
     numbers

@@ -133,7 +133,6 @@ impl Evaluator {
 
     /// The same with maps that its encoder computed before, stored at least as exactly as in messages: the messages are
     /// then the same.
-    #[must_use]
     pub fn with_maps(self, maps: MapSource) -> Self {
         Self {
             maps: Some(maps),

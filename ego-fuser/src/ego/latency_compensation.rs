@@ -16,6 +16,8 @@ const REACH_M: f64 = 1.5;
 const MIN_HITS: u32 = 2;
 /// Largest age to which boxes are carried, seconds.
 const MAX_AGE_S: f64 = 1.0;
+/// Time without a message after which a neighbour's tracks end, nanoseconds.
+const FORGOTTEN_NANOS: u64 = 10_000_000_000;
 
 /// Trackers of the neighbours that send boxes.
 #[derive(Debug, Default)]
@@ -50,6 +52,13 @@ impl LatencyCompensation {
             content: Content::Boxes(carried),
             ..view.clone()
         })
+    }
+
+    /// Removes the tracks of neighbours that have not sent for long.
+    pub(super) fn forget_absent(&mut self, now_nanos: u64) {
+        let is_absent = |sent_nanos| now_nanos.abs_diff(sent_nanos) > FORGOTTEN_NANOS;
+        self.of_cav
+            .retain(|_, followed| !followed.capture_nanos.is_some_and(is_absent));
     }
 
     /// Removes all tracks: another scene begins.
@@ -145,7 +154,10 @@ mod tests {
                 "{before:?} {after:?}"
             );
         }
-        compensation.clear();
+        compensation.forget_absent(late.capture_nanos + FORGOTTEN_NANOS);
+        assert_eq!(compensation.of_cav.len(), 1);
+        compensation.forget_absent(late.capture_nanos + FORGOTTEN_NANOS + 1);
+        assert_eq!(compensation.of_cav.len(), 0);
         let first = compensation.carried(&late, late.capture_nanos + 400_000_000);
         assert_eq!(centers(&first), before, "one view has no velocities");
     }

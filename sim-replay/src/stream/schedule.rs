@@ -60,7 +60,6 @@ impl Schedule {
     }
 
     /// Resumes at the state of the previous process instance, with its capture times.
-    #[must_use]
     pub fn resumed(self, position: Position) -> Self {
         Self { position, ..self }
     }

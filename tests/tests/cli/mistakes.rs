@@ -15,7 +15,7 @@ type Row = (&'static str, i32, &'static str);
 const EVAL: &str = "v2vloc eval --dataset {s} --weights {w} --method max";
 
 /// Mistakes in options of an evaluation: what follows [`EVAL`].
-const OF_AN_EVALUATION: [Row; 24] = [
+const OF_AN_EVALUATION: [Row; 26] = [
     (
         "--noise-position-std-m 2",
         2,
@@ -48,6 +48,16 @@ const OF_AN_EVALUATION: [Row; 24] = [
     ("--gate 2", 2, "codec.gate.threshold is 2: must be below"),
     ("--seed 3", 2, "--link"),
     ("--attackers 2", 2, "--attack"),
+    (
+        "--method late --boxes-only",
+        2,
+        "--boxes-only is for methods that exchange feature maps: late",
+    ),
+    (
+        "--latency-compensation",
+        2,
+        "--latency-compensation is for boxes of neighbours",
+    ),
     ("--latency-ms -3", 2, "latency is -3"),
     ("--link nolink", 2, "neither a preset of a link"),
     ("--frames 0", 2, "0 is not in 1"),

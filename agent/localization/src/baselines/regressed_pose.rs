@@ -64,7 +64,7 @@ pub struct PoseRegressor<N> {
     pub projection: TokenProjection,
     /// Classes of the scene.
     pub places: PlaceClasses,
-    /// What follows.
+    /// Network from tokens to poses.
     pub network: N,
     config: PoseRegressorConfig,
     device: Device,

@@ -145,13 +145,11 @@ impl PoseSourceConfig {
     }
 
     /// The same for one vehicle of several on one machine: those that are tracked measure in turn.
-    #[must_use]
     pub fn with_turn(self, turn: u32) -> Self {
         self.changed(|settings| settings.set_turn(turn))
     }
 
     /// The same for the ego of a fleet: the recorded pose in place of an error that spares it.
-    #[must_use]
     pub fn for_ego(self) -> Self {
         match self.settings().spares_ego() {
             true => Self::Recorded,
@@ -160,7 +158,6 @@ impl PoseSourceConfig {
     }
 
     /// The same with every sweep measured, to time a few of them.
-    #[must_use]
     pub fn measuring_every_sweep(self) -> Self {
         self.changed(|settings| settings.measure_every_sweep())
     }
@@ -207,7 +204,6 @@ impl PoseSourceConfig {
     }
 
     /// The same with the paths of its files changed. The name of a released head is no path.
-    #[must_use]
     pub fn map_files(mut self, change: impl Fn(&Path) -> PathBuf) -> Self {
         for file in self
             .settings_mut()

@@ -84,7 +84,7 @@ pub(crate) struct Args {
         conflicts_with_all = ["lightloc", "fit_confidence", "tracked", "solver"]
     )]
     retrieval: Vec<PathBuf>,
-    /// What --retrieval compares sweeps by.
+    /// Descriptor of a sweep that --retrieval compares.
     #[arg(long, value_enum, default_value_t, requires = "retrieval")]
     by: RetrievalBy,
     /// Register every sweep against a point-cloud map of these drives through the same scene (ICP), starting at the

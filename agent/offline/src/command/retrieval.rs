@@ -12,7 +12,7 @@ use protocol::PointCloud;
 use support::cli::BadInput;
 use terminal::progress;
 
-/// What sweeps are compared by.
+/// Descriptor of a sweep for retrieval.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub(crate) enum RetrievalBy {
     /// Features of the encoder, of the whole sweep; with --baseline its tokens, in all directions of the sensor.

@@ -77,7 +77,7 @@ impl EvaluatedSweep {
         })
     }
 
-    /// Whether its pose was registered to a map.
+    /// True if its pose was registered to a map.
     pub fn is_registered(&self) -> bool {
         let found = self.localization.found;
         found.is_some_and(|found| found.is_registered)

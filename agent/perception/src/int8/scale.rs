@@ -37,7 +37,6 @@ impl Scale {
     }
 
     /// The next smaller scale.
-    #[must_use]
     pub(super) fn finer(self) -> Self {
         Self {
             exponent: self.exponent.saturating_sub(1),

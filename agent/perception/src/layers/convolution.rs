@@ -171,13 +171,11 @@ impl ConvLayer {
     }
 
     /// The same with a batch norm after the convolution.
-    #[must_use]
     pub(crate) fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
         self.with_norm_of(norm, channels, (NORM_EPS, NORM_MOMENTUM))
     }
 
     /// The same with a batch norm of another epsilon and momentum.
-    #[must_use]
     pub(crate) fn with_norm_of(
         self,
         norm: &nn::Path<'_>,
@@ -191,7 +189,6 @@ impl ConvLayer {
     }
 
     /// The same with a ReLU at the end.
-    #[must_use]
     pub(crate) fn with_relu(self) -> Self {
         Self { relu: true, ..self }
     }

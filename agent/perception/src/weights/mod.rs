@@ -207,7 +207,6 @@ impl Weights {
     }
 
     /// The same weights for a number format: in [`InferencePrecision::Float`] the scales of activations are ignored.
-    #[must_use]
     pub fn with_precision(mut self, precision: InferencePrecision) -> Self {
         if precision == InferencePrecision::Float {
             self.metadata.remove(SCALES_KEY);

@@ -274,6 +274,17 @@ impl Arguments {
                 "options of the codec and of the rate are for feature maps: {methods} sends none"
             )));
         }
+        if self.boxes_only && exchange().all(|content| content != Exchange::Features) {
+            return Err(BadInput::new(format!(
+                "--boxes-only is for methods that exchange feature maps: {methods} does not"
+            )));
+        }
+        let carries = |content| content == Exchange::Boxes || self.boxes_only;
+        if self.latency_compensation && !exchange().any(carries) {
+            return Err(BadInput::new(format!(
+                "--latency-compensation is for boxes of neighbours: {methods} receives none"
+            )));
+        }
         let listens = self.attack.is_some() || self.trust || self.delay_ms > 0;
         if listens && exchange().all(|content| content == Exchange::Nothing) {
             return Err(BadInput::new(format!(

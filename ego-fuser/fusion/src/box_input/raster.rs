@@ -9,8 +9,8 @@ pub const CHANNELS: usize = 12;
 
 /// Boxes that are drawn at most; those of low confidence are left out first.
 const MAX_BOXES: usize = 256;
-/// Cells of one box along an axis at most: a longer box is none of a vehicle.
-const MAX_CELLS: i64 = 64;
+/// Length and width up to which a box is drawn, metres: larger than any vehicle, so that no sender's boxes take long.
+const MAX_SIZE_M: [f64; 2] = [26.0, 5.0];
 /// Size of a usual vehicle, metres: length, width, height.
 const USUAL_M: [f64; 3] = [3.9, 1.6, 1.56];
 /// Centre height of a usual vehicle in the ego's frame, metres.
@@ -102,9 +102,13 @@ fn values(placed: &PlacedBox, center_m: [f64; 2], share: f64) -> [f64; CHANNELS]
     ]
 }
 
-/// The cells that the footprint of a box covers: index, centre in metres, and covered share.
+/// The cells that the footprint of a box covers, within [`MAX_SIZE_M`]: index, centre in metres, and covered share.
 fn covered(box3d: &Box3d, grid: &BevGrid) -> Vec<(usize, [f64; 2], f64)> {
-    let corners = box3d.corners();
+    let mut drawn = *box3d;
+    for (size_m, most_m) in drawn.size_m.iter_mut().zip(MAX_SIZE_M) {
+        *size_m = size_m.min(most_m);
+    }
+    let corners = drawn.corners();
     let size = [i64::from(grid.width), i64::from(grid.height)];
     let low_m = [grid.x_min_m, grid.y_min_m];
     let range = |axis: usize| {
@@ -113,11 +117,7 @@ fn covered(box3d: &Box3d, grid: &BevGrid) -> Vec<(usize, [f64; 2], f64)> {
             (low.min(at), high.max(at))
         });
         let cell = |at: f64| ((at - low_m[axis]) / grid.cell_m).floor() as i64;
-        let (first, last) = (cell(low), cell(high));
-        match last.saturating_sub(first) > MAX_CELLS {
-            true => 0..0,
-            false => first.max(0)..last.saturating_add(1).min(size[axis]),
-        }
+        cell(low).max(0)..cell(high).saturating_add(1).min(size[axis])
     };
     let (columns, rows) = (range(0), range(1));
     let footprint = Polygon::footprint(&corners);
@@ -236,15 +236,19 @@ mod tests {
     }
 
     #[test]
-    fn a_box_at_the_edge_is_cut_and_one_outside_is_left_out() {
+    fn a_box_at_the_edge_is_cut_and_one_outside_is_not_drawn() {
         let raster = draw(&[car([8.0, 0.0, -1.0], 0.0)], &GRID);
         assert!((area_m2(&raster) - 3.2).abs() < 1e-5);
         for far in [[30.0, 0.0, 0.0], [0.0, -50.0, 0.0], [1e7, 1e7, 0.0]] {
             assert!(area_m2(&draw(&[car(far, 0.5)], &GRID)) < 1e-9);
         }
-        let mut endless = car([0.0; 3], 0.3);
-        endless.box3d.size_m[0] = 1e3;
-        assert!(area_m2(&draw(&[endless], &GRID)) < 1e-9);
+        // A box of impossible size is drawn as the largest one.
+        let [endless, largest] = [[1e3, 1e3], [26.0, 5.0]].map(|[length, width]| {
+            let mut long = car([0.0; 3], 0.3);
+            long.box3d.size_m = [length, width, 1.5];
+            area_m2(&draw(&[long], &GRID))
+        });
+        assert!(largest > 30.0 && endless == largest);
     }
 
     #[test]

@@ -9,7 +9,7 @@ use dataset::frame::Frame;
 use fusion::method::Exchange;
 use perception::detector::DetectorError;
 use protocol::{
-    CavId, CodecConfig, EncodedFeatures, PointCloud, PoseEstimate, StageTiming, WireError,
+    CavId, CodecConfig, EncodedFeatures, PointCloud, PoseEstimate, StageTiming, Stream, WireError,
 };
 use tch::Tensor;
 
@@ -21,8 +21,8 @@ pub(super) struct Participant {
     attack: Option<Attack>,
     /// Encoding of its maps.
     codec: CodecConfig,
-    /// True if it sends detections in place of maps.
-    boxes_only: bool,
+    /// True if it publishes detections in place of maps.
+    sends_boxes: bool,
     times: PoseTimes,
     /// Stages of the last sweep's perception.
     stages: Vec<StageTiming>,
@@ -43,7 +43,7 @@ impl Participant {
             agent,
             attack,
             codec: settings.codec,
-            boxes_only: settings.boxes_only,
+            sends_boxes: settings.sent_for(Stream::Bev) == Stream::Boxes,
             times: PoseTimes::default(),
             stages: Vec::new(),
         }
@@ -53,10 +53,10 @@ impl Participant {
         self.agent.cav()
     }
 
-    /// What it sends where a method needs `needed`.
+    /// Content that it publishes where a method needs `needed`.
     pub(super) fn exchange(&self, needed: Exchange) -> Exchange {
         match needed {
-            Exchange::Features if self.boxes_only => Exchange::Boxes,
+            Exchange::Features if self.sends_boxes => Exchange::Boxes,
             needed => needed,
         }
     }

@@ -101,7 +101,7 @@ fn sample(
     Ok((maps, facts.collect(), boxes))
 }
 
-/// What a neighbour detects in its own map, in its own frame.
+/// Detections of a neighbour from its own map, in its own LiDAR frame.
 fn detections(model: &CooperativeModel, map: &Tensor) -> Result<Vec<Detection>, Error> {
     let limits = PostprocessConfig::for_late_fusion(model.config());
     let heads = tch::no_grad(|| model.network().heads(map))?;

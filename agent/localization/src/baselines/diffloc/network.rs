@@ -95,7 +95,7 @@ impl DiffLoc {
         })
     }
 
-    /// What the denoiser sees of sweeps with `features` `[N, WIDTH]` in `classes` `[N]`.
+    /// Condition of the denoiser for sweeps with `features` `[N, WIDTH]` in `classes` `[N]`.
     ///
     /// # Errors
     /// Those of the tensor library.

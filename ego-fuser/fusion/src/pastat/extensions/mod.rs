@@ -15,6 +15,6 @@ pub(super) mod map_refinement;
 pub(super) mod pooled_history;
 pub(super) mod temporal_memory;
 
-/// Where the logit of the detector's class head is below this, a likelihood of 1 %, nothing is detected after the temporal
-/// memory and the refinement either: without gradients neither looks there.
+/// Logit of the detector's class head, a likelihood of 1 %, below which temporal memory and refinement leave a map as it
+/// is, without gradients: what they add there is no detection.
 const LEAST_LIKELY: f32 = -4.6;
