@@ -148,13 +148,27 @@ pub struct AgentSettings {
     /// Rate control of feature maps: a size, a byte rate, the vehicle's own queue.
     #[command(flatten)]
     pub rate: RateConfig,
-    /// Send detections in place of feature maps: a kilobyte, of any network. The ego needs weights with a box input.
-    #[arg(long)]
-    pub boxes_only: bool,
+    /// Send detections in place of feature maps, or beside them: a kilobyte, of any network. The ego needs weights with a
+    /// box input. Absent: maps alone.
+    #[arg(long, value_enum)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub boxes: Option<SentBoxes>,
     /// Falsification of the vehicle's messages, to measure its effect on the ego. Absent: none.
     #[arg(long, value_enum, help_heading = "Attack")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub falsification: Option<Falsification>,
+}
+
+/// Detections that a vehicle sends where the method fuses feature maps.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum SentBoxes {
+    /// In place of maps.
+    Only,
+    /// Beside maps, and before them: the ego falls back on them where a map is late, lost or of another network.
+    Beside,
 }
 
 /// Place of a vehicle in a fleet.
@@ -261,7 +275,7 @@ impl AgentSettings {
                 ..codec
             },
             rate: RateConfig::default(),
-            boxes_only: false,
+            boxes: None,
             ..self
         }
     }
@@ -299,11 +313,12 @@ impl ProcessConfig for AgentConfig {
 }
 
 impl AgentSettings {
-    /// Stream that the vehicle publishes where a method needs `needed`.
-    pub fn sent_for(&self, needed: Stream) -> Stream {
-        match needed {
-            Stream::Bev if self.boxes_only => Stream::Boxes,
-            needed => needed,
+    /// Streams that the vehicle publishes where a method needs `needed`, in this order.
+    pub fn sent_for(&self, needed: Stream) -> Vec<Stream> {
+        match (needed, self.boxes) {
+            (Stream::Bev, Some(SentBoxes::Only)) => vec![Stream::Boxes],
+            (Stream::Bev, Some(SentBoxes::Beside)) => vec![Stream::Boxes, Stream::Bev],
+            _ => vec![needed],
         }
     }
 }
@@ -320,7 +335,7 @@ impl AgentConfig {
             of_loop: LoopOptions {
                 publish: { self.publish.iter() }
                     .filter_map(|publish| publish.stream())
-                    .map(|stream| self.settings.sent_for(stream))
+                    .flat_map(|stream| self.settings.sent_for(stream))
                     .collect(),
                 codec: self.settings.codec,
                 rate: self.settings.rate,

@@ -34,6 +34,10 @@ use fusion::{AlignedMaps, MapMetadata, ReceivedMaps};
 pub use crate::view::{Content, View};
 pub use error::EgoError;
 
+/// Lag of a neighbour's newest map behind its newest boxes from which on the boxes are fused, nanoseconds: maps of one sweep
+/// before earn more than boxes, maps of three sweeps before less (`deploy/results/experiments.md`).
+const MAP_LAG_NANOS: i64 = 100_000_000;
+
 /// Reason why a neighbour is not in a result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Skipped {
@@ -267,19 +271,26 @@ impl Ego {
                 Err(reason) => skipped.push((index, reason)),
             }
         }
+        let mut leave_out =
+            |is_out: &[bool], reason, fused: &mut Vec<usize>, aligned: &mut Vec<_>| {
+                let left_out = fused.iter().zip(is_out).filter(|(_, is_out)| **is_out);
+                skipped.extend(left_out.map(|(&index, _)| (index, Skipped::Unusable(reason))));
+                *fused = keep(std::mem::take(fused), is_out);
+                let mut others = keep(aligned.split_off(1), is_out);
+                aligned.append(&mut others);
+            };
+        // Of each neighbour the best: boxes stand in for a map that has not come.
+        let is_unneeded: Vec<bool> = { aligned[1..].iter() }
+            .map(|one: &Aligned<'_>| one.is_unneeded_beside(&aligned))
+            .collect();
+        leave_out(&is_unneeded, DropReason::Unneeded, &mut fused, &mut aligned);
         let mut stages = StageTimes::start();
         let mut beliefs = Vec::new();
         if self.trust.is_some() && !fused.is_empty() {
             let found = self.judge(&aligned)?;
             let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
-            let left_out = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
-            skipped.extend(
-                left_out.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Misbehaviour))),
-            );
             beliefs = fused.iter().copied().zip(found).collect();
-            fused = keep(fused, &is_out);
-            let mut others = keep(aligned.split_off(1), &is_out);
-            aligned.append(&mut others);
+            leave_out(&is_out, DropReason::Misbehaviour, &mut fused, &mut aligned);
             stages.lap("trust");
         }
         let detections = no_grad(|| match needed {
@@ -563,6 +574,23 @@ struct Aligned<'a> {
 }
 
 impl Aligned<'_> {
+    /// True for a message of a neighbour of which a better one is among the views: its map, unless that is older than its
+    /// boxes by more than [`MAP_LAG_NANOS`].
+    fn is_unneeded_beside(&self, all: &[Self]) -> bool {
+        let is_map = |one: &Self| matches!(one.view.content, Content::Features(_));
+        all[1..].iter().any(|other| {
+            let (map, boxes) = if is_map(self) {
+                (self, other)
+            } else {
+                (other, self)
+            };
+            let is_late = map.view.age_nanos(boxes.view) > MAP_LAG_NANOS;
+            other.view.cav == self.view.cav
+                && is_map(other) != is_map(self)
+                && is_late == is_map(self)
+        })
+    }
+
     /// Its boxes, if it has sent boxes.
     fn boxes(&self, ego: &View) -> Vec<PlacedBox> {
         let Content::Boxes(found) = &self.view.content else {

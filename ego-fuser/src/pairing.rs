@@ -1,12 +1,12 @@
-//! Pairing: selects the message of each CAV for a frame of the ego by capture time, not by arrival.
+//! Pairing: selects the message of each sender for a frame of the ego by capture time, not by arrival.
 //!
-//! For every CAV the newest message that is not younger than the ego's frame is taken, unless it is too old. Younger
+//! A sender is a vehicle, or one of its streams. For each the newest message that is not younger than the ego's frame is taken, unless it is too old. Younger
 //! messages wait for their frame. A message that served one frame may serve the next one too, if no newer one arrives
 //! in time; it is counted as received once.
 
 use std::collections::{BTreeMap, VecDeque};
 
-use protocol::{CavId, DropReason};
+use protocol::DropReason;
 
 /// Limits of pairing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -16,7 +16,7 @@ pub struct PairingConfig {
     /// A message captured at most this long after the ego's frame still counts as of its time, nanoseconds: sensors of
     /// different vehicles are not synchronised.
     pub max_lead_nanos: u64,
-    /// Messages that wait per CAV at most.
+    /// Messages that wait per sender at most.
     pub depth: usize,
 }
 
@@ -34,9 +34,9 @@ impl PairingConfig {
 
 /// A message that will not be used, with the reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Dropped {
+pub struct Dropped<K> {
     /// Its sender.
-    pub cav: CavId,
+    pub sender: K,
     /// Its capture time, nanoseconds.
     pub capture_nanos: u64,
     /// Reason for which it is not used.
@@ -45,9 +45,9 @@ pub struct Dropped {
 
 /// A message that belongs to the ego's frame.
 #[derive(Debug, PartialEq)]
-pub struct Paired<'a, T> {
+pub struct Paired<'a, K, T> {
     /// Its sender.
-    pub cav: &'a CavId,
+    pub sender: &'a K,
     /// Capture time of the ego's frame less that of the message, nanoseconds.
     pub age_nanos: i64,
     /// True if it has not served an earlier frame: then it counts as received now.
@@ -58,9 +58,9 @@ pub struct Paired<'a, T> {
 
 /// Messages that wait for the ego's frame.
 #[derive(Debug)]
-pub struct Pairing<T> {
+pub struct Pairing<K, T> {
     config: PairingConfig,
-    waiting: BTreeMap<CavId, VecDeque<Waiting<T>>>,
+    waiting: BTreeMap<K, VecDeque<Waiting<T>>>,
 }
 
 #[derive(Debug)]
@@ -70,7 +70,7 @@ struct Waiting<T> {
     message: T,
 }
 
-impl<T> Pairing<T> {
+impl<K: Ord + Clone, T> Pairing<K, T> {
     /// No messages yet.
     pub fn new(config: PairingConfig) -> Self {
         Self {
@@ -82,15 +82,15 @@ impl<T> Pairing<T> {
     /// Queues a message. The message that has to be dropped for it is returned: the message itself when it is a
     /// duplicate or older than one that served already, or the oldest of the queue when that is full.
     #[must_use = "what was dropped has to be counted"]
-    pub fn insert(&mut self, cav: &CavId, capture_nanos: u64, message: T) -> Option<Dropped> {
+    pub fn insert(&mut self, sender: &K, capture_nanos: u64, message: T) -> Option<Dropped<K>> {
         let dropped = |capture_nanos, reason| {
             Some(Dropped {
-                cav: cav.clone(),
+                sender: sender.clone(),
                 capture_nanos,
                 reason,
             })
         };
-        let queue = self.waiting.entry(cav.clone()).or_default();
+        let queue = self.waiting.entry(sender.clone()).or_default();
         if queue.iter().any(|held| held.capture_nanos == capture_nanos) {
             return dropped(capture_nanos, DropReason::Duplicate);
         }
@@ -113,8 +113,8 @@ impl<T> Pairing<T> {
         dropped(oldest.capture_nanos, DropReason::Superseded)
     }
 
-    /// The messages that belong to the ego's frame, by CAV, and those that will never be used.
-    pub fn pair(&mut self, ego_capture_nanos: u64) -> (Vec<Paired<'_, T>>, Vec<Dropped>) {
+    /// The messages that belong to the ego's frame, by sender, and those that will never be used.
+    pub fn pair(&mut self, ego_capture_nanos: u64) -> (Vec<Paired<'_, K, T>>, Vec<Dropped<K>>) {
         let PairingConfig {
             max_age_nanos,
             max_lead_nanos,
@@ -124,7 +124,7 @@ impl<T> Pairing<T> {
         let earliest = ego_capture_nanos.saturating_sub(max_age_nanos);
         let mut paired = Vec::new();
         let mut dropped = Vec::new();
-        for (cav, queue) in &mut self.waiting {
+        for (sender, queue) in &mut self.waiting {
             let due = queue.partition_point(|held| held.capture_nanos <= latest);
             let newest = due
                 .checked_sub(1)
@@ -133,7 +133,7 @@ impl<T> Pairing<T> {
             for held in queue.drain(..newest.unwrap_or(due)) {
                 if !held.is_used {
                     dropped.push(Dropped {
-                        cav: cav.clone(),
+                        sender: sender.clone(),
                         capture_nanos: held.capture_nanos,
                         reason: match held.capture_nanos < earliest {
                             true => DropReason::Stale,
@@ -148,7 +148,7 @@ impl<T> Pairing<T> {
                 let is_first_use = !std::mem::replace(&mut held.is_used, true);
                 let age_nanos = ego_capture_nanos as i64 - held.capture_nanos as i64;
                 paired.push(Paired {
-                    cav,
+                    sender,
                     age_nanos,
                     is_first_use,
                     message: &held.message,
@@ -158,29 +158,29 @@ impl<T> Pairing<T> {
         (paired, dropped)
     }
 
-    /// True if a CAV's message for the ego's frame waits, or a later one: then this frame's own is lost, and waiting for
+    /// True if a sender's message for the ego's frame waits, or a later one: then this frame's own is lost, and waiting for
     /// it is useless.
-    pub fn has_reached(&self, cav: &CavId, ego_capture_nanos: u64) -> bool {
+    pub fn has_reached(&self, sender: &K, ego_capture_nanos: u64) -> bool {
         let lead_nanos = self.config.max_lead_nanos;
-        self.capture_times(cav)
+        self.capture_times(sender)
             .any(|time| time.saturating_add(lead_nanos) >= ego_capture_nanos)
     }
 
-    /// The capture times of messages of a CAV that wait, oldest first.
-    pub fn capture_times(&self, cav: &CavId) -> impl Iterator<Item = u64> + '_ {
-        let queue = self.waiting.get(cav).into_iter().flatten();
+    /// The capture times of messages of a sender that wait, oldest first.
+    pub fn capture_times(&self, sender: &K) -> impl Iterator<Item = u64> + '_ {
+        let queue = self.waiting.get(sender).into_iter().flatten();
         queue.map(|held| held.capture_nanos)
     }
 
-    /// All CAVs with waiting messages.
-    pub fn cavs(&self) -> Vec<CavId> {
+    /// All senders with waiting messages.
+    pub fn senders(&self) -> Vec<K> {
         self.waiting.keys().cloned().collect()
     }
 
-    /// The clock of the scene was set back to `now_nanos`: removes a CAV's messages of later times, except those up to
+    /// The clock of the scene was set back to `now_nanos`: removes a sender's messages of later times, except those up to
     /// `ahead_nanos` early. Returns the number of these that were never used.
-    pub(crate) fn turn_back(&mut self, cav: &CavId, now_nanos: u64, ahead_nanos: u64) -> usize {
-        let Some(queue) = self.waiting.get_mut(cav) else {
+    pub(crate) fn turn_back(&mut self, sender: &K, now_nanos: u64, ahead_nanos: u64) -> usize {
+        let Some(queue) = self.waiting.get_mut(sender) else {
             return 0;
         };
         let latest = now_nanos.saturating_add(ahead_nanos);
@@ -190,16 +190,16 @@ impl<T> Pairing<T> {
         unused
     }
 
-    /// Removes a CAV that has left; returns the number of its messages that were never used.
-    pub fn forget(&mut self, cav: &CavId) -> usize {
-        let unused = self.unused(cav);
-        self.waiting.remove(cav);
+    /// Removes a sender that has left; returns the number of its messages that were never used.
+    pub fn forget(&mut self, sender: &K) -> usize {
+        let unused = self.unused(sender);
+        self.waiting.remove(sender);
         unused
     }
 
-    /// Messages of a CAV that wait and were never used, at the end of a run: in flight in the message accounting.
-    pub fn unused(&self, cav: &CavId) -> usize {
-        let queue = self.waiting.get(cav).into_iter().flatten();
+    /// Messages of a sender that wait and were never used, at the end of a run: in flight in the message accounting.
+    pub fn unused(&self, sender: &K) -> usize {
+        let queue = self.waiting.get(sender).into_iter().flatten();
         queue.filter(|held| !held.is_used).count()
     }
 }
@@ -207,6 +207,7 @@ impl<T> Pairing<T> {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use protocol::CavId;
 
     use super::*;
 
@@ -216,11 +217,11 @@ mod tests {
         CavId::new(name).unwrap()
     }
 
-    fn pairing() -> Pairing<u64> {
+    fn pairing() -> Pairing<CavId, u64> {
         Pairing::new(PairingConfig::with_max_age_nanos(3 * FRAME))
     }
 
-    fn ages(pairing: &mut Pairing<u64>, ego: u64) -> (Vec<i64>, Vec<DropReason>) {
+    fn ages(pairing: &mut Pairing<CavId, u64>, ego: u64) -> (Vec<i64>, Vec<DropReason>) {
         let (paired, dropped) = pairing.pair(ego);
         (
             paired.iter().map(|found| found.age_nanos).collect(),
@@ -349,7 +350,7 @@ mod tests {
                     lost += dropped.len();
                 }
             }
-            let unused: usize = pairing.cavs().iter().map(|cav| pairing.unused(cav)).sum();
+            let unused: usize = pairing.senders().iter().map(|cav| pairing.unused(cav)).sum();
             prop_assert_eq!(sent, received + lost + unused);
         }
     }

@@ -1,6 +1,6 @@
 //! View: one vehicle's decoded message for a frame.
 
-use protocol::{CavId, DecodedFeatures, Detection, PointCloud, PoseEstimate};
+use protocol::{CavId, DecodedFeatures, Detection, PointCloud, PoseEstimate, Stream};
 
 use fusion::method::Exchange;
 
@@ -36,6 +36,15 @@ pub enum Content {
 }
 
 impl Content {
+    /// Stream that transmits this content.
+    pub fn stream(&self) -> Stream {
+        match self {
+            Self::Features(_) => Stream::Bev,
+            Self::Boxes(_) => Stream::Boxes,
+            Self::Points(_) => Stream::Points,
+        }
+    }
+
     /// Exchange that transmits this content.
     pub fn exchange(&self) -> Exchange {
         match self {

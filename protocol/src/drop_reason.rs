@@ -47,6 +47,8 @@ named! {
         Undelivered = "undelivered",
         /// The capture clock of its sender is unsteady or was corrected anew.
         Clock = "clock",
+        /// Another message of its sender was used in its place: boxes beside a feature map, or the map where it is late.
+        Unneeded = "unneeded",
     }
 }
 
@@ -56,7 +58,11 @@ impl DropReason {
     pub fn is_loss(self) -> bool {
         !matches!(
             self,
-            Self::LinkLoss | Self::LinkQueue | Self::OutOfRange | Self::Misbehaviour
+            Self::LinkLoss
+                | Self::LinkQueue
+                | Self::OutOfRange
+                | Self::Misbehaviour
+                | Self::Unneeded
         )
     }
 }

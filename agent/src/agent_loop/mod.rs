@@ -407,6 +407,11 @@ impl AgentLoop {
             Some(attack) => attack.perception(perception),
             None => perception,
         };
+        // Boxes first: they are what an ego falls back on while a large map is on its way.
+        if self.options.publish.contains(&Stream::Boxes) {
+            let content = Content::Fixed(Message::Boxes(Boxes { pose, detections }));
+            self.publish(Stream::Boxes, capture_nanos, content);
+        }
         if self.options.publish.contains(&Stream::Bev) {
             let content = Content::Map {
                 pose,
@@ -414,10 +419,6 @@ impl AgentLoop {
                 confidence,
             };
             self.publish(Stream::Bev, capture_nanos, content);
-        }
-        if self.options.publish.contains(&Stream::Boxes) {
-            let content = Content::Fixed(Message::Boxes(Boxes { pose, detections }));
-            self.publish(Stream::Boxes, capture_nanos, content);
         }
     }
 }

@@ -78,7 +78,11 @@ impl Fleet {
     /// An error that names what the scene or the weights lack.
     pub fn plan(scenario: &Scenario) -> Result<Self> {
         let mut scenario = scenario.clone();
-        scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
+        scenario.models.weights = weights_of(
+            &scenario.models.weights,
+            scenario.method,
+            scenario.sends_boxes(),
+        )?;
         let weights = &scenario.models.weights;
         let detector = { Weights::load(weights) }
             .and_then(|weights| weights.detector_config())
@@ -127,13 +131,13 @@ impl Fleet {
                 );
             }
         }
-        let sends_boxes = |cav: &&CavId| **cav != ego && scenario.settings_of(cav).boxes_only;
+        let sends_boxes = |cav: &&CavId| **cav != ego && scenario.settings_of(cav).boxes.is_some();
         if let Some(cav) = agents.iter().find(sends_boxes)
             && scenario.method.exchange() == Exchange::Features
             && !pipeline.reads_boxes()
         {
             bail!(
-                "vehicle {cav}: boxes_only: the ego's weights, {}, have no box input and would leave its boxes out",
+                "vehicle {cav}: boxes: the ego's weights, {}, have no box input and would leave its boxes out",
                 scenario.models.weights.display()
             );
         }
@@ -263,17 +267,18 @@ impl Fleet {
         self.agents.iter().filter(|cav| **cav != self.ego)
     }
 
-    /// Messages that a vehicle publishes in addition to its pose, those that the method needs, and their stream; the
-    /// ego's own agent sends its feature map even where no other counts.
-    pub(crate) fn publish(&self, cav: &CavId) -> (Publish, Stream) {
+    /// Messages that the method needs; the ego's own agent sends its feature map even where no other counts.
+    pub(crate) fn needed(&self) -> (Publish, Stream) {
         match self.scenario.method.exchange() {
-            Exchange::Features if self.settings_of(cav).boxes_only => {
-                (Publish::Boxes, Stream::Boxes)
-            }
             Exchange::Nothing | Exchange::Features => (Publish::Bev, Stream::Bev),
             Exchange::Boxes => (Publish::Boxes, Stream::Boxes),
             Exchange::Points => (Publish::Points, Stream::Points),
         }
+    }
+
+    /// Streams that a vehicle publishes in addition to its pose.
+    pub(crate) fn streams_of(&self, cav: &CavId) -> Vec<Stream> {
+        self.settings_of(cav).sent_for(self.needed().1)
     }
 }
 

@@ -164,7 +164,7 @@ impl CooperativeModel {
             None => stored_config(weights, method, &config)?,
         };
         let mut model = Self::with_fusion(&config, method, &fusion, device)?;
-        if weights.contains(box_input::WEIGHT) {
+        if box_input::is_in(weights) {
             model.add_box_input();
         }
         // A single-vehicle network becomes a cooperative one whose fusion is untrained.

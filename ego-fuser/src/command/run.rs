@@ -43,14 +43,19 @@ impl Arguments {
             let LoopReport {
                 frames,
                 fused,
+                fused_boxes,
                 at_deadline,
                 failed,
                 failure,
             } = &report;
             let reason = { failure.as_ref() }
                 .map_or(String::new(), |reason| format!(", the first: {reason}"));
+            let boxes = match fused_boxes {
+                0 => String::new(),
+                boxes => format!(" ({boxes} boxes in place of a feature map)"),
+            };
             output::line(format_args!(
-                "{frames} frames, {fused} neighbours' messages fused, {at_deadline} at the deadline, {failed} failed{reason}"
+                "{frames} frames, {fused} neighbours' messages fused{boxes}, {at_deadline} at the deadline, {failed} failed{reason}"
             ))?;
         }
         Ok(Outcome::of(report.failed > 0))

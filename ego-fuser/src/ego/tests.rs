@@ -675,5 +675,25 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
             detect(true, &[&boxes]).detections,
             detect(true, &[]).detections
         );
+
+        // Of one neighbour the map counts, and its boxes where the map does not.
+        let same = View {
+            cav: map.cav.clone(),
+            ..boxes.clone()
+        };
+        let both = detect(true, &[&same, &map]);
+        let unneeded = Skipped::Unusable(DropReason::Unneeded);
+        assert_eq!((both.fused, both.skipped), (vec![1], vec![(0, unneeded)]));
+        assert_eq!(both.detections, detect(true, &[&map]).detections);
+        let mut foreign = map.clone();
+        if let Content::Features(map) = &mut foreign.content {
+            map.features.channels += 1;
+        }
+        let from_boxes = detect(true, &[&same, &foreign]);
+        assert_eq!(
+            (from_boxes.fused, from_boxes.skipped),
+            (vec![0], vec![(1, shape)])
+        );
+        assert_eq!(from_boxes.detections, detect(true, &[&boxes]).detections);
     }
 }

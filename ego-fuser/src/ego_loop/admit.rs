@@ -6,7 +6,7 @@ use protocol::{
     wire,
 };
 
-use super::{EgoLoop, Message, Output, OwnFrame, Reception};
+use super::{EgoLoop, Message, Output, OwnFrame, Reception, Source};
 use crate::capture_clock::SweepTime;
 use crate::ego::{Content, Ego, View};
 
@@ -41,13 +41,14 @@ impl EgoLoop {
         limits: &Limits,
     ) -> Result<Message, Refusal> {
         let cav = &reception.cav;
+        let is_boxes = header.kind == Kind::Boxes && self.reads_boxes && *cav != self.cav;
+        let stream = if is_boxes { Stream::Boxes } else { self.stream };
         if *cav != self.cav {
-            self.dated(cav, header.stamp.capture_nanos)
+            self.dated(cav, stream, header.stamp.capture_nanos)
                 .map_err(Refusal::Unneeded)?;
         }
-        let is_boxes = header.kind == Kind::Boxes && self.reads_boxes && *cav != self.cav;
-        let (pose, content) = match self.stream {
-            stream if stream == Stream::Boxes || is_boxes => {
+        let (pose, content) = match stream {
+            Stream::Boxes => {
                 let Boxes { pose, detections } = payload(pieces, limits)?;
                 (pose, Content::Boxes(detections))
             }
@@ -88,23 +89,37 @@ impl EgoLoop {
         if cav == self.cav {
             return self.begin(ego, message, now_nanos);
         }
-        match message.view.content {
-            Content::Boxes(_) if self.stream != Stream::Boxes => {
-                self.box_senders.insert(cav.clone())
-            }
-            _ => self.box_senders.remove(&cav),
-        };
-        match self.dated(&cav, stated_nanos) {
+        let source = (cav.clone(), message.view.content.stream());
+        self.note_stream(&cav, source.1);
+        match self.dated(&cav, source.1, stated_nanos) {
             Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,
-            Err(reason) => return self.drop_message(&cav, reason),
+            Err(reason) => return self.drop_message(source, reason),
+        }
+        // A map that comes after the ego's next sweep is no reason to wait for the next one.
+        let lead_nanos = self.options.pairing.max_lead_nanos;
+        let latest_nanos = message.view.capture_nanos.saturating_add(lead_nanos);
+        if let Some(frames) = self.without_map.get_mut(&cav)
+            && source.1 == self.stream
+            && self.own_nanos.is_none_or(|own| own <= latest_nanos)
+        {
+            *frames = 0;
         }
         if let Some(offset_s) = message.reception.clock_offset_s {
             self.clock_offsets_s.insert(cav.clone(), offset_s);
         }
         self.silence.reset(&cav);
         let capture_nanos = message.view.capture_nanos;
-        if let Some(lost) = self.pairing.insert(&cav, capture_nanos, message) {
-            self.drop_message(&lost.cav, lost.reason);
+        if let Some(lost) = self.pairing.insert(&source, capture_nanos, message) {
+            self.drop_message(lost.sender, lost.reason);
+        }
+    }
+
+    /// Records that a neighbour publishes a stream.
+    pub fn note_stream(&mut self, cav: &CavId, stream: Stream) {
+        if stream == Stream::Boxes {
+            self.box_senders.insert(cav.clone());
+        } else if stream == self.stream {
+            self.without_map.entry(cav.clone()).or_default();
         }
     }
 
@@ -134,8 +149,8 @@ impl EgoLoop {
     /// # Errors
     /// Reason to drop it: it is of another network; its clock is unsteady; it is in the future, later than the ego's own
     /// sweeps by more than its own agent may lag behind; or it is so old that no frame of the ego will use it.
-    fn dated(&self, cav: &CavId, stated_nanos: u64) -> Result<u64, DropReason> {
-        if self.models.is_other(cav) {
+    fn dated(&self, cav: &CavId, stream: Stream, stated_nanos: u64) -> Result<u64, DropReason> {
+        if stream == self.stream && self.models.is_other(cav) {
             return Err(DropReason::Shape);
         }
         let corrected = self.clocks.corrected(cav, stated_nanos);
@@ -159,9 +174,11 @@ impl EgoLoop {
         let latest_nanos = capture_nanos.saturating_add(max_age_nanos);
         if self.own_nanos.is_some_and(|own| latest_nanos < own) {
             tracing::info!(capture_nanos, "the scene has restarted");
-            for cav in self.pairing.cavs() {
-                let gone = self.pairing.turn_back(&cav, capture_nanos, MAX_AHEAD_NANOS);
-                self.drop_messages(&cav, gone, DropReason::Stale);
+            for source in self.pairing.senders() {
+                let gone = self
+                    .pairing
+                    .turn_back(&source, capture_nanos, MAX_AHEAD_NANOS);
+                self.drop_messages(&source, gone, DropReason::Stale);
             }
             ego.forget();
         }
@@ -172,6 +189,9 @@ impl EgoLoop {
     pub(super) fn compare_models(&mut self, cav: &CavId, descriptor: &Descriptor) {
         // Boxes and points belong to no network.
         let sends_maps = descriptor.streams.contains(&Stream::Bev);
+        for &stream in &descriptor.streams {
+            self.note_stream(cav, stream);
+        }
         if self.stream != Stream::Bev || (self.reads_boxes && !sends_maps) {
             self.models.forget(cav);
             return;
@@ -184,8 +204,7 @@ impl EgoLoop {
             return;
         }
         tracing::warn!(%cav, "its maps are of another network and are left out: {other}");
-        let unused = self.pairing.forget(cav);
-        self.drop_messages(cav, unused, DropReason::Shape);
+        self.empty(&(cav.clone(), Stream::Bev), DropReason::Shape);
     }
 
     /// Compares the capture clocks of two vehicles by the arrivals of their sweeps. Messages that wait under a capture
@@ -199,8 +218,7 @@ impl EgoLoop {
             }
         }
         for cav in self.clocks.update() {
-            let unused = self.pairing.forget(&cav);
-            self.drop_messages(&cav, unused, DropReason::Clock);
+            self.empty_all(&cav, DropReason::Clock);
         }
     }
 
@@ -210,20 +228,32 @@ impl EgoLoop {
         self.silence.reset(cav);
         self.models.forget(cav);
         self.box_senders.remove(cav);
+        self.without_map.remove(cav);
         self.clocks.forget(cav);
         self.clock_offsets_s.remove(cav);
         self.ended.remove(cav);
-        let unused = self.pairing.forget(cav);
-        self.drop_messages(cav, unused, DropReason::Stale);
+        self.empty_all(cav, DropReason::Stale);
     }
 
-    pub(super) fn drop_message(&mut self, cav: &CavId, reason: DropReason) {
-        self.outputs.push(Output::Dropped(cav.clone(), reason));
+    /// Drops the messages of a neighbour that wait.
+    fn empty_all(&mut self, cav: &CavId, reason: DropReason) {
+        for stream in self.neighbour_streams() {
+            self.empty(&(cav.clone(), stream), reason);
+        }
     }
 
-    fn drop_messages(&mut self, cav: &CavId, count: usize, reason: DropReason) {
+    fn empty(&mut self, source: &Source, reason: DropReason) {
+        let unused = self.pairing.forget(source);
+        self.drop_messages(source, unused, reason);
+    }
+
+    pub(super) fn drop_message(&mut self, source: Source, reason: DropReason) {
+        self.outputs.push(Output::Dropped(source, reason));
+    }
+
+    fn drop_messages(&mut self, source: &Source, count: usize, reason: DropReason) {
         for _ in 0..count {
-            self.drop_message(cav, reason);
+            self.drop_message(source.clone(), reason);
         }
     }
 }

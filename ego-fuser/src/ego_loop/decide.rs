@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use protocol::message::{FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming};
-use protocol::{CavId, Detections, DropReason};
+use protocol::{CavId, Detections, DropReason, Stream};
 
-use super::{EgoLoop, Output, OwnFrame};
+use super::{EgoLoop, Output, OwnFrame, Source};
 use crate::ego::{Ego, EgoOutput, Skipped, View};
 use crate::misbehaviour::{self, Assessment};
 use crate::pairing::Paired;
+use crate::silence::SILENT_AFTER;
 
 /// The neighbours' messages for a frame, and the neighbours without one.
 #[derive(Default)]
@@ -21,6 +22,7 @@ struct Choice {
 
 /// Fields of a message for accounting and report.
 struct MessageInfo {
+    stream: Stream,
     is_first_use: bool,
     payload_bytes: u64,
     wire_bytes: u64,
@@ -53,7 +55,7 @@ impl EgoLoop {
     fn finish(&mut self) {
         let (_, dropped) = self.pairing.pair(u64::MAX);
         for lost in dropped {
-            self.outputs.push(Output::Dropped(lost.cav, lost.reason));
+            self.outputs.push(Output::Dropped(lost.sender, lost.reason));
         }
         self.is_finished = true;
     }
@@ -70,10 +72,25 @@ impl EgoLoop {
     fn is_complete(&self, capture_nanos: u64) -> bool {
         let mut awaited = { self.members.iter() }.filter(|cav| self.silence.is_awaited(cav));
         awaited.all(|cav| {
+            let has = |stream| {
+                let source = (cav.clone(), stream);
+                self.pairing.has_reached(&source, capture_nanos)
+            };
+            let is_other = self.models.is_other(cav);
             self.ended.contains(cav)
-                || self.models.is_other(cav)
-                || self.pairing.has_reached(cav, capture_nanos)
+                || has(self.stream)
+                || match self.reads_boxes {
+                    true if !is_other && self.sends_maps_now(cav) => false,
+                    true if self.box_senders.contains(cav) => has(Stream::Boxes),
+                    _ => is_other,
+                }
         })
+    }
+
+    /// True for a neighbour whose boxes are no reason to stop waiting: its feature maps came in time lately.
+    fn sends_maps_now(&self, cav: &CavId) -> bool {
+        let frames = self.without_map.get(cav);
+        frames.is_some_and(|frames| *frames < SILENT_AFTER)
     }
 
     fn fuse(&mut self, ego: &mut Ego, frame: OwnFrame, now_nanos: u64) {
@@ -89,8 +106,8 @@ impl EgoLoop {
                 stages,
             }) => {
                 let neighbours = self.neighbour_reports(&beliefs, &choice.views);
-                self.outputs.push(Output::Received(self.cav.clone()));
-                self.leave_out(&skipped, &mut choice);
+                self.outputs.push(Output::Received(self.own_source()));
+                self.leave_out(&skipped, &fused, &mut choice);
                 let fused = self.use_messages(&own, &fused, &choice);
                 let transport =
                     { frame.transport }.map(|transport| StageTiming::new("transport", transport));
@@ -122,7 +139,7 @@ impl EgoLoop {
                     true => DropReason::NotFinite,
                     false => DropReason::Shape,
                 };
-                self.drop_message(&self.cav.clone(), reason);
+                self.drop_message(self.own_source(), reason);
                 // The neighbours' messages are valid.
                 let all: Vec<usize> = (0..choice.views.len()).collect();
                 self.use_messages(&own, &all, &choice);
@@ -132,6 +149,10 @@ impl EgoLoop {
                 });
             }
         }
+    }
+
+    fn own_source(&self) -> Source {
+        (self.cav.clone(), self.stream)
     }
 
     /// Report of the neighbours received for a frame.
@@ -153,6 +174,7 @@ impl EgoLoop {
         let (paired, dropped) = self.pairing.pair(capture_nanos);
         let mut choice = Choice::default();
         for Paired {
+            sender: (_, stream),
             is_first_use,
             message,
             ..
@@ -161,20 +183,27 @@ impl EgoLoop {
             // A copy, as the message may serve the next frame too.
             choice.views.push(message.view.clone());
             choice.messages.push(MessageInfo {
+                stream: *stream,
                 is_first_use,
                 payload_bytes: message.payload_bytes,
                 wire_bytes: message.wire_bytes,
             });
         }
         for lost in &dropped {
-            self.drop_message(&lost.cav, lost.reason);
+            self.drop_message(lost.sender.clone(), lost.reason);
         }
         for cav in &self.members {
+            let source = (cav.clone(), self.stream);
+            if let Some(frames) = self.without_map.get_mut(cav)
+                && !self.pairing.has_reached(&source, capture_nanos)
+            {
+                *frames = frames.saturating_add(1);
+            }
             if choice.views.iter().any(|view| view.cav == *cav) {
                 continue;
             }
             self.silence.missed(cav);
-            let lost = dropped.iter().rev().find(|lost| lost.cav == *cav);
+            let lost = dropped.iter().rev().find(|lost| lost.sender.0 == *cav);
             let reason = match self.models.is_other(cav) {
                 true => Some(DropReason::Shape),
                 false => lost.map(|lost| lost.reason),
@@ -196,7 +225,8 @@ impl EgoLoop {
         let mut described = Vec::with_capacity(fused.len());
         for &index in fused {
             let (view, message) = (&choice.views[index], &choice.messages[index]);
-            self.count(&view.cav, message.is_first_use, None);
+            self.report.fused_boxes += u64::from(message.stream != self.stream);
+            self.count(view, message, None);
             described.push(FusedNeighbour {
                 cav: view.cav.clone(),
                 age_nanos: view.age_nanos(own),
@@ -209,27 +239,31 @@ impl EgoLoop {
     }
 
     /// Counts the views that are not in the result, and names those that should have been.
-    fn leave_out(&mut self, left_out: &[(usize, Skipped)], choice: &mut Choice) {
+    fn leave_out(&mut self, left_out: &[(usize, Skipped)], fused: &[usize], choice: &mut Choice) {
         for &(index, why) in left_out {
-            let cav = choice.views[index].cav.clone();
+            let view = &choice.views[index];
             let reason = match why {
                 Skipped::Unusable(reason) => Some(reason),
                 // It was evaluated, and rightly left out.
                 Skipped::NotNeeded => None,
             };
-            self.count(&cav, choice.messages[index].is_first_use, reason);
-            if reason.is_some() {
+            self.count(view, &choice.messages[index], reason);
+            // A neighbour that is in the result by another message is not left out.
+            let is_in = |&index: &usize| choice.views[index].cav == view.cav;
+            if reason.is_some() && !fused.iter().any(is_in) {
+                let cav = view.cav.clone();
                 choice.skipped.push(SkippedNeighbour { cav, reason });
             }
         }
     }
 
     /// Counts a message at its first use.
-    fn count(&mut self, cav: &CavId, is_first_use: bool, reason: Option<DropReason>) {
+    fn count(&mut self, view: &View, message: &MessageInfo, reason: Option<DropReason>) {
+        let source = (view.cav.clone(), message.stream);
         match reason {
-            _ if !is_first_use => {}
-            Some(reason) => self.drop_message(cav, reason),
-            None => self.outputs.push(Output::Received(cav.clone())),
+            _ if !message.is_first_use => {}
+            Some(reason) => self.drop_message(source, reason),
+            None => self.outputs.push(Output::Received(source)),
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use protocol::message::{Descriptor, Detections};
-use protocol::{CavId, DropReason, Pace, Tracks};
+use protocol::{CavId, DropReason, Pace, Stream, Tracks};
 use serde::{Deserialize, Serialize};
 
 use crate::capture_clock::SweepTime;
@@ -85,6 +85,9 @@ pub struct Message {
     pub wire_bytes: u64,
 }
 
+/// A vehicle and the stream of its messages.
+pub type Source = (CavId, Stream);
+
 /// Something that an ego does.
 #[derive(Debug)]
 pub enum Output {
@@ -104,10 +107,10 @@ pub enum Output {
         /// Cause.
         error: EgoError,
     },
-    /// Counts a message of a vehicle as used.
-    Received(CavId),
-    /// Counts a message of a vehicle as not used.
-    Dropped(CavId, DropReason),
+    /// Counts a message of a vehicle's stream as used.
+    Received(Source),
+    /// Counts a message of a vehicle's stream as not used.
+    Dropped(Source, DropReason),
     /// Publishes the share of sweeps that the fleet computes.
     Pace(Pace),
 }

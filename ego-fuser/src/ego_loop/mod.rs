@@ -33,7 +33,7 @@ use tracking::{Tracker, TrackerConfig};
 use waits::Waits;
 
 pub(crate) use admit::Refusal;
-pub use input::{Input, Message, Output, Reception};
+pub use input::{Input, Message, Output, Reception, Source};
 
 /// Time that an ego whose own agent has ended waits for the last messages of its neighbours, nanoseconds.
 const LAST_WAIT_NANOS: u64 = 2_000_000_000;
@@ -73,6 +73,8 @@ pub struct LoopReport {
     pub frames: u64,
     /// Neighbours' messages that were fused, over all frames.
     pub fused: u64,
+    /// Of these, boxes in place of a feature map.
+    pub fused_boxes: u64,
     /// Frames that were decided at the deadline.
     pub at_deadline: u64,
     /// Frames that could not be fused.
@@ -95,15 +97,17 @@ struct OwnFrame {
 pub struct EgoLoop {
     cav: CavId,
     stream: Stream,
-    /// True if neighbours may send boxes in place of that stream.
+    /// True if neighbours may send boxes in place of that stream, or beside it.
     reads_boxes: bool,
-    /// Neighbours whose last message had boxes in place of it.
+    /// Neighbours that send boxes in place of it or beside it.
     box_senders: BTreeSet<CavId>,
+    /// Consecutive frames that were decided before the feature map of their time, of each neighbour that sends maps.
+    without_map: BTreeMap<CavId, u32>,
     options: LoopOptions,
     members: BTreeSet<CavId>,
     silence: Silence,
     models: PeerModels,
-    pairing: Pairing<Message>,
+    pairing: Pairing<Source, Message>,
     clocks: CaptureClocks,
     /// System clock of a neighbour minus the ego's, seconds, as of its last message.
     clock_offsets_s: BTreeMap<CavId, f64>,
@@ -130,6 +134,7 @@ impl EgoLoop {
             stream,
             reads_boxes: ego.reads_boxes(),
             box_senders: BTreeSet::new(),
+            without_map: BTreeMap::new(),
             waits: Waits::new(cav, ego.method().name(), stream, ego.reads_boxes()),
             options,
             members: BTreeSet::new(),
@@ -195,19 +200,11 @@ impl EgoLoop {
         self.stream
     }
 
-    /// Streams of which a neighbour may publish either.
+    /// Streams of which a neighbour may publish either or both.
     pub fn neighbour_streams(&self) -> impl Iterator<Item = Stream> + use<> {
         [self.stream]
             .into_iter()
             .chain(self.reads_boxes.then_some(Stream::Boxes))
-    }
-
-    /// Stream of a vehicle's last message.
-    pub fn stream_of(&self, cav: &CavId) -> Stream {
-        match self.box_senders.contains(cav) {
-            true => Stream::Boxes,
-            false => self.stream,
-        }
     }
 
     /// Problems of the ego: missing messages and streams, each with the time of its beginning, nanoseconds.
@@ -220,9 +217,9 @@ impl EgoLoop {
         &self.report
     }
 
-    /// Messages of a neighbour that wait and were never used.
-    pub fn unused(&self, cav: &CavId) -> usize {
-        self.pairing.unused(cav)
+    /// Messages of a neighbour's stream that wait and were never used.
+    pub fn unused(&self, source: &Source) -> usize {
+        self.pairing.unused(source)
     }
 }
 

@@ -22,7 +22,7 @@ use serde::Serialize;
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::Ego;
 use crate::ego_loop::recorded::{KIND, Published, Record, WireMessage};
-use crate::ego_loop::{EgoLoop, Input, LoopOptions, LoopReport, Output};
+use crate::ego_loop::{EgoLoop, Input, LoopOptions, LoopReport, Output, Source};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
 use agent::input_log::{InputFile, InputLog};
 use agent::loop_clock::LoopClock;
@@ -321,9 +321,9 @@ impl<'a> Node<'a> {
                     capture_nanos,
                     error,
                 } => tracing::error!(capture_nanos, "a frame could not be fused: {error}"),
-                Output::Received(cav) => self.bus.stats().received(&self.topic(&cav)),
-                Output::Dropped(cav, reason) => {
-                    self.bus.stats().dropped(&self.topic(&cav), reason);
+                Output::Received(source) => self.bus.stats().received(&self.topic(&source)),
+                Output::Dropped(source, reason) => {
+                    self.bus.stats().dropped(&self.topic(&source), reason);
                 }
                 Output::Pace(pace) => self.pace.submit(0, pace),
             }
@@ -368,9 +368,8 @@ impl<'a> Node<'a> {
         }
     }
 
-    fn topic(&self, cav: &CavId) -> Topic {
-        let stream = self.ego_loop.stream_of(cav);
-        topic_of(&self.cav, cav, stream, self.options.over_link)
+    fn topic(&self, (cav, stream): &Source) -> Topic {
+        topic_of(&self.cav, cav, *stream, self.options.over_link)
     }
 
     fn next_moment(&self) -> Instant {

@@ -49,9 +49,9 @@ const OF_AN_EVALUATION: [Row; 26] = [
     ("--seed 3", 2, "--link"),
     ("--attackers 2", 2, "--attack"),
     (
-        "--method late --boxes-only",
+        "--method late --boxes only",
         2,
-        "--boxes-only is for methods that exchange feature maps: late",
+        "--boxes is for methods that exchange feature maps: late",
     ),
     (
         "--latency-compensation",

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -193,22 +193,29 @@ fn a_neighbour_that_sends_boxes_is_fused_where_the_weights_read_them() {
     let folder = tempfile::tempdir().unwrap();
     let link = "capacity: {token_bucket: {bandwidth_mbps: 1}}\nlatency: {constant_ms: 10}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
-    let rest = "link: {model: link.yaml}\nego: {deadline_ms: 5000}\nvehicles: {\"4288\": {boxes_only: true}}";
-    let scenario = write_scenario(folder.path(), 4, "lockstep: true", rest);
     let weights = folder.path().join("weights.safetensors");
-    write_weights_with_box_input(&weights);
-    let mut up = Up::start(folder.path(), &scenario);
-    let status = up.wait();
-    let ledger = json(&up.folder.join("ledger.json"));
-    assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
-    assert_eq!(status.code(), Some(0), "{}", ledger["total"]);
-    let results = results(&up.folder);
-    let counts: Vec<usize> = results.iter().map(fused).collect();
-    assert_eq!(counts, [1; 4]);
+    let mut scenario = PathBuf::new();
+    for (boxes, unneeded) in [("only", 0), ("beside", 4)] {
+        let rest = format!(
+            "link: {{model: link.yaml}}\nego: {{deadline_ms: 5000}}\nvehicles: {{\"4288\": {{boxes: {boxes}}}}}"
+        );
+        scenario = write_scenario(folder.path(), 4, "lockstep: true", &rest);
+        write_weights_with_box_input(&weights);
+        let mut up = Up::start(folder.path(), &scenario);
+        let status = up.wait();
+        let ledger = json(&up.folder.join("ledger.json"));
+        assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
+        assert_eq!(status.code(), Some(0), "{}", ledger["total"]);
+        let results = results(&up.folder);
+        let counts: Vec<usize> = results.iter().map(fused).collect();
+        assert_eq!(counts, [1; 4], "{boxes}");
+        let dropped = ledger["total"]["dropped"]["unneeded"].as_u64();
+        assert_eq!(dropped.unwrap_or(0), unneeded, "{}", ledger["total"]);
+    }
 
     write_sighted_weights(&weights);
     let mut up = Up::start(folder.path(), &scenario);
-    up.wait_for_line("vehicle 4288: boxes_only: the ego's weights");
+    up.wait_for_line("vehicle 4288: boxes: the ego's weights");
     assert_eq!(up.wait().code(), Some(2));
 }
 

@@ -515,10 +515,13 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             "late",
             "agents: {pose: {noisy: {position_std_m: 0.3, heading_std_deg: 1, mode: independent}}}",
         ),
-        ("max", "vehicles: {\"4288\": {boxes_only: true}}"),
+        (
+            "max",
+            "vehicles: {\"4288\": {boxes: only}, \"4297\": {boxes: beside}}",
+        ),
         ("none", ""),
     ] {
-        let weights = match rest.contains("boxes_only") {
+        let weights = match rest.contains("boxes") {
             true => "boxes.safetensors",
             false => "weights.safetensors",
         };
@@ -530,7 +533,7 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             );
             let path = folder.path().join("scenario.yaml");
             fs::write(&path, text).unwrap();
-            let name = format!("{method}-{}-{processes}", rest.contains("boxes_only"));
+            let name = format!("{method}-{}-{processes}", rest.contains("boxes"));
             run_up(folder.path(), &path, &name)
         };
         let (one, many) = (run(false), run(true));
@@ -538,6 +541,9 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
         let decided = results(one.folder.path());
         let is_found = |result: &Value| !result["detections"].as_array().unwrap().is_empty();
         assert!(decided.iter().any(is_found), "{method} {rest}");
+        let ledger = fs::read_to_string(one.folder.file("ledger.json")).unwrap();
+        let ledger: Value = serde_json::from_str(&ledger).unwrap();
+        assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
         let takes_both = |result: &Value| fused(result) == 2;
         assert!(
             method == "none" || decided.iter().any(takes_both),

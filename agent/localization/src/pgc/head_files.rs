@@ -30,7 +30,7 @@ pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
     released_file(head, "head", HEAD_PREFIX, TRAINED_FILE)
 }
 
-/// The file of a surfel map: a path, the folder that `agent map` wrote, or the name of a released one (`town1`).
+/// The file of a surfel map: a path, the folder that `agent map` wrote, or the name of a released one (`town1`, `town4`).
 ///
 /// # Errors
 /// [`FileError`] with the names of the released maps.

@@ -96,7 +96,7 @@ pub(crate) struct Args {
         conflicts_with_all = ["encoder", "head", "baseline", "lightloc", "retrieval", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
-    /// Register the poses of PGC to a surfel map of the place (`agent map`) or a released one (town1): poses to the millimetre.
+    /// Register the poses of PGC to a surfel map of the place (`agent map`) or a released one (town1, town4): poses to the millimetre.
     #[arg(long, value_name = "FILE|NAME", conflicts_with_all = ["baseline", "lightloc", "retrieval", "icp_map", "fit_confidence"])]
     surfel_map: Option<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.

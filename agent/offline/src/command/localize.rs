@@ -37,7 +37,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
-    /// wrote, or a released one (town1) [default: none].
+    /// wrote, or a released one (town1, town4) [default: none].
     #[arg(long, value_name = "FILE|NAME")]
     surfel_map: Option<PathBuf>,
     /// Number format in which networks are computed.

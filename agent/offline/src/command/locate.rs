@@ -46,7 +46,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
-    /// wrote, or a released one (town1) [default: none].
+    /// wrote, or a released one (town1, town4) [default: none].
     #[arg(long, value_name = "FILE|NAME")]
     surfel_map: Option<PathBuf>,
     /// Least confidence of a pose, 0 to 1: others are rejected, beside those that the head rejects.

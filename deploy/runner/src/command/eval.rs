@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use agent::attack::{AttackConfig, Falsification};
-use agent::config::{AgentSettings, ModelConfig, Threads};
+use agent::config::{AgentSettings, ModelConfig, SentBoxes, Threads};
 use agent::rate::RateConfig;
 use clap::ArgGroup;
 use dataset::IntensityOption;
@@ -44,7 +44,7 @@ const OF_ONE_TABLE: [&str; 19] = [
     "delay_ms",
     "attack",
     "trust",
-    "boxes_only",
+    "boxes",
     "latency_compensation",
     "feature_maps",
     "frames",
@@ -86,9 +86,9 @@ pub(crate) struct Arguments {
     codec: Section<CodecConfig>,
     #[command(flatten)]
     rate: Section<RateConfig>,
-    /// Neighbours send their detections in place of feature maps.
-    #[arg(long)]
-    boxes_only: bool,
+    /// Neighbours send their detections in place of feature maps, or beside them.
+    #[arg(long, value_enum)]
+    boxes: Option<SentBoxes>,
     /// Delay of the messages of neighbours, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
     delay_ms: u64,
@@ -238,7 +238,7 @@ impl Arguments {
                     pose: self.pose.0.clone().with_networks().map_err(BadInput::of)?,
                     codec: self.codec.0,
                     rate: self.rate.0,
-                    boxes_only: self.boxes_only,
+                    boxes: self.boxes,
                     falsification: None,
                 },
                 attack: self.attack.map(attack),
@@ -274,12 +274,12 @@ impl Arguments {
                 "options of the codec and of the rate are for feature maps: {methods} sends none"
             )));
         }
-        if self.boxes_only && exchange().all(|content| content != Exchange::Features) {
+        if self.boxes.is_some() && exchange().all(|content| content != Exchange::Features) {
             return Err(BadInput::new(format!(
-                "--boxes-only is for methods that exchange feature maps: {methods} does not"
+                "--boxes is for methods that exchange feature maps: {methods} does not"
             )));
         }
-        let carries = |content| content == Exchange::Boxes || self.boxes_only;
+        let carries = |content| content == Exchange::Boxes || self.boxes.is_some();
         if self.latency_compensation && !exchange().any(carries) {
             return Err(BadInput::new(format!(
                 "--latency-compensation is for boxes of neighbours: {methods} receives none"

@@ -166,6 +166,15 @@ impl Trial {
         })
     }
 
+    /// True if a vehicle sends boxes where a method fuses feature maps.
+    fn sends_boxes(&self) -> bool {
+        let Setup {
+            agents, vehicles, ..
+        } = &self.setup;
+        let mut all = std::iter::once(agents).chain(vehicles.values());
+        all.any(|settings| settings.boxes.is_some())
+    }
+
     /// Digests of all that these settings are applied to.
     fn provenance(&self, data: &OpenedData, method: Method) -> Result<Provenance> {
         let Setup {
@@ -178,7 +187,7 @@ impl Trial {
         } = &self.setup;
         let link = { link.as_ref() }.map(|link| (&link.config, link.folder.as_path()));
         let poses = std::iter::once(agents).chain(vehicles.values());
-        let weights = weights_of(&models.weights, method)?;
+        let weights = weights_of(&models.weights, method, self.sends_boxes())?;
         let files = files_of(method, weights, poses.map(|settings| &settings.pose), link);
         let data_sha256 = data.sha256(self.scenarios, lidar_variant.as_deref());
         let commit = env!("V2VLOC_COMMIT");
@@ -253,7 +262,8 @@ fn judged(
     method: Method,
     on_frame: &mut dyn FnMut(),
 ) -> Result<(FrameScores, Evaluator)> {
-    let weights = weights_of(&trial.setup.models.weights, method)?;
+    let weights = &trial.setup.models.weights;
+    let weights = weights_of(weights, method, trial.sends_boxes())?;
     let mut setup = Setup {
         method: Some(method),
         protocol: Some(data.protocol.clone()),

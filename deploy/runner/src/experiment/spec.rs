@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use agent::attack::AttackConfig;
+use agent::config::SentBoxes;
 use anyhow::{Result, bail};
 use dataset::IntensityScale;
 use dataset::evaluation_protocol::ProtocolConfig;
@@ -155,6 +156,10 @@ pub struct CodecSpec {
     /// not adapted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fit: Option<f64>,
+    /// Detections in place of feature maps, or beside them; the weights are `*-METHOD-boxes.safetensors` of a folder then.
+    /// Absent: maps alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub boxes: Option<SentBoxes>,
 }
 
 impl Default for CodecSpec {
@@ -164,17 +169,23 @@ impl Default for CodecSpec {
             keep: None,
             zstd_level: None,
             fit: None,
+            boxes: None,
         }
     }
 }
 
 impl CodecSpec {
-    /// Label in tables and charts: the number format, and the fraction of the link's rate.
+    /// Label in tables and charts: the number format and the fraction of the link's rate, or boxes.
     pub fn name(&self) -> String {
+        let boxes = match self.boxes {
+            Some(SentBoxes::Only) => return "boxes".to_owned(),
+            Some(SentBoxes::Beside) => " and boxes",
+            None => "",
+        };
         let fitted = self
             .fit
             .map_or(String::new(), |share| format!(" fitted to {share}"));
-        format!("{:?}{fitted}", self.dtype).to_lowercase()
+        format!("{:?}{fitted}{boxes}", self.dtype).to_lowercase()
     }
 }
 
@@ -218,9 +229,9 @@ pub struct Row {
     /// Pose source of this row, in place of that of the columns.
     #[serde(default)]
     pub poses: Option<PoseSourceConfig>,
-    /// Neighbours send their detections in place of feature maps.
+    /// Neighbours send their detections in place of feature maps, or beside them.
     #[serde(default)]
-    pub boxes_only: bool,
+    pub boxes: Option<SentBoxes>,
     /// Latency compensation of the ego.
     #[serde(default)]
     pub latency_compensation: bool,
@@ -296,13 +307,13 @@ impl Experiment {
         }
     }
 
-    /// The weights of a method.
+    /// The weights of a method, with a box input where neighbours send boxes.
     ///
     /// # Errors
     /// An error when none are named, or there are not exactly one.
-    pub(super) fn weights_of(&self, method: Method) -> Result<PathBuf> {
+    pub(super) fn weights_of(&self, method: Method, boxes: Option<SentBoxes>) -> Result<PathBuf> {
         match &self.weights {
-            Some(weights) => Ok(weights_of(weights, method)?),
+            Some(weights) => Ok(weights_of(weights, method, boxes.is_some())?),
             None => bail!("method {method} has no weights: name a file or a folder"),
         }
     }
@@ -313,7 +324,7 @@ impl Experiment {
     /// An error when neither the row nor the experiment has any.
     pub(super) fn trainings_of(&self, row: &Row) -> Result<Vec<PathBuf>> {
         match &row.weights[..] {
-            [] => Ok(vec![self.weights_of(row.method)?]),
+            [] => Ok(vec![self.weights_of(row.method, row.boxes)?]),
             files => Ok(files.to_vec()),
         }
     }

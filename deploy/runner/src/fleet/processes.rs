@@ -142,7 +142,7 @@ impl Fleet {
             cav: cav.clone(),
             models: self.scenario.models.clone(),
             settings,
-            publish: vec![self.publish(cav).0],
+            publish: vec![self.needed().0],
             egos: vec![self.ego.clone()],
             keep_running: false,
             sweep_log: notes_sweeps.then(|| context.folder.file(SWEEP_LOG)),
@@ -175,7 +175,7 @@ impl Fleet {
 
     fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
         let contents: BTreeSet<Stream> = { self.neighbours() }
-            .map(|cav| self.publish(cav).1)
+            .flat_map(|cav| self.streams_of(cav))
             .collect();
         LinkProcessConfig {
             run: context.run.clone(),

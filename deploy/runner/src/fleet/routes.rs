@@ -32,7 +32,7 @@ impl Fleet {
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
         }
-        routes.push(route(&self.ego, self.publish(&self.ego).1, &ego));
+        routes.push(route(&self.ego, self.needed().1, &ego));
         // Ego-only: the ego subscribes to its own agent and to no other.
         if self.scenario.method.exchange() == Exchange::Nothing {
             return routes;
@@ -42,8 +42,10 @@ impl Fleet {
             // The link takes nothing else of the ego. A neighbour's position is subscribed to before its stream.
             routes.push(route(&self.ego, Stream::Gnss, &link));
         }
-        for cav in self.neighbours() {
-            let (_, stream) = self.publish(cav);
+        let sent = |cav: &CavId| self.streams_of(cav).into_iter();
+        let sources =
+            { self.neighbours() }.flat_map(|cav| sent(cav).map(move |stream| (cav, stream)));
+        for (cav, stream) in sources {
             if self.is_over_link() {
                 routes.push(route(cav, stream, &link));
                 routes.push(Route {

@@ -10,16 +10,24 @@ use support::file_error::{AtFile, FileError};
 const TRAINED_FILE: &str = "weights.safetensors";
 
 /// The weights of a method: `path` itself; of the folder `path` the one file `*-METHOD.safetensors` or
-/// `METHOD/weights.safetensors`, or if it has neither, `weights.safetensors` of a training of that method.
+/// `METHOD/weights.safetensors`, or if it has neither, `weights.safetensors` of a training of that method. With
+/// `reads_boxes` the one file `*-METHOD-boxes.safetensors` or `METHOD-boxes/weights.safetensors` comes first.
 ///
 /// `late` exchanges the ego-only detections of every vehicle, so it runs with the weights of `none`; so does `early` if
 /// the folder has none of its own.
 ///
 /// # Errors
 /// [`FileError`] when the folder does not hold exactly one.
-pub(crate) fn weights_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
+pub(crate) fn weights_of(
+    path: &Path,
+    method: Method,
+    reads_boxes: bool,
+) -> Result<PathBuf, FileError> {
     if !path.is_dir() {
         return Ok(path.to_path_buf());
+    }
+    if reads_boxes && let [file] = &files_of(path, &format!("{method}-boxes"))?[..] {
+        return Ok(file.clone());
     }
     let candidates = method.weights_names();
     let mut last = (method.name(), 0);
@@ -98,12 +106,20 @@ mod tests {
         ] {
             std::fs::write(folder.path().join(name), b"").unwrap();
         }
-        let of = |method| weights_of(folder.path(), method);
+        let of = |method| weights_of(folder.path(), method, false);
         for method in [Method::NONE, Method::LATE, Method::EARLY] {
             assert!(
                 of(method).unwrap().ends_with("lean-none.safetensors"),
                 "{method}"
             );
+        }
+        std::fs::write(folder.path().join("lean-none-boxes.safetensors"), b"").unwrap();
+        for (method, file) in [
+            (Method::NONE, "lean-none-boxes"),
+            (Method::LATE, "lean-none"),
+        ] {
+            let found = weights_of(folder.path(), method, true).unwrap();
+            assert_eq!(found.file_stem().unwrap(), file);
         }
         std::fs::write(folder.path().join("lean-early.safetensors"), b"").unwrap();
         assert!(
@@ -124,7 +140,7 @@ mod tests {
                 .contains("0 files")
         );
         assert_eq!(
-            weights_of(Path::new("w.safetensors"), Method::LATE).unwrap(),
+            weights_of(Path::new("w.safetensors"), Method::LATE, true).unwrap(),
             Path::new("w.safetensors")
         );
     }
@@ -148,7 +164,7 @@ mod tests {
     fn the_folder_of_a_training_serves_the_method_it_was_trained_for() {
         let folder = tempfile::tempdir().unwrap();
         write_trained(folder.path(), Method::NONE);
-        let of = |method| weights_of(folder.path(), method);
+        let of = |method| weights_of(folder.path(), method, false);
         for method in [Method::NONE, Method::LATE, Method::EARLY] {
             assert!(of(method).unwrap().ends_with(TRAINED_FILE), "{method}");
         }
@@ -167,7 +183,7 @@ mod tests {
         for method in [Method::NONE, Method::MAX] {
             write_trained(&folder.path().join(method.name()), method);
         }
-        let of = |method| weights_of(folder.path(), method);
+        let of = |method| weights_of(folder.path(), method, false);
         assert_eq!(
             of(Method::MAX).unwrap(),
             folder.path().join("max").join(TRAINED_FILE)

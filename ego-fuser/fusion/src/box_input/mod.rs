@@ -7,6 +7,7 @@
 pub mod raster;
 
 use perception::tensor_values::tensor;
+use perception::weights::Weights;
 use protocol::BevGrid;
 use tch::nn::{self, ConvConfig, Init, Module};
 use tch::{TchError, Tensor};
@@ -16,7 +17,7 @@ pub use raster::{PlacedBox, placed};
 /// Prefix of its variables in a weights file.
 pub(crate) const PREFIX: &str = "box_input.";
 /// A variable that every box input has.
-pub(crate) const WEIGHT: &str = "box_input.out.weight";
+const WEIGHT: &str = "box_input.out.weight";
 
 /// Channels to which the fused map is reduced beside the boxes.
 const REDUCED: i64 = 32;
@@ -24,6 +25,11 @@ const REDUCED: i64 = 32;
 const HIDDEN: i64 = 48;
 /// Cells around a box in which the map is changed.
 const REACH: i64 = 2;
+
+/// True if a weights file has a box input.
+pub fn is_in(weights: &Weights) -> bool {
+    weights.contains(WEIGHT)
+}
 
 /// The network.
 #[derive(Debug)]

@@ -122,7 +122,7 @@ impl FusionStage {
         let variables = VarStore::new(device);
         let config = stored_config(weights, method, detector)?;
         let mut stage = Self::new(&variables.root(), &config, method, detector)?;
-        if weights.contains(box_input::WEIGHT) {
+        if box_input::is_in(weights) {
             stage.add_box_input(&variables.root(), detector);
         }
         weights

@@ -21,8 +21,8 @@ pub(super) struct Participant {
     attack: Option<Attack>,
     /// Encoding of its maps.
     codec: CodecConfig,
-    /// True if it publishes detections in place of maps.
-    sends_boxes: bool,
+    /// Content that it publishes where a method needs feature maps.
+    in_place_of_maps: Vec<Exchange>,
     times: PoseTimes,
     /// Stages of the last sweep's perception.
     stages: Vec<StageTiming>,
@@ -43,7 +43,12 @@ impl Participant {
             agent,
             attack,
             codec: settings.codec,
-            sends_boxes: settings.sent_for(Stream::Bev) == Stream::Boxes,
+            in_place_of_maps: { settings.sent_for(Stream::Bev).into_iter() }
+                .map(|stream| match stream {
+                    Stream::Boxes => Exchange::Boxes,
+                    _ => Exchange::Features,
+                })
+                .collect(),
             times: PoseTimes::default(),
             stages: Vec::new(),
         }
@@ -53,11 +58,11 @@ impl Participant {
         self.agent.cav()
     }
 
-    /// Content that it publishes where a method needs `needed`.
-    pub(super) fn exchange(&self, needed: Exchange) -> Exchange {
+    /// Content that it publishes where a method needs `needed`, in the order of sending.
+    pub(super) fn exchange(&self, needed: Exchange) -> Vec<Exchange> {
         match needed {
-            Exchange::Features if self.sends_boxes => Exchange::Boxes,
-            needed => needed,
+            Exchange::Features => self.in_place_of_maps.clone(),
+            needed => vec![needed],
         }
     }
 

@@ -11,36 +11,51 @@ pub(super) struct Sent {
     pub(super) cav: CavId,
     pub(super) capture_nanos: u64,
     pub(super) pose: PoseEstimate,
-    pub(super) content: Option<Content>,
-    pub(super) payload_bytes: u64,
-    pub(super) wire_bytes: u64,
-    /// Of these, the bytes of the pose message.
+    /// Bytes of the pose message.
     pub(super) pose_bytes: u64,
-    /// Reason why there is no content of a sweep that could not be computed.
+    /// Messages beside the pose, in the order of sending.
+    pub(super) messages: Vec<SentMessage>,
+    /// Reason why there is no message of a sweep that could not be computed.
     pub(super) failure: Option<String>,
+}
+
+/// Message beside the pose.
+#[derive(Debug, Clone)]
+pub(super) struct SentMessage {
+    pub(super) content: Content,
+    /// Bytes on the wire, header included.
+    pub(super) bytes: u64,
     /// Decision of the rate control, where a map had to keep within a limit.
     pub(super) rate: Option<RateChoice>,
 }
 
 impl Sent {
-    /// As received by the ego; absent where nothing was sent.
-    pub(super) fn into_view(self) -> Option<View> {
-        Some(View {
-            cav: self.cav,
+    /// A message as received by the ego.
+    pub(super) fn view(&self, content: Content) -> View {
+        View {
+            cav: self.cav.clone(),
             pose: self.pose,
             capture_nanos: self.capture_nanos,
-            content: self.content?,
-        })
+            content,
+        }
+    }
+
+    /// The first message as received by the ego; absent where nothing was sent.
+    pub(super) fn into_view(mut self) -> Option<View> {
+        let messages = std::mem::take(&mut self.messages);
+        let first = messages.into_iter().next();
+        first.map(|message| self.view(message.content))
     }
 
     /// As captured by a vehicle that replays it.
     pub(super) fn captured(&self) -> CapturedMessages {
         let mut captured = CapturedMessages::default();
-        match self.content.clone() {
-            Some(Content::Features(map)) => captured.features = Some(map.features),
-            Some(Content::Boxes(found)) => captured.detections = Some(found),
-            Some(Content::Points(points)) => captured.points = Some(points),
-            None => {}
+        for message in &self.messages {
+            match message.content.clone() {
+                Content::Features(map) => captured.features = Some(map.features),
+                Content::Boxes(found) => captured.detections = Some(found),
+                Content::Points(points) => captured.points = Some(points),
+            }
         }
         captured
     }

@@ -14,7 +14,7 @@ use std::time::Duration;
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
-use protocol::{CavId, Detections, PoseEstimate, StageTiming, Tracks};
+use protocol::{CavId, Detections, PoseEstimate, StageTiming, Stream, Tracks};
 
 pub use compute::{ComputeTimes, EstimatedTimes};
 pub use remote::{RemoteError, RemotePool};
@@ -117,13 +117,18 @@ impl<'a> Run<'a> {
         let began_nanos = { scenario.ticks.get(begin) }.map_or(0, |tick| tick.capture_nanos);
         let ego = &scenario.agents[ego_place];
         let mut ego_loop = EgoLoop::new(ego, &evaluator.ego, setup.loop_options(scenario));
-        let (link, stream) = (setup.emulator(scenario)?, ego_loop.stream());
-        let delivery = DelayedDelivery::new(link, ego, stream, began_nanos);
+        let delivery = DelayedDelivery::new(setup.emulator(scenario)?, ego, began_nanos);
         // An ego-only method needs no messages of others.
         if evaluator.ego.method().exchange() != Exchange::Nothing {
             for &place in &places[1..] {
-                let joined = Input::Joined(scenario.agents[place].clone());
+                let cav = &scenario.agents[place];
+                let joined = Input::Joined(cav.clone());
                 ego_loop.handle(&mut evaluator.ego, joined, began_nanos);
+                // As its descriptor says in a live run, before its first sweep is computed.
+                let settings = setup.vehicles.get(cav).unwrap_or(&setup.agents);
+                for stream in settings.sent_for(ego_loop.stream()) {
+                    ego_loop.note_stream(cav, stream);
+                }
             }
         }
         Ok(Self {
@@ -186,7 +191,7 @@ impl<'a> Run<'a> {
             }
             if place == 0 {
                 failure = self.send_own(tick, sent, own_sweep)?;
-            } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
+            } else if !sent.messages.is_empty() && method.exchange() != Exchange::Nothing {
                 let distance_m = distance_m(&frames[0], &frames[place]);
                 self.delivery.enqueue(tick, sent, &self.compute, distance_m);
             }
@@ -249,7 +254,8 @@ impl<'a> Run<'a> {
                 // A replaying attacker repeats the message of the vehicle before it.
                 participant.capture(all.last());
                 let exchange = exchange.map(|needed| participant.exchange(needed));
-                all.push(view(participant, frame, map.as_ref(), exchange)?);
+                let exchange = exchange.unwrap_or_default();
+                all.push(view(participant, frame, map.as_ref(), &exchange)?);
             }
         }
         Ok(all)
@@ -361,12 +367,12 @@ impl<'a> Run<'a> {
                 Output::Publish { result, tracks, .. } => Ok((*result, tracks)),
                 Output::Failed { error, .. } if error.is_of_frame() => Err(error.to_string()),
                 Output::Failed { error, .. } => return Err(error.into()),
-                Output::Received(cav) => {
-                    self.delivery.received(&cav);
+                Output::Received(source) => {
+                    self.delivery.received(&source);
                     continue;
                 }
-                Output::Dropped(cav, reason) => {
-                    self.delivery.dropped(&cav, reason);
+                Output::Dropped(source, reason) => {
+                    self.delivery.dropped(&source, reason);
                     continue;
                 }
                 // The sweeps of simulation time are all computed.
@@ -453,8 +459,12 @@ impl<'a> Run<'a> {
         }
         for &place in &self.places[1..] {
             let cav = &self.scenario.agents[place];
-            let waiting = self.ego_loop.unused(cav) as u64;
-            self.delivery.close(cav, waiting);
+            self.delivery.close(&(cav.clone(), Stream::Pose), 0);
+            for stream in self.ego_loop.neighbour_streams() {
+                let source = (cav.clone(), stream);
+                let waiting = self.ego_loop.unused(&source) as u64;
+                self.delivery.close(&source, waiting);
+            }
         }
         self.evaluator.ledger.merge(self.delivery.ledger());
         self.evaluator.sent_bytes += self.delivery.sent_bytes();

@@ -3,19 +3,17 @@
 use agent::agent::AgentInput;
 use dataset::frame::Frame;
 use protocol::message::{Bev, Boxes, Payload, Points};
-use protocol::{
-    CavId, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire,
-};
+use protocol::{CavId, Header, Limits, PoseEstimate, Stamp, WireError, wire};
 use tch::Tensor;
 
 use super::EvaluateError;
 use super::participant::Participant;
-use super::sent::Sent;
+use super::sent::{Sent, SentMessage};
 use ego_fuser::ego::Content;
 use fusion::method::Exchange;
 
-/// Messages of a vehicle for a frame: its pose and, with `exchange`, its perception. A sweep that cannot be computed
-/// gives no content.
+/// Messages of a vehicle for a frame: its pose and its perception in each form of `exchange`. A sweep that cannot be
+/// computed gives none.
 ///
 /// # Errors
 /// [`EvaluateError`] when it cannot perceive any sweep, or encode or decode its own message.
@@ -23,7 +21,7 @@ pub(super) fn view(
     participant: &mut Participant,
     frame: &Frame,
     map: Option<&Tensor>,
-    exchange: Option<Exchange>,
+    exchange: &[Exchange],
 ) -> Result<Sent, EvaluateError> {
     let input = AgentInput {
         capture_nanos: frame.capture_nanos,
@@ -36,64 +34,65 @@ pub(super) fn view(
     participant.observe(&input);
     let stamp = stamp(participant.cav(), frame.capture_nanos);
     let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
-    let sent = Sent {
+    let mut sent = Sent {
         cav: frame.cav.clone(),
         capture_nanos: frame.capture_nanos,
         pose,
-        content: None,
-        payload_bytes: 0,
-        wire_bytes: 0,
         pose_bytes,
+        messages: Vec::new(),
         failure: None,
-        rate: None,
-    };
-    let Some(exchange) = exchange else {
-        return Ok(sent);
     };
     match perceived(participant, frame, map, exchange, (&stamp, pose)) {
-        Ok((content, rate, bytes)) => Ok(Sent {
-            content: Some(content),
-            payload_bytes: bytes - HEADER_LEN as u64,
-            wire_bytes: bytes + pose_bytes,
-            rate,
-            ..sent
-        }),
-        Err(error) if error.is_of_frame() => Ok(Sent {
-            failure: Some(error.to_string()),
-            ..sent
-        }),
-        Err(error) => Err(error),
+        Ok(messages) => sent.messages = messages,
+        Err(error) if error.is_of_frame() => sent.failure = Some(error.to_string()),
+        Err(error) => return Err(error),
     }
+    Ok(sent)
 }
 
-/// Content of a vehicle's message as received, the decision of the rate control, and the bytes of the message.
+/// Messages of a vehicle beside its pose, as received. Whatever their forms, its sweep is computed once.
 fn perceived(
     participant: &mut Participant,
     frame: &Frame,
     map: Option<&Tensor>,
-    exchange: Exchange,
+    exchange: &[Exchange],
     (stamp, pose): (&Stamp, PoseEstimate),
-) -> Result<(Content, Option<RateChoice>, u64), EvaluateError> {
-    match exchange {
-        Exchange::Points => {
-            let points = participant.points(&frame.points);
-            let (message, bytes) = through_the_wire(stamp, Points { pose, points })?;
-            Ok((Content::Points(message.points), None, bytes))
-        }
-        Exchange::Boxes => {
-            let detections = participant.perceive(frame, map)?.detections;
-            let (message, bytes) = through_the_wire(stamp, Boxes { pose, detections })?;
-            Ok((Content::Boxes(message.detections), None, bytes))
-        }
-        Exchange::Features | Exchange::Nothing => {
-            let perception = participant.perceive(frame, map)?;
-            let features = participant.write_map(perception, frame.capture_nanos)?;
-            let (message, bytes) = through_the_wire(stamp, Bev { pose, features })?;
-            let rate = message.features.rate;
-            let content = Content::Features(message.features.decode(&Limits::default())?);
-            Ok((content, rate, bytes))
-        }
+) -> Result<Vec<SentMessage>, EvaluateError> {
+    let mut messages = Vec::with_capacity(exchange.len());
+    let needs_network = exchange.iter().any(|form| *form != Exchange::Points);
+    let mut perception = needs_network
+        .then(|| participant.perceive(frame, map))
+        .transpose()?;
+    for form in exchange {
+        let (content, bytes, rate) = match (form, &mut perception) {
+            (Exchange::Points, _) | (_, None) => {
+                let points = participant.points(&frame.points);
+                let (message, bytes) = through_the_wire(stamp, Points { pose, points })?;
+                (Content::Points(message.points), bytes, None)
+            }
+            (Exchange::Boxes, Some(perception)) => {
+                let detections = std::mem::take(&mut perception.detections);
+                let (message, bytes) = through_the_wire(stamp, Boxes { pose, detections })?;
+                (Content::Boxes(message.detections), bytes, None)
+            }
+            (Exchange::Features | Exchange::Nothing, found) => {
+                let Some(perception) = found.take() else {
+                    continue;
+                };
+                let features = participant.write_map(perception, frame.capture_nanos)?;
+                let (message, bytes) = through_the_wire(stamp, Bev { pose, features })?;
+                let rate = message.features.rate;
+                let map = message.features.decode(&Limits::default())?;
+                (Content::Features(map), bytes, rate)
+            }
+        };
+        messages.push(SentMessage {
+            content,
+            bytes,
+            rate,
+        });
     }
+    Ok(messages)
 }
 
 /// Encodes and decodes a message; returns its size on the wire too.

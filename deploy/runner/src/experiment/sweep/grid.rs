@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use agent::rate::RateConfig;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use ego_fuser_offline::evaluation::AgentPool;
-use fusion::Method;
+use fusion::method::Exchange;
+use fusion::{Method, box_input};
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
 use perception::model_config::DetectorConfig;
@@ -128,12 +129,23 @@ impl Point {
     /// An error when the weights or the link cannot be read.
     pub(super) fn trial(&self, experiment: &Experiment, maps: &Path) -> Result<Trial> {
         let mut trial = experiment.trial().context("link")?;
-        let weights = experiment.weights_of(self.method).context("weights")?;
-        let config: DetectorConfig = Weights::load(&weights)?.config()?;
+        let weights = experiment.weights_of(self.method, self.codec.boxes);
+        let weights = weights.context("weights")?;
+        let file = Weights::load(&weights)?;
+        ensure!(
+            self.codec.boxes.is_none()
+                || self.method.exchange() != Exchange::Features
+                || box_input::is_in(&file),
+            "grid.codec: boxes: the weights of method {}, {}, have no box input and would leave boxes out",
+            self.method,
+            weights.display()
+        );
+        let config: DetectorConfig = file.config()?;
         let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
         let setup = &mut trial.setup;
         setup.models.weights = weights;
         setup.agents.pose = self.poses(experiment);
+        setup.agents.boxes = self.codec.boxes;
         setup.agents.codec = self.codec(config.feature_grid(), channels);
         setup.agents.rate = self.rate();
         if let Some(link) = &mut setup.link {
@@ -188,6 +200,7 @@ impl Point {
             keep,
             zstd_level,
             fit: _,
+            boxes: _,
         } = self.codec;
         let cells = grid.cells() as u64;
         let budget = |keep: f64| {

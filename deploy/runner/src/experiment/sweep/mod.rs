@@ -298,10 +298,10 @@ impl Sweep {
 
     /// Weights of the encoders of some points, each file once.
     fn encoders(&self, points: &[usize]) -> Result<Vec<Arc<Weights>>> {
-        let methods = points.iter().map(|&index| self.points[index].method);
+        let points = points.iter().map(|&index| &self.points[index]);
         let mut files = Vec::new();
-        for method in methods.filter(|method| method.exchange() != Exchange::Points) {
-            let file = self.experiment.weights_of(method)?;
+        for point in points.filter(|point| point.method.exchange() != Exchange::Points) {
+            let file = (self.experiment).weights_of(point.method, point.codec.boxes)?;
             if !files.contains(&file) {
                 files.push(file);
             }

@@ -178,7 +178,7 @@ impl Run<'_> {
         if let Some(poses) = row.poses.as_ref().or(column.poses.as_ref()) {
             setup.agents.pose.clone_from(poses);
         }
-        setup.agents.boxes_only = row.boxes_only;
+        setup.agents.boxes = row.boxes;
         setup.ego.latency_compensation |= row.latency_compensation;
         setup.delay_ms = column.delay_ms;
         setup.attack = column.attack;

@@ -229,7 +229,7 @@ mod tests {
                 method,
                 weights: vec![],
                 poses: None,
-                boxes_only: false,
+                boxes: None,
                 latency_compensation: false,
             },
             cells: columns

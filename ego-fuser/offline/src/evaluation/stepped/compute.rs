@@ -208,7 +208,7 @@ impl Evaluator {
                 };
                 samples.motion = frame.motion();
                 let began = Instant::now();
-                sent.extend(view(participant, &frame, None, Some(exchange))?.into_view());
+                sent.extend(view(participant, &frame, None, &[exchange])?.into_view());
                 let all = began.elapsed();
                 let times = participant.pose_times();
                 samples.pose.push(ms(times.estimate));

@@ -5,10 +5,12 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use bus::process_id;
 use link::{Delivery, LinkEmulator, Outcome, Packet};
-use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateChoice, Role, Stream, Topic};
+use protocol::{
+    Account, CavId, DropReason, HEADER_LEN, Ledger, ProcessId, RateChoice, Role, Stream, Topic,
+};
 
 use ego_fuser::capture_clock::SweepTime;
-use ego_fuser::ego_loop::Message;
+use ego_fuser::ego_loop::{Message, Source};
 
 use super::super::sent::Sent;
 use super::{ComputeTimes, exact_reception};
@@ -47,15 +49,13 @@ pub(super) struct DelayedDelivery {
     /// Messages that were handed over and neither arrived nor were lost yet.
     kept: BTreeMap<u64, Kept>,
     next_id: u64,
-    /// Stream of the messages.
-    stream: Stream,
     ledger: Ledger,
     sent_bytes: u64,
 }
 
 impl DelayedDelivery {
-    /// Delivery of poses and the messages of a stream, from `began_nanos` on.
-    pub(super) fn new(link: LinkEmulator, ego: &CavId, stream: Stream, began_nanos: u64) -> Self {
+    /// Delivery of all messages from `began_nanos` on.
+    pub(super) fn new(link: LinkEmulator, ego: &CavId, began_nanos: u64) -> Self {
         Self {
             link,
             receiver: process_id(Role::Ego, ego),
@@ -64,7 +64,6 @@ impl DelayedDelivery {
             pending: BTreeMap::new(),
             kept: BTreeMap::new(),
             next_id: 0,
-            stream,
             ledger: Ledger::default(),
             sent_bytes: 0,
         }
@@ -74,7 +73,7 @@ impl DelayedDelivery {
     pub(super) fn enqueue(
         &mut self,
         tick: usize,
-        sent: Sent,
+        mut sent: Sent,
         compute: &ComputeTimes,
         distance_m: f64,
     ) {
@@ -88,36 +87,34 @@ impl DelayedDelivery {
             submitted_nanos: sent.capture_nanos.saturating_add(compute.pose_nanos()),
             distance_m,
         };
-        let content = Packet {
-            stream: self.stream,
-            bytes: sent.wire_bytes.saturating_sub(sent.pose_bytes),
-            submitted_nanos: sent.capture_nanos.saturating_add(compute.agent_nanos()),
-            ..pose.clone()
-        };
-        self.hand_over(pose, None);
-        if let Some(RateChoice { reason, .. }) = sent.rate {
-            let topic = topic(&sent.cav, self.stream);
-            self.ledger.adapted(&Account::published(topic), reason);
+        self.hand_over(pose.clone(), None);
+        for message in std::mem::take(&mut sent.messages) {
+            let packet = Packet {
+                stream: message.content.stream(),
+                bytes: message.bytes,
+                submitted_nanos: sent.capture_nanos.saturating_add(compute.agent_nanos()),
+                ..pose.clone()
+            };
+            if let Some(RateChoice { reason, .. }) = message.rate {
+                let topic = topic(&sent.cav, packet.stream);
+                self.ledger.adapted(&Account::published(topic), reason);
+            }
+            let mut view = sent.view(message.content);
+            let clock = self.link.clock();
+            view.capture_nanos = clock.shown_since(self.began_nanos, sent.capture_nanos);
+            let sweep = SweepTime {
+                capture_nanos: view.capture_nanos,
+                arrived_nanos: sent.capture_nanos,
+            };
+            let message = Message {
+                reception: exact_reception(&view.cav, 0),
+                view,
+                sequence: 0,
+                payload_bytes: message.bytes - HEADER_LEN as u64,
+                wire_bytes: message.bytes + sent.pose_bytes,
+            };
+            self.hand_over(packet, Some(Envelope { message, sweep }));
         }
-        let (captured_nanos, payload_bytes) = (sent.capture_nanos, sent.payload_bytes);
-        let wire_bytes = sent.wire_bytes;
-        let Some(mut view) = sent.into_view() else {
-            return;
-        };
-        let clock = self.link.clock();
-        view.capture_nanos = clock.shown_since(self.began_nanos, captured_nanos);
-        let sweep = SweepTime {
-            capture_nanos: view.capture_nanos,
-            arrived_nanos: captured_nanos,
-        };
-        let message = Message {
-            reception: exact_reception(&view.cav, 0),
-            view,
-            sequence: 0,
-            payload_bytes,
-            wire_bytes,
-        };
-        self.hand_over(content, Some(Envelope { message, sweep }));
     }
 
     fn hand_over(&mut self, mut packet: Packet, envelope: Option<Envelope>) {
@@ -182,33 +179,31 @@ impl DelayedDelivery {
     }
 
     /// The ego has used a message. That of its own agent takes no link.
-    pub(super) fn received(&mut self, cav: &CavId) {
+    pub(super) fn received(&mut self, (cav, stream): &Source) {
         if *cav != self.ego {
-            let account = Account::towards(topic(cav, self.stream), &self.receiver);
+            let account = Account::towards(topic(cav, *stream), &self.receiver);
             self.ledger.received(&account);
         }
     }
 
     /// The ego has not used a message. That of its own agent takes no link.
-    pub(super) fn dropped(&mut self, cav: &CavId, reason: DropReason) {
+    pub(super) fn dropped(&mut self, (cav, stream): &Source, reason: DropReason) {
         if *cav != self.ego {
-            let account = Account::towards(topic(cav, self.stream), &self.receiver);
+            let account = Account::towards(topic(cav, *stream), &self.receiver);
             self.ledger.dropped(&account, reason);
         }
     }
 
-    /// Counts a vehicle's messages that neither arrived nor were lost; `waiting` messages of it have arrived and were
-    /// never used.
-    pub(super) fn close(&mut self, cav: &CavId, waiting: u64) {
+    /// Counts the messages of a vehicle's stream that neither arrived nor were lost; `waiting` of them have arrived and
+    /// were never used.
+    pub(super) fn close(&mut self, (cav, stream): &Source, waiting: u64) {
         let not_sent: BTreeSet<u64> = self.pending.values().map(|packet| packet.id).collect();
-        for (stream, waiting) in [(Stream::Pose, 0), (self.stream, waiting)] {
-            let topic = topic(cav, stream);
-            let is_under_way =
-                |(id, kept): &(&u64, &Kept)| kept.topic == topic && !not_sent.contains(id);
-            let under_way = self.kept.iter().filter(is_under_way).count() as u64;
-            let account = Account::towards(topic, &self.receiver);
-            self.ledger.set_in_flight(&account, under_way + waiting);
-        }
+        let topic = topic(cav, *stream);
+        let is_under_way =
+            |(id, kept): &(&u64, &Kept)| kept.topic == topic && !not_sent.contains(id);
+        let under_way = self.kept.iter().filter(is_under_way).count() as u64;
+        let account = Account::towards(topic, &self.receiver);
+        self.ledger.set_in_flight(&account, under_way + waiting);
     }
 
     /// Bytes of all that was sent so far, poses included.

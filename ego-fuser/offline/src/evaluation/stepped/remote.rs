@@ -18,11 +18,10 @@ use bus::{
 use dataset::frame::Frame;
 use protocol::message::{Bev, Boxes, GnssSource, Points};
 use protocol::{
-    CavId, Gnss, HEADER_LEN, Lidar, Limits, PoseEstimate, ProcessId, RateChoice, Role, Stream,
-    Topic, WireError,
+    CavId, Gnss, Lidar, Limits, PoseEstimate, ProcessId, Role, Stream, Topic, WireError,
 };
 
-use super::super::sent::Sent;
+use super::super::sent::{Sent, SentMessage};
 use ego_fuser::ego::Content;
 
 /// Timeout of all vehicles together for a tick: for a busy machine, but not for one that has lost a process.
@@ -66,6 +65,8 @@ struct Sensors {
 pub struct RemotePool {
     inbox: Arc<Inbox>,
     sensors: BTreeMap<CavId, Sensors>,
+    /// Streams of each vehicle beside its pose, in the order of sending.
+    streams: BTreeMap<CavId, Vec<Stream>>,
     _subscriptions: Vec<Subscription>,
 }
 
@@ -81,22 +82,22 @@ impl fmt::Debug for RemotePool {
 #[derive(Default)]
 struct Answer {
     pose: Option<(PoseEstimate, u64)>,
-    content: Option<(Content, u64, Option<RateChoice>)>,
+    messages: Vec<SentMessage>,
 }
 
 impl RemotePool {
-    /// Waits until the process of every vehicle has joined, for `timeout` at most. Each sends the stream named beside
+    /// Waits until the process of every vehicle has joined, for `timeout` at most. Each sends the streams named beside
     /// it. The wait ends when `stop` is requested.
     ///
     /// # Errors
     /// [`RemoteError`] names those that have not joined.
     pub fn connect(
         bus: &Bus,
-        vehicles: &[(CavId, Stream)],
+        vehicles: &[(CavId, Vec<Stream>)],
         timeout: Duration,
         stop: &Stop,
     ) -> Result<Self, RemoteError> {
-        let inbox = bus.inbox(2, 2 * vehicles.len());
+        let inbox = bus.inbox(2, 3 * vehicles.len());
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
@@ -104,7 +105,7 @@ impl RemotePool {
         let (mut sensors, mut subscriptions, mut routes) =
             (BTreeMap::new(), Vec::new(), Vec::new());
         let here = bus.identity().process.clone();
-        for (cav, stream) in vehicles {
+        for (cav, streams) in vehicles {
             let topic = |stream| Topic::Stream {
                 cav: cav.clone(),
                 stream,
@@ -127,7 +128,7 @@ impl RemotePool {
             routes.extend(
                 [Stream::Gnss, Stream::Imu, Stream::Lidar].map(|stream| route(stream, &there)),
             );
-            for stream in [Stream::Pose, *stream] {
+            for stream in [Stream::Pose].into_iter().chain(streams.iter().copied()) {
                 subscriptions.push(bus.subscribe(topic(stream), &inbox)?);
                 routes.push(route(stream, &here));
             }
@@ -136,6 +137,7 @@ impl RemotePool {
         Ok(Self {
             inbox,
             sensors,
+            streams: vehicles.iter().cloned().collect(),
             _subscriptions: subscriptions,
         })
     }
@@ -177,8 +179,10 @@ impl RemotePool {
             .iter()
             .map(|frame| (&frame.cav, Answer::default()))
             .collect();
-        let is_open =
-            |(_, answer): &(&&CavId, &Answer)| answer.pose.is_none() || answer.content.is_none();
+        let is_open = |(cav, answer): &(&&CavId, &Answer)| {
+            let streams = self.streams.get(**cav).map_or(0, Vec::len);
+            answer.pose.is_none() || answer.messages.len() < streams
+        };
         while answers.iter().any(|entry| is_open(&entry)) {
             match self.inbox.take(Some(deadline)) {
                 Pop::Item(topic, Event::Message(arrival)) => {
@@ -214,7 +218,10 @@ impl RemotePool {
         }
         Ok(frames
             .iter()
-            .filter_map(|frame| answers.remove(&frame.cav)?.into_sent(frame))
+            .filter_map(|frame| {
+                let streams = self.streams.get(&frame.cav)?;
+                answers.remove(&frame.cav)?.into_sent(frame, streams)
+            })
             .collect())
     }
 }
@@ -222,42 +229,48 @@ impl RemotePool {
 impl Answer {
     fn note(&mut self, stream: Stream, arrival: &Arrival) -> Result<(), WireError> {
         let (limits, bytes) = (Limits::default(), arrival.wire_bytes());
-        match stream {
-            Stream::Pose => self.pose = Some((arrival.decode(&limits)?, bytes)),
+        let (content, rate) = match stream {
             Stream::Bev => {
                 let message: Bev = arrival.decode(&limits)?;
                 let rate = message.features.rate;
-                self.content = Some((
-                    Content::Features(message.features.decode(&limits)?),
-                    bytes,
-                    rate,
-                ));
+                (Content::Features(message.features.decode(&limits)?), rate)
             }
             Stream::Boxes => {
                 let message: Boxes = arrival.decode(&limits)?;
-                self.content = Some((Content::Boxes(message.detections), bytes, None));
+                (Content::Boxes(message.detections), None)
             }
             Stream::Points => {
                 let message: Points = arrival.decode(&limits)?;
-                self.content = Some((Content::Points(message.points), bytes, None));
+                (Content::Points(message.points), None)
             }
-            _ => {}
-        }
+            _ => {
+                self.pose = Some((arrival.decode(&limits)?, bytes));
+                return Ok(());
+            }
+        };
+        self.messages.push(SentMessage {
+            content,
+            bytes,
+            rate,
+        });
         Ok(())
     }
 
-    fn into_sent(self, frame: &Frame) -> Option<Sent> {
-        let ((pose, pose_bytes), (content, bytes, rate)) = (self.pose?, self.content?);
+    /// The answer with its messages in the order of these streams, whatever the order of their arrival.
+    fn into_sent(mut self, frame: &Frame, streams: &[Stream]) -> Option<Sent> {
+        let place = |message: &SentMessage| {
+            let stream = message.content.stream();
+            streams.iter().position(|known| *known == stream)
+        };
+        self.messages.sort_by_key(place);
+        let (pose, pose_bytes) = self.pose?;
         Some(Sent {
             cav: frame.cav.clone(),
             capture_nanos: frame.capture_nanos,
             pose,
-            content: Some(content),
-            payload_bytes: bytes - HEADER_LEN as u64,
-            wire_bytes: bytes + pose_bytes,
             pose_bytes,
+            messages: self.messages,
             failure: None,
-            rate,
         })
     }
 }
