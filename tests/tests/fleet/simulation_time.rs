@@ -5,6 +5,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, Output};
 
+use agent::config::SentBoxes;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use deploy::score::FrameScores;
@@ -12,7 +13,9 @@ use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{AgentPool, EmulatedLink, EvaluatedFrame, Evaluator, Setup};
 use fusion::Method;
-use link::{ClockStep, DeviceClock, LatencyModel, LinkConfig, LossModel};
+use link::{
+    CapacityConfig, ClockStep, DeviceClock, LatencyModel, LinkConfig, LossModel, QueueConfig,
+};
 use protocol::{DropReason, Dtype};
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
@@ -494,6 +497,51 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
         "{frames}"
     );
     assert_eq!(results(one.folder.path()).len(), TICKS - 1);
+}
+
+#[test]
+fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
+    let folder = scene();
+    write_weights_with_box_input(&folder.path().join("weights.safetensors"));
+    let sending = |boxes, link| {
+        let mut setup = config(link);
+        setup.agents.boxes = boxes;
+        evaluate(folder.path(), setup)
+    };
+    let (on_time, ledger) = sending(Some(SentBoxes::Beside), LinkConfig::default());
+    let (maps, _) = sending(None, LinkConfig::default());
+    for (beside, alone) in on_time.iter().zip(&maps) {
+        assert_eq!(beside.result.detections, alone.result.detections);
+        assert_eq!(beside.result.fused, alone.result.fused);
+    }
+    let unneeded = ledger.total().dropped.get(&DropReason::Unneeded).copied();
+    assert_eq!(unneeded, Some(2 * TICKS as u64), "boxes of two neighbours");
+
+    // A map takes 250 ms.
+    let map_bytes = maps[0].result.fused[0].payload_bytes;
+    let slow = LinkConfig {
+        capacity: CapacityConfig::of_mbps(8e-6 * map_bytes as f64 / 0.25),
+        queue: QueueConfig {
+            keep_last: true,
+            urgent_bytes: 3000,
+            ..QueueConfig::default()
+        },
+        ..LinkConfig::default()
+    };
+    let (late, _) = sending(Some(SentBoxes::Beside), slow);
+    let waits_ms: Vec<u64> = { late.iter() }
+        .map(|frame| {
+            let mut stages = frame.result.stages.iter();
+            stages.find(|stage| stage.stage == "wait").unwrap().nanos / MS
+        })
+        .collect();
+    assert_eq!(waits_ms[..3], [100; 3], "{waits_ms:?}");
+    assert!(waits_ms[3..].iter().all(|ms| *ms < 60), "{waits_ms:?}");
+    for frame in &late {
+        assert_eq!(ages_ms(frame), [0, 0]);
+        let mut fused = frame.result.fused.iter();
+        assert!(fused.all(|one| one.payload_bytes < map_bytes / 2));
+    }
 }
 
 #[test]
