@@ -16,11 +16,11 @@ macro_rules! ros_types {
             /// Every type.
             pub const ALL: [Self; [$($name),+].len()] = [$(Self::$variant),+];
 
-            fn definition(self) -> &'static Definition {
+            fn definition(self) -> Definition {
                 let name = match self {
                     $(Self::$variant => $name,)+
                 };
-                definition(name).unwrap_or(&("", ""))
+                definition(name).unwrap_or_default()
             }
         }
     };
@@ -70,11 +70,11 @@ impl RosType {
     pub fn schema(self) -> String {
         let (_, own) = self.definition();
         let separator = "=".repeat(80);
-        let with = |text: String, (name, fields): &Definition| {
+        let with = |text: String, (name, fields): Definition| {
             text + &format!("{separator}\nMSG: {name}\n{fields}")
         };
         let contained = contained(self.definition()).into_iter();
-        contained.fold((*own).to_owned(), with)
+        contained.fold(own.to_owned(), with)
     }
 
     /// Package and name.

@@ -51,7 +51,7 @@ impl Distribution {
 }
 
 /// Hash of the type `own`, which contains the types `contained`, directly or not.
-pub(crate) fn type_hash(own: &Definition, mut contained: Vec<&Definition>) -> String {
+pub(crate) fn type_hash(own: Definition, mut contained: Vec<Definition>) -> String {
     contained.sort_unstable_by_key(|(name, _)| *name);
     let references: Vec<String> = contained.into_iter().map(description).collect();
     let text = format!(
@@ -67,7 +67,7 @@ pub(crate) fn type_hash(own: &Definition, mut contained: Vec<&Definition>) -> St
     hash
 }
 
-fn description((name, fields): &Definition) -> String {
+fn description((name, fields): Definition) -> String {
     let fields = fields
         .lines()
         .filter(|line| !line.contains('='))
@@ -124,7 +124,7 @@ mod tests {
             "byte OK=0\nfloat64[36] c\nd_msgs/E[] f\nstring g\n",
         );
         assert_eq!(
-            description(&definition),
+            description(definition),
             concat!(
                 r#"{"type_name": "a_msgs/msg/B", "fields": ["#,
                 r#"{"name": "c", "type": {"type_id": 59, "capacity": 36, "string_capacity": 0, "nested_type_name": ""}}, "#,

@@ -8,70 +8,57 @@ use std::path::Path;
 use super::{Problem, ReadError};
 use crate::frame::ObjectClass;
 
-/// Two-wheelers among CARLA's blueprints of vehicles.
-const TWO_WHEELERS: [&str; 7] = [
-    "crossbike",
-    "century",
-    "omafiets",
-    "lowrider",
-    "ninja",
-    "yzf",
-    "zx125",
+/// Names of each class, of [`plain`] form. V2X-Real counts `LongVehicle` among cars and `TrashCan` among trucks.
+const NAMES: [(ObjectClass, &str); 7] = [
+    (
+        ObjectClass::Car,
+        "car suv sedan vehicle motorvehicle passengercar policecar tourcar taxi longvehicle",
+    ),
+    (ObjectClass::Van, "van minibus ambulance"),
+    (
+        ObjectClass::Truck,
+        "truck concretetruck firetruck boxtruck pickuptruck trailer hugevehicle largevehicle construction \
+         constructionvehicle engineeringvehicle crane forklift bulldozer excavator trashcan",
+    ),
+    (ObjectClass::Bus, "bus tram coach"),
+    (
+        ObjectClass::TwoWheeler,
+        "cyclist bicycle bike bicyclerider bicyclegroup densebicycle biker rider motorcycle motorcyclist \
+         motorcyclerider motorcylerider motorbike motorrider nonmotorrider scooter scooterrider tricycle tricyclist \
+         tricyclerider trimotorcycle threewheeler twowheeler barrow barrowlist",
+    ),
+    (
+        ObjectClass::Pedestrian,
+        "pedestrian person personsitting humansitting child roadworker walker adult",
+    ),
+    (
+        ObjectClass::Other,
+        "other misc dontcare cone trafficcone trafficsign trafficsigns barrier trafficbarrier roadbarrel babycart \
+         firehydrant saftytriangle safetytriangle animal dog unknown unknownmovable unknownunmovable unknownsmovable \
+         unknownsunmovable pedestrianignore carignore otherignore",
+    ),
 ];
-/// Trucks among them.
-const TRUCKS: [&str; 3] = ["carlacola", "firetruck", "europeanhgv"];
 
 /// CARLA's blueprints of the library `vehicle.*` that are no cars, by their last word.
-const BLUEPRINTS: [(ObjectClass, &[&str]); 4] = [
-    (ObjectClass::TwoWheeler, &TWO_WHEELERS),
-    (ObjectClass::Truck, &TRUCKS),
-    (ObjectClass::Van, &["ambulance", "sprinter", "t2", "t22021"]),
-    (ObjectClass::Bus, &["fusorosa"]),
+const BLUEPRINTS: [(ObjectClass, &str); 4] = [
+    (
+        ObjectClass::TwoWheeler,
+        "crossbike century omafiets lowrider ninja yzf zx125",
+    ),
+    (ObjectClass::Truck, "carlacola firetruck europeanhgv"),
+    (ObjectClass::Van, "ambulance sprinter t2 t22021"),
+    (ObjectClass::Bus, "fusorosa"),
 ];
 
 /// The class of a name; `None` if the name is unknown.
 pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
-    if let Some(class) = of_library(&name.to_ascii_lowercase()) {
-        return Some(class);
-    }
-    Some(match plain(name).as_str() {
-        "car" | "suv" | "sedan" | "vehicle" | "motorvehicle" | "passengercar" | "policecar"
-        | "tourcar" | "taxi" => ObjectClass::Car,
-        // V2X-Real counts it among cars.
-        "longvehicle" => ObjectClass::Car,
-        "van" | "minibus" | "ambulance" => ObjectClass::Van,
-        // V2X-Real counts `TrashCan` among trucks.
-        "truck"
-        | "concretetruck"
-        | "firetruck"
-        | "boxtruck"
-        | "pickuptruck"
-        | "trailer"
-        | "hugevehicle"
-        | "largevehicle"
-        | "construction"
-        | "constructionvehicle"
-        | "engineeringvehicle"
-        | "crane"
-        | "forklift"
-        | "bulldozer"
-        | "excavator"
-        | "trashcan" => ObjectClass::Truck,
-        "bus" | "tram" | "coach" => ObjectClass::Bus,
-        "cyclist" | "bicycle" | "bike" | "bicyclerider" | "bicyclegroup" | "densebicycle"
-        | "biker" | "rider" | "motorcycle" | "motorcyclist" | "motorcyclerider"
-        | "motorcylerider" | "motorbike" | "motorrider" | "nonmotorrider" | "scooter"
-        | "scooterrider" | "tricycle" | "tricyclist" | "tricyclerider" | "trimotorcycle"
-        | "threewheeler" | "twowheeler" | "barrow" | "barrowlist" => ObjectClass::TwoWheeler,
-        "pedestrian" | "person" | "personsitting" | "humansitting" | "child" | "roadworker"
-        | "walker" | "adult" => ObjectClass::Pedestrian,
-        "other" | "misc" | "dontcare" | "cone" | "trafficcone" | "trafficsign" | "trafficsigns"
-        | "barrier" | "trafficbarrier" | "roadbarrel" | "babycart" | "firehydrant"
-        | "saftytriangle" | "safetytriangle" | "animal" | "dog" | "unknown" | "unknownmovable"
-        | "unknownunmovable" | "unknownsmovable" | "unknownsunmovable" | "pedestrianignore"
-        | "carignore" | "otherignore" => ObjectClass::Other,
-        _ => return None,
-    })
+    of_library(&name.to_ascii_lowercase()).or_else(|| listed(&NAMES, &plain(name)))
+}
+
+fn listed(classes: &[(ObjectClass, &str)], name: &str) -> Option<ObjectClass> {
+    let mut classes = classes.iter();
+    let class = classes.find(|(_, names)| names.split(' ').any(|known| known == name));
+    class.map(|(class, _)| *class)
 }
 
 /// The finding about an unknown type, the same for all its objects below `dir`.
@@ -92,11 +79,8 @@ fn of_library(name: &str) -> Option<ObjectClass> {
         "vehicle" => {
             let kind = rest.split('.').next().unwrap_or(rest);
             let model = plain(rest.rsplit('.').next().unwrap_or(rest));
-            let mut blueprints = BLUEPRINTS.iter();
-            let blueprint = blueprints.find(|(_, models)| models.contains(&model.as_str()));
             // `vehicle.bus.rigid` and `vehicle.emergency.police` of nuScenes, or make and model.
-            let class = blueprint
-                .map(|(class, _)| *class)
+            let class = listed(&BLUEPRINTS, &model)
                 .or_else(|| of_name(if kind == "emergency" { &model } else { kind }));
             Some(class.unwrap_or(ObjectClass::Car))
         }

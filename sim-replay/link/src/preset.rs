@@ -1,10 +1,9 @@
 //! Links by name: published link models, and files.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::config::{
-    CapacityConfig, LatencyModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig,
-};
+use super::config::{LinkConfig, LinkError};
 use protocol::config::FieldError;
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
@@ -34,6 +33,8 @@ pub const PRESETS: [(&str, &str); 6] = [
     ),
 ];
 
+/// The links of the presets, with their sources.
+const LINKS: &str = include_str!("presets.yaml");
 /// Largest file that is read, bytes.
 const MAX_BYTES: u64 = 1 << 20;
 
@@ -73,82 +74,12 @@ impl LinkConfig {
     /// # Errors
     /// [`LinkError::Value`] lists the available names.
     pub fn preset(name: &str) -> Result<Self, LinkError> {
-        let shaped = |bandwidth_mbps: f64, burst_bytes| CapacityConfig::TokenBucket {
-            bandwidth_mbps,
-            burst_bytes,
-        };
-        let radio = QueueConfig {
-            bytes: 1 << 20,
-            keep_last: true,
-            ..QueueConfig::default()
-        };
-        Ok(match name {
-            "ideal" => Self::default(),
-            // OpenCOOD's `wild_setting`, async_mode `sim`: async_overhead 100 ms.
-            "opencood-sim" => Self {
-                latency: LatencyModel::ConstantMs(100.0),
-                floor_ms: 100.0,
-                ..Self::default()
-            },
-            // The same, async_mode `real`: transmission_speed 27 Mbit/s, backbone_delay 10 ms, U(0, async_overhead).
-            "opencood-real" => Self {
-                latency: LatencyModel::BySize {
-                    overhead_ms: 100.0,
-                    bandwidth_mbps: 27.0,
-                    fixed_ms: 10.0,
-                },
-                floor_ms: 100.0,
-                ..Self::default()
-            },
-            // IEEE 802.11p: 6 Mbit/s is the default rate of the 10 MHz safety channel (Jiang, Chen and Delgrossi 2008).
-            // Packet delivery falls from about one below 100 m to a half near 300 m in urban measurements (Bai and
-            // Krishnan 2006 and later ones agree on the order of magnitude).
-            "dsrc" => Self {
-                medium: Medium::Shared,
-                capacity: shaped(6.0, 0),
-                queue: radio,
-                latency: LatencyModel::UniformMs([1.0, 5.0]),
-                keep_order: true,
-                loss: LossModel::Distance(vec![[50.0, 0.0], [100.0, 0.001], [300.0, 0.02]]),
-                loss_unit: LossUnit::Fragment,
-                ..Self::default()
-            },
-            // 3GPP TR 36.885: a 10 MHz sidelink carries about 8 Mbit/s at the usual modulation; semi-persistent
-            // scheduling selects resources within 20 to 100 ms, here its lower end.
-            "c-v2x" => Self {
-                medium: Medium::Shared,
-                capacity: shaped(8.0, 0),
-                queue: radio,
-                latency: LatencyModel::UniformMs([5.0, 35.0]),
-                keep_order: true,
-                loss: LossModel::Distance(vec![[100.0, 0.0], [200.0, 0.001], [400.0, 0.01]]),
-                loss_unit: LossUnit::Fragment,
-                ..Self::default()
-            },
-            // 3GPP TR 22.886 requires 50 Mbit/s and more per vehicle for extended sensors; measured round trips of
-            // public 5G networks are near 20 ms with a long tail (Narayanan et al. 2021).
-            "5g-uu" => Self {
-                capacity: shaped(50.0, 64 << 10),
-                queue: radio,
-                latency: LatencyModel::Lognormal {
-                    median_ms: 20.0,
-                    sigma: 0.35,
-                },
-                keep_order: true,
-                loss: LossModel::GilbertElliott {
-                    to_bad: 0.0005,
-                    to_good: 0.1,
-                    loss_good: 0.0,
-                    loss_bad: 0.3,
-                },
-                ..Self::default()
-            },
-            _ => {
-                let known = PRESETS.map(|(name, _)| name).join(", ");
-                let name: String = name.chars().take(40).collect();
-                let rule = format!("unknown, there are {known}");
-                return Err(FieldError::new("preset", name, rule).into());
-            }
+        let links = serde_saphyr::from_str::<BTreeMap<String, Self>>(LINKS);
+        let mut links = links.expect("a test reads every preset");
+        links.remove(name).ok_or_else(|| {
+            let known = PRESETS.map(|(name, _)| name).join(", ");
+            let name: String = name.chars().take(40).collect();
+            FieldError::new("preset", name, format!("unknown, there are {known}")).into()
         })
     }
 }

@@ -32,27 +32,9 @@ use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options, beside those of pose sources, that a file of tables states itself.
-const OF_ONE_TABLE: [&str; 19] = [
-    "dataset",
-    "method",
-    "weights",
-    "precision",
-    "pose_source",
-    "CodecConfig",
-    "RateConfig",
-    "emulation",
-    "delay_ms",
-    "attack",
-    "trust",
-    "boxes",
-    "latency_compensation",
-    "feature_maps",
-    "frames",
-    "scenarios",
-    "intensity_scale",
-    "ProtocolConfig",
-    "json",
-];
+const OF_ONE_TABLE: &str = "dataset method weights precision pose_source CodecConfig RateConfig \
+    emulation delay_ms attack trust boxes latency_compensation feature_maps frames scenarios \
+    intensity_scale ProtocolConfig json";
 
 #[derive(Debug, clap::Args)]
 #[command(group = ArgGroup::new("emulation").args(["link", "bandwidth_mbps", "latency_ms"]).multiple(true))]
@@ -113,14 +95,8 @@ pub(crate) struct Arguments {
     max_age_ms: Option<u64>,
     /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is reported
     /// (--link).
-    #[arg(
-        long,
-        value_name = "MS,MS,MS",
-        value_delimiter = ',',
-        num_args = 1,
-        default_value = "0,0,0",
-        requires = "emulation"
-    )]
+    #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1)]
+    #[arg(default_value = "0,0,0", requires = "emulation")]
     compute_ms: Vec<f64>,
     /// Attack by neighbours: falsified messages, to measure their effect on the ego.
     #[arg(long, value_enum, value_name = "ATTACK")]
@@ -163,9 +139,8 @@ pub(crate) struct Arguments {
 
 fn of_one_table() -> impl Iterator<Item = &'static str> {
     OF_ONE_TABLE
-        .iter()
-        .chain(PoseSourceConfig::OPTION_GROUPS)
-        .copied()
+        .split(' ')
+        .chain(PoseSourceConfig::OPTION_GROUPS.iter().copied())
 }
 
 fn at_most(count: u64) -> usize {

@@ -66,65 +66,18 @@ enum Role {
 /// The values of a pose in the order of TUM files.
 const VALUES: [&str; 7] = ["x", "y", "z", "qx", "qy", "qz", "qw"];
 /// Words of names that are no part of the pose: velocities, biases, covariances.
-const OTHER_WORDS: [&str; 16] = [
-    "v",
-    "vel",
-    "velocity",
-    "acc",
-    "acceleration",
-    "b",
-    "bias",
-    "ba",
-    "bg",
-    "bw",
-    "cov",
-    "covariance",
-    "std",
-    "sigma",
-    "twist",
-    "imu",
-];
+const OTHER_WORDS: &str =
+    "v vel velocity acc acceleration b bias ba bg bw cov covariance std sigma twist imu";
 /// Words of the names of quaternions.
-const QUATERNION_WORDS: [&str; 7] = [
-    "q",
-    "quat",
-    "quaternion",
-    "orientation",
-    "rotation",
-    "rot",
-    "ori",
-];
+const QUATERNION_WORDS: &str = "q quat quaternion orientation rotation rot ori";
 /// Words of the names of positions.
-const POSITION_WORDS: [&str; 9] = [
-    "p",
-    "t",
-    "pos",
-    "position",
-    "trans",
-    "translation",
-    "loc",
-    "location",
-    "pose",
-];
+const POSITION_WORDS: &str = "p t pos position trans translation loc location pose";
 /// Words of the names of times.
-const TIME_WORDS: [&str; 7] = ["t", "ts", "time", "times", "stamp", "timestamp", "utime"];
+const TIME_WORDS: &str = "t ts time times stamp timestamp utime";
 /// Words of the numbers of clouds.
-const NUMBER_WORDS: [&str; 9] = [
-    "index", "idx", "id", "frame", "num", "number", "scan", "no", "keyframe",
-];
+const NUMBER_WORDS: &str = "index idx id frame num number scan no keyframe";
 /// Words of the names of files.
-const NAME_WORDS: [&str; 10] = [
-    "file",
-    "filename",
-    "name",
-    "path",
-    "filepath",
-    "cloud",
-    "pcd",
-    "pointcloud",
-    "image",
-    "lidar",
-];
+const NAME_WORDS: &str = "file filename name path filepath cloud pcd pointcloud image lidar";
 
 impl Columns {
     /// True if a value of a row says to which cloud it belongs, or when it was.
@@ -227,7 +180,7 @@ fn role(name: &str) -> Role {
     let lower = name.to_ascii_lowercase();
     let (plain, bracket) = lower.split_once(['[', '(']).unwrap_or((&lower, ""));
     let words: Vec<&str> = words(plain).collect();
-    let (Some(last), false) = (words.last(), has(&words, &OTHER_WORDS)) else {
+    let (Some(last), false) = (words.last(), has(&words, OTHER_WORDS)) else {
         return Role::Other;
     };
     if let Some(axis) = axis(last, &words) {
@@ -239,14 +192,14 @@ fn role(name: &str) -> Role {
         Some(Unit::Nanoseconds) if *last != "ns" && stated.is_none() => return Role::Nanos,
         _ => {}
     }
-    if has(&words, &TIME_WORDS) || last.ends_with("timestamp") || unit(last).is_some() {
+    if has(&words, TIME_WORDS) || last.ends_with("timestamp") || unit(last).is_some() {
         let of_name = (*last == "utime").then_some(Unit::Microseconds);
         return Role::Time(stated.or(of_name).or_else(|| unit(last)));
     }
-    if NUMBER_WORDS.contains(last) && !words.contains(&"header") {
+    if has(&[last], NUMBER_WORDS) && !words.contains(&"header") {
         return Role::Number;
     }
-    match NAME_WORDS.contains(last) {
+    match has(&[last], NAME_WORDS) {
         true => Role::Name,
         false => Role::Other,
     }
@@ -261,15 +214,15 @@ fn axis(last: &str, words: &[&str]) -> Option<Role> {
     let fused = last.strip_suffix(letter)?;
     let stem = [fused];
     let stems = if fused.is_empty() { words } else { &stem };
-    if has(stems, &QUATERNION_WORDS) {
+    if has(stems, QUATERNION_WORDS) {
         return Some(Role::Value(3 + index));
     }
     let is_plain = words == [last] && fused.is_empty();
-    (index < 3 && (is_plain || has(stems, &POSITION_WORDS))).then_some(Role::Value(index))
+    (index < 3 && (is_plain || has(stems, POSITION_WORDS))).then_some(Role::Value(index))
 }
 
-fn has(words: &[&str], known: &[&str]) -> bool {
-    words.iter().any(|word| known.contains(word))
+fn has(words: &[&str], known: &str) -> bool {
+    known.split(' ').any(|known| words.contains(&known))
 }
 
 fn words(text: &str) -> impl Iterator<Item = &str> {

@@ -376,7 +376,8 @@ impl FrameSource for Source {
 
     fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
         let mut files = self.sweeps.samples(agent);
-        files.extend(tables::NAMES.map(|name| self.version.join(name)));
+        let tables = tables::NAMES.split(' ');
+        files.extend(tables.map(|name| self.version.join(format!("{name}.json"))));
         files
     }
 

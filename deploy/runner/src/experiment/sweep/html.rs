@@ -51,7 +51,7 @@ pub(super) fn page(
     }
     page += &runs_table(&table);
     page += "<h2>Columns</h2>\n<dl>\n";
-    for (column, note) in NOTES {
+    for (column, note) in NOTES.lines().filter_map(|line| line.split_once(": ")) {
         let _ = writeln!(page, "<dt>{column}</dt><dd>{}</dd>", escaped(note));
     }
     page += "</dl>\n<h2>What it was made of</h2>\n<ul>\n";

@@ -23,55 +23,8 @@ const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbp
     stale,sent,received,in_flight,dropped_link_loss,dropped_link_queue,dropped_superseded,dropped_stale,dropped_duplicate,\
     dropped_no_pose,dropped_out_of_range,dropped_other";
 
-/// Definitions of columns whose names are not enough.
-pub(super) const NOTES: &[(&str, &str)] = &[
-    (
-        "latency_ms, bandwidth_mbps, loss",
-        "empty: as in the experiment's link; inf: unlimited",
-    ),
-    (
-        "noise_t, noise_r",
-        "standard deviation of the poses' errors, metres and degrees",
-    ),
-    (
-        "ap_global, ap_frame",
-        "average precision ordered by score over all frames, and ordered by frame as in OpenCOOD",
-    ),
-    (
-        "payload_bytes, wire_bytes",
-        "mean per neighbour and frame that was fused; wire: with headers and the pose's message",
-    ),
-    ("log2_payload, log2_wire", "binary logarithm of these"),
-    (
-        "log2_frame",
-        "binary logarithm of the wire bytes that an ego used per frame, of all neighbours together",
-    ),
-    (
-        "log2_fp32",
-        "binary logarithm of the sent values at 4 bytes each, as Where2comm counts; empty where their number does \
-         not follow from the bytes: packed, or adapted to the link",
-    ),
-    (
-        "nominal_fp32_log2",
-        "binary logarithm of a complete feature map at 4 bytes a value, independent of what was sent",
-    ),
-    (
-        "e2e_ms",
-        "from the capture of the ego's sweep to the publication of its detections, simulation time",
-    ),
-    (
-        "age_ms",
-        "capture time of the ego's sweep less that of the fused neighbour's",
-    ),
-    (
-        "frames_used",
-        "neighbours' messages fused, over all frames; one may serve several frames",
-    ),
-    (
-        "sent, received, in_flight, dropped",
-        "feature maps, boxes or points of neighbours, each counted once",
-    ),
-];
+/// Definitions of columns whose names are not enough: a line `COLUMN, ...: definition` each.
+pub(super) const NOTES: &str = include_str!("column_notes.txt");
 
 /// The whole table.
 pub fn csv(experiment: &Experiment, runs: &[Run]) -> String {
