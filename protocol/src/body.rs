@@ -2,8 +2,8 @@
 
 use crc32fast::Hasher;
 
-use crate::WireError;
 use crate::checks::check_each;
+use crate::{Result, WireError};
 
 // Bodies are cast, not converted.
 #[cfg(target_endian = "big")]
@@ -79,17 +79,13 @@ pub enum BodyShape {
 
 impl BodyShape {
     /// Checks a length in bytes against the shape.
-    pub(crate) fn check(self, body_len: u64) -> Result<(), WireError> {
+    pub(crate) fn check(self, body_len: u64) -> Result<()> {
         let (min, max) = self.bounds();
         if (min..=max).contains(&body_len) {
             return Ok(());
         }
         let expected = if body_len < min { min } else { max };
-        Err(WireError::Shape {
-            what: "body bytes",
-            expected,
-            found: body_len,
-        })
+        Err(WireError::shape("body bytes", expected, body_len))
     }
 
     /// Least and greatest length in bytes.
@@ -168,7 +164,7 @@ impl<'a> PayloadReader<'a> {
         len: u64,
         shape: BodyShape,
         max_abs: f32,
-    ) -> Result<(Body, bool), WireError> {
+    ) -> Result<(Body, bool)> {
         shape.check(len)?;
         let len = usize::try_from(len).map_err(|_| {
             let max = usize::MAX as u64;
@@ -256,7 +252,7 @@ impl<'a> PayloadReader<'a> {
 }
 
 /// Reports the first value of a tensor that is not finite or exceeds `max_abs`.
-pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<(), WireError> {
+pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<()> {
     match body {
         Body::Floats(values) => check_values("feature", values, max_abs),
         Body::Points(points) => check_values("point value", points.as_flattened(), max_abs),
@@ -265,7 +261,7 @@ pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<(), WireError> {
 }
 
 /// True if every value is finite and at most `max_abs` in absolute value.
-pub(crate) fn all_bounded(values: &[f32], max_abs: f32) -> bool {
+fn all_bounded(values: &[f32], max_abs: f32) -> bool {
     let headroom = headroom(max_abs);
     values
         .iter()
@@ -290,11 +286,7 @@ fn excess_over(headroom: i32, number: f32) -> i32 {
 }
 
 /// [`all_bounded`] with an error for the first value that is not.
-pub(crate) fn check_values(
-    what: &'static str,
-    values: &[f32],
-    max_abs: f32,
-) -> Result<(), WireError> {
+pub(crate) fn check_values(what: &'static str, values: &[f32], max_abs: f32) -> Result<()> {
     if all_bounded(values, max_abs) {
         return Ok(());
     }

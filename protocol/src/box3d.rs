@@ -7,7 +7,7 @@ use crate::checks::check_within;
 use crate::{CavId, WireError};
 
 /// An upright box: centre, full sizes, heading.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Box3d {
     /// Centre x, y, z in metres.
     pub center_m: [f64; 3],

@@ -1,14 +1,9 @@
 //! Checks of single numbers of a message, with errors that name field, value and bounds.
 
-use crate::WireError;
+use crate::{Result, WireError};
 
 /// Refuses a number outside of `min..=max`, and NaN.
-pub(crate) fn check_within(
-    what: &'static str,
-    value: f64,
-    min: f64,
-    max: f64,
-) -> Result<(), WireError> {
+pub(crate) fn check_within(what: &'static str, value: f64, min: f64, max: f64) -> Result<()> {
     // NaN is within nothing.
     if (min..=max).contains(&value) {
         return Ok(());
@@ -28,7 +23,7 @@ pub(crate) fn check_each(
     values: &[f32],
     [min, max]: [f32; 2],
     is_valid: impl Fn(f32) -> bool,
-) -> Result<(), WireError> {
+) -> Result<()> {
     let Some(index) = values.iter().position(|value| !is_valid(*value)) else {
         return Ok(());
     };
@@ -42,7 +37,7 @@ pub(crate) fn check_each(
 }
 
 /// Refuses more than the limit.
-pub(crate) fn check_limit(what: &'static str, found: u64, max: u64) -> Result<(), WireError> {
+pub(crate) fn check_limit(what: &'static str, found: u64, max: u64) -> Result<()> {
     if found <= max {
         return Ok(());
     }
@@ -50,13 +45,9 @@ pub(crate) fn check_limit(what: &'static str, found: u64, max: u64) -> Result<()
 }
 
 /// Refuses a size that is not the expected one.
-pub(crate) fn check_size(what: &'static str, found: u64, expected: u64) -> Result<(), WireError> {
+pub(crate) fn check_size(what: &'static str, found: u64, expected: u64) -> Result<()> {
     if found == expected {
         return Ok(());
     }
-    Err(WireError::Shape {
-        what,
-        expected,
-        found,
-    })
+    Err(WireError::shape(what, expected, found))
 }

@@ -4,6 +4,9 @@ use crate::CavId;
 use crate::header::{HEADER_LEN, MAGIC, WIRE_VERSION};
 use crate::{DropReason, IdError, InvalidPose, Kind};
 
+/// Result of reading or writing a message: a [`WireError`] if nothing else is named.
+pub(crate) type Result<T, E = WireError> = std::result::Result<T, E>;
+
 /// Error of decoding or encoding a message.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum WireError {
@@ -161,6 +164,15 @@ pub enum WireError {
 }
 
 impl WireError {
+    /// Two sizes that have to agree and do not.
+    pub(crate) fn shape(what: &'static str, expected: u64, found: u64) -> Self {
+        Self::Shape {
+            what,
+            expected,
+            found,
+        }
+    }
+
     /// Drop reason under which the ledger counts a message lost to this error.
     pub fn drop_reason(&self) -> DropReason {
         match self {

@@ -9,8 +9,7 @@ use crate::string_enum::written_as_text;
 
 /// Reserved chunks at the position of a CAV in a key: a vehicle of that name would publish onto a key of another
 /// process.
-pub(crate) const RESERVED_CAV_IDS: [&str; 6] =
-    ["alive", "control", "ready", "rx", "stats", "truth"];
+const RESERVED_CAV_IDS: [&str; 6] = ["alive", "control", "ready", "rx", "stats", "truth"];
 
 /// Error of a text that is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -22,7 +22,7 @@ use crate::text::excerpt;
 use crate::{CavId, IdError, ProcessId, Role, RunId, RunScope, Stream, Topic};
 
 /// First chunk of every key.
-pub(crate) const KEY_ROOT: &str = "v2v";
+const KEY_ROOT: &str = "v2v";
 /// Chunk of a key that no process ever declares.
 pub(crate) const UNDECLARED: &str = "undeclared";
 /// Maximum length of a key, bytes; longer texts are rejected.

@@ -135,22 +135,14 @@ struct Line {
 impl From<Vec<Line>> for Ledger {
     fn from(lines: Vec<Line>) -> Self {
         let mut ledger = Self::default();
-        for Line {
-            topic,
-            to,
-            sent,
-            received,
-            in_flight,
-            dropped,
-            adapted,
-        } in lines
-        {
+        for line in lines {
+            let (topic, to) = (line.topic, line.to);
             ledger.counts(&Account { topic, to }).add(&Counts {
-                sent,
-                received,
-                in_flight,
-                dropped,
-                adapted,
+                sent: line.sent,
+                received: line.received,
+                in_flight: line.in_flight,
+                dropped: line.dropped,
+                adapted: line.adapted,
             });
         }
         ledger
@@ -159,23 +151,14 @@ impl From<Vec<Line>> for Ledger {
 
 impl From<Ledger> for Vec<Line> {
     fn from(ledger: Ledger) -> Self {
-        let line = |(Account { topic, to }, counts)| {
-            let Counts {
-                sent,
-                received,
-                in_flight,
-                dropped,
-                adapted,
-            } = counts;
-            Line {
-                topic,
-                to,
-                sent,
-                received,
-                in_flight,
-                dropped,
-                adapted,
-            }
+        let line = |(Account { topic, to }, counts): (_, Counts)| Line {
+            topic,
+            to,
+            sent: counts.sent,
+            received: counts.received,
+            in_flight: counts.in_flight,
+            dropped: counts.dropped,
+            adapted: counts.adapted,
         };
         ledger.accounts.into_iter().map(line).collect()
     }

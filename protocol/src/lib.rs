@@ -80,14 +80,9 @@
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.
-#![cfg_attr(
-    not(test),
-    deny(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        clippy::indexing_slicing
-    )
-)]
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation))]
+#![cfg_attr(not(test), deny(clippy::cast_sign_loss))]
+#![cfg_attr(not(test), deny(clippy::indexing_slicing))]
 
 pub mod access;
 mod bev;
@@ -129,6 +124,7 @@ pub use codec::{
     encode_within,
 };
 pub use drop_reason::DropReason;
+pub(crate) use error::Result;
 pub use error::WireError;
 pub use header::{HEADER_LEN, Header, Stamp, WIRE_VERSION};
 pub use id::{CavId, IdError, ProcessId, RunId};

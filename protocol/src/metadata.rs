@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::text::excerpt;
-use crate::{Kind, Limits, WireError};
+use crate::{Kind, Limits, Result, WireError};
 
 const HARD_LIMIT: usize = Limits::HARD_METADATA_BYTES as usize;
 
@@ -20,11 +20,7 @@ const CONFIG: Configuration<LittleEndian, Varint, Limit<HARD_LIMIT>> =
 /// # Errors
 /// [`WireError::Metadata`] when a value cannot be written, [`WireError::Limit`] when it exceeds the limit of every
 /// receiver.
-pub(crate) fn append<T: Serialize>(
-    kind: Kind,
-    metadata: &T,
-    head: &mut Vec<u8>,
-) -> Result<u32, WireError> {
+pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>) -> Result<u32> {
     let len = bincode::serde::encode_into_std_write(metadata, head, CONFIG).map_err(|error| {
         WireError::Metadata {
             kind,
@@ -48,7 +44,7 @@ pub(crate) fn append<T: Serialize>(
 ///
 /// # Errors
 /// [`WireError::Metadata`] when they do not decode or leave bytes over.
-pub(crate) fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<T, WireError> {
+pub(crate) fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<T> {
     let refuse = |detail: String| WireError::Metadata { kind, detail };
     let (metadata, used) = bincode::serde::decode_from_slice(bytes, CONFIG)
         .map_err(|error| refuse(excerpt(&error.to_string(), 200)))?;

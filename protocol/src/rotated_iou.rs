@@ -56,7 +56,7 @@ impl Polygon {
     }
 
     /// Area of overlap of the axis-aligned bounds, square metres: never less than that of the polygons.
-    pub(crate) fn bounds_overlap(&self, other: &Self) -> f64 {
+    fn bounds_overlap(&self, other: &Self) -> f64 {
         let side = |axis: usize| {
             self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis])
         };

@@ -5,8 +5,8 @@ use half::f16;
 use half::slice::HalfFloatSliceExt;
 use serde::{Deserialize, Serialize};
 
-use crate::WireError;
 use crate::checks::check_each;
+use crate::{Result, WireError};
 
 /// Values converted at a time, through a buffer on the stack.
 const BLOCK: usize = 1024;
@@ -75,7 +75,7 @@ pub(super) fn append(
     values: &[f32],
     scales: &[f32],
     bytes: &mut Vec<u8>,
-) -> Result<(), WireError> {
+) -> Result<()> {
     match dtype {
         Dtype::F32 => bytes.extend_from_slice(cast_slice(values)),
         Dtype::F16 => append_f16(values, bytes)?,
@@ -98,7 +98,7 @@ pub(super) fn append(
     clippy::indexing_slicing,
     reason = "a chunk has at most BLOCK values, and its positions are below its length"
 )]
-fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
+fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<()> {
     let max = f32::from(f16::MAX);
     let mut block = [f16::ZERO; BLOCK];
     for (number, chunk) in values.chunks(BLOCK).enumerate() {
@@ -131,12 +131,7 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
     clippy::indexing_slicing,
     reason = "a chunk has at most 2 * BLOCK bytes"
 )]
-pub(super) fn read(
-    dtype: Dtype,
-    scales: &[u8],
-    bytes: &[u8],
-    selected: usize,
-) -> Result<Vec<f32>, WireError> {
+pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -> Result<Vec<f32>> {
     let mut values =
         Vec::with_capacity(usize::try_from(bytes.len() as u64 / dtype.size()).unwrap_or_default());
     match dtype {
@@ -167,7 +162,7 @@ pub(super) fn read(
     Ok(values)
 }
 
-fn read_scales(bytes: &[u8]) -> Result<Vec<f32>, WireError> {
+fn read_scales(bytes: &[u8]) -> Result<Vec<f32>> {
     let mut scales = vec![0f32; bytes.len() / 4];
     cast_slice_mut(&mut scales).copy_from_slice(bytes);
     check_each("channel scale", &scales, [0.0, f32::MAX], |scale| {

@@ -27,7 +27,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::body::check_values;
 use crate::checks::check_size;
-use crate::{BevFeatures, BevGrid, Body, BodyShape, Limits, WireError};
+use crate::{BevFeatures, BevGrid, Body, BodyShape, Limits, Result, WireError};
 
 use layout::Layout;
 
@@ -116,8 +116,8 @@ pub struct Codec {
     pub compression: Compression,
 }
 
-/// A feature map as it is transmitted.
-#[derive(Debug, Clone, PartialEq)]
+/// A feature map as it is transmitted. Serialized are its fields without the body: the metadata of a message.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EncodedFeatures {
     /// BEV grid.
     pub grid: BevGrid,
@@ -130,6 +130,7 @@ pub struct EncodedFeatures {
     /// Reason for this format, if the message had to keep within a limit.
     pub rate: Option<RateChoice>,
     /// The values, in the format of the codec.
+    #[serde(skip)]
     pub body: Body,
 }
 
@@ -159,7 +160,7 @@ pub fn encode_features(
     features: BevFeatures,
     config: &CodecConfig,
     confidence: Option<&[f32]>,
-) -> Result<EncodedFeatures, WireError> {
+) -> Result<EncodedFeatures> {
     let BevFeatures { grid, channels, .. } = features;
     let dense = Codec {
         dtype: config.dtype,
@@ -211,7 +212,7 @@ fn encode_selected(
     codec: Codec,
     selected: Option<&[u32]>,
     zstd_level: Option<i32>,
-) -> Result<EncodedFeatures, WireError> {
+) -> Result<EncodedFeatures> {
     let BevFeatures {
         grid,
         channels,
@@ -258,7 +259,7 @@ fn unpacked_body(
     codec: &Codec,
     values: &[f32],
     selected: Option<&[u32]>,
-) -> Result<Vec<u8>, WireError> {
+) -> Result<Vec<u8>> {
     let layout = Layout::new(grid, channels, codec, &Limits::SENDER)?;
     let mut bytes = Vec::with_capacity(layout.len());
     let scales = if codec.dtype == Dtype::I8 {
@@ -284,7 +285,7 @@ impl EncodedFeatures {
         channels: u32,
         codec: &Codec,
         limits: &Limits,
-    ) -> Result<BodyShape, WireError> {
+    ) -> Result<BodyShape> {
         let layout = Layout::new(grid, channels, codec, limits)?;
         Ok(match (codec.compression, codec.dtype, codec.selection) {
             (Compression::Raw, Dtype::F32, Selection::Dense) => {
@@ -306,12 +307,7 @@ impl EncodedFeatures {
     ///
     /// # Errors
     /// [`WireError::Grid`] and [`WireError::Shape`] state both.
-    pub fn check_shape(
-        &self,
-        grid: &BevGrid,
-        channels: u32,
-        code_of: Option<u32>,
-    ) -> Result<(), WireError> {
+    pub fn check_shape(&self, grid: &BevGrid, channels: u32, code_of: Option<u32>) -> Result<()> {
         if self.grid != *grid {
             return Err(WireError::Grid {
                 expected: grid.to_string(),
@@ -325,11 +321,8 @@ impl EncodedFeatures {
                 decoded(channels, code_of),
                 decoded(self.channels, self.code_of),
             );
-            return Err(WireError::Shape {
-                what: "channels of the map behind the compressor",
-                expected,
-                found,
-            });
+            let what = "channels of the map behind the compressor";
+            return Err(WireError::shape(what, expected, found));
         }
         Ok(())
     }
@@ -340,7 +333,7 @@ impl EncodedFeatures {
     /// # Errors
     /// [`WireError`] when sizes exceed `limits`, the body does not match shape and codec, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
-    pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures, WireError> {
+    pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures> {
         let Self {
             grid,
             channels,
@@ -377,11 +370,8 @@ impl EncodedFeatures {
         let raw = unpack(body, codec.compression, layout.len())?;
         let part = |range: &Range<usize>| {
             let (expected, found) = (range.end as u64, raw.len() as u64);
-            raw.get(range.clone()).ok_or(WireError::Shape {
-                what: "bytes of a feature map",
-                expected,
-                found,
-            })
+            let missing = WireError::shape("bytes of a feature map", expected, found);
+            raw.get(range.clone()).ok_or(missing)
         };
         let values = dtype::read(
             codec.dtype,
@@ -409,7 +399,7 @@ impl EncodedFeatures {
 }
 
 /// The unpacked body, of exactly `expected` bytes.
-fn unpack(body: Body, compression: Compression, expected: usize) -> Result<Vec<u8>, WireError> {
+fn unpack(body: Body, compression: Compression, expected: usize) -> Result<Vec<u8>> {
     let bytes = match body {
         Body::Bytes(bytes) => bytes,
         other => other.as_bytes().to_vec(),

@@ -10,7 +10,7 @@ use super::{
     selection,
 };
 use crate::string_enum::named;
-use crate::{BevFeatures, Limits, WireError};
+use crate::{BevFeatures, Limits, Result};
 
 /// Bytes of a message with a feature map that are reserved for header and metadata.
 pub const HEAD_BYTES: u64 = 256;
@@ -86,13 +86,13 @@ enum ReducedBy {
 /// As [`encode_features`]; `confidence` is needed if not all cells fit.
 ///
 /// # Errors
-/// As [`encode_features`]; [`WireError::Budget`] if not even an empty selection fits.
+/// As [`encode_features`]; [`crate::WireError::Budget`] if not even an empty selection fits.
 pub fn encode_within(
     features: BevFeatures,
     config: &CodecConfig,
     limit: &ByteLimit,
     confidence: Option<&[f32]>,
-) -> Result<EncodedFeatures, WireError> {
+) -> Result<EncodedFeatures> {
     let budget = limit
         .bytes
         .saturating_sub(HEAD_BYTES)
@@ -114,8 +114,8 @@ pub fn encode_within(
 /// Maximum size, bytes, of a message with all cells in the configured format: a limit of this size has no effect.
 ///
 /// # Errors
-/// [`WireError`] when the map exceeds the sender's limits.
-pub fn largest_message(features: &BevFeatures, config: &CodecConfig) -> Result<u64, WireError> {
+/// [`crate::WireError`] when the map exceeds the sender's limits.
+pub fn largest_message(features: &BevFeatures, config: &CodecConfig) -> Result<u64> {
     Ok(HEAD_BYTES + body_bytes(features, config.dtype, Selection::Dense)?)
 }
 
@@ -123,7 +123,7 @@ pub fn largest_message(features: &BevFeatures, config: &CodecConfig) -> Result<u
 ///
 /// # Errors
 /// As [`largest_message`].
-pub fn smallest_message(features: &BevFeatures) -> Result<u64, WireError> {
+pub fn smallest_message(features: &BevFeatures) -> Result<u64> {
     Ok(HEAD_BYTES + body_bytes(features, Dtype::I8, Selection::TopK { cells: 0 })?)
 }
 
@@ -133,7 +133,7 @@ fn choose(
     config: &CodecConfig,
     budget: u64,
     confidence: Option<&[f32]>,
-) -> Result<(Dtype, ReducedBy), WireError> {
+) -> Result<(Dtype, ReducedBy)> {
     let wanted = wanted(features, config, confidence)?;
     let coarser = DTYPES_BY_PRECISION
         .into_iter()
@@ -163,7 +163,7 @@ fn wanted(
     features: &BevFeatures,
     config: &CodecConfig,
     confidence: Option<&[f32]>,
-) -> Result<Selection, WireError> {
+) -> Result<Selection> {
     let (Some(gate), Some(confidence)) = (config.gate, confidence) else {
         return Ok(Selection::Dense);
     };
@@ -179,11 +179,7 @@ fn wanted(
     })
 }
 
-fn body_bytes(
-    features: &BevFeatures,
-    dtype: Dtype,
-    selection: Selection,
-) -> Result<u64, WireError> {
+fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Result<u64> {
     let codec = Codec {
         dtype,
         selection,
@@ -214,6 +210,7 @@ mod tests {
     use crate::ConfidenceGate;
     use crate::PoseEstimate;
     use crate::Stamp;
+    use crate::WireError;
     use crate::message::Bev;
     use crate::wire;
 

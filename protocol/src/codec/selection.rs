@@ -1,14 +1,14 @@
 //! Selection of the cells of a feature map that are sent: budget, mask, gather and scatter.
 
 use super::Dtype;
-use crate::WireError;
 use crate::checks::{check_each, check_size};
+use crate::{Result, WireError};
 
 /// Checks that there is one finite confidence per cell.
 ///
 /// # Errors
 /// [`WireError`] states the first that is not finite, or both counts.
-pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), WireError> {
+pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<()> {
     check_size("confidence map", confidence.len() as u64, cells as u64)?;
     check_each(
         "confidence",
@@ -29,7 +29,7 @@ pub(super) fn within_budget(
     channels: u32,
     dtype: Dtype,
     budget: u64,
-) -> Result<Vec<u32>, WireError> {
+) -> Result<Vec<u32>> {
     let scale_bytes = if dtype == Dtype::I8 {
         4 * u64::from(channels)
     } else {
@@ -97,11 +97,7 @@ pub(super) fn append_mask(bytes: &mut Vec<u8>, cells: usize, selected: &[u32]) {
 /// # Errors
 /// [`WireError::Shape`] when the number of cells in the mask differs from the announced one, or a cell is beyond the
 /// last.
-pub(super) fn read_mask(
-    mask: &[u8],
-    cells: usize,
-    announced: usize,
-) -> Result<Vec<u32>, WireError> {
+pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<Vec<u32>> {
     let found: u64 = mask.iter().map(|byte| u64::from(byte.count_ones())).sum();
     check_size("cells in the mask", found, announced as u64)?;
     let mut selected = Vec::with_capacity(announced);

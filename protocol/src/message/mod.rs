@@ -24,9 +24,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::checks::{check_limit, check_within};
-use crate::{Body, BodyShape, Limits, Pose, WireError};
+use crate::{Body, BodyShape, Limits, Pose, Result, WireError};
 
-pub use bev::{Bev, BevMetadata};
+pub use bev::Bev;
 pub use boxes::Boxes;
 pub use camera::{Camera, CameraMetadata, ImageFormat, Pinhole};
 pub use control::{Control, TopicCount};
@@ -58,13 +58,13 @@ pub trait Payload: Sized + private::Sealed {
     ///
     /// # Errors
     /// [`WireError`] states the field and its bounds.
-    fn check(metadata: &Self::Metadata, limits: &Limits) -> Result<BodyShape, WireError>;
+    fn check(metadata: &Self::Metadata, limits: &Limits) -> Result<BodyShape>;
 
     /// Assembles a message from checked metadata and a body of the required shape.
     ///
     /// # Errors
     /// [`WireError::Shape`] when the body is of another type.
-    fn from_parts(metadata: Self::Metadata, body: Body) -> Result<Self, WireError>;
+    fn from_parts(metadata: Self::Metadata, body: Body) -> Result<Self>;
 }
 
 mod private {
@@ -84,15 +84,12 @@ macro_rules! metadata_only {
                 (self, crate::Body::Empty)
             }
 
-            fn check(
-                metadata: &Self,
-                limits: &crate::Limits,
-            ) -> Result<crate::BodyShape, crate::WireError> {
+            fn check(metadata: &Self, limits: &crate::Limits) -> crate::Result<crate::BodyShape> {
                 metadata.check_values(limits)?;
                 Ok(crate::BodyShape::Empty)
             }
 
-            fn from_parts(metadata: Self, _: crate::Body) -> Result<Self, crate::WireError> {
+            fn from_parts(metadata: Self, _: crate::Body) -> crate::Result<Self> {
                 Ok(metadata)
             }
         }
@@ -100,37 +97,33 @@ macro_rules! metadata_only {
 }
 use metadata_only;
 
-fn check_count(what: &'static str, found: usize, max: usize) -> Result<(), WireError> {
+fn check_count(what: &'static str, found: usize, max: usize) -> Result<()> {
     check_limit(what, found as u64, max as u64)
 }
 
-fn check_pose(what: &'static str, pose: &Pose) -> Result<(), WireError> {
+fn check_pose(what: &'static str, pose: &Pose) -> Result<()> {
     pose.validate()
         .map_err(|source| WireError::Pose { what, source })
 }
 
 /// Checks names in metadata: stages, classes.
-fn check_name(what: &'static str, name: &str) -> Result<(), WireError> {
+fn check_name(what: &'static str, name: &str) -> Result<()> {
     check_count(what, name.len(), 64)
 }
 
 fn wrong_body(shape: BodyShape, body: &Body) -> WireError {
     let (expected, _) = shape.bounds();
-    WireError::Shape {
-        what: "body bytes",
-        expected,
-        found: body.len() as u64,
-    }
+    WireError::shape("body bytes", expected, body.len() as u64)
 }
 
 /// Maximum duration that a receiver accepts, nanoseconds: one day.
 const MAX_NANOS: u64 = 86_400_000_000_000;
 
-fn check_nanos(what: &'static str, nanos: u64) -> Result<(), WireError> {
+fn check_nanos(what: &'static str, nanos: u64) -> Result<()> {
     check_limit(what, nanos, MAX_NANOS)
 }
 
-fn check_detections(detections: &[crate::Detection], limits: &Limits) -> Result<(), WireError> {
+fn check_detections(detections: &[crate::Detection], limits: &Limits) -> Result<()> {
     check_count("detections", detections.len(), limits.max_boxes)?;
     for detection in detections {
         detection.box3d.check()?;

@@ -91,6 +91,14 @@ pub enum NoPoseReason {
 }
 
 impl PoseEstimate {
+    /// No pose, for a reason, from a number of inliers.
+    pub const fn no_pose(reason: NoPoseReason, inlier_count: u32) -> Self {
+        Self::NoPose {
+            reason,
+            inlier_count,
+        }
+    }
+
     /// A pose and its confidence, without a covariance.
     pub fn new(world_from_cav: Pose, confidence: f32) -> Self {
         Self::Pose {

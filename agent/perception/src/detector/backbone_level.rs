@@ -11,7 +11,7 @@ const JUDGED_EVERY: i64 = 7;
 #[derive(Debug)]
 pub struct BackboneLevel {
     /// `[1, C, H, W]`, single precision or quantised.
-    values: Tensor,
+    pub(super) values: Tensor,
     quantisation: Option<Quantisation>,
 }
 
@@ -32,11 +32,6 @@ impl BackboneLevel {
             values,
             quantisation: Some(quantisation),
         }
-    }
-
-    /// Its values as the next layer takes them.
-    pub(super) fn values(&self) -> &Tensor {
-        &self.values
     }
 
     /// Channels, height and width.

@@ -1,6 +1,6 @@
 //! Canvas, backbone and shrink of a detector, in floating point or in 8-bit integers.
 
-use tch::{Device, TchError, Tensor};
+use tch::{Device, Tensor};
 
 use super::backbone_level::BackboneLevel;
 use super::int8_backbone::{CANVAS, Int8Backbone, observe_backbone};
@@ -87,7 +87,7 @@ impl BevEncoder {
     }
 
     /// Writes pillars to the canvas.
-    pub(super) fn scatter(&mut self, pillars: &Pillars) -> Result<Canvas, TchError> {
+    pub(super) fn scatter(&mut self, pillars: &Pillars) -> tch::Result<Canvas> {
         let (pillar_grid, projection) = (&self.pillar_grid, &self.projection);
         let flat = match &mut self.layers {
             Layers::Float { canvas, .. } => {
@@ -112,7 +112,7 @@ impl BevEncoder {
     }
 
     /// Levels of the backbone for a canvas.
-    pub(super) fn levels(&self, canvas: &Canvas) -> Result<Vec<BackboneLevel>, TchError> {
+    pub(super) fn levels(&self, canvas: &Canvas) -> tch::Result<Vec<BackboneLevel>> {
         match &self.layers {
             Layers::Float { backbone, .. } => {
                 let levels = backbone.levels_of(&canvas.0, false);
@@ -123,8 +123,8 @@ impl BevEncoder {
     }
 
     /// Feature map `[1, C, H', W']` of the levels of a canvas, contiguous.
-    pub(super) fn features(&self, levels: &[BackboneLevel]) -> Result<Tensor, TchError> {
-        let maps = levels.iter().map(|level| level.values().shallow_clone());
+    pub(super) fn features(&self, levels: &[BackboneLevel]) -> tch::Result<Tensor> {
+        let maps = levels.iter().map(|level| level.values.shallow_clone());
         let maps: Vec<Tensor> = maps.collect();
         match &self.layers {
             Layers::Float {
@@ -141,11 +141,7 @@ impl BevEncoder {
     }
 
     /// Adds the activations of a canvas to a search for their scales; nothing if the layers are in integers already.
-    pub(super) fn observe(
-        &self,
-        canvas: &Canvas,
-        search: &mut ScaleSearch,
-    ) -> Result<(), TchError> {
+    pub(super) fn observe(&self, canvas: &Canvas, search: &mut ScaleSearch) -> tch::Result<()> {
         match &self.layers {
             Layers::Float {
                 backbone, shrink, ..

@@ -8,6 +8,9 @@ use crate::model_config::ConfigError;
 use crate::torch_error::first_line;
 use crate::weights::FileError;
 
+/// Result of loading or running a detector: a [`DetectorError`] if nothing else is named.
+pub(crate) type Result<T, E = DetectorError> = std::result::Result<T, E>;
+
 /// Error of loading a detector or of running it.
 #[derive(Debug, thiserror::Error)]
 pub enum DetectorError {

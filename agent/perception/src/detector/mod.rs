@@ -16,6 +16,7 @@ use tch::{Device, Kind, Tensor};
 
 pub use backbone_level::BackboneLevel;
 pub use error::DetectorError;
+pub(crate) use error::Result;
 pub use output::{Encoded, Heads, check_values};
 
 use encoder::BevEncoder;
@@ -62,7 +63,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError`] names the file, the tensor and both shapes.
-    pub fn load(path: &Path, device: Device) -> Result<Self, DetectorError> {
+    pub fn load(path: &Path, device: Device) -> Result<Self> {
         let weights = Weights::load(path)?;
         Self::from_weights(&weights, &weights.detector_config()?, device)
     }
@@ -76,7 +77,7 @@ impl Detector {
         weights: &Weights,
         config: &DetectorConfig,
         device: Device,
-    ) -> Result<Self, DetectorError> {
+    ) -> Result<Self> {
         let network = VarStore::new(device);
         let pillars = PointPillars::new(&network.root(), config)?;
         weights.copy_into(&network)?;
@@ -192,7 +193,7 @@ impl Detector {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+    pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded> {
         let crop = self.crop;
         self.encode_within(&crop, cloud)
     }
@@ -204,7 +205,7 @@ impl Detector {
     ///
     /// # Errors
     /// As [`Self::encode_sweep`].
-    pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+    pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded> {
         let crop = self.crop.range_only();
         let encoded = self.encode_within(&crop, cloud)?;
         self.checked_sweep(encoded, cloud)
@@ -214,16 +215,12 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::NoPoints`], [`DetectorError::Values`], [`DetectorError::Saturated`]; those of the tensor library.
-    pub fn encode_sweep(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+    pub fn encode_sweep(&mut self, cloud: &PointCloud) -> Result<Encoded> {
         let encoded = self.encode(cloud)?;
         self.checked_sweep(encoded, cloud)
     }
 
-    fn checked_sweep(
-        &self,
-        encoded: Encoded,
-        cloud: &PointCloud,
-    ) -> Result<Encoded, DetectorError> {
+    fn checked_sweep(&self, encoded: Encoded, cloud: &PointCloud) -> Result<Encoded> {
         if encoded.points == 0 {
             return Err(DetectorError::NoPoints {
                 points: cloud.len(),
@@ -248,11 +245,7 @@ impl Detector {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn observe(
-        &mut self,
-        cloud: &PointCloud,
-        search: &mut ScaleSearch,
-    ) -> Result<(), DetectorError> {
+    pub fn observe(&mut self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<()> {
         let crop = self.crop;
         let pillars = self.pillars(&crop, cloud);
         let canvas = self.encoder.scatter(&pillars)?;
@@ -271,7 +264,7 @@ impl Detector {
         self.voxeliser.voxelise(&self.cropped)
     }
 
-    fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+    fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded> {
         let mut times = StageTimes::start();
         let pillars = self.pillars(crop, cloud);
         times.lap("voxelise");
@@ -296,7 +289,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if there is a compressor and the feature map is not of this detector.
-    pub fn compressed(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+    pub fn compressed(&self, features: &Tensor) -> Result<Tensor> {
         let Some(compressor) = &self.compressor else {
             return Ok(features.shallow_clone());
         };
@@ -309,7 +302,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if there is a compressor and the tensor is not a code of this detector.
-    pub fn decompressed(&self, sent: &Tensor) -> Result<Tensor, DetectorError> {
+    pub fn decompressed(&self, sent: &Tensor) -> Result<Tensor> {
         let Some(compressor) = &self.compressor else {
             return Ok(sent.shallow_clone());
         };
@@ -325,7 +318,7 @@ impl Detector {
     ///
     /// # Errors
     /// As [`Self::compressed`].
-    pub fn through_compressor(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+    pub fn through_compressor(&self, features: &Tensor) -> Result<Tensor> {
         self.decompressed(&self.compressed(features)?)
     }
 
@@ -333,7 +326,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if it is not of this detector; the caller checks its BEV grid.
-    pub fn received(&self, message: &DecodedFeatures) -> Result<Tensor, DetectorError> {
+    pub fn received(&self, message: &DecodedFeatures) -> Result<Tensor> {
         let (sent, values) = (&message.sent, &message.features.values);
         let (channels, grid) = (message.features.channels, message.features.grid);
         let [expected, height, width] = self.sent_shape();
@@ -362,7 +355,7 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if the feature map is not of this detector; [`DetectorError::Values`] if an output is
     /// not valid.
-    pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
+    pub fn heads(&self, features: &Tensor) -> Result<Heads> {
         let map = checked(features, self.map_shape())?;
         tch::no_grad(|| Heads::new(&self.head.forward_one(&map)?))
     }
@@ -372,11 +365,7 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Decode`] if the heads are of another detector, [`DetectorError::Values`] or
     /// [`DetectorError::Box`] if a box is one that a message refuses, or is farther away than 10 km.
-    pub fn boxes(
-        &self,
-        heads: &Heads,
-        score_threshold: f32,
-    ) -> Result<Vec<Decoded>, DetectorError> {
+    pub fn boxes(&self, heads: &Heads, score_threshold: f32) -> Result<Vec<Decoded>> {
         let (scores, offsets) = (&heads.scores, &heads.offsets);
         let mut boxes = decode(scores, offsets, &self.anchors, score_threshold)?;
         check_boxes(&boxes)?;
@@ -392,7 +381,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if the tensor is not of this detector.
-    pub fn to_message(&self, sent: &Tensor) -> Result<BevFeatures, DetectorError> {
+    pub fn to_message(&self, sent: &Tensor) -> Result<BevFeatures> {
         let sent = one_map(sent, self.sent_shape())?;
         let channels = self.config.sent_channels() as u32;
         Ok(BevFeatures {
@@ -407,7 +396,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if the tensor is not a feature map of this detector.
-    pub fn to_kept(&self, features: &Tensor) -> Result<BevFeatures, DetectorError> {
+    pub fn to_kept(&self, features: &Tensor) -> Result<BevFeatures> {
         let map = one_map(features, self.map_shape())?;
         let channels = self.config.feature_channels() as u32;
         Ok(BevFeatures {
@@ -425,13 +414,13 @@ pub fn encoder_sha256(weights: &Weights) -> String {
 }
 
 /// A feature map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`, channel by channel in memory.
-fn one_map(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorError> {
+fn one_map(features: &Tensor, expected: [i64; 3]) -> Result<Tensor> {
     // One memory layout, or the same values would give other last bits.
     Ok(checked(features, expected)?.f_contiguous()?)
 }
 
 /// The same in its own memory order.
-fn checked(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorError> {
+fn checked(features: &Tensor, expected: [i64; 3]) -> Result<Tensor> {
     let found = features.size();
     if found == expected {
         return Ok(features.f_unsqueeze(0)?);

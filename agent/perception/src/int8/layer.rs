@@ -1,6 +1,6 @@
 //! Parameters of a quantised layer and its call.
 
-use tch::{IValue, Kind, TchError, Tensor};
+use tch::{IValue, Kind, Result, Tensor};
 
 use super::operators::Operators;
 use super::scale::{Quantisation, Scale};
@@ -58,8 +58,8 @@ impl Layer {
         weight: &Tensor,
         bias: Option<&Tensor>,
         format: LayerFormat,
-        pack: impl FnOnce(&Operators, &QuantisedWeight) -> Result<Tensor, TchError>,
-    ) -> Result<Self, TchError> {
+        pack: impl FnOnce(&Operators, &QuantisedWeight) -> Result<Tensor>,
+    ) -> Result<Self> {
         let quantised = QuantisedWeight::new(weight)?;
         let packed = pack(Operators::get()?, &quantised)?;
         let bias = bias.map(|bias| bias.f_to_kind(Kind::Float)).transpose()?;
@@ -72,12 +72,7 @@ impl Layer {
     }
 
     /// Calls an operator with this layer's parameters, followed by others of the operator.
-    pub(super) fn call(
-        &self,
-        operator: &str,
-        x: &Tensor,
-        others: Vec<IValue>,
-    ) -> Result<Tensor, TchError> {
+    pub(super) fn call(&self, operator: &str, x: &Tensor, others: Vec<IValue>) -> Result<Tensor> {
         let (input, output, relu) = (self.format.input, self.format.output, self.format.relu);
         let tensor = |tensor: &Tensor| IValue::Tensor(tensor.shallow_clone());
         let mut arguments = vec![

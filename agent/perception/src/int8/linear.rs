@@ -1,6 +1,6 @@
 //! Quantised matrix product.
 
-use tch::{IValue, TchError, Tensor};
+use tch::{IValue, Result, Tensor};
 
 use super::layer::{Layer, LayerFormat};
 
@@ -16,11 +16,7 @@ impl Int8Linear {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn new(
-        weight: &Tensor,
-        bias: Option<&Tensor>,
-        format: LayerFormat,
-    ) -> Result<Self, TchError> {
+    pub fn new(weight: &Tensor, bias: Option<&Tensor>, format: LayerFormat) -> Result<Self> {
         let inputs = weight.size2()?.1;
         let layer = Layer::new(weight, bias, format, |operators, quantised| {
             let shape = IValue::IntList(vec![USUAL_ROWS, inputs]);
@@ -36,7 +32,7 @@ impl Int8Linear {
     ///
     /// # Errors
     /// Those of the tensor library, when `x` has other channels or is not `u8`.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         self.0.call("multiply", x, Vec::new())
     }
 }

@@ -6,9 +6,9 @@ use tch::{TchError, Tensor};
 use crate::int8::{ConvGeometry, Int8Convolution, LayerFormat, Quantisation, Scale};
 
 /// Epsilon of every batch norm of PointPillars.
-pub(crate) const NORM_EPS: f64 = 1e-3;
+const NORM_EPS: f64 = 1e-3;
 /// Weight of a new batch in the running statistics of PointPillars.
-pub(crate) const NORM_MOMENTUM: f64 = 0.01;
+const NORM_MOMENTUM: f64 = 0.01;
 
 /// Batch norm over `channels` with the parameter names of the reference.
 ///

@@ -1,6 +1,6 @@
 //! Sparse 3-D convolution in 8-bit integers.
 
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Result, TchError, Tensor};
 
 use super::rulebook::{GatherIndex, KERNEL_VOLUME};
 use crate::int8::{Int8Linear, LayerFormat};
@@ -16,11 +16,7 @@ pub struct Int8SparseConv {
 
 impl Int8SparseConv {
     /// Quantises a weight `[27 * C_in, C_out]` with bias `[C_out]`.
-    pub(super) fn new(
-        weight: &Tensor,
-        bias: &Tensor,
-        format: LayerFormat,
-    ) -> Result<Self, TchError> {
+    pub(super) fn new(weight: &Tensor, bias: &Tensor, format: LayerFormat) -> Result<Self> {
         let inputs = weight.size2()?.0 / KERNEL_VOLUME as i64;
         if inputs % WORD_BYTES != 0 {
             return Err(TchError::Shape(format!(
@@ -36,7 +32,7 @@ impl Int8SparseConv {
     ///
     /// # Errors
     /// Those of the tensor library, for example when the rows are not those of the rulebook.
-    pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
+    pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor> {
         let channels = x.size2()?.1;
         // The library gathers rows of floats many times faster than rows of bytes; nothing is computed with them here.
         let words = index.gather(&x.f_view_dtype(Kind::Float)?)?;

@@ -16,7 +16,7 @@ use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 use support::bounded_file;
-use support::file_error::AtFile;
+use support::file_error::{AtFile, Result};
 use tch::Device;
 use tch::nn::{self, VarStore};
 
@@ -67,7 +67,7 @@ impl Weights {
     ///
     /// # Errors
     /// [`FileError`] when the file is missing, truncated, or holds values that are no parameters.
-    pub fn load(path: &Path) -> Result<Self, FileError> {
+    pub fn load(path: &Path) -> Result<Self> {
         if path.is_dir() {
             return Err(FileError::new(path, "a folder, must be one weights file"));
         }
@@ -138,7 +138,7 @@ impl Weights {
     ///
     /// # Errors
     /// [`FileError`] when it is another one.
-    pub fn check_kind(&self, expected: &'static str) -> Result<(), FileError> {
+    pub fn check_kind(&self, expected: &'static str) -> Result<()> {
         let detector = || self.metadata(METHOD_KEY).map(|_| DETECTOR_KIND);
         match self.metadata(KIND_KEY).or_else(detector) {
             Some(found) if found != expected => Err(self.error(format_args!(
@@ -152,7 +152,7 @@ impl Weights {
     ///
     /// # Errors
     /// See [`Self::metadata_json`].
-    pub fn config<T: DeserializeOwned>(&self) -> Result<T, FileError> {
+    pub fn config<T: DeserializeOwned>(&self) -> Result<T> {
         self.metadata_json(CONFIG_KEY)
     }
 
@@ -178,7 +178,7 @@ impl Weights {
     ///
     /// # Errors
     /// [`FileError`] when the file names another kind of network; see [`Self::metadata_json`].
-    pub fn detector_config(&self) -> Result<DetectorConfig, FileError> {
+    pub fn detector_config(&self) -> Result<DetectorConfig> {
         self.check_kind(DETECTOR_KIND)?;
         self.config()
     }
@@ -187,7 +187,7 @@ impl Weights {
     ///
     /// # Errors
     /// [`FileError`] when the key is missing, or its JSON has another form.
-    pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, FileError> {
+    pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T> {
         let Some(text) = self.metadata.get(key) else {
             let found: Vec<&String> = self.metadata.keys().collect();
             let problem = format_args!("metadata has no key {key:?}; it has {found:?}");
@@ -201,7 +201,7 @@ impl Weights {
     ///
     /// # Errors
     /// [`FileError`] when the JSON has another form.
-    pub fn activation_scales(&self) -> Result<Option<ActivationScales>, FileError> {
+    pub fn activation_scales(&self) -> Result<Option<ActivationScales>> {
         let is_there = self.metadata.contains_key(SCALES_KEY);
         is_there.then(|| self.metadata_json(SCALES_KEY)).transpose()
     }
@@ -228,7 +228,7 @@ impl Weights {
     /// # Errors
     /// [`FileError`] names the tensor that does not fit; nothing is copied
     /// then.
-    pub fn copy_into(&self, network: &VarStore) -> Result<(), FileError> {
+    pub fn copy_into(&self, network: &VarStore) -> Result<()> {
         self.copy_some_into(network, |_| true)
     }
 
@@ -236,11 +236,7 @@ impl Weights {
     ///
     /// # Errors
     /// As [`Self::copy_into`].
-    pub fn copy_some_into(
-        &self,
-        network: &VarStore,
-        wanted: impl Fn(&str) -> bool,
-    ) -> Result<(), FileError> {
+    pub fn copy_some_into(&self, network: &VarStore, wanted: impl Fn(&str) -> bool) -> Result<()> {
         let mut variables: BTreeMap<_, _> = network.variables().into_iter().collect();
         variables.retain(|name, _| wanted(name));
         for (name, variable) in &variables {
@@ -259,7 +255,7 @@ impl Weights {
         Ok(())
     }
 
-    fn checked(&self, name: &str, expected: Vec<i64>) -> Result<&Values, FileError> {
+    fn checked(&self, name: &str, expected: Vec<i64>) -> Result<&Values> {
         match self.tensors.get(name) {
             Some(tensor) if tensor.shape == expected => Ok(tensor),
             Some(Values { shape, .. }) => Err(self.error(format_args!(
@@ -279,11 +275,7 @@ fn incomplete(path: &Path, size: usize, error: SafeTensorError) -> FileError {
 }
 
 /// The values of one tensor as `f32`; `None` for integers.
-fn read_values(
-    path: &Path,
-    name: &str,
-    view: &TensorView<'_>,
-) -> Result<Option<Vec<f32>>, FileError> {
+fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<Vec<f32>>> {
     let data = view.data();
     let values: Vec<f32> = match view.dtype() {
         Dtype::F16 => numbers(data, |bytes| f16::from_le_bytes(bytes).to_f32()),
@@ -316,7 +308,7 @@ pub(crate) fn numbers<const N: usize>(data: &[u8], number: impl Fn([u8; N]) -> f
     chunks.map(|&bytes| number(bytes)).collect()
 }
 
-fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), FileError> {
+fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<()> {
     match values.iter().position(|value| !value.is_finite()) {
         None => Ok(()),
         Some(index) => Err(FileError::new(path, holds(name, values, index))),
