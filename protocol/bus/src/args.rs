@@ -121,11 +121,7 @@ impl BusConfig {
     /// # Errors
     /// [`BusError`] states the endpoint and the remedy.
     pub fn join(&self, stop: &Stop, run: &RunId, role: Role, cav: &CavId) -> Result<Bus, BusError> {
-        let identity = Identity {
-            run: run.clone(),
-            process: process_id(role, cav),
-            cav: cav.clone(),
-        };
+        let identity = Identity::new(run.clone(), process_id(role, cav), cav.clone());
         let options = self.options()?;
         if let Some(credentials) = &options.credentials {
             credentials.check_name(identity.process.as_str())?;
@@ -163,21 +159,15 @@ impl BusConfig {
 #[command(next_help_heading = "Limits on received messages")]
 pub struct InboxConfig {
     /// Messages per second of one sender; messages beyond are dropped unread (`rate_limit` in the ledger).
-    #[arg(
-        id = "inbox_messages_per_s",
-        long = "inbox-messages-per-s",
-        value_name = "N"
-    )]
+    #[arg(id = "inbox_messages_per_s", long = "inbox-messages-per-s")]
+    #[arg(value_name = "N")]
     pub messages_per_s: f64,
     /// MiB per second of one sender, on each of its streams.
     #[arg(id = "inbox_mib_per_s", long = "inbox-mib-per-s", value_name = "MIB")]
     pub mib_per_s: f64,
     /// MiB that may wait to be decoded, of all senders together.
-    #[arg(
-        id = "inbox_waiting_mib",
-        long = "inbox-waiting-mib",
-        value_name = "MIB"
-    )]
+    #[arg(id = "inbox_waiting_mib", long = "inbox-waiting-mib")]
+    #[arg(value_name = "MIB")]
     pub waiting_mib: usize,
 }
 

@@ -5,8 +5,10 @@
 //! which counts it.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex, MutexGuard};
 use std::time::Instant;
+
+use support::sync::{lock, wait, wait_at_most};
 
 /// Result of a push.
 #[derive(Debug, PartialEq, Eq)]
@@ -91,12 +93,7 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
                 Ok(()) => break,
                 Err(Full::Closed) => return PushOutcome::Closed(item),
                 Err(Full::NoLane) => return PushOutcome::NoLane(item),
-                Err(Full::Lane) => {
-                    state = self
-                        .changed
-                        .wait(state)
-                        .unwrap_or_else(PoisonError::into_inner)
-                }
+                Err(Full::Lane) => state = wait(&self.changed, state),
             }
         }
         self.append(state, key, item);
@@ -115,19 +112,13 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
                 return Pop::Closed;
             }
             state = match deadline {
-                None => self
-                    .changed
-                    .wait(state)
-                    .unwrap_or_else(PoisonError::into_inner),
+                None => wait(&self.changed, state),
                 Some(deadline) => {
                     let left = deadline.saturating_duration_since(Instant::now());
                     if left.is_zero() {
                         return Pop::TimedOut;
                     }
-                    self.changed
-                        .wait_timeout(state, left)
-                        .unwrap_or_else(PoisonError::into_inner)
-                        .0
+                    wait_at_most(&self.changed, state, left)
                 }
             };
         }
@@ -159,7 +150,7 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
 
     // A panic elsewhere leaves no half-done change: every method changes the state in one step.
     fn lock(&self) -> MutexGuard<'_, State<K, T>> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     fn make_lane(&self, state: &mut State<K, T>, key: &K, capacity: usize) -> Result<(), Full> {

@@ -23,6 +23,7 @@ use super::status_publisher::{StatusPublisher, StatusSender};
 use super::subscriber::{Inbox, Subscription};
 use super::watchdog::Heartbeat;
 use super::{BusError, BusOptions, MessageStats, open, open_unless};
+use crate::Result;
 
 /// Longest wait for the end of another process of a name: longer than a router takes to notice that one was killed.
 const NAME_LIMIT: Duration = Duration::from_secs(11);
@@ -38,6 +39,13 @@ pub struct Identity {
     pub process: ProcessId,
     /// The vehicle of the process, or a name of its own: `replay`.
     pub cav: CavId,
+}
+
+impl Identity {
+    /// The identity of `process`, which is of the vehicle `cav`.
+    pub fn new(run: RunId, process: ProcessId, cav: CavId) -> Self {
+        Self { run, process, cav }
+    }
 }
 
 /// Connection of a process to the bus: everything that it publishes and subscribes to passes through it.
@@ -58,7 +66,7 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError`], as [`open`].
-    pub fn join(options: &BusOptions, identity: Identity) -> Result<Self, BusError> {
+    pub fn join(options: &BusOptions, identity: Identity) -> Result<Self> {
         Self::with_pool(open(options)?, options, identity)
     }
 
@@ -66,19 +74,11 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError`], as [`open_unless`].
-    pub fn join_unless(
-        stop: &Stop,
-        options: &BusOptions,
-        identity: Identity,
-    ) -> Result<Self, BusError> {
+    pub fn join_unless(stop: &Stop, options: &BusOptions, identity: Identity) -> Result<Self> {
         Self::with_pool(open_unless(stop, options)?, options, identity)
     }
 
-    fn with_pool(
-        session: Session,
-        options: &BusOptions,
-        identity: Identity,
-    ) -> Result<Self, BusError> {
+    fn with_pool(session: Session, options: &BusOptions, identity: Identity) -> Result<Self> {
         let mut bus = Self::over(session, identity)?;
         bus.pool = SharedPool::open(&bus.session, options.shared_memory.pool_bytes(), &bus.stats)?;
         Ok(bus)
@@ -88,12 +88,11 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError`] when the system cannot start a thread, or the session is closed.
-    pub fn over(session: Session, identity: Identity) -> Result<Self, BusError> {
-        let (epoch, stats, status) = (
-            new_epoch(),
-            MessageStats::new(identity.process.clone()),
-            StatusPublisher::new(),
-        );
+    pub fn over(session: Session, identity: Identity) -> Result<Self> {
+        // Differs for every process instance: the standard library seeds its hashers from the system's randomness.
+        let epoch = RandomState::new().hash_one(unix_nanos());
+        let stats = MessageStats::new(identity.process.clone());
+        let status = StatusPublisher::new();
         let status_thread = status.start(StatusSender {
             session: session.clone(),
             run: identity.run.clone(),
@@ -121,7 +120,7 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError::NameTaken`] if one still has it.
-    pub(super) fn check_name(&self, role: Role, stop: &Stop) -> Result<(), BusError> {
+    pub(super) fn check_name(&self, role: Role, stop: &Stop) -> Result<()> {
         let Identity { run, process, cav } = &self.identity;
         let token = Key::alive(run, role, cav).to_string();
         let until = Instant::now() + NAME_LIMIT;
@@ -146,7 +145,7 @@ impl Bus {
         &mut self,
         address: SocketAddr,
         others: Vec<MetricsPeer>,
-    ) -> Result<SocketAddr, BusError> {
+    ) -> Result<SocketAddr> {
         let server = MetricsServer::start(address, &self.stats, others);
         let server = server.map_err(|cause| BusError::Metrics { address, cause })?;
         Ok(self.metrics.insert(server).address())
@@ -181,11 +180,7 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError`] when zenoh or the system fails.
-    pub fn publisher(
-        &self,
-        topic: Topic,
-        options: PublisherOptions,
-    ) -> Result<Publisher, BusError> {
+    pub fn publisher(&self, topic: Topic, options: PublisherOptions) -> Result<Publisher> {
         // A sensor message names the vehicle that it belongs to.
         let cav = match &topic {
             Topic::Stream { cav, .. } | Topic::Received { cav, .. } => cav.clone(),
@@ -220,14 +215,14 @@ impl Bus {
     /// waits there or has returned since the last status. A stalled process thus stops its heartbeats, which a
     /// supervisor detects.
     pub fn works_from(&self, inbox: &Inbox) -> Heartbeat {
-        Heartbeat::begin(&self.status, inbox.watchdog())
+        Heartbeat::begin(&self.status, &inbox.watchdog)
     }
 
     /// Delivers `topic` into `inbox`.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn subscribe(&self, topic: Topic, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
+    pub fn subscribe(&self, topic: Topic, inbox: &Arc<Inbox>) -> Result<Subscription> {
         Subscription::to_key(
             &self.session,
             &topic.in_run(&self.identity.run),
@@ -245,7 +240,7 @@ impl Bus {
         topic: Topic,
         places: usize,
         inbox: &Arc<Inbox>,
-    ) -> Result<Subscription, BusError> {
+    ) -> Result<Subscription> {
         Subscription::to_key(
             &self.session,
             &topic.in_run(&self.identity.run),
@@ -258,11 +253,7 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn subscribe_all(
-        &self,
-        selector: &KeyExpr,
-        inbox: &Arc<Inbox>,
-    ) -> Result<Subscription, BusError> {
+    pub fn subscribe_all(&self, selector: &KeyExpr, inbox: &Arc<Inbox>) -> Result<Subscription> {
         Subscription::to_all(&self.session, selector, inbox, &self.status)
     }
 
@@ -271,7 +262,7 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn tap(&self, selectors: &[KeyExpr], places: usize) -> Result<PassiveSubscriber, BusError> {
+    pub fn tap(&self, selectors: &[KeyExpr], places: usize) -> Result<PassiveSubscriber> {
         PassiveSubscriber::open(&self.session, selectors, places, &self.status)
     }
 
@@ -284,7 +275,7 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn announce(&self, role: Role) -> Result<LivelinessToken, BusError> {
+    pub fn announce(&self, role: Role) -> Result<LivelinessToken> {
         LivelinessToken::announce(&self.session, &self.identity.run, role, &self.identity.cav)
     }
 
@@ -297,7 +288,7 @@ impl Bus {
         &self,
         role: Role,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
-    ) -> Result<LivelinessSubscription, BusError> {
+    ) -> Result<LivelinessSubscription> {
         LivelinessSubscription::begin(
             &self.session,
             &KeyExpr::alive(&self.identity.run, role),
@@ -337,10 +328,4 @@ impl Bus {
             }
         })
     }
-}
-
-/// A random number that differs for every process instance: the standard library seeds its hashers from the system's
-/// randomness.
-fn new_epoch() -> u64 {
-    RandomState::new().hash_one(unix_nanos())
 }

@@ -23,10 +23,10 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 /// Wait for a place in the queue of a receiver.
-pub(super) const FIRST_WAIT: Duration = Duration::from_millis(10);
+const FIRST_WAIT: Duration = Duration::from_millis(10);
 /// Further wait for the other fragments of a large message. A queue and the buffers of a socket hold megabytes: a
 /// receiver on a busy machine may pause for longer.
-pub(super) const FRAGMENT_WAIT: Duration = Duration::from_millis(90);
+const FRAGMENT_WAIT: Duration = Duration::from_millis(90);
 /// Maps and sweeps have at least so many bytes, notifications fewer.
 const LARGE_BYTES: usize = 2 << 10;
 /// Priorities of maps and of sweeps.

@@ -9,6 +9,9 @@ use support::cli::Interrupted;
 
 use super::endpoint::Endpoint;
 
+/// Result of an operation on the bus: a [`BusError`] if nothing else is named.
+pub type Result<T, E = BusError> = std::result::Result<T, E>;
+
 /// Error of opening or using the bus.
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {

@@ -25,14 +25,9 @@
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.
-#![cfg_attr(
-    not(test),
-    deny(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        clippy::indexing_slicing
-    )
-)]
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation))]
+#![cfg_attr(not(test), deny(clippy::cast_sign_loss))]
+#![cfg_attr(not(test), deny(clippy::indexing_slicing))]
 
 mod access_control;
 mod args;
@@ -82,7 +77,7 @@ pub use credentials::{
     AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER,
 };
 pub use endpoint::Endpoint;
-pub use error::BusError;
+pub use error::{BusError, Result};
 pub use frame_stats::FrameStats;
 pub use inbox_limits::InboxLimits;
 pub use liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};

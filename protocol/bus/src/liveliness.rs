@@ -8,6 +8,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
 use super::{BusError, process_id};
+use crate::Result;
 
 /// Timeout of a liveliness query to the router.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
@@ -24,12 +25,7 @@ impl LivelinessToken {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn announce(
-        session: &Session,
-        run: &RunId,
-        role: Role,
-        cav: &CavId,
-    ) -> Result<Self, BusError> {
+    pub fn announce(session: &Session, run: &RunId, role: Role, cav: &CavId) -> Result<Self> {
         let key = Key::alive(run, role, cav).to_string();
         let token = session.liveliness().declare_token(&key).wait();
         token
@@ -41,7 +37,7 @@ impl LivelinessToken {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn withdraw(self) -> Result<(), BusError> {
+    pub fn withdraw(self) -> Result<()> {
         self.0
             .undeclare()
             .wait()
@@ -53,7 +49,7 @@ impl LivelinessToken {
 ///
 /// # Errors
 /// [`BusError::Zenoh`] when the session is closed.
-pub fn present(session: &Session, selector: &str) -> Result<BTreeSet<ProcessId>, BusError> {
+pub fn present(session: &Session, selector: &str) -> Result<BTreeSet<ProcessId>> {
     let tokens = session
         .liveliness()
         .get(selector)
@@ -110,7 +106,7 @@ impl LivelinessSubscription {
         session: &Session,
         selector: &KeyExpr,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
-    ) -> Result<Self, BusError> {
+    ) -> Result<Self> {
         let subscriber = session
             .liveliness()
             .declare_subscriber(selector.as_str())

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use protocol::{
@@ -11,6 +11,7 @@ use protocol::{
 };
 
 use support::statistics::{quantile, sorted};
+use support::sync::lock;
 
 use super::Arrival;
 use super::clock_offset::{ClockOffset, is_same_clock};
@@ -472,7 +473,7 @@ impl MessageStats {
 
     // Counters are changed in one step each: a panic elsewhere leaves them consistent.
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 

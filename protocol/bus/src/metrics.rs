@@ -61,7 +61,7 @@ impl MetricsServer {
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// The counters in the OpenMetrics text format.
-pub(crate) fn exposition(stats: &MessageStats) -> String {
+fn exposition(stats: &MessageStats) -> String {
     let process = (Cow::from("process"), Cow::from(stats.process().to_string()));
     let mut registry = Registry::with_prefix_and_labels("v2vloc", [process.clone()].into_iter());
     registry.register_collector(Box::new(StatsCollector(stats.clone())));

@@ -346,13 +346,8 @@ impl Sender {
         }
     }
 
-    fn send(
-        &mut self,
-        Submission {
-            capture_nanos,
-            encode,
-        }: Submission,
-    ) {
+    fn send(&mut self, submission: Submission) {
+        let (capture_nanos, encode) = (submission.capture_nanos, submission.encode);
         let began = Instant::now();
         match encode(&self.stamp(capture_nanos), &self.pool) {
             Ok(bytes) => {

@@ -8,13 +8,14 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use protocol::{CavId, Control, KeyExpr, Limits, Principal, ProcessId, Role, Topic};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use support::sync::{lock, wait_at_most};
 
 use super::bounded_queue::Pop;
 use super::{Bus, BusError, Event, Inbox, Subscription};
@@ -39,6 +40,13 @@ pub struct Route {
     pub topic: Topic,
     /// Subscribing process.
     pub receiver: ProcessId,
+}
+
+impl Route {
+    /// The route of a topic to a process.
+    pub fn new(topic: Topic, receiver: ProcessId) -> Self {
+        Self { topic, receiver }
+    }
 }
 
 impl fmt::Display for Route {
@@ -144,10 +152,7 @@ impl Barrier {
                     subscribed,
                 }) if process == *sender => {
                     for topic in subscribed {
-                        self.confirm(&Route {
-                            topic,
-                            receiver: sender.clone(),
-                        });
+                        self.confirm(&Route::new(topic, sender.clone()));
                     }
                 }
                 Some(_) => inbox.reject_invalid(&topic, "not the sender's own readiness"),
@@ -157,7 +162,7 @@ impl Barrier {
     }
 
     /// Marks `route` as confirmed. Routes that are not expected change nothing.
-    pub(crate) fn confirm(&self, route: &Route) {
+    fn confirm(&self, route: &Route) {
         if self.lock().remove(route) {
             self.changed.notify_all();
         }
@@ -197,17 +202,13 @@ impl Barrier {
                 });
             }
             let pause = left.min(POLL_PERIOD);
-            missing = self
-                .changed
-                .wait_timeout(missing, pause)
-                .unwrap_or_else(PoisonError::into_inner)
-                .0;
+            missing = wait_at_most(&self.changed, missing, pause);
         }
         Ok(())
     }
 
     fn lock(&self) -> MutexGuard<'_, BTreeSet<Route>> {
-        self.missing.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.missing)
     }
 }
 

@@ -15,7 +15,7 @@ const QUERY_TIMEOUT: Duration = Duration::from_secs(1);
 const MAX_REJECTIONS: usize = 1024;
 
 /// Name of peers that are not authenticated.
-pub(crate) const UNAUTHORISED: &str = "unauthorised";
+const UNAUTHORISED: &str = "unauthorised";
 
 /// Rejection of a message or of a connection by a router.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]

@@ -16,6 +16,7 @@ use zenoh::{Session, Wait};
 
 use super::message_stats::SharedMemoryUse;
 use super::{BusError, MessageStats};
+use crate::Result;
 
 /// Bodies of fewer bytes take the socket.
 const SMALL_BYTES: usize = 16 << 10;
@@ -42,11 +43,7 @@ impl SharedPool {
     ///
     /// # Errors
     /// [`BusError::SharedMemory`] when the system has too little; [`BusError::Zenoh`] when it gives none.
-    pub(super) fn open(
-        session: &Session,
-        bytes: usize,
-        stats: &MessageStats,
-    ) -> Result<Self, BusError> {
+    pub(super) fn open(session: &Session, bytes: usize, stats: &MessageStats) -> Result<Self> {
         if bytes == 0 {
             return Ok(Self::none());
         }
@@ -114,7 +111,7 @@ fn is_router_attached(session: &Session) -> bool {
 ///
 /// # Errors
 /// [`BusError::SharedMemory`] with the wanted and the free memory.
-pub fn check_room(bytes: usize) -> Result<(), BusError> {
+pub fn check_room(bytes: usize) -> Result<()> {
     // Elsewhere shared memory is not in a folder.
     let Ok(room) = rustix::fs::statvfs(FOLDER) else {
         return Ok(());

@@ -1,9 +1,11 @@
 //! Shutdown on request, within a time limit.
 
 use std::sync::mpsc;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
+
+use support::sync::{lock, wait_at_most};
 
 type Reaction = Box<dyn FnOnce() + Send>;
 
@@ -61,12 +63,7 @@ impl Stop {
             if left.is_zero() {
                 return false;
             }
-            state = self
-                .0
-                .1
-                .wait_timeout(state, left)
-                .unwrap_or_else(PoisonError::into_inner)
-                .0;
+            state = wait_at_most(&self.0.1, state, left);
         }
         true
     }
@@ -141,7 +138,7 @@ impl Stop {
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
-        self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0.0)
     }
 }
 

@@ -115,7 +115,8 @@ pub struct Inbox {
     meters: RateLimiter,
     max_waiting: usize,
     waiting_bytes: AtomicUsize,
-    watchdog: Arc<Watchdog>,
+    /// Watchdog of the consuming thread.
+    pub(super) watchdog: Arc<Watchdog>,
 }
 
 impl Inbox {
@@ -154,11 +155,6 @@ impl Inbox {
             Pop::TimedOut => Pop::TimedOut,
             Pop::Closed => Pop::Closed,
         }
-    }
-
-    /// Watchdog of the consuming thread.
-    pub(super) fn watchdog(&self) -> &Arc<Watchdog> {
-        &self.watchdog
     }
 
     /// Rejects further events; queued ones can still be taken.
@@ -246,12 +242,8 @@ impl Subscription {
     ) -> Result<Self, BusError> {
         // Keys outside this grammar carry none of our messages.
         let topic = |sample: &Sample| {
-            sample
-                .key_expr()
-                .as_str()
-                .parse::<Key>()
-                .ok()
-                .map(|key| key.topic)
+            let key: Result<Key, _> = sample.key_expr().as_str().parse();
+            key.ok().map(|key| key.topic)
         };
         Self::declare(
             session,

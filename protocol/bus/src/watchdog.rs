@@ -16,7 +16,7 @@ pub(super) struct Watchdog {
 
 impl Watchdog {
     /// Records activity of the thread.
-    pub(super) fn beat(&self) {
+    fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 

@@ -182,12 +182,8 @@ impl<'a> Columns<'a> {
     fn find(fields: &[Field<'a>]) -> Result<Self, PointCloudError> {
         let floats = |datatype| matches!(datatype, Datatype::Float32 | Datatype::Float64);
         let coordinate = |name| {
-            let found = || {
-                fields
-                    .iter()
-                    .map(|field| field.name.chars().take(40).collect())
-                    .collect()
-            };
+            let names = fields.iter().map(|field| field.name.chars().take(40));
+            let found = || names.map(|name| name.collect()).collect();
             let allowed = "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1";
             column(fields, name, allowed, floats)?
                 .map(|(_, column)| column)
@@ -242,22 +238,18 @@ fn column<'a>(
     allowed: &'static str,
     is_allowed: impl Fn(Datatype) -> bool,
 ) -> Result<Option<(&'a str, Column)>, PointCloudError> {
-    let Some(&Field {
-        name: found,
-        offset,
-        datatype,
-        count,
-    }) = (fields.iter()).find(|field| field.name.eq_ignore_ascii_case(name))
-    else {
+    let mut fields = fields.iter();
+    let Some(found) = fields.find(|field| field.name.eq_ignore_ascii_case(name)) else {
         return Ok(None);
     };
-    match Datatype::of(datatype).filter(|datatype| is_allowed(*datatype)) {
+    let offset = found.offset;
+    match Datatype::of(found.datatype).filter(|datatype| is_allowed(*datatype)) {
         // Some drivers leave the count at 0.
-        Some(datatype) if count <= 1 => Ok(Some((found, Column { offset, datatype }))),
+        Some(datatype) if found.count <= 1 => Ok(Some((found.name, Column { offset, datatype }))),
         _ => Err(PointCloudError::FieldType {
             name,
-            datatype,
-            count,
+            datatype: found.datatype,
+            count: found.count,
             allowed,
         }),
     }
@@ -276,10 +268,9 @@ impl Layout {
     fn stride(&self) -> u64 {
         let row = u64::from(self.width) * u64::from(self.point_step);
         // The only row of a cloud needs no step, and some drivers give none.
-        if self.height > 1 {
-            u64::from(self.row_step)
-        } else {
-            row
+        match self.height {
+            0 | 1 => row,
+            _ => u64::from(self.row_step),
         }
     }
 
@@ -290,16 +281,13 @@ impl Layout {
         limits: SweepLimits,
     ) -> Result<(), PointCloudError> {
         let at_least = |what, found, needed, why| {
-            if found >= needed {
-                Ok(())
-            } else {
-                Err(PointCloudError::Layout {
-                    what,
-                    found,
-                    needed,
-                    why,
-                })
-            }
+            let error = PointCloudError::Layout {
+                what,
+                found,
+                needed,
+                why,
+            };
+            (found >= needed).then_some(()).ok_or(error)
         };
         let points = u64::from(self.height) * u64::from(self.width);
         if points > limits.max_points {
@@ -318,10 +306,9 @@ impl Layout {
         let row = u64::from(self.width) * u64::from(self.point_step);
         at_least("row_step", self.stride(), row, "width x point_step")?;
         let rows = u64::from(self.height.saturating_sub(1));
-        let needed = if self.height == 0 {
-            0
-        } else {
-            rows.saturating_mul(self.stride()).saturating_add(row)
+        let needed = match self.height {
+            0 => 0,
+            _ => rows.saturating_mul(self.stride()).saturating_add(row),
         };
         at_least("length of data", data_len as u64, needed, "rows x row_step")
     }

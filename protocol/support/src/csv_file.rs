@@ -9,6 +9,7 @@ use protocol::text::excerpt;
 
 use crate::bounded_file;
 use crate::file_error::FileError;
+use crate::file_error::Result;
 
 /// Maximum number of characters of a foreign field or line in an error.
 const SHOWN_CHARS: usize = 80;
@@ -34,7 +35,7 @@ impl CsvFile {
     ///
     /// # Errors
     /// [`FileError`].
-    pub fn read(path: &Path, header: &'static str, max_bytes: u64) -> Result<Self, FileError> {
+    pub fn read(path: &Path, header: &'static str, max_bytes: u64) -> Result<Self> {
         let path = path.to_owned();
         match bounded_file::read_text(&path, max_bytes) {
             Ok(text) => Self { path, header, text }.checked(),
@@ -42,7 +43,7 @@ impl CsvFile {
         }
     }
 
-    fn checked(self) -> Result<Self, FileError> {
+    fn checked(self) -> Result<Self> {
         let found = self.text.lines().next().unwrap_or_default().trim();
         if found == self.header {
             return Ok(self);
@@ -72,7 +73,7 @@ impl CsvRow<'_> {
     ///
     /// # Errors
     /// [`FileError`].
-    pub fn complete(self) -> Result<Self, FileError> {
+    pub fn complete(self) -> Result<Self> {
         let expected = self.file.header.split(',').count();
         if self.record.len() == expected {
             return Ok(self);
@@ -88,12 +89,7 @@ impl CsvRow<'_> {
     ///
     /// # Errors
     /// [`FileError`] states the field.
-    pub fn number(
-        &self,
-        column: usize,
-        range: RangeInclusive<f64>,
-        must: &str,
-    ) -> Result<f64, FileError> {
+    pub fn number(&self, column: usize, range: RangeInclusive<f64>, must: &str) -> Result<f64> {
         let number = self
             .field(column)
             .parse()

@@ -5,6 +5,9 @@ use std::fmt::{self, Display};
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
+/// Result of an operation on a file: a [`FileError`] if nothing else is named.
+pub type Result<T, E = FileError> = std::result::Result<T, E>;
+
 /// A file that cannot be read, written or used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct FileError {

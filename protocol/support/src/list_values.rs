@@ -19,7 +19,8 @@ pub(crate) fn with_lists_joined(
         if let Some(option) = text.strip_prefix("--") {
             let (name, value) = option.split_once('=').unwrap_or((option, ""));
             let has_name = |arg: &&Arg| arg.get_long() == Some(name);
-            is_list = of.get_arguments().filter(has_name).any(has_commas);
+            let mut named = of.get_arguments().filter(has_name);
+            is_list = named.any(|arg| arg.get_value_delimiter() == Some(','));
             let is_value = is_list && !value.is_empty();
             is_list &= value.is_empty() || value.trim_end().ends_with(',');
             joined.push(match is_value {
@@ -42,10 +43,6 @@ pub(crate) fn with_lists_joined(
         }
     }
     joined
-}
-
-fn has_commas(arg: &Arg) -> bool {
-    arg.get_value_delimiter() == Some(',')
 }
 
 /// The list without the blanks around its commas.

@@ -105,17 +105,12 @@ impl QueueServer {
             } else {
                 self.sending.take()
             };
-            let Some(Sending {
-                packet,
-                start_nanos,
-                ..
-            }) = sent
-            else {
+            let Some(sent) = sent else {
                 return;
             };
             left.push(Departure::Sent {
-                packet,
-                start_nanos,
+                packet: sent.packet,
+                start_nanos: sent.start_nanos,
                 end_nanos,
             });
             if !is_urgent && let Some(next) = self.waiting.pop_front() {
@@ -133,17 +128,12 @@ impl QueueServer {
     /// The same, with true for an urgent packet.
     fn next(&self, rules: &Rules<'_>) -> Option<(u64, bool)> {
         let end = |sending: &Sending| {
-            rules
-                .capacity
-                .time_of(sending.end)
-                .map(|nanos| nanos.max(sending.start_nanos))
+            let nanos = rules.capacity.time_of(sending.end)?;
+            Some(nanos.max(sending.start_nanos))
         };
         let urgent = self.urgent.front().and_then(end).map(|nanos| (nanos, true));
-        let usual = self
-            .sending
-            .as_ref()
-            .and_then(end)
-            .map(|nanos| (nanos, false));
+        let usual = self.sending.as_ref().and_then(end);
+        let usual = usual.map(|nanos| (nanos, false));
         match (urgent, usual) {
             (Some(urgent), Some(usual)) => Some(if urgent.0 <= usual.0 { urgent } else { usual }),
             (urgent, usual) => urgent.or(usual),

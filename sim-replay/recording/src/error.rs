@@ -4,6 +4,9 @@ use std::path::{Path, PathBuf};
 
 use super::OWN_ENCODING;
 
+/// Result of reading or writing a recording: a [`RecordingError`] if nothing else is named.
+pub type Result<T, E = RecordingError> = std::result::Result<T, E>;
+
 /// Reasons why a recording cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {

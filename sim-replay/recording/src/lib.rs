@@ -44,14 +44,9 @@
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.
-#![cfg_attr(
-    not(test),
-    deny(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        clippy::indexing_slicing
-    )
-)]
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation))]
+#![cfg_attr(not(test), deny(clippy::cast_sign_loss))]
+#![cfg_attr(not(test), deny(clippy::indexing_slicing))]
 
 mod chunk;
 mod damage;
@@ -66,7 +61,7 @@ mod sink;
 mod writer;
 
 pub use damage::Damage;
-pub use error::RecordingError;
+pub use error::{RecordingError, Result};
 pub use export::{ExportReport, ExportTimes, export_ros2};
 pub use mcap_file::{McapFile, Place};
 pub use reader::{Entry, Recording};

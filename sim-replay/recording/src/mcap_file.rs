@@ -206,7 +206,7 @@ impl Contents<'_> {
     /// Reads all records of a file of `size` bytes, except damaged ones.
     fn look_through(&mut self, records: &mut Records<'_>, size: u64) -> std::io::Result<()> {
         loop {
-            let begin = records.at();
+            let begin = records.at;
             let taken = match records.next()? {
                 Ok(Some(record)) => self.take(&record),
                 Ok(None) if self.lost.last().is_some_and(|lost| lost.end == size) => return Ok(()),
@@ -234,7 +234,7 @@ impl Contents<'_> {
                             .is_some_and(|channel| is_own(&channel.message_encoding))
                     };
                     records.seek(begin + 1, |id| !has_chunks && is_own(id))?;
-                    self.lose((begin, records.at()), reason);
+                    self.lose((begin, records.at), reason);
                 }
             }
         }

@@ -29,7 +29,7 @@ pub(super) struct Records<'a> {
     file: &'a File,
     size: u64,
     /// Start of the next record, bytes.
-    at: u64,
+    pub(super) at: u64,
     body: Vec<u8>,
     /// Checksum of everything read so far.
     crc: crc32fast::Hasher,
@@ -56,11 +56,6 @@ impl<'a> Records<'a> {
             body: Vec::new(),
             crc,
         }))
-    }
-
-    /// Start of the next record, bytes.
-    pub(super) fn at(&self) -> u64 {
-        self.at
     }
 
     /// CRC-32 of the file up to the next record, if nothing was skipped.

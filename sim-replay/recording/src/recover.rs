@@ -4,7 +4,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{Damage, OWN_ENCODING, Recording, RecordingError, RecordingOptions, RecordingWriter};
+use super::{Damage, OWN_ENCODING, Recording, RecordingOptions, RecordingWriter};
+use crate::Result;
 
 /// Result of a recovery.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -18,12 +19,8 @@ pub struct RecoverReport {
 /// Writes the readable part of the recording `from` into the new file `to`.
 ///
 /// # Errors
-/// [`RecordingError`] if `from` holds no message of this program, or `to` exists already or cannot be written.
-pub fn recover(
-    from: &Path,
-    to: &Path,
-    options: RecordingOptions,
-) -> Result<RecoverReport, RecordingError> {
+/// [`crate::RecordingError`] if `from` holds no message of this program, or `to` exists already or cannot be written.
+pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<RecoverReport> {
     let recording = Recording::open(from)?;
     let mut writer = RecordingWriter::create(to, options)?;
     let mut messages = 0;

@@ -12,6 +12,7 @@ use ros2::{Distribution, Mount, RosMessage, RosTopic, Translator};
 
 use super::sink::{Store, WholeChunks};
 use super::{OWN_ENCODING, RecordingError};
+use crate::Result;
 
 /// Size at which a chunk is closed: the largest loss of a crash, besides the last second.
 const CHUNK_BYTES: usize = 4 << 20;
@@ -72,7 +73,7 @@ impl RecordingWriter<File> {
     ///
     /// # Errors
     /// [`RecordingError::Io`], also if the file exists already.
-    pub fn create(path: &Path, options: RecordingOptions) -> Result<Self, RecordingError> {
+    pub fn create(path: &Path, options: RecordingOptions) -> Result<Self> {
         let file = File::create_new(path).map_err(|source| RecordingError::io(path, source))?;
         Self::over(file, path, options)
     }
@@ -83,7 +84,7 @@ impl<S: Store> RecordingWriter<S> {
     ///
     /// # Errors
     /// [`RecordingError::Io`] if the header cannot be written.
-    pub fn over(store: S, path: &Path, options: RecordingOptions) -> Result<Self, RecordingError> {
+    pub fn over(store: S, path: &Path, options: RecordingOptions) -> Result<Self> {
         let format = WriteOptions::new()
             // The profile promises that every channel is one of ROS 2.
             .profile(if options.contents == Contents::Ros2 {
@@ -120,12 +121,7 @@ impl<S: Store> RecordingWriter<S> {
     ///
     /// # Errors
     /// [`RecordingError`] if the message, and with it its chunk, is not written.
-    pub fn write(
-        &mut self,
-        key: &Key,
-        arrived_nanos: u64,
-        payload: &[u8],
-    ) -> Result<(), RecordingError> {
+    pub fn write(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> Result<()> {
         self.check_open()?;
         let added = self.add(key, arrived_nanos, payload);
         self.checked(added)?;
@@ -192,7 +188,7 @@ impl<S: Store> RecordingWriter<S> {
         nanos: u64,
         vehicles: &BTreeSet<CavId>,
         mount: &Mount,
-    ) -> Result<(), RecordingError> {
+    ) -> Result<()> {
         self.check_open()?;
         let cdr = ros2::static_transforms(nanos, vehicles.iter(), mount);
         let added = self.add_ros(nanos, 0, &RosMessage::new(RosTopic::TfStatic, cdr));
@@ -203,7 +199,7 @@ impl<S: Store> RecordingWriter<S> {
     ///
     /// # Errors
     /// As [`Self::write`].
-    pub fn flush(&mut self) -> Result<(), RecordingError> {
+    pub fn flush(&mut self) -> Result<()> {
         self.check_open()?;
         let flushed = self.mcap.flush();
         self.checked(flushed)?;
@@ -221,7 +217,7 @@ impl<S: Store> RecordingWriter<S> {
     ///
     /// # Errors
     /// As [`Self::write`].
-    pub fn finish(&mut self) -> Result<(), RecordingError> {
+    pub fn finish(&mut self) -> Result<()> {
         self.flush()?;
         let finished = self.mcap.finish();
         self.checked(finished)?;
@@ -296,7 +292,7 @@ impl<S: Store> RecordingWriter<S> {
         }
     }
 
-    fn check_open(&self) -> Result<(), RecordingError> {
+    fn check_open(&self) -> Result<()> {
         match &self.ended {
             None => Ok(()),
             Some(reason) => Err(RecordingError::Ended {
@@ -306,7 +302,7 @@ impl<S: Store> RecordingWriter<S> {
         }
     }
 
-    fn checked<T>(&mut self, written: McapResult<T>) -> Result<T, RecordingError> {
+    fn checked<T>(&mut self, written: McapResult<T>) -> Result<T> {
         written.map_err(|error| {
             let error = failure(&self.path, error);
             self.ended = Some(error.to_string());
