@@ -102,11 +102,8 @@ pub fn run(
         ..
     } = node;
     report.under_way = kept.len() as u64;
-    let longest = kept
-        .values()
-        .map(|arrival| arrival.at.elapsed())
-        .max()
-        .unwrap_or_default();
+    let ages = kept.values().map(|arrival| arrival.at.elapsed());
+    let longest = ages.max().unwrap_or_default();
     report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
     for topic in kept.values().map(|arrival| &arrival.topic) {
         bus.stats().dropped(topic, DropReason::Stale);
@@ -191,18 +188,10 @@ impl<'a> Node<'a> {
         while !stop.requested() {
             self.update_membership()?;
             match self.inbox.take(Some(self.next_moment())) {
-                Pop::Item(
-                    Topic::Stream {
-                        cav,
-                        stream: Stream::Gnss,
-                    },
-                    Event::Message(arrival),
-                ) => {
-                    self.locate(&cav, &arrival);
-                }
-                Pop::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => {
-                    self.admit(cav, stream, arrival)
-                }
+                Pop::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => match stream {
+                    Stream::Gnss => self.locate(&cav, &arrival),
+                    _ => self.admit(cav, stream, arrival),
+                },
                 Pop::Item(Topic::Stream { cav, stream }, Event::End { .. }) => {
                     if let Some(vehicle) = self.vehicles.get_mut(&cav) {
                         vehicle.ended.insert(stream);
@@ -220,19 +209,16 @@ impl<'a> Node<'a> {
     }
 
     fn is_over(&self) -> bool {
-        let mut senders = self
-            .vehicles
-            .iter()
-            .filter(|(cav, _)| **cav != self.options.ego)
-            .peekable();
-        !self.options.keeps_running
+        let options = self.options;
+        let vehicles = self.vehicles.iter();
+        let mut senders = vehicles.filter(|(cav, _)| **cav != options.ego).peekable();
+        let has_ended = |vehicle: &Vehicle| {
+            let mut streams = options.streams.iter();
+            streams.all(|stream| vehicle.ended.contains(stream))
+        };
+        !options.keeps_running
             && senders.peek().is_some()
-            && senders.all(|(_, vehicle)| {
-                self.options
-                    .streams
-                    .iter()
-                    .all(|stream| vehicle.ended.contains(stream))
-            })
+            && senders.all(|(_, vehicle)| has_ended(vehicle))
             && self.kept.is_empty()
     }
 
@@ -289,22 +275,17 @@ impl<'a> Node<'a> {
         let mut subscriptions = vec![subscribe(Stream::Gnss)?];
         let mut publishers = BTreeMap::new();
         // The link does not apply to the ego's own agent.
-        let streams = if *cav == self.options.ego {
-            &[][..]
-        } else {
-            &self.options.streams
-        };
-        for &stream in streams {
+        let is_ego = *cav == self.options.ego;
+        for &stream in self.options.streams.iter().filter(|_| !is_ego) {
             subscriptions.push(subscribe(stream)?);
             let topic = Topic::Received {
                 ego: self.options.ego.clone(),
                 cav: cav.clone(),
                 stream,
             };
-            let how = if stream == Stream::Pose {
-                PublisherOptions::POSE
-            } else {
-                PublisherOptions::FEATURES
+            let how = match stream {
+                Stream::Pose => PublisherOptions::POSE,
+                _ => PublisherOptions::FEATURES,
             };
             // The emulator decides the losses; forwarding is lossless.
             publishers.insert(stream, self.bus.publisher(topic, how.waiting(PLACES))?);
@@ -318,15 +299,12 @@ impl<'a> Node<'a> {
 
     /// Records the position of a vehicle: loss may depend on distance.
     fn locate(&mut self, cav: &CavId, arrival: &Arrival) {
-        let Some(Gnss {
-            world_from_lidar, ..
-        }) = self.inbox.decode(arrival, &Limits::DEFAULT)
-        else {
+        let Some(gnss) = self.inbox.decode::<Gnss>(arrival, &Limits::DEFAULT) else {
             return;
         };
         self.bus.stats().received(&arrival.topic);
         if let Some(vehicle) = self.vehicles.get_mut(cav) {
-            vehicle.position_m = Some(world_from_lidar.translation_m);
+            vehicle.position_m = Some(gnss.world_from_lidar.translation_m);
         }
     }
 
@@ -334,14 +312,12 @@ impl<'a> Node<'a> {
         let began = *self.began.get_or_insert(arrival.at);
         let distance_m = self.distance_m(&from);
         self.report.submitted += 1;
-        match self.vehicles.get_mut(&from) {
-            // The end was that of the previous process instance; it can arrive after the first message of the new one.
-            Some(vehicle) => {
-                vehicle.ended.remove(&stream);
-            }
+        let Some(vehicle) = self.vehicles.get_mut(&from) else {
             // It has left, and another vehicle has replaced it.
-            None => return self.lose(&arrival, DropReason::PeerOffline),
-        }
+            return self.lose(&arrival, DropReason::PeerOffline);
+        };
+        // The end was that of the previous process instance; it can arrive after the first message of the new one.
+        vehicle.ended.remove(&stream);
         if self.kept_bytes.saturating_add(arrival.wire_bytes()) > self.options.max_kept_bytes {
             return self.lose(&arrival, DropReason::LinkQueue);
         }

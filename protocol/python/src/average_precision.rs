@@ -136,7 +136,7 @@ fn ground_truth(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<GroundTrut
     let Ok(objects) = objects.cast::<Objects>() else {
         return Ok(GroundTruth::of_boxes(boxes_of("truth", frame, objects)?));
     };
-    if let Some(truth) = objects.get().truth() {
+    if let Some(truth) = &objects.get().truth {
         return Ok(truth.clone());
     }
     let no_pose = || {
@@ -144,7 +144,7 @@ fn ground_truth(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<GroundTrut
             "truth of frame {frame}: objects without boxes, as the pose of the LiDAR is unknown"
         ))
     };
-    let boxes = objects.get().boxes().ok_or_else(no_pose)?;
+    let boxes = objects.get().boxes.as_ref().ok_or_else(no_pose)?;
     let boxes = boxes_of("truth", frame, boxes.bind(objects.py()).as_any())?;
     Ok(GroundTruth::of_boxes(boxes))
 }

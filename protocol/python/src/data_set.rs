@@ -111,15 +111,10 @@ impl DataSet {
         py: Python<'py>,
     ) -> PyResult<(pyo3::Bound<'py, pyo3::PyAny>, ReadArguments)> {
         use pyo3::types::PyAnyMethods;
-        let LoadOptions {
-            points,
-            radar,
-            cameras,
-            ..
-        } = self.options;
+        let (path, options) = (self.path.clone(), &self.options);
         Ok((
             py.import("v2vloc")?.getattr("read")?,
-            (self.path.clone(), points, radar, cameras),
+            (path, options.points, options.radar, options.cameras),
         ))
     }
 
@@ -144,7 +139,7 @@ impl DataSet {
                 .iter()
                 .map(|scenario| scenario.name.clone())
                 .collect(),
-            Source::Recording(recording) => vec![recording.run().to_owned()],
+            Source::Recording(recording) => vec![recording.run.clone()],
         }
     }
 

@@ -91,11 +91,7 @@ impl FrameParts {
         }
         let mut others = std::mem::take(&mut self.agents);
         for agent in &truth.agents {
-            let Frame {
-                world_from_lidar,
-                objects,
-                ..
-            } = Frame::of_truth(agent);
+            let truth = Frame::of_truth(agent);
             let known = others
                 .iter()
                 .position(|other| other.recorded.cav == agent.cav);
@@ -103,7 +99,8 @@ impl FrameParts {
                 || AgentParts::empty(&agent.cav),
                 |index| others.swap_remove(index),
             );
-            (parts.recorded.world_from_lidar, parts.recorded.objects) = (world_from_lidar, objects);
+            parts.recorded.world_from_lidar = truth.world_from_lidar;
+            parts.recorded.objects = truth.objects;
             self.agents.push(parts);
         }
         self.agents.append(&mut others);

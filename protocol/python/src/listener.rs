@@ -175,11 +175,8 @@ impl Listener {
                 Step::Message(_) | Step::Waiting => {}
                 Step::End => {
                     self.frames.finish();
-                    return self
-                        .frames
-                        .next()
-                        .map(|parts| Frame::new(py, parts))
-                        .transpose();
+                    let last = self.frames.next();
+                    return last.map(|parts| Frame::new(py, parts)).transpose();
                 }
             }
         }
@@ -216,23 +213,17 @@ impl Listener {
 
     #[getter]
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let subscriber = self
-            .connection
-            .as_ref()
-            .map(|connection| &connection.subscriber);
+        let connection = self.connection.as_ref();
+        let subscriber = connection.map(|connection| &connection.subscriber);
+        let overwritten = subscriber.map_or(0, PassiveSubscriber::overwritten);
+        let undelivered = subscriber.map_or(0, PassiveSubscriber::undelivered);
         let counts = PyDict::new(py);
         for (name, count) in [
             ("messages", self.messages),
             ("undecodable", self.undecodable),
             ("late", self.frames.late),
-            (
-                "overwritten",
-                subscriber.map_or(0, PassiveSubscriber::overwritten),
-            ),
-            (
-                "undelivered",
-                subscriber.map_or(0, PassiveSubscriber::undelivered),
-            ),
+            ("overwritten", overwritten),
+            ("undelivered", undelivered),
         ] {
             counts.set_item(name, count)?;
         }
@@ -302,11 +293,7 @@ pub(crate) fn listen(
         options = options.with_credentials(credentials);
     }
     let selectors = subscriptions::selectors(&run, streams, &access)?;
-    let identity = Identity {
-        run: run.clone(),
-        process: principal.name(),
-        cav: principal.cav,
-    };
+    let identity = Identity::new(run.clone(), principal.name(), principal.cav);
     let connect = || {
         let bus = Bus::join(&options, identity)?;
         let subscriber = bus.tap(&selectors, PLACES)?;

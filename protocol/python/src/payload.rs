@@ -11,6 +11,7 @@ use crate::arrays::{self, Matrix};
 use crate::json;
 
 /// Pose estimate of an agent, or the reason why it has none.
+#[derive(Default)]
 #[pyclass(frozen, get_all, module = "v2vloc")]
 pub(crate) struct PoseEstimate {
     world_from_cav: Option<Matrix>,
@@ -34,18 +35,15 @@ impl PoseEstimate {
                     .as_ref()
                     .map(|one| arrays::covariance(py, one))
                     .transpose()?,
-                no_pose_reason: None,
-                inlier_count: None,
+                ..Self::default()
             },
             protocol::PoseEstimate::NoPose {
                 reason,
                 inlier_count,
             } => Self {
-                world_from_cav: None,
-                confidence: None,
-                covariance: None,
                 no_pose_reason: Some(json::name(reason)?),
                 inlier_count: Some(*inlier_count),
+                ..Self::default()
             },
         };
         Py::new(py, made)
@@ -307,7 +305,7 @@ pub(crate) struct Objects {
     #[pyo3(get)]
     classes: Py<PyList>,
     #[pyo3(get)]
-    boxes: Option<Matrix>,
+    pub(crate) boxes: Option<Matrix>,
     #[pyo3(get)]
     world_from_object: Py<PyArray3<f64>>,
     #[pyo3(get)]
@@ -315,7 +313,7 @@ pub(crate) struct Objects {
     #[pyo3(get)]
     speeds_mps: Py<PyArray1<f64>>,
     /// The same objects as ground truth, with the range and the objects that do not count; `None` for an annotation.
-    truth: Option<GroundTruth>,
+    pub(crate) truth: Option<GroundTruth>,
 }
 
 impl Objects {
@@ -359,16 +357,6 @@ impl Objects {
             truth,
         };
         Py::new(py, made)
-    }
-
-    /// The ground truth, if the objects are that of an ego.
-    pub(crate) fn truth(&self) -> Option<&GroundTruth> {
-        self.truth.as_ref()
-    }
-
-    /// The boxes in the frame of a LiDAR, if its pose is known.
-    pub(crate) fn boxes(&self) -> Option<&Matrix> {
-        self.boxes.as_ref()
     }
 }
 

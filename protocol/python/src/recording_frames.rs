@@ -13,7 +13,8 @@ use crate::frame_parts::{FrameParts, is_part_of_frames};
 /// A recording, and the messages of each of its frames.
 pub(crate) struct RecordingFrames {
     recording: Recording,
-    run: String,
+    /// Name of the recorded run.
+    pub(crate) run: String,
     protocol: EvaluationProtocol,
     /// Capture times and indices of their messages, in order.
     frames: Vec<(u64, Vec<usize>)>,
@@ -46,11 +47,6 @@ impl RecordingFrames {
             protocol,
             frames: frames.into_iter().collect(),
         })
-    }
-
-    /// Name of the recorded run.
-    pub(crate) fn run(&self) -> &str {
-        &self.run
     }
 
     pub(crate) fn len(&self) -> usize {

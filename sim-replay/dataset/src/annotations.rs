@@ -149,7 +149,7 @@ impl<'a> Annotations<'a> {
             "vehicles"
         };
         match root.optional(key)? {
-            Some(field) if matches!(&field.node().value, Value::List(items) if items.is_empty()) => {
+            Some(field) if matches!(&field.node.value, Value::List(items) if items.is_empty()) => {
                 Ok(Vec::new())
             }
             Some(field) => field

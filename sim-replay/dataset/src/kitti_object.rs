@@ -26,10 +26,7 @@ pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
     data_sets: "KITTI object detection",
     files: "velodyne/<frame>.bin and calib/<frame>.txt (a folder)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence {
-        is_one: is_split,
-        open,
-    }),
+    reader: Some(Reader::Sequence(is_split, open)),
 };
 
 /// Numbers after the type in a line of labels; detections have a score as well.
@@ -46,7 +43,7 @@ struct Split {
 }
 
 /// True for a folder with sweeps and a folder of calibrations. DAIR-V2X has the same folders, with PCD files.
-pub(super) fn is_split(dir: &Path) -> bool {
+fn is_split(dir: &Path) -> bool {
     dir.join("calib").is_dir() && files::holds(&dir.join("velodyne"), ".bin")
 }
 

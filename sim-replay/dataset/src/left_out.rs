@@ -86,7 +86,7 @@ impl LeftOut {
     }
 
     /// Adds the parts left out of a frame.
-    pub(crate) fn add_parts(&mut self, frame: &Frame) {
+    fn add_parts(&mut self, frame: &Frame) {
         self.parts += frame.problems.len() as u64;
         frame
             .problems

@@ -139,11 +139,7 @@ fn scalar_of(code: &str) -> Result<Scalar, String> {
         ("V", _) => ScalarKind::Padding,
         _ => return Err(fault()),
     };
-    Ok(Scalar {
-        kind,
-        size,
-        is_big_endian: order == ">",
-    })
+    Ok(Scalar::new(kind, size, order == ">"))
 }
 
 /// Fields of a structured array: name and type.

@@ -169,11 +169,7 @@ fn scalar_of(name: &str) -> Option<Scalar> {
         "double" | "float64" => (ScalarKind::Float, 8),
         _ => return None,
     };
-    Some(Scalar {
-        kind,
-        size,
-        is_big_endian: false,
-    })
+    Some(Scalar::new(kind, size, false))
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]

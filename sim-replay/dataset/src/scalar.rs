@@ -25,6 +25,14 @@ pub(super) struct Scalar {
 }
 
 impl Scalar {
+    pub(super) fn new(kind: ScalarKind, size: usize, is_big_endian: bool) -> Self {
+        Self {
+            kind,
+            size,
+            is_big_endian,
+        }
+    }
+
     /// The number at the start of `bytes`; `None` if they are too few, or there is no such type.
     #[expect(
         clippy::cast_possible_truncation,

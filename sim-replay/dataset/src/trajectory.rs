@@ -73,7 +73,7 @@ impl Trajectory {
     clippy::indexing_slicing,
     reason = "all indices are of `values`, and `length` is at most that of `ends`"
 )]
-pub(super) fn longest_increasing(values: &[u64]) -> Vec<usize> {
+fn longest_increasing(values: &[u64]) -> Vec<usize> {
     // Of the selections of each length, the index of the smallest last value; and the predecessor of each value.
     let mut ends: Vec<usize> = Vec::new();
     let mut before: Vec<Option<usize>> = Vec::with_capacity(values.len());

@@ -29,7 +29,7 @@ impl WrittenPose {
         match (&sizes[..], values.first_chunk::<6>()) {
             ([6], Some(numbers)) => Ok(Self::SixNumbers(CarlaPose::from(*numbers))),
             ([4, 4] | [16], _) => Ok(Self::Matrix(Matrix4::from_row_slice(&values))),
-            _ if numpy_tags::is_call(field.node()) => Err(field.error(format!(
+            _ if numpy_tags::is_call(field.node) => Err(field.error(format!(
                 "an array of shape {shape:?}, expected 6 numbers or a 4x4 matrix"
             ))),
             _ => Err(field.expected("6 numbers or a 4x4 matrix")),

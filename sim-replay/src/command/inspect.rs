@@ -21,12 +21,8 @@ pub(crate) struct Args {
     dir: PathBuf,
     /// Number that stored intensities are divided by [default: 255 for bytes and red; other numbers by the range of
     /// each agent's first sweeps: up to 1 unchanged, up to 255 by 255].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t)]
+    #[arg(hide_default_value = true)]
     intensity_scale: IntensityScale,
     #[command(flatten)]
     protocol: ProtocolConfig,

@@ -59,12 +59,8 @@ pub struct WaitConfig {
     #[arg(long, value_name = "S")]
     pub ready_timeout_s: f64,
     /// Egos whose detections of a tick are awaited in lockstep.
-    #[arg(
-        long,
-        value_name = "IDS",
-        value_delimiter = ',',
-        allow_hyphen_values = true
-    )]
+    #[arg(long, value_name = "IDS", value_delimiter = ',')]
+    #[arg(allow_hyphen_values = true)]
     pub egos: Vec<CavId>,
     /// Longest time to wait for an ego's detections in lockstep, seconds; the tick then counts as unanswered.
     #[arg(long, value_name = "S")]

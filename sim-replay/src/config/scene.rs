@@ -22,12 +22,8 @@ pub struct SceneConfig {
     #[serde(default)]
     pub scenario: Option<String>,
     /// Vehicles that take part. None named: all.
-    #[arg(
-        long,
-        value_name = "IDS",
-        value_delimiter = ',',
-        allow_hyphen_values = true
-    )]
+    #[arg(long, value_name = "IDS", value_delimiter = ',')]
+    #[arg(allow_hyphen_values = true)]
     #[serde(default)]
     pub agents: Vec<CavId>,
     /// Variant of the sweeps, if the data set has several (weather), for example fog_0.060. Absent: the plain ones.

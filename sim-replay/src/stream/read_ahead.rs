@@ -1,12 +1,13 @@
 //! Read-ahead: reads the next ticks from disk during the wait for the current one.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use dataset::frame::Frame;
 use dataset::{LoadOptions, ReadError, Scenario};
+use support::sync::{wait, wait_at_most};
 
 /// The frames of one tick, one for each requested agent, in that order.
 pub(crate) type TickFrames = Vec<Result<Frame, ReadError>>;
@@ -90,12 +91,7 @@ impl ReadAhead {
                 self.shared.1.notify_all();
             }
             // A thread that panics does not notify the waiters.
-            state = self
-                .shared
-                .1
-                .wait_timeout(state, Duration::from_secs(1))
-                .unwrap_or_else(PoisonError::into_inner)
-                .0;
+            state = wait_at_most(&self.shared.1, state, Duration::from_secs(1));
         }
     }
 }
@@ -120,10 +116,10 @@ fn next_wanted(shared: &(Mutex<State>, Condvar)) -> Option<usize> {
         if let Some(tick) = state.next() {
             return Some(tick);
         }
-        state = shared.1.wait(state).unwrap_or_else(PoisonError::into_inner);
+        state = wait(&shared.1, state);
     }
 }
 
 fn lock(shared: &(Mutex<State>, Condvar)) -> MutexGuard<'_, State> {
-    shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+    support::sync::lock(&shared.0)
 }

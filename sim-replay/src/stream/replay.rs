@@ -260,7 +260,7 @@ impl<'a> Replay<'a> {
         if !self.is_resumed {
             return Ok(wait(self.options.ready_timeout)?);
         }
-        let (tick, ticks) = (self.schedule.position().next_tick, self.tick_count);
+        let (tick, ticks) = (self.schedule.position.next_tick, self.tick_count);
         tracing::warn!(
             tick,
             ticks,
@@ -298,7 +298,7 @@ impl<'a> Replay<'a> {
             mut report,
             ..
         } = self;
-        report.sensor_link = sensor_link.map(|link| link.report().clone());
+        report.sensor_link = sensor_link.map(|link| link.report.clone());
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
         report.sent = publisher.finish();
@@ -325,9 +325,8 @@ impl<'a> Replay<'a> {
             .filter(|_| self.options.await_agents);
         agents
             .flat_map(|cav| {
-                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Route {
-                    topic: Topic::stream(cav, stream),
-                    receiver: process_id(Role::Agent, cav),
+                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| {
+                    Route::new(Topic::stream(cav, stream), process_id(Role::Agent, cav))
                 })
             })
             .chain(answers)
@@ -349,10 +348,8 @@ impl<'a> Replay<'a> {
                 }
                 _ => {}
             }
-            match self
-                .inbox
-                .take(due.into_iter().chain(self.next_arrival()).min())
-            {
+            let until = due.into_iter().chain(self.next_arrival()).min();
+            match self.inbox.take(until) {
                 Pop::Item(_, Event::Message(arrival)) => {
                     if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
                         self.apply(command);
@@ -375,13 +372,9 @@ impl<'a> Replay<'a> {
         let Some(link) = &mut self.sensor_link else {
             return;
         };
-        for DelayedSweep {
-            agent,
-            capture_nanos,
-            frame,
-        } in link.arrived(Instant::now())
-        {
-            self.publisher.submit(agent, capture_nanos, frame);
+        for sweep in link.arrived(Instant::now()) {
+            let (agent, nanos) = (sweep.agent, sweep.capture_nanos);
+            self.publisher.submit(agent, nanos, sweep.frame);
         }
     }
 
@@ -400,19 +393,13 @@ impl<'a> Replay<'a> {
         let Some(checkpoint) = &self.checkpoint else {
             return;
         };
-        let StreamReport {
-            ticks,
-            unanswered,
-            unreadable_frames,
-            ..
-        } = self.report;
         checkpoint.note(Place {
             scenario: self.scenario.clone(),
-            position: self.schedule.position(),
+            position: self.schedule.position,
             is_halted: self.clock.is_halted(),
-            ticks,
-            unanswered,
-            unreadable_frames,
+            ticks: self.report.ticks,
+            unanswered: self.report.unanswered,
+            unreadable_frames: self.report.unreadable_frames,
         });
     }
 

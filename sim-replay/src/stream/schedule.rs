@@ -41,7 +41,8 @@ pub struct Position {
 pub struct Schedule {
     captures: Arc<[u64]>,
     repeats: bool,
-    position: Position,
+    /// Its state.
+    pub(super) position: Position,
 }
 
 impl Schedule {
@@ -62,11 +63,6 @@ impl Schedule {
     /// Resumes at the state of the previous process instance, with its capture times.
     pub fn resumed(self, position: Position) -> Self {
         Self { position, ..self }
-    }
-
-    /// Its state.
-    pub(super) fn position(&self) -> Position {
-        self.position
     }
 
     /// Continues from tick `index` instead.
@@ -182,7 +178,7 @@ mod tests {
         let whole = Schedule::new(&ticks, 1, Some(9), true);
         let mut first = whole.clone();
         let mut seen = plan(first.by_ref().take(4).collect::<Vec<_>>(), 9);
-        let second = Schedule::new(&ticks, 0, None, true).resumed(first.position());
+        let second = Schedule::new(&ticks, 0, None, true).resumed(first.position);
         seen.extend(plan(second, 9));
         assert_eq!(seen, plan(whole, 9));
     }

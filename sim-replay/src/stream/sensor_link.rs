@@ -42,7 +42,7 @@ pub(super) struct SensorLink {
     /// By vehicle, as for its own messages: losses must not depend on the other vehicles.
     next_sequences: BTreeMap<CavId, u64>,
     began: Instant,
-    report: SensorLinkReport,
+    pub(super) report: SensorLinkReport,
 }
 
 impl SensorLink {
@@ -117,10 +117,6 @@ impl SensorLink {
         }
         self.report.arrived += arrived.len() as u64;
         arrived
-    }
-
-    pub(super) fn report(&self) -> &SensorLinkReport {
-        &self.report
     }
 }
 
@@ -214,7 +210,7 @@ mod tests {
         let began = lossy.began;
         (0..200).for_each(|tick| lossy.submit(held(&cav, tick), began));
         let arrived = lossy.arrived(began).len() as u64;
-        let report = lossy.report();
+        let report = &lossy.report;
         assert!((70..130).contains(&arrived), "{arrived}");
         assert_eq!((report.submitted, report.arrived), (200, arrived));
         assert_eq!(

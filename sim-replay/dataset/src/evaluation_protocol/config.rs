@@ -25,12 +25,8 @@ pub struct ProtocolConfig {
     pub comm_range_m: Option<f64>,
     /// Range in which objects count, in the ego's LiDAR frame: x, y, z low, then x, y, z high, metres. Without this the
     /// range of the protocol ends at the area of the network.
-    #[arg(
-        long = "ground-truth-range-m",
-        value_name = "M,M,M,M,M,M",
-        value_delimiter = ',',
-        allow_hyphen_values = true
-    )]
+    #[arg(long = "ground-truth-range-m", value_name = "M,M,M,M,M,M")]
+    #[arg(value_delimiter = ',', allow_hyphen_values = true)]
     pub ground_truth_range_m: Option<Vec<f64>>,
     /// Corners of a box, of 8, that must lie within that range.
     #[arg(long = "min-corners", value_name = "N")]

@@ -43,18 +43,14 @@ pub(super) fn read_dtype(field: &Field<'_>) -> Result<Scalar> {
             return Err(order.error(format!("byte order {other:?}, {expected}")));
         }
     };
-    Ok(Scalar {
-        kind,
-        size,
-        is_big_endian,
-    })
+    Ok(Scalar::new(kind, size, is_big_endian))
 }
 
 /// Bytes in base64, on their own or as the one argument of `bytearray`.
 pub(super) fn binary(field: &Field<'_>) -> Result<Vec<u8>> {
-    let tag = field.node().tag.as_deref();
+    let tag = field.node.tag.as_deref();
     let function = tag.and_then(|tag| tag.strip_prefix(APPLY));
-    if function == Some("builtins.bytearray") && !matches!(field.node().value, Value::Text(_)) {
+    if function == Some("builtins.bytearray") && !matches!(field.node.value, Value::Text(_)) {
         let [inner] = items::<1>(&args(field)?)?;
         return base64(&inner);
     }

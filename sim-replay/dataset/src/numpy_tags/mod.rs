@@ -27,6 +27,12 @@ pub(super) struct NumpyArray {
     pub(super) values: Vec<f64>,
 }
 
+impl NumpyArray {
+    pub(super) fn new(shape: Vec<usize>, values: Vec<f64>) -> Self {
+        Self { shape, values }
+    }
+}
+
 /// True if the node carries a tag of Python's.
 pub(super) fn is_python(node: &Node) -> bool {
     node.tag
@@ -53,10 +59,7 @@ pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray> {
     match function(field)? {
         Function::Reconstruct => reconstruct(field),
         Function::FromBuffer => from_buffer(field),
-        Function::Scalar => Ok(NumpyArray {
-            shape: vec![],
-            values: vec![scalar_value(field)?],
-        }),
+        Function::Scalar => Ok(NumpyArray::new(vec![], vec![scalar_value(field)?])),
     }
 }
 
@@ -85,7 +88,7 @@ fn function(field: &Field<'_>) -> Result<Function> {
         ("multiarray.scalar", Function::Scalar),
     ];
     let call = field
-        .node()
+        .node
         .tag
         .as_deref()
         .and_then(|tag| tag.strip_prefix(APPLY));
@@ -98,7 +101,7 @@ fn function(field: &Field<'_>) -> Result<Function> {
     });
     let known = name.and_then(|name| KNOWN.iter().find(|(known, _)| *known == name));
     known.map(|(_, function)| *function).ok_or_else(|| {
-        let tag = shown(field.node().tag.as_deref());
+        let tag = shown(field.node.tag.as_deref());
         field.error(format!(
             "tag {tag} is not supported, expected numbers or NumPy's arrays of them"
         ))
@@ -119,7 +122,7 @@ fn reconstruct(field: &Field<'_>) -> Result<NumpyArray> {
     }
     let shape = read_shape(&shape)?;
     let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
-    let is_fortran = match is_fortran.node().value {
+    let is_fortran = match is_fortran.node.value {
         Value::Bool(flag) => flag,
         Value::Integer(0) => false,
         Value::Integer(1) => true,
@@ -152,7 +155,7 @@ fn scalar_value(field: &Field<'_>) -> Result<f64> {
 
 /// Arguments of a call without state are its items, or the entry `args`.
 fn args<'a>(field: &Field<'a>) -> Result<Field<'a>> {
-    if matches!(field.node().value, Value::Map(_)) {
+    if matches!(field.node.value, Value::Map(_)) {
         field.required("args")
     } else {
         Ok(field.clone())
@@ -160,7 +163,7 @@ fn args<'a>(field: &Field<'a>) -> Result<Field<'a>> {
 }
 
 fn expect_tag(field: &Field<'_>, expected: &str) -> Result<()> {
-    match field.node().tag.as_deref() {
+    match field.node.tag.as_deref() {
         Some(tag) if tag == expected => Ok(()),
         tag => Err(field.error(format!("tag {}, expected !!{expected}", shown(tag)))),
     }

@@ -126,51 +126,30 @@ fn gather(header: &Header, data: &[u8], column: impl Fn(&Field, usize) -> Column
 impl Column {
     /// Sets one component of all points. Integers beyond 2^24 and doubles are rounded.
     #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
-    fn fill(self, data: &[u8], points: &mut [[f32; 4]], component: usize) {
-        match (self.kind, self.size) {
-            (Kind::Float, 4) => self.numbers(data, points, component, f32::from_le_bytes),
-            (Kind::Float, _) => self.numbers(data, points, component, |bytes| {
-                f64::from_le_bytes(bytes) as f32
-            }),
-            (Kind::Unsigned, 1) => self.numbers(data, points, component, |[byte]| f32::from(byte)),
-            (Kind::Unsigned, 2) => self.numbers(data, points, component, |bytes| {
-                f32::from(u16::from_le_bytes(bytes))
-            }),
-            (Kind::Unsigned, 4) => self.numbers(data, points, component, |bytes| {
-                u32::from_le_bytes(bytes) as f32
-            }),
-            (Kind::Signed, 1) => self.numbers(data, points, component, |bytes| {
-                f32::from(i8::from_le_bytes(bytes))
-            }),
-            (Kind::Signed, 2) => self.numbers(data, points, component, |bytes| {
-                f32::from(i16::from_le_bytes(bytes))
-            }),
-            (Kind::Signed, 4) => self.numbers(data, points, component, |bytes| {
-                i32::from_le_bytes(bytes) as f32
-            }),
-            (Kind::Signed, _) => self.numbers(data, points, component, |bytes| {
-                i64::from_le_bytes(bytes) as f32
-            }),
-            // The header accepts no other type.
-            (Kind::Unsigned | Kind::Other, _) => {
-                self.numbers(data, points, component, |bytes| {
-                    u64::from_le_bytes(bytes) as f32
-                });
-            }
-        }
-    }
-
     #[expect(clippy::indexing_slicing, reason = "a component is 0 to 3")]
-    fn numbers<const N: usize>(
-        self,
-        data: &[u8],
-        points: &mut [[f32; 4]],
-        component: usize,
-        number: impl Fn([u8; N]) -> f32,
-    ) {
-        self.each(data, points, |point, bytes| {
-            point[component] = number(bytes)
-        });
+    fn fill(self, data: &[u8], points: &mut [[f32; 4]], component: usize) {
+        macro_rules! numbers {
+            ($number:ty) => {
+                self.each(data, points, |point, bytes| {
+                    point[component] = <$number>::from_le_bytes(bytes) as f32
+                })
+            };
+        }
+        match (self.kind, self.size) {
+            (Kind::Float, 4) => self.each(data, points, |point, bytes| {
+                point[component] = f32::from_le_bytes(bytes)
+            }),
+            (Kind::Float, _) => numbers!(f64),
+            (Kind::Unsigned, 1) => numbers!(u8),
+            (Kind::Unsigned, 2) => numbers!(u16),
+            (Kind::Unsigned, 4) => numbers!(u32),
+            (Kind::Signed, 1) => numbers!(i8),
+            (Kind::Signed, 2) => numbers!(i16),
+            (Kind::Signed, 4) => numbers!(i32),
+            (Kind::Signed, _) => numbers!(i64),
+            // The header accepts no other type.
+            (Kind::Unsigned | Kind::Other, _) => numbers!(u64),
+        }
     }
 
     /// Passes on each point with its bytes.

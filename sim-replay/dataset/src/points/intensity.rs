@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::pcd::{IntensityKind, PcdCloud};
 
 /// Largest number in a byte.
-pub(super) const BYTE: f32 = 255.0;
+const BYTE: f32 = 255.0;
 /// Number of sweeps of a LiDAR whose range determines the scale.
 pub(super) const SAMPLES: usize = 3;
 /// Finding about sweeps without intensities.
@@ -36,13 +36,9 @@ impl Eq for IntensityScale {}
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub struct IntensityOption {
     /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` describes the rule].
-    #[arg(
-        id = "intensity_scale",
-        long = "intensity-scale",
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
+    #[arg(id = "intensity_scale", long = "intensity-scale")]
+    #[arg(value_name = "auto|1|255|NUMBER", default_value_t)]
+    #[arg(hide_default_value = true)]
     pub scale: IntensityScale,
 }
 

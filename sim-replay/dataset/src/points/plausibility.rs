@@ -13,7 +13,7 @@ const AT_ORIGIN: f64 = 0.5;
 /// Magnitude below which only zero itself is a coordinate: integers read as floats lie there.
 pub(super) const TINY: f32 = 1e-30;
 /// Largest share of coordinates that are tiny.
-pub(super) const TINY_SHARE: f64 = 0.01;
+const TINY_SHARE: f64 = 0.01;
 
 /// Counts over the points of some sweeps.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

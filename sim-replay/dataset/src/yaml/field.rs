@@ -15,7 +15,7 @@ pub(crate) struct Field<'a> {
     path: &'a Path,
     /// Dotted names from the root, for example `vehicles.4335.extent`.
     name: String,
-    node: &'a Node,
+    pub(crate) node: &'a Node,
 }
 
 impl<'a> Field<'a> {
@@ -26,10 +26,6 @@ impl<'a> Field<'a> {
             name: String::new(),
             node,
         }
-    }
-
-    pub(crate) fn node(&self) -> &'a Node {
-        self.node
     }
 
     /// The file of the node.
@@ -201,18 +197,12 @@ impl<'a> Field<'a> {
                     .iter()
                     .map(Self::number)
                     .collect::<Result<_, _>>()?;
-                Ok(NumpyArray {
-                    shape: vec![items.len()],
-                    values,
-                })
+                Ok(NumpyArray::new(vec![items.len()], values))
             }
             Value::Map(_) | Value::List(_) if numpy_tags::is_python(self.node) => {
                 numpy_tags::array(self)
             }
-            _ => Ok(NumpyArray {
-                shape: vec![],
-                values: vec![self.number()?],
-            }),
+            _ => Ok(NumpyArray::new(vec![], vec![self.number()?])),
         }
     }
 }

@@ -127,11 +127,11 @@ mod tests {
         );
         let root = Field::root(Path::new("a.yaml"), &node);
         let tuple = root.required("a").unwrap();
-        assert_eq!(tuple.node().tag.as_deref(), Some("python/tuple"));
+        assert_eq!(tuple.node.tag.as_deref(), Some("python/tuple"));
         let items = tuple.items().unwrap();
         assert_eq!(items[1].text().unwrap().trim(), "Yg==");
         assert_eq!(
-            items[2].node().tag.as_deref(),
+            items[2].node.tag.as_deref(),
             Some("python/name:numpy.ndarray")
         );
     }

@@ -10,6 +10,7 @@ use super::error::SynthError;
 use super::layout::{SceneLayout, remove_folder};
 use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
+use crate::generate::Result;
 use crate::map::RoadMapSource;
 use support::file_error::{AtFile, FileError};
 use support::{atomic_file, bounded_file};
@@ -48,7 +49,7 @@ fn default_layout() -> String {
 /// # Errors
 /// [`SynthError::Kept`] if the folder holds other scenes, with the first setting in which they differ;
 /// [`SynthError::File`] if their settings cannot be read.
-pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
+pub fn are_kept(options: &SynthOptions) -> Result<bool> {
     let folder = options.out.as_path();
     if !folder.exists() {
         return Ok(false);
@@ -100,10 +101,7 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
 ///
 /// # Errors
 /// As [`generate`].
-pub fn generate_whole(
-    options: &SynthOptions,
-    progress: &(dyn Fn(u64) + Sync),
-) -> Result<Summary, SynthError> {
+pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary> {
     let unfinished = options.out.with_added_extension("unfinished");
     remove_folder(&unfinished)?;
     let aside = SynthOptions {
@@ -121,7 +119,7 @@ pub fn generate_whole(
 }
 
 /// Settings with which the scenarios in a folder were made; an error if a scenario has no file with its settings.
-fn read(folder: &Path) -> Result<Vec<Generator>, SynthError> {
+fn read(folder: &Path) -> Result<Vec<Generator>> {
     let mut generators = Vec::new();
     for entry in fs::read_dir(folder).at(folder)? {
         let scenario = entry.at(folder)?.path();

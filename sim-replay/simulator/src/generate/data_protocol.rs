@@ -34,18 +34,12 @@ pub(crate) fn protocol_yaml(
     spec: &SceneSpec,
     map_model: &MapModel,
 ) -> String {
-    let SynthOptions {
-        subset,
-        seed,
-        map_seed,
-        weather,
-        frames,
-        period_s,
-        ..
-    } = options;
+    let (seed, map_seed) = (options.seed, options.map_seed);
+    let (frames, period_s) = (options.frames, options.period_s);
     let (name, map_name, scene_seed, agents) =
         (&spec.name, &map_model.name, spec.seed, spec.agents);
-    let (subset, weather, version) = (subset.name(), weather.name(), env!("CARGO_PKG_VERSION"));
+    let (subset, weather) = (options.subset.name(), options.weather.name());
+    let version = env!("CARGO_PKG_VERSION");
     // Without the entry the layout is OPV2V's.
     let layout = match options.layout {
         SceneLayout::Opv2v => String::new(),

@@ -5,6 +5,9 @@ use std::path::PathBuf;
 use protocol::config::FieldError;
 use support::file_error::FileError;
 
+/// Result of generating scenes: a [`SynthError`] if nothing else is named.
+pub(crate) type Result<T, E = SynthError> = std::result::Result<T, E>;
+
 /// Reasons why scenes could not be generated.
 #[derive(Debug, thiserror::Error)]
 pub enum SynthError {

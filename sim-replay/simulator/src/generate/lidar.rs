@@ -31,7 +31,7 @@ const ATTENUATION_PER_M: f32 = 0.004;
 const GROUND_REFLECTIVITY: f32 = 0.25;
 
 /// The rays of one turn. The sensor turns clockwise seen from above and passes the rear when a sweep begins and ends.
-pub(crate) fn lidar_pattern() -> RayPattern {
+fn lidar_pattern() -> RayPattern {
     let [low, high] = ELEVATIONS_DEG.map(f32::to_radians);
     let azimuth_step_rad = -TAU / COLUMNS as f32;
     RayPattern {
@@ -107,7 +107,7 @@ impl Lidar {
         self.hits.clear();
         self.hits.resize(bodies.len(), 0);
         let mut random = SplitMix64::new(seed);
-        let image = self.caster.image();
+        let image = &self.caster.image;
         let depths = image.depths_m.chunks_exact(CHANNELS);
         let rows = depths.zip(image.hits.chunks_exact(CHANNELS));
         for (column, (depths, hits)) in self.caster.columns_at_end(sensor).zip(rows) {

@@ -134,11 +134,9 @@ impl SynthOptions {
         let images = self
             .cameras
             .map_or("none".to_owned(), |size| size.to_string());
-        let are_small = self.cameras.is_none_or(|size| {
-            size.edges_px()
-                .iter()
-                .all(|edge| (16..=4096).contains(edge))
-        });
+        let edges = 16..=4096;
+        let are_small = { self.cameras }
+            .is_none_or(|size| edges.contains(&size.width_px) && edges.contains(&size.height_px));
         let rule = "must be 16 to 4096 pixels along each edge";
         require(are_small, "--cameras", &images, rule)?;
         let rule = "must be none, as images are written in the layout opv2v alone";

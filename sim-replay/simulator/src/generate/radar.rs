@@ -9,7 +9,7 @@ use support::random::SplitMix64;
 ///
 /// Red 0 is -64 m/s (approaching), 255 is +64 m/s, `v = (red / 255 - 0.5) * 128`; steps of half a metre per second.
 /// V2X-R stores its velocities in the red channel too and leaves the mapping open.
-pub(crate) const RADAR_VELOCITY_SPAN_MPS: f64 = 64.0;
+const RADAR_VELOCITY_SPAN_MPS: f64 = 64.0;
 
 /// Height of the radar above the ground, metres; it sits at the front bumper.
 const HEIGHT_M: f64 = 0.7;
@@ -75,7 +75,7 @@ impl Radar {
         self.points.clear();
         let mut random = SplitMix64::new(seed);
         let shift: Vector3<f64> = Vector3::from(mount_m) - Vector3::from(reference_m);
-        let (image, channels) = (self.caster.image(), self.caster.pattern().channels);
+        let (image, channels) = (&self.caster.image, self.caster.pattern.channels);
         let rotation = sensor.end.rotation();
         for (index, column) in self.caster.columns_at_end(&sensor).enumerate() {
             for (channel, elevation) in self.caster.elevations().enumerate() {

@@ -9,7 +9,7 @@ use super::world::World;
 use support::random::{SplitMix64, derive_seed};
 
 /// Communication range: agents farther than this from the ego are not received, metres.
-pub(crate) const COMM_RANGE_M: f64 = 70.0;
+const COMM_RANGE_M: f64 = 70.0;
 /// Companions are chosen within this, so that few frames fall out of range, metres.
 const COMPANION_RANGE_M: f64 = 62.0;
 /// Share of frames that a companion should be in range.

@@ -19,6 +19,7 @@ use super::positioning::Positioning;
 use super::recording::{Recording, SceneSpec, record};
 use super::sensing::{Agent, Bench, STEP_NANOS, Scene, capture_nanos};
 use super::world::World;
+use crate::generate::Result;
 use crate::map::{self, Finding, MapModel, RoadMapSource};
 use dataset::frame::Frame;
 use support::random::derive_seed;
@@ -55,10 +56,7 @@ impl Summary {
 ///
 /// # Errors
 /// [`SynthError`] if an option is invalid, the map cannot be built or a file cannot be written.
-pub fn generate(
-    options: &SynthOptions,
-    progress: &(dyn Fn(u64) + Sync),
-) -> Result<Summary, SynthError> {
+pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary> {
     options.validate()?;
     check_folder(&options.out, options.force)?;
     let unfinished = Unfinished::mark(&options.out)?;
@@ -119,7 +117,7 @@ fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpe
 }
 
 /// Creates the output folder, or refuses one that is not empty.
-pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), SynthError> {
+pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<()> {
     make_folder(out)?;
     let mut entries = fs::read_dir(out).at(out).map_err(SynthError::Write)?;
     if entries.next().is_some() && !force {
@@ -134,7 +132,7 @@ impl Scene<'_, '_> {
         writer: &mut dyn SceneWriter,
         omitted: &Omissions,
         progress: &(dyn Fn(u64) + Sync),
-    ) -> Result<Summary, SynthError> {
+    ) -> Result<Summary> {
         let recording = record(self.world, &self.spec)?;
         let agents = self.agents(&recording)?;
         writer.begin(&self.header(&recording, &agents))?;
@@ -158,7 +156,7 @@ impl Scene<'_, '_> {
         }
     }
 
-    fn agents(&self, recording: &Recording) -> Result<Vec<Agent>, SynthError> {
+    fn agents(&self, recording: &Recording) -> Result<Vec<Agent>> {
         let mut agents = Vec::new();
         for &vehicle in &recording.agents {
             // Agents are chosen among those that are present from the first frame to the last.
@@ -194,7 +192,7 @@ impl Scene<'_, '_> {
         agents: &[Agent],
         (writer, omitted): (&dyn SceneWriter, &Omissions),
         progress: &(dyn Fn(u64) + Sync),
-    ) -> Result<Summary, SynthError> {
+    ) -> Result<Summary> {
         let moments = recording.frames.len();
         let (next, done) = (AtomicUsize::new(0), AtomicUsize::new(0));
         let total = Mutex::new(Ok(Summary::default()));

@@ -5,7 +5,7 @@ use super::curve::Pose2;
 use super::{LaneId, MapModel, Shape, Solid};
 
 /// Height over a lane that stays free of solids, metres.
-pub(crate) const LANE_HEADROOM_M: f64 = 4.5;
+const LANE_HEADROOM_M: f64 = 4.5;
 /// Solids whose top is this little above a lane lie under it (slabs of bridges), metres.
 const SURFACE_M: f64 = 0.02;
 /// Edge of a cell of the index, metres.

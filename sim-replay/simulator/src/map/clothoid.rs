@@ -20,12 +20,7 @@ pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
         wrap_angle(to.heading_rad - chord),
     );
     if phi0.abs() < 1e-9 && phi1.abs() < 1e-9 {
-        return Curve {
-            s_m,
-            start: from,
-            length_m: distance,
-            shape: CurveShape::Line,
-        };
+        return Curve::new(s_m, from, distance, CurveShape::Line);
     }
     let delta = phi1 - phi0;
     let mut a = 3.0 * (phi0 + phi1);
@@ -45,12 +40,7 @@ pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
     } else {
         CurveShape::Spiral { start, end }
     };
-    Curve {
-        s_m,
-        start: from,
-        length_m,
-        shape,
-    }
+    Curve::new(s_m, from, length_m, shape)
 }
 
 /// Integrals over 0..1 of sin(heading), of its derivative by `a`, and of cos(heading); composite Simpson.

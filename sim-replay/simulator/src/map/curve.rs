@@ -95,6 +95,16 @@ impl Pose2 {
 }
 
 impl Curve {
+    /// A curve from its place along the road, its start and its shape.
+    pub(crate) fn new(s_m: f64, start: Pose2, length_m: f64, shape: CurveShape) -> Self {
+        Self {
+            s_m,
+            start,
+            length_m,
+            shape,
+        }
+    }
+
     /// Place and heading `s_m` metres after its start.
     pub fn at(&self, s_m: f64) -> Pose2 {
         let (u, v, turn) = match self.shape {

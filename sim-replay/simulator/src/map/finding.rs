@@ -105,16 +105,8 @@ impl FindingLog {
 }
 
 fn shortened(text: &str) -> String {
-    text.chars()
-        .take(MAX_TEXT)
-        .map(|character| {
-            if character.is_control() {
-                ' '
-            } else {
-                character
-            }
-        })
-        .collect()
+    let shown = |letter: char| if letter.is_control() { ' ' } else { letter };
+    text.chars().take(MAX_TEXT).map(shown).collect()
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 /// A lane by its index in [`LaneGraph::lanes`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LaneId(pub u32);
 
 /// A junction, numbered from 0 without gaps.
@@ -11,9 +11,10 @@ pub struct LaneId(pub u32);
 pub struct JunctionId(pub u32);
 
 /// Direction in which a lane leads through a junction.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Turn {
     /// Ahead, and every lane outside junctions.
+    #[default]
     Straight,
     /// More than 30 degrees to the left.
     Left,
@@ -29,7 +30,7 @@ pub struct LaneGraph {
 }
 
 /// A stretch of driving lane without branches inside.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Lane {
     /// Its own index in the graph.
     pub id: LaneId,
@@ -79,17 +80,9 @@ impl Lane {
             centerline,
             length_m,
             widths_m,
-            banks_rad: Vec::new(),
             width_m,
             speed_limit_mps,
-            successors: Vec::new(),
-            predecessors: Vec::new(),
-            left: None,
-            right: None,
-            in_junction: false,
-            junction: None,
-            turn: Turn::Straight,
-            conflicts: Vec::new(),
+            ..Self::default()
         }
     }
 

@@ -96,6 +96,7 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
 }
 
 /// A lane's middle in driving direction.
+#[derive(Default)]
 struct CenterLine {
     /// Even points, metres.
     points: Vec<[f64; 3]>,
@@ -136,10 +137,8 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<Center
     }
     let steps = (total / STEP_M).round().max(1.0) as usize;
     let mut line = CenterLine {
-        points: Vec::new(),
-        widths_m: Vec::new(),
-        banks_rad: Vec::new(),
         length_m: total,
+        ..CenterLine::default()
     };
     let mut place = 0;
     for i in 0..=steps {

@@ -25,7 +25,7 @@ pub struct RoadNetwork {
 }
 
 /// One road.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Road {
     /// Its id in the map.
     pub id: String,
@@ -389,19 +389,9 @@ mod tests {
         let road = Road {
             id: "1".into(),
             length_m: 10.0,
-            left_hand: false,
-            junction: None,
-            predecessor: None,
-            successor: None,
-            plan_view: vec![],
-            elevation: Profile::default(),
-            lateral: LateralProfile::default(),
             lane_offset: Profile::constant(0.5),
             sections: vec![section],
-            speed_limits: vec![],
-            objects: vec![],
-            signals: vec![],
-            structures: vec![],
+            ..Road::default()
         };
         assert_eq!(road.lane_span_m(0, 1, 0.0), [0.5, 3.5]);
         assert_eq!(road.lane_span_m(0, -1, 0.0), [-3.0, 0.5]);

@@ -312,7 +312,7 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
 }
 
 /// True if a patch lies above the terrain anywhere.
-pub(crate) fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
+fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
     let [a, b, c, d] = patch.quad;
     let middle = |p: [f64; 2], q: [f64; 2]| [(p[0] + q[0]) / 2.0, (p[1] + q[1]) / 2.0];
     let probes = [

@@ -37,13 +37,6 @@ pub struct ImageSize {
     pub height_px: u32,
 }
 
-impl ImageSize {
-    /// Columns and rows.
-    pub(super) fn edges_px(self) -> [u32; 2] {
-        [self.width_px, self.height_px]
-    }
-}
-
 impl fmt::Display for ImageSize {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}x{}", self.width_px, self.height_px)

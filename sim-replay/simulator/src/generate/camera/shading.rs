@@ -38,8 +38,8 @@ pub(super) struct Shader<'a> {
 impl<'a> Shader<'a> {
     pub(super) fn new(caster: &'a Caster, sensor: &Sweep, surroundings: &Surroundings<'a>) -> Self {
         Self {
-            image: caster.image(),
-            channels: caster.pattern().channels,
+            image: &caster.image,
+            channels: caster.pattern.channels,
             columns: caster.columns_at_end(sensor).collect(),
             elevations: caster.elevations().collect(),
             world_from_sensor: sensor.end.rotation().cast(),

@@ -55,10 +55,10 @@ fn a_box_is_where_the_calibration_projects_it_in_every_camera() {
         let depth_m = |column: f64, row: f64| {
             let pixel = row as usize * SIZE.width_px as usize + column as usize;
             let (column, channel) = camera.rays[pixel];
-            let pattern = camera.caster.pattern();
+            let pattern = &camera.caster.pattern;
             let column = (column as usize).min(pattern.columns - 1);
             let channel = (channel as usize).min(pattern.channels - 1);
-            camera.caster.image().depths_m[column * pattern.channels + channel]
+            camera.caster.image.depths_m[column * pattern.channels + channel]
         };
         let distance_m = middle.coords.norm() as f32;
         assert!(

@@ -21,7 +21,7 @@ pub(super) struct AgentFolders {
 
 impl AgentFolders {
     /// Creates the folders, removing old ones.
-    pub(super) fn make(root: &Path, scene: &SceneHeader) -> Result<Self, SynthError> {
+    fn make(root: &Path, scene: &SceneHeader) -> Result<Self, SynthError> {
         let folder = scene_path(root, &scene.name);
         make_fresh_folder(&folder)?;
         let mark = Unfinished::mark(&folder)?;
@@ -43,7 +43,7 @@ impl AgentFolders {
     }
 
     /// Finishes the folders: all files are written.
-    pub(super) fn close(self) -> Result<(), SynthError> {
+    fn close(self) -> Result<(), SynthError> {
         self.mark.clear()
     }
 }

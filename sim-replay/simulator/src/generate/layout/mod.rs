@@ -28,7 +28,7 @@ mod tests;
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use clap::ValueEnum;
 use protocol::{CavId, Pose};
@@ -40,6 +40,7 @@ use dataset::frame::{Frame, Object};
 use agent_folders::AgentFolderWriter;
 pub(crate) use disk::{Unfinished, make_folder, remove_folder};
 use sequences::Sequences;
+pub(crate) use support::sync::lock as locked;
 
 /// The layouts that scenes are written in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum)]
@@ -240,9 +241,4 @@ impl Omissions {
     pub(crate) fn into_counts(self) -> BTreeMap<&'static str, u64> {
         self.0.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// The content of a lock, also after a panic of a thread that held it, since such a panic ends the program.
-pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -40,10 +40,6 @@ fn pcd_of(points: &[[f32; 4]], intensity: IntensityField<'_>) -> Vec<u8> {
     pcd::encode(&PointCloud { xyzi }, Encoding::Binary, intensity)
 }
 
-fn six(pose: &Pose) -> [f64; 6] {
-    CarlaPose::from_pose(pose).into()
-}
-
 fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std::fmt::Result {
     let frame = &agent.frame;
     writeln!(yaml, "RSU: {is_roadside}")?;
@@ -62,7 +58,8 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
     ];
     for (key, pose) in poses {
         let Some(pose) = pose else { continue };
-        write_list(yaml, "", key, &six(&pose))?;
+        let numbers: [f64; 6] = CarlaPose::from_pose(&pose).into();
+        write_list(yaml, "", key, &numbers)?;
         if key == "lidar_pose" {
             writeln!(yaml, "plan_trajectory: []")?;
         }

@@ -133,12 +133,13 @@ pub(crate) struct RangeImage {
 /// Casts sweeps of one pattern; keeps its buffers from one to the next.
 #[derive(Debug, Clone)]
 pub(crate) struct Caster {
-    pattern: RayPattern,
+    pub(crate) pattern: RayPattern,
     cos: Vec<f32>,
     sin: Vec<f32>,
     columns: Vec<ColumnPose>,
     order: Vec<(Footprint, usize)>,
-    image: RangeImage,
+    /// The last sweep, as [`Caster::cast`] returned it.
+    pub(crate) image: RangeImage,
 }
 
 impl Caster {
@@ -153,10 +154,6 @@ impl Caster {
             image: RangeImage::default(),
             pattern,
         }
-    }
-
-    pub(crate) fn pattern(&self) -> &RayPattern {
-        &self.pattern
     }
 
     /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are transparent.
@@ -205,11 +202,6 @@ impl Caster {
             let (footprint, body) = self.order[index].clone();
             self.cast_body(&bodies[body], &footprint, body as u32, &anchor);
         }
-        &self.image
-    }
-
-    /// The last sweep, as [`Caster::cast`] returned it.
-    pub(crate) fn image(&self) -> &RangeImage {
         &self.image
     }
 

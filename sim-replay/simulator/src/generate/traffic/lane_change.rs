@@ -173,7 +173,7 @@ impl Traffic<'_> {
         if !leader.is_none_or(|leader| brakes_softly(car, leader)) {
             return false;
         }
-        let follower = self.follower_on(index, path.lane(), path.s_m());
+        let follower = self.follower_on(index, path.lane(), path.s_m);
         if !follower.is_none_or(|(follower, apart_m)| {
             let follower = &self.cars[follower];
             let gap_m = apart_m - car.half_length_m() - follower.half_length_m();
@@ -183,7 +183,7 @@ impl Traffic<'_> {
             return false;
         }
         // Vehicles that are not in the list of the lane: those that cross it, or have nearly left it.
-        let beside = Path::new(path.lane(), path.s_m());
+        let beside = Path::new(path.lane(), path.s_m);
         let graph = self.roads.graph;
         let beside = beside.placement(graph, 0.0, car.wheelbase_m(), car.aside_m);
         let mut room = Rectangle::new(&beside, &car.vehicle.size_m).grown(0.3);
@@ -236,7 +236,7 @@ impl Traffic<'_> {
             path.ahead(graph)
                 .for_each(|(lane, _)| explorer.choose(lane));
         }
-        let entry = (path.s_m(), index as u32);
+        let entry = (path.s_m, index as u32);
         let occupants = &mut self.occupants[path.lane().0 as usize];
         let place = occupants.partition_point(|other| *other < entry);
         occupants.insert(place, entry);
@@ -246,7 +246,7 @@ impl Traffic<'_> {
 
 /// The desired speed here without a vehicle ahead, metres per second.
 fn free_speed_mps(car: &Car, roads: &Roads<'_>) -> f64 {
-    car.driver.pace * roads.speed_mps(car.path.lane(), car.path.s_m())
+    car.driver.pace * roads.speed_mps(car.path.lane(), car.path.s_m)
 }
 
 fn is_held_up(car: &Car, roads: &Roads<'_>) -> bool {
@@ -270,7 +270,7 @@ fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     }
     let mut left = car.path.lane();
     let mut lane = side.of(graph.lane(left))?;
-    let s_m = car.path.s_m() / graph.lane(left).length_m * graph.lane(lane).length_m;
+    let s_m = car.path.s_m / graph.lane(left).length_m * graph.lane(lane).length_m;
     let needed_m = change_m(car) + 0.5 * car.wheelbase_m() + car.half_length_m();
     let (mut beside, mut reach_m) = (Vec::new(), -s_m);
     loop {

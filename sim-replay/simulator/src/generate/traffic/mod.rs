@@ -145,7 +145,7 @@ impl<'t> Traffic<'t> {
         self.occupants.iter_mut().for_each(Vec::clear);
         let cars = self.cars.iter().enumerate();
         for (index, car) in cars.filter(|(_, car)| car.is_present) {
-            self.occupants[car.path.lane().0 as usize].push((car.path.s_m(), index as u32));
+            self.occupants[car.path.lane().0 as usize].push((car.path.s_m, index as u32));
             // Vehicles behind it on the lane that it leaves must not hit it.
             if let Some((lane, s_m)) = car.path.leaving(self.roads.graph) {
                 self.occupants[lane.0 as usize].push((s_m, index as u32));

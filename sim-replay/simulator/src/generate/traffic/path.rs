@@ -13,7 +13,7 @@ pub(crate) struct Path {
     /// Index of the lane under the vehicle's centre.
     current: usize,
     /// Position along that lane, metres.
-    s_m: f64,
+    pub(crate) s_m: f64,
     /// The change of lanes under way.
     change: Option<Change>,
 }
@@ -69,11 +69,6 @@ impl Path {
     /// The lane under the vehicle's centre.
     pub(crate) fn lane(&self) -> LaneId {
         self.lanes[self.current]
-    }
-
-    /// Position along that lane, metres.
-    pub(crate) fn s_m(&self) -> f64 {
-        self.s_m
     }
 
     /// The last lane that is decided.
@@ -287,7 +282,7 @@ mod tests {
         let mut path = Path::new(LaneId(0), 18.0);
         path.push(LaneId(1));
         path.advance(&graph, 3.0, 6.0);
-        assert_eq!((path.lane(), path.s_m()), (LaneId(1), 1.0));
+        assert_eq!((path.lane(), path.s_m), (LaneId(1), 1.0));
         assert_eq!(
             path.lanes_under(&graph, 3.0).collect::<Vec<_>>(),
             [LaneId(1), LaneId(0)]

@@ -25,7 +25,7 @@ const QUEUE_GAP_M: f64 = 8.0;
 /// Tries to place one vehicle in one step.
 const TRIES: usize = 4;
 /// The id of the focus; all others follow.
-pub(crate) const FOCUS_ID: i64 = 1000;
+const FOCUS_ID: i64 = 1000;
 
 impl<'t> Traffic<'t> {
     /// Traffic around a focus that starts at `start`, parked vehicles given by their footprints.

@@ -2,7 +2,6 @@
 
 use super::super::clothoid;
 use super::super::curve::{Curve, CurveShape, Pose2};
-use super::super::lateral::LateralProfile;
 use super::super::profile::Profile;
 use super::super::road::{
     Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork,
@@ -248,19 +247,11 @@ impl Builder {
         self.network.roads.push(Road {
             id: format!("r{place}"),
             length_m: path_length_m(&plan_view),
-            left_hand: false,
-            junction: None,
-            predecessor: None,
-            successor: None,
             plan_view,
             elevation,
-            lateral: LateralProfile::default(),
-            lane_offset: Profile::default(),
             sections: vec![section],
             speed_limits: vec![(0.0, limit_mps)],
-            objects: Vec::new(),
-            signals: Vec::new(),
-            structures: Vec::new(),
+            ..Road::default()
         });
         place
     }

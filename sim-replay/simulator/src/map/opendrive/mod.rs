@@ -7,14 +7,9 @@
 //! before it is used, so that no file can cause a panic, a hang or unbounded memory.
 
 // Maps come from other programs: an index or a cast that does not fit is an error of the map, not a panic.
-#![cfg_attr(
-    not(test),
-    deny(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        clippy::indexing_slicing
-    )
-)]
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation))]
+#![cfg_attr(not(test), deny(clippy::cast_sign_loss))]
+#![cfg_attr(not(test), deny(clippy::indexing_slicing))]
 
 mod beside;
 mod border;

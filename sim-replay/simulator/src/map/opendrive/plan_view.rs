@@ -69,12 +69,7 @@ fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
     let Some(kind) = element.elements().find(|child| child.name() != "userData") else {
         return Err(element.error_element("has no shape"));
     };
-    let curve = |shape| Curve {
-        s_m,
-        start,
-        length_m,
-        shape,
-    };
+    let curve = |shape| Curve::new(s_m, start, length_m, shape);
     let shape = match kind.name() {
         "line" => return Ok(curve(CurveShape::Line)),
         "arc" => match curvatures(kind, ["curvature"], length_m, log)? {

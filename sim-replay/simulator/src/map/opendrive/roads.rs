@@ -24,9 +24,6 @@ pub(super) fn read(element: Element, log: &mut FindingLog) -> Result<Road> {
         id: element.text("id")?.to_owned(),
         length_m,
         left_hand: read_rule(element, log),
-        junction: None,
-        predecessor: None,
-        successor: None,
         plan_view,
         elevation: match element.child("elevationProfile") {
             Some(profile) => read_profile(profile, "elevation", "s", MAX_HEIGHT_M)?,
@@ -39,6 +36,7 @@ pub(super) fn read(element: Element, log: &mut FindingLog) -> Result<Road> {
         objects: beside::read_objects(element, log),
         signals: beside::read_signals(element, log),
         structures: beside::read_structures(element, length_m, log),
+        ..Road::default()
     })
 }
 
