@@ -10,7 +10,8 @@ use plotters::series::LineSeries;
 use plotters::style::{Color, IntoFont, RGBColor, TRANSPARENT, TextStyle};
 
 use super::scale::Scale;
-use super::{FONT, FigureError, PAPER};
+use super::{FONT, PAPER};
+use crate::Result;
 
 const INK: RGBColor = RGBColor(40, 44, 52);
 const RULE: RGBColor = RGBColor(226, 229, 234);
@@ -145,10 +146,7 @@ impl Series {
 }
 
 impl Chart {
-    pub(super) fn draw<DB: DrawingBackend>(
-        &self,
-        area: &DrawingArea<DB, Shift>,
-    ) -> Result<(), FigureError> {
+    pub(super) fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>) -> Result<()> {
         let mut context = ChartBuilder::on(area)
             .margin(12)
             .margin_right(24)

@@ -35,6 +35,9 @@ pub const FONT: &str = "sans-serif";
 const CHART: (u32, u32) = (560, 440);
 const PAPER: RGBColor = RGBColor(255, 255, 255);
 
+/// Result of drawing or writing a figure: a [`FigureError`] if nothing else is named.
+pub type Result<T, E = FigureError> = std::result::Result<T, E>;
+
 /// Error of drawing or writing a figure.
 #[derive(Debug, thiserror::Error)]
 pub enum FigureError {

@@ -9,6 +9,7 @@ use plotters::drawing::{DrawingArea, IntoDrawingArea};
 use plotters::prelude::BitMapBackend;
 
 use super::{FigureError, load_font};
+use crate::Result;
 
 /// Area of an image; x to the right and y down, pixels.
 pub type Image<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
@@ -20,8 +21,8 @@ pub type Image<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
 pub fn save_image(
     path: &Path,
     size: (u32, u32),
-    draw: impl FnOnce(&Image<'_>) -> Result<(), FigureError>,
-) -> Result<(), FigureError> {
+    draw: impl FnOnce(&Image<'_>) -> Result<()>,
+) -> Result<()> {
     let rgb = render(size, draw)?;
     write_png(path, size, &rgb).map_err(|source| FigureError::Write {
         path: path.to_owned(),
@@ -33,10 +34,7 @@ pub fn save_image(
 ///
 /// # Errors
 /// [`FigureError`] of `draw`.
-pub fn render(
-    size: (u32, u32),
-    draw: impl FnOnce(&Image<'_>) -> Result<(), FigureError>,
-) -> Result<Vec<u8>, FigureError> {
+pub fn render(size: (u32, u32), draw: impl FnOnce(&Image<'_>) -> Result<()>) -> Result<Vec<u8>> {
     load_font()?;
     let mut rgb = vec![0; 3 * size.0 as usize * size.1 as usize];
     draw(&BitMapBackend::with_buffer(&mut rgb, size).into_drawing_area())?;

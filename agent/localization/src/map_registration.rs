@@ -20,7 +20,7 @@ use crate::registration::icp::surfel_map::SurfelMap;
 use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, register};
 
 /// Stage of a localization.
-pub(crate) const REGISTER: &str = "pose register";
+const REGISTER: &str = "pose register";
 /// Least share of the points above the ground with a partner, with which a registered pose is taken.
 const CONFIRMED: f64 = 0.2;
 /// Confidence of the localizer with which a pose stays that the map does not confirm.

@@ -9,6 +9,9 @@ use perception::train::TrainingError;
 use perception::weights::FileError;
 use tch::TchError;
 
+/// Result of training, evaluating or mapping: a [`Error`] if nothing else is named.
+pub(crate) type Result<T, E = Error> = std::result::Result<T, E>;
+
 /// Error that ends a training, an evaluation or a map early.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

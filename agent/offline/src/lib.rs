@@ -35,4 +35,5 @@ pub mod training;
 mod training_bar;
 
 pub use error::Error;
+pub(crate) use error::Result;
 pub use training_bar::TrainingBar;

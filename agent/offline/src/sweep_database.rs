@@ -1,6 +1,6 @@
 //! Database of sweeps for retrieval, from drives with true poses.
 
-use crate::Error;
+use crate::{Error, Result};
 use std::path::Path;
 
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
@@ -18,7 +18,7 @@ pub fn read_database(
     localizer: &Localizer,
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<SweepDatabase, Error> {
+) -> Result<SweepDatabase> {
     let mut describe = |cloud: &PointCloud| localizer.sweep_features(cloud, &mut stopwatch());
     let sweeps = described_sweeps(folders, &mut describe, left_out, progress)?;
     let sweeps = sweeps.into_iter();
@@ -40,7 +40,7 @@ pub fn described_sweeps<D, E: Into<LocalizerError>>(
     describe: &mut dyn FnMut(&PointCloud) -> Result<Option<D>, E>,
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<Vec<(D, Isometry3<f64>)>, Error> {
+) -> Result<Vec<(D, Isometry3<f64>)>> {
     let datasets = folders.iter().map(|folder| dataset::open(folder.as_ref()));
     let datasets: Vec<_> = datasets.collect::<Result<_, _>>()?;
     for dataset in &datasets {
@@ -81,11 +81,7 @@ pub(crate) fn present_sweeps(scenario: &Scenario) -> impl Iterator<Item = (usize
 }
 
 /// Points and true pose of a sweep.
-fn posed(
-    scenario: &Scenario,
-    agent: usize,
-    tick: usize,
-) -> Result<(PointCloud, Isometry3<f64>), Error> {
+fn posed(scenario: &Scenario, agent: usize, tick: usize) -> Result<(PointCloud, Isometry3<f64>)> {
     let frame = scenario.load(agent, tick, &LoadOptions::default())?;
     let Some(pose) = frame.world_from_lidar else {
         let path = scenario.points_path(agent, tick, None)?;

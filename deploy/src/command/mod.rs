@@ -100,11 +100,7 @@ fn client(
     keys: Option<&Path>,
 ) -> anyhow::Result<(Identity, BusOptions)> {
     let cav = CavId::new(role.as_str())?;
-    let identity = Identity {
-        run: run.clone(),
-        process: process_id(role, &cav),
-        cav,
-    };
+    let identity = Identity::new(run.clone(), process_id(role, &cav), cav);
     let mut options = BusOptions::client(router.clone());
     if let Some(folder) = keys {
         let credentials = credentials(folder, identity.process.as_str())?;

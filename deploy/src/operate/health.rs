@@ -55,7 +55,6 @@ pub struct ProcessStatus {
     /// Description of its last crash.
     pub last_fall: Option<String>,
     /// Description of its failure, for a process that has failed in its task.
-    #[serde(default)]
     pub failure: Option<String>,
     /// Problems that it reports while it runs.
     #[serde(default)]

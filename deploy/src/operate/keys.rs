@@ -27,7 +27,7 @@ use support::atomic_file;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 
 /// File name of the authority's key.
-pub(crate) const AUTHORITY_KEY: &str = "authority.key";
+const AUTHORITY_KEY: &str = "authority.key";
 const AUTHORITY_NAME: &str = "v2vloc test authority";
 const DAY: Duration = Duration::from_secs(24 * 3600);
 /// Certificates hold from a little before they are made: clocks differ.

@@ -7,7 +7,9 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{AccessControl, BusError, BusOptions, Credentials, ROUTER, Rejection, RejectionLog};
+use bus::{
+    AccessControl, BusError, BusOptions, Credentials, ROUTER, Rejection, RejectionLog, Result,
+};
 use protocol::{Principal, RunScope};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -65,11 +67,7 @@ impl RunKeys {
 ///
 /// # Errors
 /// [`BusError::Keys`] names the problem.
-pub(crate) fn guarded(
-    options: BusOptions,
-    folder: &Path,
-    runs: RunScope,
-) -> Result<BusOptions, BusError> {
+pub(crate) fn guarded(options: BusOptions, folder: &Path, runs: RunScope) -> Result<BusOptions> {
     let credentials = credentials(folder, ROUTER)?;
     let members = credentials.members()?;
     let options = options.with_credentials(credentials);
@@ -80,7 +78,7 @@ pub(crate) fn guarded(
 ///
 /// # Errors
 /// [`BusError::Keys`] names the problem.
-pub(crate) fn credentials(folder: &Path, name: &str) -> Result<Credentials, BusError> {
+pub(crate) fn credentials(folder: &Path, name: &str) -> Result<Credentials> {
     let credentials = Credentials::read(folder)?;
     credentials.check_name(name)?;
     Ok(credentials)
@@ -111,7 +109,7 @@ impl RefusalWatch {
     ///
     /// # Errors
     /// [`BusError::Thread`] when the system gives no thread.
-    pub fn over(place: &RouterEndpoint) -> Result<Self, BusError> {
+    pub fn over(place: &RouterEndpoint) -> Result<Self> {
         let stop = Stop::new();
         if !place.is_guarded {
             return Ok(Self { stop, thread: None });

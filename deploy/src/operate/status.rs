@@ -38,7 +38,6 @@ pub struct RunStatus {
     /// Time since its start, seconds.
     pub seconds: f64,
     /// Evaluation protocol of the run.
-    #[serde(default)]
     pub protocol: Option<EvaluationProtocol>,
     /// Number of results of the ego so far: the answered ticks.
     pub frames: u64,
@@ -46,7 +45,6 @@ pub struct RunStatus {
     #[serde(default)]
     pub ticks: u64,
     /// Results per second so far.
-    #[serde(default)]
     pub rate_hz: Option<f64>,
     /// Time since the last result, seconds.
     pub last_result_s: Option<f64>,
@@ -63,7 +61,6 @@ pub struct RunStatus {
     #[serde(default)]
     pub causes: Vec<String>,
     /// Time since which the router is gone, seconds.
-    #[serde(default)]
     pub router_gone_s: Option<f64>,
     /// Status of each process.
     pub processes: Vec<ProcessStatus>,
@@ -185,12 +182,6 @@ impl RunStatus {
             _ => None,
         };
         run.into_iter().chain(sick.map(describe)).collect()
-    }
-
-    /// True if there is no problem.
-    #[cfg(test)]
-    fn is_well(&self) -> bool {
-        self.troubles().is_empty()
     }
 
     /// Time since it was written.
@@ -439,7 +430,7 @@ mod tests {
             (status.phase, status.frames, status.processes.len()),
             (Phase::Running, 7, 1)
         );
-        assert!(status.is_well());
+        assert!(status.troubles().is_empty());
         let table = status.table();
         assert!(
             table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: answered 7/9, - Hz"),
@@ -464,7 +455,7 @@ mod tests {
         };
         fs::write(run.join(FILE), serde_json::to_string(&ended).unwrap()).unwrap();
         let found = RunStatus::read(&run).unwrap();
-        assert!(found.phase == Phase::Lost && !found.is_well());
+        assert!(found.phase == Phase::Lost && !found.troubles().is_empty());
         let gone = RunStatus {
             router_gone_s: Some(2.5),
             ..status.clone()
@@ -512,7 +503,10 @@ mod tests {
                 vec![process(state)]
             });
             assert_eq!(
-                RunStatus::read(folder.path()).unwrap().is_well(),
+                RunStatus::read(folder.path())
+                    .unwrap()
+                    .troubles()
+                    .is_empty(),
                 is_well,
                 "{state:?}"
             );

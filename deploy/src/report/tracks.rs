@@ -10,7 +10,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use dataset::ground_truth::{GroundTruth, TrueBox};
-use protocol::{Box3d, Detections, DetectionsReport, Track, TracksReport, corners_within};
+use protocol::{Box3d, DetectionsReport, Track, TracksReport, corners_within};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
@@ -87,24 +87,19 @@ impl TrackReport {
         let mut results = Results::default();
         let mut method = None;
         let mut without_truth = 0;
-        for_each_line(
-            &folder.join("detections.jsonl"),
-            |line: OfScenario<DetectionsReport>| {
-                let OfScenario { scenario, line } = line;
-                let DetectionsReport {
-                    tick, ref result, ..
-                } = line;
-                method.get_or_insert_with(|| result.method.clone());
-                match tick {
-                    Some(tick) => {
-                        let key = (scenario, result.ego.to_string(), tick);
-                        results.detections.entry(key).or_insert(line);
-                    }
-                    None => without_truth += 1,
+        let detections = folder.join("detections.jsonl");
+        for_each_line(&detections, |line: OfScenario<DetectionsReport>| {
+            let OfScenario { scenario, line } = line;
+            method.get_or_insert_with(|| line.result.method.clone());
+            match line.tick {
+                Some(tick) => {
+                    let key = (scenario, line.result.ego.to_string(), tick);
+                    results.detections.entry(key).or_insert(line);
                 }
-                Ok(())
-            },
-        )?;
+                None => without_truth += 1,
+            }
+            Ok(())
+        })?;
         let recorded = folder.join(TRACKS);
         if recorded.exists() {
             for_each_line(&recorded, |line: OfScenario<TracksReport>| {
@@ -128,12 +123,10 @@ impl TrackReport {
             ..Self::default()
         };
         let mut followed: Vec<Followed> = Vec::new();
-        for_each_line(
-            &folder.join("truth.jsonl"),
-            |OfScenario { scenario, line }| {
-                report.follow(&mut followed, scenario, &line, &mut results)
-            },
-        )?;
+        let truth = folder.join("truth.jsonl");
+        for_each_line(&truth, |OfScenario { scenario, line }| {
+            report.follow(&mut followed, scenario, &line, &mut results)
+        })?;
         report.without_truth = without_truth + results.detections.len();
         let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
         report.quality = TrackQuality::of(&sequences);
@@ -168,7 +161,9 @@ impl TrackReport {
         one.last_nanos = line.capture_nanos;
         self.ticks += 1;
         self.answered += usize::from(result.is_some());
-        self.without_pose += usize::from(result.as_ref().is_some_and(|of| !has_pose(&of.result)));
+        let pose = result.as_ref().map(|of| of.result.pose.world_from_cav());
+        let is_unposed = pose.is_some_and(|pose| pose.is_none_or(|pose| pose.validate().is_err()));
+        self.without_pose += usize::from(is_unposed);
         let tracks = match result {
             Some(of) if !self.recorded => {
                 Some({ &mut one.tracker }.follow(line.capture_nanos, &of.result))
@@ -197,10 +192,6 @@ impl Followed {
             sequence: Sequence::default(),
         }
     }
-}
-
-fn has_pose(result: &Detections) -> bool {
-    { result.pose.world_from_cav() }.is_some_and(|pose| pose.validate().is_ok())
 }
 
 /// A tick with the tracks that count, as for detections: all corners in range, and not on an object that does not count.
@@ -303,7 +294,7 @@ impl fmt::Display for TrackTable<'_> {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{CavId, Detection, Pose, PoseEstimate, Stamp};
+    use protocol::{CavId, Detection, Detections, Pose, PoseEstimate, Stamp};
 
     use super::*;
 

@@ -1,6 +1,6 @@
 //! Initial pose: the first fix of a vehicle on `/initialpose`, for a localizer that needs one.
 
-use protocol::{CavId, Message, PlanarCovariance, PoseEstimate};
+use protocol::{CavId, Message, PlanarCovariance};
 use ros2::{Mount, RosTopic};
 
 /// Variances where the pose has none of its own: those that RViz gives the poses that a person draws.
@@ -37,21 +37,17 @@ impl InitialPose {
         message: &Message,
         is_wanted: impl FnOnce() -> bool,
     ) -> Option<Vec<u8>> {
-        let Message::Pose(PoseEstimate::Pose {
-            world_from_cav,
-            covariance,
-            ..
-        }) = message
-        else {
+        let Message::Pose(estimate) = message else {
             return None;
         };
+        let world_from_cav = estimate.world_from_cav()?;
         if self.is_published || *cav != self.cav || !is_wanted() {
             return None;
         }
         self.is_published = true;
         let lidar_from_base = self.mount.base_from_lidar.isometry().inverse();
         let world_from_base = (world_from_cav.isometry() * lidar_from_base).into();
-        let covariance = covariance.as_ref().unwrap_or(&DRAWN);
+        let covariance = estimate.covariance().unwrap_or(&DRAWN);
         Some(ros2::pose(
             capture_nanos,
             &world_from_base,
@@ -64,7 +60,7 @@ impl InitialPose {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{NoPoseReason, Pose};
+    use protocol::{NoPoseReason, Pose, PoseEstimate};
 
     use super::*;
 

@@ -172,7 +172,7 @@ impl Input {
                 return self.log.warn(&error);
             }
         };
-        let previous_nanos = self.stamps.last_nanos();
+        let previous_nanos = self.stamps.last_nanos;
         match self.stamps.take(sweep.capture_nanos, unix_nanos()) {
             Ok(odd) => {
                 odd.into_iter().for_each(|odd| self.note(odd, report));

@@ -120,14 +120,11 @@ impl MotionInput {
 impl Measurements {
     fn add(&mut self, topic: &RosName, read: Option<TimedMotion>, takes_yaw_rate: bool) {
         let report = self.reports.entry(topic.clone()).or_default();
-        let Some(TimedMotion {
-            capture_nanos: nanos,
-            motion,
-        }) = read
-        else {
+        let Some(read) = read else {
             report.unreadable += 1;
             return;
         };
+        let (nanos, motion) = (read.capture_nanos, read.motion);
         report.read += 1;
         if let Some(speed_mps) = motion.speed_mps {
             report.out_of_order += self.speed_mps.add(nanos, speed_mps);

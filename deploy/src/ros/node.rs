@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use bus::bounded_queue::{BoundedQueue, Pop};
 use bus::shutdown::Stop;
-use bus::{Bus, BusError, LivelinessEvent, PassiveSubscriber, RawMessage};
+use bus::{Bus, LivelinessEvent, PassiveSubscriber, RawMessage, Result};
 use protocol::{CavId, KeyExpr, Kind, Limits, Message, Role, Stream, Topic, wire};
 use ros2::{FrameNames, RosTopic, Translator, VehicleTopic};
 use serde::Serialize;
@@ -63,13 +63,13 @@ impl NodeReport {
 /// Connects the run of `bus` with a ROS 2 network until `stop` is requested.
 ///
 /// # Errors
-/// [`BusError`] when a session fails. Errors of single messages are counted and logged.
+/// [`bus::BusError`] when a session fails. Errors of single messages are counted and logged.
 pub fn run(
     bus: &Bus,
     session: &RosSession,
     options: &NodeOptions,
     stop: &Stop,
-) -> Result<NodeReport, BusError> {
+) -> Result<NodeReport> {
     use Stream::{Detections, Imu, Pose, Tracks};
     let streams = [Imu, Pose, Detections, Tracks];
     let run = &bus.identity().run;
@@ -143,7 +143,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         scope: &'scope Scope<'scope, 'env>,
         (bus, session, options): (&'env Bus, &'env RosSession, &'env NodeOptions),
         frames: RobotFrames,
-    ) -> Result<Self, BusError> {
+    ) -> Result<Self> {
         let mount = options.mount.unwrap_or_default();
         let initial_pose = options.initial_pose_of.clone();
         let initial_pose = initial_pose.map(|cav| InitialPose::of(cav, mount));
@@ -184,7 +184,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         mut self,
         subscriber: &PassiveSubscriber,
         members: &BoundedQueue<(), LivelinessEvent>,
-    ) -> Result<NodeReport, BusError> {
+    ) -> Result<NodeReport> {
         let ended = self.publish_all(subscriber, members);
         self.sweeps.into_values().for_each(Forwarding::end);
         let left_out = self.left_out + subscriber.overwritten() + subscriber.undelivered();
@@ -199,7 +199,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         &mut self,
         subscriber: &PassiveSubscriber,
         members: &BoundedQueue<(), LivelinessEvent>,
-    ) -> Result<(), BusError> {
+    ) -> Result<()> {
         loop {
             while let Pop::Item((), event) = members.take(Some(Instant::now())) {
                 self.note(event)?;
@@ -214,7 +214,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
     }
 
     /// A process of a vehicle has joined or left: its topics appear, or disappear.
-    fn note(&mut self, event: LivelinessEvent) -> Result<(), BusError> {
+    fn note(&mut self, event: LivelinessEvent) -> Result<()> {
         match event {
             LivelinessEvent::Joined { role, cav } => match role {
                 Role::Agent => {
@@ -240,7 +240,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         Ok(())
     }
 
-    fn declare_all(&mut self, cav: &CavId, topics: &[VehicleTopic]) -> Result<(), BusError> {
+    fn declare_all(&mut self, cav: &CavId, topics: &[VehicleTopic]) -> Result<()> {
         let mut topics = topics.iter();
         topics.try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), *topic)))
     }
@@ -253,7 +253,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
     }
 
     /// The transforms that robots have got since, and the fixed ones if they have changed.
-    fn place_robots(&mut self) -> Result<(), BusError> {
+    fn place_robots(&mut self) -> Result<()> {
         for (nanos, frame) in self.frames.odometry_in_map() {
             self.publish(RosTopic::Tf, ros2::transforms(nanos, &[frame]))?;
         }
@@ -262,7 +262,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
 
     /// The bodies of vehicles below their LiDARs, and the LiDARs of robots in the robots' own frames: all of them in one
     /// message, as only the last is kept for late subscribers.
-    fn publish_static_transforms(&mut self) -> Result<(), BusError> {
+    fn publish_static_transforms(&mut self) -> Result<()> {
         let mount = self.options.mount.unwrap_or_default();
         let mut in_robots = self.frames.lidars_in_robots(&self.names);
         let is_robot = |cav: &CavId| self.options.robots().any(|robot| robot == *cav);
@@ -280,7 +280,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         self.publish(RosTopic::TfStatic, cdr)
     }
 
-    fn forward_sweeps(&mut self, cav: &CavId) -> Result<(), BusError> {
+    fn forward_sweeps(&mut self, cav: &CavId) -> Result<()> {
         // The LiDAR comes from the ROS 2 network: its own topic is there.
         if self.sweeps.contains_key(cav)
             || self.options.lidars.iter().any(|source| source.cav == *cav)
@@ -302,7 +302,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         Ok(())
     }
 
-    fn take(&mut self, topic: &Topic, raw: &RawMessage) -> Result<(), BusError> {
+    fn take(&mut self, topic: &Topic, raw: &RawMessage) -> Result<()> {
         let (header, message) = match wire::decode_any(raw.pieces(), &Limits::DEFAULT) {
             Ok((header, _)) if header.kind == Kind::Control => return Ok(()),
             Ok(decoded) => decoded,
@@ -328,12 +328,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
     }
 
     /// The clock before the message: nothing has a stamp in the future.
-    fn publish_time(
-        &mut self,
-        cav: &CavId,
-        stream: Stream,
-        capture_nanos: u64,
-    ) -> Result<(), BusError> {
+    fn publish_time(&mut self, cav: &CavId, stream: Stream, capture_nanos: u64) -> Result<()> {
         let time_nanos = self.clock.advance(cav, stream, capture_nanos);
         match time_nanos.filter(|_| self.publishes_clock) {
             Some(nanos) => self.publish(RosTopic::Clock, ros2::clock(nanos)),
@@ -346,7 +341,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         cav: &CavId,
         capture_nanos: u64,
         message: &Message,
-    ) -> Result<(), BusError> {
+    ) -> Result<()> {
         let Some(initial) = &mut self.initial_pose else {
             return Ok(());
         };
@@ -358,7 +353,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         }
     }
 
-    fn declare(&mut self, topic: RosTopic) -> Result<(), BusError> {
+    fn declare(&mut self, topic: RosTopic) -> Result<()> {
         if !self.publishers.contains_key(&topic) {
             let publisher = self.session.publisher(&topic)?;
             self.publishers.insert(topic, publisher);
@@ -366,7 +361,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         Ok(())
     }
 
-    fn publish(&mut self, topic: RosTopic, cdr: Vec<u8>) -> Result<(), BusError> {
+    fn publish(&mut self, topic: RosTopic, cdr: Vec<u8>) -> Result<()> {
         self.declare(topic.clone())?;
         let name = topic.name(self.session.node().namespace.as_ref());
         *self.published.entry(name.to_string()).or_default() += 1;

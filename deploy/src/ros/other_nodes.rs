@@ -21,7 +21,7 @@ const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
 pub(super) fn watch_namesakes(session: &RosSession) -> Result<Subscriber<()>, BusError> {
     let (own, domain_id) = (session.node().name_in_network(), session.node().domain_id);
     let selector = session.node().namesakes();
-    let liveliness = session.zenoh().liveliness();
+    let liveliness = session.zenoh.liveliness();
     let builder = liveliness.declare_subscriber(&selector).history(true);
     let subscriber = builder.callback(move |sample| {
         let token = sample.key_expr().as_str();
@@ -70,7 +70,7 @@ pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<b
 fn publishers(session: &RosSession, topic: &RosName) -> Result<BTreeSet<String>, BusError> {
     let (own, selector) = (session.node(), session.node().publishers_of(topic));
     let tokens = session
-        .zenoh()
+        .zenoh
         .liveliness()
         .get(&selector)
         .timeout(QUERY_TIMEOUT)

@@ -138,20 +138,17 @@ impl RobotFrames {
     /// pose repeats the one before: the robot goes on by its odometry.
     pub(super) fn odometry_in_map(&self) -> Vec<(u64, FrameInParent)> {
         let mut state = lock(&self.state);
-        let State {
-            tree,
-            robots,
-            unplaced,
-        } = &mut *state;
+        let state = &mut *state;
         let mut found = Vec::new();
-        for (cav, robot) in robots {
+        for (cav, robot) in &mut state.robots {
             while let Some((nanos, pose)) = robot.waiting.front().copied() {
-                match pose.map(|pose| robot.map_from_odom(tree, self.mount.as_ref(), nanos, &pose))
+                match pose
+                    .map(|pose| robot.map_from_odom(&state.tree, self.mount.as_ref(), nanos, &pose))
                 {
                     Some(Err(NoPlace::NoTransform(NoTransform::Later { .. }))) => break,
                     Some(Ok(map_from_odom)) => robot.map_from_odom = Some(map_from_odom),
                     Some(Err(reason)) => {
-                        *unplaced += 1;
+                        state.unplaced += 1;
                         robot.log(cav, &reason);
                     }
                     None => {}

@@ -18,7 +18,8 @@ const NODE_NAME: &str = "v2vloc";
 
 /// A node of a ROS 2 network. Its tokens are withdrawn when this is dropped.
 pub struct RosSession {
-    session: Session,
+    /// The session.
+    pub(super) zenoh: Session,
     node: Node,
     /// Number of the last endpoint.
     endpoints: AtomicU32,
@@ -52,7 +53,7 @@ impl RosSession {
         };
         let token = declare_token(&session, &node.token())?;
         Ok(Self {
-            session,
+            zenoh: session,
             node,
             endpoints: AtomicU32::new(0),
             _token: token,
@@ -64,19 +65,14 @@ impl RosSession {
         &self.node
     }
 
-    /// The session.
-    pub(super) fn zenoh(&self) -> &Session {
-        &self.session
-    }
-
     /// Declares a publisher of `topic`.
     pub(super) fn publisher(&self, topic: &RosTopic) -> Result<RosPublisher, BusError> {
         let name = topic.name(self.node.namespace.as_ref());
         let key = self.node.key(&name, topic.ros_type());
         let token =
             self.endpoint_token(EndpointKind::Publisher, name, topic.ros_type(), topic.qos());
-        let declared = declare_token(&self.session, &token)?;
-        RosPublisher::declare(&self.session, &key, topic.qos(), (gid(&token), declared))
+        let declared = declare_token(&self.zenoh, &token)?;
+        RosPublisher::declare(&self.zenoh, &key, topic.qos(), (gid(&token), declared))
     }
 
     /// Calls `receive` for every message of a topic, on zenoh's receive thread: it must not wait.
@@ -90,7 +86,7 @@ impl RosSession {
         // Publishers of every distribution are heard, whatever hash they write; but not our own.
         let keys = self.node.any_hash(topic, ros_type);
         let builder = self
-            .session
+            .zenoh
             .declare_subscriber(&keys)
             .allowed_origin(Locality::Remote)
             .callback(receive);
@@ -105,7 +101,7 @@ impl RosSession {
         let token = self.endpoint_token(EndpointKind::Subscription, topic.clone(), ros_type, qos);
         Ok(RosSubscription {
             _subscriber: subscriber,
-            _token: declare_token(&self.session, &token)?,
+            _token: declare_token(&self.zenoh, &token)?,
         })
     }
 

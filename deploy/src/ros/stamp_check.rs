@@ -10,7 +10,8 @@ const PERIOD: Duration = Duration::from_secs(10);
 /// Stamps of one LiDAR.
 #[derive(Debug, Default)]
 pub(super) struct StampCheck {
-    last_nanos: Option<u64>,
+    /// Stamp of the last sweep that was not left out, nanoseconds.
+    pub(super) last_nanos: Option<u64>,
     warned: [Option<Instant>; 2],
 }
 
@@ -39,11 +40,6 @@ pub(super) enum OddStamp {
 }
 
 impl StampCheck {
-    /// Stamp of the last sweep that was not left out, nanoseconds.
-    pub(super) fn last_nanos(&self) -> Option<u64> {
-        self.last_nanos
-    }
-
     /// Takes the stamp of a sweep that arrives at `now_nanos` of this machine's clock; what is odd about it.
     pub(super) fn take(&mut self, nanos: u64, now_nanos: u64) -> Result<Option<OddStamp>, NoTime> {
         if nanos == 0 {
@@ -91,13 +87,13 @@ mod tests {
     fn a_sweep_without_a_time_is_left_out_and_an_odd_time_is_named() {
         let mut check = StampCheck::default();
         assert_eq!(check.take(0, 9 * S), Err(NoTime::Zero));
-        assert_eq!(check.last_nanos(), None);
+        assert_eq!(check.last_nanos, None);
         assert_eq!(check.take(8 * S, 9 * S), Ok(None));
         assert_eq!(check.take(8 * S, 9 * S), Err(NoTime::Repeated(8 * S)));
         assert_eq!(check.take(9 * S + S / 20, 9 * S), Ok(None));
         assert_eq!(check.take(12 * S, 9 * S), Ok(Some(OddStamp::Ahead(3.0))));
         assert_eq!(check.take(7 * S, 9 * S), Ok(Some(OddStamp::Back(5.0))));
-        assert_eq!(check.last_nanos(), Some(7 * S));
+        assert_eq!(check.last_nanos, Some(7 * S));
     }
 
     #[test]

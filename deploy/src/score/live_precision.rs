@@ -67,27 +67,22 @@ impl LivePrecision {
         let detections = answer.as_ref().map_or(&[][..], |answer| answer.detections);
         self.all_ticks.add(detections, truth.truth);
         let streamed = self.stream(truth);
-        match answer {
-            Some(Answer {
-                published_nanos: Some(nanos),
-                detections,
-            }) => {
-                self.published.push_back(Published {
-                    nanos,
-                    tick: truth.tick,
-                    began_nanos: truth.began_nanos,
-                    world_from_ego: truth.world_from_ego,
-                    detections: detections.to_vec(),
-                });
-                if self.published.len() > MOST_KEPT {
-                    self.published.pop_front();
-                }
-            }
-            Some(Answer {
-                published_nanos: None,
-                ..
-            }) => self.is_untimed = true,
-            None => {}
+        let Some(answer) = answer else {
+            return streamed;
+        };
+        let Some(nanos) = answer.published_nanos else {
+            self.is_untimed = true;
+            return streamed;
+        };
+        self.published.push_back(Published {
+            nanos,
+            tick: truth.tick,
+            began_nanos: truth.began_nanos,
+            world_from_ego: truth.world_from_ego,
+            detections: answer.detections.to_vec(),
+        });
+        if self.published.len() > MOST_KEPT {
+            self.published.pop_front();
         }
         streamed
     }

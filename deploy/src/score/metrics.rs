@@ -54,7 +54,6 @@ pub struct Metrics {
     /// Streaming average precision (Li et al. 2020, "Towards Streaming Perception"), ordered by score: at each tick the
     /// last detections published until then are moved by the ego's true motion since their capture and compared with
     /// the truth at that tick. Latency and missing results both lower it. `null` if results have no time of publication.
-    #[serde(default)]
     pub ap_streaming: Option<ByIou>,
     /// `ap_answered` by the distance of the objects from the ego's LiDAR, metres in the plane: bins that have objects.
     #[serde(default)]
@@ -81,14 +80,12 @@ pub struct Metrics {
     /// Totals of the ledger.
     pub messages: Messages,
     /// The evaluation protocol, with the ground-truth range as it was applied.
-    #[serde(default)]
     pub protocol: Option<EvaluationProtocol>,
     /// Data of the scene that could not be used, and frames that could not be computed. On the wall clock frames that
     /// failed are unanswered, and `messages` counts theirs as dropped.
     #[serde(default)]
     pub left_out: LeftOut,
     /// Command, programs, and the digests of everything that the result was made from.
-    #[serde(default)]
     pub provenance: Option<Provenance>,
 }
 

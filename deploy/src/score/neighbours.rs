@@ -25,7 +25,6 @@ pub struct NeighbourRecord {
     /// simulation time.
     pub clock_offset_s: Option<f64>,
     /// Offset of its capture times from the ego's that the ego corrected last, seconds; `None` if they agreed.
-    #[serde(default)]
     pub capture_offset_s: Option<f64>,
     /// Misbehaviour reason at the end, if it was excluded.
     pub misbehaviour: Option<MisbehaviourReason>,

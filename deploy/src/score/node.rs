@@ -149,11 +149,7 @@ impl ScorerNode {
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
         let process = process_id(Role::Scorer, &cav);
-        let identity = Identity {
-            run: run.clone(),
-            process,
-            cav,
-        };
+        let identity = Identity::new(run.clone(), process, cav);
         let bus = Bus::over(session, identity)?;
         let inbox = bus.inbox(PLACES, 4 * agents.len() + 64);
         let detections = Topic::stream(ego, Stream::Detections);

@@ -9,7 +9,7 @@ use protocol::{
     Camera, CavId, Descriptor, Detections, ImageFormat, Payload, PoseEstimate, Stream, Topic,
     Tracks, Truth,
 };
-use recording::{Entry, Recording, RecordingError};
+use recording::{Entry, Recording, RecordingError, Result};
 use serde::Serialize;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage, decoded};
@@ -186,11 +186,7 @@ impl RecordedRun {
     ///
     /// # Errors
     /// [`RecordingError`] when the file has changed.
-    pub fn frame(
-        &self,
-        index: usize,
-        ego: Option<&CavId>,
-    ) -> Result<Option<SceneFrame>, RecordingError> {
+    pub fn frame(&self, index: usize, ego: Option<&CavId>) -> Result<Option<SceneFrame>> {
         let (Some(moment), Some(timeline)) = (self.moments.get(index), self.shown(ego)) else {
             return Ok(None);
         };
@@ -231,7 +227,7 @@ impl RecordedRun {
         index: usize,
         cav: &CavId,
         number: u8,
-    ) -> Result<Option<(ImageFormat, Bytes)>, RecordingError> {
+    ) -> Result<Option<(ImageFormat, Bytes)>> {
         let bytes = self.message(index, cav, Stream::Camera(number))?;
         let camera = bytes.and_then(|bytes| decoded::<Camera>(&bytes));
         Ok(camera.map(|Camera { metadata, image }| (metadata.format, image.into())))
@@ -241,21 +237,12 @@ impl RecordedRun {
     ///
     /// # Errors
     /// [`RecordingError`] when the file has changed.
-    pub(super) fn heat_map(
-        &self,
-        index: usize,
-        cav: &CavId,
-    ) -> Result<Option<HeatMap>, RecordingError> {
+    pub(super) fn heat_map(&self, index: usize, cav: &CavId) -> Result<Option<HeatMap>> {
         let bytes = self.message(index, cav, Stream::Bev)?;
         Ok(bytes.and_then(|bytes| HeatMap::of(&bytes)))
     }
 
-    fn message(
-        &self,
-        index: usize,
-        cav: &CavId,
-        stream: Stream,
-    ) -> Result<Option<Vec<u8>>, RecordingError> {
+    fn message(&self, index: usize, cav: &CavId, stream: Stream) -> Result<Option<Vec<u8>>> {
         let topic = Topic::stream(cav, stream);
         let moment = self.moments.get(index).into_iter();
         let mut entries = moment.flat_map(|moment| self.entries_of(moment));
@@ -310,7 +297,7 @@ impl RecordedRun {
         })
     }
 
-    fn timeline_of(&self, ego: Option<CavId>) -> Result<Timeline, RecordingError> {
+    fn timeline_of(&self, ego: Option<CavId>) -> Result<Timeline> {
         let links_to = |ego| LinkSeries::new(self.recording.entries(), ego);
         let links = ego.as_ref().map(links_to).unwrap_or_default();
         let (mut pace, mut judge) = (PaceCounter::default(), Judge::new(self.protocol.clone()));
@@ -397,7 +384,7 @@ impl RecordedRun {
         moment: &Moment,
         ego: Option<&CavId>,
         judge: &mut Judge,
-    ) -> Result<MomentSummary, RecordingError> {
+    ) -> Result<MomentSummary> {
         let mut summary = MomentSummary {
             capture_s: moment.capture_nanos as f64 / 1e9,
             ..MomentSummary::default()
@@ -428,7 +415,7 @@ impl RecordedRun {
     }
 
     /// Time of publication and content of a message; `None` if it is damaged.
-    fn published<M: Payload>(&self, entry: &Entry) -> Result<Option<(u64, M)>, RecordingError> {
+    fn published<M: Payload>(&self, entry: &Entry) -> Result<Option<(u64, M)>> {
         let message = decoded(&self.recording.read(entry)?);
         Ok(message.map(|message| (entry.header.stamp.publish_nanos, message)))
     }

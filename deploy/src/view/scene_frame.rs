@@ -105,7 +105,7 @@ pub struct Planar {
 }
 
 /// A box in the world frame.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ShownBox {
     /// Its rectangle.
     #[serde(flatten)]
@@ -227,14 +227,7 @@ impl ShownBox {
     pub(super) fn of(box3d: Box3d) -> Self {
         Self {
             box3d,
-            score: None,
-            source: None,
-            class: None,
-            id: None,
-            speed_mps: None,
-            is_counted: false,
-            found_score: None,
-            is_hit: None,
+            ..Self::default()
         }
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::{BevGrid, Pose};
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Result, Tensor};
 
 use crate::f64_tensor::{are_numbers, numbers};
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, Samples, places_of};
@@ -42,7 +42,7 @@ pub(crate) struct CellSamples {
 impl FullResolutionMap {
     /// From a map `[1, C, H, W]` without negative values and the mask of cells that were sent, `[1, 1, H, W]`; absent:
     /// all.
-    pub(crate) fn of(map: &Tensor, sent: Option<&Tensor>) -> Result<Self, TchError> {
+    pub(crate) fn of(map: &Tensor, sent: Option<&Tensor>) -> Result<Self> {
         let sent = match sent {
             Some(sent) => sent.f_to_kind(Kind::Float)?,
             None => map.f_narrow(1, 0, 1)?.f_ones_like()?,
@@ -90,7 +90,7 @@ impl FullResolutionMap {
         maps: &[(usize, Pose, &Self)],
         cells: &[[usize; 2]],
         grid: &BevGrid,
-    ) -> Result<BTreeMap<usize, CellSamples>, TchError> {
+    ) -> Result<BTreeMap<usize, CellSamples>> {
         maps.iter()
             .try_fold(BTreeMap::new(), |mut by_step, (step, pose, map)| {
                 let seen = map.at(&places_of(cells, pose, grid), None)?;
@@ -105,18 +105,14 @@ impl FullResolutionMap {
 
     /// Features at positions in `grid_sampler`'s coordinates, two for each: `[R, C]`, and their validity, `[R, 1]`; those
     /// in plain floats times their `shares` `[R]`, if there are such.
-    pub(crate) fn at(
-        &self,
-        places: &[f32],
-        shares: Option<&[f32]>,
-    ) -> Result<CellSamples, TchError> {
+    pub(crate) fn at(&self, places: &[f32], shares: Option<&[f32]>) -> Result<CellSamples> {
         match self {
             Self::Numbers { cells, size, sent } => {
                 let mut samples = Samples::default();
                 samples.add((0, *size), sent, places, shares);
                 Ok(CellSamples {
                     features: samples.read(cells)?,
-                    mask: Tensor::f_from_slice(samples.valid())?.f_unsqueeze(1)?,
+                    mask: Tensor::f_from_slice(&samples.valid)?.f_unsqueeze(1)?,
                 })
             }
             Self::Tensors { map, sent } => {
@@ -139,7 +135,7 @@ impl FullResolutionMap {
 
 impl CellSamples {
     /// Element-wise maximum of both.
-    fn or(&self, other: &Self) -> Result<Self, TchError> {
+    fn or(&self, other: &Self) -> Result<Self> {
         Ok(Self {
             features: self.features.f_maximum(&other.features)?,
             mask: self.mask.f_maximum(&other.mask)?,

@@ -129,10 +129,7 @@ impl AlignedMaps {
         grid: &BevGrid,
     ) -> Self {
         Self {
-            warped: WarpedMaps {
-                features: features.shallow_clone(),
-                mask: mask.shallow_clone(),
-            },
+            warped: WarpedMaps::new(features.shallow_clone(), mask.shallow_clone()),
             received: ReceivedMaps::new(features.shallow_clone(), None),
             metadata: metadata.to_vec(),
             grid: *grid,

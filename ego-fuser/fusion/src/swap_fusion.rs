@@ -8,7 +8,7 @@ use perception::model_config::ConfigError;
 use protocol::config::{require, within};
 use serde::{Deserialize, Serialize};
 use tch::nn;
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Device, Kind, Tensor};
 
 use super::layers::{FeedForward, LayerNorm, Linear, SMALL, attend, dropout, unseen};
 use super::partition::{Partition, shape_error};
@@ -113,7 +113,7 @@ impl OffsetTable {
     }
 
     /// `[M, asking * cells, asked * cells]` added to the scores. Agents beyond the table's range use its last entry.
-    pub(super) fn bias(&self, asking: i64, asked: i64) -> Result<Tensor, TchError> {
+    pub(super) fn bias(&self, asking: i64, asked: i64) -> tch::Result<Tensor> {
         let (span, last) = (2 * self.window - 1, self.slots - 1);
         let tokens = |slots: i64| {
             let window = self.window;
@@ -162,13 +162,7 @@ impl GroupAttention {
     }
 
     /// `[G, S, P, C]` to the same, of which the first `asked` slots are attended to.
-    fn forward(
-        &self,
-        x: &Tensor,
-        asked: i64,
-        bias: &Tensor,
-        train: bool,
-    ) -> Result<Tensor, TchError> {
+    fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> tch::Result<Tensor> {
         let &[groups, slots, _, channels] = &x.size()[..] else {
             return Err(shape_error(x));
         };
@@ -224,13 +218,7 @@ impl HalfBlock {
         }
     }
 
-    fn forward(
-        &self,
-        x: &Tensor,
-        asked: i64,
-        bias: &Tensor,
-        train: bool,
-    ) -> Result<Tensor, TchError> {
+    fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> tch::Result<Tensor> {
         let x = x + self
             .attention
             .forward(&self.norm.forward(x)?, asked, bias, train)?;
@@ -247,7 +235,7 @@ impl HalfBlock {
         slots: Slots<'_>,
         window: i64,
         train: bool,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let x = self.partition.cut(map, window)?;
         let bias = self
             .attention
@@ -275,11 +263,7 @@ pub struct Slots<'a> {
 
 impl Slots<'_> {
     /// `[G, 1, 1, asked * P]`: 0 for valid tokens, minus infinity for invalid ones.
-    pub(super) fn unseen(
-        &self,
-        partition: Partition,
-        window: i64,
-    ) -> Result<Option<Tensor>, TchError> {
+    pub(super) fn unseen(&self, partition: Partition, window: i64) -> tch::Result<Option<Tensor>> {
         let Some(reach) = self.reach else {
             return Ok(None);
         };
@@ -306,7 +290,7 @@ impl MeanHead {
     }
 
     /// `[S, H, W, C]` to `[C, H, W]`.
-    pub(super) fn forward(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, x: &Tensor, slots: Slots<'_>) -> tch::Result<Tensor> {
         let mean = match slots.reach {
             Some(reach) if !slots.count_missing => {
                 let reach = reach.f_unsqueeze(3)?.f_to_kind(x.kind())?;
@@ -371,13 +355,8 @@ impl SwapFusion {
     /// Fuses `[S, C, H, W]` into `[C, H, W]`. H and W are multiples of the window; the first slot reaches every cell.
     ///
     /// # Errors
-    /// [`TchError`] when shapes do not fit.
-    pub fn forward(
-        &self,
-        maps: &Tensor,
-        slots: Slots<'_>,
-        train: bool,
-    ) -> Result<Tensor, TchError> {
+    /// [`tch::TchError`] when shapes do not fit.
+    pub fn forward(&self, maps: &Tensor, slots: Slots<'_>, train: bool) -> tch::Result<Tensor> {
         let last = self.halves.len();
         self.head
             .forward(&self.through(maps, slots, last, train)?, slots)
@@ -386,13 +365,13 @@ impl SwapFusion {
     /// All slots `[S, C, H, W]` after the first `layers` layers.
     ///
     /// # Errors
-    /// [`TchError`] when shapes do not fit.
+    /// [`tch::TchError`] when shapes do not fit.
     pub fn after_layers(
         &self,
         maps: &Tensor,
         slots: Slots<'_>,
         layers: usize,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         self.through(maps, slots, 2 * layers, false)?
             .f_permute([0, 3, 1, 2])?
             .f_contiguous()
@@ -405,7 +384,7 @@ impl SwapFusion {
         slots: Slots<'_>,
         halves: usize,
         train: bool,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let map = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let size = [map.size()[1], map.size()[2]];
         let mut x = map;
@@ -437,7 +416,7 @@ impl SwapFusion {
         lies_in: Option<Partition>,
         slots: Slots<'_>,
         size: [i64; 2],
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let channels = x.size()[3];
         let rows = x.f_view([-1, channels])?;
         let total = rows.size()[0];

@@ -119,10 +119,7 @@ impl Fusion for Where2comm {
             // Maps are zero wherever their mask is.
             Missing::Zero => warped.mask.f_ones_like()?,
         };
-        let maps = WarpedMaps {
-            features: warped.features.shallow_clone(),
-            mask,
-        };
+        let maps = WarpedMaps::new(warped.features.shallow_clone(), mask);
         Ok(match self.0.aggregation {
             Aggregation::Attention => attended(&maps)?,
             Aggregation::Max => maximum(&maps)?,

@@ -132,16 +132,10 @@ impl Tracker {
         if self.last_nanos.is_some_and(|last| capture_nanos <= last) {
             (self.tracks, self.last_nanos) = (Vec::new(), None);
         }
-        let PoseEstimate::Pose {
-            world_from_cav,
-            covariance,
-            ..
-        } = pose
-        else {
+        let Some(world_from_cav) = pose.world_from_cav() else {
             return Vec::new();
         };
-        let covariance = covariance.as_ref();
-        self.update(capture_nanos, world_from_cav, covariance, detections)
+        self.update(capture_nanos, world_from_cav, pose.covariance(), detections)
             .unwrap_or_default()
     }
 

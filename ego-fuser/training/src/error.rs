@@ -12,6 +12,9 @@ use perception::train::TrainingError;
 use perception::weights::FileError;
 use tch::TchError;
 
+/// Result of making samples or training: a [`Error`] if nothing else is named.
+pub(crate) type Result<T, E = Error> = std::result::Result<T, E>;
+
 /// Reason why there is no next sample or no stored map, or why a training ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

@@ -13,3 +13,4 @@ pub mod samples;
 pub mod train;
 
 pub use error::Error;
+pub(crate) use error::Result;

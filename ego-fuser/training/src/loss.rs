@@ -4,7 +4,7 @@
 //! divided by the batch size.
 
 use perception::tensor_values::tensor;
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Device, Kind, Result, Tensor};
 
 use crate::samples::Offset;
 use fusion::targets::{BOX_CODE, Labels};
@@ -133,13 +133,13 @@ impl LabelTensors {
 /// - `boxes`: `[B, 7A, H, W]`, channel `7 * anchor + component`
 ///
 /// # Errors
-/// [`TchError`] when the maps do not fit the labels.
+/// [`tch::TchError`] when the maps do not fit the labels.
 pub fn detection_loss(
     scores: &Tensor,
     boxes: &Tensor,
     labels: &LabelTensors,
     config: &LossConfig,
-) -> Result<Loss, TchError> {
+) -> Result<Loss> {
     let batch = scores.size()[0].max(1) as f64;
     let score = focal_loss(scores, labels, config)?.f_sum(Kind::Float)?;
     let boxes = box_loss(boxes, labels, config)?.f_sum(Kind::Float)?;
@@ -156,11 +156,11 @@ pub fn detection_loss(
 /// was added to. Where more than 5 m are left the term is zero: such a map was not found by the search.
 ///
 /// # Errors
-/// [`TchError`] when a sample has other views than offsets.
+/// [`tch::TchError`] when a sample has other views than offsets.
 pub(crate) fn alignment_loss(
     corrections: &[Option<Tensor>],
     offsets: &[Vec<Offset>],
-) -> Result<Tensor, TchError> {
+) -> Result<Tensor> {
     let unit = Tensor::f_from_slice(&[1.0, 1.0, METRES_PER_RADIAN as f32])?;
     let mut losses = Vec::new();
     for (moved_by, offsets) in corrections.iter().zip(offsets) {
@@ -181,11 +181,7 @@ pub(crate) fn alignment_loss(
 }
 
 /// Weighted focal loss of every anchor, `[B, H*W*A]`.
-fn focal_loss(
-    scores: &Tensor,
-    labels: &LabelTensors,
-    config: &LossConfig,
-) -> Result<Tensor, TchError> {
+fn focal_loss(scores: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor> {
     let target = &labels.positive;
     let logits = scores.f_to_kind(Kind::Float)?.f_permute([0, 2, 3, 1])?;
     let logits = logits.f_reshape(target.size())?;
@@ -200,11 +196,7 @@ fn focal_loss(
 }
 
 /// Weighted smooth L1 of every positive, `[P, 7]`.
-fn box_loss(
-    boxes: &Tensor,
-    labels: &LabelTensors,
-    config: &LossConfig,
-) -> Result<Tensor, TchError> {
+fn box_loss(boxes: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor> {
     let code = BOX_CODE as i64;
     let predicted = boxes.f_permute([0, 2, 3, 1])?.f_reshape([-1, code])?;
     let predicted = predicted.f_index_select(0, &labels.index)?;

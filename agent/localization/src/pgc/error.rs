@@ -7,6 +7,9 @@ use perception::detector::DetectorError;
 use perception::torch_error::first_line;
 use perception::weights::FileError;
 
+/// Result of loading a localizer or of localizing: a [`LocalizerError`] if nothing else is named.
+pub(crate) type Result<T, E = LocalizerError> = std::result::Result<T, E>;
+
 /// Error of loading a localizer or of localizing a sweep.
 #[derive(Debug, thiserror::Error)]
 pub enum LocalizerError {

@@ -6,6 +6,7 @@ use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
 use super::error::LocalizerError;
+use crate::pgc::Result;
 
 /// Largest number of values of a key grid.
 const MAX_KEY_GRID: i64 = 64_000_000;
@@ -134,12 +135,7 @@ impl SceneHeadConfig {
     ///
     /// # Errors
     /// [`LocalizerError::OtherEncoder`] with both digests.
-    pub fn check_encoder(
-        &self,
-        head: &Path,
-        encoder: &Path,
-        sha256: &str,
-    ) -> Result<(), LocalizerError> {
+    pub fn check_encoder(&self, head: &Path, encoder: &Path, sha256: &str) -> Result<()> {
         if self.encoder_sha256 == sha256 {
             return Ok(());
         }

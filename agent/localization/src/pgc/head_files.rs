@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use perception::weights::{FileError, Weights};
+use support::file_error::Result;
 use support::shared_files;
 
 use super::{CellEncoder, SceneHead, SceneHeadConfig};
@@ -26,7 +27,7 @@ const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
 ///
 /// # Errors
 /// [`FileError`] with the names of the released heads.
-pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
+pub fn head_file(head: &Path) -> Result<PathBuf> {
     released_file(head, "head", HEAD_PREFIX, TRAINED_FILE)
 }
 
@@ -34,17 +35,12 @@ pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
 ///
 /// # Errors
 /// [`FileError`] with the names of the released maps.
-pub fn surfel_map_file(map: &Path) -> Result<PathBuf, FileError> {
+pub fn surfel_map_file(map: &Path) -> Result<PathBuf> {
     released_file(map, "surfel map", SURFELS_PREFIX, SURFELS_FILE)
 }
 
 /// The file at a path, `trained` in a folder, or the released file of a name with this prefix.
-fn released_file(
-    head: &Path,
-    kind: &str,
-    prefix: &str,
-    trained: &str,
-) -> Result<PathBuf, FileError> {
+fn released_file(head: &Path, kind: &str, prefix: &str, trained: &str) -> Result<PathBuf> {
     if head.is_file() {
         return Ok(head.to_owned());
     }
@@ -77,7 +73,7 @@ fn released_file(
 ///
 /// # Errors
 /// [`FileError`] when there is none, or the head cannot be read.
-pub fn encoder_of(head: &Path) -> Result<PathBuf, FileError> {
+pub fn encoder_of(head: &Path) -> Result<PathBuf> {
     let beside = Some(head.with_file_name(ENCODER_FILE)).filter(|file| file.is_file());
     match (named_encoder(head), beside) {
         (Ok(Ok(found)), _) => Ok(found),
@@ -97,7 +93,7 @@ pub fn encoder_of(head: &Path) -> Result<PathBuf, FileError> {
 ///
 /// # Errors
 /// As [`encoder_of`].
-pub fn encoder_or_named(encoder: Option<&Path>, head: &Path) -> Result<PathBuf, FileError> {
+pub fn encoder_or_named(encoder: Option<&Path>, head: &Path) -> Result<PathBuf> {
     encoder.map_or_else(|| encoder_of(head), |given| Ok(given.to_owned()))
 }
 
@@ -107,7 +103,7 @@ pub fn is_name(head: &Path) -> bool {
 }
 
 /// The encoder that a head names, or its digest if no file has it.
-fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>, FileError> {
+fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>> {
     let weights = Weights::load(head)?;
     weights.check_kind(SceneHead::KIND)?;
     let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;

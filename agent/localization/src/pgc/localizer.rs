@@ -26,6 +26,7 @@ use super::scene_coordinates::SceneCoordinates;
 use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
 use crate::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
+use crate::pgc::Result;
 
 /// Largest number of regressed cells, where the head allows for more: more cells hardly improve poses, and they take
 /// time.
@@ -58,7 +59,7 @@ impl Localizer {
     /// # Errors
     /// [`LocalizerError`] when a file is missing, truncated or of another kind, when its confidence model is not valid,
     /// or when the head was trained on the features of another encoder.
-    pub fn load(encoder: &Path, head: &Path, inference: Inference) -> Result<Self, LocalizerError> {
+    pub fn load(encoder: &Path, head: &Path, inference: Inference) -> Result<Self> {
         let (mut localizer, weights) = Self::open(encoder, head, inference)?;
         localizer.solver.confidence = stored_confidence(&weights)?;
         localizer.solver.covariance = fitted(&weights, COVARIANCE_KEY, CovarianceScale::check)?;
@@ -74,15 +75,11 @@ impl Localizer {
         encoder: &Path,
         head: &Path,
         inference: Inference,
-    ) -> Result<Self, LocalizerError> {
+    ) -> Result<Self> {
         Ok(Self::open(encoder, head, inference)?.0)
     }
 
-    fn open(
-        encoder: &Path,
-        head: &Path,
-        inference: Inference,
-    ) -> Result<(Self, Weights), LocalizerError> {
+    fn open(encoder: &Path, head: &Path, inference: Inference) -> Result<(Self, Weights)> {
         let Inference { device, precision } = inference;
         let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
@@ -112,11 +109,7 @@ impl Localizer {
     ///
     /// # Errors
     /// [`LocalizerError::Tensor`] when the tensor library fails.
-    pub fn observe(
-        &self,
-        cloud: &PointCloud,
-        search: &mut ScaleSearch,
-    ) -> Result<(), LocalizerError> {
+    pub fn observe(&self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<()> {
         let Some(encoded) = self.encode(LocalizerInput::of(cloud), &mut stopwatch())? else {
             return Ok(());
         };
@@ -152,7 +145,7 @@ impl Localizer {
     pub fn scene_coordinates(
         &self,
         sweep: LocalizerInput<'_>,
-    ) -> Result<(SceneCoordinates, StageTimes), LocalizerError> {
+    ) -> Result<(SceneCoordinates, StageTimes)> {
         let mut times = stopwatch();
         let Some(encoded) = self.encode(sweep, &mut times)? else {
             return Ok((SceneCoordinates::default(), times));
@@ -170,7 +163,7 @@ impl Localizer {
         &self,
         cloud: &PointCloud,
         times: &mut StageTimes,
-    ) -> Result<Option<Vec<f32>>, LocalizerError> {
+    ) -> Result<Option<Vec<f32>>> {
         let Some(encoded) = self.encode(LocalizerInput::of(cloud), times)? else {
             return Ok(None);
         };
@@ -182,7 +175,7 @@ impl Localizer {
         &self,
         input: LocalizerInput<'_>,
         times: &mut StageTimes,
-    ) -> Result<Option<EncodedSweep>, LocalizerError> {
+    ) -> Result<Option<EncodedSweep>> {
         let sweep = self.encoder.format().prepare(&input.cloud.xyzi);
         times.lap(VOXELISE);
         let refined = choose_evenly(sweep.cells(), REFINEMENT_CELLS);
@@ -212,7 +205,7 @@ impl Localizer {
         count: usize,
         logits: &Tensor,
         times: &mut StageTimes,
-    ) -> Result<SceneCoordinates, LocalizerError> {
+    ) -> Result<SceneCoordinates> {
         let sweep = &encoded.sweep;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(count));
         let cells = self.pick(sweep, &encoded.features, &chosen)?;
@@ -267,7 +260,7 @@ impl Localizer {
 ///
 /// # Errors
 /// [`LocalizerError`] names the file and the value that is wrong.
-pub fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
+pub fn stored_confidence(weights: &Weights) -> Result<Confidence> {
     let model = fitted(weights, CONFIDENCE_KEY, ConfidenceModel::check)?;
     Ok(model.map_or(Confidence::Plain, Confidence::Calibrated))
 }
@@ -277,7 +270,7 @@ fn fitted<T: DeserializeOwned>(
     weights: &Weights,
     key: &'static str,
     check: impl Fn(&T) -> Result<(), FieldError>,
-) -> Result<Option<T>, LocalizerError> {
+) -> Result<Option<T>> {
     if weights.metadata(key).is_none() {
         return Ok(None);
     }

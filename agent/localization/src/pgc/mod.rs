@@ -43,6 +43,7 @@ pub(crate) use cell_choice::choose_evenly;
 pub use cell_encoder::{CellEncoder, EncodedCells, PreparedSweep, SweepFormat};
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use error::LocalizerError;
+pub(crate) use error::Result;
 pub use head_config::{RefinerConfig, SceneHeadConfig};
 pub use localization::{Localization, stopwatch};
 pub use localize::{Localize, LocalizerInput};

@@ -9,7 +9,7 @@ use super::scene_coordinates::{SceneCoordinates, sigma};
 use crate::registration::Registration;
 
 /// Statistics of the cells that a pose was estimated from.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct PoseEvidence {
     /// Number of cells of the sweep.
     pub cells: usize,
@@ -99,16 +99,9 @@ impl PoseEvidence {
     /// Evidence of a pose that was not estimated from cells.
     pub(crate) fn none() -> Self {
         Self {
-            cells: 0,
-            inliers: 0,
-            inlier_ratio: 0.0,
-            rms_m: 0.0,
-            inlier_epsilon_m: 0.0,
-            median_epsilon_m: 0.0,
-            inlier_sigma: 0.0,
             position_std_m: PoseStd::UNBOUNDED.position_m,
             rotation_std_rad: PoseStd::UNBOUNDED.rotation_rad,
-            second: None,
+            ..Self::default()
         }
     }
 

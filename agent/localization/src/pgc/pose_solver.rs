@@ -190,9 +190,8 @@ pub(super) fn confirm(
 
 /// The estimate of a sweep that is published.
 pub fn estimate(solved: &Solved) -> PoseEstimate {
-    let none = |reason, inliers: usize| PoseEstimate::NoPose {
-        reason,
-        inlier_count: u32::try_from(inliers).unwrap_or(u32::MAX),
+    let none = |reason, inliers: usize| {
+        PoseEstimate::no_pose(reason, u32::try_from(inliers).unwrap_or(u32::MAX))
     };
     match solved {
         Ok(found) if found.is_rejected => none(NoPoseReason::LowConfidence, found.evidence.inliers),

@@ -23,6 +23,12 @@ pub struct SceneFeatures {
     pub sweeps: Tensor,
 }
 
+impl SceneFeatures {
+    pub(super) fn new(cells: Tensor, sweeps: Tensor) -> Self {
+        Self { cells, sweeps }
+    }
+}
+
 /// Features of cells before their surroundings are added.
 #[derive(Debug)]
 pub struct LocalFeatures {

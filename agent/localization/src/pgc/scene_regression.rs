@@ -1,7 +1,7 @@
 //! Scene-specific head: classifies the part of the scene of a sweep and predicts the world coordinates of each cell.
 
 use tch::nn::{self, LinearConfig, Module};
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
 
 use super::dense::Dense;
 use super::error::LocalizerError;
@@ -98,7 +98,7 @@ impl SceneHead {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn normalise(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+    pub fn normalise(&self, cells: &Tensor) -> tch::Result<Tensor> {
         self.cell_norm.forward(cells)
     }
 
@@ -106,7 +106,7 @@ impl SceneHead {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn classify(&self, sweeps: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    pub fn classify(&self, sweeps: &Tensor, train: bool) -> tch::Result<Tensor> {
         self.classifier
             .forward(&self.sweep_norm.forward(sweeps)?, train)
     }
@@ -116,12 +116,7 @@ impl SceneHead {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn regress(
-        &self,
-        cells: &Tensor,
-        logits: &Tensor,
-        kind: Kind,
-    ) -> Result<Regression, TchError> {
+    pub fn regress(&self, cells: &Tensor, logits: &Tensor, kind: Kind) -> tch::Result<Regression> {
         Ok(self.regress_among_centres(cells, logits, kind)?.0)
     }
 
@@ -134,7 +129,7 @@ impl SceneHead {
         cells: &Tensor,
         logits: &Tensor,
         kind: Kind,
-    ) -> Result<(Regression, Tensor), TchError> {
+    ) -> tch::Result<(Regression, Tensor)> {
         let input = self.input(cells, logits)?;
         let inward = self.inward.forward(&input.f_to_kind(kind)?)?.f_relu()?;
         let hidden = match &self.int8 {
@@ -155,11 +150,7 @@ impl SceneHead {
     }
 
     /// Residual blocks in floating point, from the output of the first layer on.
-    fn hidden(
-        &self,
-        inward: Tensor,
-        on_activation: &mut OnActivation<'_>,
-    ) -> Result<Tensor, TchError> {
+    fn hidden(&self, inward: Tensor, on_activation: &mut OnActivation<'_>) -> tch::Result<Tensor> {
         on_activation(INWARD, &inward)?;
         let mut x = inward;
         for (number, [first, second, third]) in self.blocks.iter().enumerate() {
@@ -182,7 +173,7 @@ impl SceneHead {
         cells: &Tensor,
         logits: &Tensor,
         search: &mut ScaleSearch,
-    ) -> Result<(), TchError> {
+    ) -> tch::Result<()> {
         let inward = self.inward.forward(&self.input(cells, logits)?)?.f_relu()?;
         self.hidden(inward, &mut |name, values| search.observe(name, values))
             .map(drop)
@@ -211,7 +202,7 @@ impl SceneHead {
     }
 
     /// `[N, cell_channels + classes]`: features of cells beside the normalised logits of their sweeps.
-    fn input(&self, cells: &Tensor, logits: &Tensor) -> Result<Tensor, TchError> {
+    fn input(&self, cells: &Tensor, logits: &Tensor) -> tch::Result<Tensor> {
         let squares = (logits.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?;
         let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
         Tensor::f_cat(&[cells, &(logits / norm)], 1)
@@ -232,7 +223,7 @@ impl SceneHead {
         cells: &Tensor,
         sweeps: &Tensor,
         centres: &Tensor,
-    ) -> Result<(), TchError> {
+    ) -> tch::Result<()> {
         self.cell_norm.fit(cells)?;
         self.sweep_norm.fit(sweeps)?;
         tch::no_grad(|| self.centres.f_copy_(centres))
@@ -260,7 +251,7 @@ impl Classifier {
         }
     }
 
-    fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    fn forward(&self, x: &Tensor, train: bool) -> tch::Result<Tensor> {
         let mut x = x.shallow_clone();
         for (layer, norm) in self.layers.iter().zip(&self.norms) {
             let activation = norm.forward(&layer.forward(&x), train).f_relu()?;

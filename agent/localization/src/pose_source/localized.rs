@@ -14,7 +14,7 @@ use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
 use crate::baselines::{LightLoc, load_baseline};
 use crate::map_registration::MapRegistration;
 use crate::pgc::pose_solver::PoseSolver;
-use crate::pgc::{Localize, Localizer, LocalizerError};
+use crate::pgc::{Localize, Localizer, Result};
 
 /// Networks of PGC.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -74,8 +74,8 @@ impl LocalizedPose {
     /// Reads the networks of PGC.
     ///
     /// # Errors
-    /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn pgc(config: &PgcConfig, inference: Inference) -> Result<Self, LocalizerError> {
+    /// [`crate::pgc::LocalizerError`] names the file and what is wrong with it.
+    pub fn pgc(config: &PgcConfig, inference: Inference) -> Result<Self> {
         let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         let min_confidence = config.min_confidence;
         localizer.set_min_confidence(min_confidence);
@@ -94,11 +94,8 @@ impl LocalizedPose {
     /// Reads a baseline, which is computed in floating point.
     ///
     /// # Errors
-    /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn baseline(
-        config: &BaselinePoseConfig,
-        inference: Inference,
-    ) -> Result<Self, LocalizerError> {
+    /// [`crate::pgc::LocalizerError`] names the file and what is wrong with it.
+    pub fn baseline(config: &BaselinePoseConfig, inference: Inference) -> Result<Self> {
         let localizer = load_baseline(&config.weights, inference.device, PoseSolver::default())?;
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
@@ -199,7 +196,7 @@ impl PoseSource for LocalizedPose {
     }
 
     fn jumps(&self) -> u64 {
-        self.motion_gate.jumps()
+        self.motion_gate.jumps
     }
 }
 
@@ -209,7 +206,7 @@ mod tests {
 
     use super::*;
     use crate::pgc::synthetic::SyntheticScene;
-    use crate::pgc::{Localization, LocalizerInput, stopwatch};
+    use crate::pgc::{Localization, LocalizerError, LocalizerInput, stopwatch};
 
     fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {
         let cav = CavId::new("7").unwrap();

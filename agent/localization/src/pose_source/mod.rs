@@ -111,10 +111,7 @@ pub const NO_SOURCE: PoseEstimate = no_pose(NoPoseReason::NoSource);
 
 /// Result without a pose and without inliers.
 pub const fn no_pose(reason: NoPoseReason) -> PoseEstimate {
-    PoseEstimate::NoPose {
-        reason,
-        inlier_count: 0,
-    }
+    PoseEstimate::no_pose(reason, 0)
 }
 
 /// Error of setting up a pose source.

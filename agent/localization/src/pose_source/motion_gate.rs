@@ -78,7 +78,8 @@ pub(crate) struct MotionGate {
     accepted: VecDeque<TimedPose>,
     /// Jumps in a row that can be reached from each other.
     elsewhere: Vec<TimedPose>,
-    jumps: u64,
+    /// Number of jumps so far.
+    pub(crate) jumps: u64,
 }
 
 impl MotionGate {
@@ -90,11 +91,6 @@ impl MotionGate {
             elsewhere: Vec::new(),
             jumps: 0,
         }
-    }
-
-    /// Number of jumps so far.
-    pub(crate) fn jumps(&self) -> u64 {
-        self.jumps
     }
 
     /// Factor on the confidence of a pose with this verdict.
@@ -243,7 +239,7 @@ mod tests {
                 .iter()
                 .all(|&verdict| verdict == Verdict::Reachable)
         );
-        assert_eq!(motion_gate.jumps(), 0);
+        assert_eq!(motion_gate.jumps, 0);
     }
 
     #[test]
@@ -261,7 +257,7 @@ mod tests {
             };
             assert_eq!(verdict, expected, "step {step}");
         }
-        assert_eq!(motion_gate.jumps(), 2);
+        assert_eq!(motion_gate.jumps, 2);
         assert!(
             motion_gate.factor(Verdict::Jump) < 0.5
                 && motion_gate.factor(Verdict::Reachable) == 1.0

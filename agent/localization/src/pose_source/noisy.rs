@@ -19,26 +19,16 @@ use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError, no_pose};
 #[serde(default, deny_unknown_fields)]
 pub struct NoisyPoseConfig {
     /// Correlation of the errors of successive frames (pose source noisy).
-    #[arg(
-        id = "noise_mode",
-        long = "noise-mode",
-        value_name = "MODE",
-        value_enum
-    )]
+    #[arg(id = "noise_mode", long = "noise-mode", value_name = "MODE")]
+    #[arg(value_enum)]
     pub mode: NoiseMode,
     /// Standard deviation of x, y and z, metres (pose source noisy).
-    #[arg(
-        id = "noise_position_std_m",
-        long = "noise-position-std-m",
-        value_name = "M"
-    )]
+    #[arg(id = "noise_position_std_m", long = "noise-position-std-m")]
+    #[arg(value_name = "M")]
     pub position_std_m: f64,
     /// Standard deviation of yaw, degrees (pose source noisy).
-    #[arg(
-        id = "noise_heading_std_deg",
-        long = "noise-heading-std-deg",
-        value_name = "DEG"
-    )]
+    #[arg(id = "noise_heading_std_deg", long = "noise-heading-std-deg")]
+    #[arg(value_name = "DEG")]
     pub heading_std_deg: f64,
     /// Seed of the errors (pose source noisy).
     #[arg(id = "noise_seed", long = "noise-seed", value_name = "SEED")]

@@ -11,7 +11,7 @@ use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::csv_file::{CsvFile, CsvRow, CsvText};
-use support::file_error::{AtFile, FileError};
+use support::file_error::{AtFile, FileError, Result};
 
 use super::settings::{PoseBasis, PoseSettings, require_file};
 use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError};
@@ -51,7 +51,7 @@ impl PoseTable {
     ///
     /// # Errors
     /// [`FileError`] names the file and the line.
-    pub fn read(path: &Path) -> Result<Self, FileError> {
+    pub fn read(path: &Path) -> Result<Self> {
         let mut table = Self {
             path: path.to_owned(),
             ..Self::default()
@@ -95,7 +95,7 @@ impl PoseTable {
     ///
     /// # Errors
     /// [`FileError`] when the file cannot be written.
-    pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<(), FileError> {
+    pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<()> {
         let mut text = if path.exists() {
             CsvText::headless()
         } else {
@@ -113,10 +113,7 @@ impl PoseTable {
     ///
     /// # Errors
     /// [`FileError`] when there is none, or several and none is requested.
-    fn of_scenario(
-        mut self,
-        scenario: Option<&str>,
-    ) -> Result<HashMap<SweepKey, PoseEstimate>, FileError> {
+    fn of_scenario(mut self, scenario: Option<&str>) -> Result<HashMap<SweepKey, PoseEstimate>> {
         let wrong = match (scenario, self.scenarios.len()) {
             (Some(name), _) => match self.scenarios.remove(last_part(name)) {
                 Some(poses) => return Ok(poses),
@@ -155,7 +152,7 @@ impl CachedPose {
     ///
     /// # Errors
     /// [`FileError`] names the file and what is wrong with it.
-    pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self, FileError> {
+    pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self> {
         Ok(Self {
             poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())?,
         })
@@ -241,7 +238,7 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
     fields
 }
 
-fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, FileError> {
+fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey> {
     let cav = CavId::new(row.field(1)).map_err(|error| row.fault(format_args!("cav: {error}")))?;
     Ok((
         cav,
@@ -251,7 +248,7 @@ fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, FileError> {
     ))
 }
 
-fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
+fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate> {
     if row.field(11).is_empty() {
         pose(row)
     } else {
@@ -259,7 +256,7 @@ fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
     }
 }
 
-fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
+fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
     let number = |column| row.number(column, f64::MIN..=f64::MAX, "a finite number");
     let translation_m = [number(3)?, number(4)?, number(5)?];
     let rotation_wxyz = [number(6)?, number(7)?, number(8)?, number(9)?];
@@ -274,7 +271,7 @@ fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
     Ok(PoseEstimate::new(world_from_cav, confidence as f32))
 }
 
-fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
+fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
     let reason: NoPoseReason =
         serde_json::from_value(serde_json::Value::String(row.field(11).to_owned()))
             .map_err(|_| row.wrong(11, "a reason for no pose"))?;
@@ -282,10 +279,7 @@ fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
         .field(12)
         .parse()
         .map_err(|_| row.wrong(12, "a count"))?;
-    Ok(PoseEstimate::NoPose {
-        reason,
-        inlier_count,
-    })
+    Ok(PoseEstimate::no_pose(reason, inlier_count))
 }
 
 #[cfg(test)]

@@ -37,22 +37,16 @@ pub struct TrackedPoseConfig {
     pub min_confidence: f64,
     /// Sweeps from one measurement to the next, 1 to 100, of a vehicle that measures its yaw rate; of one without, half
     /// as many (pose source tracked).
-    #[arg(
-        id = "tracking_measure_every",
-        long = "measure-every",
-        value_name = "SWEEPS"
-    )]
+    #[arg(id = "tracking_measure_every", long = "measure-every")]
+    #[arg(value_name = "SWEEPS")]
     pub measure_every: u32,
     /// Number of the first measured sweep: vehicles on one machine take turns (pose source tracked).
     #[arg(id = "tracking_phase", long = "measure-phase", value_name = "SWEEPS")]
     pub phase: u32,
     /// Longest time between two measurements by the whole localizer, which uses no prediction, seconds (pose source
     /// tracked).
-    #[arg(
-        id = "tracking_global_period_s",
-        long = "global-period-s",
-        value_name = "S"
-    )]
+    #[arg(id = "tracking_global_period_s", long = "global-period-s")]
+    #[arg(value_name = "S")]
     pub global_period_s: f64,
     /// Longest time without an accepted measurement, seconds; then the vehicle is lost (pose source tracked).
     #[arg(id = "tracking_max_coast_s", long = "max-coast-s", value_name = "S")]

@@ -62,13 +62,8 @@ pub(crate) struct Args {
     encoder: Option<PathBuf>,
     /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0]; FILE may be
     /// the name of a released one (town1, town4). The report is over all scenes together.
-    #[arg(
-        long,
-        visible_alias = "weights",
-        value_name = "[MAP=]FILE|NAME",
-        num_args = 1..,
-        default_value = "town1"
-    )]
+    #[arg(long, visible_alias = "weights", value_name = "[MAP=]FILE|NAME")]
+    #[arg(num_args = 1.., default_value = "town1")]
     head: Vec<SceneHeadFile>,
     /// Weights of a baseline (`agent train sgloc`, `diffloc`, `hypliloc`), instead of encoder and head.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
@@ -137,12 +132,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "SHARE", conflicts_with_all = ["good_loss", "surfel_map"])]
     max_wrong: Option<f64>,
     /// Largest share of poses less than 3 m off that --fit-confidence may reject.
-    #[arg(
-        long,
-        value_name = "SHARE",
-        default_value_t = 0.01,
-        requires = "fit_confidence"
-    )]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.01)]
+    #[arg(requires = "fit_confidence")]
     good_loss: f64,
     /// Write a row per sweep.
     #[arg(long, value_name = "FILE")]

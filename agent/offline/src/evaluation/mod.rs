@@ -63,7 +63,7 @@ impl EvaluatedSweep {
     }
 
     /// Error of the pose that is published, if there is one.
-    pub(crate) fn published_error(&self) -> Option<PoseError> {
+    fn published_error(&self) -> Option<PoseError> {
         let pose = self.localization.estimate.world_from_cav()?;
         Some(PoseError::between(pose, &self.truth))
     }

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use protocol::PoseEstimate;
 use serde::Serialize;
 use support::statistics::{mean, median, quantile, sorted};
 
@@ -238,14 +237,8 @@ fn beyond_95(sweeps: &[EvaluatedSweep]) -> BTreeMap<&'static str, f64> {
 
 /// Error in the plane of a published pose with a covariance, and its bound of 95 %, metres.
 fn covariance_bound(sweep: &EvaluatedSweep) -> Option<(f64, f64)> {
-    let PoseEstimate::Pose {
-        world_from_cav,
-        covariance: Some(covariance),
-        ..
-    } = &sweep.localization.estimate
-    else {
-        return None;
-    };
+    let estimate = &sweep.localization.estimate;
+    let (world_from_cav, covariance) = (estimate.world_from_cav()?, estimate.covariance()?);
     let [x, y] =
         [0, 1].map(|axis| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis]);
     Some((x.hypot(y), covariance.bound_95_m()))

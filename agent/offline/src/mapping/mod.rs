@@ -17,12 +17,12 @@ pub use report::{HeldOutAccuracy, MapReport};
 
 use self::check::Check;
 use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
-use crate::Error;
 use crate::evaluation::{EvaluatedSweep, LocalizationSummary};
 use crate::training::{
     CELLS, FeatureCache, SceneSummary, SceneSweeps, SceneTrainConfig, SweepAugmentation, SweepList,
     train_scene_on,
 };
+use crate::{Error, Result};
 use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 use localization::pgc::confidence::{
     CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Rejection,
@@ -77,10 +77,7 @@ pub enum MapProgress {
 ///
 /// # Errors
 /// [`Error`]; a checkpoint may stay.
-pub fn make_map(
-    config: &MapConfig,
-    observe: &mut dyn FnMut(MapProgress),
-) -> Result<MapReport, Error> {
+pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Result<MapReport> {
     let mut map = Map {
         config,
         started: Instant::now(),
@@ -182,7 +179,7 @@ impl Map<'_> {
     }
 
     /// Reads the poses and holds sweeps out.
-    fn survey(&mut self) -> Result<Sweeps, Error> {
+    fn survey(&mut self) -> Result<Sweeps> {
         let list = SweepList::open(&self.config.drives)?;
         self.at(format!("reading the poses of {} sweeps", list.len()));
         let poses = list.poses().into_iter();
@@ -218,7 +215,7 @@ impl Map<'_> {
     }
 
     /// Measures the time of a sweep, plans and announces; or takes the plan of the map that is resumed.
-    fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan, Error> {
+    fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan> {
         let run = &self.config.run;
         let with_pose = sweeps.training.len() + sweeps.held_out.len();
         if run.resume {
@@ -299,7 +296,7 @@ impl Map<'_> {
         &mut self,
         training: &Arc<SweepList>,
         plan: &Plan,
-    ) -> Result<(SceneSummary, RunConfig), Error> {
+    ) -> Result<(SceneSummary, RunConfig)> {
         let left_s =
             (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
         let run = RunConfig {
@@ -356,7 +353,7 @@ impl Map<'_> {
     }
 
     /// Copies the encoder beside the head, so that the folder is all that is needed.
-    fn copy_encoder(&self) -> Result<(), Error> {
+    fn copy_encoder(&self) -> Result<()> {
         let path = self.config.run.out.join(ENCODER_FILE);
         let is_there = path.canonicalize().ok() == self.config.encoder.canonicalize().ok();
         if !is_there {
@@ -366,12 +363,7 @@ impl Map<'_> {
     }
 
     /// Searches the scales of activations; their number.
-    fn quantise(
-        &mut self,
-        weights: &Path,
-        training: &SweepList,
-        sweeps: usize,
-    ) -> Result<usize, Error> {
+    fn quantise(&mut self, weights: &Path, training: &SweepList, sweeps: usize) -> Result<usize> {
         self.at("scales for 8-bit inference".to_owned());
         let localizer =
             Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
@@ -390,7 +382,7 @@ impl Map<'_> {
         Ok(scales.len())
     }
 
-    fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check, Error> {
+    fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check> {
         let (encoder, inference) = (&self.config.encoder, Inference::default());
         let mut localizer = Localizer::load_without_confidence(encoder, weights, inference)?;
         let started = self.started;
@@ -410,7 +402,7 @@ impl Map<'_> {
         &mut self,
         weights: &Path,
         checked: &mut Check,
-    ) -> Result<(Option<FitReport>, Option<String>), Error> {
+    ) -> Result<(Option<FitReport>, Option<String>)> {
         match ConfidenceModel::fit(&checked.labelled, self.config.rejection) {
             Ok((model, report)) => {
                 let text = serde_json::to_string(&model).expect("a model is numbers");

@@ -14,7 +14,7 @@ use crate::Error;
 use localization::pgc::{Cell, SceneEncoderConfig, SweepVoxels};
 
 /// Largest distance of the sensors of a pair in the plane, metres.
-pub(super) const PAIR_RANGE_M: f64 = 12.0;
+const PAIR_RANGE_M: f64 = 12.0;
 /// Distance below which cells match, metres.
 const MATCH_M: f32 = 1.5;
 /// Probability that the partner is of another drive, if there is one: other traffic, often the other direction.

@@ -52,7 +52,8 @@ const ENOUGH_PASSES: usize = 2;
 pub(crate) struct Redundancy {
     config: RedundancyConfig,
     class_of_sweep: Vec<usize>,
-    weights: Vec<f32>,
+    /// Weight of each sweep; 0: not used.
+    pub(crate) weights: Vec<f32>,
     /// Median losses of each sweep in the current window, one per pass.
     recorded: Vec<Vec<f32>>,
     windows_done: usize,
@@ -71,11 +72,6 @@ impl Redundancy {
             recorded: vec![Vec::new(); count],
             windows_done: 0,
         }
-    }
-
-    /// Weight of each sweep; 0: not used.
-    pub(crate) fn weights(&self) -> &[f32] {
-        &self.weights
     }
 
     /// True if losses are recorded when this share of the training is done.
@@ -190,15 +186,15 @@ mod tests {
         }
         assert!(!redundancy.advance(0.2));
         assert!(redundancy.advance(0.25));
-        assert_eq!(redundancy.weights()[..2], [0.0, 0.0]);
+        assert_eq!(redundancy.weights[..2], [0.0, 0.0]);
         assert!(
-            redundancy.weights()[2..]
+            redundancy.weights[2..]
                 .iter()
                 .all(|weight| (weight - 8.0 / 6.0).abs() < 1e-6)
         );
         assert!(redundancy.watches(0.4) && !redundancy.watches(0.2));
         assert!(redundancy.advance(0.9));
-        assert_eq!(redundancy.weights(), [1.0; 8]);
+        assert_eq!(redundancy.weights, [1.0; 8]);
     }
 
     #[test]
@@ -216,7 +212,7 @@ mod tests {
                 }));
             }
             assert!(redundancy.advance(0.25));
-            let unused = |&sweep: &usize| redundancy.weights()[sweep] == 0.0;
+            let unused = |&sweep: &usize| redundancy.weights[sweep] == 0.0;
             (0..8).filter(unused).collect::<Vec<usize>>()
         };
         let choices: Vec<_> = (0..8).map(left_out).collect();
@@ -236,8 +232,8 @@ mod tests {
         redundancy.record(&[(0, 1.0), (1, 1.0)]);
         redundancy.record(&[(0, 1.0), (1, 2.0)]);
         redundancy.advance(0.25);
-        assert_eq!(redundancy.weights()[0], 0.0);
-        assert!(redundancy.weights()[1..].iter().all(|&weight| weight > 0.0));
+        assert_eq!(redundancy.weights[0], 0.0);
+        assert!(redundancy.weights[1..].iter().all(|&weight| weight > 0.0));
     }
 
     #[test]
@@ -247,11 +243,10 @@ mod tests {
             (sweep, sweep as f32)
         }));
         redundancy.advance(0.25);
-        assert_eq!(redundancy.weights(), [1.0; 8]);
+        assert_eq!(redundancy.weights, [1.0; 8]);
         redundancy.advance(0.5);
         assert_eq!(
-            redundancy.weights(),
-            [1.0; 8],
+            redundancy.weights, [1.0; 8],
             "nor does a window that a resumed training has not seen"
         );
     }

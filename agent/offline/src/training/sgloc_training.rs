@@ -7,7 +7,7 @@ use std::time::Instant;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::nn::VarStore;
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, Tensor, no_grad};
 
 use super::{CELLS, FeatureCache, SweepAugmentation, SweepList};
 use crate::Error;
@@ -121,12 +121,7 @@ impl Task for Training<'_> {
 }
 
 /// `[wanted]` random rows of a cache, the same for the same step.
-fn drawn_rows(
-    cache: &FeatureCache,
-    seed: u64,
-    step: u64,
-    wanted: usize,
-) -> Result<Tensor, TchError> {
+fn drawn_rows(cache: &FeatureCache, seed: u64, step: u64, wanted: usize) -> tch::Result<Tensor> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(step);
     let rows: Vec<i64> = (0..wanted)

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use dataset::frame::Frame;
 use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario, findings, reasons};
@@ -14,6 +14,7 @@ use crate::sweep_database::present_sweeps;
 use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 use perception::train::{DataListing, Prefetch};
 use support::file_digests::FileDigests;
+use support::sync::lock;
 
 /// Unit of stored coordinates, metres.
 const UNIT_M: f32 = 0.01;
@@ -155,7 +156,7 @@ impl SweepList {
 
     /// Identity of the data, and the part of it that proved unusable so far.
     pub(crate) fn data(&self) -> DataListing {
-        let (without_pose, unreadable) = (locked(&self.without_pose), locked(&self.unreadable));
+        let (without_pose, unreadable) = (lock(&self.without_pose), lock(&self.unreadable));
         let problems = self.problems.iter().chain(unreadable.values());
         DataListing {
             sha256: self.sha256.clone(),
@@ -203,7 +204,7 @@ impl SweepList {
     }
 
     fn leave_out(&self, index: usize, error: &ReadError) {
-        locked(&self.unreadable).insert(index, error.to_string());
+        lock(&self.unreadable).insert(index, error.to_string());
     }
 
     /// Keeps at most `count` sweeps, evenly spread.
@@ -249,7 +250,7 @@ impl SweepList {
     pub(crate) fn posed_frame(&self, index: usize) -> Option<(Frame, Isometry3<f64>)> {
         let (frame, ..) = self.frame(index)?;
         let Some(pose) = frame.world_from_lidar else {
-            locked(&self.without_pose).insert(index);
+            lock(&self.without_pose).insert(index);
             return None;
         };
         Some((frame, pose.isometry()))
@@ -259,10 +260,6 @@ impl SweepList {
     pub(crate) fn drive(&self, index: usize) -> Option<usize> {
         Some(self.places.get(index)?.drive)
     }
-}
-
-fn locked<T>(of_threads: &Mutex<T>) -> MutexGuard<'_, T> {
-    of_threads.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Sweeps of a list in memory, without those that cannot be read or have no pose.

@@ -57,12 +57,8 @@ pub(crate) struct Arguments {
     #[arg(long)]
     view: bool,
     /// Address of the page (--view).
-    #[arg(
-        long,
-        value_name = "HOST:PORT",
-        default_value = "127.0.0.1:8088",
-        requires = "view"
-    )]
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
+    #[arg(requires = "view")]
     page: SocketAddr,
     /// Print the metrics of the last method's run as JSON instead of a table of all.
     #[arg(long)]

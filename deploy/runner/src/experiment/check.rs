@@ -13,7 +13,7 @@ use super::sweep::grid::{count, sizes};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
 /// Largest number of runs; more are a mistake.
-pub(super) const MOST_RUNS: usize = 10_000;
+const MOST_RUNS: usize = 10_000;
 
 /// Checks everything that does not depend on the data.
 pub(super) fn check(experiment: &Experiment) -> Result<(), String> {

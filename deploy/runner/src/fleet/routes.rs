@@ -15,15 +15,11 @@ impl Fleet {
     pub(super) fn routes(&self) -> Vec<Route> {
         let ego = process_id(Role::Ego, &self.ego);
         let scorer = process_id(Role::Scorer, &scorer_cav());
-        let route = |cav: &CavId, stream, receiver: &ProcessId| Route {
-            topic: Topic::stream(cav, stream),
-            receiver: receiver.clone(),
+        let route = |cav: &CavId, stream, receiver: &ProcessId| {
+            Route::new(Topic::stream(cav, stream), receiver.clone())
         };
         let mut routes = vec![
-            Route {
-                topic: Topic::Truth,
-                receiver: scorer.clone(),
-            },
+            Route::new(Topic::Truth, scorer.clone()),
             route(&self.ego, Stream::Detections, &scorer),
         ];
         if self.scenario.ego.tracks {

@@ -221,10 +221,9 @@ pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
         all.push("fewer vehicles (scene.agents)".to_owned());
     }
     let relative = capacity.map_or(0.5, Capacity::relative_rate);
-    all.push(format!(
-        "--rate {}",
-        rounded(relative * scenario.scene.rate)
-    ));
+    // At most two digits after the point.
+    let rate = (relative * scenario.scene.rate * 100.0).round() / 100.0;
+    all.push(format!("--rate {rate}"));
     // Simulation time refuses processes that are slower than the scene.
     let fits = capacity
         .is_none_or(|capacity| capacity.agent_ms.max(capacity.fuse_ms) < 0.9 * capacity.period_ms);
@@ -237,11 +236,6 @@ pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
         .to_owned(),
     );
     listed(&all, "or")
-}
-
-/// A rate with at most two significant digits after the point.
-fn rounded(rate: f64) -> f64 {
-    (rate * 100.0).round() / 100.0
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use figures::{self, FONT, FigureError, Image};
+use figures::{self, FONT, FigureError, Image, Result};
 use plotters::coord::cartesian::Cartesian2d;
 use plotters::coord::types::RangedCoordf64;
 use plotters::drawing::DrawingArea;
@@ -79,13 +79,13 @@ impl Picture<'_> {
     ///
     /// # Errors
     /// [`FigureError`] when the range makes no picture or the file cannot be written.
-    pub(crate) fn save(&self, path: &Path) -> Result<(), FigureError> {
+    pub(crate) fn save(&self, path: &Path) -> Result<()> {
         let map = self.map_size()?;
         figures::save_image(path, picture_size(map), |image| self.draw(map, image))
     }
 
     /// Width and height of the plan view, pixels.
-    fn map_size(&self) -> Result<(u32, u32), FigureError> {
+    fn map_size(&self) -> Result<(u32, u32)> {
         let [width, height] =
             [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
         let can_be_drawn = |side: f64| (1.0..=MAX_SIDE).contains(&side);
@@ -101,7 +101,7 @@ impl Picture<'_> {
         }
     }
 
-    fn draw(&self, (width, height): (u32, u32), image: &Image<'_>) -> Result<(), FigureError> {
+    fn draw(&self, (width, height): (u32, u32), image: &Image<'_>) -> Result<()> {
         image.fill(&BACKGROUND)?;
         let (map, legend) = image.split_vertically(height);
         let (x, y) = (self.x_m[0]..self.x_m[1], self.y_m[0]..self.y_m[1]);
@@ -142,7 +142,7 @@ impl Picture<'_> {
     }
 
     /// A line every 10 m.
-    fn draw_grid(&self, plane: &Plane<'_>) -> Result<(), FigureError> {
+    fn draw_grid(&self, plane: &Plane<'_>) -> Result<()> {
         let tens = |[low, high]: [f64; 2]| {
             ((low / 10.0).ceil() as i64..=(high / 10.0).floor() as i64).map(|ten| 10.0 * ten as f64)
         };
@@ -155,12 +155,7 @@ impl Picture<'_> {
         Ok(())
     }
 
-    fn draw_points(
-        &self,
-        view: &View<'_>,
-        colour: RGBColor,
-        plane: &Plane<'_>,
-    ) -> Result<(), FigureError> {
+    fn draw_points(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<()> {
         let ego_from_cav = view.ego_from_cav.isometry();
         for &[x, y, z, _] in view.xyzi {
             let point =
@@ -175,12 +170,7 @@ impl Picture<'_> {
     }
 
     /// The outline, with a stroke from the centre to the front.
-    fn draw_box(
-        &self,
-        shape: &Box3d,
-        colour: RGBColor,
-        plane: &Plane<'_>,
-    ) -> Result<(), FigureError> {
+    fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &Plane<'_>) -> Result<()> {
         let corners = shape.corners();
         if !corners
             .iter()
@@ -220,7 +210,7 @@ impl Picture<'_> {
         labelled
     }
 
-    fn draw_score(&self, found: &Box3d, score: f32, plane: &Plane<'_>) -> Result<(), FigureError> {
+    fn draw_score(&self, found: &Box3d, score: f32, plane: &Plane<'_>) -> Result<()> {
         let [x, y, _] = found.center_m;
         if !self.is_near(x, y, 0.0) {
             return Ok(());
@@ -229,12 +219,7 @@ impl Picture<'_> {
         Ok(plane.draw(&(EmptyElement::at((x, y)) + text))?)
     }
 
-    fn draw_position(
-        &self,
-        view: &View<'_>,
-        colour: RGBColor,
-        plane: &Plane<'_>,
-    ) -> Result<(), FigureError> {
+    fn draw_position(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<()> {
         let [x, y, _] = view.ego_from_cav.translation_m;
         if !self.is_near(x, y, 0.0) {
             return Ok(());
@@ -243,7 +228,7 @@ impl Picture<'_> {
         Ok(plane.draw(&Circle::new((x, y), 4, colour.filled()))?)
     }
 
-    fn draw_legend(&self, area: &Image<'_>) -> Result<(), FigureError> {
+    fn draw_legend(&self, area: &Image<'_>) -> Result<()> {
         let right = area.dim_in_pixel().0 as i32;
         area.draw(&PathElement::new([(0, 0), (right, 0)], stroke(GRID)))?;
         area.draw(&Text::new(self.title.as_str(), (14, 8), text(18, INK)))?;
@@ -280,7 +265,7 @@ impl Picture<'_> {
 }
 
 /// A bar of 10 m and the axes.
-fn draw_scale(area: &Image<'_>) -> Result<(), FigureError> {
+fn draw_scale(area: &Image<'_>) -> Result<()> {
     let (left, right, y) = (14, 14 + (10.0 * PIXELS_PER_M) as i32, 68);
     for line in [
         [(left, y), (right, y)],

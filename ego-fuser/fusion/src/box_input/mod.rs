@@ -10,7 +10,7 @@ use perception::tensor_values::tensor;
 use perception::weights::Weights;
 use protocol::BevGrid;
 use tch::nn::{self, ConvConfig, Init, Module};
-use tch::{TchError, Tensor};
+use tch::{Result, Tensor};
 
 pub use raster::{PlacedBox, placed};
 
@@ -72,13 +72,8 @@ impl BoxInput {
     /// The fused map `[C, H, W]` of `grid` with the correction by `boxes`.
     ///
     /// # Errors
-    /// [`TchError`] when the map is of another shape.
-    pub fn add(
-        &self,
-        fused: &Tensor,
-        boxes: &[PlacedBox],
-        grid: &BevGrid,
-    ) -> Result<Tensor, TchError> {
+    /// [`tch::TchError`] when the map is of another shape.
+    pub fn add(&self, fused: &Tensor, boxes: &[PlacedBox], grid: &BevGrid) -> Result<Tensor> {
         let shape = [
             raster::CHANNELS as i64,
             grid.height.into(),

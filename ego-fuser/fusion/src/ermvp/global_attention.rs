@@ -1,7 +1,7 @@
 //! Window attention with global queries: queries summarise the whole feature map and are the same for all windows.
 
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
+use tch::{Result, nn};
 
 use crate::layers::{FeedForward, LayerNorm, Linear, attend, dropout};
 use crate::partition::{Partition, shape_error};
@@ -39,7 +39,7 @@ impl Extract {
     }
 
     /// `[S, C, H, W]` to `[S, C, H / 2, W / 2]`.
-    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let channels = x.size4()?.1;
         let one = [1i64, 1];
         let seen = x
@@ -97,12 +97,7 @@ impl GlobalHalf {
     }
 
     /// A feature map `[S, H, W, C]` to the same. H and W are multiples of [`REDUCTION`] windows.
-    pub(super) fn forward(
-        &self,
-        map: &Tensor,
-        slots: Slots<'_>,
-        train: bool,
-    ) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, map: &Tensor, slots: Slots<'_>, train: bool) -> Result<Tensor> {
         let &[count, height, width, channels] = &map.size()[..] else {
             return Err(shape_error(map));
         };
@@ -138,7 +133,7 @@ impl GlobalHalf {
 
     /// One query for each token of a window, `[1, S * P, C]`: the mean over all windows of a smaller feature map after
     /// self-attention among the tokens of each window.
-    fn queries(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor, TchError> {
+    fn queries(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor> {
         let small = x.f_permute([0, 3, 1, 2])?.f_contiguous()?;
         let small = self.extract[1]
             .forward(&self.extract[0].forward(&small)?)?

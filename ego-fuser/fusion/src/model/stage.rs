@@ -9,7 +9,7 @@ use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::weights::{FileError, METHOD_KEY, Weights};
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
-use tch::{Device, TchError, Tensor};
+use tch::{Device, Tensor};
 
 use crate::box_input::{self, BoxInput, PlacedBox};
 use crate::channel_mixing::{self, ChannelMixing};
@@ -174,8 +174,8 @@ impl FusionStage {
     /// The fused map `[C, H, W]` with what `boxes` say. Without boxes, or a box input, it is the same map.
     ///
     /// # Errors
-    /// [`TchError`] when the map is of another shape.
-    pub fn with_boxes(&self, fused: Tensor, boxes: &[PlacedBox]) -> Result<Tensor, TchError> {
+    /// [`tch::TchError`] when the map is of another shape.
+    pub fn with_boxes(&self, fused: Tensor, boxes: &[PlacedBox]) -> tch::Result<Tensor> {
         match boxes {
             [] => Ok(fused),
             boxes => self.read_boxes(fused, boxes),
@@ -183,11 +183,7 @@ impl FusionStage {
     }
 
     /// The same, computed without boxes too: in training every sample has a gradient.
-    pub(super) fn read_boxes(
-        &self,
-        fused: Tensor,
-        boxes: &[PlacedBox],
-    ) -> Result<Tensor, TchError> {
+    pub(super) fn read_boxes(&self, fused: Tensor, boxes: &[PlacedBox]) -> tch::Result<Tensor> {
         match (&self.box_input, self.y_axis) {
             (None, _) => Ok(fused),
             (Some(input), YAxis::Left) => input.add(&fused, boxes, &self.grid),
@@ -242,12 +238,12 @@ impl FusionStage {
     /// The form in which maps are kept for later frames, given the same maps in the axes of the ego, `turned`.
     ///
     /// # Errors
-    /// [`TchError`] when the maps have not four dimensions.
+    /// [`tch::TchError`] when the maps have not four dimensions.
     pub fn kept(
         &self,
         received: &ReceivedMaps,
         turned: &ReceivedMaps,
-    ) -> Result<ReceivedMaps, TchError> {
+    ) -> tch::Result<ReceivedMaps> {
         let ReceivedMaps { maps, sent, .. } = received;
         let history = self.requirements.history;
         let kept = match history.earlier_cells {
@@ -279,7 +275,7 @@ impl FusionStage {
     }
 
     /// Maps in the axes of the ego.
-    fn turned(&self, maps: &Tensor, poses: &[Pose], order: Order) -> Result<Tensor, TchError> {
+    fn turned(&self, maps: &Tensor, poses: &[Pose], order: Order) -> tch::Result<Tensor> {
         match &self.mixing {
             Some(mixing) => mixing.turn(maps, poses, order),
             None => Ok(maps.shallow_clone()),
@@ -419,7 +415,7 @@ impl FusionStage {
 /// Each of the maps at full resolution.
 fn full_resolution(
     ReceivedMaps { maps, sent, .. }: &ReceivedMaps,
-) -> Result<Vec<FullResolutionMap>, TchError> {
+) -> tch::Result<Vec<FullResolutionMap>> {
     (0..maps.size4()?.0)
         .map(|map| {
             let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);

@@ -186,10 +186,7 @@ fn rows_of(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<WarpedMa
         true => tensor.f_to_kind(Kind::Float),
         false => tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float),
     };
-    Ok(WarpedMaps {
-        features: pick(features)?,
-        mask: pick(mask)?,
-    })
+    Ok(WarpedMaps::new(pick(features)?, pick(mask)?))
 }
 
 /// With rows below and columns to the right that reach nothing, so that both counts are multiples of `cells`.

@@ -98,11 +98,7 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
     let Some(own) = seen.first() else {
         return Vec::new();
     };
-    let mut graph = Assembly {
-        objects: Vec::new(),
-        observations: Vec::new(),
-        joined: Vec::new(),
-    };
+    let mut graph = Assembly::default();
     graph.join(0, &Isometry3::identity(), own, &[]);
     let mut waiting: Vec<usize> = (1..agents.len()).collect();
     while let Some((place, found)) = graph.next(&waiting, &seen, &priors, config) {
@@ -160,6 +156,7 @@ fn planar(node: &Node) -> Isometry3<f64> {
 }
 
 /// The graph while agents join it.
+#[derive(Default)]
 struct Assembly {
     /// In the frame of the ego.
     objects: Vec<Node>,

@@ -6,7 +6,7 @@ use tch::{TchError, Tensor};
 use crate::layers::{Linear, SMALL, attend, dropout};
 
 /// Types of agents with separate projections: vehicles and infrastructure.
-pub(crate) const AGENT_TYPES: usize = 2;
+const AGENT_TYPES: usize = 2;
 /// Cells that are computed at once outside training, for all agents together.
 const CHUNK: i64 = 512;
 

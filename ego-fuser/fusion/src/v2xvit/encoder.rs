@@ -1,7 +1,7 @@
 //! Encoder of V2X-ViT: layers of agent attention, window attention and a feed-forward network, all pre-norm.
 
+use tch::Tensor;
 use tch::nn;
-use tch::{TchError, Tensor};
 
 use super::agent_attention::AgentAttention;
 use super::config::V2xVitConfig;
@@ -47,7 +47,7 @@ impl Block {
     /// Across the agents at every cell: `[N, T, C]` to the output of the first `queries` of them.
     ///
     /// # Errors
-    /// [`TchError`] when shapes do not fit.
+    /// [`tch::TchError`] when shapes do not fit.
     pub fn across_agents(
         &self,
         x: &Tensor,
@@ -55,7 +55,7 @@ impl Block {
         types: &[usize],
         queries: usize,
         train: bool,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let seen =
             self.agents
                 .forward(&self.agent_norm.forward(x)?, unseen, types, queries, train)?;
@@ -65,8 +65,8 @@ impl Block {
     /// Across the cells of one agent, `[T, C]` to the same.
     ///
     /// # Errors
-    /// [`TchError`] when shapes do not fit.
-    pub fn across_cells(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    /// [`tch::TchError`] when shapes do not fit.
+    pub fn across_cells(&self, x: &Tensor, train: bool) -> tch::Result<Tensor> {
         Ok(x + self.windows.forward(&self.window_norm.forward(x)?, train)?)
     }
 }
@@ -88,8 +88,8 @@ impl Layer {
     /// The feed-forward network on the tokens of one agent, `[T, C]` to the same.
     ///
     /// # Errors
-    /// [`TchError`] when shapes do not fit.
-    pub fn feed_forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    /// [`tch::TchError`] when shapes do not fit.
+    pub fn feed_forward(&self, x: &Tensor, train: bool) -> tch::Result<Tensor> {
         Ok(x + self.feed_forward.forward(&self.norm.forward(x)?, train)?)
     }
 }
@@ -150,14 +150,14 @@ impl Encoder {
     /// - returns: `[T, C]`
     ///
     /// # Errors
-    /// [`TchError`] when shapes do not fit.
+    /// [`tch::TchError`] when shapes do not fit.
     pub fn forward(
         &self,
         x: &Tensor,
         unseen: Option<&Tensor>,
         types: &[usize],
         train: bool,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let mut x = x.shallow_clone();
         let attentions: usize = self.layers.iter().map(|layer| layer.blocks.len()).sum();
         let mut done = 0;
@@ -183,10 +183,7 @@ impl Encoder {
 }
 
 /// Applies `step` to each of `[N, T, C]`.
-fn each_agent(
-    x: &Tensor,
-    step: impl Fn(&Tensor) -> Result<Tensor, TchError>,
-) -> Result<Tensor, TchError> {
+fn each_agent(x: &Tensor, step: impl Fn(&Tensor) -> tch::Result<Tensor>) -> tch::Result<Tensor> {
     let agents = (0..x.size3()?.0)
         .map(|agent| step(&x.f_get(agent)?))
         .collect::<Result<Vec<_>, _>>()?;

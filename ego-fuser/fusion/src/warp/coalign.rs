@@ -3,7 +3,7 @@
 //! The pairwise matrix `P[i, j]` takes points of agent i to the frame of agent j, and is used as it is for the
 //! destination-to-source map: `normalized[b, i, j]` brings the features of agent j into the frame of agent i.
 
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Result, Tensor};
 
 use super::{BILINEAR, PADDING_ZEROS};
 
@@ -12,13 +12,8 @@ use super::{BILINEAR, PADDING_ZEROS};
 /// `pixel_m` is the edge of a cell of the map to be warped, `height` and `width` its size in cells.
 ///
 /// # Errors
-/// [`TchError`] when the last two sizes are not 4.
-pub fn normalized(
-    pairwise: &Tensor,
-    height: i64,
-    width: i64,
-    pixel_m: f64,
-) -> Result<Tensor, TchError> {
+/// [`tch::TchError`] when the last two sizes are not 4.
+pub fn normalized(pairwise: &Tensor, height: i64, width: i64, pixel_m: f64) -> Result<Tensor> {
     let (height, width) = (height as f64, width as f64);
     let scale = [
         1.0,
@@ -40,8 +35,8 @@ pub fn normalized(
 /// Warps `[N, C, H, W]` by normalised destination-to-source matrices `[N, 2, 3]`, bilinearly, zeros outside.
 ///
 /// # Errors
-/// [`TchError`] when shapes do not fit.
-pub fn warp_affine(source: &Tensor, matrix: &Tensor) -> Result<Tensor, TchError> {
+/// [`tch::TchError`] when shapes do not fit.
+pub fn warp_affine(source: &Tensor, matrix: &Tensor) -> Result<Tensor> {
     let sampling_grid =
         Tensor::f_affine_grid_generator(&matrix.f_to_kind(Kind::Float)?, source.size(), false)?;
     let sampling_grid = sampling_grid.f_to_kind(source.kind())?;

@@ -58,6 +58,10 @@ pub struct WarpedMaps {
 }
 
 impl WarpedMaps {
+    pub(crate) fn new(features: Tensor, mask: Tensor) -> Self {
+        Self { features, mask }
+    }
+
     /// Number of maps.
     pub(crate) fn count(&self) -> Result<i64, TchError> {
         Ok(self.features.size4()?.0)
@@ -156,11 +160,8 @@ pub(crate) fn warp_cells(
     let features = samples
         .read(&cells)?
         .f_view([count, height, width, channels])?;
-    let mask = Tensor::f_from_slice(samples.valid())?.f_view([count, 1, height, width])?;
-    Ok(WarpedMaps {
-        features: features.f_permute([0, 3, 1, 2])?,
-        mask,
-    })
+    let mask = Tensor::f_from_slice(&samples.valid)?.f_view([count, 1, height, width])?;
+    Ok(WarpedMaps::new(features.f_permute([0, 3, 1, 2])?, mask))
 }
 
 /// Checks that maps `[N, C, H, W]` lie on `grid`, one for each pose.

@@ -3,7 +3,7 @@
 //! The tensor library gathers the four cells around a position anew for every channel. Here a map is transposed first,
 //! so that the channels of a cell are contiguous and are read together.
 
-use tch::{TchError, Tensor};
+use tch::{Result, Tensor};
 
 use crate::f64_tensor::{self, BLOCK, numbers};
 
@@ -31,7 +31,7 @@ struct Place {
 
 impl Cells {
     /// Of a map `[C, H, W]` that is not empty.
-    pub(super) fn of(map: &Tensor) -> Result<Self, TchError> {
+    pub(super) fn of(map: &Tensor) -> Result<Self> {
         let (channels, height, width) = map.size3()?;
         let [channels, height, width] = [channels, height, width].map(|size| size as usize);
         Ok(Self {
@@ -44,11 +44,7 @@ impl Cells {
 
     /// The map `[C, h, w]` sampled bilinearly at `sampling_grid` `[h, w, 2]` (`grid_sampler`'s coordinates), and its validity
     /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where cells are invalid.
-    pub(super) fn read(
-        &self,
-        valid: &Tensor,
-        sampling_grid: &Tensor,
-    ) -> Result<(Tensor, Tensor), TchError> {
+    pub(super) fn read(&self, valid: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor)> {
         let (rows, columns, _) = sampling_grid.size3()?;
         let (valid, sampling_grid) = (numbers(valid)?, numbers(sampling_grid)?);
         let cells = (rows * columns) as usize;
@@ -136,7 +132,7 @@ pub(crate) struct Samples {
     /// Index in `cells` at which each sum begins.
     first: Vec<i32>,
     /// Validity of each position by its nearest cell.
-    valid: Vec<f32>,
+    pub(crate) valid: Vec<f32>,
 }
 
 impl Samples {
@@ -188,13 +184,8 @@ impl Samples {
         self.valid.reserve(positions);
     }
 
-    /// Validity of each position.
-    pub(crate) fn valid(&self) -> &[f32] {
-        &self.valid
-    }
-
     /// `[positions, C]` of `cells` `[.., C]`.
-    pub(crate) fn read(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+    pub(crate) fn read(&self, cells: &Tensor) -> Result<Tensor> {
         let [places, first] = [&self.cells, &self.first].map(|rows| Tensor::f_from_slice(rows));
         let weights = Some(Tensor::f_from_slice(&self.weights)?);
         let (places, first) = (places?, first?);

@@ -101,10 +101,7 @@ impl SweepEncoder {
             capture_nanos: 0,
             publish_nanos: 0,
         };
-        let pose = PoseEstimate::NoPose {
-            reason: NoPoseReason::NoSource,
-            inlier_count: 0,
-        };
+        let pose = PoseEstimate::no_pose(NoPoseReason::NoSource, 0);
         let encode = || -> Result<_, WireError> {
             let features = encode_features(features, &codec, None)?;
             Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())

@@ -16,8 +16,8 @@ use super::augment::{Augmentation, ViewAugment};
 use super::moments::Moments;
 use super::poses::{DrawnError, Offset, SamplePoses, without_pose};
 use super::scenes::{SceneSet, TickRef};
-use crate::Error;
 use crate::feature_store::MapSource;
+use crate::{Error, Result};
 use fusion::MapMetadata;
 use fusion::points::merge_points;
 use fusion::targets::{Labels, TargetAssigner};
@@ -159,7 +159,7 @@ impl SampleBuilder {
     ///
     /// # Errors
     /// [`Error`] when a file is missing or malformed, or a vehicle has no pose.
-    pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, Error> {
+    pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample> {
         let frames = self.scenes.annotations(tick);
         let present = (0..frames.len()).filter(|&agent| frames[agent].is_some());
         let present: Vec<usize> = present.collect();
@@ -207,12 +207,7 @@ impl SampleBuilder {
 
     /// Views of a sample: the newest of every vehicle, the ego first, then older ones. Vehicles without a pose have no
     /// part; an ego without a pose is alone with its newest view.
-    fn entries(
-        &self,
-        now: TickRef,
-        agents: &[usize],
-        rng: &mut impl Rng,
-    ) -> Result<Vec<Entry>, Error> {
+    fn entries(&self, now: TickRef, agents: &[usize], rng: &mut impl Rng) -> Result<Vec<Entry>> {
         let ticks = &self.scenes.scenario(now).ticks;
         let gap = rng.random_range(1..=self.config.moments.gap.max(1));
         let error = self.config.poses.draw(rng)?;
@@ -278,13 +273,10 @@ impl SampleBuilder {
         agent: usize,
         place: [usize; 2],
         error: &DrawnError,
-    ) -> Result<[PoseEstimate; 2], Error> {
+    ) -> Result<[PoseEstimate; 2]> {
         let frames = self.scenes.annotations(tick);
         let Some(frame) = &frames[agent] else {
-            let absent = PoseEstimate::NoPose {
-                reason: NoPoseReason::NoSource,
-                inlier_count: 0,
-            };
+            let absent = PoseEstimate::no_pose(NoPoseReason::NoSource, 0);
             return Ok([absent; 2]);
         };
         let scenario = &self.scenes.scenario(tick).name;
@@ -300,7 +292,7 @@ impl SampleBuilder {
         entries: &[Entry],
         changes: &[ViewAugment],
         facts: &mut Vec<MapMetadata>,
-    ) -> Result<Vec<Pillars>, Error> {
+    ) -> Result<Vec<Pillars>> {
         let mut clouds = Vec::with_capacity(entries.len());
         for (entry, change) in entries.iter().zip(changes) {
             let tick = entry.tick;
@@ -327,7 +319,7 @@ impl SampleBuilder {
         frames: &[Option<Frame>],
         ego: usize,
         rng: &mut impl Rng,
-    ) -> Result<Vec<usize>, Error> {
+    ) -> Result<Vec<usize>> {
         let mut agents = vec![ego];
         let Some(ego_frame) = &frames[ego] else {
             return Ok(agents);
@@ -345,7 +337,7 @@ impl SampleBuilder {
         Ok(agents)
     }
 
-    fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose, Error> {
+    fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose> {
         let missing = || without_pose(&self.scenes.scenario(tick).name, frame);
         frame.world_from_lidar.ok_or_else(missing)
     }

@@ -3,10 +3,9 @@
 use csv::StringRecord;
 use figures::{self, Axis, Chart, Mark, Series};
 use perception::train::{Curve, Trainer};
-use perception::weights::FileError;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::csv_file;
-use support::file_error::AtFile;
+use support::file_error::{AtFile, Result};
 
 use super::accuracy::Accuracy;
 use super::observer::StepReport;
@@ -21,11 +20,11 @@ const SMOOTH_POINTS: usize = 150;
 pub(super) struct DetectorCurve(Curve);
 
 impl DetectorCurve {
-    pub(super) fn open(trainer: &Trainer) -> Result<Self, FileError> {
+    pub(super) fn open(trainer: &Trainer) -> Result<Self> {
         Ok(Self(trainer.curve(HEADER)?))
     }
 
-    pub(super) fn step(&mut self, report: &StepReport) -> Result<(), FileError> {
+    pub(super) fn step(&mut self, report: &StepReport) -> Result<()> {
         let (score_loss, box_loss) = (report.score_loss, report.box_loss);
         self.0.row(&format!(
             "{},{:.3},{:.1},{:.3e},{:.5},{score_loss:.5},{box_loss:.5},{:.2},{:.3},,,",
@@ -44,7 +43,7 @@ impl DetectorCurve {
         step: u64,
         seconds: f64,
         accuracy: &Accuracy,
-    ) -> Result<(), FileError> {
+    ) -> Result<()> {
         let [ap_30, ap_50, ap_70] = accuracy.ap_global;
         self.0.row(&format!(
             "{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"

@@ -7,9 +7,9 @@ use perception::weights::Weights;
 
 use super::config::TrainConfig;
 use super::observer::Observer;
-use crate::Error;
 use crate::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use crate::samples::{Augmentation, SampleBuilder, SampleConfig};
+use crate::{Error, Result};
 use fusion::model::{CooperativeModel, ModelError};
 use support::file_digests::FileDigests;
 
@@ -22,10 +22,7 @@ pub(super) struct FrozenEncoder<'a> {
 
 impl<'a> FrozenEncoder<'a> {
     /// Excludes the encoder of `model` from the training, if that is configured. Call it before the optimizer is built.
-    pub(super) fn of(
-        config: &'a TrainConfig,
-        model: &CooperativeModel,
-    ) -> Result<Option<Self>, Error> {
+    pub(super) fn of(config: &'a TrainConfig, model: &CooperativeModel) -> Result<Option<Self>> {
         let Some(kept) = &config.frozen_encoder else {
             return Ok(None);
         };
@@ -50,7 +47,7 @@ impl<'a> FrozenEncoder<'a> {
         &self,
         builder: &mut SampleBuilder,
         observer: &mut dyn Observer,
-    ) -> Result<(), Error> {
+    ) -> Result<()> {
         let on_sweep = &mut |done, all| observer.encoded(done, all);
         let store = FeatureStore::open(
             self.kept,

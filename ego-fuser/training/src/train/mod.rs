@@ -28,9 +28,9 @@ pub use observer::{Observer, StepReport, Summary};
 pub(crate) use validation::Validator;
 
 use self::curve::DetectorCurve;
-use crate::Error;
 use crate::loss::{LabelTensors, Loss, alignment_loss, detection_loss};
 use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleKind, SceneSet, batches};
+use crate::{Error, Result};
 use fusion::method::{Exchange, Method};
 use fusion::model::{CooperativeModel, ModelError};
 
@@ -38,14 +38,14 @@ use fusion::model::{CooperativeModel, ModelError};
 ///
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
-pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary, Error> {
+pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary> {
     let (mut training, mut trainer) = Training::prepare(config, observer)?;
     trainer.run(&mut training, SaveEvery::Steps(config.validate_every))?;
     training.finish(&trainer)
 }
 
 /// The views that a method is trained on; `is_frozen`: its encoder is frozen, `is_ego_only`: ego-only training.
-fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<SampleKind, Error> {
+fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<SampleKind> {
     match method.exchange() {
         Exchange::Nothing => Ok(SampleKind::Single),
         Exchange::Points if is_frozen => Err(Error::NothingToKeep(method)),
@@ -57,7 +57,7 @@ fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<Sam
 }
 
 /// The initial model of a training.
-fn first_model(config: &TrainConfig) -> Result<CooperativeModel, Error> {
+fn first_model(config: &TrainConfig) -> Result<CooperativeModel> {
     let (detector, method, device) = (&config.detector, config.method, config.run.device);
     Ok(match (&config.init, &config.fusion) {
         (Some(path), fusion) => {
@@ -70,7 +70,7 @@ fn first_model(config: &TrainConfig) -> Result<CooperativeModel, Error> {
 }
 
 /// A seed from the generator of the tensor library, which the training's own seed has set.
-fn random_seed() -> Result<u64, Error> {
+fn random_seed() -> Result<u64> {
     let drawn = Tensor::f_randint(i64::MAX, [1], (Kind::Int64, Device::Cpu))?;
     Ok(drawn.f_int64_value(&[0])?.unsigned_abs())
 }
@@ -80,7 +80,7 @@ struct Training<'a> {
     observer: &'a mut dyn Observer,
     model: CooperativeModel,
     scenes: Arc<SceneSet>,
-    loader: Prefetch<Result<Batch, Error>>,
+    loader: Prefetch<Result<Batch>>,
     validator: Option<Validator>,
     curve: DetectorCurve,
     /// Terms of the loss of the step in progress.
@@ -90,10 +90,7 @@ struct Training<'a> {
 }
 
 impl<'a> Training<'a> {
-    fn prepare(
-        config: &'a TrainConfig,
-        observer: &'a mut dyn Observer,
-    ) -> Result<(Self, Trainer), Error> {
+    fn prepare(config: &'a TrainConfig, observer: &'a mut dyn Observer) -> Result<(Self, Trainer)> {
         let kind = sample_kind(
             config.method,
             config.frozen_encoder.is_some(),
@@ -149,7 +146,7 @@ impl<'a> Training<'a> {
         Ok((training, trainer))
     }
 
-    fn draw_curve(&self) -> Result<(), Error> {
+    fn draw_curve(&self) -> Result<()> {
         let (method, run) = (self.config.method, &self.config.run);
         self.curve.draw(&format!(
             "{method}, {} samples a step, seed {}",
@@ -158,7 +155,7 @@ impl<'a> Training<'a> {
     }
 
     /// Metadata of the weights. Where all but the box input is frozen, scales of activations stay what they were.
-    fn about(&self) -> Result<BTreeMap<String, String>, Error> {
+    fn about(&self) -> Result<BTreeMap<String, String>> {
         let mut about = self.model.about();
         if let Some(init) = self.config.init.as_ref().filter(|_| self.config.box_input) {
             let weights = Weights::load(init).map_err(ModelError::from)?;
@@ -168,7 +165,7 @@ impl<'a> Training<'a> {
         Ok(about)
     }
 
-    fn finish(self, trainer: &Trainer) -> Result<Summary, Error> {
+    fn finish(self, trainer: &Trainer) -> Result<Summary> {
         self.draw_curve()?;
         let (config, model, scenes) = (self.config, &self.model, &self.scenes);
         let summary = Summary {
@@ -193,7 +190,7 @@ impl Task for Training<'_> {
         (steps * self.config.run.batch as u64) as f64 / self.scenes.ticks().len() as f64
     }
 
-    fn loss(&mut self, _: &Trainer) -> Result<Tensor, Error> {
+    fn loss(&mut self, _: &Trainer) -> Result<Tensor> {
         let asked = Instant::now();
         let batch = self.loader.next_batch()??;
         self.window.waited += asked.elapsed();
@@ -222,7 +219,7 @@ impl Task for Training<'_> {
         Ok(total)
     }
 
-    fn stepped(&mut self, _: &Trainer, is_taken: bool) -> Result<(), Error> {
+    fn stepped(&mut self, _: &Trainer, is_taken: bool) -> Result<()> {
         self.window.steps += 1;
         if let (Some(terms), true) = (self.terms.take(), is_taken) {
             self.window.losses[0] += terms.score.f_double_value(&[])?;
@@ -236,7 +233,7 @@ impl Task for Training<'_> {
         trainer.steps().is_multiple_of(Self::REPORT_EVERY)
     }
 
-    fn report(&mut self, trainer: &Trainer) -> Result<(), Error> {
+    fn report(&mut self, trainer: &Trainer) -> Result<()> {
         let window = std::mem::replace(&mut self.window, Window::new());
         let [score_loss, box_loss] = window.losses.map(|sum| sum / window.finite as f64);
         let seconds = window.since.elapsed().as_secs_f64().max(1e-9);
@@ -257,7 +254,7 @@ impl Task for Training<'_> {
         Ok(())
     }
 
-    fn validate(&mut self, trainer: &Trainer) -> Result<(), Error> {
+    fn validate(&mut self, trainer: &Trainer) -> Result<()> {
         let Some(validator) = &mut self.validator else {
             return Ok(());
         };

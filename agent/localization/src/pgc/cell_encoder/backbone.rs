@@ -70,10 +70,7 @@ impl BackboneEncoder {
             cells.push(features.cells);
             of_sweeps.push(features.sweeps);
         }
-        let features = SceneFeatures {
-            cells: Tensor::f_cat(&cells, 0)?,
-            sweeps: Tensor::f_cat(&of_sweeps, 0)?,
-        };
+        let features = SceneFeatures::new(Tensor::f_cat(&cells, 0)?, Tensor::f_cat(&of_sweeps, 0)?);
         Ok(EncodedCells { features, rows })
     }
 
@@ -105,10 +102,7 @@ impl BackboneEncoder {
             let mean = map.f_mean_dim([2_i64, 3].as_slice(), false, Kind::Float)?;
             let sweeps = Tensor::f_cat(&[mean, map.f_amax([2_i64, 3].as_slice(), false)?], 1)?;
             let cells = Tensor::f_cat(&parts, 1)?.f_to_device(self.device)?;
-            Ok::<_, TchError>(SceneFeatures {
-                cells,
-                sweeps: sweeps.f_to_device(self.device)?,
-            })
+            Ok::<_, TchError>(SceneFeatures::new(cells, sweeps.f_to_device(self.device)?))
         })?)
     }
 }

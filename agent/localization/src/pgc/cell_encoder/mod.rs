@@ -21,6 +21,7 @@ use super::error::LocalizerError;
 use super::scene_encoder::{SceneEncoder, SceneFeatures};
 use super::voxel_batch::VoxelBatch;
 use super::voxelise::{Cell, SweepVoxels};
+use crate::pgc::Result;
 use backbone::BackboneEncoder;
 
 /// An encoder and the device that it computes on.
@@ -73,7 +74,7 @@ impl CellEncoder {
     ///
     /// # Errors
     /// [`LocalizerError`] when the file is missing, truncated or of another kind.
-    pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
+    pub fn load(path: &Path, device: Device) -> Result<(Self, String)> {
         let weights = Weights::load(path)?;
         let sha256 = Self::sha256_of(&weights);
         if BackboneEncoder::is_in(&weights) {
@@ -117,11 +118,7 @@ impl CellEncoder {
     ///
     /// # Errors
     /// [`LocalizerError`] when a sweep has another format, or the tensor library fails.
-    pub fn encode(
-        &self,
-        sweeps: &[&PreparedSweep],
-        kind: Kind,
-    ) -> Result<EncodedCells, LocalizerError> {
+    pub fn encode(&self, sweeps: &[&PreparedSweep], kind: Kind) -> Result<EncodedCells> {
         match &self.network {
             Network::Sparse(encoder) => {
                 let batch = self.batch(encoder, sweeps)?;
@@ -143,7 +140,7 @@ impl CellEncoder {
         &self,
         sweep: &PreparedSweep,
         levels: Option<&[BackboneLevel]>,
-    ) -> Result<SceneFeatures, LocalizerError> {
+    ) -> Result<SceneFeatures> {
         match (&self.network, levels) {
             (Network::Backbone(encoder), Some(levels)) if encoder.takes(levels) => {
                 encoder.features(sweep.bev()?, levels)
@@ -172,11 +169,7 @@ impl CellEncoder {
     ///
     /// # Errors
     /// As [`Self::encode`].
-    pub fn observe(
-        &self,
-        sweep: &PreparedSweep,
-        search: &mut ScaleSearch,
-    ) -> Result<(), LocalizerError> {
+    pub fn observe(&self, sweep: &PreparedSweep, search: &mut ScaleSearch) -> Result<()> {
         match &self.network {
             Network::Sparse(encoder) => {
                 Ok(encoder.observe(&self.batch(encoder, &[sweep])?, search)?)
@@ -185,11 +178,7 @@ impl CellEncoder {
         }
     }
 
-    fn batch(
-        &self,
-        encoder: &SceneEncoder,
-        sweeps: &[&PreparedSweep],
-    ) -> Result<VoxelBatch, LocalizerError> {
+    fn batch(&self, encoder: &SceneEncoder, sweeps: &[&PreparedSweep]) -> Result<VoxelBatch> {
         let voxels: Result<Vec<_>, _> = sweeps.iter().map(|sweep| sweep.voxels()).collect();
         Ok(VoxelBatch::new(&voxels?, encoder.config(), self.device)?)
     }
@@ -250,7 +239,7 @@ impl PreparedSweep {
         }
     }
 
-    fn voxels(&self) -> Result<&SweepVoxels, LocalizerError> {
+    fn voxels(&self) -> Result<&SweepVoxels> {
         match self {
             Self::Voxels(voxels) => Ok(voxels),
             Self::Bev(_) => {
@@ -260,7 +249,7 @@ impl PreparedSweep {
         }
     }
 
-    fn bev(&self) -> Result<&BevCells, LocalizerError> {
+    fn bev(&self) -> Result<&BevCells> {
         match self {
             Self::Bev(cells) => Ok(cells),
             Self::Voxels(_) => Err(LocalizerError::Config(

@@ -73,7 +73,7 @@ impl Moments {
 }
 
 /// A cloud, or many clouds in one frame, as planes on a voxel grid.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Surfels {
     pub(super) voxel_m: f64,
     sites: Sites,
@@ -88,10 +88,7 @@ impl Surfels {
     pub(super) fn new(voxel_m: f64) -> Self {
         Self {
             voxel_m,
-            sites: Sites::default(),
-            moments: Vec::new(),
-            planes: Vec::new(),
-            count: 0,
+            ..Self::default()
         }
     }
 
@@ -238,7 +235,7 @@ pub(super) fn decimate(
 }
 
 /// Voxel of a point; `None` if no voxel can hold it.
-pub(super) fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
+fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
     let voxel = (point_m / voxel_m).map(f64::floor);
     // One voxel of margin for the neighbours that are looked up. Also rejects values that are not finite.
     let held = voxel

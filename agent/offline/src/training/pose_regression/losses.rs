@@ -4,7 +4,7 @@ use localization::baselines::RegressPose;
 use localization::baselines::diffloc::{DiffLoc, Windows};
 use localization::baselines::hypliloc::HypLiLoc;
 use localization::baselines::place_classes::PlaceClasses;
-use tch::{Kind, Reduction, TchError, Tensor};
+use tch::{Kind, Reduction, Result, Tensor};
 
 use super::token_cache::TokenSweeps;
 
@@ -46,11 +46,11 @@ pub(super) trait PoseLoss: RegressPose {
         places: &PlaceClasses,
         kind: Kind,
         share_done: f64,
-    ) -> Result<Losses, TchError>;
+    ) -> Result<Losses>;
 }
 
 /// The true classes of poses, and those near which the network shall state them, with the poses relative to these.
-fn classes(poses: &Tensor, places: &PlaceClasses) -> Result<[Tensor; 3], TchError> {
+fn classes(poses: &Tensor, places: &PlaceClasses) -> Result<[Tensor; 3]> {
     let noise = poses.f_randn_like()?.f_narrow(1, 0, 3)? * CLASS_NOISE_M;
     let moved = poses.f_narrow(1, 0, 3)?.f_add(&noise)?;
     let moved = Tensor::f_cat(&[moved, poses.f_narrow(1, 3, 2)?], 1)?;
@@ -59,7 +59,7 @@ fn classes(poses: &Tensor, places: &PlaceClasses) -> Result<[Tensor; 3], TchErro
     Ok([places.nearest(poses)?, near, relative])
 }
 
-fn cross_entropy(logits: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+fn cross_entropy(logits: &Tensor, classes: &Tensor) -> Result<Tensor> {
     let mean = Reduction::Mean;
     logits.f_cross_entropy_loss(classes, None::<Tensor>, mean, -100, LABEL_SMOOTHING)
 }
@@ -74,7 +74,7 @@ impl PoseLoss for DiffLoc {
         places: &PlaceClasses,
         kind: Kind,
         _share_done: f64,
-    ) -> Result<Losses, TchError> {
+    ) -> Result<Losses> {
         let described = self.describe(&batch.tokens, kind, true)?;
         let (logits, statics) = (&described.static_logits, &batch.statics);
         let mean = Reduction::Mean;
@@ -96,11 +96,7 @@ impl PoseLoss for DiffLoc {
 }
 
 /// L1 of the poses, and of their differences between sweeps that see each other.
-fn denoising_losses(
-    network: &DiffLoc,
-    features: &Tensor,
-    poses: &Tensor,
-) -> Result<[Tensor; 2], TchError> {
+fn denoising_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Result<[Tensor; 2]> {
     let drawn = |of: &Tensor| of.f_repeat([DRAWS, 1, 1]);
     let (features, poses) = (drawn(features)?, drawn(poses)?);
     let count = poses.size()[0];
@@ -134,7 +130,7 @@ impl PoseLoss for HypLiLoc {
         places: &PlaceClasses,
         kind: Kind,
         share_done: f64,
-    ) -> Result<Losses, TchError> {
+    ) -> Result<Losses> {
         let features = self.features(&batch.tokens, kind, true)?;
         let [truth, near, relative] = classes(&batch.poses, places)?;
         let (mut errors, mut entropies) = (Vec::new(), Vec::new());

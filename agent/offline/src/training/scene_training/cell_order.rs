@@ -99,7 +99,7 @@ impl CellOrder {
             }
             changed |= redundancy.advance(share_done);
             if changed {
-                self.sweep_weights = tensor(redundancy.weights(), &[-1], device)?;
+                self.sweep_weights = tensor(&redundancy.weights, &[-1], device)?;
             }
         }
         if changed {

@@ -1,7 +1,7 @@
 //! Coarse poses for the training of the refiner, drawn around true ones.
 
 use nalgebra::Isometry3;
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Device, Kind, Result, Tensor};
 
 use crate::training::sweep_store::heading_rad;
 
@@ -18,10 +18,7 @@ pub(super) struct CoarsePoses {
 }
 
 impl CoarsePoses {
-    pub(super) fn new(
-        world_from_sensor: &[Isometry3<f64>],
-        device: Device,
-    ) -> Result<Self, TchError> {
+    pub(super) fn new(world_from_sensor: &[Isometry3<f64>], device: Device) -> Result<Self> {
         let headings: Vec<f32> = world_from_sensor
             .iter()
             .map(|pose| heading_rad(pose) as f32)
@@ -33,11 +30,7 @@ impl CoarsePoses {
 
     /// Positions of cells `[N, 3]` with random errors, and cosine and sine of the heading `[N, 2]` with random errors;
     /// `sweeps` `[N]` is the sweep of each cell.
-    pub(super) fn draw(
-        &self,
-        targets_m: &Tensor,
-        sweeps: &Tensor,
-    ) -> Result<(Tensor, Tensor), TchError> {
+    pub(super) fn draw(&self, targets_m: &Tensor, sweeps: &Tensor) -> Result<(Tensor, Tensor)> {
         let like = (Kind::Float, targets_m.device());
         let count = targets_m.size()[0];
         // Small and large errors both occur: the second round starts from a better pose than the first.

@@ -5,8 +5,8 @@ use std::path::Path;
 use tch::nn::VarStore;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::Error;
 use crate::training::FeatureCache;
+use crate::{Error, Result};
 use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
 use perception::weights::Weights;
 
@@ -43,10 +43,7 @@ impl StoredHead {
 
 /// Class of each sweep of `cache`, which a trained head does not store: the one whose trusted sweeps lie nearest. A
 /// sweep is trusted if the head finds its cells with the class that it gives it.
-pub(super) fn classes_of_sweeps(
-    head: &SceneHead,
-    cache: &FeatureCache,
-) -> Result<Vec<usize>, Error> {
+pub(super) fn classes_of_sweeps(head: &SceneHead, cache: &FeatureCache) -> Result<Vec<usize>> {
     let (classes, errors_m) = no_grad(|| classify(head, cache))?;
     let positions = cache.positions_m();
     let mut sums = vec![[0.0; 4]; head.config().classes as usize];

@@ -31,7 +31,7 @@ use super::kmeans::kmeans;
 use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
-use crate::Error;
+use crate::{Error, Result};
 use localization::pgc::{SceneHead, SceneHeadConfig};
 use perception::train::{
     Curve, DataListing, Length, Means, Observe, Progress, SaveEvery, Task, Trainer,
@@ -51,10 +51,7 @@ const MAX_CELLS: usize = 1024;
 ///
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
-pub fn train_scene(
-    config: &SceneTrainConfig,
-    observe: &mut Observe<'_>,
-) -> Result<SceneSummary, Error> {
+pub fn train_scene(config: &SceneTrainConfig, observe: &mut Observe<'_>) -> Result<SceneSummary> {
     let training = Arc::new(SweepList::open(&config.scenes)?);
     let validation = match config.validation.as_slice() {
         [] => None,
@@ -76,7 +73,7 @@ pub(crate) fn train_scene_on(
     config: &SceneTrainConfig,
     sweeps: &SceneSweeps,
     observe: &mut Observe<'_>,
-) -> Result<SceneSummary, Error> {
+) -> Result<SceneSummary> {
     let (mut training, mut trainer) = Training::prepare(config, sweeps, observe)?;
     trainer.run(&mut training, SaveEvery::Time(config.validate_every))?;
     training.finish(&trainer)
@@ -111,7 +108,7 @@ impl<'a> Training<'a> {
         config: &'a SceneTrainConfig,
         sweeps: &SceneSweeps,
         observe: &'a mut Observe<'_>,
-    ) -> Result<(Self, Trainer), Error> {
+    ) -> Result<(Self, Trainer)> {
         let started = Instant::now();
         let run = &config.run;
         run.start()?;
@@ -177,7 +174,7 @@ impl<'a> Training<'a> {
         Ok((training, trainer))
     }
 
-    fn finish(mut self, trainer: &Trainer) -> Result<SceneSummary, Error> {
+    fn finish(mut self, trainer: &Trainer) -> Result<SceneSummary> {
         let variables = match self.config.init {
             // Cropped already, to the sweeps of its first training, which may have been elsewhere in the scene.
             Some(_) => self.variables,
@@ -220,7 +217,7 @@ impl Task for Training<'_> {
     }
 
     /// Eq. 4 and 5.
-    fn loss(&mut self, trainer: &Trainer) -> Result<Tensor, Error> {
+    fn loss(&mut self, trainer: &Trainer) -> Result<Tensor> {
         let (head, cache) = (&self.head, &self.cache);
         let share_done = self.share_done(trainer);
         let rows = self.order.next_batch(share_done)?;
@@ -257,7 +254,7 @@ impl Task for Training<'_> {
         Ok(loss)
     }
 
-    fn stepped(&mut self, trainer: &Trainer, _is_taken: bool) -> Result<(), Error> {
+    fn stepped(&mut self, trainer: &Trainer, _is_taken: bool) -> Result<()> {
         let share_done = self.share_done(trainer);
         if let Some([sweeps, error]) = self.latest.take() {
             self.order.watch(share_done, &sweeps, &error)?;
@@ -265,7 +262,7 @@ impl Task for Training<'_> {
         Ok(())
     }
 
-    fn report(&mut self, trainer: &Trainer) -> Result<(), Error> {
+    fn report(&mut self, trainer: &Trainer) -> Result<()> {
         let means @ [error_m, epsilon_m, refined_m] = self.means.take();
         self.reported = Some(means);
         let text = format!(
@@ -277,7 +274,7 @@ impl Task for Training<'_> {
         Ok(())
     }
 
-    fn validate(&mut self, trainer: &Trainer) -> Result<(), Error> {
+    fn validate(&mut self, trainer: &Trainer) -> Result<()> {
         // A validation right after a report has no newer steps to report.
         if !self.means.is_empty() {
             self.reported = Some(self.means.take());
@@ -306,7 +303,7 @@ fn classifier_time(length: Length) -> Option<Duration> {
 }
 
 /// The configuration of the head for these features.
-fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig, Error> {
+fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig> {
     let (training, format) = (&features.training, &features.format);
     let refiner = || key_grid::covering(&training.targets_m, format.local_channels());
     Ok(SceneHeadConfig {

@@ -3,7 +3,7 @@
 use perception::tensor_values::{tensor, values};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::{Device, TchError};
+use tch::{Device, Result};
 
 use crate::training::{FeatureCache, kmeans};
 use localization::pgc::SceneHead;
@@ -12,11 +12,7 @@ use localization::pgc::SceneHead;
 const SAMPLE: usize = 20_000;
 
 /// Sets both, reproducibly by `seed`.
-pub(super) fn set_statistics(
-    head: &mut SceneHead,
-    cache: &FeatureCache,
-    seed: u64,
-) -> Result<(), TchError> {
+pub(super) fn set_statistics(head: &mut SceneHead, cache: &FeatureCache, seed: u64) -> Result<()> {
     let centre_count = head.config().centres as usize;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let sample = (0..SAMPLE).map(|_| rng.random_range(0..cache.cell_count()));

@@ -8,7 +8,7 @@
 //! of one source.
 
 use protocol::Pose;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Result, Tensor};
 
 use crate::f64_tensor::picked;
 use crate::pastat::config::SearchConfig;
@@ -46,7 +46,7 @@ pub(crate) fn displacements(
     area: &Area,
     known: Option<&Tensor>,
     is_training: bool,
-) -> Result<Displacements, TchError> {
+) -> Result<Displacements> {
     let count = pairs.ego_from_cav.len() as i64;
     let nowhere = Tensor::f_zeros([count, 3], (Kind::Float, pairs.shown.device()))?;
     let config = network.search();
@@ -77,7 +77,7 @@ fn compare_there(
     near: Displacements,
     (searched, far): (&[i64], &Tensor),
     area: &Area,
-) -> Result<Displacements, TchError> {
+) -> Result<Displacements> {
     let moved = rows_where(&far.f_count_nonzero_dim_intlist([1_i64].as_slice())?)?;
     if moved.is_empty() {
         return Ok(near);
@@ -99,7 +99,7 @@ fn compare_again(
     pairs: &Pairs,
     found: Displacements,
     area: &Area,
-) -> Result<Displacements, TchError> {
+) -> Result<Displacements> {
     let rows = rows_where(&is_large(&found.deltas)?.f_squeeze_dim(1)?)?;
     if rows.is_empty() {
         return Ok(found);
@@ -109,7 +109,7 @@ fn compare_again(
 }
 
 /// `[K, 1]`: true for displacements `[K, 3]` by more than [`AGAIN_M`].
-fn is_large(deltas: &Tensor) -> Result<Tensor, TchError> {
+fn is_large(deltas: &Tensor) -> Result<Tensor> {
     deltas
         .f_narrow(1, 0, 2)?
         .f_square()?
@@ -118,7 +118,7 @@ fn is_large(deltas: &Tensor) -> Result<Tensor, TchError> {
 }
 
 /// Displacements `[K, 3]`, zeros in place of small ones, which the comparison at the poses finds.
-fn large_only(deltas: &Tensor) -> Result<Tensor, TchError> {
+fn large_only(deltas: &Tensor) -> Result<Tensor> {
     deltas.f_mul(&is_large(deltas)?)
 }
 
@@ -130,20 +130,15 @@ fn large_only(deltas: &Tensor) -> Result<Tensor, TchError> {
 /// comparison.
 ///
 /// The maps are on the grid of `area`.
-fn offsets(
-    pairs: &Pairs,
-    area: &Area,
-    config: SearchConfig,
-    train: bool,
-) -> Result<Tensor, TchError> {
-    let (cells, radius) = (config.cells / area.cells(), config.radius);
+fn offsets(pairs: &Pairs, area: &Area, config: SearchConfig, train: bool) -> Result<Tensor> {
+    let (cells, radius) = (config.cells / area.cells, config.radius);
     let (edges, none): ([i64; 2], [i64; 2]) = ([cells; 2], [0; 2]);
     let large = |maps: &Tensor| {
         let maps = maps.f_detach()?;
         maps.f_avg_pool2d(edges, edges, none, false, true, None::<i64>)
     };
     let maps = [&large(&pairs.ego)?, &large(&pairs.shown)?];
-    let cell_m = area.cell_m() * cells as f64;
+    let cell_m = area.cell_m * cells as f64;
     let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
     if train {
         let _ = fit
@@ -174,7 +169,7 @@ fn turned_tries(
     area: &Area,
     cell_m: f64,
     radius: i64,
-) -> Result<Vec<(Tensor, Tensor)>, TchError> {
+) -> Result<Vec<(Tensor, Tensor)>> {
     let turned = turned(others, &TURNS_RAD, ego_from_cav, area)?;
     // All at once, as the ego's map at each shift is the same for all.
     let fit = Shifted::new(ego, radius, 1)?
@@ -191,12 +186,7 @@ fn turned_tries(
 }
 
 /// All maps rotated about their senders by the first of some angles, then by the second, and so on.
-fn turned(
-    maps: &Tensor,
-    turns_rad: &[f64],
-    ego_from_cav: &[Pose],
-    area: &Area,
-) -> Result<Tensor, TchError> {
+fn turned(maps: &Tensor, turns_rad: &[f64], ego_from_cav: &[Pose], area: &Area) -> Result<Tensor> {
     let (count, _, rows, columns) = maps.size4()?;
     let deltas: Vec<f32> = turns_rad
         .iter()

@@ -13,11 +13,12 @@ pub(crate) struct Area {
     half_m: [f64; 2],
     /// Rows and columns.
     size: [i64; 2],
-    cell_m: f64,
+    /// Edge of a cell, metres.
+    pub(crate) cell_m: f64,
     /// Cells of the ego's grid along each edge of a cell.
-    cells: i64,
+    pub(crate) cells: i64,
     /// Largest offset between compared cells, cells.
-    radius: i64,
+    pub(crate) radius: i64,
 }
 
 impl Area {
@@ -54,16 +55,6 @@ impl Area {
         }
     }
 
-    /// Edge of a cell, metres.
-    pub(crate) fn cell_m(&self) -> f64 {
-        self.cell_m
-    }
-
-    /// Cells of the ego's grid along each edge of a cell.
-    pub(crate) fn cells(&self) -> i64 {
-        self.cells
-    }
-
     /// Positions of vehicles, metres from the centre of the area, `[N, 2]`.
     pub(crate) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
         let place = |pose: &Pose| {
@@ -71,11 +62,6 @@ impl Area {
         };
         let places: Vec<f32> = ego_from_cav.iter().flat_map(place).collect();
         Tensor::f_from_slice(&places)?.f_view([-1, 2])
-    }
-
-    /// Largest offset between compared cells, cells.
-    pub(crate) fn radius(&self) -> i64 {
-        self.radius
     }
 
     /// `[PARTS^2, 2]`: centres of the compared parts, metres from the centre of the area.

@@ -3,7 +3,7 @@
 use std::cell::OnceCell;
 
 use multiversion::multiversion;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Result, Tensor};
 
 use crate::f64_tensor::{are_numbers, numbers};
 use crate::vector_loops::{LANES, add_products};
@@ -28,7 +28,7 @@ pub(crate) struct Correlation {
 
 /// The shifts in the order of [`Correlation`], `[K, 2]`: cells along x and y from a cell of a neighbour's map to the
 /// cell of the ego's that it is compared with.
-pub(crate) fn shifts(radius: i64) -> Result<Tensor, TchError> {
+pub(crate) fn shifts(radius: i64) -> Result<Tensor> {
     let steps = || -radius..=radius;
     let all: Vec<f32> = steps()
         .flat_map(|row| steps().flat_map(move |column| [column as f32, row as f32]))
@@ -54,7 +54,7 @@ pub(crate) struct Shifted {
 impl Shifted {
     /// `ego` `[1, M, H, W]`, `H` and `W` multiples of `parts`, moved by up to `radius` cells, in `parts` parts along
     /// each edge. No gradient flows into it: the same layers learn from the other map.
-    pub(crate) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self, TchError> {
+    pub(crate) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self> {
         let ego = ego.f_detach()?;
         let around = ego.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
         let numbers = if are_numbers(&around) {
@@ -74,7 +74,7 @@ impl Shifted {
     }
 
     /// Compares it with the maps of `others`, `[N, M, H, W]`.
-    pub(crate) fn correlate(&self, others: &Tensor) -> Result<Correlation, TchError> {
+    pub(crate) fn correlate(&self, others: &Tensor) -> Result<Correlation> {
         let products = match &self.numbers {
             Some(own) if are_numbers(others) && others.size4()?.0 <= FEW_MAPS => {
                 self.sums(own, others)?
@@ -95,7 +95,7 @@ impl Shifted {
     }
 
     /// `[parts^2, K, M * H/parts * W/parts]`: the map at every shift.
-    fn maps(&self) -> Result<&Tensor, TchError> {
+    fn maps(&self) -> Result<&Tensor> {
         if let Some(maps) = self.maps.get() {
             return Ok(maps);
         }
@@ -118,7 +118,7 @@ impl Shifted {
 
     /// `[parts^2, N, K]`: for each part, map and shift the sum of the products with the ego's map, `own`, in plain
     /// floats.
-    fn sums(&self, own: &[f32], others: &Tensor) -> Result<Tensor, TchError> {
+    fn sums(&self, own: &[f32], others: &Tensor) -> Result<Tensor> {
         let (count, channels, height, width) = others.size4()?;
         let values = numbers(others)?;
         let [channels, height, width, parts, radius] =
@@ -161,7 +161,7 @@ fn add_shifted(sums: &mut [[f32; LANES]], shown: &[f32], own: &[f32]) {
 }
 
 /// `[parts^2, N, M * H/parts * W/parts]` of maps `[N, M, H, W]`.
-fn by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
+fn by_part(maps: &Tensor, parts: i64) -> Result<Tensor> {
     let (count, channels, height, width) = maps.size4()?;
     maps.f_reshape([count, channels, parts, height / parts, parts, width / parts])?
         .f_permute([2, 4, 0, 1, 3, 5])?
@@ -169,7 +169,7 @@ fn by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
 }
 
 /// `[parts^2, N]`: sums of maps `[N, M, H, W]` over each part.
-fn sum_by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
+fn sum_by_part(maps: &Tensor, parts: i64) -> Result<Tensor> {
     let (count, channels, height, width) = maps.size4()?;
     let by_part = [count, channels, parts, height / parts, parts, width / parts];
     // Summed where they are: by_part would copy them.
@@ -181,11 +181,7 @@ fn sum_by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
 
 /// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by
 /// `exp(sharpness * correlation)`.
-pub(crate) fn peaks(
-    correlation: &Tensor,
-    sharpness: &Tensor,
-    shifts: &Tensor,
-) -> Result<Tensor, TchError> {
+pub(crate) fn peaks(correlation: &Tensor, sharpness: &Tensor, shifts: &Tensor) -> Result<Tensor> {
     (correlation * sharpness)
         .f_softmax(-1, None)?
         .f_matmul(shifts)

@@ -206,7 +206,7 @@ fn moved_maps(
     let own = Area::new(
         grid,
         [i64::from(grid.height), i64::from(grid.width)],
-        area.radius(),
+        area.radius,
     );
     let (deltas, poses) = (
         deltas.f_narrow(0, 0, count)?,

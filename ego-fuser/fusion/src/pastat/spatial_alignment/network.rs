@@ -4,7 +4,7 @@ use std::rc::Rc;
 
 use protocol::Pose;
 use tch::nn::{self, Init, Module};
-use tch::{TchError, Tensor};
+use tch::{Result, Tensor};
 
 use super::area::{Area, resample, sampling_grid};
 use super::correlation::{PARTS, Shifted, peaks, shifts};
@@ -74,10 +74,7 @@ impl AlignmentNetwork {
     }
 
     /// The reduced channels in which maps are compared.
-    pub(crate) fn reduced(
-        &self,
-        WarpedMaps { features, mask }: &WarpedMaps,
-    ) -> Result<WarpedMaps, TchError> {
+    pub(crate) fn reduced(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<WarpedMaps> {
         Ok(WarpedMaps {
             features: pointwise(&self.matching[0], features)?,
             mask: mask.shallow_clone(),
@@ -96,10 +93,10 @@ impl AlignmentNetwork {
         confidences: &Tensor,
         ego_from_cav: &[Pose],
         area: &Area,
-    ) -> Result<Pairs, TchError> {
+    ) -> Result<Pairs> {
         let (ego, shown) = (self.shown(ego)?, self.shown(others)?);
         Ok(Pairs {
-            own: Rc::new(Shifted::new(&ego, area.radius(), PARTS)?),
+            own: Rc::new(Shifted::new(&ego, area.radius, PARTS)?),
             ego,
             shown,
             mask: others.mask.shallow_clone(),
@@ -114,11 +111,11 @@ impl AlignmentNetwork {
         pairs: &Pairs,
         deltas: &Tensor,
         area: &Area,
-    ) -> Result<Displacements, TchError> {
+    ) -> Result<Displacements> {
         let ego_from_cav = &pairs.ego_from_cav;
         let device = deltas.device();
         let found = pairs.own.correlate(&moved(pairs, deltas, area)?)?;
-        let shifts = (shifts(area.radius())? * area.cell_m()).f_to_device(device)?;
+        let shifts = (shifts(area.radius)? * area.cell_m).f_to_device(device)?;
         let sharpness = self.sharpness.f_exp()?;
         let parts = peaks(&found.parts, &sharpness, &shifts)?;
         let whole = peaks(&found.whole, &sharpness, &shifts)?;
@@ -153,7 +150,7 @@ impl AlignmentNetwork {
 
     /// `[K, 3]` from the network's output `learnt` `[K, 6]`, an addition and the share of the `motion` `[K, 3]`, within
     /// bounds.
-    fn bounded(&self, learnt: &Tensor, motion: Tensor) -> Result<Tensor, TchError> {
+    fn bounded(&self, learnt: &Tensor, motion: Tensor) -> Result<Tensor> {
         let shift_m = self.config.max_shift_m as f32;
         let bounds = Tensor::f_from_slice(&[shift_m, shift_m, self.config.max_turn_rad as f32])?;
         let bounds = bounds.f_to_device(motion.device())?;
@@ -162,7 +159,7 @@ impl AlignmentNetwork {
     }
 
     /// Compared form of maps, `[N, M, H, W]`: zero mean over the valid cells, so that empty road matches nothing.
-    fn shown(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor, TchError> {
+    fn shown(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor> {
         let shown = self.matching[1].forward(&features.f_relu()?);
         let over_map =
             |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
@@ -172,7 +169,7 @@ impl AlignmentNetwork {
 }
 
 /// Compared form of others, moved by `deltas` `[K, 3]`.
-fn moved(pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor, TchError> {
+fn moved(pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor> {
     let shown = &pairs.shown;
     if deltas.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
         return Ok(shown.shallow_clone());
@@ -190,12 +187,7 @@ fn moved(pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor, TchError
 /// - `parts`: `[PARTS^2, N, 2]` shifts, metres
 /// - `weight`: `[PARTS^2, N]`, confidence of each of them
 /// - `senders`: `[N, 2]`, positions of the maps' senders, metres from the centre of `area`
-fn rigid_motion(
-    parts: &Tensor,
-    weight: &Tensor,
-    senders: &Tensor,
-    area: &Area,
-) -> Result<Tensor, TchError> {
+fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) -> Result<Tensor> {
     let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
     let share = weight / over_parts(weight)?.f_add_scalar(EPSILON)?;
     let share = share.f_unsqueeze(2)?;

@@ -1,7 +1,7 @@
 //! Attention among the tokens of one cell, over agents and time, and among the tokens of one map, within windows.
 
 use tch::nn::{self, Init, Module};
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Result, Tensor};
 
 use super::window_loops::{Windows, attend};
 use crate::f64_tensor::{are_numbers, numbers};
@@ -47,7 +47,7 @@ impl AgentAttention {
     /// - `tokens`: `[N, h, w, D]`, the ego's newest first
     /// - `valid`: `[N, h, w]`, 1 for valid tokens
     /// - returns: `[1, h, w, D]`
-    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor> {
         let (entries, height, width, dim) = tokens.size4()?;
         let (cells, each) = (height * width, dim / self.heads);
         let query = self.query.forward(&tokens.f_narrow(0, 0, 1)?) / (each as f64).sqrt();
@@ -74,7 +74,7 @@ impl AgentAttention {
         norm: &nn::LayerNorm,
         ego: &Tensor,
         others: &Others,
-    ) -> Result<Tensor, TchError> {
+    ) -> Result<Tensor> {
         let (_, height, width, dim) = ego.size4()?;
         let (cells, each) = (height * width, dim / self.heads);
         let by_channel = |tokens: &Tensor| tokens.f_view([cells, dim])?.f_transpose(0, 1);
@@ -148,7 +148,7 @@ impl WindowAttention {
     /// - `tokens`: `[N, h, w, D]`, `h` and `w` multiples of every window
     /// - `valid`: `[N, h, w]`, 1 for valid tokens
     /// - returns: `[N, h, w, D]`
-    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor> {
         let (entries, height, width, dim) = tokens.size4()?;
         let share = dim / self.sizes.len() as i64;
         let projected = self.query_key_value.forward(tokens);
@@ -178,12 +178,7 @@ impl WindowAttention {
         Ok(self.out.forward(&Tensor::f_cat(&parts, 3)?))
     }
 
-    fn within(
-        &self,
-        size: &WindowSize,
-        parts: [Tensor; 3],
-        valid: &Tensor,
-    ) -> Result<Tensor, TchError> {
+    fn within(&self, size: &WindowSize, parts: [Tensor; 3], valid: &Tensor) -> Result<Tensor> {
         let (entries, height, width, share) = parts[0].size4()?;
         let (edge, each) = (size.edge, share / self.heads);
         let (down, across) = (height / edge, width / edge);
@@ -219,7 +214,7 @@ impl WindowAttention {
     }
 
     /// `[heads, edge^2, edge^2]`.
-    fn preference(&self, size: &WindowSize) -> Result<Tensor, TchError> {
+    fn preference(&self, size: &WindowSize) -> Result<Tensor> {
         let tokens = size.edge * size.edge;
         let places = Tensor::f_from_slice(&size.places)?.f_to_device(size.bias.device())?;
         size.bias

@@ -1,7 +1,7 @@
 //! The transformer's blocks: attention, then an MLP, both pre-norm with a residual (Eq. 8 and 9).
 
 use tch::nn::{self, Module};
-use tch::{TchError, Tensor};
+use tch::{Result, Tensor};
 
 use super::attention::{AgentAttention, WindowAttention};
 use crate::pastat::config::PastatConfig;
@@ -38,7 +38,7 @@ impl Block {
     /// - `tokens`: `[N, h, w, D]`, the ego's newest first
     /// - `valid`: `[N, h, w]`
     /// - returns: `[1, h, w, D]`
-    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor> {
         let attended = self.agents.forward(&self.norms[0].forward(tokens), valid)?;
         let kept = attended + tokens.f_narrow(0, 0, 1)?;
         self.across(&kept, &valid.f_narrow(0, 0, 1)?)
@@ -46,18 +46,13 @@ impl Block {
 
     /// The ego's newest `[1, h, w, D]` after this block, in plain floats: the result of
     /// [`forward`](Self::forward).
-    pub(super) fn gather(
-        &self,
-        ego: &Tensor,
-        others: &Others,
-        valid: &Tensor,
-    ) -> Result<Tensor, TchError> {
+    pub(super) fn gather(&self, ego: &Tensor, others: &Others, valid: &Tensor) -> Result<Tensor> {
         let kept = self.agents.gather(&self.norms[0], ego, others)? + ego;
         self.across(&kept, valid)
     }
 
     /// Second half of the block, after the attention over agents and time: across cells, and cell by cell.
-    fn across(&self, kept: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+    fn across(&self, kept: &Tensor, valid: &Tensor) -> Result<Tensor> {
         let [_, norm_windows, norm_mlp] = &self.norms;
         let kept = self.windows.forward(&norm_windows.forward(kept), valid)? + kept;
         let inner = self.mlp[0]

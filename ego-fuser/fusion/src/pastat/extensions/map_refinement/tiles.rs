@@ -7,7 +7,7 @@ use crate::pastat::extensions::LEAST_LIKELY;
 use crate::warp::Samples;
 
 /// Edge of a tile, cells.
-pub(super) const EDGE: i64 = 8;
+const EDGE: i64 = 8;
 /// Cells around a tile on which two 3x3 convolutions depend.
 const MARGIN: i64 = 2;
 /// Cells around a tile on which the second depends.

@@ -11,7 +11,7 @@ mod selection;
 
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, Init, Module};
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Device, Kind, Result, Tensor};
 
 use self::selection::{AROUND, Selection};
 use super::LEAST_LIKELY;
@@ -69,7 +69,7 @@ impl TemporalMemory {
         coarse: &CoarseMaps,
         fine: &FineMaps,
         context: &Tensor,
-    ) -> Result<Tensor, TchError> {
+    ) -> Result<Tensor> {
         let earlier = aligned
             .earlier
             .as_ref()
@@ -99,7 +99,7 @@ impl TemporalMemory {
         maps: &'a [FullResolutionMap],
         coarse: &CoarseMaps,
         corrections: Option<&Tensor>,
-    ) -> Result<Vec<(usize, Pose, &'a FullResolutionMap)>, TchError> {
+    ) -> Result<Vec<(usize, Pose, &'a FullResolutionMap)>> {
         let steps = self.step.size()[0] as usize - 1;
         let origins = &coarse.origins;
         let first = origins.count() - coarse.earlier_entries.len();
@@ -166,7 +166,7 @@ impl TemporalMemory {
         past: &Earlier<'_>,
         ego: &Tensor,
         likely: &Tensor,
-    ) -> Result<Tensor, TchError> {
+    ) -> Result<Tensor> {
         let (_, channels, height, width) = now.size4()?;
         let least = if are_numbers(now) {
             LEAST_LIKELY
@@ -204,13 +204,7 @@ impl TemporalMemory {
     }
 
     /// `[P, C]`: weight of the `features` `[R, C]` of a time step, given the tokens' features `known` `[P, hidden]`.
-    fn gate(
-        &self,
-        step: usize,
-        features: &Tensor,
-        known: &Tensor,
-        at: &Places,
-    ) -> Result<Tensor, TchError> {
+    fn gate(&self, step: usize, features: &Tensor, known: &Tensor, at: &Places) -> Result<Tensor> {
         let step = self.step.f_get(step as i64)?;
         let hidden = (beside(&self.past, features, &at.around)? + known + step).f_relu()?;
         hidden
@@ -219,7 +213,7 @@ impl TemporalMemory {
     }
 
     /// Features of the tokens, on the cells of some `patches`: `[P, hidden]`.
-    fn token_features(&self, ego: &Tensor, patches: &Tensor) -> Result<Tensor, TchError> {
+    fn token_features(&self, ego: &Tensor, patches: &Tensor) -> Result<Tensor> {
         let features = self
             .token
             .forward(&ego.f_flatten(0, 2)?.f_index_select(0, patches)?);
@@ -235,11 +229,7 @@ impl TemporalMemory {
 /// Shift along x and y, metres, and rotation, radians: corrections of the entries from `first` on, the earlier ones,
 /// given those of all but the very first, `corrections` `[N - 1, 3]`. A correction close to that of its agent's newest
 /// map is replaced by it.
-fn settled(
-    origins: &Origins,
-    corrections: &Tensor,
-    first: usize,
-) -> Result<Vec<[f64; 3]>, TchError> {
+fn settled(origins: &Origins, corrections: &Tensor, first: usize) -> Result<Vec<[f64; 3]>> {
     let corrections = Vec::<f64>::try_from(
         corrections
             .f_detach()?
@@ -281,7 +271,7 @@ struct Places {
 }
 
 impl Places {
-    fn of(selection: &Selection, width: i64, device: Device) -> Result<Self, TchError> {
+    fn of(selection: &Selection, width: i64, device: Device) -> Result<Self> {
         let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(device);
         let near: Vec<i64> = selection
             .near
@@ -310,7 +300,7 @@ struct Around {
 impl Around {
     /// Given the indices `[P, 9]` of the cells around each among those that are shown; the index after the last is
     /// beyond the edge.
-    fn of(around: &Tensor) -> Result<Self, TchError> {
+    fn of(around: &Tensor) -> Result<Self> {
         let options = (Kind::Int64, around.device());
         let results = (around * AROUND + Tensor::f_arange(AROUND, options)?).f_flatten(0, 1)?;
         Ok(Self {
@@ -324,7 +314,7 @@ impl Around {
 ///
 /// Each cell is multiplied with all nine weights first: the nine results that a cell needs are fewer numbers than the
 /// features of nine cells.
-fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<Tensor, TchError> {
+fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<Tensor> {
     let hidden = convolution.ws.size4()?.0;
     let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?;
     let shown = shown.f_constant_pad_nd([0, 0, 0, 1])?;

@@ -1,6 +1,6 @@
 //! Selection of the cells in which earlier maps are blended in.
 
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Result, Tensor};
 
 use crate::f64_tensor::{above, largest};
 
@@ -39,12 +39,7 @@ pub(super) struct Selection {
 impl Selection {
     /// Up to a `share` of all patches of `patch` cells along each edge, at least one: those with the highest likelihood
     /// of a vehicle in or close to them by `likely` `[1, 1, H, W]`, and `least`. H and W are multiples of `patch`.
-    pub(super) fn most_likely(
-        likely: &Tensor,
-        patch: i64,
-        share: f64,
-        least: f32,
-    ) -> Result<Self, TchError> {
+    pub(super) fn most_likely(likely: &Tensor, patch: i64, share: f64, least: f32) -> Result<Self> {
         let (_, _, height, width) = likely.size4()?;
         let window = patch + 2 * MARGIN_CELLS;
         let margin = [MARGIN_CELLS; 2];
