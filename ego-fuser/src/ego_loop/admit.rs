@@ -9,6 +9,7 @@ use protocol::{
 use super::{EgoLoop, Message, Output, OwnFrame, Reception, Source};
 use crate::capture_clock::SweepTime;
 use crate::ego::{Content, Ego, View};
+use crate::pairing::Dropped;
 
 /// Largest lead of a neighbour's message over the newest of the ego's own, nanoseconds: its computer may be faster.
 const MAX_AHEAD_NANOS: u64 = 2_000_000_000;
@@ -110,7 +111,7 @@ impl EgoLoop {
         self.silence.reset(&cav);
         let capture_nanos = message.view.capture_nanos;
         if let Some(lost) = self.pairing.insert(&source, capture_nanos, message) {
-            self.drop_message(lost.sender, lost.reason);
+            self.drop_lost(lost);
         }
     }
 
@@ -180,6 +181,7 @@ impl EgoLoop {
                     .turn_back(&source, capture_nanos, MAX_AHEAD_NANOS);
                 self.drop_messages(&source, gone, DropReason::Stale);
             }
+            self.fused_nanos.clear();
             ego.forget();
         }
         self.own_nanos = Some(capture_nanos);
@@ -229,6 +231,7 @@ impl EgoLoop {
         self.models.forget(cav);
         self.box_senders.remove(cav);
         self.without_map.remove(cav);
+        self.fused_nanos.remove(cav);
         self.clocks.forget(cav);
         self.clock_offsets_s.remove(cav);
         self.ended.remove(cav);
@@ -245,6 +248,19 @@ impl EgoLoop {
     fn empty(&mut self, source: &Source, reason: DropReason) {
         let unused = self.pairing.forget(source);
         self.drop_messages(source, unused, reason);
+    }
+
+    /// Drops a message that was not used. Boxes that came after the map of their sweep was fused are not missing.
+    pub(super) fn drop_lost(&mut self, lost: Dropped<Source>) {
+        let (cav, stream) = &lost.sender;
+        let fused_nanos = self.fused_nanos.get(cav).copied();
+        let is_late = *stream != self.stream && fused_nanos >= Some(lost.capture_nanos);
+        let reason = if is_late {
+            DropReason::Unneeded
+        } else {
+            lost.reason
+        };
+        self.drop_message(lost.sender, reason);
     }
 
     pub(super) fn drop_message(&mut self, source: Source, reason: DropReason) {

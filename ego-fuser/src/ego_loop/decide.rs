@@ -55,7 +55,7 @@ impl EgoLoop {
     fn finish(&mut self) {
         let (_, dropped) = self.pairing.pair(u64::MAX);
         for lost in dropped {
-            self.outputs.push(Output::Dropped(lost.sender, lost.reason));
+            self.drop_lost(lost);
         }
         self.is_finished = true;
     }
@@ -189,8 +189,8 @@ impl EgoLoop {
                 wire_bytes: message.wire_bytes,
             });
         }
-        for lost in &dropped {
-            self.drop_message(lost.sender.clone(), lost.reason);
+        for lost in dropped.iter().cloned() {
+            self.drop_lost(lost);
         }
         for cav in &self.members {
             let source = (cav.clone(), self.stream);
@@ -226,6 +226,10 @@ impl EgoLoop {
         for &index in fused {
             let (view, message) = (&choice.views[index], &choice.messages[index]);
             self.report.fused_boxes += u64::from(message.stream != self.stream);
+            if message.stream == self.stream {
+                let cav = view.cav.clone();
+                self.fused_nanos.insert(cav, view.capture_nanos);
+            }
             self.count(view, message, None);
             described.push(FusedNeighbour {
                 cav: view.cav.clone(),

@@ -103,6 +103,8 @@ pub struct EgoLoop {
     box_senders: BTreeSet<CavId>,
     /// Consecutive frames that were decided before the feature map of their time, of each neighbour that sends maps.
     without_map: BTreeMap<CavId, u32>,
+    /// Capture time of the newest message of its stream that was fused, by neighbour, nanoseconds.
+    fused_nanos: BTreeMap<CavId, u64>,
     options: LoopOptions,
     members: BTreeSet<CavId>,
     silence: Silence,
@@ -135,6 +137,7 @@ impl EgoLoop {
             reads_boxes: ego.reads_boxes(),
             box_senders: BTreeSet::new(),
             without_map: BTreeMap::new(),
+            fused_nanos: BTreeMap::new(),
             waits: Waits::new(cav, ego.method().name(), stream, ego.reads_boxes()),
             options,
             members: BTreeSet::new(),

@@ -191,7 +191,7 @@ fn a_fleet_runs_over_an_emulated_link() {
 fn a_neighbour_that_sends_boxes_is_fused_where_the_weights_read_them() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    let link = "capacity: {token_bucket: {bandwidth_mbps: 1}}\nlatency: {constant_ms: 10}\n";
+    let link = "capacity: {token_bucket: {bandwidth_mbps: 50}}\nlatency: {constant_ms: 10}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
     let weights = folder.path().join("weights.safetensors");
     let mut scenario = PathBuf::new();
@@ -211,6 +211,7 @@ fn a_neighbour_that_sends_boxes_is_fused_where_the_weights_read_them() {
         assert_eq!(counts, [1; 4], "{boxes}");
         let dropped = ledger["total"]["dropped"]["unneeded"].as_u64();
         assert_eq!(dropped.unwrap_or(0), unneeded, "{}", ledger["total"]);
+        fs::remove_dir_all(&up.folder).unwrap();
     }
 
     write_sighted_weights(&weights);

@@ -517,13 +517,13 @@ fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
     let unneeded = ledger.total().dropped.get(&DropReason::Unneeded).copied();
     assert_eq!(unneeded, Some(2 * TICKS as u64), "boxes of two neighbours");
 
-    // A map takes 250 ms.
+    // A map takes 120 ms, more than the ego waits.
     let map_bytes = maps[0].result.fused[0].payload_bytes;
     let slow = LinkConfig {
-        capacity: CapacityConfig::of_mbps(8e-6 * map_bytes as f64 / 0.25),
+        capacity: CapacityConfig::of_mbps(8e-6 * map_bytes as f64 / 0.12),
         queue: QueueConfig {
             keep_last: true,
-            urgent_bytes: 3000,
+            urgent_bytes: map_bytes / 2,
             ..QueueConfig::default()
         },
         ..LinkConfig::default()
@@ -536,11 +536,13 @@ fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
         })
         .collect();
     assert_eq!(waits_ms[..3], [100; 3], "{waits_ms:?}");
-    assert!(waits_ms[3..].iter().all(|ms| *ms < 60), "{waits_ms:?}");
+    assert!(waits_ms[3..].iter().all(|ms| *ms < 80), "{waits_ms:?}");
     for frame in &late {
-        assert_eq!(ages_ms(frame), [0, 0]);
-        let mut fused = frame.result.fused.iter();
-        assert!(fused.all(|one| one.payload_bytes < map_bytes / 2));
+        for fused in &frame.result.fused {
+            // A map of one sweep before comes before boxes.
+            let is_map = fused.payload_bytes > map_bytes / 2;
+            assert_eq!(fused.age_nanos / MS as i64, if is_map { 100 } else { 0 });
+        }
     }
 }
 
