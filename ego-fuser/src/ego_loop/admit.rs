@@ -231,11 +231,11 @@ impl EgoLoop {
         self.models.forget(cav);
         self.box_senders.remove(cav);
         self.without_map.remove(cav);
-        self.fused_nanos.remove(cav);
         self.clocks.forget(cav);
         self.clock_offsets_s.remove(cav);
         self.ended.remove(cav);
         self.empty_all(cav, DropReason::Stale);
+        self.fused_nanos.remove(cav);
     }
 
     /// Drops the messages of a neighbour that wait.
@@ -246,21 +246,30 @@ impl EgoLoop {
     }
 
     fn empty(&mut self, source: &Source, reason: DropReason) {
+        let newest_nanos = self.pairing.capture_times(source).last();
+        let reason = self.reason_of(source, newest_nanos.unwrap_or(0), reason);
         let unused = self.pairing.forget(source);
         self.drop_messages(source, unused, reason);
     }
 
-    /// Drops a message that was not used. Boxes that came after the map of their sweep was fused are not missing.
+    /// Drops a message that was not used.
     pub(super) fn drop_lost(&mut self, lost: Dropped<Source>) {
-        let (cav, stream) = &lost.sender;
-        let fused_nanos = self.fused_nanos.get(cav).copied();
-        let is_late = *stream != self.stream && fused_nanos >= Some(lost.capture_nanos);
-        let reason = if is_late {
-            DropReason::Unneeded
-        } else {
-            lost.reason
-        };
+        let reason = self.reason_of(&lost.sender, lost.capture_nanos, lost.reason);
         self.drop_message(lost.sender, reason);
+    }
+
+    /// Reason why a message was not used. Boxes that came after the map of their sweep was fused are not missing.
+    fn reason_of(
+        &self,
+        (cav, stream): &Source,
+        capture_nanos: u64,
+        reason: DropReason,
+    ) -> DropReason {
+        let is_fused = self.fused_nanos.get(cav) >= Some(&capture_nanos);
+        match is_fused && *stream != self.stream {
+            true => DropReason::Unneeded,
+            false => reason,
+        }
     }
 
     pub(super) fn drop_message(&mut self, source: Source, reason: DropReason) {
