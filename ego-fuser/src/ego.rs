@@ -34,8 +34,8 @@ use fusion::{AlignedMaps, MapMetadata, ReceivedMaps};
 pub use crate::view::{Content, View};
 pub use error::EgoError;
 
-/// Lag of a neighbour's newest map behind its newest boxes from which on the boxes are fused, nanoseconds: maps of one sweep
-/// before earn more than boxes, maps of three sweeps before less (`deploy/results/experiments.md`).
+/// Lag of a neighbour's newest map behind its newest boxes beyond which the boxes are fused, nanoseconds: at 10 Hz maps of
+/// one sweep before earn more than boxes, maps of three sweeps before less (`deploy/results/experiments.md`).
 const MAP_LAG_NANOS: i64 = 100_000_000;
 
 /// Reason why a neighbour is not in a result.
@@ -247,10 +247,6 @@ impl Ego {
             });
         }
         self.history.advance(own.capture_nanos);
-        let mut aligned = vec![Aligned {
-            view: own,
-            ego_from_cav: Pose::IDENTITY,
-        }];
         if let Some(compensation) = &mut self.compensation {
             compensation.forget_absent(own.capture_nanos);
         }
@@ -260,51 +256,56 @@ impl Ego {
                 None => Cow::Borrowed(view),
             })
             .collect();
-        let mut fused = Vec::new();
-        let mut skipped = Vec::new();
-        for (index, view) in carried.iter().map(Cow::as_ref).enumerate() {
-            match self.align(own, view) {
-                Ok(ego_from_cav) => {
-                    aligned.push(Aligned { view, ego_from_cav });
-                    fused.push(index);
-                }
-                Err(reason) => skipped.push((index, reason)),
-            }
-        }
-        let mut leave_out =
-            |is_out: &[bool], reason, fused: &mut Vec<usize>, aligned: &mut Vec<_>| {
-                let left_out = fused.iter().zip(is_out).filter(|(_, is_out)| **is_out);
-                skipped.extend(left_out.map(|(&index, _)| (index, Skipped::Unusable(reason))));
-                *fused = keep(std::mem::take(fused), is_out);
-                let mut others = keep(aligned.split_off(1), is_out);
-                aligned.append(&mut others);
-            };
-        // Of each neighbour the best: boxes stand in for a map that has not come.
-        let is_unneeded: Vec<bool> = { aligned[1..].iter() }
-            .map(|one: &Aligned<'_>| one.is_unneeded_beside(&aligned))
-            .collect();
-        leave_out(&is_unneeded, DropReason::Unneeded, &mut fused, &mut aligned);
+        let mut chosen = self.choose(own, &carried);
         let mut stages = StageTimes::start();
         let mut beliefs = Vec::new();
-        if self.trust.is_some() && !fused.is_empty() {
-            let found = self.judge(&aligned)?;
+        if self.trust.is_some() && !chosen.fused.is_empty() {
+            let found = self.judge(&chosen.aligned)?;
             let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
-            beliefs = fused.iter().copied().zip(found).collect();
-            leave_out(&is_out, DropReason::Misbehaviour, &mut fused, &mut aligned);
+            beliefs = chosen.fused.iter().copied().zip(found).collect();
+            chosen.leave_out(&is_out, DropReason::Misbehaviour);
             stages.lap("trust");
         }
+        let aligned = &chosen.aligned;
         let detections = no_grad(|| match needed {
-            Exchange::Boxes => Ok(self.merge_boxes(&aligned, &mut stages)),
-            Exchange::Points => self.merge_points(&aligned, &mut stages),
-            Exchange::Features | Exchange::Nothing => self.merge_features(&aligned, &mut stages),
+            Exchange::Boxes => Ok(self.merge_boxes(aligned, &mut stages)),
+            Exchange::Points => self.merge_points(aligned, &mut stages),
+            Exchange::Features | Exchange::Nothing => self.merge_features(aligned, &mut stages),
         })?;
         Ok(EgoOutput {
             detections,
-            fused,
-            skipped,
+            fused: chosen.fused,
+            skipped: chosen.skipped,
             beliefs,
             stages: stages.into_timings(),
         })
+    }
+
+    /// The views that can be fused: of each neighbour its map, or its boxes where they are better.
+    fn choose<'a>(&self, own: &'a View, neighbours: &'a [Cow<'_, View>]) -> Choice<'a> {
+        let ego_from_cav = Pose::IDENTITY;
+        let mut choice = Choice {
+            aligned: vec![Aligned {
+                view: own,
+                ego_from_cav,
+            }],
+            fused: Vec::new(),
+            skipped: Vec::new(),
+        };
+        for (index, view) in neighbours.iter().map(Cow::as_ref).enumerate() {
+            match self.align(own, view) {
+                Ok(ego_from_cav) => {
+                    choice.aligned.push(Aligned { view, ego_from_cav });
+                    choice.fused.push(index);
+                }
+                Err(reason) => choice.skipped.push((index, reason)),
+            }
+        }
+        let others = choice.aligned[1..].iter();
+        let is_unneeded = others.map(|view| view.is_unneeded_beside(&choice.aligned));
+        let is_unneeded: Vec<bool> = is_unneeded.collect();
+        choice.leave_out(&is_unneeded, DropReason::Unneeded);
+        choice
     }
 
     /// Assessment of each of the neighbours, which follow the ego itself.
@@ -557,6 +558,28 @@ fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
     }
 }
 
+/// Views of a frame.
+struct Choice<'a> {
+    /// The ego's own, then one for each of `fused`.
+    aligned: Vec<Aligned<'a>>,
+    /// Indices of the neighbours that are fused.
+    fused: Vec<usize>,
+    /// The others, each with its reason.
+    skipped: Vec<(usize, Skipped)>,
+}
+
+impl Choice<'_> {
+    /// Leaves the marked of the fused neighbours out.
+    fn leave_out(&mut self, is_out: &[bool], reason: DropReason) {
+        let left_out = self.fused.iter().zip(is_out).filter(|(_, is_out)| **is_out);
+        let left_out = left_out.map(|(&index, _)| (index, Skipped::Unusable(reason)));
+        self.skipped.extend(left_out);
+        self.fused = keep(std::mem::take(&mut self.fused), is_out);
+        let others = self.aligned.split_off(1);
+        self.aligned.extend(keep(others, is_out));
+    }
+}
+
 /// The items that are not marked.
 fn keep<T>(items: Vec<T>, is_out: &[bool]) -> Vec<T> {
     items
@@ -632,4 +655,4 @@ fn sent_cells(
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -1,8 +1,8 @@
 //! Test fixtures: golden archives of the project and sample data outside it.
 //!
 //! Golden archives are in `tests/golden`, or in `V2V_GOLDEN`. Sample data may not be redistributed: tests that need it
-//! are `#[ignore]`d, and read it from `V2V_DATA`, else from the folder `shared/data` beside the project. A missing fixture
-//! fails the test with its path. A missing tensor or an unexpected type fails with the names in the message.
+//! are `#[ignore]`d, and read it from the folder that `V2V_DATA` names. A missing fixture fails the test with its path. A
+//! missing tensor or an unexpected type fails with the names in the message.
 //!
 //! ```
 //! let golden = tests::fixtures::golden("c5_poses");
@@ -30,7 +30,8 @@ pub struct Golden {
 /// When it is missing or damaged, with its path.
 #[must_use]
 pub fn golden(name: &str) -> Golden {
-    let path = fixture("V2V_GOLDEN", "golden", &format!("{name}.safetensors"));
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("golden");
+    let path = fixture("V2V_GOLDEN", Some(folder), &format!("{name}.safetensors"));
     let bytes = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     let (_, header) = SafeTensors::read_metadata(&bytes)
         .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
@@ -52,18 +53,17 @@ pub fn golden(name: &str) -> Golden {
 /// The sample folder or file `name`, for example `v2xset-scene`.
 ///
 /// # Panics
-/// When it is missing, with its path.
+/// When it is missing, with its path, or `V2V_DATA` is not set.
 #[must_use]
 pub fn data(name: &str) -> PathBuf {
-    fixture("V2V_DATA", "../../shared/data", name)
+    fixture("V2V_DATA", None, name)
 }
 
-/// Path of `name` in the folder of the environment variable, else in `default` from the manifest's folder.
-fn fixture(variable: &str, default: &str, name: &str) -> PathBuf {
-    let root = std::env::var_os(variable).map_or_else(
-        || Path::new(env!("CARGO_MANIFEST_DIR")).join(default),
-        PathBuf::from,
-    );
+/// Path of `name` in the folder of the environment variable, else in `default`.
+fn fixture(variable: &str, default: Option<PathBuf>, name: &str) -> PathBuf {
+    let root = std::env::var_os(variable).map(PathBuf::from).or(default);
+    let root =
+        root.unwrap_or_else(|| panic!("{variable} names no folder, which has to have {name}"));
     let path = root.join(name);
     assert!(
         path.exists(),

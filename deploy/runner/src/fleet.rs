@@ -88,7 +88,7 @@ impl Fleet {
             .and_then(|weights| weights.detector_config())
             .context("weights")?;
         // As the ego-fuser does: weights of another method are refused before any process starts.
-        let pipeline = Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
+        Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
         let loaded = scenario.poses().iter().try_for_each(load_networks);
         loaded.context("localizer")?;
         if let Some(link) = &scenario.link {
@@ -130,16 +130,6 @@ impl Fleet {
                     pose.name()
                 );
             }
-        }
-        let sends_boxes = |cav: &&CavId| **cav != ego && scenario.settings_of(cav).boxes.is_some();
-        if let Some(cav) = agents.iter().find(sends_boxes)
-            && scenario.method.exchange() == Exchange::Features
-            && !pipeline.reads_boxes()
-        {
-            bail!(
-                "vehicle {cav}: boxes: the ego's weights, {}, have no box input and would leave its boxes out",
-                scenario.models.weights.display()
-            );
         }
         let scene = &mut scenario.scene;
         let left = recorded.ticks.len() - scene.seek;

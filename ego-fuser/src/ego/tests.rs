@@ -16,9 +16,9 @@ use dataset::ground_truth::GroundTruth;
 use fusion::model::CooperativeModel;
 
 /// Capture time of all sweeps unless stated otherwise.
-const NOW: u64 = 5_000_000_000;
+pub(crate) const NOW: u64 = 5_000_000_000;
 
-const HERE: Pose = Pose {
+pub(crate) const HERE: Pose = Pose {
     translation_m: [100.0, 50.0, 2.0],
     rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
 };
@@ -85,7 +85,7 @@ fn cloud(phase: f32) -> PointCloud {
     }
 }
 
-fn view(name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
+pub(crate) fn view(name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
     view_by(detector(), name, world_from_cav, method, phase)
 }
 
@@ -122,7 +122,7 @@ fn view_by(
     }
 }
 
-fn near() -> Pose {
+pub(crate) fn near() -> Pose {
     Pose::from_xyz_yaw([104.0, 51.0, 2.0], 0.3)
 }
 
@@ -613,7 +613,7 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
 }
 
 /// Egos of `method` from files of the same weights, without and with a box input.
-fn egos_of_files(method: Method) -> [Ego; 2] {
+pub(crate) fn egos_of_files(method: Method) -> [Ego; 2] {
     let config = detector().config().clone();
     let new = || CooperativeModel::new(&config, method, Device::Cpu).unwrap();
     let (without, mut with) = (new(), new());

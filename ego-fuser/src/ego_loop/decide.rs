@@ -77,18 +77,22 @@ impl EgoLoop {
                 self.pairing.has_reached(&source, capture_nanos)
             };
             let is_other = self.models.is_other(cav);
+            // Boxes end the wait for maps that are of another network, or not in time.
+            let boxes_do = self.reads_boxes
+                && self.box_senders.contains(cav)
+                && (is_other || !self.sends_maps_in_time(cav));
             self.ended.contains(cav)
                 || has(self.stream)
-                || match self.reads_boxes {
-                    true if !is_other && self.sends_maps_now(cav) => false,
-                    true if self.box_senders.contains(cav) => has(Stream::Boxes),
-                    _ => is_other,
+                || if boxes_do {
+                    has(Stream::Boxes)
+                } else {
+                    is_other
                 }
         })
     }
 
-    /// True for a neighbour whose boxes are no reason to stop waiting: its feature maps came in time lately.
-    fn sends_maps_now(&self, cav: &CavId) -> bool {
+    /// True for a neighbour whose feature maps came before the ego's next sweep lately.
+    fn sends_maps_in_time(&self, cav: &CavId) -> bool {
         let frames = self.without_map.get(cav);
         frames.is_some_and(|frames| *frames < SILENT_AFTER)
     }

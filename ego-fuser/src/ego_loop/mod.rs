@@ -242,3 +242,6 @@ fn stream_of(exchange: Exchange) -> Stream {
         Exchange::Features | Exchange::Nothing => Stream::Bev,
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -6,7 +6,17 @@ use pyo3::{PyErr, PyResult};
 use crate::error::error;
 
 /// Streams of a listener that asks for none: all but sweeps and images, which are most of the traffic.
-const STREAMS: &str = "gnss imu pose bev boxes points detections tracks truth";
+const STREAMS: [&str; 9] = [
+    "gnss",
+    "imu",
+    "pose",
+    "bev",
+    "boxes",
+    "points",
+    "detections",
+    "tracks",
+    "truth",
+];
 
 /// Key expressions that a listener may subscribe to.
 pub(crate) enum Access {
@@ -44,7 +54,7 @@ pub(crate) fn selectors(
 ) -> PyResult<Vec<KeyExpr>> {
     let mut selectors = vec![KeyExpr::control(run)];
     let is_choice = names.is_some();
-    for name in names.unwrap_or_else(|| STREAMS.split(' ').map(str::to_owned).collect()) {
+    for name in names.unwrap_or_else(|| STREAMS.map(str::to_owned).into()) {
         let wanted = selector(run, &name)?;
         match access {
             _ if access.permits(run, &wanted) => selectors.push(wanted),

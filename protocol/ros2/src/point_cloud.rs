@@ -182,8 +182,12 @@ impl<'a> Columns<'a> {
     fn find(fields: &[Field<'a>]) -> Result<Self, PointCloudError> {
         let floats = |datatype| matches!(datatype, Datatype::Float32 | Datatype::Float64);
         let coordinate = |name| {
-            let names = fields.iter().map(|field| field.name.chars().take(40));
-            let found = || names.map(|name| name.collect()).collect();
+            let found = || {
+                fields
+                    .iter()
+                    .map(|field| field.name.chars().take(40).collect())
+                    .collect()
+            };
             let allowed = "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1";
             column(fields, name, allowed, floats)?
                 .map(|(_, column)| column)
@@ -238,18 +242,22 @@ fn column<'a>(
     allowed: &'static str,
     is_allowed: impl Fn(Datatype) -> bool,
 ) -> Result<Option<(&'a str, Column)>, PointCloudError> {
-    let mut fields = fields.iter();
-    let Some(found) = fields.find(|field| field.name.eq_ignore_ascii_case(name)) else {
+    let Some(&Field {
+        name: found,
+        offset,
+        datatype,
+        count,
+    }) = (fields.iter()).find(|field| field.name.eq_ignore_ascii_case(name))
+    else {
         return Ok(None);
     };
-    let offset = found.offset;
-    match Datatype::of(found.datatype).filter(|datatype| is_allowed(*datatype)) {
+    match Datatype::of(datatype).filter(|datatype| is_allowed(*datatype)) {
         // Some drivers leave the count at 0.
-        Some(datatype) if found.count <= 1 => Ok(Some((found.name, Column { offset, datatype }))),
+        Some(datatype) if count <= 1 => Ok(Some((found, Column { offset, datatype }))),
         _ => Err(PointCloudError::FieldType {
             name,
-            datatype: found.datatype,
-            count: found.count,
+            datatype,
+            count,
             allowed,
         }),
     }
@@ -268,9 +276,10 @@ impl Layout {
     fn stride(&self) -> u64 {
         let row = u64::from(self.width) * u64::from(self.point_step);
         // The only row of a cloud needs no step, and some drivers give none.
-        match self.height {
-            0 | 1 => row,
-            _ => u64::from(self.row_step),
+        if self.height > 1 {
+            u64::from(self.row_step)
+        } else {
+            row
         }
     }
 
@@ -281,13 +290,16 @@ impl Layout {
         limits: SweepLimits,
     ) -> Result<(), PointCloudError> {
         let at_least = |what, found, needed, why| {
-            let error = PointCloudError::Layout {
-                what,
-                found,
-                needed,
-                why,
-            };
-            (found >= needed).then_some(()).ok_or(error)
+            if found >= needed {
+                Ok(())
+            } else {
+                Err(PointCloudError::Layout {
+                    what,
+                    found,
+                    needed,
+                    why,
+                })
+            }
         };
         let points = u64::from(self.height) * u64::from(self.width);
         if points > limits.max_points {
@@ -306,9 +318,10 @@ impl Layout {
         let row = u64::from(self.width) * u64::from(self.point_step);
         at_least("row_step", self.stride(), row, "width x point_step")?;
         let rows = u64::from(self.height.saturating_sub(1));
-        let needed = match self.height {
-            0 => 0,
-            _ => rows.saturating_mul(self.stride()).saturating_add(row),
+        let needed = if self.height == 0 {
+            0
+        } else {
+            rows.saturating_mul(self.stride()).saturating_add(row)
         };
         at_least("length of data", data_len as u64, needed, "rows x row_step")
     }

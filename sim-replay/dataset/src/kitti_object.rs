@@ -26,7 +26,10 @@ pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
     data_sets: "KITTI object detection",
     files: "velodyne/<frame>.bin and calib/<frame>.txt (a folder)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence(is_split, open)),
+    reader: Some(Reader::Sequence {
+        is_one: is_split,
+        open,
+    }),
 };
 
 /// Numbers after the type in a line of labels; detections have a score as well.

@@ -27,7 +27,10 @@ pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
     data_sets: "KITTI odometry, SemanticKITTI",
     files: "velodyne/<scan>.bin and calib.txt (a file)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence(is_sequence, open)),
+    reader: Some(Reader::Sequence {
+        is_one: is_sequence,
+        open,
+    }),
 };
 
 /// A sequence.

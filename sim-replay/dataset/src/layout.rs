@@ -34,13 +34,14 @@ pub struct LayoutRow {
 pub(crate) enum Reader {
     /// Opens the data sets at or below a folder; `Ok(None)` where there are none.
     DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>>),
-    /// Opens sequences of a single vehicle, one at a time: a function that is true for the folder of a sequence, and
-    /// one that opens it.
-    Sequence(fn(&Path) -> bool, OpenSequence),
+    /// Opens sequences of a single vehicle, one at a time.
+    Sequence {
+        /// True for the folder of a sequence.
+        is_one: fn(&Path) -> bool,
+        /// Opens it; its name is relative to the first path.
+        open: fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
+    },
 }
-
-/// Opens a sequence, whose name is relative to the first path.
-type OpenSequence = fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>;
 
 impl Layout {
     /// Its name in messages and tables.

@@ -78,7 +78,7 @@ fn open_sequences(
     problems: &mut Vec<ReadError>,
 ) -> Result<()> {
     let reader = layouts.iter().find_map(|layout| match layout.reader {
-        Some(Reader::Sequence(is_one, open)) if is_one(dir) => Some(open),
+        Some(Reader::Sequence { is_one, open }) if is_one(dir) => Some(open),
         _ => None,
     });
     match reader.map(|open| open(root, dir, options, problems)) {
@@ -156,10 +156,10 @@ mod tests {
         data_sets: "none",
         files: "dummy.txt with a number of ticks",
         protocol: "opv2v",
-        reader: Some(Reader::Sequence(
-            |dir| dir.join("dummy.txt").is_file(),
-            open_dummy,
-        )),
+        reader: Some(Reader::Sequence {
+            is_one: |dir| dir.join("dummy.txt").is_file(),
+            open: open_dummy,
+        }),
     };
 
     #[derive(Debug)]

@@ -1,5 +1,6 @@
 //! Fleets: replay, agents and ego together, live and in simulation time, in one process and in several.
 
+mod boxes_beside_maps;
 mod compressor;
 mod in_process;
 mod live_figures;

@@ -216,7 +216,7 @@ fn a_neighbour_that_sends_boxes_is_fused_where_the_weights_read_them() {
 
     write_sighted_weights(&weights);
     let mut up = Up::start(folder.path(), &scenario);
-    up.wait_for_line("vehicle 4288: boxes: the ego's weights");
+    up.wait_for_line("has no box input, and the boxes of neighbours would be left out");
     assert_eq!(up.wait().code(), Some(2));
 }
 

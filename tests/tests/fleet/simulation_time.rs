@@ -5,7 +5,6 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use agent::config::SentBoxes;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use deploy::score::FrameScores;
@@ -13,9 +12,7 @@ use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{AgentPool, EmulatedLink, EvaluatedFrame, Evaluator, Setup};
 use fusion::Method;
-use link::{
-    CapacityConfig, ClockStep, DeviceClock, LatencyModel, LinkConfig, LossModel, QueueConfig,
-};
+use link::{ClockStep, DeviceClock, LatencyModel, LinkConfig, LossModel};
 use protocol::{DropReason, Dtype};
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
@@ -26,16 +23,16 @@ use tests::fleet::{
 };
 use tests::locks::exclusive_lock;
 
-const TICKS: usize = 8;
+pub(super) const TICKS: usize = 8;
 /// A method that comes with the programs.
 const ATTENTION: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
     "/../deploy/examples/attention.pt"
 );
-const MS: u64 = 1_000_000;
+pub(super) const MS: u64 = 1_000_000;
 
 /// A fleet with feature maps in half precision and zero compute times, over a link.
-fn config(link: LinkConfig) -> Setup {
+pub(super) fn config(link: LinkConfig) -> Setup {
     over(link, in_half_precision())
 }
 
@@ -62,7 +59,7 @@ fn in_half_precision() -> Setup {
 }
 
 /// The frames of a scene in `folder`, and the ledger.
-fn evaluate(folder: &Path, mut setup: Setup) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
+pub(super) fn evaluate(folder: &Path, mut setup: Setup) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
     tch::set_num_threads(1);
     setup.models.weights = folder.join("weights.safetensors");
     setup.method = Some(Method::MAX);
@@ -82,7 +79,7 @@ fn evaluate(folder: &Path, mut setup: Setup) -> (Vec<EvaluatedFrame>, protocol::
     (frames, ledger)
 }
 
-fn scene() -> tempfile::TempDir {
+pub(super) fn scene() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
     write_sighted_weights(&folder.path().join("weights.safetensors"));
@@ -497,53 +494,6 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
         "{frames}"
     );
     assert_eq!(results(one.folder.path()).len(), TICKS - 1);
-}
-
-#[test]
-fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
-    let folder = scene();
-    write_weights_with_box_input(&folder.path().join("weights.safetensors"));
-    let sending = |boxes, link| {
-        let mut setup = config(link);
-        setup.agents.boxes = boxes;
-        evaluate(folder.path(), setup)
-    };
-    let (on_time, ledger) = sending(Some(SentBoxes::Beside), LinkConfig::default());
-    let (maps, _) = sending(None, LinkConfig::default());
-    for (beside, alone) in on_time.iter().zip(&maps) {
-        assert_eq!(beside.result.detections, alone.result.detections);
-        assert_eq!(beside.result.fused, alone.result.fused);
-    }
-    let unneeded = ledger.total().dropped.get(&DropReason::Unneeded).copied();
-    assert_eq!(unneeded, Some(2 * TICKS as u64), "boxes of two neighbours");
-
-    // A map takes 120 ms, more than the ego waits.
-    let map_bytes = maps[0].result.fused[0].payload_bytes;
-    let slow = LinkConfig {
-        capacity: CapacityConfig::of_mbps(8e-6 * map_bytes as f64 / 0.12),
-        queue: QueueConfig {
-            keep_last: true,
-            urgent_bytes: map_bytes / 2,
-            ..QueueConfig::default()
-        },
-        ..LinkConfig::default()
-    };
-    let (late, _) = sending(Some(SentBoxes::Beside), slow);
-    let waits_ms: Vec<u64> = { late.iter() }
-        .map(|frame| {
-            let mut stages = frame.result.stages.iter();
-            stages.find(|stage| stage.stage == "wait").unwrap().nanos / MS
-        })
-        .collect();
-    assert_eq!(waits_ms[..3], [100; 3], "{waits_ms:?}");
-    assert!(waits_ms[3..].iter().all(|ms| *ms < 80), "{waits_ms:?}");
-    for frame in &late {
-        for fused in &frame.result.fused {
-            // A map of one sweep before comes before boxes.
-            let is_map = fused.payload_bytes > map_bytes / 2;
-            assert_eq!(fused.age_nanos / MS as i64, if is_map { 100 } else { 0 });
-        }
-    }
 }
 
 #[test]

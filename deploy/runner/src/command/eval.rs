@@ -32,9 +32,27 @@ use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options, beside those of pose sources, that a file of tables states itself.
-const OF_ONE_TABLE: &str = "dataset method weights precision pose_source CodecConfig RateConfig \
-    emulation delay_ms attack trust boxes latency_compensation feature_maps frames scenarios \
-    intensity_scale ProtocolConfig json";
+const OF_ONE_TABLE: [&str; 19] = [
+    "dataset",
+    "method",
+    "weights",
+    "precision",
+    "pose_source",
+    "CodecConfig",
+    "RateConfig",
+    "emulation",
+    "delay_ms",
+    "attack",
+    "trust",
+    "boxes",
+    "latency_compensation",
+    "feature_maps",
+    "frames",
+    "scenarios",
+    "intensity_scale",
+    "ProtocolConfig",
+    "json",
+];
 
 #[derive(Debug, clap::Args)]
 #[command(group = ArgGroup::new("emulation").args(["link", "bandwidth_mbps", "latency_ms"]).multiple(true))]
@@ -139,8 +157,9 @@ pub(crate) struct Arguments {
 
 fn of_one_table() -> impl Iterator<Item = &'static str> {
     OF_ONE_TABLE
-        .split(' ')
-        .chain(PoseSourceConfig::OPTION_GROUPS.iter().copied())
+        .iter()
+        .chain(PoseSourceConfig::OPTION_GROUPS)
+        .copied()
 }
 
 fn at_most(count: u64) -> usize {

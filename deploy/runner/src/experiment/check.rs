@@ -67,6 +67,10 @@ fn tables(experiment: &Experiment) -> Result<(), String> {
         if table.rows.is_empty() || table.columns.is_empty() {
             return Err(format!("table {:?} has no rows or no columns", table.name));
         }
+        for vehicles in table.rows.iter().filter_map(|row| row.vehicles) {
+            let field = format!("table {:?}: vehicles", table.name);
+            number(&field, vehicles as f64, 1.0, 64.0)?;
+        }
         if experiment.link.is_some() && table.columns.iter().any(|column| column.delay_ms > 0) {
             let name = &table.name;
             return Err(format!(
@@ -108,13 +112,21 @@ fn check_name(field: &str, name: &str) -> Result<(), String> {
 }
 
 /// Checks everything that depends on the data.
-pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> Result<(), String> {
+pub(super) fn check_scenes<'a>(
+    experiment: &Experiment,
+    scenarios: impl IntoIterator<Item = &'a Scenario>,
+) -> Result<(), String> {
     for scenario in scenarios {
         let found = scenario.agents.len();
-        let mut asked = experiment.grid.vehicles.iter().flatten();
-        if let Some(asked) = asked.find(|asked| **asked > found) {
+        let rows = experiment.tables.iter().flat_map(|table| &table.rows);
+        let of_rows = rows.filter_map(|row| Some(("a row's vehicles", row.vehicles?)));
+        let of_grid = experiment.grid.vehicles.iter().flatten();
+        let mut asked = of_grid
+            .map(|count| ("grid.vehicles", *count))
+            .chain(of_rows);
+        if let Some((field, asked)) = asked.find(|(_, asked)| *asked > found) {
             return Err(format!(
-                "grid.vehicles is {asked}, but scenario {} has {found} vehicles",
+                "{field} is {asked}, but scenario {} has {found} vehicles",
                 scenario.name
             ));
         }

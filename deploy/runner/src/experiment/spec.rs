@@ -229,6 +229,9 @@ pub struct Row {
     /// Pose source of this row, in place of that of the columns.
     #[serde(default)]
     pub poses: Option<PoseSourceConfig>,
+    /// Number of participating vehicles, the ego included; absent: all. Annotations of the others count.
+    #[serde(default)]
+    pub vehicles: Option<usize>,
     /// Neighbours send their detections in place of feature maps, or beside them.
     #[serde(default)]
     pub boxes: Option<SentBoxes>,

@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use fusion::Method;
+use fusion::method::Exchange;
+use fusion::{Method, box_input};
 use perception::weights::{METHOD_KEY, Weights};
 use support::file_error::{AtFile, FileError};
 
@@ -11,23 +12,41 @@ const TRAINED_FILE: &str = "weights.safetensors";
 
 /// The weights of a method: `path` itself; of the folder `path` the one file `*-METHOD.safetensors` or
 /// `METHOD/weights.safetensors`, or if it has neither, `weights.safetensors` of a training of that method. With
-/// `reads_boxes` the one file `*-METHOD-boxes.safetensors` or `METHOD-boxes/weights.safetensors` comes first.
+/// `reads_boxes`, where neighbours send boxes, the one file `*-METHOD-boxes.safetensors` or
+/// `METHOD-boxes/weights.safetensors` comes first.
 ///
 /// `late` exchanges the ego-only detections of every vehicle, so it runs with the weights of `none`; so does `early` if
 /// the folder has none of its own.
 ///
 /// # Errors
-/// [`FileError`] when the folder does not hold exactly one.
+/// [`FileError`] when the folder does not hold exactly one, and with `reads_boxes` when a method that fuses feature maps
+/// would leave boxes out.
 pub(crate) fn weights_of(
     path: &Path,
     method: Method,
     reads_boxes: bool,
 ) -> Result<PathBuf, FileError> {
+    if !reads_boxes || method.exchange() != Exchange::Features {
+        return one_of(path, method);
+    }
+    let file = match path.is_dir() {
+        false => path.to_path_buf(),
+        true => match &files_of(path, &format!("{method}-boxes"))?[..] {
+            [file] => file.clone(),
+            _ => one_of(path, method)?,
+        },
+    };
+    if !box_input::is_in(&Weights::load(&file)?) {
+        let problem = "has no box input, and the boxes of neighbours would be left out";
+        return Err(FileError::new(file, problem));
+    }
+    Ok(file)
+}
+
+/// The weights of a method where neighbours send what it fuses.
+fn one_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
     if !path.is_dir() {
         return Ok(path.to_path_buf());
-    }
-    if reads_boxes && let [file] = &files_of(path, &format!("{method}-boxes"))?[..] {
-        return Ok(file.clone());
     }
     let candidates = method.weights_names();
     let mut last = (method.name(), 0);
@@ -113,14 +132,6 @@ mod tests {
                 "{method}"
             );
         }
-        std::fs::write(folder.path().join("lean-none-boxes.safetensors"), b"").unwrap();
-        for (method, file) in [
-            (Method::NONE, "lean-none-boxes"),
-            (Method::LATE, "lean-none"),
-        ] {
-            let found = weights_of(folder.path(), method, true).unwrap();
-            assert_eq!(found.file_stem().unwrap(), file);
-        }
         std::fs::write(folder.path().join("lean-early.safetensors"), b"").unwrap();
         assert!(
             of(Method::EARLY)
@@ -158,6 +169,31 @@ mod tests {
             Precision::Single,
         )
         .unwrap();
+    }
+
+    #[test]
+    fn where_neighbours_send_boxes_weights_read_them_or_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        for method in [Method::NONE, Method::MAX] {
+            write_trained(&folder.path().join(method.name()), method);
+        }
+        let of = |method| weights_of(folder.path(), method, true);
+        assert!(
+            of(Method::LATE)
+                .unwrap()
+                .ends_with("none/weights.safetensors")
+        );
+        let refused = of(Method::MAX).unwrap_err().to_string();
+        assert!(
+            refused.contains("max/weights.safetensors") && refused.contains("no box input"),
+            "{refused}"
+        );
+        let variables = VarStore::new(Device::Cpu);
+        let out = variables.root() / "box_input" / "out";
+        let _ = out.var("weight", &[2], Init::Const(1.0));
+        let with = folder.path().join("lean-max-boxes.safetensors");
+        save(&with, &variables, &BTreeMap::new(), Precision::Single).unwrap();
+        assert_eq!(of(Method::MAX).unwrap(), with);
     }
 
     #[test]

@@ -29,6 +29,17 @@ pub(super) struct SentMessage {
     pub(super) rate: Option<RateChoice>,
 }
 
+impl SentMessage {
+    /// A message that had to keep within no limit.
+    pub(super) fn new(content: Content, bytes: u64) -> Self {
+        Self {
+            content,
+            bytes,
+            rate: None,
+        }
+    }
+}
+
 impl Sent {
     /// A message as received by the ego.
     pub(super) fn view(&self, content: Content) -> View {
@@ -40,11 +51,10 @@ impl Sent {
         }
     }
 
-    /// The first message as received by the ego; absent where nothing was sent.
-    pub(super) fn into_view(mut self) -> Option<View> {
-        let messages = std::mem::take(&mut self.messages);
-        let first = messages.into_iter().next();
-        first.map(|message| self.view(message.content))
+    /// The messages as received by the ego.
+    pub(super) fn into_views(mut self) -> Vec<View> {
+        let messages = std::mem::take(&mut self.messages).into_iter();
+        messages.map(|message| self.view(message.content)).collect()
     }
 
     /// As captured by a vehicle that replays it.

@@ -225,7 +225,7 @@ impl<'a> Run<'a> {
             sweep.arrived_nanos,
         )?;
         let failure = sent.failure.clone();
-        let Some(view) = sent.into_view() else {
+        let Some(view) = sent.into_views().pop() else {
             return Ok(Some(failure.unwrap_or_default()));
         };
         self.own.push_back(Message {

@@ -50,7 +50,7 @@ pub(super) fn view(
     Ok(sent)
 }
 
-/// Messages of a vehicle beside its pose, as received. Whatever their forms, its sweep is computed once.
+/// Messages of a vehicle beside its pose, as received; boxes before the map, as an agent sends them.
 fn perceived(
     participant: &mut Participant,
     frame: &Frame,
@@ -59,38 +59,29 @@ fn perceived(
     (stamp, pose): (&Stamp, PoseEstimate),
 ) -> Result<Vec<SentMessage>, EvaluateError> {
     let mut messages = Vec::with_capacity(exchange.len());
-    let needs_network = exchange.iter().any(|form| *form != Exchange::Points);
-    let mut perception = needs_network
-        .then(|| participant.perceive(frame, map))
-        .transpose()?;
-    for form in exchange {
-        let (content, bytes, rate) = match (form, &mut perception) {
-            (Exchange::Points, _) | (_, None) => {
-                let points = participant.points(&frame.points);
-                let (message, bytes) = through_the_wire(stamp, Points { pose, points })?;
-                (Content::Points(message.points), bytes, None)
-            }
-            (Exchange::Boxes, Some(perception)) => {
-                let detections = std::mem::take(&mut perception.detections);
-                let (message, bytes) = through_the_wire(stamp, Boxes { pose, detections })?;
-                (Content::Boxes(message.detections), bytes, None)
-            }
-            (Exchange::Features | Exchange::Nothing, found) => {
-                let Some(perception) = found.take() else {
-                    continue;
-                };
-                let features = participant.write_map(perception, frame.capture_nanos)?;
-                let (message, bytes) = through_the_wire(stamp, Bev { pose, features })?;
-                let rate = message.features.rate;
-                let map = message.features.decode(&Limits::default())?;
-                (Content::Features(map), bytes, rate)
-            }
-        };
-        messages.push(SentMessage {
-            content,
-            bytes,
-            rate,
-        });
+    if exchange.contains(&Exchange::Points) {
+        let points = participant.points(&frame.points);
+        let (message, bytes) = through_the_wire(stamp, Points { pose, points })?;
+        messages.push(SentMessage::new(Content::Points(message.points), bytes));
+    }
+    if exchange.iter().all(|form| *form == Exchange::Points) {
+        return Ok(messages);
+    }
+    let perception = participant.perceive(frame, map)?;
+    if exchange.contains(&Exchange::Boxes) {
+        let detections = perception.detections.clone();
+        let (message, bytes) = through_the_wire(stamp, Boxes { pose, detections })?;
+        messages.push(SentMessage::new(Content::Boxes(message.detections), bytes));
+    }
+    // An ego without an exchange has its own map.
+    let sends_map = |form| matches!(form, &Exchange::Features | &Exchange::Nothing);
+    if exchange.iter().any(sends_map) {
+        let features = participant.write_map(perception, frame.capture_nanos)?;
+        let (message, bytes) = through_the_wire(stamp, Bev { pose, features })?;
+        let rate = message.features.rate;
+        let map = message.features.decode(&Limits::default())?;
+        let message = SentMessage::new(Content::Features(map), bytes);
+        messages.push(SentMessage { rate, ..message });
     }
     Ok(messages)
 }

@@ -37,12 +37,23 @@ pub(crate) static CLOUDS: LayoutRow = LayoutRow {
             <sequence>_poses_tum.txt or optimized_poses.txt (x y z qx qy qz qw or the columns of a header, 3x4 or 4x4 \
             matrices; possibly with time, number or name of the cloud)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence(|dir| place_of(dir).is_some(), open)),
+    reader: Some(Reader::Sequence {
+        is_one: |dir| place_of(dir).is_some(),
+        open,
+    }),
 };
 
 /// Names of the file of poses, or their ends (KISS-ICP, SC-LIO-SAM), the first that exists.
-const POSES: &str = "poses.txt poses.csv poses.tum trajectory.txt trajectory.csv optimized_poses.txt \
-    _poses_tum.txt _poses_kitti.txt";
+const POSES: [&str; 8] = [
+    "poses.txt",
+    "poses.csv",
+    "poses.tum",
+    "trajectory.txt",
+    "trajectory.csv",
+    "optimized_poses.txt",
+    "_poses_tum.txt",
+    "_poses_kitti.txt",
+];
 /// Folders of the clouds below that of the poses, whatever the case of their letters.
 const FOLDERS: [&str; 4] = ["clouds", "scans", "lidar", "points"];
 
@@ -64,7 +75,7 @@ fn is_poses(name: &str, known: &str) -> bool {
 fn place_of(dir: &Path) -> Option<(PathBuf, Vec<PathBuf>)> {
     let listing = files::list(dir).ok()?;
     let poses = POSES
-        .split(' ')
+        .iter()
         .find_map(|known| listing.files.iter().find(|name| is_poses(name, known)))?;
     let below = FOLDERS.iter().filter_map(|known| {
         let mut folders = listing.folders.iter();

@@ -376,8 +376,7 @@ impl FrameSource for Source {
 
     fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
         let mut files = self.sweeps.samples(agent);
-        let tables = tables::NAMES.split(' ');
-        files.extend(tables.map(|name| self.version.join(format!("{name}.json"))));
+        files.extend(tables::NAMES.map(|name| self.version.join(name)));
         files
     }
 

@@ -14,7 +14,17 @@ use crate::time_stamps;
 use crate::{ReadError, Result};
 
 /// The tables that are read.
-pub(super) const NAMES: &str = "sensor calibrated_sensor scene sample sample_data ego_pose sample_annotation category instance";
+pub(super) const NAMES: [&str; 9] = [
+    "sensor.json",
+    "calibrated_sensor.json",
+    "scene.json",
+    "sample.json",
+    "sample_data.json",
+    "ego_pose.json",
+    "sample_annotation.json",
+    "category.json",
+    "instance.json",
+];
 
 /// A drive.
 #[derive(Debug)]

@@ -99,7 +99,18 @@ struct Entries<'a> {
     found: Vec<(&'static str, Entry<'a>)>,
 }
 
-const KEYS: &str = "VERSION FIELDS SIZE TYPE COUNT WIDTH HEIGHT VIEWPOINT POINTS DATA";
+const KEYS: [&str; 10] = [
+    "VERSION",
+    "FIELDS",
+    "SIZE",
+    "TYPE",
+    "COUNT",
+    "WIDTH",
+    "HEIGHT",
+    "VIEWPOINT",
+    "POINTS",
+    "DATA",
+];
 const VERSIONS: [&str; 6] = ["0.7", ".7", "0.6", ".6", "0.5", ".5"];
 
 impl Header {
@@ -241,7 +252,7 @@ impl<'a> Entries<'a> {
         } else {
             word
         };
-        let Some(key) = KEYS.split(' ').find(|key| key.eq_ignore_ascii_case(asked)) else {
+        let Some(key) = KEYS.into_iter().find(|key| key.eq_ignore_ascii_case(asked)) else {
             let word: String = word.chars().take(40).collect();
             return Err(PcdError {
                 line: Some(line),

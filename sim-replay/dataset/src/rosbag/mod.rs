@@ -43,7 +43,10 @@ pub(crate) static ROSBAG: LayoutRow = LayoutRow {
     files: "a folder with metadata.yaml of rosbag2, or a file <name>.mcap or .db3 (.zstd): sensor_msgs/PointCloud2 with \
             nav_msgs/Odometry, tf2_msgs/TFMessage, geometry_msgs/PoseStamped or PoseWithCovarianceStamped",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence(files::is_bag, open)),
+    reader: Some(Reader::Sequence {
+        is_one: files::is_bag,
+        open,
+    }),
 };
 
 /// Limits of a sweep: those of a file.

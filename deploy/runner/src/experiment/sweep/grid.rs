@@ -3,10 +3,9 @@
 use std::path::Path;
 
 use agent::rate::RateConfig;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use ego_fuser_offline::evaluation::AgentPool;
-use fusion::method::Exchange;
-use fusion::{Method, box_input};
+use fusion::Method;
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
 use perception::model_config::DetectorConfig;
@@ -131,16 +130,7 @@ impl Point {
         let mut trial = experiment.trial().context("link")?;
         let weights = experiment.weights_of(self.method, self.codec.boxes);
         let weights = weights.context("weights")?;
-        let file = Weights::load(&weights)?;
-        ensure!(
-            self.codec.boxes.is_none()
-                || self.method.exchange() != Exchange::Features
-                || box_input::is_in(&file),
-            "grid.codec: boxes: the weights of method {}, {}, have no box input and would leave boxes out",
-            self.method,
-            weights.display()
-        );
-        let config: DetectorConfig = file.config()?;
+        let config: DetectorConfig = Weights::load(&weights)?.config()?;
         let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
         let setup = &mut trial.setup;
         setup.models.weights = weights;

@@ -9,12 +9,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+use ego_fuser_offline::evaluation::AgentPool;
 use support::atomic_file;
-use support::cli::NotWritten;
+use support::cli::{BadInput, NotWritten};
 
 pub use text::{csv, markdown};
 
 use super::cell::Cell;
+use super::check::check_scenes;
 use super::evaluation::{OpenedData, Trial, compute};
 use super::slices::Slice;
 use super::spec::{Column, Experiment, Row, Table};
@@ -63,6 +65,7 @@ pub fn run(
     fs::create_dir_all(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
+    check_scenes(experiment, data.chosen(experiment.scenarios)).map_err(BadInput::new)?;
     let run = Run {
         experiment,
         cells,
@@ -178,6 +181,7 @@ impl Run<'_> {
         if let Some(poses) = row.poses.as_ref().or(column.poses.as_ref()) {
             setup.agents.pose.clone_from(poses);
         }
+        setup.pool = row.vehicles.map_or(AgentPool::All, AgentPool::First);
         setup.agents.boxes = row.boxes;
         setup.ego.latency_compensation |= row.latency_compensation;
         setup.delay_ms = column.delay_ms;

@@ -229,6 +229,7 @@ mod tests {
                 method,
                 weights: vec![],
                 poses: None,
+                vehicles: None,
                 boxes: None,
                 latency_compensation: false,
             },

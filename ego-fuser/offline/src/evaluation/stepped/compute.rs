@@ -197,7 +197,7 @@ impl Evaluator {
         let mut samples = Samples::default();
         self.ego.forget();
         for tick in (0..scenario.ticks.len()).take_while(|tick| is_needed(*tick)) {
-            let mut sent = Vec::with_capacity(participants.len());
+            let (mut own, mut neighbour) = (None, Vec::new());
             for (place, participant) in participants.iter_mut().enumerate() {
                 if !scenario.is_present(place, tick) {
                     continue;
@@ -208,7 +208,12 @@ impl Evaluator {
                 };
                 samples.motion = frame.motion();
                 let began = Instant::now();
-                sent.extend(view(participant, &frame, None, &[exchange])?.into_view());
+                let forms = participant.exchange(exchange);
+                let sent = view(participant, &frame, None, &forms)?.into_views();
+                match place {
+                    0 => own = sent.into_iter().next(),
+                    _ => neighbour = sent,
+                }
                 let all = began.elapsed();
                 let times = participant.pose_times();
                 samples.pose.push(ms(times.estimate));
@@ -218,25 +223,18 @@ impl Evaluator {
                     .map
                     .push(ms(all.saturating_sub(times.estimate + times.observe)));
             }
-            let own = sent.first().map(|own: &View| &own.cav);
-            if own.is_none() || own != scenario.agents.first() {
-                continue;
-            }
-            let others = scenario.agents.iter().take(vehicles).skip(sent.len());
-            let copies = sent.get(1).map(|neighbour: &View| {
-                others.map(|cav| View {
+            let Some(own) = own else { continue };
+            let others = scenario.agents.iter().take(vehicles).skip(1);
+            let copies = others.flat_map(|cav| {
+                neighbour.iter().map(|view: &View| View {
                     cav: cav.clone(),
-                    ..neighbour.clone()
+                    ..view.clone()
                 })
             });
-            let copies: Vec<View> = copies.into_iter().flatten().collect();
-            sent.extend(copies);
+            let neighbours: Vec<View> = copies.collect();
             let began = Instant::now();
             // A frame that fails takes its time too; it is counted when it is evaluated.
-            let [own, neighbours @ ..] = &sent[..] else {
-                continue;
-            };
-            let detected = self.ego.detect(own, neighbours);
+            let detected = self.ego.detect(&own, &neighbours);
             samples.fuse.push(ms(began.elapsed()));
             match detected {
                 Ok(output) => samples.add(1, &output.stages),

@@ -82,7 +82,7 @@ impl fmt::Debug for RemotePool {
 #[derive(Default)]
 struct Answer {
     pose: Option<(PoseEstimate, u64)>,
-    messages: Vec<SentMessage>,
+    messages: BTreeMap<Stream, SentMessage>,
 }
 
 impl RemotePool {
@@ -180,8 +180,8 @@ impl RemotePool {
             .map(|frame| (&frame.cav, Answer::default()))
             .collect();
         let is_open = |(cav, answer): &(&&CavId, &Answer)| {
-            let streams = self.streams.get(**cav).map_or(0, Vec::len);
-            answer.pose.is_none() || answer.messages.len() < streams
+            let mut streams = self.streams.get(**cav).into_iter().flatten();
+            answer.pose.is_none() || streams.any(|stream| !answer.messages.contains_key(stream))
         };
         while answers.iter().any(|entry| is_open(&entry)) {
             match self.inbox.take(Some(deadline)) {
@@ -243,33 +243,31 @@ impl Answer {
                 let message: Points = arrival.decode(&limits)?;
                 (Content::Points(message.points), None)
             }
-            _ => {
+            Stream::Pose => {
                 self.pose = Some((arrival.decode(&limits)?, bytes));
                 return Ok(());
             }
+            _ => return Ok(()),
         };
-        self.messages.push(SentMessage {
+        let message = SentMessage {
             content,
             bytes,
             rate,
-        });
+        };
+        self.messages.insert(stream, message);
         Ok(())
     }
 
     /// The answer with its messages in the order of these streams, whatever the order of their arrival.
     fn into_sent(mut self, frame: &Frame, streams: &[Stream]) -> Option<Sent> {
-        let place = |message: &SentMessage| {
-            let stream = message.content.stream();
-            streams.iter().position(|known| *known == stream)
-        };
-        self.messages.sort_by_key(place);
         let (pose, pose_bytes) = self.pose?;
+        let messages = streams.iter().map(|stream| self.messages.remove(stream));
         Some(Sent {
             cav: frame.cav.clone(),
             capture_nanos: frame.capture_nanos,
             pose,
             pose_bytes,
-            messages: self.messages,
+            messages: messages.collect::<Option<_>>()?,
             failure: None,
         })
     }

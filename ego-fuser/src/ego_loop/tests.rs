@@ -1,0 +1,135 @@
+use fusion::method::Method;
+use protocol::message::{Descriptor, ModelHash};
+use protocol::{Box3d, Detection, DropReason, Dtype};
+
+use super::*;
+use crate::ego::Content;
+use crate::ego::tests::{HERE, NOW, egos_of_files, near, view};
+
+const PERIOD: u64 = 100_000_000;
+
+/// A loop of vehicle `a` with the neighbour `b`, whose boxes it reads.
+struct Case {
+    ego: Ego,
+    ego_loop: EgoLoop,
+    own: View,
+    map: View,
+    boxes: View,
+}
+
+impl Case {
+    fn new() -> Self {
+        let [_, ego] = egos_of_files(Method::MAX);
+        let own = view("a", HERE, Method::MAX, 0.0);
+        let map = view("b", near(), Method::MAX, 0.15);
+        let found = Detection {
+            box3d: Box3d {
+                center_m: [2.0, 1.0, -1.0],
+                size_m: [4.0, 1.8, 1.6],
+                heading_rad: 0.4,
+            },
+            score: 0.9,
+            source: None,
+        };
+        let boxes = View {
+            content: Content::Boxes(vec![found]),
+            ..map.clone()
+        };
+        let options = LoopOptions::stepped(&EgoSettings::default());
+        let ego_loop = EgoLoop::new(&own.cav, &ego, options);
+        let mut case = Self {
+            ego,
+            ego_loop,
+            own,
+            map,
+            boxes,
+        };
+        case.handle(Input::Joined(case.map.cav.clone()));
+        case
+    }
+
+    fn handle(&mut self, input: Input) -> Vec<Output> {
+        self.ego_loop.handle(&mut self.ego, input, NOW)
+    }
+
+    /// The same view, captured `sweeps` later, arrives.
+    fn receive(&mut self, view: &View, sweeps: u64) -> Vec<Output> {
+        let view = View {
+            capture_nanos: NOW + sweeps * PERIOD,
+            ..view.clone()
+        };
+        self.handle(Input::Message(Box::new(Message {
+            reception: Reception {
+                cav: view.cav.clone(),
+                arrived_nanos: NOW,
+                transport: None,
+                clock_offset_s: None,
+            },
+            view,
+            sequence: 0,
+            payload_bytes: 0,
+            wire_bytes: 0,
+        })))
+    }
+
+    /// Streams of `b` whose messages were used, and those not used with the reason.
+    fn accounts(outputs: &[Output]) -> (Vec<Stream>, Vec<(Stream, DropReason)>) {
+        let is_b = |cav: &CavId| cav.to_string() == "b";
+        let used = outputs.iter().filter_map(|output| match output {
+            Output::Received((cav, stream)) if is_b(cav) => Some(*stream),
+            _ => None,
+        });
+        let dropped = outputs.iter().filter_map(|output| match output {
+            Output::Dropped((cav, stream), reason) if is_b(cav) => Some((*stream, *reason)),
+            _ => None,
+        });
+        (used.collect(), dropped.collect())
+    }
+}
+
+#[test]
+fn a_neighbour_of_another_network_counts_by_its_boxes() {
+    let mut case = Case::new();
+    let (own, map, boxes) = (case.own.clone(), case.map.clone(), case.boxes.clone());
+    let descriptor = Descriptor {
+        model_hash: ModelHash([7; 32]),
+        grid: case.ego.detector().grid(),
+        channels: u32::try_from(case.ego.detector().sent_shape()[0]).unwrap(),
+        dtype: Dtype::F32,
+        streams: vec![Stream::Pose, Stream::Boxes, Stream::Bev],
+        sweeps: vec![],
+    };
+    case.handle(Input::Model(map.cav.clone(), descriptor));
+    let refused = Case::accounts(&case.receive(&map, 0));
+    assert_eq!(refused, (vec![], vec![(Stream::Bev, DropReason::Shape)]));
+    case.receive(&own, 0);
+    assert!(case.handle(Input::Wake).is_empty(), "its boxes are awaited");
+    case.receive(&boxes, 0);
+    let outputs = case.handle(Input::Wake);
+    assert_eq!(Case::accounts(&outputs), (vec![Stream::Boxes], vec![]));
+    let result = outputs.iter().find_map(|output| match output {
+        Output::Publish { result, .. } => Some(result),
+        _ => None,
+    });
+    let result = result.unwrap();
+    assert_eq!(result.fused[0].cav, boxes.cav);
+    assert!(result.skipped.is_empty(), "{:?}", result.skipped);
+    assert_eq!(case.ego_loop.report().fused_boxes, 1);
+}
+
+#[test]
+fn boxes_that_come_after_their_map_was_fused_are_not_missing() {
+    let mut case = Case::new();
+    let (own, map, boxes) = (case.own.clone(), case.map.clone(), case.boxes.clone());
+    let unneeded = (Stream::Boxes, DropReason::Unneeded);
+    for sweep in 0..2 {
+        case.receive(&map, sweep);
+        case.receive(&own, sweep);
+        let accounts = Case::accounts(&case.handle(Input::Wake));
+        let late = if sweep == 0 { vec![] } else { vec![unneeded] };
+        assert_eq!(accounts, (vec![Stream::Bev], late), "sweep {sweep}");
+        case.receive(&boxes, sweep);
+    }
+    let left = case.handle(Input::Left(map.cav.clone()));
+    assert_eq!(Case::accounts(&left), (vec![], vec![unneeded]));
+}
