@@ -100,6 +100,7 @@ impl Bus {
             epoch,
             stats: stats.clone(),
             sequence: 0,
+            is_start_reported: false,
         })?;
         let (pool, contact) = (SharedPool::none(), RouterContact::watch(&session)?);
         Ok(Self {

@@ -3,6 +3,7 @@
 //! One thread publishes everything, so that neither zenoh's callbacks nor the worker threads wait for the network.
 
 use std::collections::BTreeSet;
+use std::mem;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -117,6 +118,8 @@ pub(super) struct StatusSender {
     pub(super) epoch: u64,
     pub(super) stats: MessageStats,
     pub(super) sequence: u64,
+    /// True once what the process has used to load its models is reported.
+    pub(super) is_start_reported: bool,
 }
 
 impl StatusSender {
@@ -153,6 +156,10 @@ impl StatusSender {
         shared.answer_due.store(false, Ordering::Release);
         let subscribed: Vec<Topic> = lock(&shared.confirmed).iter().cloned().collect();
         if !subscribed.is_empty() {
+            // The scene may start with this answer: what was used before belongs to no frame.
+            if !mem::replace(&mut self.is_start_reported, true) {
+                self.stats();
+            }
             let process = self.stats.process().clone();
             let key = Topic::Ready(process.clone()).in_run(&self.run);
             let ready = Control::Ready {

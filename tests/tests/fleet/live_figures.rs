@@ -111,7 +111,14 @@ fn a_run_that_answers_every_tick_reports_its_stages_and_resources() {
     let processes = report["processes"].as_array().unwrap();
     assert_eq!(processes.len(), 5, "{processes:?}");
     for process in processes {
-        assert!(process["cpu_s"].as_f64().unwrap() > 0.0, "{process}");
+        let [all, playing] = ["cpu_s", "playing_cpu_s"].map(|time| process[time].as_f64().unwrap());
+        let name = process["process"].as_str().unwrap();
+        let loads_models = name.starts_with("agent") || name.starts_with("ego");
+        assert!(all > 0.0, "{process}");
+        assert!(
+            !loads_models || (0.0 < playing && playing < all),
+            "the loading of models belongs to no frame: {process}"
+        );
         assert!(
             process["peak_resident_bytes"].as_u64().unwrap() > 1 << 20,
             "{process}"
