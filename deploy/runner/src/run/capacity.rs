@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use agent::config::{AgentSettings, SentBoxes};
 use bus::process_cpu_s;
 use dataset::LoadOptions;
 use deploy::report::{Capacity, Machine};
@@ -75,7 +76,7 @@ pub fn estimate(fleet: &Fleet, programs: &Path, budget: Duration) -> io::Result<
             fleet.agents.len(),
             local_vehicles(fleet),
         ),
-        vehicle_mb(fleet).map_err(io::Error::other)?,
+        frame_mb(fleet).map_err(io::Error::other)?,
         (period_ms, answer(unit)?),
     )))
 }
@@ -149,8 +150,8 @@ fn period_ms(fleet: &Fleet) -> Option<f64> {
     Some(least as f64 * 1e-6 / scene.rate)
 }
 
-/// Megabytes of a vehicle's sweep and of its map.
-fn vehicle_mb(fleet: &Fleet) -> Result<f64, RunError> {
+/// Megabytes of a frame: of each vehicle its sweep, and its map if it sends maps.
+fn frame_mb(fleet: &Fleet) -> Result<f64, RunError> {
     let is_recorded = |tick: &usize| fleet.recorded.is_present(0, *tick);
     let sweep = (0..fleet.recorded.ticks.len())
         .find(is_recorded)
@@ -158,11 +159,17 @@ fn vehicle_mb(fleet: &Fleet) -> Result<f64, RunError> {
         .transpose()
         .map_err(EvaluateError::from)?;
     let sweep_bytes = sweep.map_or(0, |frame| size_of_val(&frame.points.xyzi[..]) as u64);
-    let map_bytes = match fleet.scenario.method.exchange() {
-        Exchange::Features => fleet.map_values() * fleet.scenario.agents.codec.dtype.size(),
-        _ => 0,
+    let shares_maps = fleet.scenario.method.exchange() == Exchange::Features;
+    let map_bytes = |cav| {
+        let AgentSettings { codec, boxes, .. } = fleet.settings_of(cav);
+        let all = fleet.map_values() * codec.dtype.size();
+        match shares_maps && boxes != Some(SentBoxes::Only) {
+            true => codec.budget_bytes.map_or(all, |budget| all.min(budget)),
+            false => 0,
+        }
     };
-    Ok((sweep_bytes + map_bytes) as f64 * 1e-6)
+    let bytes = fleet.agents.iter().map(|cav| sweep_bytes + map_bytes(cav));
+    Ok(bytes.sum::<u64>() as f64 * 1e-6)
 }
 
 /// Capacity from measured times: their means.
@@ -170,7 +177,7 @@ fn capacity_of(
     machine: Machine,
     measured: &[Measured],
     (method, vehicles, local_vehicles): (String, usize, usize),
-    vehicle_mb: f64,
+    frame_mb: f64,
     (period_ms, unit_ms): (f64, f64),
 ) -> Capacity {
     let mean = |value: fn(&Measured) -> f64| {
@@ -178,7 +185,7 @@ fn capacity_of(
     };
     let (agent_ms, fuse_ms) = (mean(|one| one.agent_ms), mean(|one| one.fuse_ms));
     let free_share = mean(|one| one.free_share);
-    let messages_ms = vehicles as f64 * vehicle_mb * UNITS_PER_MB * unit_ms;
+    let messages_ms = frame_mb * UNITS_PER_MB * unit_ms;
     let needed_ms = local_vehicles as f64 * agent_ms + fuse_ms + messages_ms;
     let available_ms = machine.cores as f64 * free_share * period_ms;
     // Neither an agent nor the ego computes two frames at once.
@@ -247,7 +254,7 @@ mod tests {
         capacity_with(
             cores,
             [agent_ms, fuse_ms, free_share],
-            0.5 / UNITS_PER_MB,
+            1.0 / UNITS_PER_MB,
             10.0,
         )
     }
@@ -255,7 +262,7 @@ mod tests {
     fn capacity_with(
         cores: usize,
         [agent_ms, fuse_ms, free_share]: [f64; 3],
-        vehicle_mb: f64,
+        frame_mb: f64,
         unit_ms: f64,
     ) -> Capacity {
         let measured = Measured {
@@ -270,14 +277,14 @@ mod tests {
         };
         let all = [measured.clone(), measured];
         let fleet = ("pastat".to_owned(), 2, 2);
-        capacity_of(machine, &all, fleet, vehicle_mb, (100.0, unit_ms))
+        capacity_of(machine, &all, fleet, frame_mb, (100.0, unit_ms))
     }
 
     /// Measured on two cores of an EPYC 7003, AVX2, while both compute: an agent takes 42 ms and the ego 89; a run took
     /// 240 ms of CPU per frame of 200 ms.
     #[test]
     fn a_run_that_needs_240_of_200_ms_answers_50_of_60_frames() {
-        let capacity = capacity_with(2, [42.3, 89.1, 1.0], 2.5, 19.4);
+        let capacity = capacity_with(2, [42.3, 89.1, 1.0], 5.0, 19.4);
         assert!((capacity.needed_ms - 232.0).abs() < 1.0, "{capacity:?}");
         assert_eq!((60.0 * capacity.expected_share).round(), 52.0);
     }
