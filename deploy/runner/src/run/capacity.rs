@@ -159,17 +159,21 @@ fn frame_mb(fleet: &Fleet) -> Result<f64, RunError> {
         .transpose()
         .map_err(EvaluateError::from)?;
     let sweep_bytes = sweep.map_or(0, |frame| size_of_val(&frame.points.xyzi[..]) as u64);
-    let shares_maps = fleet.scenario.method.exchange() == Exchange::Features;
-    let map_bytes = |cav| {
-        let AgentSettings { codec, boxes, .. } = fleet.settings_of(cav);
-        let all = fleet.map_values() * codec.dtype.size();
-        match shares_maps && boxes != Some(SentBoxes::Only) {
-            true => codec.budget_bytes.map_or(all, |budget| all.min(budget)),
-            false => 0,
-        }
+    let values = match fleet.scenario.method.exchange() {
+        Exchange::Features => fleet.map_values(),
+        _ => 0,
     };
-    let bytes = fleet.agents.iter().map(|cav| sweep_bytes + map_bytes(cav));
-    Ok(bytes.sum::<u64>() as f64 * 1e-6)
+    let of_vehicle = |cav| sweep_bytes + map_bytes(&fleet.settings_of(cav), values);
+    Ok(fleet.agents.iter().map(of_vehicle).sum::<u64>() as f64 * 1e-6)
+}
+
+/// Bytes of a vehicle's map of so many `values`; none where it sends boxes only.
+fn map_bytes(AgentSettings { codec, boxes, .. }: &AgentSettings, values: u64) -> u64 {
+    if *boxes == Some(SentBoxes::Only) {
+        return 0;
+    }
+    let all = values * codec.dtype.size();
+    codec.budget_bytes.map_or(all, |budget| all.min(budget))
 }
 
 /// Capacity from measured times: their means.
@@ -278,6 +282,18 @@ mod tests {
         let all = [measured.clone(), measured];
         let fleet = ("pastat".to_owned(), 2, 2);
         capacity_of(machine, &all, fleet, frame_mb, (100.0, unit_ms))
+    }
+
+    #[test]
+    fn a_vehicle_that_sends_boxes_only_has_no_map_and_a_budget_limits_one() {
+        let (mut settings, values) = (AgentSettings::default(), 1000);
+        let all = values * settings.codec.dtype.size();
+        assert_eq!(map_bytes(&settings, values), all);
+        settings.boxes = Some(SentBoxes::Beside);
+        settings.codec.budget_bytes = Some(300);
+        assert_eq!(map_bytes(&settings, values), 300);
+        settings.boxes = Some(SentBoxes::Only);
+        assert_eq!(map_bytes(&settings, values), 0);
     }
 
     /// Measured on two cores of an EPYC 7003, AVX2, while both compute: an agent takes 42 ms and the ego 89; a run took
