@@ -327,6 +327,8 @@ impl Agent {
             .iter()
             .map(|candidate| candidate.detection(Some(self.cav.clone())))
             .collect();
+        let mut detections = detector.refined(map, detections)?;
+        detections.retain(|detection| detection.score > settings.score_threshold);
         times.lap("boxes");
         Ok((heads.confidence, detections))
     }

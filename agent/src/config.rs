@@ -153,6 +153,10 @@ pub struct AgentSettings {
     #[arg(long, value_enum)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub boxes: Option<SentBoxes>,
+    /// Weights of a vehicle with a network of its own. Absent: those of the run, as always of the ego's own agent.
+    #[arg(skip)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weights: Option<PathBuf>,
     /// Falsification of the vehicle's messages, to measure its effect on the ego. Absent: none.
     #[arg(long, value_enum, help_heading = "Attack")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -167,7 +171,7 @@ pub struct AgentSettings {
 pub enum SentBoxes {
     /// In place of maps.
     Only,
-    /// Beside maps, and before them: the ego falls back on them where a map is late, lost or of another network.
+    /// Beside maps, and before them: the ego reads both, and boxes alone where a map is late, lost or of another network.
     Beside,
 }
 
@@ -276,6 +280,7 @@ impl AgentSettings {
             },
             rate: RateConfig::default(),
             boxes: None,
+            weights: None,
             ..self
         }
     }
@@ -297,6 +302,10 @@ impl ProcessConfig for AgentConfig {
         if self.publish.contains(&Publish::None) && self.publish.len() > 1 {
             let rule = "must be alone: nothing is published beside the pose";
             return Err(FieldError::new("publish", "none and others", rule));
+        }
+        if let Some(weights) = &self.settings.weights {
+            let rule = "must be left out: those of one agent are models.weights (--weights)";
+            return Err(FieldError::new("settings.weights", weights.display(), rule));
         }
         let weights = self.models.weights.display();
         match self.gives_poses_only() {

@@ -8,12 +8,13 @@ mod error;
 mod latency_compensation;
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use nalgebra::Isometry3;
 use perception::boxes::decode::Decoded;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, detections, postprocess};
-use perception::detector::{Detector, check_values};
+use perception::detector::{Detector, Heads, check_values};
 use perception::weights::{METHOD_KEY, Weights};
 use protocol::{
     CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming,
@@ -23,7 +24,7 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use self::latency_compensation::LatencyCompensation;
 use crate::misbehaviour::{Assessment, MisbehaviourDetector};
-use fusion::box_input::{PlacedBox, placed};
+use fusion::box_input::{MAX_BOXES, PlacedBox, placed};
 use fusion::f64_tensor;
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
@@ -34,8 +35,8 @@ use fusion::{AlignedMaps, MapMetadata, ReceivedMaps};
 pub use crate::view::{Content, View};
 pub use error::EgoError;
 
-/// Lag of a neighbour's newest map behind its newest boxes beyond which the boxes are fused, nanoseconds: at 10 Hz maps of
-/// one sweep before earn more than boxes, maps of three sweeps before less (`deploy/results/experiments.md`).
+/// Lag of a neighbour's newest map behind its newest boxes beyond which the boxes alone are fused, nanoseconds: at 10 Hz
+/// one sweep.
 const MAP_LAG_NANOS: i64 = 100_000_000;
 
 /// Reason why a neighbour is not in a result.
@@ -72,6 +73,8 @@ pub struct Ego {
     trust: Option<MisbehaviourDetector>,
     /// Absent: boxes stay where they were detected.
     compensation: Option<LatencyCompensation>,
+    /// Senders of more boxes than are read.
+    crowded: BTreeSet<CavId>,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -128,6 +131,7 @@ impl Ego {
             history,
             trust: None,
             compensation: reads_boxes.then(LatencyCompensation::default),
+            crowded: BTreeSet::new(),
             limits,
             comm_range_m: Self::COMM_RANGE_M,
         }
@@ -281,7 +285,7 @@ impl Ego {
         })
     }
 
-    /// The views that can be fused: of each neighbour its map, or its boxes where they are better.
+    /// The views that can be fused: of each neighbour its map and its boxes, or its boxes alone where its map is outdated.
     fn choose<'a>(&self, own: &'a View, neighbours: &'a [Cow<'_, View>]) -> Choice<'a> {
         let ego_from_cav = Pose::IDENTITY;
         let mut choice = Choice {
@@ -302,7 +306,7 @@ impl Ego {
             }
         }
         let others = choice.aligned[1..].iter();
-        let is_unneeded = others.map(|view| view.is_unneeded_beside(&choice.aligned));
+        let is_unneeded = others.map(|view| view.is_outdated_beside(&choice.aligned));
         let is_unneeded: Vec<bool> = is_unneeded.collect();
         choice.leave_out(&is_unneeded, DropReason::Unneeded);
         choice
@@ -360,16 +364,16 @@ impl Ego {
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
 
-    /// Intermediate fusion, and ego-only detection; boxes of neighbours without a map are an input of the fused map.
+    /// Intermediate fusion, and ego-only detection; boxes of neighbours without a map change what the head finds.
     fn merge_features(
         &mut self,
         all: &[Aligned<'_>],
         stages: &mut StageTimes,
     ) -> Result<Vec<Detection>, EgoError> {
-        let boxes: Vec<PlacedBox> = all[1..]
-            .iter()
-            .flat_map(|view| view.boxes(all[0].view))
+        let boxes: Vec<PlacedBox> = (1..all.len())
+            .flat_map(|sender| all[sender].boxes(sender, all[0].view))
             .collect();
+        self.name_crowded(all);
         let has_map = |view: &&Aligned<'_>| matches!(view.view.content, Content::Features(_));
         let aligned: Vec<Aligned<'_>> = all.iter().filter(has_map).copied().collect();
         let aligned = aligned.as_slice();
@@ -412,12 +416,25 @@ impl Ego {
         let on_grid = self.fusion.align_with(&newest, earlier, &metadata)?;
         stages.lap("align");
         let fused = self.fusion.fuse(&on_grid)?.map;
-        let fused = f64_tensor::as_batch(&self.fusion.with_boxes(fused, &boxes)?)?;
+        let fused = f64_tensor::as_batch(&fused)?;
         check_values("the fused feature map", &fused)?;
         stages.lap("fuse");
-        let detections = self.boxes_of(&fused, stages)?;
+        let detections = self.boxes_of(&fused, &boxes, stages)?;
         self.keep(aligned, maps.into_iter().zip(sent), &on_grid)?;
         Ok(detections)
+    }
+
+    /// Names each sender of more boxes than are read, once.
+    fn name_crowded(&mut self, all: &[Aligned<'_>]) {
+        for Aligned { view, .. } in all {
+            if let Content::Boxes(found) = &view.content
+                && found.len() > MAX_BOXES
+                && self.crowded.insert(view.cav.clone())
+            {
+                let boxes = found.len();
+                tracing::warn!(cav = %view.cav, boxes, "more than {MAX_BOXES} boxes: those of the lowest scores are left out");
+            }
+        }
     }
 
     /// A feature map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`.
@@ -498,7 +515,7 @@ impl Ego {
         let encoded = self.detector.encode_merged(&merged)?.features;
         let features = self.detector.through_compressor(&encoded)?;
         stages.lap("encode");
-        self.boxes_of(&features, stages)
+        self.boxes_of(&features, &[], stages)
     }
 
     /// Late fusion: the boxes of all in the ego frame, the best of those that overlap.
@@ -538,10 +555,15 @@ impl Ego {
 
     fn boxes_of(
         &self,
-        features: &Tensor,
+        fused: &Tensor,
+        of_neighbours: &[PlacedBox],
         stages: &mut StageTimes,
     ) -> Result<Vec<Detection>, EgoError> {
-        let heads = self.detector.heads(features)?;
+        let mut head = self.detector.head_output(fused)?;
+        if !of_neighbours.is_empty() {
+            head = tch::no_grad(|| self.fusion.with_boxes(fused, head, of_neighbours))?;
+        }
+        let heads = Heads::new(&head)?;
         stages.lap("head");
         let decoded = self.detector.boxes(&heads, self.limits.score_threshold)?;
         let detections = detections(&decoded, &self.limits);
@@ -597,25 +619,19 @@ struct Aligned<'a> {
 }
 
 impl Aligned<'_> {
-    /// True for a message of a neighbour of which a better one is among the views: its map, unless that is older than its
-    /// boxes by more than [`MAP_LAG_NANOS`].
-    fn is_unneeded_beside(&self, all: &[Self]) -> bool {
+    /// True for a map of a neighbour whose boxes are newer by more than [`MAP_LAG_NANOS`], and for boxes whose map is newer.
+    fn is_outdated_beside(&self, all: &[Self]) -> bool {
         let is_map = |one: &Self| matches!(one.view.content, Content::Features(_));
+        let most_nanos = if is_map(self) { MAP_LAG_NANOS } else { 0 };
         all[1..].iter().any(|other| {
-            let (map, boxes) = if is_map(self) {
-                (self, other)
-            } else {
-                (other, self)
-            };
-            let is_late = map.view.age_nanos(boxes.view) > MAP_LAG_NANOS;
             other.view.cav == self.view.cav
                 && is_map(other) != is_map(self)
-                && is_late == is_map(self)
+                && self.view.age_nanos(other.view) > most_nanos
         })
     }
 
-    /// Its boxes, if it has sent boxes.
-    fn boxes(&self, ego: &View) -> Vec<PlacedBox> {
+    /// Its boxes, if it has sent boxes; `sender` is its number.
+    fn boxes(&self, sender: usize, ego: &View) -> Vec<PlacedBox> {
         let Content::Boxes(found) = &self.view.content else {
             return Vec::new();
         };
@@ -625,7 +641,7 @@ impl Aligned<'_> {
             age_secs,
             ..
         } = self.metadata(0, ego);
-        placed(found, &ego_from_cav, age_secs, confidence)
+        placed(found, &ego_from_cav, sender, age_secs, confidence)
     }
 
     fn metadata(&self, agent: usize, ego: &View) -> MapMetadata {

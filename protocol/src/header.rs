@@ -27,7 +27,7 @@ use crate::{CavId, IdError, Kind, WireError};
 /// First four bytes of every message.
 pub const MAGIC: [u8; 4] = *b"V2VL";
 /// Version of the whole wire format; any change of layout or metadata raises it.
-pub const WIRE_VERSION: u16 = 6;
+pub const WIRE_VERSION: u16 = 7;
 /// Bytes of a header.
 pub const HEADER_LEN: usize = 92;
 
@@ -230,7 +230,7 @@ mod tests {
     fn bytes_are_stable() {
         let mut golden = Vec::new();
         golden.extend(b"V2VL");
-        golden.extend([6, 0, 5, 4]);
+        golden.extend([7, 0, 5, 4]);
         golden.extend(b"4279");
         golden.extend([0; 28]);
         golden.extend([8, 7, 6, 5, 4, 3, 2, 1]);
@@ -241,7 +241,7 @@ mod tests {
         golden.extend([40, 0, 0, 0]);
         golden.extend([0xef, 0xbe, 0xad, 0xde]);
         // zlib.crc32 of the above.
-        golden.extend([0xbf, 0x6a, 0xd0, 0xad]);
+        golden.extend([0x70, 0xca, 0xd3, 0xf7]);
         assert_eq!(header().to_bytes().as_slice(), golden);
         assert_eq!(Header::from_bytes(&header().to_bytes()).unwrap(), header());
     }
@@ -262,8 +262,8 @@ mod tests {
             Err(WireError::Magic { found: [b'X', ..] })
         ));
         assert!(matches!(
-            resealed(|b| b[4] = 7),
-            Err(WireError::Version { found: 7 })
+            resealed(|b| b[4] = 8),
+            Err(WireError::Version { found: 8 })
         ));
         assert!(matches!(
             resealed(|b| b[6] = 99),

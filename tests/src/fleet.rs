@@ -80,7 +80,7 @@ pub fn programs() -> &'static Path {
 /// # Panics
 /// When a file cannot be written.
 pub fn write_weights(path: &Path) {
-    write(path, &tiny());
+    write(path, &tiny(8));
 }
 
 /// The same with a head that detects vehicles everywhere: where boxes are compared there have to be some.
@@ -88,17 +88,26 @@ pub fn write_weights(path: &Path) {
 /// # Panics
 /// When a file cannot be written.
 pub fn write_sighted_weights(path: &Path) {
-    write(path, &sighted());
+    write(path, &sighted(8));
 }
 
-/// The same with a box input, which changes the map.
+/// The same of another network, whose maps have more channels.
+///
+/// # Panics
+/// When a file cannot be written.
+pub fn write_weights_of_another_network(path: &Path) {
+    write(path, &sighted(12));
+}
+
+/// The same with a box input, which changes scores and boxes, and a refinement of the boxes that a vehicle sends.
 ///
 /// # Panics
 /// When a file cannot be written.
 pub fn write_weights_with_box_input(path: &Path) {
-    let mut model = sighted();
+    let mut model = sighted(8);
     model.train_box_input_only().expect("a box input");
     set(&model, "box_input.out.weight", 0.1);
+    set(&model, "box_refinement.out.weight", 0.01);
     write(path, &model);
 }
 
@@ -107,8 +116,8 @@ fn write(path: &Path, model: &CooperativeModel) {
     weights::save(path, &model.variables, &model.about(), precision).expect("a writable folder");
 }
 
-fn sighted() -> CooperativeModel {
-    let model = tiny();
+fn sighted(channels: i64) -> CooperativeModel {
+    let model = tiny(channels);
     set(&model, "cls_head.bias", 0.5);
     model
 }
@@ -118,7 +127,7 @@ fn set(model: &CooperativeModel, name: &str, value: f64) {
     let _ = tch::no_grad(|| variable.fill_(value));
 }
 
-fn tiny() -> CooperativeModel {
+fn tiny(channels: i64) -> CooperativeModel {
     let _generator = random_generator_lock();
     tch::manual_seed(7);
     let config = DetectorConfig {
@@ -128,7 +137,7 @@ fn tiny() -> CooperativeModel {
         layer_nums: vec![1, 1, 1],
         num_filters: vec![8, 8, 8],
         num_upsample_filters: vec![8; 3],
-        shrink: Some(ShrinkConfig::Pointwise { channels: 8 }),
+        shrink: Some(ShrinkConfig::Pointwise { channels }),
         ..DetectorConfig::lean()
     };
     CooperativeModel::new(&config, Method::MAX, tch::Device::Cpu)

@@ -409,7 +409,7 @@ impl AgentLoop {
         };
         // Boxes first: they are what an ego falls back on while a large map is on its way.
         if self.options.publish.contains(&Stream::Boxes) {
-            let content = Content::Fixed(Message::Boxes(Boxes { pose, detections }));
+            let content = Content::Fixed(Message::Boxes(Boxes::new(pose, detections)));
             self.publish(Stream::Boxes, capture_nanos, content);
         }
         if self.options.publish.contains(&Stream::Bev) {

@@ -227,14 +227,14 @@ impl Fleet {
             link,
             ..
         } = &self.scenario;
-        let settings = self.agents.iter().map(|cav| self.settings_of(cav));
-        let poses: Vec<_> = settings.map(|settings| settings.pose).collect();
+        let vehicles = self.agents.iter().map(|cav| self.settings_of(cav));
+        let vehicles: Vec<_> = vehicles.collect();
         // Opened before, when the run was planned.
         let link = link
             .as_ref()
             .and_then(|link| LinkConfig::open(&link.model).ok());
         let link = link.as_ref().map(|(link, folder)| (link, folder.as_path()));
-        let files = files_of(*method, models.weights.clone(), &poses, link);
+        let files = files_of(*method, models.weights.clone(), &vehicles, link);
         let mut data = self.recorded.clone();
         data.agents.clone_from(&self.agents);
         data.ticks.drain(..scene.seek);

@@ -473,7 +473,7 @@ impl OpenFrame {
     /// Detections that single vehicles sent.
     fn single(&self) -> Vec<ShownBox> {
         let each = |(cav, boxes): (&CavId, &Boxes)| {
-            self.placed(cav, &boxes.pose, &boxes.detections, Some(cav))
+            self.placed(cav, &boxes.pose, boxes.detections(), Some(cav))
         };
         self.own_boxes.iter().flat_map(each).collect()
     }

@@ -8,6 +8,7 @@ use std::path::Path;
 use perception::boxes::anchors::Anchors;
 use perception::boxes::decode::{DecodeError, decode};
 use perception::boxes::postprocess::{PostprocessConfig, detections};
+use perception::boxes::refinement::{self, BoxRefinement};
 use perception::detector::DetectorError;
 use perception::layers::head::HeadOutput;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
@@ -93,6 +94,8 @@ pub struct CooperativeModel {
     network: PointPillars,
     anchors: Anchors,
     fusion: FusionStage,
+    /// Refinement of the boxes that a vehicle sends.
+    refinement: Option<BoxRefinement>,
 }
 
 impl CooperativeModel {
@@ -132,6 +135,7 @@ impl CooperativeModel {
             variables,
             anchors,
             fusion,
+            refinement: None,
         })
     }
 
@@ -167,6 +171,9 @@ impl CooperativeModel {
         if box_input::is_in(weights) {
             model.add_box_input();
         }
+        if refinement::is_in(weights) {
+            model.add_refinement();
+        }
         // A single-vehicle network becomes a cooperative one whose fusion is untrained.
         let is_fusion =
             |name: &str| name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
@@ -181,7 +188,17 @@ impl CooperativeModel {
         self.fusion.add_box_input(&root, &self.network.config);
     }
 
-    /// Freezes everything but the box input, which is made if there is none.
+    fn add_refinement(&mut self) {
+        let root = self.variables.root();
+        self.refinement = Some(BoxRefinement::new(&root, &self.network.config));
+    }
+
+    /// Refinement of the boxes that a vehicle sends, if it has one.
+    pub fn refinement(&self) -> Option<&BoxRefinement> {
+        self.refinement.as_ref()
+    }
+
+    /// Freezes everything but the box input and the refinement of boxes, which are made if there are none.
     ///
     /// # Errors
     /// [`TchError`] from the tensor library.
@@ -189,9 +206,13 @@ impl CooperativeModel {
         if !self.fusion.reads_boxes() {
             self.add_box_input();
         }
+        if self.refinement.is_none() {
+            self.add_refinement();
+        }
         for (name, variable) in self.variables.variables() {
-            let is_trained = name.starts_with(box_input::PREFIX);
-            let _ = variable.f_set_requires_grad(is_trained)?;
+            let is_trained =
+                [box_input::PREFIX, refinement::PREFIX].map(|prefix| name.starts_with(prefix));
+            let _ = variable.f_set_requires_grad(is_trained.contains(&true))?;
         }
         Ok(())
     }
@@ -326,12 +347,26 @@ impl CooperativeModel {
         &self,
         samples: &[(Tensor, Vec<MapMetadata>, Vec<PlacedBox>)],
     ) -> Result<HeadOutput, ModelError> {
-        let fused = samples.iter().map(|(maps, facts, boxes)| {
-            let fused = tch::no_grad(|| self.fuse(maps.shallow_clone(), facts, false))?;
-            Ok(self.fusion.read_boxes(fused.map, boxes)?)
+        let heads = samples.iter().map(|(maps, facts, boxes)| {
+            let (fused, head) = tch::no_grad(|| {
+                let fused = self
+                    .fuse(maps.shallow_clone(), facts, false)?
+                    .map
+                    .f_unsqueeze(0)?;
+                let head = self.network.heads(&fused)?;
+                Ok::<_, ModelError>((fused, head))
+            })?;
+            Ok(self.fusion.with_boxes(&fused, head, boxes)?)
         });
-        let fused = fused.collect::<Result<Vec<_>, ModelError>>()?;
-        Ok(self.network.heads(&Tensor::f_stack(&fused, 0)?)?)
+        let heads = heads.collect::<Result<Vec<HeadOutput>, ModelError>>()?;
+        let all = |map: fn(&HeadOutput) -> &Tensor| {
+            let maps: Vec<&Tensor> = heads.iter().map(map).collect();
+            Tensor::f_cat(&maps, 0)
+        };
+        Ok(HeadOutput {
+            scores: all(|head| &head.scores)?,
+            offsets: all(|head| &head.offsets)?,
+        })
     }
 
     /// Mask of the cells of maps `[N, C, H, W]` that agents would have sent, for a method in which they select: in

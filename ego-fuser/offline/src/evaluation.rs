@@ -190,14 +190,19 @@ impl Evaluator {
             is_ego,
             gate: self.ego.method().gate(),
         });
-        let detector =
-            Detector::from_weights(&self.weights, &self.weights.detector_config()?, Device::Cpu)?;
+        let precision = self.setup.models.precision;
+        let own = { settings.weights.as_deref() }
+            .map(Weights::load)
+            .transpose()?;
+        let own = own.map(|weights| weights.with_precision(precision));
+        let weights = own.as_ref().unwrap_or(&self.weights);
+        let detector = Detector::from_weights(weights, &weights.detector_config()?, Device::Cpu)?;
         let cav = &scenario.agents[place];
         let attack = match settings.falsification {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),
             None => { self.setup.attack }.and_then(|attack| attack.of(place, cav)),
         };
-        let inference = Inference::new(Device::Cpu, self.setup.models.precision);
+        let inference = Inference::new(Device::Cpu, precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
         let agent = agent.within(settings.rate);
         Ok(Participant::new(agent, attack, &settings))
@@ -211,7 +216,8 @@ impl Evaluator {
         self.remote.is_some()
             || self.maps.is_none()
             || shares_points
-            || settings.any(|settings| settings.pose.looks_at_sweeps())
+            || settings
+                .any(|settings| settings.weights.is_some() || settings.pose.looks_at_sweeps())
     }
 }
 

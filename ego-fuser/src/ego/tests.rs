@@ -676,15 +676,21 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
             detect(true, &[]).detections
         );
 
-        // Of one neighbour the map counts, and its boxes where the map does not.
+        // Of one neighbour map and boxes count, and its boxes alone where the map does not.
         let same = View {
             cav: map.cav.clone(),
             ..boxes.clone()
         };
         let both = detect(true, &[&same, &map]);
+        assert_eq!((both.fused, both.skipped), (vec![0, 1], vec![]));
+        assert_eq!(both.detections, read.detections);
+        let late = View {
+            capture_nanos: map.capture_nanos.saturating_sub(200_000_000),
+            ..map.clone()
+        };
+        let newer = detect(true, &[&same, &late]);
         let unneeded = Skipped::Unusable(DropReason::Unneeded);
-        assert_eq!((both.fused, both.skipped), (vec![1], vec![(0, unneeded)]));
-        assert_eq!(both.detections, detect(true, &[&map]).detections);
+        assert_eq!((newer.fused, newer.skipped), (vec![0], vec![(1, unneeded)]));
         let mut foreign = map.clone();
         if let Content::Features(map) = &mut foreign.content {
             map.features.channels += 1;

@@ -50,8 +50,8 @@ impl EgoLoop {
         }
         let (pose, content) = match stream {
             Stream::Boxes => {
-                let Boxes { pose, detections } = payload(pieces, limits)?;
-                (pose, Content::Boxes(detections))
+                let boxes: Boxes = payload(pieces, limits)?;
+                (boxes.pose, Content::Boxes(boxes.into_detections()))
             }
             Stream::Points => {
                 let Points { pose, points } = payload(pieces, limits)?;

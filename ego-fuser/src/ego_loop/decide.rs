@@ -235,6 +235,15 @@ impl EgoLoop {
                 self.fused_nanos.insert(cav, view.capture_nanos);
             }
             self.count(view, message, None);
+            // A neighbour is one, also by two messages: its boxes are read beside its map.
+            if let Some(same) =
+                { described.iter_mut() }.find(|same: &&mut FusedNeighbour| same.cav == view.cav)
+            {
+                same.age_nanos = same.age_nanos.max(view.age_nanos(own));
+                same.payload_bytes += message.payload_bytes;
+                same.wire_bytes += message.wire_bytes;
+                continue;
+            }
             described.push(FusedNeighbour {
                 cav: view.cav.clone(),
                 age_nanos: view.age_nanos(own),

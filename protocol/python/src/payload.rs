@@ -195,7 +195,7 @@ impl Detections {
         cav: &str,
         boxes: &protocol::Boxes,
     ) -> PyResult<Py<Self>> {
-        Py::new(py, Self::of_list(py, cav, &boxes.pose, &boxes.detections)?)
+        Py::new(py, Self::of_list(py, cav, &boxes.pose, boxes.detections())?)
     }
 
     fn of_list(

@@ -517,7 +517,7 @@ pub(crate) fn any_message() -> impl Strategy<Value = Message> {
         1 => any_estimate().prop_map(Message::Pose),
         3 => any_bev().prop_map(Message::Bev),
         1 => (any_estimate(), vec(any_detection(), 0..20))
-            .prop_map(|(pose, detections)| Message::Boxes(Boxes { pose, detections })),
+            .prop_map(|(pose, detections)| Message::Boxes(Boxes::new(pose, detections))),
         1 => (any_estimate(), any_points()).prop_map(|(pose, points)| Message::Points(Points { pose, points })),
         1 => any_descriptor().prop_map(Message::Descriptor),
         1 => any_detections().prop_map(Message::Detections),

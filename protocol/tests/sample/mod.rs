@@ -313,10 +313,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
             reason: NoPoseReason::TooFewInliers,
             inlier_count: 4,
         }),
-        Message::Boxes(Boxes {
-            pose: pose(),
-            detections: vec![detection(0.25); 5],
-        }),
+        Message::Boxes(Boxes::new(pose(), vec![detection(0.25); 5])),
         Message::Points(Points {
             pose: pose(),
             points: points(),

@@ -195,7 +195,7 @@ fn a_neighbour_that_sends_boxes_is_fused_where_the_weights_read_them() {
     fs::write(folder.path().join("link.yaml"), link).unwrap();
     let weights = folder.path().join("weights.safetensors");
     let mut scenario = PathBuf::new();
-    for (boxes, unneeded) in [("only", 0), ("beside", 4)] {
+    for boxes in ["only", "beside"] {
         let rest = format!(
             "link: {{model: link.yaml}}\nego: {{deadline_ms: 5000}}\nvehicles: {{\"4288\": {{boxes: {boxes}}}}}"
         );
@@ -209,8 +209,8 @@ fn a_neighbour_that_sends_boxes_is_fused_where_the_weights_read_them() {
         let results = results(&up.folder);
         let counts: Vec<usize> = results.iter().map(fused).collect();
         assert_eq!(counts, [1; 4], "{boxes}");
-        let dropped = ledger["total"]["dropped"]["unneeded"].as_u64();
-        assert_eq!(dropped.unwrap_or(0), unneeded, "{}", ledger["total"]);
+        let dropped = &ledger["total"]["dropped"]["unneeded"];
+        assert!(dropped.is_null(), "{}", ledger["total"]);
         fs::remove_dir_all(&up.folder).unwrap();
     }
 

@@ -19,7 +19,7 @@ use runner::scenario::Scenario;
 use serde_json::Value;
 use tests::fleet::{
     check_origin, fused, programs, results, write_scenario, write_sighted_weights,
-    write_weights_with_box_input,
+    write_weights_of_another_network, write_weights_with_box_input,
 };
 use tests::locks::exclusive_lock;
 
@@ -503,6 +503,8 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
     tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
     write_sighted_weights(&folder.path().join("weights.safetensors"));
     write_weights_with_box_input(&folder.path().join("boxes.safetensors"));
+    write_weights_of_another_network(&folder.path().join("other.safetensors"));
+    let mut with_boxes = Vec::new();
     let link = "capacity: {token_bucket: {bandwidth_mbps: 20}}\nlatency: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
     // All settings that an agent's process needs: noise, codec, limits, one vehicle with settings of its own.
@@ -519,6 +521,10 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             "max",
             "vehicles: {\"4288\": {boxes: only}, \"4297\": {boxes: beside}}",
         ),
+        (
+            "max",
+            "vehicles: {\"4288\": {boxes: only, weights: other.safetensors}, \"4297\": {boxes: beside}}",
+        ),
         ("none", ""),
     ] {
         let weights = match rest.contains("boxes") {
@@ -533,7 +539,7 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             );
             let path = folder.path().join("scenario.yaml");
             fs::write(&path, text).unwrap();
-            let name = format!("{method}-{}-{processes}", rest.contains("boxes"));
+            let name = format!("{method}-{}-{processes}", rest.len());
             run_up(folder.path(), &path, &name)
         };
         let (one, many) = (run(false), run(true));
@@ -541,6 +547,9 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
         let decided = results(one.folder.path());
         let is_found = |result: &Value| !result["detections"].as_array().unwrap().is_empty();
         assert!(decided.iter().any(is_found), "{method} {rest}");
+        if rest.contains("boxes") {
+            with_boxes.push(decided.clone());
+        }
         let ledger = fs::read_to_string(one.folder.file("ledger.json")).unwrap();
         let ledger: Value = serde_json::from_str(&ledger).unwrap();
         assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
@@ -552,6 +561,7 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
         let logs = fs::read_dir(many.folder.log_dir()).unwrap().count();
         assert_eq!((logs, many.killed.len()), (3, 0), "one process a vehicle");
     }
+    assert_ne!(with_boxes[0], with_boxes[1], "of another network");
 }
 
 #[test]

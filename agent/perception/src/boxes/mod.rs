@@ -4,3 +4,5 @@ pub mod anchors;
 pub mod decode;
 pub mod nms;
 pub mod postprocess;
+pub mod refinement;
+pub mod surroundings;

@@ -9,7 +9,7 @@ mod output;
 use std::path::Path;
 
 use protocol::message::ModelHash;
-use protocol::{BevFeatures, BevGrid, DecodedFeatures, PointCloud};
+use protocol::{BevFeatures, BevGrid, DecodedFeatures, Detection, PointCloud};
 use support::stage_times::StageTimes;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor};
@@ -24,9 +24,10 @@ use output::{check_boxes, flat};
 
 use crate::boxes::anchors::Anchors;
 use crate::boxes::decode::{Decoded, decode};
+use crate::boxes::refinement::{self, BoxRefinement};
 use crate::crop::Crop;
 use crate::int8::{ActivationScales, QuantiseError, ScaleSearch};
-use crate::layers::head::DetectionHead;
+use crate::layers::head::{DetectionHead, HeadOutput};
 use crate::layers::shrink::{Compressor, Shrink};
 use crate::model_config::{DetectorConfig, YAxis};
 use crate::pillars::point_pillars::PointPillars;
@@ -54,6 +55,8 @@ pub struct Detector {
     encoder: BevEncoder,
     compressor: Option<Compressor>,
     head: DetectionHead,
+    /// Second stage for boxes that are sent, where the weights have it.
+    refinement: Option<BoxRefinement>,
     anchors: Anchors,
     cropped: Vec<[f32; 4]>,
 }
@@ -80,11 +83,14 @@ impl Detector {
     ) -> Result<Self> {
         let network = VarStore::new(device);
         let pillars = PointPillars::new(&network.root(), config)?;
+        let refinement =
+            refinement::is_in(weights).then(|| BoxRefinement::new(&network.root(), config));
         weights.copy_into(&network)?;
         let (sha256, encoder_sha256) = (weights.sha256().to_owned(), encoder_sha256(weights));
         let detector = Self {
             sha256,
             encoder_sha256,
+            refinement,
             ..Self::from_network(pillars)
         };
         match weights.activation_scales()? {
@@ -125,6 +131,7 @@ impl Detector {
             compressor: network.compressor.as_ref().map(Compressor::folded),
             anchors: Anchors::for_detector(&network.config),
             head: network.head,
+            refinement: None,
             config: network.config,
             cropped: Vec::new(),
         })
@@ -356,8 +363,16 @@ impl Detector {
     /// [`DetectorError::Shape`] if the feature map is not of this detector; [`DetectorError::Values`] if an output is
     /// not valid.
     pub fn heads(&self, features: &Tensor) -> Result<Heads> {
+        Heads::new(&self.head_output(features)?)
+    }
+
+    /// Scores and offsets of such a map as tensors, not checked.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] if the feature map is not of this detector.
+    pub fn head_output(&self, features: &Tensor) -> Result<HeadOutput> {
         let map = checked(features, self.map_shape())?;
-        tch::no_grad(|| Heads::new(&self.head.forward_one(&map)?))
+        Ok(tch::no_grad(|| self.head.forward_one(&map))?)
     }
 
     /// Boxes above a score, in the frame of the feature map's vehicle, not yet suppressed.
@@ -375,6 +390,20 @@ impl Detector {
             }
         }
         Ok(boxes)
+    }
+
+    /// Detections of a feature map `[1, C, H, W]` of one vehicle, refined where the weights have a refinement, by
+    /// descending score.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] if the feature map is not of this detector.
+    pub fn refined(&self, map: &Tensor, detections: Vec<Detection>) -> Result<Vec<Detection>> {
+        match &self.refinement {
+            Some(refinement) => {
+                Ok(refinement.refined(&checked(map, self.map_shape())?, detections)?)
+            }
+            None => Ok(detections),
+        }
     }
 
     /// Message of a feature map in its transmitted form, see [`Self::compressed`].

@@ -32,7 +32,7 @@ use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options, beside those of pose sources, that a file of tables states itself.
-const OF_ONE_TABLE: [&str; 19] = [
+const OF_ONE_TABLE: [&str; 20] = [
     "dataset",
     "method",
     "weights",
@@ -45,6 +45,7 @@ const OF_ONE_TABLE: [&str; 19] = [
     "attack",
     "trust",
     "boxes",
+    "neighbour_weights",
     "latency_compensation",
     "feature_maps",
     "frames",
@@ -89,6 +90,9 @@ pub(crate) struct Arguments {
     /// Neighbours send their detections in place of feature maps, or beside them.
     #[arg(long, value_enum)]
     boxes: Option<SentBoxes>,
+    /// Weights of neighbours with a network of their own. Absent: that of the ego.
+    #[arg(long, value_name = "FILE")]
+    neighbour_weights: Option<PathBuf>,
     /// Delay of the messages of neighbours, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
     delay_ms: u64,
@@ -233,6 +237,7 @@ impl Arguments {
                     codec: self.codec.0,
                     rate: self.rate.0,
                     boxes: self.boxes,
+                    weights: self.neighbour_weights.clone(),
                     falsification: None,
                 },
                 attack: self.attack.map(attack),

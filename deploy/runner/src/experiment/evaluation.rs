@@ -159,6 +159,12 @@ impl Trial {
             ..self.clone()
         };
         settings.setup.models.weights = PathBuf::new();
+        let Setup {
+            agents, vehicles, ..
+        } = &mut settings.setup;
+        for settings in std::iter::once(agents).chain(vehicles.values_mut()) {
+            settings.weights = settings.weights.take().map(|_| PathBuf::new());
+        }
         Ok(CellKey {
             method,
             sha256: provenance.key(&format!("{method} {settings:?}")),
@@ -186,9 +192,9 @@ impl Trial {
             ..
         } = &self.setup;
         let link = { link.as_ref() }.map(|link| (&link.config, link.folder.as_path()));
-        let poses = std::iter::once(agents).chain(vehicles.values());
+        let vehicles = std::iter::once(agents).chain(vehicles.values());
         let weights = weights_of(&models.weights, method, self.sends_boxes())?;
-        let files = files_of(method, weights, poses.map(|settings| &settings.pose), link);
+        let files = files_of(method, weights, vehicles, link);
         let data_sha256 = data.sha256(self.scenarios, lidar_variant.as_deref());
         let commit = env!("V2VLOC_COMMIT");
         Ok(Provenance::collect(

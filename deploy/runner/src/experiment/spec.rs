@@ -235,6 +235,9 @@ pub struct Row {
     /// Neighbours send their detections in place of feature maps, or beside them.
     #[serde(default)]
     pub boxes: Option<SentBoxes>,
+    /// Weights of neighbours with a network of their own. Absent: that of the row.
+    #[serde(default)]
+    pub neighbour_weights: Option<PathBuf>,
     /// Latency compensation of the ego.
     #[serde(default)]
     pub latency_compensation: bool,

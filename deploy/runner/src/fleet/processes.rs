@@ -135,12 +135,16 @@ impl Fleet {
         context: &SessionContext<'_>,
         bus: BusConfig,
     ) -> AgentConfig {
-        let settings = self.settings_of(cav);
+        let mut settings = self.settings_of(cav);
+        let mut models = self.scenario.models.clone();
+        if let Some(weights) = settings.weights.take() {
+            models.weights = weights;
+        }
         let notes_sweeps = *cav == self.ego && self.scenario.clock == Clock::Wall;
         AgentConfig {
             run: context.run.clone(),
             cav: cav.clone(),
-            models: self.scenario.models.clone(),
+            models,
             settings,
             publish: vec![self.needed().0],
             egos: vec![self.ego.clone()],

@@ -2,21 +2,24 @@
 
 use std::path::{Path, PathBuf};
 
+use agent::config::AgentSettings;
 use fusion::Method;
 use link::LinkConfig;
-use localization::pose_source::PoseSourceConfig;
 
-/// Files that a method reads beside the data: its weights, its TorchScript module, those of the pose sources, and the
-/// trace of the link, whose paths are relative to a folder.
+/// Files that a method reads beside the data: its weights, its TorchScript module, those of the vehicles' pose sources and
+/// networks, and the trace of the link, whose paths are relative to a folder.
 pub(crate) fn files_of<'a>(
     method: Method,
     weights: PathBuf,
-    poses: impl IntoIterator<Item = &'a PoseSourceConfig>,
+    vehicles: impl IntoIterator<Item = &'a AgentSettings>,
     link: Option<(&LinkConfig, &Path)>,
 ) -> Vec<PathBuf> {
     let mut files = vec![weights];
     files.extend(method.script_file().map(Path::to_owned));
-    files.extend(poses.into_iter().flat_map(PoseSourceConfig::files));
+    for settings in vehicles {
+        files.extend(settings.pose.files());
+        files.extend(settings.weights.clone());
+    }
     let trace = link.and_then(|(link, folder)| Some(folder.join(link.trace_file()?)));
     files.extend(trace);
     files
@@ -27,6 +30,7 @@ mod tests {
     use link::{CapacityConfig, TraceConfig};
     use localization::pose_source::{
         BaselinePoseConfig, CachedPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig,
+        PoseSourceConfig,
     };
 
     use support::file_digests::FileDigests;
@@ -34,8 +38,8 @@ mod tests {
 
     use super::*;
 
-    /// Two heads of one encoder, a baseline, a table of poses and one of errors.
-    fn poses(folder: &Path) -> Vec<PoseSourceConfig> {
+    /// Two heads of one encoder, a baseline, a table of poses and one of errors; one vehicle has a network of its own.
+    fn vehicles(folder: &Path) -> Vec<AgentSettings> {
         let pgc = |head: &str| {
             PoseSourceConfig::Pgc(PgcConfig {
                 encoder: folder.join("encoder"),
@@ -43,7 +47,7 @@ mod tests {
                 ..Default::default()
             })
         };
-        vec![
+        let poses = vec![
             pgc("town1"),
             pgc("town4"),
             PoseSourceConfig::Baseline(BaselinePoseConfig {
@@ -59,13 +63,22 @@ mod tests {
                 table: Some(folder.join("errors")),
                 ..Default::default()
             }),
-        ]
+        ];
+        let mut vehicles: Vec<AgentSettings> = { poses.into_iter() }
+            .map(|pose| AgentSettings {
+                pose,
+                ..AgentSettings::default()
+            })
+            .collect();
+        vehicles[1].weights = Some(folder.join("own weights"));
+        vehicles
     }
 
     #[test]
     fn a_flipped_byte_of_any_file_changes_the_key_and_a_moved_folder_does_not() {
         let names = [
             "weights",
+            "own weights",
             "script.pt",
             "encoder",
             "town1",
@@ -91,7 +104,7 @@ mod tests {
             let files = files_of(
                 method.parse().unwrap(),
                 folder.join("weights"),
-                &poses(folder),
+                &vehicles(folder),
                 Some((&link, folder)),
             );
             let digests = FileDigests::default();

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use agent::config::AgentSettings;
 use bus::config_file;
 use localization::pose_source::PoseSourceConfig;
 use support::file_error::{AtFile, FileError};
@@ -69,10 +70,15 @@ impl Scenario {
             let found = pose.map_files(absolute).with_networks();
             found.map_err(|error| FileError::new(path, format_args!("agents.pose: {error}")))
         };
-        agents.pose = with_files(std::mem::take(&mut agents.pose))?;
-        vehicles
-            .values_mut()
-            .try_for_each(|own| own.change_pose(with_files))?;
+        let with_files = |settings: AgentSettings| {
+            Ok(AgentSettings {
+                pose: with_files(settings.pose)?,
+                weights: settings.weights.map(|weights| absolute(&weights)),
+                ..settings
+            })
+        };
+        *agents = with_files(std::mem::take(agents))?;
+        { vehicles.values_mut() }.try_for_each(|own| own.change(with_files))?;
         if let Some(link) = link.as_mut().filter(|link| !link.is_preset()) {
             link.model = absolute(Path::new(&link.model))
                 .to_string_lossy()

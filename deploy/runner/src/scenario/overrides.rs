@@ -1,7 +1,6 @@
 //! Settings of single vehicles that override those of all.
 
 use agent::config::AgentSettings;
-use localization::pose_source::PoseSourceConfig;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -47,17 +46,16 @@ impl AgentOverrides {
         serde_json::from_value(Value::Object(all)).unwrap_or_else(|_| settings.clone())
     }
 
-    /// Changes the pose source, if the vehicle overrides it.
-    pub(super) fn change_pose<E>(
+    /// Changes the settings that the vehicle has of its own.
+    pub(super) fn change<E>(
         &mut self,
-        change: impl FnOnce(PoseSourceConfig) -> Result<PoseSourceConfig, E>,
+        change: impl FnOnce(AgentSettings) -> Result<AgentSettings, E>,
     ) -> Result<(), E> {
-        if !self.0.contains_key("pose") {
-            return Ok(());
-        }
-        let pose = change(self.over(&AgentSettings::default()).pose)?;
-        if let Ok(pose) = serde_json::to_value(pose) {
-            self.0.insert("pose".into(), pose);
+        let changed = change(self.over(&AgentSettings::default()))?;
+        if let Ok(serde_json::Value::Object(changed)) = serde_json::to_value(changed) {
+            for (field, value) in changed {
+                self.0.entry(field).and_modify(|own| *own = value);
+            }
         }
         Ok(())
     }

@@ -1,30 +1,49 @@
-//! Box input: adds what neighbours' boxes say to the fused feature map of any method.
+//! Box input: changes what the head finds where neighbours' boxes lie, behind the fusion of any method.
 //!
-//! Boxes need no common network and take a kilobyte. They are drawn on the ego's grid ([`raster`]); a small network reads
-//! them beside the fused map and adds a correction to it near the boxes. It is trained with late, lost, shifted and
-//! invented boxes, so that age and confidence decide what they are worth. Without boxes the map stays as it is.
+//! Boxes need no common network and take a kilobyte. Around each box a small network reads the fused map, the box and
+//! how far other senders agree with it; then, cell by cell, it decides how far the head's own scores and boxes give way
+//! to it. It is trained with late, lost, shifted and invented boxes, so that age and confidence decide what they are
+//! worth. Without boxes the output of the head stays as it is.
 
-pub mod raster;
+mod cells;
+mod placed;
 
+use std::f64::consts::PI;
+
+use perception::boxes::anchors::Anchors;
+use perception::boxes::surroundings::{CHANNELS, Surroundings};
+use perception::layers::head::HeadOutput;
+use perception::model_config::DetectorConfig;
 use perception::tensor_values::tensor;
 use perception::weights::Weights;
-use protocol::BevGrid;
-use tch::nn::{self, ConvConfig, Init, Module};
-use tch::{Result, Tensor};
+use protocol::{BevGrid, Box3d};
+use tch::nn::{self, Module};
+use tch::{Kind, Result, Tensor};
 
-pub use raster::{PlacedBox, placed};
+pub use placed::{MAX_BOXES, PlacedBox, placed};
+
+use self::cells::{BoxCells, VALUES};
+use crate::layers::BARE;
+use crate::targets::BOX_CODE;
 
 /// Prefix of its variables in a weights file.
 pub(crate) const PREFIX: &str = "box_input.";
 /// A variable that every box input has.
 const WEIGHT: &str = "box_input.out.weight";
 
-/// Channels to which the fused map is reduced beside the boxes.
-const REDUCED: i64 = 32;
 /// Channels of the layers.
-const HIDDEN: i64 = 48;
-/// Cells around a box in which the map is changed.
-const REACH: i64 = 2;
+const HIDDEN: i64 = 96;
+/// Numbers of the component that holds the heading.
+const YAW: i64 = BOX_CODE as i64 - 1;
+/// Changes of an anchor: of its score, share of the way to the box, and of each number of its own box.
+const CHANGES: i64 = 2 + BOX_CODE as i64;
+/// Limits of the changes, so that no boxes of a neighbour lead to a box that is none: share of the way to the box, change of
+/// a number of the own box, and of the logit of its score.
+const WAY: [f64; 2] = [-0.5, 1.5];
+const MOST_OF_BOX: f64 = 0.5;
+const MOST_OF_SCORE: f64 = 20.0;
+/// Largest exponent of the weight of a box among those on a cell.
+const MAX_LOG_WEIGHT: f64 = 8.0;
 
 /// True if a weights file has a box input.
 pub fn is_in(weights: &Weights) -> bool {
@@ -34,127 +53,324 @@ pub fn is_in(weights: &Weights) -> bool {
 /// The network.
 #[derive(Debug)]
 pub struct BoxInput {
-    reduce: nn::Conv2D,
-    layers: [nn::Conv2D; 3],
+    surroundings: Surroundings,
+    cell: [nn::Linear; 2],
     /// Zero at the start and without bias: an untrained box input changes nothing.
-    out: nn::Conv2D,
+    out: nn::Linear,
+    grid: BevGrid,
+    anchors: Anchors,
 }
 
 impl BoxInput {
-    /// The network behind a fused map of `channels`; its variables are below `path`, `box_input.*`.
-    pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+    /// The network behind the head of a detector; its variables are below `path`, `box_input.*`.
+    pub fn new(path: &nn::Path<'_>, detector: &DetectorConfig) -> Self {
         let path = path / "box_input";
-        let conv = |name: &str, from: i64, kernel: i64, dilation: i64| {
-            let config = ConvConfig {
-                padding: dilation * (kernel / 2),
-                dilation,
-                ..ConvConfig::default()
-            };
-            let to = if kernel == 1 { REDUCED } else { HIDDEN };
-            nn::conv2d(&path / name, from, to, kernel, config)
+        let anchors = Anchors::for_detector(detector);
+        let (channels, count) = (detector.feature_channels(), anchors.yaws_rad.len() as i64);
+        let layer = |name: &str, from: i64, to: i64| {
+            nn::linear(&path / name, from, to, nn::LinearConfig::default())
         };
-        let out = ConvConfig {
-            bias: false,
-            ws_init: Init::Const(0.0),
-            ..ConvConfig::default()
+        // Map, own scores and boxes, the box, its difference, covered share; and what is around the box.
+        let of_cell = channels + count * (1 + 3 * BOX_CODE as i64) + 1 + CHANNELS;
+        let out = nn::LinearConfig {
+            ws_init: nn::Init::Const(0.0),
+            ..BARE
         };
         Self {
-            reduce: conv("reduce", channels, 1, 1),
-            layers: [
-                conv("first", REDUCED + raster::CHANNELS as i64, 3, 1),
-                conv("second", HIDDEN, 3, 2),
-                conv("third", HIDDEN, 3, 1),
+            surroundings: Surroundings::new(&path, detector, VALUES),
+            cell: [
+                layer("cell", of_cell, HIDDEN),
+                layer("second", HIDDEN, HIDDEN),
             ],
-            out: nn::conv2d(&path / "out", HIDDEN, channels, 1, out),
+            out: nn::linear(&path / "out", HIDDEN, count * CHANGES + 1, out),
+            grid: detector.feature_grid(),
+            anchors,
         }
     }
 
-    /// The fused map `[C, H, W]` of `grid` with the correction by `boxes`.
+    /// The output of the head for one fused map `[1, C, H, W]` with the changes by `boxes`, in the frame of the map. Gradients
+    /// flow to its own variables only.
     ///
     /// # Errors
-    /// [`tch::TchError`] when the map is of another shape.
-    pub fn add(&self, fused: &Tensor, boxes: &[PlacedBox], grid: &BevGrid) -> Result<Tensor> {
-        let shape = [
-            raster::CHANNELS as i64,
-            grid.height.into(),
-            grid.width.into(),
+    /// [`tch::TchError`] when map and output are of another shape.
+    pub fn change(
+        &self,
+        fused: &Tensor,
+        head: HeadOutput,
+        boxes: &[PlacedBox],
+    ) -> Result<HeadOutput> {
+        let found = BoxCells::new(boxes, &self.grid, &self.anchors);
+        if found.cell_of.is_empty() {
+            // In training every sample has a gradient.
+            let nothing = self.out.ws.f_sum(Kind::Float)? * 0.0;
+            return Ok(HeadOutput {
+                scores: head.scores.f_add(&nothing)?,
+                ..head
+            });
+        }
+        let device = fused.device();
+        let pairs = Pairs::new(&found, &head)?;
+        let by_cell = fused
+            .f_detach()?
+            .f_squeeze_dim(0)?
+            .f_flatten(1, 2)?
+            .f_transpose(0, 1)?;
+        let values = tensor(&found.values, &[-1, VALUES as i64], device)?;
+        let placed: Vec<Box3d> = boxes.iter().map(|placed| placed.box3d).collect();
+        let around = self.surroundings.forward(fused, &placed, &values)?;
+        let input = [
+            &by_cell.f_index_select(0, &pairs.cell_of)?,
+            &pairs.own.f_clamp(-8.0, 8.0)?,
+            &pairs.code.f_flatten(1, 2)?,
+            &pairs.difference.f_flatten(1, 2)?,
+            &pairs.share,
+            &around.f_index_select(0, &pairs.box_of)?,
         ];
-        let drawn = tensor(&raster::draw(boxes, grid), &shape, fused.device())?.f_unsqueeze(0)?;
-        let window = [2 * REACH + 1; 2];
-        let near = drawn
-            .f_narrow(1, 0, 1)?
-            .f_gt(0.0)?
-            .f_to_kind(fused.kind())?
-            .f_max_pool2d(window, [1, 1], [REACH; 2], [1, 1], false)?;
-        let reduced = self.reduce.forward(&fused.f_unsqueeze(0)?).f_relu()?;
-        let mut hidden = Tensor::f_cat(&[reduced, drawn], 1)?;
-        for layer in &self.layers {
+        let mut hidden = Tensor::f_cat(&input, 1)?;
+        for layer in &self.cell {
             hidden = layer.forward(&hidden).f_relu()?;
         }
-        let change = self.out.forward(&hidden).f_mul(&near)?;
-        fused.f_add(&change.f_squeeze_dim(0)?)
+        pairs.apply(head, &self.out.forward(&hidden))
+    }
+}
+
+/// Pairs of a box and a cell that it covers.
+struct Pairs {
+    /// `[K]`.
+    box_of: Tensor,
+    /// `[K]`.
+    cell_of: Tensor,
+    /// `[K, 1]`.
+    share: Tensor,
+    /// `[K, A, BOX_CODE]`: the box relative to the anchors of the cell.
+    code: Tensor,
+    /// The same relative to the head's own boxes.
+    difference: Tensor,
+    /// `[K, A (1 + BOX_CODE)]`: the head's own scores and boxes.
+    own: Tensor,
+}
+
+impl Pairs {
+    fn new(found: &BoxCells, head: &HeadOutput) -> Result<Self> {
+        let device = head.scores.device();
+        let [box_of, cell_of] = [&found.box_of, &found.cell_of]
+            .map(|indices| Tensor::f_from_slice(indices)?.f_to_device(device));
+        let cell_of = cell_of?;
+        let anchors = head.scores.size4()?.1;
+        let code = tensor(&found.code, &[-1, anchors, BOX_CODE as i64], device)?;
+        let of_cells = |map: &Tensor| {
+            let flat = map.f_detach()?.f_squeeze_dim(0)?.f_flatten(1, 2)?;
+            flat.f_index_select(1, &cell_of)?.f_transpose(0, 1)
+        };
+        let (scores, offsets) = (of_cells(&head.scores)?, of_cells(&head.offsets)?);
+        let difference = code.f_sub(&offsets.f_reshape(code.size())?)?;
+        let turn = difference.f_narrow(2, YAW, 1)?;
+        // A heading and its opposite are the same box.
+        let turn = turn.f_sub(&((&turn / PI).f_round()? * PI))?;
+        let difference = Tensor::f_cat(&[difference.f_narrow(2, 0, YAW)?, turn], 2)?;
+        Ok(Self {
+            box_of: box_of?,
+            share: tensor(&found.share, &[-1, 1], device)?,
+            own: Tensor::f_cat(&[scores, offsets], 1)?,
+            cell_of,
+            code,
+            difference,
+        })
+    }
+
+    /// The output of the head with `changes` `[K, A CHANGES + 1]`: of several boxes on a cell a weighted mean, in which
+    /// the head's own output has the weight 1.
+    fn apply(&self, head: HeadOutput, changes: &Tensor) -> Result<HeadOutput> {
+        let (_, anchors, height, width) = head.scores.size4()?;
+        let last = anchors * CHANGES;
+        let limit = MAX_LOG_WEIGHT;
+        let weight = changes
+            .f_narrow(1, last, 1)?
+            .f_clamp(-limit, limit)?
+            .f_exp()?;
+        let changes = changes
+            .f_narrow(1, 0, last)?
+            .f_view([-1, anchors, CHANGES])?;
+        let within = |first: i64, count: i64, [least, most]: [f64; 2]| {
+            changes.f_narrow(2, first, count)?.f_clamp(least, most)
+        };
+        let score = within(0, 1, [-MOST_OF_SCORE, MOST_OF_SCORE])?;
+        let own_box = within(2, BOX_CODE as i64, [-MOST_OF_BOX, MOST_OF_BOX])?;
+        let toward = within(1, 1, WAY)?.f_mul(&self.difference)?;
+        let change = Tensor::f_cat(&[score, own_box.f_add(&toward)?], 2)?;
+        let numbers = anchors * (1 + BOX_CODE as i64);
+        let change = change.f_view([-1, numbers])?.f_mul(&weight)?;
+        let options = (change.kind(), change.device());
+        let sum = |count: i64, values: &Tensor| {
+            Tensor::f_zeros([height * width, count], options)?.f_index_add(0, &self.cell_of, values)
+        };
+        let mean = sum(numbers, &change)? / (sum(1, &weight)? + 1.0);
+        let mean = mean
+            .f_view([height, width, anchors, 1 + BOX_CODE as i64])?
+            .f_permute([2, 3, 0, 1])?;
+        let to = |map: &Tensor, first: i64, count: i64| {
+            map.f_add(&mean.f_narrow(1, first, count)?.f_reshape(map.size())?)
+        };
+        Ok(HeadOutput {
+            scores: to(&head.scores, 0, 1)?,
+            offsets: to(&head.offsets, 1, BOX_CODE as i64)?,
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use protocol::Box3d;
+    use tch::Device;
     use tch::nn::VarStore;
-    use tch::{Device, Kind};
 
     use super::*;
 
-    const GRID: BevGrid = BevGrid {
-        x_min_m: -8.0,
-        y_min_m: -8.0,
-        cell_m: 0.8,
-        width: 20,
-        height: 20,
-    };
-
-    fn map() -> Tensor {
-        tch::manual_seed(3);
-        Tensor::rand([8, 20, 20], (Kind::Float, Device::Cpu))
+    fn detector() -> DetectorConfig {
+        DetectorConfig {
+            lidar_range_m: [-8.0, -8.0, -3.0, 8.0, 8.0, 1.0],
+            ..DetectorConfig::lean()
+        }
     }
 
-    fn boxes() -> [PlacedBox; 1] {
-        [PlacedBox {
+    fn map(detector: &DetectorConfig) -> Tensor {
+        tch::manual_seed(3);
+        let grid = detector.feature_grid();
+        let size = [
+            1,
+            detector.feature_channels(),
+            grid.height.into(),
+            grid.width.into(),
+        ];
+        Tensor::rand(size, (Kind::Float, Device::Cpu))
+    }
+
+    fn head(detector: &DetectorConfig) -> HeadOutput {
+        let grid = detector.feature_grid();
+        let of = |channels: i64| {
+            let size = [1, channels, grid.height.into(), grid.width.into()];
+            Tensor::randn(size, (Kind::Float, Device::Cpu))
+        };
+        HeadOutput {
+            scores: of(2),
+            offsets: of(14),
+        }
+    }
+
+    fn car(sender: usize) -> PlacedBox {
+        PlacedBox {
             box3d: Box3d {
                 center_m: [2.0, 0.8, -1.0],
                 size_m: [4.0, 1.6, 1.5],
                 heading_rad: 0.0,
             },
+            sender,
             age_secs: 0.1,
             score: 0.7,
             pose_confidence: 1.0,
-        }]
-    }
-
-    #[test]
-    fn an_untrained_input_changes_nothing() {
-        let variables = VarStore::new(Device::Cpu);
-        let input = BoxInput::new(&variables.root(), 8);
-        assert_eq!(input.add(&map(), &boxes(), &GRID).unwrap(), map());
-    }
-
-    #[test]
-    fn a_trained_one_changes_the_map_near_boxes_only() {
-        let variables = VarStore::new(Device::Cpu);
-        let input = BoxInput::new(&variables.root(), 8);
-        let _ = tch::no_grad(|| variables.variables()[WEIGHT].shallow_clone().fill_(0.5));
-        let change = |boxes: &[PlacedBox]| {
-            (input.add(&map(), boxes, &GRID).unwrap() - map())
-                .abs()
-                .amax([0_i64].as_slice(), false)
-        };
-        assert_eq!(change(&[]).max().double_value(&[]), 0.0);
-        let changed = change(&boxes());
-        assert!(changed.max().double_value(&[]) > 0.0);
-        // The box is in columns 10 to 14 and rows 10 to 12.
-        let is_still = |row: i64, column: i64| changed.double_value(&[row, column]) == 0.0;
-        for (row, column) in [(10, 7), (10, 17), (7, 12), (15, 12), (0, 0)] {
-            assert!(is_still(row, column), "{row} {column}");
         }
-        assert!(!is_still(11, 12));
+    }
+
+    fn copy(head: &HeadOutput) -> HeadOutput {
+        HeadOutput {
+            scores: head.scores.copy(),
+            offsets: head.offsets.copy(),
+        }
+    }
+
+    #[test]
+    fn an_untrained_input_and_no_box_change_nothing() {
+        let (variables, detector) = (VarStore::new(Device::Cpu), detector());
+        let input = BoxInput::new(&variables.root(), &detector);
+        let (map, before) = (map(&detector), head(&detector));
+        let changed = |boxes: &[PlacedBox]| input.change(&map, copy(&before), boxes).unwrap();
+        let untrained = changed(&[car(1)]);
+        assert_eq!(untrained.scores, before.scores);
+        assert_eq!(untrained.offsets, before.offsets);
+        let _ = tch::no_grad(|| variables.variables()[WEIGHT].shallow_clone().fill_(0.5));
+        assert_eq!(changed(&[]).scores, before.scores);
+        let mut far = car(1);
+        far.box3d.center_m = [1e6, 0.0, 0.0];
+        assert_eq!(changed(&[far]).scores, before.scores);
+    }
+
+    #[test]
+    fn a_trained_one_changes_the_covered_cells_only_in_any_order_of_boxes() {
+        let (variables, detector) = (VarStore::new(Device::Cpu), detector());
+        let input = BoxInput::new(&variables.root(), &detector);
+        let (map, before) = (map(&detector), head(&detector));
+        let _ = tch::no_grad(|| {
+            variables.variables()[WEIGHT]
+                .shallow_clone()
+                .normal_(0.0, 0.1)
+        });
+        let boxes = [
+            car(1),
+            PlacedBox {
+                score: 0.4,
+                ..car(2)
+            },
+        ];
+        let after = input.change(&map, copy(&before), &boxes).unwrap();
+        let change = (&after.scores - &before.scores).abs().amax([0, 1], false);
+        // The box covers columns 10 to 14 and rows 10 and 11.
+        for (row, column) in [(10, 10), (11, 14)] {
+            assert!(change.double_value(&[row, column]) > 1e-4, "{row} {column}");
+        }
+        for (row, column) in [(8, 12), (13, 12), (10, 8), (11, 16), (0, 0)] {
+            assert_eq!(change.double_value(&[row, column]), 0.0, "{row} {column}");
+        }
+        let turned = input
+            .change(&map, copy(&before), &[boxes[1], boxes[0]])
+            .unwrap();
+        let off = (&turned.offsets - &after.offsets).abs().max();
+        assert!(off.double_value(&[]) < 1e-5);
+    }
+
+    #[test]
+    fn whatever_is_received_and_learnt_the_changes_are_bounded() {
+        let (variables, detector) = (VarStore::new(Device::Cpu), detector());
+        let input = BoxInput::new(&variables.root(), &detector);
+        let map = map(&detector);
+        let nothing = |head: HeadOutput| HeadOutput {
+            scores: head.scores.zeros_like(),
+            offsets: head.offsets.zeros_like(),
+        };
+        for (weight, size_m) in [(50.0, [1e3; 3]), (-50.0, [1e-3; 3])] {
+            let _ = tch::no_grad(|| variables.variables()[WEIGHT].shallow_clone().fill_(weight));
+            let mut strange = car(1);
+            strange.box3d.size_m = size_m;
+            let after = input
+                .change(&map, nothing(head(&detector)), &[strange])
+                .unwrap();
+            // Sizes of an anchor change by up to e^2.75, scores by as much as they can.
+            let sizes = after.offsets.narrow(1, 3, 3).abs().max().double_value(&[]);
+            assert!(sizes > 0.2 && sizes <= 2.75 + 1e-5, "{sizes}");
+            assert!(after.scores.abs().max().double_value(&[]) <= MOST_OF_SCORE);
+        }
+    }
+
+    #[test]
+    fn the_whole_way_to_the_box_ends_at_the_box() {
+        let detector = detector();
+        let before = head(&detector);
+        let anchors = Anchors::for_detector(&detector);
+        let found = BoxCells::new(&[car(1)], &detector.feature_grid(), &anchors);
+        let pairs = Pairs::new(&found, &before).unwrap();
+        let count = found.cell_of.len() as i64;
+        let changes = Tensor::zeros([count, 2 * CHANGES + 1], (Kind::Float, Device::Cpu));
+        for anchor in 0..2 {
+            let _ = changes.narrow(1, anchor * CHANGES + 1, 1).fill_(1.0);
+        }
+        let _ = changes.narrow(1, 2 * CHANGES, 1).fill_(50.0);
+        let after = pairs.apply(copy(&before), &changes).unwrap();
+        let cell = found.cell_of[0];
+        let at =
+            |map: &Tensor, component: i64| map.flatten(2, 3).double_value(&[0, component, cell]);
+        for component in 0..6 {
+            let expected = f64::from(found.code[component as usize]);
+            // The head's own output keeps a weight of 1 beside one of e^8.
+            assert!((at(&after.offsets, component) - expected).abs() < 2e-3);
+        }
+        assert_eq!(at(&after.scores, 0), at(&before.scores, 0));
     }
 }

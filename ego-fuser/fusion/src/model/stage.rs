@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use std::cell::RefCell;
 
 use perception::int8::ScaleSearch;
+use perception::layers::head::HeadOutput;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::weights::{FileError, METHOD_KEY, Weights};
 use protocol::{BevGrid, Pose};
@@ -163,7 +164,7 @@ impl FusionStage {
 
     /// Reads boxes beside maps from here on; the variables are below `path`.
     pub(crate) fn add_box_input(&mut self, path: &nn::Path<'_>, detector: &DetectorConfig) {
-        self.box_input = Some(BoxInput::new(path, detector.feature_channels()));
+        self.box_input = Some(BoxInput::new(path, detector));
     }
 
     /// True if it reads boxes of neighbours without a map.
@@ -171,28 +172,26 @@ impl FusionStage {
         self.box_input.is_some()
     }
 
-    /// The fused map `[C, H, W]` with what `boxes` say. Without boxes, or a box input, it is the same map.
+    /// The output of the head for one fused map `[1, C, H, W]` with what `boxes` say. Without boxes, or a box input, it is
+    /// the same.
     ///
     /// # Errors
-    /// [`tch::TchError`] when the map is of another shape.
-    pub fn with_boxes(&self, fused: Tensor, boxes: &[PlacedBox]) -> tch::Result<Tensor> {
-        match boxes {
-            [] => Ok(fused),
-            boxes => self.read_boxes(fused, boxes),
-        }
-    }
-
-    /// The same, computed without boxes too: in training every sample has a gradient.
-    pub(super) fn read_boxes(&self, fused: Tensor, boxes: &[PlacedBox]) -> tch::Result<Tensor> {
+    /// [`tch::TchError`] when map and output are of another shape.
+    pub fn with_boxes(
+        &self,
+        fused: &Tensor,
+        head: HeadOutput,
+        boxes: &[PlacedBox],
+    ) -> tch::Result<HeadOutput> {
         match (&self.box_input, self.y_axis) {
-            (None, _) => Ok(fused),
-            (Some(input), YAxis::Left) => input.add(&fused, boxes, &self.grid),
+            (None, _) => Ok(head),
+            (Some(input), YAxis::Left) => input.change(fused, head, boxes),
             (Some(input), YAxis::Right) => {
                 let mirrored = boxes.iter().map(|placed| PlacedBox {
                     box3d: placed.box3d.mirrored_y(),
                     ..*placed
                 });
-                input.add(&fused, &mirrored.collect::<Vec<_>>(), &self.grid)
+                input.change(fused, head, &mirrored.collect::<Vec<_>>())
             }
         }
     }

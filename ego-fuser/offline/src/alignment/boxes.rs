@@ -87,16 +87,13 @@ fn message(boxes: &[Box3d]) -> Message {
             source: None,
         })
         .collect();
-    Message::Boxes(Boxes {
-        pose: NO_POSE,
-        detections,
-    })
+    Message::Boxes(Boxes::new(NO_POSE, detections))
 }
 
 fn boxes(message: &Message) -> Result<Vec<Box3d>, NotAligned> {
     match message {
         Message::Boxes(boxes) => Ok(boxes
-            .detections
+            .detections()
             .iter()
             .map(|detection| detection.box3d)
             .collect()),

@@ -95,8 +95,8 @@ pub(crate) struct Arguments {
     /// Freeze the encoder of --init and train the fusion and the head only: fast, as maps are computed once.
     #[arg(long, requires = "init")]
     freeze_encoder: bool,
-    /// Freeze the method and the head of --init too, and train a box input behind it: a part that reads the boxes of
-    /// neighbours that send no map.
+    /// Freeze the method and the head of --init too, and train a box input behind it, a part that reads the boxes
+    /// of neighbours that send no map, and the refinement of the boxes that a vehicle sends.
     #[arg(long, requires = "freeze_encoder")]
     box_input: bool,
     /// Folder of such maps.

@@ -19,6 +19,8 @@ use super::sent::Sent;
 pub(super) struct Participant {
     agent: Agent,
     attack: Option<Attack>,
+    /// True if its network is not that of the run.
+    has_own_network: bool,
     /// Encoding of its maps.
     codec: CodecConfig,
     /// Content that it publishes where a method needs feature maps.
@@ -42,6 +44,7 @@ impl Participant {
         Self {
             agent,
             attack,
+            has_own_network: settings.weights.is_some(),
             codec: settings.codec,
             in_place_of_maps: { settings.sent_for(Stream::Bev).into_iter() }
                 .map(|stream| match stream {
@@ -100,13 +103,13 @@ impl Participant {
         &self.stages
     }
 
-    /// The published map, confidence and detections, from a map `[1, C, H, W]` of the encoder where there is one.
+    /// The published map, confidence and detections, from a map `[1, C, H, W]` of the run's encoder where there is one.
     pub(super) fn perceive(
         &mut self,
         frame: &Frame,
         map: Option<&Tensor>,
     ) -> Result<Perception, DetectorError> {
-        let perception = match map {
+        let perception = match map.filter(|_| !self.has_own_network) {
             Some(map) => self.agent.perceive_map(map),
             None => self.agent.perceive(&frame.points),
         }?;

@@ -70,8 +70,9 @@ fn perceived(
     let perception = participant.perceive(frame, map)?;
     if exchange.contains(&Exchange::Boxes) {
         let detections = perception.detections.clone();
-        let (message, bytes) = through_the_wire(stamp, Boxes { pose, detections })?;
-        messages.push(SentMessage::new(Content::Boxes(message.detections), bytes));
+        let (message, bytes) = through_the_wire(stamp, Boxes::new(pose, detections))?;
+        let content = Content::Boxes(message.into_detections());
+        messages.push(SentMessage::new(content, bytes));
     }
     // An ego without an exchange has its own map.
     let sends_map = |form| matches!(form, &Exchange::Features | &Exchange::Nothing);

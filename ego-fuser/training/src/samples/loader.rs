@@ -1,5 +1,6 @@
 //! Loader: samples in batches, in the order of a training.
 
+use dataset::ground_truth::GroundTruth;
 use perception::pillars::batch::{PillarBatch, PillarGrid};
 use perception::train::{Prefetch, RunConfig};
 use rand::SeedableRng;
@@ -35,6 +36,8 @@ pub struct Batch {
     pub offsets: Vec<Vec<Offset>>,
     /// Targets of each sample.
     pub labels: Vec<Labels>,
+    /// Objects of each sample.
+    pub(crate) truth: Vec<GroundTruth>,
 }
 
 impl Batch {
@@ -60,11 +63,13 @@ impl Batch {
             facts: Vec::new(),
             offsets: Vec::new(),
             labels: Vec::new(),
+            truth: Vec::new(),
         };
         for sample in samples {
             batch.facts.push(sample.facts);
             batch.offsets.push(sample.offsets);
             batch.labels.push(sample.labels);
+            batch.truth.push(sample.truth);
         }
         Ok(batch)
     }

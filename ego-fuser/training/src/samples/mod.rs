@@ -9,11 +9,13 @@ mod loader;
 mod moments;
 mod neighbour_boxes;
 mod poses;
+mod refined_boxes;
 mod scenes;
 
 pub use augment::{Augmentation, ViewAugment};
 pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews};
 pub use loader::{Batch, BatchViews, batches};
 pub use moments::Moments;
+pub(crate) use neighbour_boxes::described as neighbour_boxes;
 pub use poses::{Offset, SamplePoses};
 pub use scenes::{SceneSet, TickRef};

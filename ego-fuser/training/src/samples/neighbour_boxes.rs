@@ -6,12 +6,12 @@ use std::f64::consts::TAU;
 use fusion::MapMetadata;
 use fusion::box_input::{PlacedBox, placed};
 use fusion::model::CooperativeModel;
-use perception::boxes::postprocess::PostprocessConfig;
 use protocol::{Box3d, Detection, Pose};
 use rand::Rng;
 use tch::Tensor;
 
 use super::loader::{Batch, BatchViews};
+use super::refined_boxes::refined_boxes;
 use crate::Error;
 
 /// Share of the neighbours in training that send boxes only; the others send their map.
@@ -26,9 +26,42 @@ const LARGEST_SHIFT: [f64; 3] = [2.5, 1.0, 5.0];
 const OVERCONFIDENT: f64 = 0.2;
 /// Share of the neighbours that invent boxes, and the largest number of these.
 const INVENTING: (f64, usize) = (0.1, 4);
+/// Share of the neighbours whose boxes are late, and the largest age, seconds.
+const LATE: (f64, f64) = (0.5, 0.5);
+/// Largest error of the velocity by which a late box was carried to the time of the frame, metres per second: of most
+/// boxes, and of vehicles without a track.
+const CARRIED_MPS: [f64; 2] = [2.0, 12.0];
+/// Share of the vehicles without a track.
+const UNTRACKED: f64 = 0.15;
+
+/// What is wrong with the boxes of a training, for its card.
+pub(crate) fn described() -> String {
+    let percent = |share: f64| (100.0 * share).round();
+    let ([of_each, of_all], [plane_m, _, turn_deg]) = (SHIFTED, LARGEST_SHIFT);
+    format!(
+        "{} % send boxes in place of their map: {} % of the boxes lost, poses up to {plane_m} m and {turn_deg} degrees off in \
+         {} % of the samples, boxes of {} % of the neighbours up to {} s late and displaced by up to {} to {} m/s, invented \
+         boxes of {} %",
+        percent(BOXES_ONLY),
+        percent(LOST),
+        percent(of_each + of_all),
+        percent(LATE.0),
+        LATE.1,
+        CARRIED_MPS[0],
+        CARRIED_MPS[1],
+        percent(INVENTING.0),
+    )
+}
 
 /// A sample's maps, their metadata, and the boxes of neighbours without a map.
 pub(crate) type SampleWithBoxes = (Tensor, Vec<MapMetadata>, Vec<PlacedBox>);
+
+/// Samples with boxes.
+pub(crate) struct SamplesWithBoxes {
+    pub(crate) samples: Vec<SampleWithBoxes>,
+    /// Loss of the refinement of each vehicle's boxes.
+    pub(crate) refinement_losses: Vec<Tensor>,
+}
 
 impl Batch {
     /// The samples with boxes. With `rng`, some neighbours send boxes, with all errors; without, all do, as detected.
@@ -36,30 +69,58 @@ impl Batch {
         &self,
         model: &CooperativeModel,
         mut rng: Option<&mut impl Rng>,
-    ) -> Result<Vec<SampleWithBoxes>, Error> {
+    ) -> Result<SamplesWithBoxes, Error> {
         let BatchViews::Maps(maps) = &self.views else {
             return Err(Error::NothingToFreeze);
         };
         let maps = maps.f_to_device(model.device())?;
         let maps = model.network().through_compressor(&maps, false);
         let mut first = 0;
-        let mut samples = Vec::with_capacity(self.facts.len());
-        for facts in &self.facts {
+        let (mut samples, mut refinement_losses) = (Vec::new(), Vec::new());
+        for (facts, truth) in self.facts.iter().zip(&self.truth) {
             let of_sample = maps.f_narrow(0, first, facts.len() as i64)?;
             first += facts.len() as i64;
-            samples.push(sample(model, &of_sample, facts, rng.as_deref_mut())?);
+            let agents = facts.iter().map(|fact| fact.agent + 1).max().unwrap_or(0);
+            let mut found = vec![Vec::new(); agents];
+            for (agent, boxes) in found.iter_mut().enumerate() {
+                let Some(index) = newest_of(agent, facts) else {
+                    continue;
+                };
+                let map = of_sample.f_narrow(0, index as i64, 1)?;
+                let (refined, loss) =
+                    refined_boxes(model, &map, &facts[index].ego_from_cav, truth)?;
+                refinement_losses.extend(loss);
+                *boxes = refined;
+            }
+            samples.push(sample(
+                model,
+                &of_sample,
+                facts,
+                &found,
+                rng.as_deref_mut(),
+            )?);
         }
-        Ok(samples)
+        Ok(SamplesWithBoxes {
+            samples,
+            refinement_losses,
+        })
     }
 }
 
+/// Index of the newest map of an agent.
+fn newest_of(agent: usize, facts: &[MapMetadata]) -> Option<usize> {
+    facts.iter().position(|fact| fact.agent == agent)
+}
+
+/// A sample in which some of the agents send what they have `found`.
 fn sample(
     model: &CooperativeModel,
     maps: &Tensor,
     facts: &[MapMetadata],
+    found: &[Vec<Detection>],
     mut rng: Option<&mut impl Rng>,
 ) -> Result<SampleWithBoxes, Error> {
-    let agents = facts.iter().map(|fact| fact.agent + 1).max().unwrap_or(0);
+    let agents = found.len();
     let sends_boxes: Vec<bool> = (0..agents)
         .map(|agent| {
             agent > 0 && { rng.as_deref_mut() }.is_none_or(|rng| rng.random_bool(BOXES_ONLY))
@@ -71,18 +132,21 @@ fn sample(
     };
     let mut boxes = Vec::new();
     for (agent, shift) in (0..agents).zip(&shifts) {
-        let newest = facts.iter().position(|fact| fact.agent == agent);
-        let Some(index) = newest.filter(|_| sends_boxes[agent]) else {
+        let Some(index) = newest_of(agent, facts).filter(|_| sends_boxes[agent]) else {
             continue;
         };
-        let found = detections(model, &maps.f_narrow(0, index as i64, 1)?)?;
-        boxes.append(&mut shift.placed(&found, &facts[index]));
+        let mut of_agent = shift.placed(&found[agent], agent, &facts[index]);
         if let Some(rng) = rng.as_deref_mut() {
-            boxes.retain(|_| !rng.random_bool(LOST));
+            of_agent.retain(|_| !rng.random_bool(LOST));
             if rng.random_bool(INVENTING.0) {
-                boxes.append(&mut invented(model, facts[index].age_secs, rng));
+                of_agent.append(&mut invented(model, agent, facts[index].age_secs, rng));
+            }
+            if rng.random_bool(LATE.0) {
+                let age_secs = rng.random_range(0.0..LATE.1);
+                { of_agent.iter_mut() }.for_each(|placed| carry(placed, age_secs, rng));
             }
         }
+        boxes.append(&mut of_agent);
     }
     // The others, numbered without gaps.
     let number = |agent: usize| sends_boxes[..agent].iter().filter(|boxes| !**boxes).count();
@@ -101,15 +165,27 @@ fn sample(
     Ok((maps, facts.collect(), boxes))
 }
 
-/// Detections of a neighbour from its own map, in its own LiDAR frame.
-fn detections(model: &CooperativeModel, map: &Tensor) -> Result<Vec<Detection>, Error> {
-    let limits = PostprocessConfig::for_late_fusion(model.config());
-    let heads = tch::no_grad(|| model.network().heads(map))?;
-    Ok(model.detections(&heads, &limits)?.pop().unwrap_or_default())
+/// Makes a box late: it was carried to the time of the frame by a velocity with an error.
+fn carry(placed: &mut PlacedBox, age_secs: f64, rng: &mut impl Rng) {
+    let [tracked_mps, untracked_mps] = CARRIED_MPS;
+    let most_mps = match rng.random_bool(UNTRACKED) {
+        true => untracked_mps,
+        false => tracked_mps,
+    };
+    let off_m = rng.random_range(-most_mps..most_mps) * age_secs;
+    let (sin, cos) = placed.box3d.heading_rad.sin_cos();
+    placed.box3d.center_m[0] += off_m * cos;
+    placed.box3d.center_m[1] += off_m * sin;
+    placed.age_secs += age_secs;
 }
 
 /// Boxes anywhere in the area, in the frame of the ego.
-fn invented(model: &CooperativeModel, age_secs: f64, rng: &mut impl Rng) -> Vec<PlacedBox> {
+fn invented(
+    model: &CooperativeModel,
+    sender: usize,
+    age_secs: f64,
+    rng: &mut impl Rng,
+) -> Vec<PlacedBox> {
     let [x0, y0, _, x1, y1, _] = model.config().lidar_range_m;
     let count = rng.random_range(1..=INVENTING.1);
     let one = |_| PlacedBox {
@@ -122,6 +198,7 @@ fn invented(model: &CooperativeModel, age_secs: f64, rng: &mut impl Rng) -> Vec<
             size_m: [rng.random_range(3.5..5.0), rng.random_range(1.5..2.1), 1.6],
             heading_rad: rng.random_range(0.0..TAU),
         },
+        sender,
         age_secs,
         score: rng.random_range(0.2..1.0),
         pose_confidence: 1.0,
@@ -180,7 +257,7 @@ impl Shift {
     }
 
     /// The boxes of a sender whose pose has this error.
-    fn placed(&self, found: &[Detection], fact: &MapMetadata) -> Vec<PlacedBox> {
+    fn placed(&self, found: &[Detection], sender: usize, fact: &MapMetadata) -> Vec<PlacedBox> {
         let pose = &fact.ego_from_cav;
         let translation_m = std::array::from_fn(|axis| pose.translation_m[axis] + self.by_m[axis]);
         let moved = match self.turn_rad == 0.0 {
@@ -193,6 +270,7 @@ impl Shift {
         placed(
             found,
             &moved,
+            sender,
             fact.age_secs,
             fact.confidence * self.confidence,
         )
@@ -248,7 +326,7 @@ mod tests {
             turn_rad: 0.0,
             confidence: 0.5,
         };
-        let [placed] = shift.placed(&[found], &fact)[..] else {
+        let [placed] = shift.placed(&[found], 1, &fact)[..] else {
             panic!("one box");
         };
         assert_eq!(placed.box3d.center_m, [16.0, -2.0, -0.5]);

@@ -5,7 +5,7 @@ use perception::train::ModelCard;
 use super::config::TrainConfig;
 use super::frozen::sample_config;
 use super::observer::Summary;
-use crate::samples::SceneSet;
+use crate::samples::{SceneSet, neighbour_boxes};
 use fusion::model::CooperativeModel;
 
 /// The card of a detector.
@@ -89,6 +89,11 @@ pub(super) fn card(
     }
     if config.frozen_encoder.is_some() {
         card.row("encoder", "frozen, its maps kept");
+    }
+    if config.box_input {
+        let trained = "everything but the box input and the refinement of boxes";
+        card.row("frozen", trained);
+        card.row("neighbours", neighbour_boxes());
     }
     if let Some(accuracy) = &summary.accuracy {
         card.paragraph(&format!(

@@ -199,10 +199,12 @@ impl Task for Training<'_> {
         let labels = LabelTensors::gather(&batch.labels, config.unassigned, device);
         if self.config.box_input {
             let mut rng = ChaCha8Rng::seed_from_u64(random_seed()?);
-            let samples = batch.with_boxes(&self.model, Some(&mut rng))?;
-            let head = self.model.detect_with_boxes(&samples)?;
+            let with_boxes = batch.with_boxes(&self.model, Some(&mut rng))?;
+            let head = self.model.detect_with_boxes(&with_boxes.samples)?;
             let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
-            let total = terms.total();
+            let refinement: Tensor = with_boxes.refinement_losses.iter().sum();
+            let vehicles = with_boxes.refinement_losses.len().max(1) as f64;
+            let total = terms.total() + refinement / vehicles;
             self.terms = Some(terms);
             return Ok(total);
         }

@@ -83,7 +83,7 @@ impl Validator {
             let head = no_grad(|| match with_boxes {
                 true => {
                     let samples = batch.with_boxes(model, None::<&mut ChaCha8Rng>)?;
-                    Ok::<_, Error>(model.detect_with_boxes(&samples)?)
+                    Ok::<_, Error>(model.detect_with_boxes(&samples.samples)?)
                 }
                 false => Ok(batch.output(model, false)?.head),
             })?;

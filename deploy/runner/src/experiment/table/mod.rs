@@ -183,6 +183,7 @@ impl Run<'_> {
         }
         setup.pool = row.vehicles.map_or(AgentPool::All, AgentPool::First);
         setup.agents.boxes = row.boxes;
+        setup.agents.weights.clone_from(&row.neighbour_weights);
         setup.ego.latency_compensation |= row.latency_compensation;
         setup.delay_ms = column.delay_ms;
         setup.attack = column.attack;

@@ -230,6 +230,7 @@ mod tests {
                 weights: vec![],
                 poses: None,
                 vehicles: None,
+                neighbour_weights: None,
                 boxes: None,
                 latency_compensation: false,
             },

@@ -1,0 +1,169 @@
+//! Surroundings of boxes: what a feature map holds in and around each box, read in the box's own direction.
+
+use protocol::{BevGrid, Box3d};
+use tch::nn::{self, Module};
+use tch::{Result, Tensor};
+
+use crate::model_config::DetectorConfig;
+use crate::tensor_values::tensor;
+
+/// Places along and across a box at which the map is read, as shares of its half length and half width.
+const ALONG: [f64; 5] = [-1.5, -0.75, 0.0, 0.75, 1.5];
+const ACROSS: [f64; 3] = [-1.8, 0.0, 1.8];
+/// Number of these places.
+const PLACES: usize = ALONG.len() * ACROSS.len();
+/// Length and width up to which places are spread, metres: larger than any vehicle.
+const MAX_SIZE_M: [f64; 2] = [26.0, 5.0];
+/// Channels to which the map is reduced at each place.
+const REDUCED: i64 = 24;
+/// Channels of the output.
+pub const CHANNELS: i64 = 96;
+
+/// Network that reads a map around boxes.
+#[derive(Debug)]
+pub struct Surroundings {
+    reduce: nn::Linear,
+    layers: [nn::Linear; 2],
+    grid: BevGrid,
+}
+
+impl Surroundings {
+    /// For maps of a detector, and `values` numbers of each box; its variables are below `path`.
+    pub fn new(path: &nn::Path<'_>, detector: &DetectorConfig, values: usize) -> Self {
+        let layer = |name: &str, from: i64, to: i64| {
+            nn::linear(path / name, from, to, nn::LinearConfig::default())
+        };
+        let read = PLACES as i64 * REDUCED + values as i64;
+        Self {
+            reduce: layer("reduce", detector.feature_channels(), REDUCED),
+            layers: [
+                layer("around", read, CHANNELS),
+                layer("box", CHANNELS, CHANNELS),
+            ],
+            grid: detector.feature_grid(),
+        }
+    }
+
+    /// `[N, CHANNELS]` of boxes in the frame of a map `[1, C, H, W]`, and their values `[N, values]`. Gradients flow to its
+    /// own variables only.
+    ///
+    /// # Errors
+    /// [`tch::TchError`] when the map is of another shape.
+    pub fn forward(&self, map: &Tensor, boxes: &[Box3d], values: &Tensor) -> Result<Tensor> {
+        let read = read(map, boxes, &self.grid)?;
+        let reduced = self.reduce.forward(&read).f_relu()?;
+        let reduced = reduced.f_view([-1, PLACES as i64 * REDUCED])?;
+        let mut hidden = Tensor::f_cat(&[&reduced, values], 1)?;
+        for layer in &self.layers {
+            hidden = layer.forward(&hidden).f_relu()?;
+        }
+        Ok(hidden)
+    }
+}
+
+/// `[N * PLACES, C]`: the map at the places of each box, between cells bilinear; zeros beyond its edges.
+fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
+    let size = [i64::from(grid.width), i64::from(grid.height)];
+    let (mut cells, mut weights) = (Vec::new(), Vec::new());
+    for [x_m, y_m] in boxes.iter().flat_map(places) {
+        let column = (x_m - grid.x_min_m) / grid.cell_m - 0.5;
+        let row = (y_m - grid.y_min_m) / grid.cell_m - 0.5;
+        for [down, right] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
+            let at = [column.floor() as i64 + right, row.floor() as i64 + down];
+            let share = |at: f64, step: i64| match step {
+                0 => 1.0 - at.rem_euclid(1.0),
+                _ => at.rem_euclid(1.0),
+            };
+            let is_in = (0..2).all(|axis| (0..size[axis]).contains(&at[axis]));
+            let weight = share(column, right) * share(row, down);
+            cells.push(if is_in { at[1] * size[0] + at[0] } else { 0 });
+            weights.push(if is_in { weight as f32 } else { 0.0 });
+        }
+    }
+    let (channels, device) = (map.size4()?.1, map.device());
+    let by_cell = map.f_detach()?.f_view([channels, -1])?.f_transpose(0, 1)?;
+    let cells = tensor(&cells, &[-1], device)?;
+    let weights = tensor(&weights, &[-1, 4, 1], device)?;
+    let corners = by_cell
+        .f_index_select(0, &cells)?
+        .f_view([-1, 4, channels])?;
+    (corners * weights).f_sum_dim_intlist([1_i64].as_slice(), false, None)
+}
+
+/// Where the map is read around a box, metres.
+fn places(box3d: &Box3d) -> impl Iterator<Item = [f64; 2]> + use<> {
+    let (sin, cos) = box3d.heading_rad.sin_cos();
+    let [x_m, y_m, _] = box3d.center_m;
+    let [half_length_m, half_width_m] =
+        [0, 1].map(|axis| box3d.size_m[axis].min(MAX_SIZE_M[axis]) / 2.0);
+    ALONG.into_iter().flat_map(move |along| {
+        ACROSS.into_iter().map(move |across| {
+            let (along_m, across_m) = (along * half_length_m, across * half_width_m);
+            [
+                x_m + cos * along_m - sin * across_m,
+                y_m + sin * along_m + cos * across_m,
+            ]
+        })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::FRAC_PI_2;
+
+    use tch::{Device, Kind};
+
+    use super::*;
+
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -8.0,
+        y_min_m: -4.0,
+        cell_m: 0.8,
+        width: 20,
+        height: 10,
+    };
+
+    fn car(center_m: [f64; 3], heading_rad: f64) -> Box3d {
+        Box3d {
+            center_m,
+            size_m: [4.0, 1.6, 1.5],
+            heading_rad,
+        }
+    }
+
+    #[test]
+    fn places_lie_around_the_box_in_its_direction() {
+        let found: Vec<[f64; 2]> = places(&car([0.0, 0.0, -1.0], FRAC_PI_2)).collect();
+        assert_eq!(found.len(), PLACES);
+        // The first is behind and to the right: turned by 90 degrees right is +x and behind is -y.
+        let [x_m, y_m] = found[0];
+        assert!((x_m - 1.44).abs() < 1e-9 && (y_m + 3.0).abs() < 1e-9);
+        let [x_m, y_m] = found[PLACES / 2];
+        assert!(x_m.abs() < 1e-9 && y_m.abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_map_is_read_between_its_cells_and_as_zeros_beyond_its_edges() {
+        // Two channels: x and y of the centres of the cells.
+        let along = |count: i64, low_m: f64| {
+            Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.8 + low_m + 0.4
+        };
+        let x = along(20, -8.0)
+            .view([1, 1, 1, 20])
+            .expand([1, 1, 10, 20], true);
+        let y = along(10, -4.0)
+            .view([1, 1, 10, 1])
+            .expand([1, 1, 10, 20], true);
+        let map = Tensor::cat(&[x, y], 1);
+        let inside = car([0.33, -0.21, 0.0], 0.4);
+        let found = read(&map, &[inside], &GRID).unwrap();
+        for (index, [x_m, y_m]) in (0..).zip(places(&inside)) {
+            assert!((found.double_value(&[index, 0]) - x_m).abs() < 1e-5);
+            assert!((found.double_value(&[index, 1]) - y_m).abs() < 1e-5);
+        }
+        for far in [[100.0, 0.0, 0.0], [1e7, -1e7, 0.0]] {
+            let found = read(&map, &[car(far, 0.4)], &GRID).unwrap();
+            assert_eq!(found.abs().max().double_value(&[]), 0.0);
+        }
+    }
+}

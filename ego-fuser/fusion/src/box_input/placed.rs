@@ -1,0 +1,145 @@
+//! Placed boxes: neighbours' detections in the frame of the ego, and how far other senders agree with each.
+
+use protocol::rotated_iou::Polygon;
+use protocol::{Box3d, Detection, Pose};
+
+/// Boxes of one sender that are read at most, so that none takes long or crowds out the others.
+pub const MAX_BOXES: usize = 128;
+/// Distance from which on boxes cannot overlap, metres.
+const APART_M: f64 = 30.0;
+
+/// A neighbour's box in the frame of the ego.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlacedBox {
+    /// The box.
+    pub box3d: Box3d,
+    /// Number of its sender among those of the frame.
+    pub sender: usize,
+    /// Age relative to the ego's frame, seconds.
+    pub age_secs: f64,
+    /// Score of the detection, 0..1.
+    pub score: f64,
+    /// Confidence of the sender's pose, 0..1.
+    pub pose_confidence: f64,
+}
+
+impl PlacedBox {
+    pub(super) fn confidence(&self) -> f64 {
+        self.score * self.pose_confidence
+    }
+}
+
+/// The detections of a sender in the frame of the ego, at most [`MAX_BOXES`], those of the highest scores; `pose_confidence`
+/// is that of its pose.
+pub fn placed(
+    detections: &[Detection],
+    ego_from_cav: &Pose,
+    sender: usize,
+    age_secs: f64,
+    pose_confidence: f64,
+) -> Vec<PlacedBox> {
+    let ego_from_cav = ego_from_cav.isometry();
+    let place = |detection: &Detection| PlacedBox {
+        box3d: detection.box3d.transformed(&ego_from_cav),
+        sender,
+        age_secs,
+        score: f64::from(detection.score),
+        pose_confidence,
+    };
+    let mut boxes: Vec<PlacedBox> = detections.iter().map(place).collect();
+    boxes.sort_by(|a, b| b.score.total_cmp(&a.score));
+    boxes.truncate(MAX_BOXES);
+    boxes
+}
+
+/// How far other senders agree with each box: the sum over them of the largest product of IoU from above and confidence.
+pub(super) fn agreement(boxes: &[PlacedBox]) -> Vec<f64> {
+    let footprints: Vec<Polygon> = { boxes.iter() }
+        .map(|placed| Polygon::footprint(&placed.box3d.corners()))
+        .collect();
+    let mut senders: Vec<usize> = boxes.iter().map(|placed| placed.sender).collect();
+    senders.sort_unstable();
+    senders.dedup();
+    let of = |index: usize| {
+        let [x, y, _] = boxes[index].box3d.center_m;
+        let from = |sender: usize| {
+            let same = (0..boxes.len()).filter(|&other| {
+                let [other_x, other_y, _] = boxes[other].box3d.center_m;
+                boxes[other].sender == sender && (other_x - x).hypot(other_y - y) < APART_M
+            });
+            same.map(|other| footprints[index].iou(&footprints[other]) * boxes[other].confidence())
+                .fold(0.0, f64::max)
+        };
+        let others = senders
+            .iter()
+            .filter(|sender| **sender != boxes[index].sender);
+        others.map(|&sender| from(sender)).sum()
+    };
+    (0..boxes.len()).map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::FRAC_PI_2;
+
+    use super::*;
+
+    fn car(sender: usize, x_m: f64, score: f64) -> PlacedBox {
+        PlacedBox {
+            box3d: Box3d {
+                center_m: [x_m, 0.0, -1.0],
+                size_m: [4.0, 1.6, 1.5],
+                heading_rad: 0.0,
+            },
+            sender,
+            age_secs: 0.0,
+            score,
+            pose_confidence: 0.5,
+        }
+    }
+
+    #[test]
+    fn others_agree_by_overlap_and_confidence_and_a_sender_never_with_itself() {
+        let boxes = [
+            car(1, 0.0, 0.8),
+            car(1, 0.0, 0.9),
+            car(2, 0.0, 0.6),
+            car(3, 2.0, 1.0),
+            car(3, 20.0, 1.0),
+        ];
+        let found = agreement(&boxes);
+        // Half a length apart: a third of the union.
+        assert!((found[0] - (0.3 + 0.5 / 3.0)).abs() < 1e-9, "{found:?}");
+        assert!((found[2] - (0.45 + 0.5 / 3.0)).abs() < 1e-9, "{found:?}");
+        assert_eq!(found[4], 0.0);
+    }
+
+    #[test]
+    fn of_too_many_boxes_the_least_confident_are_left_out() {
+        let many = (0..300_u16).map(|n| Detection {
+            box3d: car(0, 4.0, 0.8).box3d,
+            score: f32::from(n) / 300.0,
+            source: None,
+        });
+        let kept = placed(&many.collect::<Vec<_>>(), &Pose::IDENTITY, 1, 0.0, 1.0);
+        assert_eq!(kept.len(), MAX_BOXES);
+        assert!(kept.iter().all(|placed| placed.score * 300.0 > 171.5));
+    }
+
+    #[test]
+    fn boxes_are_placed_by_the_pose_of_their_sender() {
+        let detection = Detection {
+            box3d: car(0, 4.0, 0.8).box3d,
+            score: 0.8,
+            source: None,
+        };
+        let pose = Pose::from_xyz_yaw([1.0, 2.0, 0.0], FRAC_PI_2);
+        let [placed] = placed(&[detection], &pose, 3, 0.2, 0.5)[..] else {
+            panic!("one box");
+        };
+        let [x, y, _] = placed.box3d.center_m;
+        assert!((x - 1.0).abs() < 1e-9 && (y - 6.0).abs() < 1e-9);
+        assert!((placed.box3d.heading_rad - FRAC_PI_2).abs() < 1e-9);
+        assert_eq!(placed.sender, 3);
+    }
+}

@@ -1,0 +1,181 @@
+//! Refined boxes in samples: what the refinement makes of a vehicle's own detections, and how far that is from the truth.
+
+use dataset::ground_truth::GroundTruth;
+use fusion::model::CooperativeModel;
+use perception::boxes::postprocess::PostprocessConfig;
+use perception::boxes::refinement::{NUMBERS, corrected, correction, is_in_reach};
+use perception::tensor_values::{tensor, values};
+use protocol::rotated_iou::Polygon;
+use protocol::{Box3d, Detection, Pose};
+use tch::{Kind, Reduction, Tensor};
+
+use crate::Error;
+
+/// Least IoU from above of a detection with the object that it is corrected to.
+const LEAST_IOU: f64 = 0.25;
+/// IoU of a corrected box from which on its score should be above 0, and at which it should be 1.
+const SCORED_IOU: [f64; 2] = [0.3, 0.7];
+/// Numbers of a correction beside the score.
+const OF_BOX: i64 = NUMBERS as i64 - 1;
+/// Smooth L1: end of the quadratic part.
+const BETA: f64 = 0.05;
+/// Weight of the boxes beside the scores.
+const BOX_WEIGHT: f64 = 10.0;
+
+/// Detections of a vehicle from its own map `[1, C, H, W]`, in its own LiDAR frame, refined if the model does, and the loss
+/// of the refinement; absent without one.
+pub(super) fn refined_boxes(
+    model: &CooperativeModel,
+    map: &Tensor,
+    ego_from_cav: &Pose,
+    truth: &GroundTruth,
+) -> Result<(Vec<Detection>, Option<Tensor>), Error> {
+    let limits = PostprocessConfig::for_late_fusion(model.config());
+    let heads = tch::no_grad(|| model.network().heads(map))?;
+    let found = model.detections(&heads, &limits)?.pop().unwrap_or_default();
+    let Some(refinement) = model.refinement().filter(|_| !found.is_empty()) else {
+        return Ok((found, None));
+    };
+    let corrections = refinement.corrections(map, &found)?;
+    let mut refined = corrected(found.clone(), &values(&corrections)?);
+    let targets = Targets::new(&found, &refined, ego_from_cav, truth);
+    let loss = targets.loss(&corrections, &found)?;
+    refined.retain(|detection| detection.score > limits.score_threshold);
+    Ok((refined, Some(loss)))
+}
+
+/// What the detections of a vehicle should be corrected to.
+#[derive(Debug, Default)]
+struct Targets {
+    /// `[N, OF_BOX]`.
+    corrections: Vec<f32>,
+    /// `[N]`: 1 for a detection of an object.
+    is_object: Vec<f32>,
+    /// `[N]`: score of the corrected box.
+    score: Vec<f32>,
+    /// `[N]`: 1 where the truth is known.
+    is_known: Vec<f32>,
+}
+
+impl Targets {
+    fn new(
+        found: &[Detection],
+        refined: &[Detection],
+        ego_from_cav: &Pose,
+        truth: &GroundTruth,
+    ) -> Self {
+        let cav_from_ego = ego_from_cav.isometry().inverse();
+        let objects: Vec<Box3d> = { truth.objects.iter() }
+            .map(|object| object.box3d.transformed(&cav_from_ego))
+            .collect();
+        let footprint = |box3d: &Box3d| Polygon::footprint(&box3d.corners());
+        let footprints: Vec<Polygon> = objects.iter().map(footprint).collect();
+        let best = |box3d: &Box3d| {
+            let own = footprint(box3d);
+            let overlaps = footprints.iter().map(|object| own.iou(object));
+            overlaps.enumerate().max_by(|(_, a), (_, b)| a.total_cmp(b))
+        };
+        let mut targets = Self::default();
+        for (detection, refined) in found.iter().zip(refined) {
+            let object = best(&detection.box3d).filter(|(_, iou)| *iou >= LEAST_IOU);
+            let wanted = object.map(|(index, _)| correction(&detection.box3d, &objects[index]));
+            let wanted = wanted.filter(is_in_reach);
+            let numbers = wanted.unwrap_or_default();
+            targets
+                .corrections
+                .extend({ numbers[..OF_BOX as usize].iter() }.map(|at| *at as f32));
+            targets
+                .is_object
+                .push(f32::from(u8::from(wanted.is_some())));
+            let [least, most] = SCORED_IOU;
+            let iou = best(&refined.box3d).map_or(0.0, |(_, iou)| iou);
+            targets
+                .score
+                .push(((iou - least) / (most - least)).clamp(0.0, 1.0) as f32);
+            let [x, y, _] = detection
+                .box3d
+                .transformed(&ego_from_cav.isometry())
+                .center_m;
+            let [x0, y0, x1, y1] = truth.area_m;
+            let is_known = (x0..=x1).contains(&x) && (y0..=y1).contains(&y);
+            targets.is_known.push(f32::from(u8::from(is_known)));
+        }
+        targets
+    }
+
+    /// Smooth L1 of the boxes of objects and cross entropy of the scores, both divided by the number of detections.
+    fn loss(&self, corrections: &Tensor, found: &[Detection]) -> tch::Result<Tensor> {
+        let device = corrections.device();
+        let column = |values: &[f32]| tensor(values, &[-1, 1], device);
+        let wanted = tensor(&self.corrections, &[-1, OF_BOX], device)?;
+        let off = corrections.f_narrow(1, 0, OF_BOX)?;
+        let boxes = off.f_smooth_l1_loss(&wanted, Reduction::None, BETA)?;
+        let boxes = boxes.f_mul(&column(&self.is_object)?)?.f_sum(Kind::Float)?;
+        let before: Vec<f32> = { found.iter() }
+            .map(|detection| detection.score.clamp(1e-4, 1.0 - 1e-4))
+            .collect();
+        let logit = column(&before)?.f_logit(None)? + corrections.f_narrow(1, OF_BOX, 1)?;
+        let (none, each) = (None::<&Tensor>, Reduction::None);
+        let score = column(&self.score)?;
+        let scores = logit.f_binary_cross_entropy_with_logits(&score, none, none, each)?;
+        let scores = scores.f_mul(&column(&self.is_known)?)?.f_sum(Kind::Float)?;
+        Ok((boxes * BOX_WEIGHT + scores) / found.len().max(1) as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dataset::frame::ObjectClass;
+    use dataset::ground_truth::TrueBox;
+
+    use super::*;
+
+    fn detection(x_m: f64, y_m: f64) -> Detection {
+        Detection {
+            box3d: Box3d {
+                center_m: [x_m, y_m, -1.0],
+                size_m: [4.0, 1.8, 1.5],
+                heading_rad: 0.0,
+            },
+            score: 0.5,
+            source: None,
+        }
+    }
+
+    #[test]
+    fn detections_are_corrected_to_their_objects_and_others_lose_their_score() {
+        let ego_from_cav = Pose::from_xyz_yaw([10.0, 0.0, 0.0], 0.0);
+        let object = TrueBox {
+            box3d: detection(15.0, 0.2).box3d,
+            id: 1,
+            class: ObjectClass::Car,
+        };
+        let truth = GroundTruth {
+            objects: vec![object],
+            ignored: Vec::new(),
+            area_m: [-50.0, -40.0, 50.0, 40.0],
+        };
+        // On the object but for 0.4 and 0.2 m, of nothing, and beyond the area.
+        let found = [
+            detection(4.6, 0.0),
+            detection(-20.0, 0.0),
+            detection(60.0, 0.0),
+        ];
+        let refined = [detection(5.0, 0.2), found[1].clone(), found[2].clone()];
+        let targets = Targets::new(&found, &refined, &ego_from_cav, &truth);
+        assert_eq!(targets.is_object, [1.0, 0.0, 0.0]);
+        assert_eq!(targets.is_known, [1.0, 1.0, 0.0]);
+        assert_eq!(targets.score, [1.0, 0.0, 0.0]);
+        assert!((targets.corrections[0] - 0.1).abs() < 1e-6);
+        assert!((targets.corrections[1] - 0.2 / 1.8).abs() < 1e-6);
+        // Right corrections leave the scores alone: -ln(1/2) twice, over three detections.
+        let mut right = vec![0.0; 3 * NUMBERS];
+        right[..OF_BOX as usize].copy_from_slice(&targets.corrections[..OF_BOX as usize]);
+        let corrections = Tensor::from_slice(&right).view([3, NUMBERS as i64]);
+        let loss = targets
+            .loss(&corrections, &found)
+            .unwrap()
+            .double_value(&[]);
+        assert!((loss - 2.0 * 2_f64.ln() / 3.0).abs() < 1e-5, "{loss}");
+    }
+}
