@@ -53,6 +53,10 @@ struct CompactBox {
 }
 
 impl CompactBox {
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "numbers are transmitted in single precision"
+    )]
     fn of(Detection { box3d, score, .. }: &Detection) -> Self {
         Self {
             center_m: box3d.center_m.map(|value| value as f32),

@@ -6,7 +6,7 @@ use link::{CapacityConfig, LinkConfig, QueueConfig};
 use protocol::{CavId, DropReason};
 use tests::fleet::write_weights_with_box_input;
 
-use super::simulation_time::{MS, TICKS, config, evaluate, scene};
+use super::simulation_time::{MS, config, evaluate, scene};
 
 #[test]
 fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
