@@ -67,7 +67,7 @@ fn every_shipped_experiment_runs_to_its_end() {
         let name = file.file_stem().unwrap().to_str().unwrap();
         // JSON has no infinity: a rate that limits nothing.
         let text = fs::read_to_string(&file).unwrap().replace(".inf", "1e6");
-        let text = text.replace("[deploy/weights/", &format!("[{WEIGHTS}/"));
+        let text = text.replace("deploy/weights/", &format!("{WEIGHTS}/"));
         let mut content: Value = serde_saphyr::from_str(&text).unwrap();
         let is_table = content.get("tables").is_some();
         if is_table {

@@ -22,8 +22,8 @@ use localization::pose_source::RecordedPose;
 use perception::detector::Detector;
 use protocol::message::{Descriptor, ModelHash, SweepArrival};
 use protocol::{
-    Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason,
-    Stream, Topic,
+    Account, Boxes, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits,
+    RateReason, Stream, Topic,
 };
 use recording::{Recording, RecordingOptions};
 use sim_replay::recorder::{self, RecordReport, RecorderOptions};
@@ -336,7 +336,11 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                 };
                 let output = agent.process(&input).unwrap();
                 let content = match method.own_content() {
-                    Exchange::Boxes => Content::Boxes(output.perception.detections),
+                    Exchange::Boxes => {
+                        // Numbers of boxes are sent in single precision.
+                        let boxes = Boxes::new(output.pose, output.perception.detections);
+                        Content::Boxes(boxes.into_detections())
+                    }
                     Exchange::Points => Content::Points(agent.share_points(&frame.points)),
                     Exchange::Features | Exchange::Nothing => Content::Features(DecodedFeatures {
                         features: output.perception.features,
