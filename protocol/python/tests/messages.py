@@ -11,7 +11,7 @@ from fleet import FRAMES
 
 def header(kind: int, cav: bytes, metadata: bytes) -> bytes:
     """A message without a body, as the reference of the wire format describes it."""
-    fields = struct.pack("<4sHBB32sQQQQQII", b"V2VL", 6, kind, len(cav), cav, 7, 3, 100_000_000, 0, 0, len(metadata),
+    fields = struct.pack("<4sHBB32sQQQQQII", b"V2VL", 7, kind, len(cav), cav, 7, 3, 100_000_000, 0, 0, len(metadata),
                          zlib.crc32(metadata))
     return fields + struct.pack("<I", zlib.crc32(fields)) + metadata
 
