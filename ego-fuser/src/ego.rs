@@ -74,7 +74,7 @@ pub struct Ego {
     /// Absent: boxes stay where they were detected.
     compensation: Option<LatencyCompensation>,
     /// Senders of more boxes than are read.
-    crowded: BTreeSet<CavId>,
+    over_limit: BTreeSet<CavId>,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -131,7 +131,7 @@ impl Ego {
             history,
             trust: None,
             compensation: reads_boxes.then(LatencyCompensation::default),
-            crowded: BTreeSet::new(),
+            over_limit: BTreeSet::new(),
             limits,
             comm_range_m: Self::COMM_RANGE_M,
         }
@@ -364,7 +364,7 @@ impl Ego {
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
 
-    /// Intermediate fusion, and ego-only detection; boxes of neighbours without a map change what the head finds.
+    /// Intermediate fusion, and ego-only detection; boxes of neighbours change the output of the head.
     fn merge_features(
         &mut self,
         all: &[Aligned<'_>],
@@ -373,7 +373,7 @@ impl Ego {
         let boxes: Vec<PlacedBox> = (1..all.len())
             .flat_map(|sender| all[sender].boxes(sender, all[0].view))
             .collect();
-        self.name_crowded(all);
+        self.name_senders_over_limit(all);
         let has_map = |view: &&Aligned<'_>| matches!(view.view.content, Content::Features(_));
         let aligned: Vec<Aligned<'_>> = all.iter().filter(has_map).copied().collect();
         let aligned = aligned.as_slice();
@@ -425,11 +425,11 @@ impl Ego {
     }
 
     /// Names each sender of more boxes than are read, once.
-    fn name_crowded(&mut self, all: &[Aligned<'_>]) {
+    fn name_senders_over_limit(&mut self, all: &[Aligned<'_>]) {
         for Aligned { view, .. } in all {
             if let Content::Boxes(found) = &view.content
                 && found.len() > MAX_BOXES
-                && self.crowded.insert(view.cav.clone())
+                && self.over_limit.insert(view.cav.clone())
             {
                 let boxes = found.len();
                 tracing::warn!(cav = %view.cav, boxes, "more than {MAX_BOXES} boxes: those of the lowest scores are left out");
@@ -619,15 +619,15 @@ struct Aligned<'a> {
 }
 
 impl Aligned<'_> {
-    /// True for a map of a neighbour whose boxes are newer by more than [`MAP_LAG_NANOS`], and for boxes whose map is newer.
+    /// True for a map of a neighbour whose boxes are newer by more than [`MAP_LAG_NANOS`]. Older boxes are read beside a
+    /// newer map: their tracks carry them to the time of the frame.
     fn is_outdated_beside(&self, all: &[Self]) -> bool {
         let is_map = |one: &Self| matches!(one.view.content, Content::Features(_));
-        let most_nanos = if is_map(self) { MAP_LAG_NANOS } else { 0 };
-        all[1..].iter().any(|other| {
-            other.view.cav == self.view.cav
-                && is_map(other) != is_map(self)
-                && self.view.age_nanos(other.view) > most_nanos
-        })
+        is_map(self)
+            && all[1..].iter().any(|other| {
+                let lag_nanos = self.view.age_nanos(other.view);
+                other.view.cav == self.view.cav && !is_map(other) && lag_nanos > MAP_LAG_NANOS
+            })
     }
 
     /// Its boxes, if it has sent boxes; `sender` is its number.

@@ -23,6 +23,7 @@ use crate::rate::RateConfig;
 use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
 use crate::sweep_selection::{MAX_EGOS, SweepSelection};
 use sweep_reports::SweepReports;
+pub use sweep_reports::descriptor;
 
 pub use input::{Input, Output, Sweep};
 pub use message::{Content, MessageEncoder, Unsent};

@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 
 use perception::detector::Detector;
-use protocol::Stream;
 use protocol::message::{Descriptor, SweepArrival};
+use protocol::{Dtype, Stream};
 
 use super::LoopOptions;
 
@@ -29,18 +29,24 @@ pub(super) struct SweepReports {
     early: usize,
 }
 
+/// Descriptor of a vehicle that publishes these streams beside its pose, without sweeps.
+pub fn descriptor(detector: &Detector, dtype: Dtype, publish: &[Stream]) -> Descriptor {
+    Descriptor {
+        model_hash: detector.model_hash(),
+        grid: detector.grid(),
+        channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
+        dtype,
+        streams: std::iter::once(Stream::Pose)
+            .chain(publish.iter().copied())
+            .collect(),
+        sweeps: Vec::new(),
+    }
+}
+
 impl SweepReports {
     pub(super) fn new(detector: Option<&Detector>, options: &LoopOptions) -> Self {
-        let description = detector.map(|detector| Descriptor {
-            model_hash: detector.model_hash(),
-            grid: detector.grid(),
-            channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
-            dtype: options.codec.dtype,
-            streams: std::iter::once(Stream::Pose)
-                .chain(options.publish.iter().copied())
-                .collect(),
-            sweeps: Vec::new(),
-        });
+        let (dtype, publish) = (options.codec.dtype, &options.publish);
+        let description = detector.map(|detector| descriptor(detector, dtype, publish));
         Self {
             description,
             next_nanos: 0,

@@ -16,8 +16,8 @@ use perception::pillars::batch::PillarBatch;
 use perception::pillars::point_pillars::PointPillars;
 use perception::train::ComputePrecision;
 use perception::weights::{CONFIG_KEY, FileError, METHOD_KEY, Weights};
+use protocol::Detection;
 use protocol::config::require;
-use protocol::{Box3d, Detection};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
@@ -421,14 +421,7 @@ impl CooperativeModel {
     /// [`AnchorGridError`] when the configuration has no anchors.
     pub fn assigner(&self) -> Result<TargetAssigner, AnchorGridError> {
         let anchors = &self.anchors;
-        let boxes = (0..anchors.len()).map(|index| {
-            let [x, y, z, h, w, l, yaw] = anchors.get(index);
-            Box3d {
-                center_m: [x, y, z],
-                size_m: [l, w, h],
-                heading_rad: yaw,
-            }
-        });
+        let boxes = (0..anchors.len()).map(|index| anchors.box_at(index));
         let shape = [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len()];
         TargetAssigner::new(boxes.collect(), shape, TargetRule::default())
     }

@@ -16,6 +16,7 @@ mod transmission;
 use std::ops::ControlFlow;
 
 use agent::agent::Agent;
+use agent::agent_loop::descriptor;
 use agent::attack::Attack;
 use agent::config::{AgentSettings, FleetPlace};
 use dataset::class_set::ClassSet;
@@ -27,8 +28,8 @@ use perception::detector::Detector;
 use perception::inference::Inference;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
-use protocol::message::Detections;
-use protocol::{Ledger, PoseEstimate, Stamp, Tracks};
+use protocol::message::{Descriptor, Detections};
+use protocol::{Ledger, PoseEstimate, Stamp, Stream, Tracks};
 use tch::Device;
 
 use ego_fuser::ego::Ego;
@@ -190,22 +191,43 @@ impl Evaluator {
             is_ego,
             gate: self.ego.method().gate(),
         });
-        let precision = self.setup.models.precision;
-        let own = { settings.weights.as_deref() }
-            .map(Weights::load)
-            .transpose()?;
-        let own = own.map(|weights| weights.with_precision(precision));
-        let weights = own.as_ref().unwrap_or(&self.weights);
-        let detector = Detector::from_weights(weights, &weights.detector_config()?, Device::Cpu)?;
+        let detector = self.detector_of(&settings)?;
         let cav = &scenario.agents[place];
         let attack = match settings.falsification {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),
             None => { self.setup.attack }.and_then(|attack| attack.of(place, cav)),
         };
-        let inference = Inference::new(Device::Cpu, precision);
+        let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
         let agent = agent.within(settings.rate);
         Ok(Participant::new(agent, attack, &settings))
+    }
+
+    /// The detector of a vehicle: its own network, or that of the run.
+    fn detector_of(&self, settings: &AgentSettings) -> Result<Detector, EvaluateError> {
+        let own = { settings.weights.as_deref() }
+            .map(Weights::load)
+            .transpose()?;
+        let own = own.map(|weights| weights.with_precision(self.setup.models.precision));
+        let weights = own.as_ref().unwrap_or(&self.weights);
+        Ok(Detector::from_weights(
+            weights,
+            &weights.detector_config()?,
+            Device::Cpu,
+        )?)
+    }
+
+    /// The descriptor of a neighbour with these settings, where the method needs a `stream`.
+    fn descriptor_of(
+        &self,
+        settings: &AgentSettings,
+        stream: Stream,
+    ) -> Result<Descriptor, EvaluateError> {
+        let (dtype, publish) = (settings.codec.dtype, settings.sent_for(stream));
+        Ok(match settings.weights {
+            None => descriptor(self.ego.detector(), dtype, &publish),
+            Some(_) => descriptor(&self.detector_of(settings)?, dtype, &publish),
+        })
     }
 
     /// True if sweeps have to be read at all.

@@ -116,7 +116,7 @@ impl EgoLoop {
     }
 
     /// Records that a neighbour publishes a stream.
-    pub fn note_stream(&mut self, cav: &CavId, stream: Stream) {
+    fn note_stream(&mut self, cav: &CavId, stream: Stream) {
         if stream == Stream::Boxes {
             self.box_senders.insert(cav.clone());
         } else if stream == self.stream {

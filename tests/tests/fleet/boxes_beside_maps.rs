@@ -6,7 +6,7 @@ use link::{CapacityConfig, LinkConfig, QueueConfig};
 use protocol::{CavId, DropReason};
 use tests::fleet::write_weights_with_box_input;
 
-use super::simulation_time::{MS, config, evaluate, scene};
+use super::simulation_time::{MS, TICKS, config, evaluate, scene};
 
 #[test]
 fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
@@ -60,4 +60,21 @@ fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
             assert_eq!(fused.age_nanos / MS as i64, if is_map { 100 } else { 0 });
         }
     }
+}
+
+#[test]
+fn maps_of_another_network_are_left_out_on_every_clock_also_of_the_same_shape() {
+    let folder = scene();
+    let other = folder.path().join("other.safetensors");
+    write_weights_with_box_input(&other);
+    let mut setup = config(LinkConfig::default());
+    setup.agents.weights = Some(other);
+    let (frames, ledger) = evaluate(folder.path(), setup.clone());
+    assert!(frames.iter().all(|frame| frame.result.fused.is_empty()));
+    let shape = ledger.total().dropped.get(&DropReason::Shape).copied();
+    assert_eq!(shape, Some(2 * TICKS as u64), "maps of two neighbours");
+    // Nor without an emulation of the link, where no ledger is kept.
+    setup.link = None;
+    let (frames, _) = evaluate(folder.path(), setup);
+    assert!(frames.iter().all(|frame| frame.result.fused.is_empty()));
 }

@@ -1,5 +1,7 @@
 //! Anchors: prior boxes of the head.
 
+use protocol::Box3d;
+
 use crate::model_config::{AnchorConfig, DetectorConfig};
 
 /// Anchors of a head: a regular grid with the same boxes at every point.
@@ -92,6 +94,18 @@ impl Anchors {
             l,
             self.yaws_rad[anchor],
         ]
+    }
+    /// The anchor with this index as a box.
+    ///
+    /// # Panics
+    /// As [`Self::get`].
+    pub fn box_at(&self, index: usize) -> Box3d {
+        let [x, y, z, h, w, l, yaw] = self.get(index);
+        Box3d {
+            center_m: [x, y, z],
+            size_m: [l, w, h],
+            heading_rad: yaw,
+        }
     }
 }
 

@@ -5,4 +5,4 @@ pub mod decode;
 pub mod nms;
 pub mod postprocess;
 pub mod refinement;
-pub mod surroundings;
+pub mod roi;

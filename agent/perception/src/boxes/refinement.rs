@@ -1,4 +1,4 @@
-//! Box refinement, a second stage of the detector: corrects each detected box by what the feature map holds around it.
+//! Box refinement, the second stage of a detector: corrects each detected box from the features of its region of interest.
 //!
 //! The head of a fusion is trained for fused maps, and a 1x1 head sees one cell only. Boxes that a vehicle sends are
 //! those of its own map, so they are refined before they are sent, where the weights have it.
@@ -8,7 +8,7 @@ use tch::nn::{self, Init, Module};
 use tch::{Result, Tensor};
 
 use crate::boxes::decode::sigmoid;
-use crate::boxes::surroundings::{self, Surroundings};
+use crate::boxes::roi::{self, RoiEncoder};
 use crate::model_config::{DetectorConfig, YAxis};
 use crate::tensor_values::{tensor, values};
 use crate::weights::Weights;
@@ -23,14 +23,14 @@ pub const NUMBERS: usize = 8;
 /// Numbers of a box that are read beside the map.
 const VALUES: usize = 8;
 /// Largest correction of a position in sizes of the box, of a logarithm, and of a heading in radians.
-const MOST: f64 = 0.5;
-/// Scores are read and changed between this and its complement.
-const LEAST_SCORE: f64 = 1e-4;
+const MAX_CORRECTION: f64 = 0.5;
+/// Scores are limited to this and its complement before their logit is taken.
+const MIN_SCORE: f64 = 1e-4;
 
 /// The network.
 #[derive(Debug)]
 pub struct BoxRefinement {
-    surroundings: Surroundings,
+    roi: RoiEncoder,
     /// Zero at the start and without bias: an untrained refinement changes nothing.
     out: nn::Linear,
     /// Height of a usual vehicle's centre, metres.
@@ -54,13 +54,8 @@ impl BoxRefinement {
             bias: false,
         };
         Self {
-            surroundings: Surroundings::new(&path, detector, VALUES),
-            out: nn::linear(
-                &path / "out",
-                surroundings::CHANNELS,
-                NUMBERS as i64,
-                config,
-            ),
+            roi: RoiEncoder::new(&path, detector, VALUES),
+            out: nn::linear(&path / "out", roi::CHANNELS, NUMBERS as i64, config),
             usual_z_m: detector.anchors.center_z_m,
             usual_size_m: detector.anchors.size_lwh_m,
             y_axis: detector.y_axis,
@@ -95,7 +90,7 @@ impl BoxRefinement {
             .flat_map(|(box3d, detection)| self.values(box3d, detection.score))
             .collect();
         let all = tensor(&all, &[-1, VALUES as i64], map.device())?;
-        let hidden = self.surroundings.forward(map, &boxes, &all)?;
+        let hidden = self.roi.forward(map, &boxes, &all)?;
         let corrections = self.out.forward(&hidden);
         match self.y_axis {
             YAxis::Left => Ok(corrections),
@@ -109,31 +104,30 @@ impl BoxRefinement {
 
     fn values(&self, box3d: &Box3d, score: f32) -> [f32; VALUES] {
         let [x_m, y_m, z_m] = box3d.center_m;
-        let (sin, cos) = (2.0 * box3d.heading_rad).sin_cos();
-        let log = |axis: usize| (box3d.size_m[axis].max(0.1) / self.usual_size_m[axis]).ln();
+        let [length, width, height, sin, cos] = roi::shape(box3d, self.usual_size_m);
         [
             logit(score) / 4.0,
             (x_m.hypot(y_m) / 50.0).min(2.0),
             ((z_m - self.usual_z_m) / self.usual_size_m[2]).clamp(-2.0, 2.0),
             sin,
             cos,
-            log(0),
-            log(1),
-            log(2),
+            length,
+            width,
+            height,
         ]
         .map(|value| value as f32)
     }
 }
 
 fn logit(score: f32) -> f64 {
-    let score = f64::from(score).clamp(LEAST_SCORE, 1.0 - LEAST_SCORE);
+    let score = f64::from(score).clamp(MIN_SCORE, 1.0 - MIN_SCORE);
     (score / (1.0 - score)).ln()
 }
 
 /// Detections with their corrections, `NUMBERS` each.
 pub fn corrected(mut detections: Vec<Detection>, corrections: &[f32]) -> Vec<Detection> {
     for (detection, numbers) in detections.iter_mut().zip(corrections.chunks_exact(NUMBERS)) {
-        let at = |index: usize| f64::from(numbers[index]).clamp(-MOST, MOST);
+        let at = |index: usize| f64::from(numbers[index]).clamp(-MAX_CORRECTION, MAX_CORRECTION);
         let Box3d {
             center_m,
             size_m,
@@ -159,8 +153,6 @@ pub fn correction(from: &Box3d, to: &Box3d) -> [f64; NUMBERS] {
     let (sin, cos) = from.heading_rad.sin_cos();
     let [length_m, width_m, height_m] = from.size_m;
     let log = |axis: usize| (to.size_m[axis] / from.size_m[axis]).ln();
-    let turn = to.heading_rad - from.heading_rad;
-    let half_turn = std::f64::consts::PI;
     [
         (cos * dx + sin * dy) / length_m,
         (cos * dy - sin * dx) / width_m,
@@ -168,14 +160,16 @@ pub fn correction(from: &Box3d, to: &Box3d) -> [f64; NUMBERS] {
         log(0),
         log(1),
         log(2),
-        turn - half_turn * (turn / half_turn).round(),
+        roi::within_quarter_turn(to.heading_rad - from.heading_rad),
         0.0,
     ]
 }
 
-/// True if a box can be corrected to another one: no number is beyond what a correction reaches.
-pub fn is_in_reach(correction: &[f64; NUMBERS]) -> bool {
-    correction[..7].iter().all(|number| number.abs() <= MOST)
+/// True if no number of a correction is beyond the largest one.
+pub fn is_within_limits(correction: &[f64; NUMBERS]) -> bool {
+    correction[..7]
+        .iter()
+        .all(|number| number.abs() <= MAX_CORRECTION)
 }
 
 #[cfg(test)]
@@ -264,7 +258,7 @@ mod tests {
                 to.heading_rad += std::f64::consts::PI;
             }
             let found = correction(&from.box3d, &to);
-            prop_assert!(is_in_reach(&found));
+            prop_assert!(is_within_limits(&found));
             for (found, number) in found.into_iter().zip(numbers) {
                 prop_assert!((found - f64::from(number)).abs() < 1e-5);
             }

@@ -278,6 +278,13 @@ impl Arguments {
                 "--boxes is for methods that exchange feature maps: {methods} does not"
             )));
         }
+        if self.neighbour_weights.is_some()
+            && exchange().all(|content| content == Exchange::Nothing)
+        {
+            return Err(BadInput::new(format!(
+                "--neighbour-weights is for messages of neighbours: {methods} receives none"
+            )));
+        }
         let carries = |content| content == Exchange::Boxes || self.boxes.is_some();
         if self.latency_compensation && !exchange().any(carries) {
             return Err(BadInput::new(format!(

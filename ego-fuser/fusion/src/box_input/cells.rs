@@ -1,24 +1,22 @@
 //! Cells of boxes: the cells of the ego's grid that each box covers, and the box as the anchors there encode it.
 
-use std::f64::consts::PI;
-
 use perception::boxes::anchors::Anchors;
+use perception::boxes::roi::{MAX_LOG_RATIO, shape, within_quarter_turn};
 use protocol::rotated_iou::Polygon;
 use protocol::{BevGrid, Box3d};
 
-use super::placed::{PlacedBox, agreement};
-use crate::targets::BOX_CODE;
+use super::placed::{PlacedBox, support};
+use crate::targets::{BOX_CODE, encode};
 
 /// Length and width up to which a box covers cells, metres: larger than any vehicle, so that no sender's boxes take long.
 const MAX_SIZE_M: [f64; 2] = [26.0, 5.0];
-/// Largest logarithm of a size relative to an anchor's.
-const MOST_LOG_SIZE: f64 = 1.5;
 /// Numbers that describe a box.
 pub(super) const VALUES: usize = 11;
+
 /// Boxes and the cells that they cover.
 #[derive(Debug, Default)]
 pub(super) struct BoxCells {
-    /// `[N, VALUES]`: age, score, pose confidence, agreement of other senders, distance, height,
+    /// `[N, VALUES]`: age, score, pose confidence, support by other senders, distance, height,
     /// logarithms of sizes, sine and cosine of twice the heading.
     pub(super) values: Vec<f32>,
     /// `[K]`: box of each pair of box and cell.
@@ -35,15 +33,15 @@ impl BoxCells {
     /// Those of `boxes` on `grid`.
     pub(super) fn new(boxes: &[PlacedBox], grid: &BevGrid, anchors: &Anchors) -> Self {
         let mut cells = Self::default();
-        for ((placed, agreement), index) in boxes.iter().zip(agreement(boxes)).zip(0..) {
-            cells.values.extend(values(placed, agreement, anchors));
+        for ((placed, support), index) in boxes.iter().zip(support(boxes)).zip(0..) {
+            cells.values.extend(values(placed, support, anchors));
             for (cell, share) in covered(&placed.box3d, grid) {
                 cells.box_of.push(index);
                 cells.cell_of.push(cell as i64);
                 cells.share.push(share as f32);
                 for anchor in 0..anchors.yaws_rad.len() {
-                    let anchor = anchors.get(cell * anchors.yaws_rad.len() + anchor);
-                    cells.code.extend(code(&placed.box3d, anchor));
+                    let anchor = anchors.box_at(cell * anchors.yaws_rad.len() + anchor);
+                    cells.code.extend(code(&placed.box3d, &anchor));
                 }
             }
         }
@@ -52,17 +50,15 @@ impl BoxCells {
 }
 
 /// The numbers of a box that are the same in all its cells.
-fn values(placed: &PlacedBox, agreement: f64, anchors: &Anchors) -> [f32; VALUES] {
+fn values(placed: &PlacedBox, support: f64, anchors: &Anchors) -> [f32; VALUES] {
     let [x, y, z] = placed.box3d.center_m;
     let [_, _, height] = anchors.size_lwh_m;
-    let [length, width, high] = log_sizes(&placed.box3d, anchors.size_lwh_m);
-    // A heading and its opposite are the same box.
-    let (sin, cos) = (2.0 * placed.box3d.heading_rad).sin_cos();
+    let [length, width, high, sin, cos] = shape(&placed.box3d, anchors.size_lwh_m);
     [
         placed.age_secs.clamp(-1.0, 1.0),
         placed.score,
         placed.pose_confidence,
-        agreement,
+        support,
         (x.hypot(y) / 50.0).min(2.0),
         ((z - anchors.z_m) / height).clamp(-2.0, 2.0),
         length,
@@ -74,27 +70,18 @@ fn values(placed: &PlacedBox, agreement: f64, anchors: &Anchors) -> [f32; VALUES
     .map(|value| value as f32)
 }
 
-/// Logarithms of the sizes relative to an anchor's, of boxes of up to 4.5 times its size and down to its 4.5th part.
-fn log_sizes(box3d: &Box3d, of_anchor_m: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|axis| {
-        let ratio = box3d.size_m[axis].max(0.1) / of_anchor_m[axis];
-        ratio.ln().clamp(-MOST_LOG_SIZE, MOST_LOG_SIZE)
-    })
-}
-
-/// The box relative to an anchor, as a head encodes it; a heading and its opposite are the same box.
-fn code(box3d: &Box3d, [x, y, z, h, w, l, yaw]: [f64; BOX_CODE]) -> [f32; BOX_CODE] {
-    let diagonal = l.hypot(w);
-    let [length, width, height] = log_sizes(box3d, [l, w, h]);
-    let turn = box3d.heading_rad - yaw;
+/// The box relative to an anchor, within the limits of what boxes of vehicles need.
+fn code(box3d: &Box3d, anchor: &Box3d) -> [f32; BOX_CODE] {
+    let [x, y, z, height, width, length, yaw] = encode(box3d, anchor);
+    let log = |ratio: f64| ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO);
     [
-        (box3d.center_m[0] - x) / diagonal,
-        (box3d.center_m[1] - y) / diagonal,
-        ((box3d.center_m[2] - z) / h).clamp(-2.0, 2.0),
-        height,
-        width,
-        length,
-        turn - PI * (turn / PI).round(),
+        x,
+        y,
+        z.clamp(-2.0, 2.0),
+        log(height),
+        log(width),
+        log(length),
+        within_quarter_turn(yaw),
     ]
     .map(|value| value as f32)
 }

@@ -1,9 +1,9 @@
-//! Box input: changes what the head finds where neighbours' boxes lie, behind the fusion of any method.
+//! Box input: neighbours' boxes change scores and box offsets of the detection head, behind the fusion of any method.
 //!
-//! Boxes need no common network and take a kilobyte. Around each box a small network reads the fused map, the box and
-//! how far other senders agree with it; then, cell by cell, it decides how far the head's own scores and boxes give way
-//! to it. It is trained with late, lost, shifted and invented boxes, so that age and confidence decide what they are
-//! worth. Without boxes the output of the head stays as it is.
+//! Boxes need no common network and take less than a kilobyte. A small network encodes the fused map in and around each
+//! box, the box, and its support by other senders. For each cell that the box covers it predicts a change of the head's
+//! scores and a gate between the head's own box and the neighbour's. It is trained with late, lost, shifted and invented
+//! boxes, so age and confidence determine their weight. Without boxes the output of the head is unchanged.
 
 mod cells;
 mod placed;
@@ -11,7 +11,7 @@ mod placed;
 use std::f64::consts::PI;
 
 use perception::boxes::anchors::Anchors;
-use perception::boxes::surroundings::{CHANNELS, Surroundings};
+use perception::boxes::roi::{CHANNELS, RoiEncoder};
 use perception::layers::head::HeadOutput;
 use perception::model_config::DetectorConfig;
 use perception::tensor_values::tensor;
@@ -35,13 +35,15 @@ const WEIGHT: &str = "box_input.out.weight";
 const HIDDEN: i64 = 96;
 /// Numbers of the component that holds the heading.
 const YAW: i64 = BOX_CODE as i64 - 1;
-/// Changes of an anchor: of its score, share of the way to the box, and of each number of its own box.
+/// Changes of an anchor: of its score, gate to the neighbour's box, and of each number of its own box.
 const CHANGES: i64 = 2 + BOX_CODE as i64;
-/// Limits of the changes, so that no boxes of a neighbour lead to a box that is none: share of the way to the box, change of
-/// a number of the own box, and of the logit of its score.
-const WAY: [f64; 2] = [-0.5, 1.5];
-const MOST_OF_BOX: f64 = 0.5;
-const MOST_OF_SCORE: f64 = 20.0;
+/// Range of the gate: 0 keeps the head's own box, 1 gives the neighbour's. Limits keep every box valid whatever neighbours
+/// send.
+const GATE_RANGE: [f64; 2] = [-0.5, 1.5];
+/// Largest change of an offset of the own box.
+const MAX_OFFSET_CHANGE: f64 = 0.5;
+/// Largest change of the logit of a score.
+const MAX_LOGIT_CHANGE: f64 = 20.0;
 /// Largest exponent of the weight of a box among those on a cell.
 const MAX_LOG_WEIGHT: f64 = 8.0;
 
@@ -53,7 +55,7 @@ pub fn is_in(weights: &Weights) -> bool {
 /// The network.
 #[derive(Debug)]
 pub struct BoxInput {
-    surroundings: Surroundings,
+    roi: RoiEncoder,
     cell: [nn::Linear; 2],
     /// Zero at the start and without bias: an untrained box input changes nothing.
     out: nn::Linear,
@@ -70,14 +72,14 @@ impl BoxInput {
         let layer = |name: &str, from: i64, to: i64| {
             nn::linear(&path / name, from, to, nn::LinearConfig::default())
         };
-        // Map, own scores and boxes, the box, its difference, covered share; and what is around the box.
+        // Map, own scores and boxes, the box, its difference, covered share, and features of the region of interest.
         let of_cell = channels + count * (1 + 3 * BOX_CODE as i64) + 1 + CHANNELS;
         let out = nn::LinearConfig {
             ws_init: nn::Init::Const(0.0),
             ..BARE
         };
         Self {
-            surroundings: Surroundings::new(&path, detector, VALUES),
+            roi: RoiEncoder::new(&path, detector, VALUES),
             cell: [
                 layer("cell", of_cell, HIDDEN),
                 layer("second", HIDDEN, HIDDEN),
@@ -117,7 +119,7 @@ impl BoxInput {
             .f_transpose(0, 1)?;
         let values = tensor(&found.values, &[-1, VALUES as i64], device)?;
         let placed: Vec<Box3d> = boxes.iter().map(|placed| placed.box3d).collect();
-        let around = self.surroundings.forward(fused, &placed, &values)?;
+        let around = self.roi.forward(fused, &placed, &values)?;
         let input = [
             &by_cell.f_index_select(0, &pairs.cell_of)?,
             &pairs.own.f_clamp(-8.0, 8.0)?,
@@ -194,10 +196,10 @@ impl Pairs {
         let within = |first: i64, count: i64, [least, most]: [f64; 2]| {
             changes.f_narrow(2, first, count)?.f_clamp(least, most)
         };
-        let score = within(0, 1, [-MOST_OF_SCORE, MOST_OF_SCORE])?;
-        let own_box = within(2, BOX_CODE as i64, [-MOST_OF_BOX, MOST_OF_BOX])?;
-        let toward = within(1, 1, WAY)?.f_mul(&self.difference)?;
-        let change = Tensor::f_cat(&[score, own_box.f_add(&toward)?], 2)?;
+        let score = within(0, 1, [-MAX_LOGIT_CHANGE, MAX_LOGIT_CHANGE])?;
+        let own_box = within(2, BOX_CODE as i64, [-MAX_OFFSET_CHANGE, MAX_OFFSET_CHANGE])?;
+        let gated = within(1, 1, GATE_RANGE)?.f_mul(&self.difference)?;
+        let change = Tensor::f_cat(&[score, own_box.f_add(&gated)?], 2)?;
         let numbers = anchors * (1 + BOX_CODE as i64);
         let change = change.f_view([-1, numbers])?.f_mul(&weight)?;
         let options = (change.kind(), change.device());
@@ -344,13 +346,13 @@ mod tests {
                 .unwrap();
             // Sizes of an anchor change by up to e^2.75, scores by as much as they can.
             let sizes = after.offsets.narrow(1, 3, 3).abs().max().double_value(&[]);
-            assert!(sizes > 0.2 && sizes <= 2.75 + 1e-5, "{sizes}");
-            assert!(after.scores.abs().max().double_value(&[]) <= MOST_OF_SCORE);
+            assert!(sizes > 0.0 && sizes <= 2.75 + 1e-5, "{sizes}");
+            assert!(after.scores.abs().max().double_value(&[]) <= MAX_LOGIT_CHANGE);
         }
     }
 
     #[test]
-    fn the_whole_way_to_the_box_ends_at_the_box() {
+    fn a_gate_of_one_gives_the_box_of_the_neighbour() {
         let detector = detector();
         let before = head(&detector);
         let anchors = Anchors::for_detector(&detector);

@@ -1,12 +1,12 @@
-//! Placed boxes: neighbours' detections in the frame of the ego, and how far other senders agree with each.
+//! Placed boxes: neighbours' detections in the frame of the ego, and the support of each by other senders.
+
+use std::collections::BTreeMap;
 
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Detection, Pose};
 
 /// Boxes of one sender that are read at most, so that none takes long or crowds out the others.
 pub const MAX_BOXES: usize = 128;
-/// Distance from which on boxes cannot overlap, metres.
-const APART_M: f64 = 30.0;
 
 /// A neighbour's box in the frame of the ego.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,7 +24,7 @@ pub struct PlacedBox {
 }
 
 impl PlacedBox {
-    pub(super) fn confidence(&self) -> f64 {
+    fn confidence(&self) -> f64 {
         self.score * self.pose_confidence
     }
 }
@@ -52,30 +52,23 @@ pub fn placed(
     boxes
 }
 
-/// How far other senders agree with each box: the sum over them of the largest product of IoU from above and confidence.
-pub(super) fn agreement(boxes: &[PlacedBox]) -> Vec<f64> {
+/// Support of each box by other senders: the sum over them of the largest product of BEV IoU and confidence.
+pub(super) fn support(boxes: &[PlacedBox]) -> Vec<f64> {
     let footprints: Vec<Polygon> = { boxes.iter() }
         .map(|placed| Polygon::footprint(&placed.box3d.corners()))
         .collect();
-    let mut senders: Vec<usize> = boxes.iter().map(|placed| placed.sender).collect();
-    senders.sort_unstable();
-    senders.dedup();
-    let of = |index: usize| {
-        let [x, y, _] = boxes[index].box3d.center_m;
-        let from = |sender: usize| {
-            let same = (0..boxes.len()).filter(|&other| {
-                let [other_x, other_y, _] = boxes[other].box3d.center_m;
-                boxes[other].sender == sender && (other_x - x).hypot(other_y - y) < APART_M
-            });
-            same.map(|other| footprints[index].iou(&footprints[other]) * boxes[other].confidence())
-                .fold(0.0, f64::max)
-        };
-        let others = senders
-            .iter()
-            .filter(|sender| **sender != boxes[index].sender);
-        others.map(|&sender| from(sender)).sum()
+    let of = |(own, footprint): (&PlacedBox, &Polygon)| {
+        let mut by_sender = BTreeMap::new();
+        for (other, overlapping) in boxes.iter().zip(&footprints) {
+            if other.sender != own.sender {
+                let iou = footprint.iou(overlapping);
+                let best: &mut f64 = by_sender.entry(other.sender).or_default();
+                *best = best.max(iou * other.confidence());
+            }
+        }
+        by_sender.values().sum()
     };
-    (0..boxes.len()).map(of).collect()
+    boxes.iter().zip(&footprints).map(of).collect()
 }
 
 #[cfg(test)]
@@ -99,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn others_agree_by_overlap_and_confidence_and_a_sender_never_with_itself() {
+    fn support_is_overlap_and_confidence_of_other_senders_only() {
         let boxes = [
             car(1, 0.0, 0.8),
             car(1, 0.0, 0.9),
@@ -107,7 +100,7 @@ mod tests {
             car(3, 2.0, 1.0),
             car(3, 20.0, 1.0),
         ];
-        let found = agreement(&boxes);
+        let found = support(&boxes);
         // Half a length apart: a third of the union.
         assert!((found[0] - (0.3 + 0.5 / 3.0)).abs() < 1e-9, "{found:?}");
         assert!((found[2] - (0.45 + 0.5 / 3.0)).abs() < 1e-9, "{found:?}");

@@ -124,11 +124,12 @@ impl<'a> Run<'a> {
                 let cav = &scenario.agents[place];
                 let joined = Input::Joined(cav.clone());
                 ego_loop.handle(&mut evaluator.ego, joined, began_nanos);
-                // As its descriptor says in a live run, before its first sweep is computed.
-                let settings = setup.vehicles.get(cav).unwrap_or(&setup.agents);
-                for stream in settings.sent_for(ego_loop.stream()) {
-                    ego_loop.note_stream(cav, stream);
-                }
+                // As in a live run, before its first sweep is computed.
+                let settings = evaluator.setup.vehicles.get(cav);
+                let settings = settings.unwrap_or(&evaluator.setup.agents);
+                let descriptor = evaluator.descriptor_of(settings, ego_loop.stream())?;
+                let described = Input::Model(cav.clone(), descriptor);
+                ego_loop.handle(&mut evaluator.ego, described, began_nanos);
             }
         }
         Ok(Self {

@@ -16,6 +16,6 @@ pub use augment::{Augmentation, ViewAugment};
 pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews};
 pub use loader::{Batch, BatchViews, batches};
 pub use moments::Moments;
-pub(crate) use neighbour_boxes::described as neighbour_boxes;
+pub(crate) use neighbour_boxes::augmentation_summary as box_augmentation;
 pub use poses::{Offset, SamplePoses};
 pub use scenes::{SceneSet, TickRef};

@@ -34,8 +34,8 @@ const CARRIED_MPS: [f64; 2] = [2.0, 12.0];
 /// Share of the vehicles without a track.
 const UNTRACKED: f64 = 0.15;
 
-/// What is wrong with the boxes of a training, for its card.
-pub(crate) fn described() -> String {
+/// Augmentation of neighbours' boxes in training, for the model card.
+pub(crate) fn augmentation_summary() -> String {
     let percent = |share: f64| (100.0 * share).round();
     let ([of_each, of_all], [plane_m, _, turn_deg]) = (SHIFTED, LARGEST_SHIFT);
     format!(

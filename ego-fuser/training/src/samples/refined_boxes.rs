@@ -1,9 +1,9 @@
-//! Refined boxes in samples: what the refinement makes of a vehicle's own detections, and how far that is from the truth.
+//! Refined boxes in samples: a vehicle's own detections after the refinement, and the loss against the ground truth.
 
 use dataset::ground_truth::GroundTruth;
 use fusion::model::CooperativeModel;
 use perception::boxes::postprocess::PostprocessConfig;
-use perception::boxes::refinement::{NUMBERS, corrected, correction, is_in_reach};
+use perception::boxes::refinement::{NUMBERS, corrected, correction, is_within_limits};
 use perception::tensor_values::{tensor, values};
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Detection, Pose};
@@ -44,7 +44,7 @@ pub(super) fn refined_boxes(
     Ok((refined, Some(loss)))
 }
 
-/// What the detections of a vehicle should be corrected to.
+/// Targets of the refinement for the detections of a vehicle: corrections and scores.
 #[derive(Debug, Default)]
 struct Targets {
     /// `[N, OF_BOX]`.
@@ -79,7 +79,7 @@ impl Targets {
         for (detection, refined) in found.iter().zip(refined) {
             let object = best(&detection.box3d).filter(|(_, iou)| *iou >= LEAST_IOU);
             let wanted = object.map(|(index, _)| correction(&detection.box3d, &objects[index]));
-            let wanted = wanted.filter(is_in_reach);
+            let wanted = wanted.filter(is_within_limits);
             let numbers = wanted.unwrap_or_default();
             targets
                 .corrections

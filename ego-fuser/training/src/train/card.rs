@@ -5,7 +5,7 @@ use perception::train::ModelCard;
 use super::config::TrainConfig;
 use super::frozen::sample_config;
 use super::observer::Summary;
-use crate::samples::{SceneSet, neighbour_boxes};
+use crate::samples::{SceneSet, box_augmentation};
 use fusion::model::CooperativeModel;
 
 /// The card of a detector.
@@ -93,7 +93,7 @@ pub(super) fn card(
     if config.box_input {
         let trained = "everything but the box input and the refinement of boxes";
         card.row("frozen", trained);
-        card.row("neighbours", neighbour_boxes());
+        card.row("neighbours", box_augmentation());
     }
     if let Some(accuracy) = &summary.accuracy {
         card.paragraph(&format!(

@@ -1,4 +1,8 @@
-//! Surroundings of boxes: what a feature map holds in and around each box, read in the box's own direction.
+//! RoI encoder: features of a region of interest, the feature map in and around a box, sampled along the axes of the box.
+//!
+//! As the second stage of PV-RCNN and CenterPoint does from the points of a grid or the faces of a box.
+
+use std::f64::consts::PI;
 
 use protocol::{BevGrid, Box3d};
 use tch::nn::{self, Module};
@@ -7,33 +11,35 @@ use tch::{Result, Tensor};
 use crate::model_config::DetectorConfig;
 use crate::tensor_values::tensor;
 
-/// Places along and across a box at which the map is read, as shares of its half length and half width.
+/// Sampling positions along and across a box, as shares of its half length and half width.
 const ALONG: [f64; 5] = [-1.5, -0.75, 0.0, 0.75, 1.5];
 const ACROSS: [f64; 3] = [-1.8, 0.0, 1.8];
-/// Number of these places.
-const PLACES: usize = ALONG.len() * ACROSS.len();
-/// Length and width up to which places are spread, metres: larger than any vehicle.
+/// Number of sampling positions of a box.
+const POSITIONS: usize = ALONG.len() * ACROSS.len();
+/// Length and width up to which a box is sampled, metres: larger than any vehicle.
 const MAX_SIZE_M: [f64; 2] = [26.0, 5.0];
-/// Channels to which the map is reduced at each place.
+/// Channels to which the map is reduced at each position.
 const REDUCED: i64 = 24;
+/// Largest logarithm of the ratio of a size to a usual one: 4.5 times as long.
+pub const MAX_LOG_RATIO: f64 = 1.5;
 /// Channels of the output.
 pub const CHANNELS: i64 = 96;
 
-/// Network that reads a map around boxes.
+/// Network that encodes the map in and around boxes.
 #[derive(Debug)]
-pub struct Surroundings {
+pub struct RoiEncoder {
     reduce: nn::Linear,
     layers: [nn::Linear; 2],
     grid: BevGrid,
 }
 
-impl Surroundings {
+impl RoiEncoder {
     /// For maps of a detector, and `values` numbers of each box; its variables are below `path`.
     pub fn new(path: &nn::Path<'_>, detector: &DetectorConfig, values: usize) -> Self {
         let layer = |name: &str, from: i64, to: i64| {
             nn::linear(path / name, from, to, nn::LinearConfig::default())
         };
-        let read = PLACES as i64 * REDUCED + values as i64;
+        let read = POSITIONS as i64 * REDUCED + values as i64;
         Self {
             reduce: layer("reduce", detector.feature_channels(), REDUCED),
             layers: [
@@ -52,7 +58,7 @@ impl Surroundings {
     pub fn forward(&self, map: &Tensor, boxes: &[Box3d], values: &Tensor) -> Result<Tensor> {
         let read = read(map, boxes, &self.grid)?;
         let reduced = self.reduce.forward(&read).f_relu()?;
-        let reduced = reduced.f_view([-1, PLACES as i64 * REDUCED])?;
+        let reduced = reduced.f_view([-1, POSITIONS as i64 * REDUCED])?;
         let mut hidden = Tensor::f_cat(&[&reduced, values], 1)?;
         for layer in &self.layers {
             hidden = layer.forward(&hidden).f_relu()?;
@@ -61,11 +67,11 @@ impl Surroundings {
     }
 }
 
-/// `[N * PLACES, C]`: the map at the places of each box, between cells bilinear; zeros beyond its edges.
+/// `[N * POSITIONS, C]`: the map at the sampling positions of each box, bilinear between cells; zeros beyond its edges.
 fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
     let size = [i64::from(grid.width), i64::from(grid.height)];
     let (mut cells, mut weights) = (Vec::new(), Vec::new());
-    for [x_m, y_m] in boxes.iter().flat_map(places) {
+    for [x_m, y_m] in boxes.iter().flat_map(sampling_positions) {
         let column = (x_m - grid.x_min_m) / grid.cell_m - 0.5;
         let row = (y_m - grid.y_min_m) / grid.cell_m - 0.5;
         for [down, right] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
@@ -90,8 +96,8 @@ fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
     (corners * weights).f_sum_dim_intlist([1_i64].as_slice(), false, None)
 }
 
-/// Where the map is read around a box, metres.
-fn places(box3d: &Box3d) -> impl Iterator<Item = [f64; 2]> + use<> {
+/// Sampling positions of a box: x and y in the frame of the map, metres.
+fn sampling_positions(box3d: &Box3d) -> impl Iterator<Item = [f64; 2]> + use<> {
     let (sin, cos) = box3d.heading_rad.sin_cos();
     let [x_m, y_m, _] = box3d.center_m;
     let [half_length_m, half_width_m] =
@@ -105,6 +111,23 @@ fn places(box3d: &Box3d) -> impl Iterator<Item = [f64; 2]> + use<> {
             ]
         })
     })
+}
+
+/// Shape of a box relative to a usual size, which is length, width and height in metres: logarithms of the size ratios, at
+/// most [`MAX_LOG_RATIO`] in magnitude, then sine and cosine of twice the heading. A heading and its opposite are the same
+/// box.
+pub fn shape(box3d: &Box3d, usual_m: [f64; 3]) -> [f64; 5] {
+    let log = |axis: usize| {
+        let ratio = box3d.size_m[axis] / usual_m[axis];
+        ratio.ln().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
+    };
+    let (sin, cos) = (2.0 * box3d.heading_rad).sin_cos();
+    [log(0), log(1), log(2), sin, cos]
+}
+
+/// An angle within a quarter turn of zero, radians, up to half turns.
+pub fn within_quarter_turn(angle_rad: f64) -> f64 {
+    angle_rad - PI * (angle_rad / PI).round()
 }
 
 #[cfg(test)]
@@ -133,12 +156,12 @@ mod tests {
 
     #[test]
     fn places_lie_around_the_box_in_its_direction() {
-        let found: Vec<[f64; 2]> = places(&car([0.0, 0.0, -1.0], FRAC_PI_2)).collect();
-        assert_eq!(found.len(), PLACES);
+        let found: Vec<[f64; 2]> = sampling_positions(&car([0.0, 0.0, -1.0], FRAC_PI_2)).collect();
+        assert_eq!(found.len(), POSITIONS);
         // The first is behind and to the right: turned by 90 degrees right is +x and behind is -y.
         let [x_m, y_m] = found[0];
         assert!((x_m - 1.44).abs() < 1e-9 && (y_m + 3.0).abs() < 1e-9);
-        let [x_m, y_m] = found[PLACES / 2];
+        let [x_m, y_m] = found[POSITIONS / 2];
         assert!(x_m.abs() < 1e-9 && y_m.abs() < 1e-9);
     }
 
@@ -157,7 +180,7 @@ mod tests {
         let map = Tensor::cat(&[x, y], 1);
         let inside = car([0.33, -0.21, 0.0], 0.4);
         let found = read(&map, &[inside], &GRID).unwrap();
-        for (index, [x_m, y_m]) in (0..).zip(places(&inside)) {
+        for (index, [x_m, y_m]) in (0..).zip(sampling_positions(&inside)) {
             assert!((found.double_value(&[index, 0]) - x_m).abs() < 1e-5);
             assert!((found.double_value(&[index, 1]) - y_m).abs() < 1e-5);
         }
