@@ -5,8 +5,8 @@
 use std::time::{Duration, Instant};
 
 use protocol::{
-    BevFeatures, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, Gnss, PointCloud, Pose,
-    PoseEstimate, StageTiming, WireError,
+    BevFeatures, Boxes, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, Gnss,
+    PointCloud, Pose, PoseEstimate, StageTiming, WireError,
 };
 use support::stage_times::StageTimes;
 use tch::Tensor;
@@ -16,6 +16,7 @@ use localization::pose_source::{PoseInput, PoseSource};
 use localization::tracker::PoseMeasurement;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::detector::{BackboneLevel, Detector, DetectorError, Encoded};
+use tracking::ObjectTracker;
 
 /// All inputs of one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -77,6 +78,7 @@ pub struct Agent {
     pose_source: Box<dyn PoseSource>,
     detector: Option<Detector>,
     rate: RateControl,
+    object_tracker: ObjectTracker,
     has_head: bool,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
@@ -100,6 +102,7 @@ impl Agent {
             pose_source,
             detector: None,
             rate: RateControl::default(),
+            object_tracker: ObjectTracker::default(),
             has_head: true,
             shares_encoder: false,
         }
@@ -261,6 +264,19 @@ impl Agent {
     ) -> Result<EncodedFeatures, WireError> {
         self.rate
             .encode(features, codec, confidence, capture_nanos, None)
+    }
+
+    /// The message of a sweep's detections, with the tracks of objects that were detected before.
+    pub fn boxes(
+        &mut self,
+        capture_nanos: u64,
+        pose: PoseEstimate,
+        detections: Vec<Detection>,
+    ) -> Boxes {
+        let objects = self
+            .object_tracker
+            .objects(capture_nanos, &pose, detections);
+        Boxes::new(pose, &objects)
     }
 
     /// Number of poses so far that the vehicle cannot have reached from the previous ones.

@@ -281,7 +281,11 @@ fn message(
     let (content, features) = match method.own_content() {
         Exchange::Points => (Content::Points(agent.share_points(&frame.points)), None),
         Exchange::Boxes => (
-            Content::Boxes(agent.perceive(&frame.points)?.detections),
+            Content::Boxes(
+                { agent.perceive(&frame.points)?.detections.into_iter() }
+                    .map(Into::into)
+                    .collect(),
+            ),
             None,
         ),
         Exchange::Features | Exchange::Nothing => {

@@ -522,13 +522,13 @@ impl Ego {
     fn merge_boxes(&self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Vec<Detection> {
         let decoded: Vec<(Vec<Decoded>, Isometry3<f64>)> = (aligned.iter())
             .map(|Aligned { view, ego_from_cav }| {
-                let found = if let Content::Boxes(found) = &view.content {
-                    found.as_slice()
+                let objects = if let Content::Boxes(objects) = &view.content {
+                    objects.as_slice()
                 } else {
                     &[]
                 };
-                let found = found
-                    .iter()
+                let found = { objects.iter() }
+                    .map(|object| &object.detection)
                     .filter(|found| found.score > self.limits.score_threshold);
                 let boxes = found.map(|found| Decoded {
                     anchor: 0,
@@ -632,9 +632,10 @@ impl Aligned<'_> {
 
     /// Its boxes, if it has sent boxes; `sender` is its number.
     fn boxes(&self, sender: usize, ego: &View) -> Vec<PlacedBox> {
-        let Content::Boxes(found) = &self.view.content else {
+        let Content::Boxes(objects) = &self.view.content else {
             return Vec::new();
         };
+        let found = objects.iter().map(|object| &object.detection);
         let MapMetadata {
             ego_from_cav,
             confidence,

@@ -1,6 +1,6 @@
 //! View: one vehicle's decoded message for a frame.
 
-use protocol::{CavId, DecodedFeatures, Detection, PointCloud, PoseEstimate, Stream};
+use protocol::{CavId, DecodedFeatures, PerceivedObject, PointCloud, PoseEstimate, Stream};
 
 use fusion::method::Exchange;
 
@@ -29,8 +29,8 @@ impl View {
 pub enum Content {
     /// A feature map: `none`, and all methods of intermediate fusion.
     Features(DecodedFeatures),
-    /// Detections: `late`.
-    Boxes(Vec<Detection>),
+    /// Detected objects: `late`, and methods with a box input.
+    Boxes(Vec<PerceivedObject>),
     /// Points, without those on the sender's own body: `early`.
     Points(PointCloud),
 }

@@ -135,10 +135,10 @@ pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Camera, CameraMetadata, Control, Descriptor, Detections,
     DetectionsReport, EgoMotion, FrameReport, FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind,
-    Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, Pinhole,
-    PlanarCovariance, Points, PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary,
-    StageTiming, Stats, SweepArrival, TopicCount, TopicTraffic, Track, Tracks, TracksReport,
-    TrueObject, Truth,
+    Lidar, Message, ModelHash, NeighbourState, NoPoseReason, ObjectTrack, Pace, Payload,
+    PerceivedObject, Pinhole, PlanarCovariance, Points, PoseEstimate, ProcessUsage, Radar,
+    SkippedNeighbour, StageSummary, StageTiming, Stats, SweepArrival, TopicCount, TopicTraffic,
+    Track, Tracks, TracksReport, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

@@ -14,7 +14,7 @@ mod sweep_reports;
 use std::collections::BTreeMap;
 
 use protocol::codec::CodecConfig;
-use protocol::message::{Boxes, Points, StageTiming};
+use protocol::message::{Points, StageTiming};
 use protocol::{CavId, DropReason, Dtype, Gnss, GnssSource, Message, Pace, PoseEstimate, Stream};
 
 use crate::agent::{Agent, AgentInput, EncodedSweep, Perception};
@@ -410,7 +410,8 @@ impl AgentLoop {
         };
         // Boxes first: they are what an ego falls back on while a large map is on its way.
         if self.options.publish.contains(&Stream::Boxes) {
-            let content = Content::Fixed(Message::Boxes(Boxes::new(pose, detections)));
+            let boxes = self.agent.boxes(capture_nanos, pose, detections);
+            let content = Content::Fixed(Message::Boxes(boxes));
             self.publish(Stream::Boxes, capture_nanos, content);
         }
         if self.options.publish.contains(&Stream::Bev) {

@@ -463,7 +463,7 @@ impl OpenFrame {
         let Some(result) = self.result() else {
             return Vec::new();
         };
-        let mut shown = self.placed(&result.ego, &result.pose, &result.detections, None);
+        let mut shown = self.placed(&result.ego, &result.pose, result.detections.iter(), None);
         for (shown, verdict) in shown.iter_mut().zip(&judgement.verdicts) {
             shown.is_hit = is_hit(*verdict);
         }
@@ -479,11 +479,11 @@ impl OpenFrame {
     }
 
     /// Detections in the frame of a vehicle, placed by its estimated pose, or else by its true one.
-    fn placed(
+    fn placed<'a>(
         &self,
         cav: &CavId,
         pose: &PoseEstimate,
-        found: &[Detection],
+        found: impl Iterator<Item = &'a Detection>,
         source: Option<&CavId>,
     ) -> Vec<ShownBox> {
         let pose = pose.world_from_cav().or(self.true_pose(cav));
@@ -495,7 +495,7 @@ impl OpenFrame {
             source: source.or(detection.source.as_ref()).cloned(),
             ..ShownBox::of(detection.box3d.transformed(&world_from_cav))
         };
-        found.iter().map(shown).collect()
+        found.map(shown).collect()
     }
 
     fn links(&self) -> Vec<Link> {

@@ -1,25 +1,21 @@
 //! Latency compensation: carries neighbours' boxes from their capture time to that of the ego's frame.
 //!
-//! Every neighbour has a tracker of its own, in the frame of the world; a box moves with the velocity of its track.
+//! A box moves with the velocity that its sender states. Boxes of a sender that states none are tracked here.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
-use protocol::{CavId, Detection};
-use tracking::Tracker;
+use protocol::{CavId, Detection, PerceivedObject};
+use tracking::ObjectTracker;
 
 use super::{Content, View};
 
-/// Largest distance of a box from its track, metres in the plane.
-const REACH_M: f64 = 1.5;
-/// Detections from which on the velocity of a track is one.
-const MIN_HITS: u32 = 2;
 /// Largest age to which boxes are carried, seconds.
 const MAX_AGE_S: f64 = 1.0;
 /// Time without a message after which a neighbour's tracks end, nanoseconds.
 const FORGOTTEN_NANOS: u64 = 10_000_000_000;
 
-/// Trackers of the neighbours that send boxes.
+/// Trackers of the neighbours that send boxes without velocities.
 #[derive(Debug, Default)]
 pub(super) struct LatencyCompensation {
     of_cav: BTreeMap<CavId, Followed>,
@@ -27,29 +23,29 @@ pub(super) struct LatencyCompensation {
 
 #[derive(Debug, Default)]
 struct Followed {
-    tracker: Tracker,
+    tracker: ObjectTracker,
     capture_nanos: Option<u64>,
-    /// Velocities over ground of the boxes of that time, in the sender's LiDAR frame, metres per second.
-    velocities_mps: Vec<[f64; 2]>,
+    /// The objects of that time.
+    objects: Vec<PerceivedObject>,
 }
 
 impl LatencyCompensation {
     /// The view with its boxes at `now_nanos`; views of other content, and without a pose, as they are.
     pub(super) fn carried<'a>(&mut self, view: &'a View, now_nanos: u64) -> Cow<'a, View> {
-        let (Content::Boxes(found), Some(_)) = (&view.content, view.pose.world_from_cav()) else {
+        let (Content::Boxes(sent), Some(_)) = (&view.content, view.pose.world_from_cav()) else {
             return Cow::Borrowed(view);
         };
-        let followed = self.of_cav.entry(view.cav.clone()).or_default();
-        followed.follow(view, found);
+        let objects = if sent.iter().any(|object| object.track.is_some()) {
+            sent
+        } else {
+            let followed = self.of_cav.entry(view.cav.clone()).or_default();
+            followed.objects(view, sent)
+        };
         let age_s = (now_nanos as f64 - view.capture_nanos as f64) * 1e-9;
-        let mut carried = found.clone();
-        for (detection, velocity_mps) in carried.iter_mut().zip(&followed.velocities_mps) {
-            for (at, speed) in detection.box3d.center_m.iter_mut().zip(velocity_mps) {
-                *at += speed * age_s.clamp(-MAX_AGE_S, MAX_AGE_S);
-            }
-        }
+        let age_s = age_s.clamp(-MAX_AGE_S, MAX_AGE_S);
+        let carried = objects.iter().map(|object| after(object.clone(), age_s));
         Cow::Owned(View {
-            content: Content::Boxes(carried),
+            content: Content::Boxes(carried.collect()),
             ..view.clone()
         })
     }
@@ -67,35 +63,34 @@ impl LatencyCompensation {
     }
 }
 
-impl Followed {
-    /// Takes a message once: it may serve several frames.
-    fn follow(&mut self, view: &View, found: &[Detection]) {
-        if self.capture_nanos == Some(view.capture_nanos) {
-            return;
+/// The object after a time.
+fn after(mut object: PerceivedObject, elapsed_s: f64) -> PerceivedObject {
+    if let Some(track) = &object.track {
+        let center_m = &mut object.detection.box3d.center_m;
+        for (at, speed) in center_m.iter_mut().zip(track.velocity_mps) {
+            *at += f64::from(speed) * elapsed_s;
         }
-        let tracks = self
-            .tracker
-            .tracks_of(view.capture_nanos, &view.pose, found);
-        let velocity_mps = |detection: &Detection| {
-            let [x, y, _] = detection.box3d.center_m;
-            let near = { tracks.iter() }
-                .filter(|track| track.hits >= MIN_HITS && track.unseen_s == 0.0)
-                .map(|track| {
-                    let [at_x, at_y, _] = track.box3d.center_m;
-                    ((at_x - x).hypot(at_y - y), track.velocity_mps)
-                })
-                .filter(|(distance_m, _)| *distance_m <= REACH_M)
-                .min_by(|(a, _), (b, _)| a.total_cmp(b));
-            near.map_or([0.0; 2], |(_, velocity_mps)| velocity_mps)
-        };
-        self.velocities_mps = found.iter().map(velocity_mps).collect();
-        self.capture_nanos = Some(view.capture_nanos);
+    }
+    object
+}
+
+impl Followed {
+    /// The objects of a message with their tracks; it is taken once and may serve several frames.
+    fn objects(&mut self, view: &View, sent: &[PerceivedObject]) -> &[PerceivedObject] {
+        if self.capture_nanos != Some(view.capture_nanos) {
+            let found: Vec<Detection> = { sent.iter() }
+                .map(|object| object.detection.clone())
+                .collect();
+            self.objects = self.tracker.objects(view.capture_nanos, &view.pose, found);
+            self.capture_nanos = Some(view.capture_nanos);
+        }
+        &self.objects
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use protocol::{Box3d, Pose, PoseEstimate};
+    use protocol::{Box3d, ObjectTrack, Pose, PoseEstimate};
 
     use super::*;
 
@@ -103,15 +98,17 @@ mod tests {
     fn view(tick: u32) -> View {
         let t = 0.1 * f64::from(tick);
         let world_from_cav = Pose::from_xyz_yaw([0.0, 10.0 * t, 0.0], 90_f64.to_radians());
-        let car = |world_m: [f64; 3]| Detection {
-            box3d: Box3d {
-                center_m: world_m,
-                size_m: [4.0, 1.8, 1.5],
-                heading_rad: 0.0,
-            }
-            .transformed(&world_from_cav.isometry().inverse()),
-            score: 0.9,
-            source: None,
+        let car = |world_m: [f64; 3]| {
+            PerceivedObject::from(Detection {
+                box3d: Box3d {
+                    center_m: world_m,
+                    size_m: [4.0, 1.8, 1.5],
+                    heading_rad: 0.0,
+                }
+                .transformed(&world_from_cav.isometry().inverse()),
+                score: 0.9,
+                source: None,
+            })
         };
         View {
             cav: CavId::new("1").unwrap(),
@@ -125,11 +122,12 @@ mod tests {
     }
 
     fn centers(view: &View) -> Vec<[f64; 2]> {
-        let Content::Boxes(found) = &view.content else {
+        let Content::Boxes(objects) = &view.content else {
             panic!("{view:?}");
         };
-        { found.iter() }
-            .map(|found| [found.box3d.center_m[0], found.box3d.center_m[1]])
+        let center = |object: &PerceivedObject| object.detection.box3d.center_m;
+        { objects.iter() }
+            .map(|object| [center(object)[0], center(object)[1]])
             .collect()
     }
 
@@ -160,5 +158,28 @@ mod tests {
         assert_eq!(compensation.of_cav.len(), 0);
         let first = compensation.carried(&late, late.capture_nanos + 400_000_000);
         assert_eq!(centers(&first), before, "one view has no velocities");
+    }
+    #[test]
+    fn a_first_message_is_carried_by_the_velocities_that_it_states() {
+        let mut first = view(0);
+        let Content::Boxes(objects) = &mut first.content else {
+            panic!("{first:?}");
+        };
+        objects[1].track = Some(ObjectTrack {
+            id: 3,
+            velocity_mps: [2.0, -15.0],
+            position_covariance: [0.1, 0.0, 0.1],
+            velocity_covariance: [1.0, 0.0, 1.0],
+        });
+        let mut compensation = LatencyCompensation::default();
+        let before = centers(&first);
+        let after = centers(&compensation.carried(&first, 500_000_000));
+        assert_eq!(after[0], before[0], "an object without a track stays");
+        assert!((after[1][0] - before[1][0] - 1.0).abs() < 1e-9);
+        assert!((after[1][1] - before[1][1] + 7.5).abs() < 1e-9);
+        // Beyond a second nothing is carried, and what a sender tracks is not tracked again.
+        let far = centers(&compensation.carried(&first, 9_000_000_000));
+        assert!((far[1][1] - before[1][1] + 15.0).abs() < 1e-9);
+        assert!(compensation.of_cav.is_empty());
     }
 }

@@ -4,8 +4,8 @@ use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
 use perception::weights::{Precision, save};
 use protocol::{
-    CavId, CodecConfig, ConfidenceGate, EgoMotion, Limits, NoPoseReason, PointCloud, PoseEstimate,
-    encode_features,
+    CavId, CodecConfig, ConfidenceGate, EgoMotion, Limits, NoPoseReason, PerceivedObject,
+    PointCloud, PoseEstimate, encode_features,
 };
 use tch::Device;
 use tch::nn::VarStore;
@@ -107,7 +107,10 @@ fn view_by(
     };
     let output = agent.process(&input).unwrap();
     let content = match method.own_content() {
-        Exchange::Boxes => Content::Boxes(output.perception.detections),
+        Exchange::Boxes => {
+            let found = output.perception.detections.into_iter();
+            Content::Boxes(found.map(Into::into).collect())
+        }
         Exchange::Points => Content::Points(agent.share_points(&cloud)),
         _ => Content::Features(DecodedFeatures {
             features: output.perception.features,
@@ -186,7 +189,7 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
         cav: CavId::new(name).unwrap(),
         pose: PoseEstimate::new(world_from_cav, 1.0),
         capture_nanos: NOW,
-        content: Content::Boxes(found),
+        content: Content::Boxes(found.into_iter().map(Into::into).collect()),
     };
     // The other is 4 m ahead: its box at 1 m is the ego's at 5 m, only it has detected the one at -10 m.
     let own = boxes("a", HERE, vec![found(5.2, 0.6)]);
@@ -639,7 +642,7 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
         let [own, map] = [("a", HERE, 0.0), ("b", near(), 0.15)]
             .map(|(name, pose, phase)| view(name, pose, method, phase));
         let boxes = View {
-            content: Content::Boxes(vec![Detection {
+            content: Content::Boxes(vec![PerceivedObject::from(Detection {
                 box3d: protocol::Box3d {
                     center_m: [2.0, 1.0, -1.0],
                     size_m: [4.0, 1.8, 1.6],
@@ -647,7 +650,7 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
                 },
                 score: 0.9,
                 source: None,
-            }]),
+            })]),
             ..view("c", near(), method, 0.0)
         };
         let mut egos = egos_of_files(method);

@@ -51,7 +51,7 @@ impl EgoLoop {
         let (pose, content) = match stream {
             Stream::Boxes => {
                 let boxes: Boxes = payload(pieces, limits)?;
-                (boxes.pose, Content::Boxes(boxes.into_detections()))
+                (boxes.pose, Content::Boxes(boxes.into_objects()))
             }
             Stream::Points => {
                 let Points { pose, points } = payload(pieces, limits)?;

@@ -32,7 +32,7 @@ impl Case {
             source: None,
         };
         let boxes = View {
-            content: Content::Boxes(vec![found]),
+            content: Content::Boxes(vec![found.into()]),
             ..map.clone()
         };
         let options = LoopOptions::stepped(&EgoSettings::default());

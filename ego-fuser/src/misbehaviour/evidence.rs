@@ -250,16 +250,18 @@ mod tests {
         });
         Content::Boxes(
             seen.filter(|found| found.box3d.center_m[0].hypot(found.box3d.center_m[1]) > 1.0)
+                .map(Into::into)
                 .collect(),
         )
     }
 
     fn seen(content: &Content) -> Observation {
-        let Content::Boxes(found) = content else {
+        let Content::Boxes(objects) = content else {
             panic!("boxes")
         };
+        let found = objects.iter().map(|object| &object.detection);
         let at = |found: &Detection| [found.box3d.center_m[0], found.box3d.center_m[1]];
-        Observation::of_boxes(found.iter().map(|found| (at(found), found.score)).collect())
+        Observation::of_boxes(found.map(|found| (at(found), found.score)).collect())
     }
 
     const WORLD: [[f64; 2]; 6] = [

@@ -51,8 +51,9 @@ impl Observation {
                 let received = detector.received(map)?;
                 Self::in_map(&received, map.sent.as_deref(), detector, empty)
             }
-            Content::Boxes(found) => {
-                let evident = found.iter().filter(|found| found.score > EVIDENT);
+            Content::Boxes(objects) => {
+                let found = objects.iter().map(|object| &object.detection);
+                let evident = found.filter(|found| found.score > EVIDENT);
                 let boxes = evident.map(|found| {
                     let [x, y, _] = found.box3d.center_m;
                     ([x, y], found.score)
@@ -251,8 +252,12 @@ mod tests {
             score,
             source: None,
         });
-        let seen =
-            Observation::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
+        let seen = Observation::in_message(
+            &Content::Boxes(found.map(Into::into).to_vec()),
+            &mut detector,
+            &[],
+        )
+        .unwrap();
         assert_eq!(seen.vehicles, [[4.0, 0.0]]);
         assert_eq!(
             (

@@ -161,6 +161,7 @@ pub(crate) struct Detections {
     boxes: Matrix,
     scores: Py<PyArray1<f32>>,
     sources: Py<PyList>,
+    tracks: Py<PyAny>,
     pose: Py<PoseEstimate>,
     method: Option<String>,
     agent_frame: Option<u64>,
@@ -195,7 +196,13 @@ impl Detections {
         cav: &str,
         boxes: &protocol::Boxes,
     ) -> PyResult<Py<Self>> {
-        Py::new(py, Self::of_list(py, cav, &boxes.pose, boxes.detections())?)
+        let found: Vec<Detection> = boxes.detections().cloned().collect();
+        let tracks: Vec<_> = boxes.objects().iter().map(|object| object.track).collect();
+        let made = Self {
+            tracks: json::to_python(py, &tracks)?.unbind(),
+            ..Self::of_list(py, cav, &boxes.pose, &found)?
+        };
+        Py::new(py, made)
     }
 
     fn of_list(
@@ -213,6 +220,7 @@ impl Detections {
             boxes: arrays::boxes(py, found.iter().map(|one| &one.box3d))?,
             scores: PyArray1::from_vec(py, found.iter().map(|one| one.score).collect()).unbind(),
             sources: PyList::new(py, sources.collect::<Vec<_>>())?.unbind(),
+            tracks: empty(),
             pose: PoseEstimate::new(py, pose)?,
             method: None,
             agent_frame: None,

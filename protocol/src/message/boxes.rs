@@ -1,73 +1,162 @@
-//! Detections of one agent from its own sensors.
+//! Objects that one agent detects from its own sensors, with the motion of those that it tracks.
 
+use half::f16;
 use serde::{Deserialize, Serialize};
 
-use super::{PoseEstimate, check_detections, metadata_only};
-use crate::{Box3d, Detection, Limits, WireError};
+use super::{PoseEstimate, check_count, check_detection, check_within, metadata_only};
+use crate::{Box3d, Detection, EgoMotion, Limits, WireError};
 
-/// Detections of one agent: agent to ego, for late fusion and as an input of other methods.
+/// Objects of one agent: agent to ego, for late fusion and as an input of other methods.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Boxes {
     /// Pose of the sender.
     pub pose: PoseEstimate,
-    /// Detections in the frame of the sender's LiDAR, in single precision, all of the sender.
+    /// Objects in the frame of the sender's LiDAR, all of the sender.
     #[serde(with = "compact")]
-    detections: Vec<Detection>,
+    objects: Vec<PerceivedObject>,
+}
+
+/// A detection, and the track of the same object where its vehicle has one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PerceivedObject {
+    /// The detection in the frame of the sender's LiDAR.
+    pub detection: Detection,
+    /// Its track; `None` for an object that has not been detected before, or of a sender that tracks nothing.
+    pub track: Option<ObjectTrack>,
+}
+
+/// Identity and motion of an object at the capture time of its detection.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ObjectTrack {
+    /// Identity, from 1 on; never used again by the same agent.
+    pub id: u64,
+    /// Velocity over ground along x, y of the sender's LiDAR frame, metres per second.
+    pub velocity_mps: [f32; 2],
+    /// Covariance of the track's x and y along the same axes, that of the sender's pose included: xx, xy, yy, square
+    /// metres.
+    pub position_covariance: [f32; 3],
+    /// Covariance of the velocity: xx, xy, yy, square metres per square second.
+    pub velocity_covariance: [f32; 3],
+}
+
+/// Largest variance: standard deviations of 200 m and of 200 m/s.
+const MAX_VARIANCE: f64 = 4e4;
+
+impl From<Detection> for PerceivedObject {
+    fn from(detection: Detection) -> Self {
+        Self {
+            detection,
+            track: None,
+        }
+    }
 }
 
 impl Boxes {
-    /// A message of detections; their numbers are rounded to single precision, and a source that they name is left out.
-    pub fn new(pose: PoseEstimate, detections: Vec<Detection>) -> Self {
-        let round = |detection: &Detection| CompactBox::of(detection).detection();
+    /// A message of objects. Their numbers are rounded to those that are transmitted: single precision, covariances half
+    /// precision. The source that a detection names is left out, and a track that no receiver would take.
+    pub fn new(pose: PoseEstimate, objects: &[PerceivedObject]) -> Self {
+        let round = |object: &PerceivedObject| {
+            let PerceivedObject { detection, track } = CompactBox::of(object).object();
+            let track = track.filter(|track| track.check_values().is_ok());
+            PerceivedObject { detection, track }
+        };
         Self {
             pose,
-            detections: detections.iter().map(round).collect(),
+            objects: objects.iter().map(round).collect(),
         }
     }
 
-    /// Its detections.
-    pub fn detections(&self) -> &[Detection] {
-        &self.detections
+    /// Its objects.
+    pub fn objects(&self) -> &[PerceivedObject] {
+        &self.objects
     }
 
-    /// Its detections, out of the message.
-    pub fn into_detections(self) -> Vec<Detection> {
-        self.detections
+    /// Their detections.
+    pub fn detections(&self) -> impl Iterator<Item = &Detection> {
+        self.objects.iter().map(|object| &object.detection)
+    }
+
+    /// Its objects, out of the message.
+    pub fn into_objects(self) -> Vec<PerceivedObject> {
+        self.objects
     }
 
     fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
         self.pose.check_values(limits)?;
-        check_detections(&self.detections, limits)
+        check_count("detections", self.objects.len(), limits.max_boxes)?;
+        for PerceivedObject { detection, track } in &self.objects {
+            check_detection(detection)?;
+            track.iter().try_for_each(ObjectTrack::check_values)?;
+        }
+        Ok(())
+    }
+}
+
+impl ObjectTrack {
+    fn check_values(&self) -> Result<(), WireError> {
+        let most = EgoMotion::MAX_SPEED_MPS;
+        for speed in self.velocity_mps {
+            check_within("object velocity_mps", speed.into(), -most, most)?;
+        }
+        for [xx, xy, yy] in [self.position_covariance, self.velocity_covariance] {
+            let [xx, xy, yy] = [xx, xy, yy].map(f64::from);
+            check_within("object covariance", xx, 0.0, MAX_VARIANCE)?;
+            check_within("object covariance", yy, 0.0, MAX_VARIANCE)?;
+            // Rounding to half precision may exceed the bound by a little.
+            let bound = (xx * yy).sqrt() * 1.002 + 1e-6;
+            check_within("object covariance", xy, -bound, bound)?;
+        }
+        Ok(())
     }
 }
 
 metadata_only!(Boxes, Boxes);
 
-/// A detection as it is transmitted: 32 bytes.
+/// An object as it is transmitted: 33 bytes, and with a track 21 more, or up to 29 where its number is large.
 #[derive(Serialize, Deserialize)]
 struct CompactBox {
     center_m: [f32; 3],
     size_m: [f32; 3],
     heading_rad: f32,
     score: f32,
+    track: Option<CompactTrack>,
 }
+
+#[derive(Serialize, Deserialize)]
+struct CompactTrack {
+    id: u64,
+    velocity_mps: [f32; 2],
+    position_covariance: [HalfBytes; 3],
+    velocity_covariance: [HalfBytes; 3],
+}
+
+/// Half precision, little-endian: the encoding of integers would take three bytes.
+type HalfBytes = [u8; 2];
 
 impl CompactBox {
     #[expect(
         clippy::cast_possible_truncation,
         reason = "numbers are transmitted in single precision"
     )]
-    fn of(Detection { box3d, score, .. }: &Detection) -> Self {
+    fn of(object: &PerceivedObject) -> Self {
+        let Detection { box3d, score, .. } = &object.detection;
+        let half = |value: f32| f16::from_f32(value).to_le_bytes();
         Self {
             center_m: box3d.center_m.map(|value| value as f32),
             size_m: box3d.size_m.map(|value| value as f32),
             heading_rad: box3d.heading_rad as f32,
             score: *score,
+            track: object.track.map(|track| CompactTrack {
+                id: track.id,
+                velocity_mps: track.velocity_mps,
+                position_covariance: track.position_covariance.map(half),
+                velocity_covariance: track.velocity_covariance.map(half),
+            }),
         }
     }
 
-    fn detection(&self) -> Detection {
-        Detection {
+    fn object(&self) -> PerceivedObject {
+        let detection = Detection {
             box3d: Box3d {
                 center_m: self.center_m.map(f64::from),
                 size_m: self.size_m.map(f64::from),
@@ -75,28 +164,36 @@ impl CompactBox {
             },
             score: self.score,
             source: None,
-        }
+        };
+        let single = |bytes: HalfBytes| f16::from_le_bytes(bytes).to_f32();
+        let track = self.track.as_ref().map(|track| ObjectTrack {
+            id: track.id,
+            velocity_mps: track.velocity_mps,
+            position_covariance: track.position_covariance.map(single),
+            velocity_covariance: track.velocity_covariance.map(single),
+        });
+        PerceivedObject { detection, track }
     }
 }
 
-/// Serialisation of detections as [`CompactBox`].
+/// Serialisation of objects as [`CompactBox`].
 mod compact {
     use serde::{Deserialize, Deserializer, Serializer};
 
-    use super::{CompactBox, Detection};
+    use super::{CompactBox, PerceivedObject};
 
     pub(super) fn serialize<S: Serializer>(
-        detections: &[Detection],
+        objects: &[PerceivedObject],
         serializer: S,
     ) -> Result<S::Ok, S::Error> {
-        serializer.collect_seq(detections.iter().map(CompactBox::of))
+        serializer.collect_seq(objects.iter().map(CompactBox::of))
     }
 
     pub(super) fn deserialize<'de, D: Deserializer<'de>>(
         deserializer: D,
-    ) -> Result<Vec<Detection>, D::Error> {
+    ) -> Result<Vec<PerceivedObject>, D::Error> {
         let boxes = Vec::<CompactBox>::deserialize(deserializer)?;
-        Ok(boxes.iter().map(CompactBox::detection).collect())
+        Ok(boxes.iter().map(CompactBox::object).collect())
     }
 }
 
@@ -105,8 +202,7 @@ mod tests {
     use super::*;
     use crate::CavId;
 
-    #[test]
-    fn a_box_takes_32_bytes_and_is_of_its_sender() {
+    fn object() -> PerceivedObject {
         let detection = Detection {
             box3d: Box3d {
                 center_m: [12.345_678_901, -7.0, 0.1],
@@ -116,20 +212,86 @@ mod tests {
             score: 0.7,
             source: Some(CavId::new("1000").unwrap()),
         };
-        let pose = PoseEstimate::NoPose {
-            reason: crate::message::NoPoseReason::TooFewInliers,
-            inlier_count: 4,
+        let track = ObjectTrack {
+            id: 7,
+            velocity_mps: [8.25, -0.5],
+            position_covariance: [0.04, 0.01, 0.09],
+            velocity_covariance: [1.0, -0.5, 2.0],
         };
-        let size = |count: usize| {
-            let message = Boxes::new(pose, vec![detection.clone(); count]);
+        PerceivedObject {
+            detection,
+            track: Some(track),
+        }
+    }
+
+    const NO_POSE: PoseEstimate = PoseEstimate::NoPose {
+        reason: crate::message::NoPoseReason::TooFewInliers,
+        inlier_count: 4,
+    };
+
+    #[test]
+    fn an_object_takes_33_bytes_a_tracked_one_54_and_is_of_its_sender() {
+        let size = |object: &PerceivedObject, count: usize| {
+            let message = Boxes::new(NO_POSE, &vec![object.clone(); count]);
             let mut bytes = Vec::new();
             crate::metadata::append(crate::Kind::Boxes, &message, &mut bytes).unwrap();
             bytes.len()
         };
-        assert_eq!(size(9) - size(1), 8 * 32);
-        let found = Boxes::new(pose, vec![detection.clone()]).into_detections();
-        assert_eq!(found[0].source, None);
-        let off = found[0].box3d.center_m[0] - detection.box3d.center_m[0];
+        let tracked = object();
+        let bare = PerceivedObject::from(tracked.detection.clone());
+        assert_eq!(size(&bare, 9) - size(&bare, 1), 8 * 33);
+        assert_eq!(size(&tracked, 9) - size(&tracked, 1), 8 * 54);
+        let found = Boxes::new(NO_POSE, &[object()]).into_objects().remove(0);
+        assert_eq!(found.detection.source, None);
+        let off = found.detection.box3d.center_m[0] - tracked.detection.box3d.center_m[0];
         assert!(off != 0.0 && off.abs() < 1e-6);
+        let variance = found.track.unwrap().position_covariance[0];
+        assert!(variance != 0.04 && (variance - 0.04).abs() < 4e-5);
+    }
+
+    #[test]
+    fn numbers_that_are_no_track_are_refused_by_name() {
+        let refused = |change: &dyn Fn(&mut ObjectTrack)| {
+            let mut object = object();
+            object.track.iter_mut().for_each(change);
+            let sent = Boxes::new(NO_POSE, std::slice::from_ref(&object));
+            let received = Boxes {
+                pose: NO_POSE,
+                objects: vec![object],
+            };
+            let found = received.check_values(&Limits::default());
+            assert_eq!(sent.objects[0].track.is_some(), found.is_ok());
+            found
+        };
+        assert_eq!(refused(&|_| {}), Ok(()));
+        for (found, name) in [
+            (
+                refused(&|track| track.velocity_mps[1] = f32::NAN),
+                "velocity_mps",
+            ),
+            (
+                refused(&|track| track.velocity_mps[0] = 201.0),
+                "velocity_mps",
+            ),
+            (
+                refused(&|track| track.position_covariance[1] = 0.07),
+                "covariance",
+            ),
+            (
+                refused(&|track| track.velocity_covariance[0] = -1.0),
+                "covariance",
+            ),
+            (
+                refused(&|track| track.velocity_covariance[2] = f32::NAN),
+                "covariance",
+            ),
+            (
+                refused(&|track| track.velocity_covariance[2] = 1e9),
+                "covariance",
+            ),
+        ] {
+            let error = found.unwrap_err().to_string();
+            assert!(error.contains(name), "{error}");
+        }
     }
 }

@@ -27,7 +27,7 @@ use crate::checks::{check_limit, check_within};
 use crate::{Body, BodyShape, Limits, Pose, Result, WireError};
 
 pub use bev::Bev;
-pub use boxes::Boxes;
+pub use boxes::{Boxes, ObjectTrack, PerceivedObject};
 pub use camera::{Camera, CameraMetadata, ImageFormat, Pinhole};
 pub use control::{Control, TopicCount};
 pub use descriptor::{Descriptor, ModelHash, SweepArrival};
@@ -125,9 +125,10 @@ fn check_nanos(what: &'static str, nanos: u64) -> Result<()> {
 
 fn check_detections(detections: &[crate::Detection], limits: &Limits) -> Result<()> {
     check_count("detections", detections.len(), limits.max_boxes)?;
-    for detection in detections {
-        detection.box3d.check()?;
-        check_within("detection score", detection.score.into(), 0.0, 1.0)?;
-    }
-    Ok(())
+    detections.iter().try_for_each(check_detection)
+}
+
+fn check_detection(detection: &crate::Detection) -> Result<()> {
+    detection.box3d.check()?;
+    check_within("detection score", detection.score.into(), 0.0, 1.0)
 }

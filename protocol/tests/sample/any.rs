@@ -123,6 +123,24 @@ fn any_points() -> impl Strategy<Value = PointCloud> {
     vec(prop::array::uniform4(-1e6f32..1e6), 0..300).prop_map(|xyzi| PointCloud { xyzi })
 }
 
+fn any_object() -> impl Strategy<Value = PerceivedObject> {
+    let covariance = || {
+        (0f32..4e4, -1f32..1.0, 0f32..4e4)
+            .prop_map(|(xx, correlation, yy)| [xx, correlation * (xx * yy).sqrt(), yy])
+    };
+    let speeds = prop::array::uniform2(-200f32..200.0);
+    let track = (any::<u64>(), speeds, covariance(), covariance()).prop_map(
+        |(id, velocity_mps, position_covariance, velocity_covariance)| ObjectTrack {
+            id,
+            velocity_mps,
+            position_covariance,
+            velocity_covariance,
+        },
+    );
+    (any_detection(), option::of(track))
+        .prop_map(|(detection, track)| PerceivedObject { detection, track })
+}
+
 fn any_detection() -> impl Strategy<Value = Detection> {
     let box3d = (
         prop::array::uniform3(-1e3..1e3f64),
@@ -516,8 +534,8 @@ pub(crate) fn any_message() -> impl Strategy<Value = Message> {
         }),
         1 => any_estimate().prop_map(Message::Pose),
         3 => any_bev().prop_map(Message::Bev),
-        1 => (any_estimate(), vec(any_detection(), 0..20))
-            .prop_map(|(pose, detections)| Message::Boxes(Boxes::new(pose, detections))),
+        1 => (any_estimate(), vec(any_object(), 0..20))
+            .prop_map(|(pose, objects)| Message::Boxes(Boxes::new(pose, &objects))),
         1 => (any_estimate(), any_points()).prop_map(|(pose, points)| Message::Points(Points { pose, points })),
         1 => any_descriptor().prop_map(Message::Descriptor),
         1 => any_detections().prop_map(Message::Detections),

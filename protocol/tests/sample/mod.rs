@@ -102,6 +102,21 @@ fn detection(score: f32) -> Detection {
     }
 }
 
+/// Five objects, every second one with a track.
+fn objects() -> Vec<PerceivedObject> {
+    let track = |id| ObjectTrack {
+        id,
+        velocity_mps: [8.25, -0.5],
+        position_covariance: [0.25, 0.0, 0.5],
+        velocity_covariance: [1.0, -0.25, 2.0],
+    };
+    let object = |id: u64| PerceivedObject {
+        detection: detection(0.25),
+        track: id.is_multiple_of(2).then(|| track(300 * id)),
+    };
+    (0..5).map(object).collect()
+}
+
 /// A feature map in every codec: dtype times selection times compression.
 pub(crate) fn every_codec() -> Vec<CodecConfig> {
     let mut configs = Vec::new();
@@ -313,7 +328,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
             reason: NoPoseReason::TooFewInliers,
             inlier_count: 4,
         }),
-        Message::Boxes(Boxes::new(pose(), vec![detection(0.25); 5])),
+        Message::Boxes(Boxes::new(pose(), &objects())),
         Message::Points(Points {
             pose: pose(),
             points: points(),

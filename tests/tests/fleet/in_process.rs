@@ -22,8 +22,8 @@ use localization::pose_source::RecordedPose;
 use perception::detector::Detector;
 use protocol::message::{Descriptor, ModelHash, SweepArrival};
 use protocol::{
-    Account, Boxes, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits,
-    RateReason, Stream, Topic,
+    Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason,
+    Stream, Topic,
 };
 use recording::{Recording, RecordingOptions};
 use sim_replay::recorder::{self, RecordReport, RecorderOptions};
@@ -337,9 +337,9 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                 let output = agent.process(&input).unwrap();
                 let content = match method.own_content() {
                     Exchange::Boxes => {
-                        // Numbers of boxes are sent in single precision.
-                        let boxes = Boxes::new(output.pose, output.perception.detections);
-                        Content::Boxes(boxes.into_detections())
+                        let detections = output.perception.detections;
+                        let boxes = agent.boxes(input.capture_nanos, output.pose, detections);
+                        Content::Boxes(boxes.into_objects())
                     }
                     Exchange::Points => Content::Points(agent.share_points(&frame.points)),
                     Exchange::Features | Exchange::Nothing => Content::Features(DecodedFeatures {

@@ -31,8 +31,8 @@ impl PlacedBox {
 
 /// The detections of a sender in the frame of the ego, at most [`MAX_BOXES`], those of the highest scores; `pose_confidence`
 /// is that of its pose.
-pub fn placed(
-    detections: &[Detection],
+pub fn placed<'a>(
+    detections: impl Iterator<Item = &'a Detection>,
     ego_from_cav: &Pose,
     sender: usize,
     age_secs: f64,
@@ -46,7 +46,7 @@ pub fn placed(
         score: f64::from(detection.score),
         pose_confidence,
     };
-    let mut boxes: Vec<PlacedBox> = detections.iter().map(place).collect();
+    let mut boxes: Vec<PlacedBox> = detections.map(place).collect();
     boxes.sort_by(|a, b| b.score.total_cmp(&a.score));
     boxes.truncate(MAX_BOXES);
     boxes
@@ -114,7 +114,13 @@ mod tests {
             score: f32::from(n) / 300.0,
             source: None,
         });
-        let kept = placed(&many.collect::<Vec<_>>(), &Pose::IDENTITY, 1, 0.0, 1.0);
+        let kept = placed(
+            many.collect::<Vec<_>>().iter(),
+            &Pose::IDENTITY,
+            1,
+            0.0,
+            1.0,
+        );
         assert_eq!(kept.len(), MAX_BOXES);
         assert!(kept.iter().all(|placed| placed.score * 300.0 > 171.5));
     }
@@ -127,7 +133,7 @@ mod tests {
             source: None,
         };
         let pose = Pose::from_xyz_yaw([1.0, 2.0, 0.0], FRAC_PI_2);
-        let [placed] = placed(&[detection], &pose, 3, 0.2, 0.5)[..] else {
+        let [placed] = placed([&detection].into_iter(), &pose, 3, 0.2, 0.5)[..] else {
             panic!("one box");
         };
         let [x, y, _] = placed.box3d.center_m;

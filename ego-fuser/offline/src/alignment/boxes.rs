@@ -79,22 +79,21 @@ impl AlignmentMethod for BoxIcp {
 }
 
 fn message(boxes: &[Box3d]) -> Message {
-    let detections = boxes
-        .iter()
-        .map(|box3d| Detection {
-            box3d: *box3d,
-            score: 1.0,
-            source: None,
-        })
+    let detection = |box3d: &Box3d| Detection {
+        box3d: *box3d,
+        score: 1.0,
+        source: None,
+    };
+    let objects: Vec<_> = { boxes.iter() }
+        .map(|box3d| detection(box3d).into())
         .collect();
-    Message::Boxes(Boxes::new(NO_POSE, detections))
+    Message::Boxes(Boxes::new(NO_POSE, &objects))
 }
 
 fn boxes(message: &Message) -> Result<Vec<Box3d>, NotAligned> {
     match message {
         Message::Boxes(boxes) => Ok(boxes
             .detections()
-            .iter()
             .map(|detection| detection.box3d)
             .collect()),
         _ => Err(NotAligned::Message),

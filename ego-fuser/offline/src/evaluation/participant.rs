@@ -9,7 +9,8 @@ use dataset::frame::Frame;
 use fusion::method::Exchange;
 use perception::detector::DetectorError;
 use protocol::{
-    CavId, CodecConfig, EncodedFeatures, PointCloud, PoseEstimate, StageTiming, Stream, WireError,
+    Boxes, CavId, CodecConfig, Detection, EncodedFeatures, PointCloud, PoseEstimate, StageTiming,
+    Stream, WireError,
 };
 use tch::Tensor;
 
@@ -118,6 +119,16 @@ impl Participant {
             Some(attack) => attack.perception(perception),
             None => perception,
         })
+    }
+
+    /// As [`Agent::boxes`].
+    pub(super) fn boxes(
+        &mut self,
+        capture_nanos: u64,
+        pose: PoseEstimate,
+        detections: Vec<Detection>,
+    ) -> Boxes {
+        self.agent.boxes(capture_nanos, pose, detections)
     }
 
     /// The published points.

@@ -63,7 +63,10 @@ impl Sent {
         for message in &self.messages {
             match message.content.clone() {
                 Content::Features(map) => captured.features = Some(map.features),
-                Content::Boxes(found) => captured.detections = Some(found),
+                Content::Boxes(objects) => {
+                    let detections = objects.into_iter().map(|object| object.detection);
+                    captured.detections = Some(detections.collect());
+                }
                 Content::Points(points) => captured.points = Some(points),
             }
         }

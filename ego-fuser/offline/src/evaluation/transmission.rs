@@ -2,7 +2,7 @@
 
 use agent::agent::AgentInput;
 use dataset::frame::Frame;
-use protocol::message::{Bev, Boxes, Payload, Points};
+use protocol::message::{Bev, Payload, Points};
 use protocol::{CavId, Header, Limits, PoseEstimate, Stamp, WireError, wire};
 use tch::Tensor;
 
@@ -70,8 +70,9 @@ fn perceived(
     let perception = participant.perceive(frame, map)?;
     if exchange.contains(&Exchange::Boxes) {
         let detections = perception.detections.clone();
-        let (message, bytes) = through_the_wire(stamp, Boxes::new(pose, detections))?;
-        let content = Content::Boxes(message.into_detections());
+        let boxes = participant.boxes(frame.capture_nanos, pose, detections);
+        let (message, bytes) = through_the_wire(stamp, boxes)?;
+        let content = Content::Boxes(message.into_objects());
         messages.push(SentMessage::new(content, bytes));
     }
     // An ego without an exchange has its own map.

@@ -268,7 +268,7 @@ impl Shift {
             false => Pose::from_xyz_yaw(translation_m, pose.yaw_rad() + self.turn_rad),
         };
         placed(
-            found,
+            found.iter(),
             &moved,
             sender,
             fact.age_secs,

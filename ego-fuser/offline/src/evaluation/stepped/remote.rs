@@ -237,7 +237,7 @@ impl Answer {
             }
             Stream::Boxes => {
                 let message: Boxes = arrival.decode(&limits)?;
-                (Content::Boxes(message.into_detections()), None)
+                (Content::Boxes(message.into_objects()), None)
             }
             Stream::Points => {
                 let message: Points = arrival.decode(&limits)?;

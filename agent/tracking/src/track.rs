@@ -29,6 +29,8 @@ pub(crate) struct TrackState {
     hits: u32,
     age_s: f64,
     unseen_s: f64,
+    /// Place of its detection in the list of this frame.
+    detection: Option<usize>,
 }
 
 impl TrackState {
@@ -46,6 +48,7 @@ impl TrackState {
             hits: 1,
             age_s: 0.0,
             unseen_s: 0.0,
+            detection: Some(measured.detection),
         }
     }
 
@@ -53,6 +56,7 @@ impl TrackState {
         self.filter.predict(elapsed_s, config.acceleration_mps2);
         self.age_s += elapsed_s;
         self.unseen_s += elapsed_s;
+        self.detection = None;
     }
 
     pub(crate) fn innovation(&self, measured: &Measurement) -> Option<Innovation> {
@@ -75,6 +79,7 @@ impl TrackState {
         self.score_sum += measured.score;
         self.hits = self.hits.saturating_add(1);
         self.unseen_s = 0.0;
+        self.detection = Some(measured.detection);
     }
 
     /// Moves the heading towards a measured one. Detectors confuse front and rear: the nearer of the two counts, and the
@@ -99,6 +104,11 @@ impl TrackState {
 
     pub(crate) fn is_alive(&self, config: &TrackerConfig) -> bool {
         self.existence >= config.death_existence && self.unseen_s <= config.max_unseen_s
+    }
+
+    /// Place of its detection in the list of this frame, if it was detected in a frame before, too.
+    pub(crate) fn repeated_detection(&self) -> Option<usize> {
+        self.detection.filter(|_| self.hits > 1)
     }
 
     pub(crate) fn is_reported(&self, config: &TrackerConfig) -> bool {

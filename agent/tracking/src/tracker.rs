@@ -129,14 +129,26 @@ impl Tracker {
         pose: &PoseEstimate,
         detections: &[Detection],
     ) -> Vec<Track> {
-        if self.last_nanos.is_some_and(|last| capture_nanos <= last) {
-            (self.tracks, self.last_nanos) = (Vec::new(), None);
+        let taken = self.take_or_begin_again(capture_nanos, pose, detections);
+        taken.map_or_else(Vec::new, |cav_from_world| self.reported(&cav_from_world))
+    }
+
+    /// The same, but for each detection its track: `None` where the object was not detected before.
+    pub fn track_of_each(
+        &mut self,
+        capture_nanos: u64,
+        pose: &PoseEstimate,
+        detections: &[Detection],
+    ) -> Vec<Option<Track>> {
+        let mut found = vec![None; detections.len()];
+        if let Some(cav_from_world) = self.take_or_begin_again(capture_nanos, pose, detections) {
+            for track in &self.tracks {
+                if let Some(place) = track.repeated_detection() {
+                    found[place] = Some(track.report(&cav_from_world));
+                }
+            }
         }
-        let Some(world_from_cav) = pose.world_from_cav() else {
-            return Vec::new();
-        };
-        self.update(capture_nanos, world_from_cav, pose.covariance(), detections)
-            .unwrap_or_default()
+        found
     }
 
     /// Takes a frame and returns the tracks at its capture time in the ego's LiDAR frame, ordered by id.
@@ -153,12 +165,39 @@ impl Tracker {
         covariance: Option<&PlanarCovariance>,
         detections: &[Detection],
     ) -> Result<Vec<Track>, TrackingError> {
+        let ego_from_world = self.take(capture_nanos, world_from_ego, covariance, detections)?;
+        Ok(self.reported(&ego_from_world))
+    }
+
+    /// Takes a frame; where time does not advance all tracks end first. `None` without a usable pose.
+    fn take_or_begin_again(
+        &mut self,
+        capture_nanos: u64,
+        pose: &PoseEstimate,
+        detections: &[Detection],
+    ) -> Option<Isometry3<f64>> {
+        if self.last_nanos.is_some_and(|last| capture_nanos <= last) {
+            (self.tracks, self.last_nanos) = (Vec::new(), None);
+        }
+        let world_from_cav = pose.world_from_cav()?;
+        self.take(capture_nanos, world_from_cav, pose.covariance(), detections)
+            .ok()
+    }
+
+    /// Takes a frame and returns `ego_from_world`.
+    fn take(
+        &mut self,
+        capture_nanos: u64,
+        world_from_ego: &Pose,
+        covariance: Option<&PlanarCovariance>,
+        detections: &[Detection],
+    ) -> Result<Isometry3<f64>, TrackingError> {
         world_from_ego.validate()?;
         let elapsed_s = self.advance(capture_nanos)?;
         let world_from_ego = world_from_ego.isometry();
         let measure =
             |detection| Measurement::new(detection, &world_from_ego, covariance, &self.config);
-        let mut measurements: Vec<_> = detections.iter().filter_map(measure).collect();
+        let mut measurements: Vec<_> = detections.iter().enumerate().filter_map(measure).collect();
         keep_best(&mut measurements, self.config.max_detections);
         self.left_out += (detections.len() - measurements.len()) as u64;
         for track in &mut self.tracks {
@@ -169,11 +208,15 @@ impl Tracker {
         self.count_misses(&owners, &ego_from_world);
         self.tracks.retain(|track| track.is_alive(&self.config));
         self.begin(&measurements, &owners);
+        Ok(ego_from_world)
+    }
+
+    fn reported(&self, ego_from_world: &Isometry3<f64>) -> Vec<Track> {
         let reported = self.tracks.iter();
-        Ok(reported
+        reported
             .filter(|track| track.is_reported(&self.config))
-            .map(|track| track.report(&ego_from_world))
-            .collect())
+            .map(|track| track.report(ego_from_world))
+            .collect()
     }
 
     /// Time since the frame before, seconds; 0 for the first.

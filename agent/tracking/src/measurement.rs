@@ -11,6 +11,8 @@ const MAX_ABS: f64 = 1e7;
 /// A detection that can be used.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Measurement {
+    /// Place of the detection in its list.
+    pub(crate) detection: usize,
     /// The box in the world frame.
     pub(crate) box3d: Box3d,
     /// Confidence, 0..=1.
@@ -22,7 +24,7 @@ pub(crate) struct Measurement {
 impl Measurement {
     /// The detection in the world; `None` if a number is not finite, beyond all bounds, or the score not within 0..=1.
     pub(crate) fn new(
-        detection: &Detection,
+        (place, detection): (usize, &Detection),
         world_from_ego: &Isometry3<f64>,
         pose_covariance: Option<&PlanarCovariance>,
         config: &TrackerConfig,
@@ -48,6 +50,7 @@ impl Measurement {
         let of_pose =
             pose_covariance.map_or_else(Matrix2::zeros, |covariance| of_pose(covariance, offset_m));
         Some(Self {
+            detection: place,
             box3d,
             score,
             noise_m2: Matrix2::identity() * (sigma_m * sigma_m) + of_pose,
@@ -110,7 +113,7 @@ mod tests {
             ..TrackerConfig::default()
         };
         let measured = Measurement::new(
-            &detection(20.0, 1.0),
+            (0, &detection(20.0, 1.0)),
             &world_from_ego.isometry(),
             Some(&covariance),
             &config,
@@ -126,7 +129,7 @@ mod tests {
     fn numbers_that_are_no_box_are_refused() {
         let config = TrackerConfig::default();
         let usable = |detection: &Detection| {
-            Measurement::new(detection, &Isometry3::identity(), None, &config).is_some()
+            Measurement::new((0, detection), &Isometry3::identity(), None, &config).is_some()
         };
         assert!(usable(&detection(1.0, 0.5)));
         for bad in [f64::NAN, f64::INFINITY, -1e30] {

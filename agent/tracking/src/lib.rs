@@ -1,4 +1,4 @@
-//! Multi-object tracking: detections of an ego get identities and velocities, and the metrics that judge tracks.
+//! Multi-object tracking: detections of a vehicle get identities and velocities, and the metrics that judge tracks.
 //!
 //! [`Tracker`] follows objects in the ground plane of the world (map) frame, so that the motion of the ego does not
 //! matter: a constant-velocity Kalman filter for each ([`kalman`]), an optimal assignment of detections to tracks
@@ -27,7 +27,9 @@ pub mod assignment;
 pub mod kalman;
 mod measurement;
 pub mod metrics;
+mod object_tracker;
 mod track;
 mod tracker;
 
+pub use object_tracker::ObjectTracker;
 pub use tracker::{Tracker, TrackerConfig, TrackingError};
