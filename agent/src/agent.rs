@@ -11,12 +11,14 @@ use protocol::{
 use support::stage_times::StageTimes;
 use tch::Tensor;
 
+use crate::agent_output::{AgentOutput, Perception};
+use crate::attack::{Attack, CapturedMessages};
 use crate::rate::{RateConfig, RateControl};
 use localization::pose_source::{PoseInput, PoseSource};
 use localization::tracker::PoseMeasurement;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::detector::{BackboneLevel, Detector, DetectorError, Encoded};
-use tracking::ObjectTracker;
+use tracking::Tracker;
 
 /// All inputs of one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -29,29 +31,6 @@ pub struct AgentInput<'a> {
     pub measured_pose: Option<&'a Pose>,
     /// Speed and yaw rate of the vehicle, where its sensors measure them.
     pub motion: EgoMotion,
-}
-
-/// Result of the detector for one sweep.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Perception {
-    /// The BEV feature map for intermediate fusion as it is transmitted: with a compressor, its code.
-    pub features: BevFeatures,
-    /// `[H, W]`, 0..1: probability of a vehicle per cell; selects the cells that are sent. Empty without head.
-    pub confidence: Vec<f32>,
-    /// Detections of this vehicle by itself, in its own LiDAR frame, for late fusion. Empty without head.
-    pub detections: Vec<Detection>,
-    /// Durations: the encoder's stages, the copy of the map out of the tensor library, the head, and decoding with
-    /// suppression.
-    pub times: Vec<StageTiming>,
-}
-
-/// Pose and perception of one sweep.
-#[derive(Debug, Clone, PartialEq)]
-pub struct AgentOutput {
-    /// Pose of the vehicle, or the reason why there is none.
-    pub pose: PoseEstimate,
-    /// Perception of the vehicle.
-    pub perception: Perception,
 }
 
 /// A sweep between the steps of its computation: it is encoded once, for its pose, its feature map and the measurement
@@ -78,7 +57,9 @@ pub struct Agent {
     pose_source: Box<dyn PoseSource>,
     detector: Option<Detector>,
     rate: RateControl,
-    object_tracker: ObjectTracker,
+    tracker: Tracker,
+    /// Falsifies everything that is published.
+    attack: Option<Attack>,
     has_head: bool,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
@@ -102,7 +83,8 @@ impl Agent {
             pose_source,
             detector: None,
             rate: RateControl::default(),
-            object_tracker: ObjectTracker::default(),
+            tracker: Tracker::default(),
+            attack: None,
             has_head: true,
             shares_encoder: false,
         }
@@ -116,6 +98,18 @@ impl Agent {
         }
     }
 
+    /// The same with an attack on everything that it publishes.
+    pub fn attacking(self, attack: Option<Attack>) -> Self {
+        Self { attack, ..self }
+    }
+
+    /// Passes on the last messages of another vehicle, which an attack may replay.
+    pub fn capture(&mut self, captured: CapturedMessages) {
+        if let Some(attack) = &mut self.attack {
+            attack.capture(captured);
+        }
+    }
+
     /// An agent that computes neither confidence nor detections, for maps that are sent whole.
     pub(crate) fn without_head(self) -> Self {
         Self {
@@ -125,11 +119,15 @@ impl Agent {
     }
 
     /// The points that the vehicle shares: those that are not on its own body, whose extent its detector knows.
-    pub fn share_points(&self, cloud: &PointCloud) -> PointCloud {
-        self.detector.as_ref().map_or_else(
+    pub fn share_points(&mut self, cloud: &PointCloud) -> PointCloud {
+        let points = self.detector.as_ref().map_or_else(
             || cloud.clone(),
             |detector| detector.crop().without_own_body(cloud),
-        )
+        );
+        match &mut self.attack {
+            Some(attack) => attack.points(points),
+            None => points,
+        }
     }
 
     /// Id of the vehicle.
@@ -149,7 +147,7 @@ impl Agent {
     pub(crate) fn warm_up(&mut self) -> Result<(), DetectorError> {
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
         let encoded = detector.encode(&PointCloud::default())?;
-        self.perceive_map(&encoded.features)?;
+        self.own_perception(&encoded.features)?;
         Ok(())
     }
 
@@ -171,6 +169,7 @@ impl Agent {
         let pose = self
             .pose_source
             .estimate(&pose_input(&self.cav, input, levels));
+        let pose = self.published(pose);
         (pose, self.pose_stages("pose", began), sweep)
     }
 
@@ -229,8 +228,12 @@ impl Agent {
 
     /// The pose of a sweep by itself, without the other steps.
     pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        self.pose_source
-            .estimate(&pose_input(&self.cav, input, None))
+        let pose = (self.pose_source).estimate(&pose_input(&self.cav, input, None));
+        self.published(pose)
+    }
+
+    fn published(&self, pose: PoseEstimate) -> PoseEstimate {
+        { self.attack.as_ref() }.map_or(pose, |attack| attack.pose(pose))
     }
 
     /// The measurement of a sweep for the poses of later ones by itself. True if it was measured.
@@ -273,10 +276,12 @@ impl Agent {
         pose: PoseEstimate,
         detections: Vec<Detection>,
     ) -> Boxes {
-        let objects = self
-            .object_tracker
-            .objects(capture_nanos, &pose, detections);
-        Boxes::new(pose, &objects)
+        let objects = self.tracker.objects(capture_nanos, &pose, detections);
+        let boxes = Boxes::new(pose, &objects);
+        match &self.attack {
+            Some(attack) => attack.boxes(boxes),
+            None => boxes,
+        }
     }
 
     /// Number of poses so far that the vehicle cannot have reached from the previous ones.
@@ -302,6 +307,14 @@ impl Agent {
     /// # Errors
     /// [`DetectorError::Shape`] if it is not a feature map of this detector.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
+        let perception = self.own_perception(map)?;
+        Ok(match &mut self.attack {
+            Some(attack) => attack.perception(perception),
+            None => perception,
+        })
+    }
+
+    fn own_perception(&self, map: &Tensor) -> Result<Perception, DetectorError> {
         let detector = self.detector.as_ref().ok_or(DetectorError::Absent)?;
         let mut times = StageTimes::start();
         // The own head sees what neighbours receive, so that both judge the same map.

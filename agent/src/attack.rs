@@ -3,15 +3,20 @@
 //! Every falsified message is well-formed: right sizes, finite numbers, a valid pose. Only its content is false.
 //! The same seed gives the same falsified messages, offline and live.
 
-use protocol::{BevFeatures, BevGrid, Box3d, CavId, Detection, PointCloud, Pose, PoseEstimate};
+use protocol::{
+    BevFeatures, BevGrid, Box3d, Boxes, CavId, Detection, ObjectTrack, PointCloud, Pose,
+    PoseEstimate,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::random::SplitMix64;
 
-use crate::agent::Perception;
+use crate::agent_output::Perception;
 
-/// Number of synthetic objects in every frame.
-const INVENTED: usize = 10;
+/// Number of synthetic objects in every frame, and of a flood.
+const INVENTED: [usize; 2] = [10, 1000];
+/// Score of a synthetic object: no honest detection has a higher one.
+const INVENTED_SCORE: f32 = 1.0;
 /// Largest distance of a synthetic object from the attacker, metres.
 const INVENTED_WITHIN_M: f64 = 35.0;
 /// Gain of the features of synthetic objects relative to those of real ones.
@@ -21,10 +26,21 @@ const PATCH_CELLS: i64 = 3;
 
 /// Kind of falsification.
 #[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    Hash,
+    Serialize,
+    Deserialize,
+    JsonSchema,
+    clap::ValueEnum,
+    strum::IntoStaticStr,
 )]
 #[serde(rename_all = "snake_case")]
 #[value(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
 pub enum Falsification {
     /// The pose is shifted by a constant offset of 5 to 30 m, with full confidence.
     ShiftedPose,
@@ -35,20 +51,16 @@ pub enum Falsification {
     Copied,
     /// Ten vehicles that do not exist are added to the true perception.
     Invented,
+    /// A thousand vehicles that do not exist are added to the true perception.
+    Flood,
+    /// All detected objects have one false velocity of 5 to 30 m/s, stated with certainty.
+    FalseVelocity,
 }
 
 impl Falsification {
-    /// All kinds, in the order of tables.
-    pub const ALL: [Self; 4] = [Self::ShiftedPose, Self::Noise, Self::Copied, Self::Invented];
-
     /// Name in settings and tables.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::ShiftedPose => "shifted_pose",
-            Self::Noise => "noise",
-            Self::Copied => "copied",
-            Self::Invented => "invented",
-        }
+        self.into()
     }
 }
 
@@ -115,7 +127,8 @@ impl Attack {
                 |random: &mut SplitMix64| random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
             [reach(random), reach(random), random.between(-0.2, 0.2)]
         };
-        let places = (0..INVENTED).map(|_| place(&mut random)).collect();
+        let invented = INVENTED[usize::from(falsification == Falsification::Flood)];
+        let places = (0..invented).map(|_| place(&mut random)).collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
         tracing::warn!(%cav, falsification = falsification.name(), "ATTACK: this vehicle falsifies its messages");
         Self {
@@ -162,11 +175,13 @@ impl Attack {
     pub fn perception(&mut self, truth: Perception) -> Perception {
         let mut falsified = truth;
         match self.falsification {
-            Falsification::ShiftedPose => {}
+            Falsification::ShiftedPose | Falsification::FalseVelocity => {}
             Falsification::Noise => {
                 make_noise(&mut falsified.features, &mut self.random);
                 falsified.confidence.fill_with(|| self.random.unit() as f32);
-                falsified.detections = (0..2 * INVENTED).map(|_| self.random_detection()).collect();
+                falsified.detections = (0..2 * INVENTED[0])
+                    .map(|_| self.random_detection())
+                    .collect();
             }
             Falsification::Copied => {
                 let features = self
@@ -182,24 +197,42 @@ impl Attack {
                     .get_or_insert(falsified.detections)
                     .clone();
             }
-            Falsification::Invented => {
+            Falsification::Invented | Falsification::Flood => {
                 invent(
                     &mut falsified.features,
                     &mut falsified.confidence,
                     &self.places,
                 );
-                falsified
-                    .detections
-                    .extend(self.places.iter().map(|&place| vehicle(place, 0.9)));
+                let invented = self.places.iter();
+                let invented = invented.map(|&place| vehicle(place, INVENTED_SCORE));
+                falsified.detections.extend(invented);
             }
         }
         falsified
     }
 
+    /// The boxes that are published instead of these, which are those of the published perception.
+    pub fn boxes(&self, truth: Boxes) -> Boxes {
+        if self.falsification != Falsification::FalseVelocity {
+            return truth;
+        }
+        let track = ObjectTrack {
+            id: 1,
+            velocity_mps: self.offset_m.map(|per_second| per_second as f32),
+            position_covariance: [0.0; 3],
+            velocity_covariance: [0.0; 3],
+        };
+        let mut objects = truth.objects().to_vec();
+        for object in &mut objects {
+            object.track = Some(track);
+        }
+        Boxes::new(truth.pose, &objects)
+    }
+
     /// The points that are published instead of the measured ones.
     pub fn points(&mut self, truth: PointCloud) -> PointCloud {
         match self.falsification {
-            Falsification::ShiftedPose => truth,
+            Falsification::ShiftedPose | Falsification::FalseVelocity => truth,
             Falsification::Noise => {
                 let random = &mut self.random;
                 let any = |_: &[f32; 4]| {
@@ -211,7 +244,7 @@ impl Attack {
                 }
             }
             Falsification::Copied => self.captured.points.get_or_insert(truth).clone(),
-            Falsification::Invented => {
+            Falsification::Invented | Falsification::Flood => {
                 let mut falsified = truth;
                 for &place in &self.places {
                     points_of(place, &mut self.random, &mut falsified.xyzi);
@@ -369,7 +402,11 @@ mod tests {
 
     #[test]
     fn falsified_output_has_the_shape_of_the_truth_and_other_values() {
-        for falsification in [Falsification::Noise, Falsification::Invented] {
+        for falsification in [
+            Falsification::Noise,
+            Falsification::Invented,
+            Falsification::Flood,
+        ] {
             let falsified = Attack::new(falsification, &cav("a"), 1).perception(truth());
             assert_eq!(
                 falsified.features.values.len(),
@@ -415,5 +452,31 @@ mod tests {
         };
         attack.capture(captured);
         assert_eq!(attack.perception(truth()).features, later().features);
+    }
+    #[test]
+    fn a_flood_is_a_thousand_objects_of_the_highest_score() {
+        let invented = |falsification| {
+            let mut attack = Attack::new(falsification, &cav("a"), 1);
+            attack.perception(truth()).detections
+        };
+        let (ten, flood) = (
+            invented(Falsification::Invented),
+            invented(Falsification::Flood),
+        );
+        assert_eq!((ten.len(), flood.len()), (10, 1000));
+        assert!(flood.iter().all(|found| found.score == 1.0));
+        assert_eq!(ten, flood[..10]);
+    }
+
+    #[test]
+    fn a_false_velocity_is_stated_for_every_object_and_only_by_its_attack() {
+        let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
+        let boxes = || Boxes::new(pose, &[vehicle([5.0, 0.0, 0.0], 0.5).into()]);
+        let attack = |falsification| Attack::new(falsification, &cav("a"), 1);
+        assert_eq!(attack(Falsification::Invented).boxes(boxes()), boxes());
+        let falsified = attack(Falsification::FalseVelocity).boxes(boxes());
+        let [u, v] = falsified.objects()[0].track.unwrap().velocity_mps;
+        assert!((5.0..=30.0).contains(&u.hypot(v)));
+        assert!(falsified.detections().eq(boxes().detections()));
     }
 }

@@ -32,6 +32,7 @@
 
 pub mod agent;
 pub mod agent_loop;
+pub mod agent_output;
 pub mod attack;
 mod command;
 pub mod command_line;

@@ -427,11 +427,8 @@ impl Ego {
     /// Names each sender of more boxes than are read, once.
     fn name_senders_over_limit(&mut self, all: &[Aligned<'_>]) {
         for Aligned { view, .. } in all {
-            if let Content::Boxes(found) = &view.content
-                && found.len() > MAX_BOXES
-                && self.over_limit.insert(view.cav.clone())
-            {
-                let boxes = found.len();
+            let boxes = view.content.objects().len();
+            if boxes > MAX_BOXES && self.over_limit.insert(view.cav.clone()) {
                 tracing::warn!(cav = %view.cav, boxes, "more than {MAX_BOXES} boxes: those of the lowest scores are left out");
             }
         }
@@ -522,13 +519,7 @@ impl Ego {
     fn merge_boxes(&self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Vec<Detection> {
         let decoded: Vec<(Vec<Decoded>, Isometry3<f64>)> = (aligned.iter())
             .map(|Aligned { view, ego_from_cav }| {
-                let objects = if let Content::Boxes(objects) = &view.content {
-                    objects.as_slice()
-                } else {
-                    &[]
-                };
-                let found = { objects.iter() }
-                    .map(|object| &object.detection)
+                let found = { view.content.detections() }
                     .filter(|found| found.score > self.limits.score_threshold);
                 let boxes = found.map(|found| Decoded {
                     anchor: 0,
@@ -632,16 +623,13 @@ impl Aligned<'_> {
 
     /// Its boxes, if it has sent boxes; `sender` is its number.
     fn boxes(&self, sender: usize, ego: &View) -> Vec<PlacedBox> {
-        let Content::Boxes(objects) = &self.view.content else {
-            return Vec::new();
-        };
-        let found = objects.iter().map(|object| &object.detection);
         let MapMetadata {
             ego_from_cav,
             confidence,
             age_secs,
             ..
         } = self.metadata(0, ego);
+        let found = self.view.content.detections();
         placed(found, &ego_from_cav, sender, age_secs, confidence)
     }
 

@@ -1,6 +1,6 @@
 //! View: one vehicle's decoded message for a frame.
 
-use protocol::{CavId, DecodedFeatures, PerceivedObject, PointCloud, PoseEstimate, Stream};
+use protocol::{CavId, DecodedFeatures, Detection, PerceivedObject, PointCloud, PoseEstimate};
 
 use fusion::method::Exchange;
 
@@ -36,15 +36,6 @@ pub enum Content {
 }
 
 impl Content {
-    /// Stream that transmits this content.
-    pub fn stream(&self) -> Stream {
-        match self {
-            Self::Features(_) => Stream::Bev,
-            Self::Boxes(_) => Stream::Boxes,
-            Self::Points(_) => Stream::Points,
-        }
-    }
-
     /// Exchange that transmits this content.
     pub fn exchange(&self) -> Exchange {
         match self {
@@ -52,5 +43,18 @@ impl Content {
             Self::Boxes(_) => Exchange::Boxes,
             Self::Points(_) => Exchange::Points,
         }
+    }
+
+    /// Its objects, none of other content.
+    pub(crate) fn objects(&self) -> &[PerceivedObject] {
+        match self {
+            Self::Boxes(objects) => objects,
+            _ => &[],
+        }
+    }
+
+    /// Their detections.
+    pub(crate) fn detections(&self) -> impl Iterator<Item = &Detection> {
+        self.objects().iter().map(|object| &object.detection)
     }
 }

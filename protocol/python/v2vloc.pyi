@@ -83,6 +83,10 @@ class Detections:
     def sources(self) -> list[Optional[str]]:
         """The CAV of each box, if a single one has detected it (late fusion)."""
     @property
+    def tracks(self) -> list[Optional[dict[str, Any]]]:
+        """Of one agent: the track of each object that it detected before: ``id``, ``velocity_mps``, ``position_covariance``,
+        ``velocity_covariance`` (xx, xy, yy) along x, y of its LiDAR frame; empty of an ego."""
+    @property
     def pose(self) -> PoseEstimate:
         """Pose of the vehicle."""
     @property

@@ -314,17 +314,6 @@ pub enum Operation {
     Query,
 }
 
-impl Operation {
-    /// Every operation, in order.
-    pub const ALL: [Self; 5] = [
-        Self::Publish,
-        Self::Subscribe,
-        Self::DeclareLiveliness,
-        Self::SubscribeLiveliness,
-        Self::Query,
-    ];
-}
-
 /// One operation that a principal may carry out.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Permission {

@@ -17,7 +17,7 @@ const PINNED: [(&str, usize, u64); 34] = [
     ("pose", 154, 0x5d20_b4d7_b332_cf64),
     ("pose", 170, 0x0209_78ad_eff1_39e8),
     ("pose", 95, 0xcdd6_48c4_58dd_05a2),
-    ("boxes", 315, 0x5226_f66b_7596_283e),
+    ("boxes", 387, 0x9b35_efdc_63a0_4ad0),
     ("points", 1755, 0x1825_fa1d_e899_883c),
     ("descriptor", 207, 0x44ee_520b_ed0f_b2a8),
     ("detections", 389, 0x2be8_5fd7_c978_796b),

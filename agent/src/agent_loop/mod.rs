@@ -17,7 +17,8 @@ use protocol::codec::CodecConfig;
 use protocol::message::{Points, StageTiming};
 use protocol::{CavId, DropReason, Dtype, Gnss, GnssSource, Message, Pace, PoseEstimate, Stream};
 
-use crate::agent::{Agent, AgentInput, EncodedSweep, Perception};
+use crate::agent::{Agent, AgentInput, EncodedSweep};
+use crate::agent_output::Perception;
 use crate::attack::{Attack, Falsification};
 use crate::rate::RateConfig;
 use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
@@ -124,7 +125,6 @@ impl PairedSweep<Sweep> {
 /// The state of an agent between two inputs.
 pub struct AgentLoop {
     agent: Agent,
-    attack: Option<Attack>,
     options: LoopOptions,
     pairing: SweepPairing<Sweep>,
     selection: SweepSelection,
@@ -152,13 +152,13 @@ impl AgentLoop {
         {
             tracing::warn!("the detector is not warmed up: {error}");
         }
+        let attack = { options.falsification }
+            .map(|falsification| Attack::new(falsification, agent.cav(), 0));
         Self {
             pairing: SweepPairing::new(POSE_TIMEOUT_NANOS),
             selection: SweepSelection::of(&options.egos),
             reports: SweepReports::new(agent.detector(), &options),
-            attack: { options.falsification }
-                .map(|falsification| Attack::new(falsification, agent.cav(), 0)),
-            agent,
+            agent: agent.attacking(attack),
             options,
             step: Step::default(),
             numbers: BTreeMap::new(),
@@ -317,7 +317,6 @@ impl AgentLoop {
         let received = used.into_iter().flatten().map(Output::Received);
         self.outputs.extend(received);
         let (pose, times, sweep) = self.agent.localize(&paired.input());
-        let pose = { self.attack.as_ref() }.map_or(pose, |attack| attack.pose(pose));
         let content = Content::Fixed(Message::Pose(pose));
         self.publish(Stream::Pose, paired.capture_nanos, content);
         self.outputs.push(Output::Timed(times));
@@ -369,10 +368,6 @@ impl AgentLoop {
                 self.outputs.push(Output::Timed(times));
                 if self.options.publish.contains(&Stream::Points) {
                     let points = self.agent.share_points(&paired.sweep.cloud);
-                    let points = match &mut self.attack {
-                        Some(attack) => attack.points(points),
-                        None => points,
-                    };
                     let content = Content::Fixed(Message::Points(Points { pose, points }));
                     self.publish(Stream::Points, capture_nanos, content);
                 }
@@ -404,10 +399,7 @@ impl AgentLoop {
             confidence,
             detections,
             ..
-        } = match &mut self.attack {
-            Some(attack) => attack.perception(perception),
-            None => perception,
-        };
+        } = perception;
         // Boxes first: they are what an ego falls back on while a large map is on its way.
         if self.options.publish.contains(&Stream::Boxes) {
             let boxes = self.agent.boxes(capture_nanos, pose, detections);

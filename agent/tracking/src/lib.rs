@@ -27,9 +27,7 @@ pub mod assignment;
 pub mod kalman;
 mod measurement;
 pub mod metrics;
-mod object_tracker;
 mod track;
 mod tracker;
 
-pub use object_tracker::ObjectTracker;
 pub use tracker::{Tracker, TrackerConfig, TrackingError};

@@ -3,7 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use nalgebra::{Isometry3, Matrix4, Rotation2, Vector2, Vector3};
-use protocol::{Box3d, Track};
+use protocol::{Box3d, ObjectTrack, Track};
 
 use crate::TrackerConfig;
 use crate::kalman::{ConstantVelocity, Innovation};
@@ -143,6 +143,17 @@ impl TrackState {
             hits: self.hits,
             age_s: self.age_s,
             unseen_s: self.unseen_s,
+        }
+    }
+    /// The same for a message of its vehicle.
+    pub(crate) fn in_message(&self, cav_from_world: &Isometry3<f64>) -> ObjectTrack {
+        let track = self.report(cav_from_world);
+        let [x, y, u, v] = track.covariance;
+        ObjectTrack {
+            id: track.id,
+            velocity_mps: track.velocity_mps.map(|speed| speed as f32),
+            position_covariance: [x[0], x[1], y[1]],
+            velocity_covariance: [u[2], u[3], v[3]],
         }
     }
 }

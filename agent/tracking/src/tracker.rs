@@ -2,7 +2,8 @@
 
 use nalgebra::{Isometry3, Point3};
 use protocol::{
-    Detection, Detections, InvalidPose, PlanarCovariance, Pose, PoseEstimate, Track, Tracks,
+    Detection, Detections, InvalidPose, PerceivedObject, PlanarCovariance, Pose, PoseEstimate,
+    Track, Tracks,
 };
 
 use crate::assignment;
@@ -112,43 +113,35 @@ impl Tracker {
     /// scene begins again: all tracks end.
     pub fn follow(&mut self, capture_nanos: u64, result: &Detections) -> Tracks {
         let before = self.left_out;
-        let tracks = self.tracks_of(capture_nanos, &result.pose, &result.detections);
+        let taken = self.take_or_begin_again(capture_nanos, &result.pose, &result.detections);
+        let tracks = taken.map(|ego_from_world| self.reported(&ego_from_world));
         Tracks {
             ego: result.ego.clone(),
             agent_frame: result.agent_frame,
             pose: result.pose,
-            tracks,
+            tracks: tracks.unwrap_or_default(),
             left_out: u32::try_from(self.left_out - before).unwrap_or(u32::MAX),
         }
     }
 
-    /// The same of a vehicle's pose and its detections in its own LiDAR frame.
-    pub fn tracks_of(
+    /// Takes a vehicle's detections in its own LiDAR frame in the same way and returns them with the track of each object
+    /// that was detected before, as neighbours need them.
+    pub fn objects(
         &mut self,
         capture_nanos: u64,
         pose: &PoseEstimate,
-        detections: &[Detection],
-    ) -> Vec<Track> {
-        let taken = self.take_or_begin_again(capture_nanos, pose, detections);
-        taken.map_or_else(Vec::new, |cav_from_world| self.reported(&cav_from_world))
-    }
-
-    /// The same, but for each detection its track: `None` where the object was not detected before.
-    pub fn track_of_each(
-        &mut self,
-        capture_nanos: u64,
-        pose: &PoseEstimate,
-        detections: &[Detection],
-    ) -> Vec<Option<Track>> {
-        let mut found = vec![None; detections.len()];
-        if let Some(cav_from_world) = self.take_or_begin_again(capture_nanos, pose, detections) {
+        detections: Vec<Detection>,
+    ) -> Vec<PerceivedObject> {
+        let taken = self.take_or_begin_again(capture_nanos, pose, &detections);
+        let mut objects: Vec<PerceivedObject> = detections.into_iter().map(Into::into).collect();
+        if let Some(cav_from_world) = taken {
             for track in &self.tracks {
                 if let Some(place) = track.repeated_detection() {
-                    found[place] = Some(track.report(&cav_from_world));
+                    objects[place].track = Some(track.in_message(&cav_from_world));
                 }
             }
         }
-        found
+        objects
     }
 
     /// Takes a frame and returns the tracks at its capture time in the ego's LiDAR frame, ordered by id.

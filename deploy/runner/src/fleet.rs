@@ -6,7 +6,7 @@ mod routes;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use agent::config::{AgentSettings, FleetPlace, Publish};
+use agent::config::{AgentSettings, FleetPlace};
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::ground_truth::GroundTruthRule;
@@ -258,17 +258,13 @@ impl Fleet {
     }
 
     /// Messages that the method needs; the ego's own agent sends its feature map even where no other counts.
-    pub(crate) fn needed(&self) -> (Publish, Stream) {
-        match self.scenario.method.exchange() {
-            Exchange::Nothing | Exchange::Features => (Publish::Bev, Stream::Bev),
-            Exchange::Boxes => (Publish::Boxes, Stream::Boxes),
-            Exchange::Points => (Publish::Points, Stream::Points),
-        }
+    pub(crate) fn needed(&self) -> Exchange {
+        self.scenario.method.own_content()
     }
 
     /// Streams that a vehicle publishes in addition to its pose.
     pub(crate) fn streams_of(&self, cav: &CavId) -> Vec<Stream> {
-        self.settings_of(cav).sent_for(self.needed().1)
+        self.settings_of(cav).sent_for(self.needed().stream())
     }
 }
 

@@ -6,6 +6,7 @@ mod ros2;
 mod router;
 mod status;
 mod view;
+mod watched_run;
 
 use std::path::Path;
 
@@ -55,7 +56,8 @@ pub(crate) enum Command {
     /// Print stages, pace, latency, CPU, memory and bytes of a run that has ended.
     #[command(display_order = 20)]
     Report(report::Arguments),
-    /// Show a run in a browser: the scene from above, the links, the latency of each stage.
+    /// Show a run in a browser, live while it goes on, else from its recording (`v2vloc up --record`; a folder or a
+    /// recording.mcap): the scene from above, the links, the latency of each stage.
     #[command(display_order = 21)]
     View(view::Arguments),
     /// Report the state of a run: every process present, ready and answering? Exit code 1 if not.

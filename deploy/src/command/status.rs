@@ -1,16 +1,13 @@
 //! `v2vloc status`.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::operate::remote_status::RemoteStatus;
 use crate::operate::status::RunStatus;
 use anyhow::ensure;
-use bus::Endpoint;
-use protocol::RunId;
 use support::output;
 
-use super::viewer_bus;
+use super::watched_run::WatchedRun;
 use support::cli::{BadInput, Outcome};
 
 /// Time of observation: processes report twice a second.
@@ -18,21 +15,8 @@ const OBSERVED: Duration = Duration::from_millis(2500);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Folder of the run [default: the one in --runs with the newest status].
-    #[arg(conflicts_with = "connect")]
-    run: Option<PathBuf>,
-    /// Folder of the run folders.
-    #[arg(long, default_value = "runs", conflicts_with = "connect")]
-    runs: PathBuf,
-    /// Router of a run without a folder here, tcp/HOST:PORT: its processes are observed for 2.5 s.
-    #[arg(long, requires = "name", value_name = "ENDPOINT")]
-    connect: Option<Endpoint>,
-    /// Name of the run (--connect).
-    #[arg(long = "run", id = "name", requires = "connect", value_name = "NAME")]
-    name: Option<RunId>,
-    /// Folder with the viewer's keys, where the run has security (--connect).
-    #[arg(long, value_name = "DIR", requires = "connect")]
-    keys: Option<PathBuf>,
+    #[command(flatten)]
+    run: WatchedRun,
     /// Print JSON instead of a table.
     #[arg(long)]
     json: bool,
@@ -41,14 +25,13 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Prints the state of the run.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        if let (Some(router), Some(name)) = (&self.connect, &self.name) {
-            let bus = viewer_bus(name, router, self.keys.as_deref())?;
+        if let Some((name, router)) = self.run.remote() {
+            let bus = self.run.bus(name, router)?;
             let status = RemoteStatus::observe(&bus, OBSERVED)?;
             self.print(&status, &status.table())?;
             return check(&status.run, &status.troubles());
         }
-        let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(BadInput::of)?;
-        let status = RunStatus::read(&folder).map_err(BadInput::of)?;
+        let status = RunStatus::read(&self.run.folder()?).map_err(BadInput::of)?;
         self.print(&status, &status.table())?;
         check(&status.run, &status.troubles())
     }

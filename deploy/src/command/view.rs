@@ -1,7 +1,7 @@
 //! `v2vloc view`.
 
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use crate::operate::status::{Phase, RunStatus};
@@ -11,8 +11,8 @@ use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::RunId;
 use support::output;
 
-use super::viewer_bus;
-use support::cli::{BadInput, Outcome};
+use super::watched_run::WatchedRun;
+use support::cli::Outcome;
 
 /// Niceness of the viewer relative to the processes of a run. Not the largest value: on a machine without spare time
 /// the page would show nothing.
@@ -20,22 +20,8 @@ const VIEWER_NICENESS: i32 = 15;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Folder of a run, or its name in --runs: shown live while it goes on, otherwise from its recording (`v2vloc up
-    /// --record`); or a recording.mcap [default: the newest run in --runs].
-    #[arg(conflicts_with = "connect")]
-    run: Option<PathBuf>,
-    /// Folder of the run folders.
-    #[arg(long, default_value = "runs", conflicts_with = "connect")]
-    runs: PathBuf,
-    /// Router of a live run without a folder here, tcp/HOST:PORT; `v2vloc up` prints it.
-    #[arg(long, requires = "name", value_name = "ENDPOINT")]
-    connect: Option<Endpoint>,
-    /// Name of the run (--connect).
-    #[arg(long = "run", id = "name", requires = "connect", value_name = "NAME")]
-    name: Option<RunId>,
-    /// Folder with the viewer's keys, where the run has security; `v2vloc keys` writes DIR/viewer (--connect).
-    #[arg(long, value_name = "DIR", requires = "connect")]
-    keys: Option<PathBuf>,
+    #[command(flatten)]
+    run: WatchedRun,
     /// Address of the page.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
     page: SocketAddr,
@@ -44,13 +30,13 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Serves the page until Ctrl-C.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        if let (Some(name), Some(router)) = (&self.name, &self.connect) {
+        if let Some((name, router)) = self.run.remote() {
             return self.show_live(name, router, None);
         }
-        if let Some(file) = self.run.as_ref().filter(|path| path.is_file()) {
+        if let Some(file) = self.run.run.as_ref().filter(|path| path.is_file()) {
             return self.show_recording(file);
         }
-        let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(BadInput::of)?;
+        let folder = self.run.folder()?;
         match RunStatus::read(&folder) {
             Ok(status) if status.phase == Phase::Running => {
                 let (run, endpoint) = (&status.run, &status.endpoint);
@@ -76,7 +62,7 @@ impl Arguments {
     ) -> anyhow::Result<Outcome> {
         // On the machine of the run, the run has priority.
         let _ = rustix::process::nice(VIEWER_NICENESS);
-        let bus = viewer_bus(name, router, self.keys.as_deref())?;
+        let bus = self.run.bus(name, router)?;
         let run = Arc::new(LiveRun::start(bus, protocol)?);
         until_stopped(self.page, |address| serve_live(address, run))?;
         Ok(Outcome::Done)

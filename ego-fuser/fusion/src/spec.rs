@@ -1,7 +1,7 @@
 //! Method specification: name, exchange and fusion of one collaboration method.
 
 use perception::model_config::DetectorConfig;
-use protocol::ConfidenceGate;
+use protocol::{ConfidenceGate, Stream};
 use serde::{Deserialize, Serialize};
 
 use super::settings::{FusionConfig, FusionSettings};
@@ -18,6 +18,17 @@ pub enum Exchange {
     Points,
     /// BEV feature maps.
     Features,
+}
+
+impl Exchange {
+    /// Stream of these messages; a method without any reads the ego's own map.
+    pub fn stream(self) -> Stream {
+        match self {
+            Self::Boxes => Stream::Boxes,
+            Self::Points => Stream::Points,
+            Self::Features | Self::Nothing => Stream::Bev,
+        }
+    }
 }
 
 /// A collaboration method. A `static` of this type and its line in the table of [`crate::method`] are all that the rest

@@ -199,8 +199,8 @@ impl Evaluator {
         };
         let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
-        let agent = agent.within(settings.rate);
-        Ok(Participant::new(agent, attack, &settings))
+        let agent = agent.within(settings.rate).attacking(attack);
+        Ok(Participant::new(agent, &settings))
     }
 
     /// The detector of a vehicle: its own network, or that of the run.

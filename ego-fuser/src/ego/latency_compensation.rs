@@ -6,7 +6,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use protocol::{CavId, Detection, PerceivedObject};
-use tracking::ObjectTracker;
+use tracking::Tracker;
 
 use super::{Content, View};
 
@@ -23,7 +23,7 @@ pub(super) struct LatencyCompensation {
 
 #[derive(Debug, Default)]
 struct Followed {
-    tracker: ObjectTracker,
+    tracker: Tracker,
     capture_nanos: Option<u64>,
     /// The objects of that time.
     objects: Vec<PerceivedObject>,

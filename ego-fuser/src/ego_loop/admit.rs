@@ -90,7 +90,7 @@ impl EgoLoop {
         if cav == self.cav {
             return self.begin(ego, message, now_nanos);
         }
-        let source = (cav.clone(), message.view.content.stream());
+        let source = (cav.clone(), message.view.content.exchange().stream());
         self.note_stream(&cav, source.1);
         match self.dated(&cav, source.1, stated_nanos) {
             Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,

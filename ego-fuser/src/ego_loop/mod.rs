@@ -27,7 +27,6 @@ use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
 use crate::silence::Silence;
 use crate::view::View;
-use fusion::method::Exchange;
 use pace_keeper::PaceKeeper;
 use tracking::{Tracker, TrackerConfig};
 use waits::Waits;
@@ -130,7 +129,7 @@ pub struct EgoLoop {
 impl EgoLoop {
     /// Loop of the vehicle `cav`, whose frames `ego` fuses, before its first input.
     pub fn new(cav: &CavId, ego: &Ego, options: LoopOptions) -> Self {
-        let stream = stream_of(ego.method().own_content());
+        let stream = ego.method().own_content().stream();
         Self {
             cav: cav.clone(),
             stream,
@@ -233,14 +232,6 @@ fn tracker_of(ego: &Ego) -> Tracker {
         area_m: [x_low, y_low, x_high, y_high],
         ..TrackerConfig::default()
     })
-}
-
-fn stream_of(exchange: Exchange) -> Stream {
-    match exchange {
-        Exchange::Boxes => Stream::Boxes,
-        Exchange::Points => Stream::Points,
-        Exchange::Features | Exchange::Nothing => Stream::Bev,
-    }
 }
 
 #[cfg(test)]

@@ -51,9 +51,8 @@ impl Observation {
                 let received = detector.received(map)?;
                 Self::in_map(&received, map.sent.as_deref(), detector, empty)
             }
-            Content::Boxes(objects) => {
-                let found = objects.iter().map(|object| &object.detection);
-                let evident = found.filter(|found| found.score > EVIDENT);
+            Content::Boxes(_) => {
+                let evident = content.detections().filter(|found| found.score > EVIDENT);
                 let boxes = evident.map(|found| {
                     let [x, y, _] = found.box3d.center_m;
                     ([x, y], found.score)

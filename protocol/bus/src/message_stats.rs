@@ -35,7 +35,8 @@ pub struct MessageStats {
 }
 
 /// Way of a large message of a process that has a pool of shared memory.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, strum::IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
 pub enum SharedMemoryUse {
     /// It was in shared memory.
     Carried,
@@ -48,11 +49,7 @@ pub enum SharedMemoryUse {
 impl SharedMemoryUse {
     /// Its name in metrics.
     pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Carried => "carried",
-            Self::PoolFull => "pool_full",
-            Self::RouterNotAttached => "router_not_attached",
-        }
+        self.into()
     }
 }
 

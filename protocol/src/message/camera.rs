@@ -9,7 +9,8 @@ use crate::{Body, BodyShape, Kind, Limits, Pose, WireError};
 const MAX_EDGE_PX: u32 = 1 << 14;
 
 /// Encoding of an image.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, strum::IntoStaticStr)]
+#[strum(serialize_all = "lowercase")]
 #[serde(rename_all = "snake_case")]
 pub enum ImageFormat {
     /// Portable Network Graphics.
@@ -21,10 +22,7 @@ pub enum ImageFormat {
 impl ImageFormat {
     /// Its name in `sensor_msgs/CompressedImage` and in file names.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Png => "png",
-            Self::Jpeg => "jpeg",
-        }
+        self.into()
     }
 
     /// The format of a file by its first bytes.

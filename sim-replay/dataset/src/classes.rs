@@ -187,7 +187,7 @@ mod tests {
 
     #[test]
     fn our_own_names_are_read_as_they_are() {
-        for class in ObjectClass::ALL {
+        for class in ObjectClass::ALL.iter().copied() {
             assert_eq!(of_name(class.name()), Some(class));
         }
     }

@@ -6,12 +6,16 @@ use std::str::FromStr;
 
 use protocol::{AgentTruth, Camera, CavId, EgoMotion, Handedness, PointCloud, Pose, TrueObject};
 use serde::{Deserialize, Serialize};
+use strum::{IntoStaticStr, VariantArray};
 
 use crate::Problem;
 
 /// Class of an annotated object.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, VariantArray, IntoStaticStr,
+)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
 pub enum ObjectClass {
     /// A passenger car; also every object of data sets without types.
     Car,
@@ -31,15 +35,7 @@ pub enum ObjectClass {
 
 impl ObjectClass {
     /// Every class.
-    pub const ALL: [Self; 7] = [
-        Self::Car,
-        Self::Van,
-        Self::Truck,
-        Self::Bus,
-        Self::TwoWheeler,
-        Self::Pedestrian,
-        Self::Other,
-    ];
+    pub const ALL: &'static [Self] = Self::VARIANTS;
     /// Classes of motor vehicles with at least three wheels: the default targets of detection.
     pub const VEHICLES: [Self; 4] = [Self::Car, Self::Van, Self::Truck, Self::Bus];
 
@@ -50,15 +46,7 @@ impl ObjectClass {
 
     /// Its name in files and options: `car`, `two_wheeler`.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Car => "car",
-            Self::Van => "van",
-            Self::Truck => "truck",
-            Self::Bus => "bus",
-            Self::TwoWheeler => "two_wheeler",
-            Self::Pedestrian => "pedestrian",
-            Self::Other => "other",
-        }
+        self.into()
     }
 }
 
@@ -67,8 +55,7 @@ impl FromStr for ObjectClass {
 
     /// Reads [`ObjectClass::name`].
     fn from_str(text: &str) -> Result<Self, UnknownClass> {
-        Self::ALL
-            .into_iter()
+        { Self::ALL.iter().copied() }
             .find(|class| class.name() == text)
             .ok_or_else(|| UnknownClass(text.to_owned()))
     }
@@ -201,7 +188,7 @@ mod tests {
 
     #[test]
     fn names_of_classes_are_those_of_files_and_are_read_back() {
-        for class in ObjectClass::ALL {
+        for class in ObjectClass::ALL.iter().copied() {
             assert_eq!(class.name().parse(), Ok(class));
             assert_eq!(serde_json::to_value(class).unwrap(), class.name());
         }

@@ -69,11 +69,7 @@ pub(super) fn agent(cav_id: &str, method: Method) -> Agent {
 }
 
 fn published(method: Method) -> Stream {
-    match method.own_content() {
-        Exchange::Boxes => Stream::Boxes,
-        Exchange::Points => Stream::Points,
-        Exchange::Features | Exchange::Nothing => Stream::Bev,
-    }
+    method.own_content().stream()
 }
 
 /// Runs an agent on a session of its own until `stop`; returns its ledger.

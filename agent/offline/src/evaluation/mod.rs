@@ -153,21 +153,31 @@ pub fn evaluate_source(
     let mut ask = |frame: &Frame| {
         let measured = frame.gnss_world_from_lidar();
         let mut times = stopwatch();
-        let input = PoseInput {
-            cav: &frame.cav,
-            capture_nanos: frame.capture_nanos,
-            cloud: &frame.points,
-            levels: None,
-            measured: measured.as_ref(),
-            motion: frame.motion(),
-        };
-        // As in a live run: the answer first, then what the source keeps of the sweep.
-        let estimate = source.estimate(&input);
-        source.observe(&input);
+        let estimate = estimate_pose(source, frame, measured.as_ref());
         times.lap("pose solve");
         Ok(Localization::from_estimate(estimate, times))
     };
     evaluate_with(&mut ask, options, on_sweep)
+}
+
+/// The pose of a frame, starting at a measured one where there is one.
+pub fn estimate_pose(
+    source: &mut dyn PoseSource,
+    frame: &Frame,
+    measured: Option<&Pose>,
+) -> PoseEstimate {
+    let input = PoseInput {
+        cav: &frame.cav,
+        capture_nanos: frame.capture_nanos,
+        cloud: &frame.points,
+        levels: None,
+        measured,
+        motion: frame.motion(),
+    };
+    // As in a live run: the answer first, then what the source keeps of the sweep.
+    let estimate = source.estimate(&input);
+    source.observe(&input);
+    estimate
 }
 
 /// The same for an oracle: the pose of the nearest of some sweeps, the most that retrieval among them can give.

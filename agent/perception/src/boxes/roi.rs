@@ -69,31 +69,24 @@ impl RoiEncoder {
 
 /// `[N * POSITIONS, C]`: the map at the sampling positions of each box, bilinear between cells; zeros beyond its edges.
 fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
-    let size = [i64::from(grid.width), i64::from(grid.height)];
-    let (mut cells, mut weights) = (Vec::new(), Vec::new());
-    for [x_m, y_m] in boxes.iter().flat_map(sampling_positions) {
-        let column = (x_m - grid.x_min_m) / grid.cell_m - 0.5;
-        let row = (y_m - grid.y_min_m) / grid.cell_m - 0.5;
-        for [down, right] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
-            let at = [column.floor() as i64 + right, row.floor() as i64 + down];
-            let share = |at: f64, step: i64| match step {
-                0 => 1.0 - at.rem_euclid(1.0),
-                _ => at.rem_euclid(1.0),
-            };
-            let is_in = (0..2).all(|axis| (0..size[axis]).contains(&at[axis]));
-            let weight = share(column, right) * share(row, down);
-            cells.push(if is_in { at[1] * size[0] + at[0] } else { 0 });
-            weights.push(if is_in { weight as f32 } else { 0.0 });
-        }
-    }
-    let (channels, device) = (map.size4()?.1, map.device());
-    let by_cell = map.f_detach()?.f_view([channels, -1])?.f_transpose(0, 1)?;
-    let cells = tensor(&cells, &[-1], device)?;
-    let weights = tensor(&weights, &[-1, 4, 1], device)?;
-    let corners = by_cell
-        .f_index_select(0, &cells)?
-        .f_view([-1, 4, channels])?;
-    (corners * weights).f_sum_dim_intlist([1_i64].as_slice(), false, None)
+    // From -1 to 1 over the area of the map, as `grid_sampler` takes positions.
+    let normalised = |at_m: f64, min_m: f64, cells: u32| {
+        (2.0 * (at_m - min_m) / (grid.cell_m * f64::from(cells)) - 1.0) as f32
+    };
+    let positions: Vec<f32> = { boxes.iter().flat_map(sampling_positions) }
+        .flat_map(|[x_m, y_m]| {
+            [
+                normalised(x_m, grid.x_min_m, grid.width),
+                normalised(y_m, grid.y_min_m, grid.height),
+            ]
+        })
+        .collect();
+    let positions = tensor(&positions, &[1, -1, 1, 2], map.device())?;
+    let (bilinear, zeros) = (0, 0);
+    let sampled = map
+        .f_detach()?
+        .f_grid_sampler(&positions, bilinear, zeros, false)?;
+    sampled.f_view([map.size4()?.1, -1])?.f_transpose(0, 1)
 }
 
 /// Sampling positions of a box: x and y in the frame of the map, metres.

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
-use agent::config::AgentConfig;
+use agent::config::{AgentConfig, Publish};
 use bus::{BusConfig, Endpoint};
 use deploy::operate::run_folder::{CHECKPOINT, RECORDING, RunFolder, RunFolderError, SWEEP_LOG};
 use deploy::operate::security::RunKeys;
@@ -146,7 +146,11 @@ impl Fleet {
             cav: cav.clone(),
             models,
             settings,
-            publish: vec![self.needed().0],
+            publish: vec![match self.needed() {
+                Exchange::Nothing | Exchange::Features => Publish::Bev,
+                Exchange::Boxes => Publish::Boxes,
+                Exchange::Points => Publish::Points,
+            }],
             egos: vec![self.ego.clone()],
             keep_running: false,
             sweep_log: notes_sweeps.then(|| context.folder.file(SWEEP_LOG)),

@@ -28,7 +28,7 @@ impl Fleet {
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
         }
-        routes.push(route(&self.ego, self.needed().1, &ego));
+        routes.push(route(&self.ego, self.needed().stream(), &ego));
         // Ego-only: the ego subscribes to its own agent and to no other.
         if self.scenario.method.exchange() == Exchange::Nothing {
             return routes;

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::rc::Rc;
 
-use localization::pose_source::{PoseInput, PoseSource, PoseSourceError};
+use agent_offline::evaluation::estimate_pose;
+use localization::pose_source::{PoseSource, PoseSourceError};
 use nalgebra::Isometry3;
 use protocol::CavId;
 use protocol::message::Message;
@@ -65,16 +66,7 @@ impl AlignmentMethod for Poses {
             std::collections::btree_map::Entry::Occupied(known) => known.into_mut(),
             std::collections::btree_map::Entry::Vacant(place) => place.insert((self.build)()?),
         };
-        let input = PoseInput {
-            cav: &frame.cav,
-            capture_nanos: frame.capture_nanos,
-            cloud: &frame.points,
-            levels: None,
-            measured: measured.as_ref(),
-            motion: frame.motion(),
-        };
-        let estimate = source.estimate(&input);
-        source.observe(&input);
+        let estimate = estimate_pose(source.as_mut(), frame, measured.as_ref());
         Ok(Message::Pose(estimate))
     }
 

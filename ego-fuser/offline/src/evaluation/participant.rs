@@ -1,25 +1,21 @@
-//! Participant of an evaluation: an agent, and for an adversary the attack on what it publishes.
+//! Participant of an evaluation: an agent with its settings.
 
 use std::time::{Duration, Instant};
 
-use agent::agent::{Agent, AgentInput, Perception};
-use agent::attack::Attack;
+use agent::agent::{Agent, AgentInput};
+use agent::agent_output::Perception;
 use agent::config::AgentSettings;
 use dataset::frame::Frame;
 use fusion::method::Exchange;
 use perception::detector::DetectorError;
-use protocol::{
-    Boxes, CavId, CodecConfig, Detection, EncodedFeatures, PointCloud, PoseEstimate, StageTiming,
-    Stream, WireError,
-};
+use protocol::{CavId, CodecConfig, EncodedFeatures, PoseEstimate, StageTiming, Stream, WireError};
 use tch::Tensor;
 
 use super::sent::Sent;
 
 #[derive(Debug)]
 pub(super) struct Participant {
-    agent: Agent,
-    attack: Option<Attack>,
+    pub(super) agent: Agent,
     /// True if its network is not that of the run.
     has_own_network: bool,
     /// Encoding of its maps.
@@ -41,10 +37,9 @@ pub(super) struct PoseTimes {
 }
 
 impl Participant {
-    pub(super) fn new(agent: Agent, attack: Option<Attack>, settings: &AgentSettings) -> Self {
+    pub(super) fn new(agent: Agent, settings: &AgentSettings) -> Self {
         Self {
             agent,
-            attack,
             has_own_network: settings.weights.is_some(),
             codec: settings.codec,
             in_place_of_maps: { settings.sent_for(Stream::Bev).into_iter() }
@@ -72,9 +67,8 @@ impl Participant {
 
     /// Passes on the last messages of another participant, which an attack may replay.
     pub(super) fn capture(&mut self, latest: Option<&Sent>) {
-        if let Some(attack) = &mut self.attack {
-            attack.capture(latest.map(Sent::captured).unwrap_or_default());
-        }
+        self.agent
+            .capture(latest.map(Sent::captured).unwrap_or_default());
     }
 
     /// The published pose.
@@ -82,9 +76,7 @@ impl Participant {
         let began = Instant::now();
         let pose = self.agent.estimate_pose(input);
         self.times.estimate = began.elapsed();
-        self.attack
-            .as_ref()
-            .map_or(pose, |attack| attack.pose(pose))
+        pose
     }
 
     /// Last step of a sweep.
@@ -115,29 +107,7 @@ impl Participant {
             None => self.agent.perceive(&frame.points),
         }?;
         self.stages.clone_from(&perception.times);
-        Ok(match &mut self.attack {
-            Some(attack) => attack.perception(perception),
-            None => perception,
-        })
-    }
-
-    /// As [`Agent::boxes`].
-    pub(super) fn boxes(
-        &mut self,
-        capture_nanos: u64,
-        pose: PoseEstimate,
-        detections: Vec<Detection>,
-    ) -> Boxes {
-        self.agent.boxes(capture_nanos, pose, detections)
-    }
-
-    /// The published points.
-    pub(super) fn points(&mut self, cloud: &PointCloud) -> PointCloud {
-        let points = self.agent.share_points(cloud);
-        match &mut self.attack {
-            Some(attack) => attack.points(points),
-            None => points,
-        }
+        Ok(perception)
     }
 
     /// As [`Agent::write_map`].

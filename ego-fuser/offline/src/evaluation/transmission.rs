@@ -60,7 +60,7 @@ fn perceived(
 ) -> Result<Vec<SentMessage>, EvaluateError> {
     let mut messages = Vec::with_capacity(exchange.len());
     if exchange.contains(&Exchange::Points) {
-        let points = participant.points(&frame.points);
+        let points = participant.agent.share_points(&frame.points);
         let (message, bytes) = through_the_wire(stamp, Points { pose, points })?;
         messages.push(SentMessage::new(Content::Points(message.points), bytes));
     }
@@ -70,7 +70,7 @@ fn perceived(
     let perception = participant.perceive(frame, map)?;
     if exchange.contains(&Exchange::Boxes) {
         let detections = perception.detections.clone();
-        let boxes = participant.boxes(frame.capture_nanos, pose, detections);
+        let boxes = (participant.agent).boxes(frame.capture_nanos, pose, detections);
         let (message, bytes) = through_the_wire(stamp, boxes)?;
         let content = Content::Boxes(message.into_objects());
         messages.push(SentMessage::new(content, bytes));

@@ -42,7 +42,7 @@ impl Breakdown {
     /// All bins and classes.
     pub(super) fn parts() -> impl Iterator<Item = Self> {
         let bins = DISTANCE_EDGES_M.array_windows().copied();
-        let classes = ObjectClass::ALL.map(Self::Class);
+        let classes = ObjectClass::ALL.iter().copied().map(Self::Class);
         bins.map(Self::Distance).chain(classes)
     }
 

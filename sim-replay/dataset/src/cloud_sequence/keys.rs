@@ -1,5 +1,6 @@
 //! Keys of clouds and poses: names, numbers or times. A list as a whole decides which.
 
+use strum::IntoEnumIterator;
 use support::rounding;
 
 /// Least value of a whole number that is a time: nine digits.
@@ -23,7 +24,7 @@ pub(super) enum Keys {
 }
 
 /// Unit of a time.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, strum::EnumIter)]
 pub(super) enum Unit {
     Seconds,
     Milliseconds,
@@ -32,13 +33,6 @@ pub(super) enum Unit {
 }
 
 impl Unit {
-    const ALL: [Self; 4] = [
-        Self::Seconds,
-        Self::Milliseconds,
-        Self::Microseconds,
-        Self::Nanoseconds,
-    ];
-
     fn seconds(self) -> f64 {
         match self {
             Self::Seconds => 1.0,
@@ -58,7 +52,7 @@ impl Unit {
             .collect();
         steps.sort_unstable_by(f64::total_cmp);
         let step = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
-        Self::ALL.into_iter().find(|unit| {
+        Self::iter().find(|unit| {
             most * unit.seconds() < MOST_SECONDS && step * unit.seconds() <= MOST_STEP_S
         })
     }

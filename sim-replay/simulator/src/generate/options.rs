@@ -13,7 +13,8 @@ use super::weather::Weather;
 use crate::map::RoadMapSource;
 
 /// The three subsets of V2VLoc.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ValueEnum, strum::IntoStaticStr)]
+#[strum(serialize_all = "lowercase")]
 pub enum Subset {
     /// One agent drives through town 1, in several traversals.
     Town1loc,
@@ -26,11 +27,7 @@ pub enum Subset {
 impl Subset {
     /// The name in files and on the command line.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Town1loc => "town1loc",
-            Self::Town4loc => "town4loc",
-            Self::V2vdet => "v2vdet",
-        }
+        self.into()
     }
 }
 

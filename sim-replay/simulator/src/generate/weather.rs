@@ -21,7 +21,8 @@ const WEAKEST_REFLECTIVITY: f32 = 0.1;
 const CLEAR_RANGE_M: f32 = 120.0;
 
 /// The weather of a scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum, strum::IntoStaticStr)]
+#[strum(serialize_all = "lowercase")]
 pub enum Weather {
     /// Clear air.
     #[default]
@@ -46,11 +47,7 @@ pub(crate) enum Echo {
 impl Weather {
     /// The name in files and on the command line.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Sunny => "sunny",
-            Self::Fog => "fog",
-            Self::Snow => "snow",
-        }
+        self.into()
     }
 
     /// The name of a sweep in this weather beside the clear one, as in V2X-R: with the extinction of fog per metre, or

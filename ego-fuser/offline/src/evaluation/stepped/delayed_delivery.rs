@@ -90,7 +90,7 @@ impl DelayedDelivery {
         self.hand_over(pose.clone(), None);
         for message in std::mem::take(&mut sent.messages) {
             let packet = Packet {
-                stream: message.content.stream(),
+                stream: message.content.exchange().stream(),
                 bytes: message.bytes,
                 submitted_nanos: sent.capture_nanos.saturating_add(compute.agent_nanos()),
                 ..pose.clone()

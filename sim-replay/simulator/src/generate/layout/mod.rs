@@ -43,7 +43,8 @@ use sequences::Sequences;
 pub(crate) use support::sync::lock as locked;
 
 /// The layouts that scenes are written in.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum SceneLayout {
     /// OPV2V, V2XSet: a folder per agent with PCD and YAML, left-handed. The only layout with radar, GNSS and copies in
     /// other weather.
@@ -74,19 +75,7 @@ pub enum SceneLayout {
 impl SceneLayout {
     /// The name on the command line.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Opv2v => "opv2v",
-            Self::V2v4real => "v2v4real",
-            Self::Dair => "dair",
-            Self::V2xseq => "v2xseq",
-            Self::V2xreal => "v2xreal",
-            Self::V2xsim => "v2xsim",
-            Self::Mars => "mars",
-            Self::Nclt => "nclt",
-            Self::Oxford => "oxford",
-            Self::KittiOdometry => "kitti-odometry",
-            Self::KittiObject => "kitti-object",
-        }
+        self.into()
     }
 
     /// True if it cannot hold scenes of one agent.
