@@ -91,11 +91,9 @@ impl Agent {
     }
 
     /// The same with feature maps that keep within `rate`, applied by [`Self::write_map`].
-    pub fn within(self, rate: RateConfig) -> Self {
-        Self {
-            rate: RateControl::new(rate),
-            ..self
-        }
+    pub fn within(mut self, rate: RateConfig) -> Self {
+        self.rate = RateControl::new(rate);
+        self
     }
 
     /// The same with an attack on everything that it publishes.

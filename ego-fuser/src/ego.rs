@@ -22,6 +22,7 @@ use protocol::{
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
+use self::box_correction::{boxes_in, corrected};
 use self::latency_compensation::LatencyCompensation;
 use crate::misbehaviour::{Assessment, MisbehaviourDetector};
 use fusion::box_input::{MAX_BOXES, PlacedBox, placed};
@@ -138,11 +139,9 @@ impl Ego {
     }
 
     /// The same with another communication range: neighbours farther away, metres in the plane, are ignored.
-    pub fn with_comm_range(self, comm_range_m: f64) -> Self {
-        Self {
-            comm_range_m,
-            ..self
-        }
+    pub fn with_comm_range(mut self, comm_range_m: f64) -> Self {
+        self.comm_range_m = comm_range_m;
+        self
     }
 
     /// The same with misbehaviour detection, if it is enabled: leaves out neighbours whose messages contradict the
@@ -262,6 +261,9 @@ impl Ego {
             .collect();
         let mut chosen = self.choose(own, &carried);
         let mut stages = StageTimes::start();
+        if self.reads_boxes() {
+            no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
+        }
         let mut beliefs = Vec::new();
         if self.trust.is_some() && !chosen.fused.is_empty() {
             let found = self.judge(&chosen.aligned)?;
@@ -362,6 +364,28 @@ impl Ego {
             && features.code_of == self.detector.code_of()
             && features.values.len() == cells * features.channels as usize
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
+    }
+
+    /// Corrects the poses of neighbours that sent boxes by those that the ego detects itself.
+    fn correct_poses_of_boxes(
+        &self,
+        aligned: &mut [Aligned<'_>],
+        stages: &mut StageTimes,
+    ) -> Result<(), EgoError> {
+        let Content::Features(own) = &aligned[0].view.content else {
+            return Ok(());
+        };
+        let has_boxes = |one: &Aligned<'_>| !one.view.content.objects().is_empty();
+        if !aligned[1..].iter().any(has_boxes) {
+            return Ok(());
+        }
+        let own = boxes_in(&self.tensors(own, true)?.0, &self.detector)?;
+        for sender in &mut aligned[1..] {
+            let received: Vec<Detection> = sender.view.content.detections().cloned().collect();
+            sender.ego_from_cav = corrected(sender.ego_from_cav, &received, &own);
+        }
+        stages.lap("correct");
+        Ok(())
     }
 
     /// Intermediate fusion, and ego-only detection; boxes of neighbours change the output of the head.

@@ -7,9 +7,10 @@ macro_rules! named {
         $(#[$doc])*
         #[derive(
             Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize,
+            strum::Display, strum::IntoStaticStr,
         )]
         pub enum $name {
-            $($(#[$value_doc])* #[serde(rename = $text)] $value,)+
+            $($(#[$value_doc])* #[serde(rename = $text)] #[strum(serialize = $text)] $value,)+
         }
 
         impl $name {
@@ -18,15 +19,7 @@ macro_rules! named {
 
             /// Its name.
             pub fn as_str(self) -> &'static str {
-                match self {
-                    $(Self::$value => $text,)+
-                }
-            }
-        }
-
-        impl std::fmt::Display for $name {
-            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.write_str(self.as_str())
+                self.into()
             }
         }
     };

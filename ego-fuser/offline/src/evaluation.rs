@@ -134,11 +134,9 @@ impl Evaluator {
 
     /// The same with maps that its encoder computed before, stored at least as exactly as in messages: the messages are
     /// then the same.
-    pub fn with_maps(self, maps: MapSource) -> Self {
-        Self {
-            maps: Some(maps),
-            ..self
-        }
+    pub fn with_maps(mut self, maps: MapSource) -> Self {
+        self.maps = Some(maps);
+        self
     }
 
     /// The ego's pipeline.

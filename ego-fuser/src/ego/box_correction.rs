@@ -5,7 +5,7 @@
 
 use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::detector::{Detector, DetectorError};
-use protocol::Detection;
+use protocol::{Detection, Pose};
 use tch::Tensor;
 
 use fusion::MapMetadata;
@@ -14,6 +14,13 @@ use fusion::pose_graph::{Observer, PoseGraphConfig, correct};
 /// Boxes at or below this score are no landmarks: the reference's threshold for boxes that correct poses. It is
 /// independent of the boxes that are scored.
 const LANDMARK_SCORE: f32 = 0.2;
+
+/// The same for boxes that were sent, which are refined. Chosen with the two below on validation scenes.
+const SENT_LANDMARK_SCORE: f32 = 0.4;
+/// Largest distance between the centres of two boxes that match, metres in the plane.
+const MATCHED_M: f64 = 0.7;
+/// Number of boxes that a correction has to match in addition.
+const MORE_MATCHES: usize = 2;
 
 /// Corrects the poses in `metadata` by the boxes in each map `[1, C, H, W]`; the ego's pose is fixed.
 pub(super) fn correct_by_boxes(
@@ -41,12 +48,94 @@ pub(super) fn correct_by_boxes(
     Ok(())
 }
 
+/// The pose of a neighbour that sent boxes, corrected by those that the ego detects, too, if at least [`MORE_MATCHES`] more
+/// of them match then. Each neighbour by itself: one that lies moves no other.
+pub(super) fn corrected(ego_from_cav: Pose, received: &[Detection], own: &[Detection]) -> Pose {
+    let config = PoseGraphConfig {
+        min_score: SENT_LANDMARK_SCORE,
+        ..PoseGraphConfig::default()
+    };
+    let pair = [(Pose::IDENTITY, own), (ego_from_cav, received)];
+    let pair = pair.map(|(ego_from_agent, boxes)| Observer {
+        ego_from_agent,
+        boxes,
+    });
+    let corrected = correct(&pair, &config)[1].ego_from_agent;
+    let is_near = |[x, y, _]: [f64; 3]| {
+        let mut own = own.iter().map(|own| own.box3d.center_m);
+        own.any(|[own_x, own_y, _]| (own_x - x).hypot(own_y - y) < MATCHED_M)
+    };
+    let matches = |ego_from_cav: &Pose| {
+        let ego_from_cav = ego_from_cav.isometry();
+        let landmarks = received.iter().filter(|one| one.score >= config.min_score);
+        landmarks
+            .filter(|one| is_near(one.box3d.transformed(&ego_from_cav).center_m))
+            .count()
+    };
+    match matches(&corrected) >= matches(&ego_from_cav) + MORE_MATCHES {
+        true => corrected,
+        false => ego_from_cav,
+    }
+}
+
 /// Ego-only detections of a vehicle, in its own frame.
-fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detection>, DetectorError> {
+pub(super) fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detection>, DetectorError> {
     let limits = PostprocessConfig {
         score_threshold: LANDMARK_SCORE,
         ..PostprocessConfig::for_late_fusion(detector.config())
     };
     let boxes = detector.boxes(&detector.heads(map)?, limits.score_threshold)?;
-    Ok(detections(&boxes, &limits))
+    detector.refined(map, detections(&boxes, &limits))
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::Box3d;
+
+    use super::*;
+
+    fn car([x, y]: [f64; 2], score: f32) -> Detection {
+        Detection {
+            box3d: Box3d {
+                center_m: [x, y, -1.0],
+                size_m: [4.4, 1.9, 1.6],
+                heading_rad: 0.0,
+            },
+            score,
+            source: None,
+        }
+    }
+
+    const PLACES: [[f64; 2]; 6] = [
+        [12.0, 3.0],
+        [-9.0, -4.0],
+        [25.0, 8.0],
+        [4.0, -12.0],
+        [-20.0, 9.0],
+        [33.0, -6.0],
+    ];
+
+    /// The pose that is found for a neighbour at 20 m that states to be off by a vector.
+    fn found(off_m: [f64; 2], own: &[Detection], received: &[Detection]) -> [f64; 2] {
+        let stated = Pose::from_xyz_yaw([20.0 + off_m[0], off_m[1], 0.0], 0.0);
+        let [x, y, _] = corrected(stated, received, own).translation_m;
+        [x - 20.0, y]
+    }
+
+    #[test]
+    fn a_pose_is_corrected_where_its_boxes_match_better_then() {
+        let cars = |from_m: f64| PLACES.map(|[x, y]| car([x - from_m, y], 0.8));
+        let (own, received) = (cars(0.0), cars(20.0));
+        let [x, y] = found([1.2, -0.9], &own, &received);
+        assert!(x.abs() < 0.1 && y.abs() < 0.1, "{x} {y}");
+        assert_eq!(found([0.0, 0.0], &own, &received), [0.0, 0.0]);
+        // Two common boxes, or weak ones, are no evidence.
+        assert_eq!(found([1.2, -0.9], &own[..2], &received), [1.2, -0.9]);
+        let weak = received.map(|found| Detection {
+            score: 0.3,
+            ..found
+        });
+        assert_eq!(found([1.2, -0.9], &own, &weak), [1.2, -0.9]);
+        assert_eq!(found([1.2, -0.9], &own, &[]), [1.2, -0.9]);
+    }
 }

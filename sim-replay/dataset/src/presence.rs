@@ -40,11 +40,9 @@ impl AbsentFrames {
     }
 
     /// The same with further capture times of other agents; `moments` are all of them.
-    pub(super) fn among(self, moments: Vec<Tick>) -> Self {
-        Self {
-            moments: Some(Arc::new(moments)),
-            ..self
-        }
+    pub(super) fn among(mut self, moments: Vec<Tick>) -> Self {
+        self.moments = Some(Arc::new(moments));
+        self
     }
 }
 

@@ -264,40 +264,25 @@ impl Arguments {
         let methods = methods.join(", ");
         let encodes =
             self.codec.0 != CodecConfig::default() || self.rate.0 != RateConfig::default();
-        let exchange = || self.method.iter().map(|method| method.exchange());
-        if encodes
-            && self.feature_maps.is_none()
-            && exchange().all(|content| content != Exchange::Features)
-        {
-            return Err(BadInput::new(format!(
-                "options of the codec and of the rate are for feature maps: {methods} sends none"
-            )));
-        }
-        if self.boxes.is_some() && exchange().all(|content| content != Exchange::Features) {
-            return Err(BadInput::new(format!(
-                "--boxes is for methods that exchange feature maps: {methods} does not"
-            )));
-        }
-        if self.neighbour_weights.is_some()
-            && exchange().all(|content| content == Exchange::Nothing)
-        {
-            return Err(BadInput::new(format!(
-                "--neighbour-weights is for messages of neighbours: {methods} receives none"
-            )));
-        }
-        let carries = |content| content == Exchange::Boxes || self.boxes.is_some();
-        if self.latency_compensation && !exchange().any(carries) {
-            return Err(BadInput::new(format!(
-                "--latency-compensation is for boxes of neighbours: {methods} receives none"
-            )));
-        }
         let listens = self.attack.is_some() || self.trust || self.delay_ms > 0;
-        if listens && exchange().all(|content| content == Exchange::Nothing) {
-            return Err(BadInput::new(format!(
-                "--attack, --trust and --delay-ms are for messages of neighbours: {methods} uses none"
-            )));
-        }
-        Ok(())
+        let any_exchanges = |content| { self.method.iter() }.any(|one| one.exchange() == content);
+        let maps = any_exchanges(Exchange::Features);
+        let boxes = any_exchanges(Exchange::Boxes) || self.boxes.is_some();
+        let messages = !{ self.method.iter() }.all(|one| one.exchange() == Exchange::Nothing);
+        let rule = if encodes && self.feature_maps.is_none() && !maps {
+            "options of the codec and of the rate are for feature maps: METHODS sends none"
+        } else if self.boxes.is_some() && !maps {
+            "--boxes is for methods that exchange feature maps: METHODS does not"
+        } else if self.neighbour_weights.is_some() && !messages {
+            "--neighbour-weights is for messages of neighbours: METHODS receives none"
+        } else if self.latency_compensation && !boxes {
+            "--latency-compensation is for boxes of neighbours: METHODS receives none"
+        } else if listens && !messages {
+            "--attack, --trust and --delay-ms are for messages of neighbours: METHODS uses none"
+        } else {
+            return Ok(());
+        };
+        Err(BadInput::new(rule.replace("METHODS", &methods)))
     }
 
     fn emulates_link(&self) -> bool {

@@ -8,10 +8,8 @@ use agent::config::AgentSettings;
 use dataset::frame::Frame;
 use fusion::method::Exchange;
 use perception::detector::DetectorError;
-use protocol::{CavId, CodecConfig, EncodedFeatures, PoseEstimate, StageTiming, Stream, WireError};
+use protocol::{CodecConfig, EncodedFeatures, PoseEstimate, StageTiming, Stream, WireError};
 use tch::Tensor;
-
-use super::sent::Sent;
 
 #[derive(Debug)]
 pub(super) struct Participant {
@@ -22,9 +20,10 @@ pub(super) struct Participant {
     codec: CodecConfig,
     /// Content that it publishes where a method needs feature maps.
     in_place_of_maps: Vec<Exchange>,
-    times: PoseTimes,
+    /// Durations of the last sweep's pose.
+    pub(super) times: PoseTimes,
     /// Stages of the last sweep's perception.
-    stages: Vec<StageTiming>,
+    pub(super) stages: Vec<StageTiming>,
 }
 
 /// Durations of the last sweep's pose.
@@ -53,22 +52,12 @@ impl Participant {
         }
     }
 
-    pub(super) fn cav(&self) -> &CavId {
-        self.agent.cav()
-    }
-
     /// Content that it publishes where a method needs `needed`, in the order of sending.
     pub(super) fn exchange(&self, needed: Exchange) -> Vec<Exchange> {
         match needed {
             Exchange::Features => self.in_place_of_maps.clone(),
             needed => vec![needed],
         }
-    }
-
-    /// Passes on the last messages of another participant, which an attack may replay.
-    pub(super) fn capture(&mut self, latest: Option<&Sent>) {
-        self.agent
-            .capture(latest.map(Sent::captured).unwrap_or_default());
     }
 
     /// The published pose.
@@ -84,16 +73,6 @@ impl Participant {
         let began = Instant::now();
         self.agent.observe(input);
         self.times.observe = began.elapsed();
-    }
-
-    /// Durations of the last sweep's pose.
-    pub(super) fn pose_times(&self) -> PoseTimes {
-        self.times
-    }
-
-    /// Stages of the last sweep's perception.
-    pub(super) fn stages(&self) -> &[StageTiming] {
-        &self.stages
     }
 
     /// The published map, confidence and detections, from a map `[1, C, H, W]` of the run's encoder where there is one.

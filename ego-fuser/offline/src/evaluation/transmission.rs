@@ -32,7 +32,7 @@ pub(super) fn view(
     let pose = participant.pose(&input);
     // Nothing of this sweep depends on it.
     participant.observe(&input);
-    let stamp = stamp(participant.cav(), frame.capture_nanos);
+    let stamp = stamp(participant.agent.cav(), frame.capture_nanos);
     let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
     let mut sent = Sent {
         cav: frame.cav.clone(),

@@ -215,10 +215,10 @@ impl Evaluator {
                     _ => neighbour = sent,
                 }
                 let all = began.elapsed();
-                let times = participant.pose_times();
+                let times = participant.times;
                 samples.pose.push(ms(times.estimate));
                 samples.observe.push(ms(times.observe));
-                samples.add(0, participant.stages());
+                samples.add(0, &participant.stages);
                 samples
                     .map
                     .push(ms(all.saturating_sub(times.estimate + times.observe)));
