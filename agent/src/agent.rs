@@ -91,29 +91,27 @@ impl Agent {
     }
 
     /// The same with feature maps that keep within `rate`, applied by [`Self::write_map`].
-    pub fn within(mut self, rate: RateConfig) -> Self {
+    pub fn with_rate(mut self, rate: RateConfig) -> Self {
         self.rate = RateControl::new(rate);
         self
     }
 
     /// The same with an attack on everything that it publishes.
-    pub fn attacking(self, attack: Option<Attack>) -> Self {
+    pub fn with_attack(self, attack: Option<Attack>) -> Self {
         Self { attack, ..self }
     }
 
     /// Passes on the last messages of another vehicle, which an attack may replay.
-    pub fn capture(&mut self, captured: CapturedMessages) {
+    pub fn capture(&mut self, captured: impl FnOnce() -> CapturedMessages) {
         if let Some(attack) = &mut self.attack {
-            attack.capture(captured);
+            attack.capture(captured());
         }
     }
 
     /// An agent that computes neither confidence nor detections, for maps that are sent whole.
-    pub(crate) fn without_head(self) -> Self {
-        Self {
-            has_head: false,
-            ..self
-        }
+    pub(crate) fn without_head(mut self) -> Self {
+        self.has_head = false;
+        self
     }
 
     /// The points that the vehicle shares: those that are not on its own body, whose extent its detector knows.

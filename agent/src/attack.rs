@@ -13,8 +13,10 @@ use support::random::SplitMix64;
 
 use crate::agent_output::Perception;
 
-/// Number of synthetic objects in every frame, and of a flood.
-const INVENTED: [usize; 2] = [10, 1000];
+/// Number of synthetic objects in every frame.
+const INVENTED: usize = 10;
+/// The same of a flood.
+const FLOOD: usize = 1000;
 /// Score of a synthetic object: no honest detection has a higher one.
 const INVENTED_SCORE: f32 = 1.0;
 /// Largest distance of a synthetic object from the attacker, metres.
@@ -25,20 +27,9 @@ const GAIN: f32 = 2.0;
 const PATCH_CELLS: i64 = 3;
 
 /// Kind of falsification.
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Eq,
-    Hash,
-    Serialize,
-    Deserialize,
-    JsonSchema,
-    clap::ValueEnum,
-    strum::IntoStaticStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
+#[derive(clap::ValueEnum, strum::IntoStaticStr)]
 #[value(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum Falsification {
@@ -127,7 +118,7 @@ impl Attack {
                 |random: &mut SplitMix64| random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
             [reach(random), reach(random), random.between(-0.2, 0.2)]
         };
-        let invented = INVENTED[usize::from(falsification == Falsification::Flood)];
+        let invented = [INVENTED, FLOOD][usize::from(falsification == Falsification::Flood)];
         let places = (0..invented).map(|_| place(&mut random)).collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
         tracing::warn!(%cav, falsification = falsification.name(), "ATTACK: this vehicle falsifies its messages");
@@ -179,9 +170,7 @@ impl Attack {
             Falsification::Noise => {
                 make_noise(&mut falsified.features, &mut self.random);
                 falsified.confidence.fill_with(|| self.random.unit() as f32);
-                falsified.detections = (0..2 * INVENTED[0])
-                    .map(|_| self.random_detection())
-                    .collect();
+                falsified.detections = (0..2 * INVENTED).map(|_| self.random_detection()).collect();
             }
             Falsification::Copied => {
                 let features = self

@@ -261,9 +261,6 @@ impl Ego {
             .collect();
         let mut chosen = self.choose(own, &carried);
         let mut stages = StageTimes::start();
-        if self.reads_boxes() {
-            no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
-        }
         let mut beliefs = Vec::new();
         if self.trust.is_some() && !chosen.fused.is_empty() {
             let found = self.judge(&chosen.aligned)?;
@@ -271,6 +268,9 @@ impl Ego {
             beliefs = chosen.fused.iter().copied().zip(found).collect();
             chosen.leave_out(&is_out, DropReason::Misbehaviour);
             stages.lap("trust");
+        }
+        if self.reads_boxes() {
+            no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
         }
         let aligned = &chosen.aligned;
         let detections = no_grad(|| match needed {
@@ -366,7 +366,8 @@ impl Ego {
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
 
-    /// Corrects the poses of neighbours that sent boxes by those that the ego detects itself.
+    /// Corrects the poses at which neighbours' boxes are placed by those that the ego detects itself. Their maps keep the
+    /// stated pose.
     fn correct_poses_of_boxes(
         &self,
         aligned: &mut [Aligned<'_>],

@@ -46,7 +46,7 @@
 //! | [`Gnss`] | `gnss` | replay | that vehicle's agent |
 //! | [`PoseEstimate`] | `pose` | agent | ego-fusers |
 //! | [`Bev`] | `bev` | agent | ego-fusers (intermediate fusion) |
-//! | [`Boxes`] | `boxes` | agent | ego-fusers (late fusion) |
+//! | [`Boxes`] | `boxes` | agent | ego-fusers (late fusion, box input) |
 //! | [`Points`] | `points` | agent | ego-fusers (early fusion) |
 //! | [`Descriptor`] | `descriptor` | agent | ego-fusers |
 //! | [`Detections`] | `detections` | ego-fuser | scorer, anyone |

@@ -158,7 +158,7 @@ impl AgentLoop {
             pairing: SweepPairing::new(POSE_TIMEOUT_NANOS),
             selection: SweepSelection::of(&options.egos),
             reports: SweepReports::new(agent.detector(), &options),
-            agent: agent.attacking(attack),
+            agent: agent.with_attack(attack),
             options,
             step: Step::default(),
             numbers: BTreeMap::new(),

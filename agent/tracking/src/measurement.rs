@@ -11,7 +11,7 @@ const MAX_ABS: f64 = 1e7;
 /// A detection that can be used.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Measurement {
-    /// Place of the detection in its list.
+    /// Index of the detection in its list.
     pub(crate) detection: usize,
     /// The box in the world frame.
     pub(crate) box3d: Box3d,
@@ -24,7 +24,7 @@ pub(crate) struct Measurement {
 impl Measurement {
     /// The detection in the world; `None` if a number is not finite, beyond all bounds, or the score not within 0..=1.
     pub(crate) fn new(
-        (place, detection): (usize, &Detection),
+        (index, detection): (usize, &Detection),
         world_from_ego: &Isometry3<f64>,
         pose_covariance: Option<&PlanarCovariance>,
         config: &TrackerConfig,
@@ -50,7 +50,7 @@ impl Measurement {
         let of_pose =
             pose_covariance.map_or_else(Matrix2::zeros, |covariance| of_pose(covariance, offset_m));
         Some(Self {
-            detection: place,
+            detection: index,
             box3d,
             score,
             noise_m2: Matrix2::identity() * (sigma_m * sigma_m) + of_pose,

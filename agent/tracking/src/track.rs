@@ -29,7 +29,7 @@ pub(crate) struct TrackState {
     hits: u32,
     age_s: f64,
     unseen_s: f64,
-    /// Place of its detection in the list of this frame.
+    /// Index of its detection in the list of this frame.
     detection: Option<usize>,
 }
 
@@ -106,7 +106,7 @@ impl TrackState {
         self.existence >= config.death_existence && self.unseen_s <= config.max_unseen_s
     }
 
-    /// Place of its detection in the list of this frame, if it was detected in a frame before, too.
+    /// Index of its detection in the list of this frame, if it was detected in a frame before, too.
     pub(crate) fn repeated_detection(&self) -> Option<usize> {
         self.detection.filter(|_| self.hits > 1)
     }

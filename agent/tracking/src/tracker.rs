@@ -1,4 +1,4 @@
-//! Tracker: the tracks of an ego from frame to frame.
+//! Tracker: the tracks of a vehicle from frame to frame.
 
 use nalgebra::{Isometry3, Point3};
 use protocol::{
@@ -84,7 +84,7 @@ pub enum TrackingError {
     Pose(#[from] InvalidPose),
 }
 
-/// Tracks of one ego.
+/// Tracks of one vehicle.
 #[derive(Debug, Clone, Default)]
 pub struct Tracker {
     config: TrackerConfig,
@@ -136,8 +136,8 @@ impl Tracker {
         let mut objects: Vec<PerceivedObject> = detections.into_iter().map(Into::into).collect();
         if let Some(cav_from_world) = taken {
             for track in &self.tracks {
-                if let Some(place) = track.repeated_detection() {
-                    objects[place].track = Some(track.in_message(&cav_from_world));
+                if let Some(index) = track.repeated_detection() {
+                    objects[index].track = Some(track.in_message(&cav_from_world));
                 }
             }
         }

@@ -197,7 +197,7 @@ impl Evaluator {
         };
         let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
-        let agent = agent.within(settings.rate).attacking(attack);
+        let agent = agent.with_rate(settings.rate).with_attack(attack);
         Ok(Participant::new(agent, &settings))
     }
 

@@ -52,7 +52,7 @@ impl Arguments {
                 .map_or(String::new(), |reason| format!(", the first: {reason}"));
             let boxes = match fused_boxes {
                 0 => String::new(),
-                boxes => format!(" ({boxes} boxes in place of a feature map)"),
+                boxes => format!(" ({boxes} of them boxes)"),
             };
             output::line(format_args!(
                 "{frames} frames, {fused} neighbours' messages fused{boxes}, {at_deadline} at the deadline, {failed} failed{reason}"

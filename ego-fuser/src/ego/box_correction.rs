@@ -1,4 +1,4 @@
-//! Pose correction by the boxes that neighbours' maps show.
+//! Pose correction by boxes: those that neighbours' maps show, and those that neighbours send.
 //!
 //! The head applied to a single vehicle's map gives that vehicle's ego-only boxes. The ego has both, map and head: it
 //! detects in a neighbour's map the boxes that the neighbour would have sent, without waiting for another message.
@@ -49,7 +49,7 @@ pub(super) fn correct_by_boxes(
 }
 
 /// The pose of a neighbour that sent boxes, corrected by those that the ego detects, too, if at least [`MORE_MATCHES`] more
-/// of them match then. Each neighbour by itself: one that lies moves no other.
+/// of them match then. Each neighbour by itself: a false message moves no other.
 pub(super) fn corrected(ego_from_cav: Pose, received: &[Detection], own: &[Detection]) -> Pose {
     let config = PoseGraphConfig {
         min_score: SENT_LANDMARK_SCORE,
@@ -85,7 +85,9 @@ pub(super) fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detectio
         ..PostprocessConfig::for_late_fusion(detector.config())
     };
     let boxes = detector.boxes(&detector.heads(map)?, limits.score_threshold)?;
-    detector.refined(map, detections(&boxes, &limits))
+    let mut found = detector.refined(map, detections(&boxes, &limits))?;
+    found.retain(|found| found.score > LANDMARK_SCORE);
+    Ok(found)
 }
 
 #[cfg(test)]
@@ -115,27 +117,29 @@ mod tests {
         [33.0, -6.0],
     ];
 
-    /// The pose that is found for a neighbour at 20 m that states to be off by a vector.
-    fn found(off_m: [f64; 2], own: &[Detection], received: &[Detection]) -> [f64; 2] {
-        let stated = Pose::from_xyz_yaw([20.0 + off_m[0], off_m[1], 0.0], 0.0);
-        let [x, y, _] = corrected(stated, received, own).translation_m;
-        [x - 20.0, y]
-    }
+    const TRUE: Pose = Pose {
+        translation_m: [20.0, 0.0, 0.0],
+        ..Pose::IDENTITY
+    };
+    const STATED: Pose = Pose {
+        translation_m: [21.2, -0.9, 0.0],
+        ..Pose::IDENTITY
+    };
 
     #[test]
     fn a_pose_is_corrected_where_its_boxes_match_better_then() {
         let cars = |from_m: f64| PLACES.map(|[x, y]| car([x - from_m, y], 0.8));
         let (own, received) = (cars(0.0), cars(20.0));
-        let [x, y] = found([1.2, -0.9], &own, &received);
-        assert!(x.abs() < 0.1 && y.abs() < 0.1, "{x} {y}");
-        assert_eq!(found([0.0, 0.0], &own, &received), [0.0, 0.0]);
+        let [x, y, _] = corrected(STATED, &received, &own).translation_m;
+        assert!((x - 20.0).abs() < 0.1 && y.abs() < 0.1, "{x} {y}");
+        assert_eq!(corrected(TRUE, &received, &own), TRUE);
         // Two common boxes, or weak ones, are no evidence.
-        assert_eq!(found([1.2, -0.9], &own[..2], &received), [1.2, -0.9]);
+        assert_eq!(corrected(STATED, &received, &own[..2]), STATED);
         let weak = received.map(|found| Detection {
             score: 0.3,
             ..found
         });
-        assert_eq!(found([1.2, -0.9], &own, &weak), [1.2, -0.9]);
-        assert_eq!(found([1.2, -0.9], &own, &[]), [1.2, -0.9]);
+        assert_eq!(corrected(STATED, &weak, &own), STATED);
+        assert_eq!(corrected(STATED, &[], &own), STATED);
     }
 }

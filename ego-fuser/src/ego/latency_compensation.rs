@@ -43,7 +43,9 @@ impl LatencyCompensation {
         };
         let age_s = (now_nanos as f64 - view.capture_nanos as f64) * 1e-9;
         let age_s = age_s.clamp(-MAX_AGE_S, MAX_AGE_S);
-        let carried = objects.iter().map(|object| after(object.clone(), age_s));
+        let carried = objects
+            .iter()
+            .map(|object| extrapolated(object.clone(), age_s));
         Cow::Owned(View {
             content: Content::Boxes(carried.collect()),
             ..view.clone()
@@ -64,7 +66,7 @@ impl LatencyCompensation {
 }
 
 /// The object after a time.
-fn after(mut object: PerceivedObject, elapsed_s: f64) -> PerceivedObject {
+fn extrapolated(mut object: PerceivedObject, elapsed_s: f64) -> PerceivedObject {
     if let Some(track) = &object.track {
         let center_m = &mut object.detection.box3d.center_m;
         for (at, speed) in center_m.iter_mut().zip(track.velocity_mps) {
@@ -177,7 +179,7 @@ mod tests {
         assert_eq!(after[0], before[0], "an object without a track stays");
         assert!((after[1][0] - before[1][0] - 1.0).abs() < 1e-9);
         assert!((after[1][1] - before[1][1] + 7.5).abs() < 1e-9);
-        // Beyond a second nothing is carried, and what a sender tracks is not tracked again.
+        // An older box is carried by one second only, and what a sender tracks is not tracked again.
         let far = centers(&compensation.carried(&first, 9_000_000_000));
         assert!((far[1][1] - before[1][1] + 15.0).abs() < 1e-9);
         assert!(compensation.of_cav.is_empty());

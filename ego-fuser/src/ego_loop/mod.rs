@@ -72,7 +72,7 @@ pub struct LoopReport {
     pub frames: u64,
     /// Neighbours' messages that were fused, over all frames.
     pub fused: u64,
-    /// Of these, boxes in place of a feature map.
+    /// Of these, messages of boxes, in place of a feature map or beside it.
     pub fused_boxes: u64,
     /// Frames that were decided at the deadline.
     pub at_deadline: u64,

@@ -4,9 +4,9 @@
 //! the two detects, mutual detection at the reported positions, similarity to other senders' messages, values that the
 //! network does not give. Evidence is
 //! averaged over frames, the newest counting half; a neighbour below a threshold is left out until its average has
-//! recovered. A neighbour without evidence keeps its trust. Maps are accepted until there is evidence against them, as
-//! fused features must agree with the ego's own in any case; boxes, which count as received, are accepted only with
-//! evidence in their favour.
+//! recovered. A neighbour without evidence keeps its trust. Maps, and boxes beside an own map, are accepted until there
+//! is evidence against them, as they must agree with the ego's own features in any case; boxes of late fusion, which
+//! count as received, are accepted only with evidence in their favour.
 
 mod evidence;
 mod seen;
@@ -21,6 +21,7 @@ use protocol::{CavId, MisbehaviourReason, PointCloud, Pose};
 
 use crate::view::View;
 use evidence::Evidence;
+use fusion::method::Exchange;
 use seen::{Observation, cosine_similarity};
 use value_range::ValueRange;
 
@@ -63,8 +64,8 @@ struct Reputation {
     reason: MisbehaviourReason,
     /// Capture time of the ego's own view at its last message, nanoseconds.
     last_message_nanos: u64,
-    /// Capture time, pose and fingerprint of the last judged message.
-    last: Option<(u64, Pose, Vec<f32>)>,
+    /// Capture time, pose and fingerprint of the last judged map or points, and of the last judged boxes.
+    last: [Option<(u64, Pose, Vec<f32>)>; 2],
 }
 
 /// Assessment of a neighbour.
@@ -143,7 +144,7 @@ impl MisbehaviourDetector {
         }
         // A message that serves a second frame is no new evidence.
         let is_new = |view: &View| {
-            let last = self.last_of(&view.cav);
+            let last = self.last_of(view);
             last.is_none_or(|(nanos, ..)| *nanos != view.capture_nanos)
         };
         let mut evidence = Vec::with_capacity(neighbours.len());
@@ -152,24 +153,36 @@ impl MisbehaviourDetector {
             evidence.push(is_new(view).then(evidence_of));
         }
         flag_duplicates(&mut evidence, &all);
-        let mut assessments = Vec::with_capacity(neighbours.len());
+        // Of a neighbour's map and boxes the worse counts, once: true boxes are no excuse for a false map.
+        let mut judgements: BTreeMap<&CavId, Option<(f64, MisbehaviourReason)>> = BTreeMap::new();
         for ((view, _), evidence) in neighbours.iter().zip(evidence) {
             let judgement = evidence.as_ref().and_then(Evidence::judgement);
             tracing::debug!(cav = %view.cav, ?judgement, ?evidence, "neighbour judged");
-            assessments.push(self.add_up(own.capture_nanos, &view.cav, judgement, mine.is_boxes()));
+            let worst = judgements.entry(&view.cav).or_default();
+            let both = worst.iter().copied().chain(judgement);
+            *worst = both.min_by(|one, other| one.0.total_cmp(&other.0));
         }
+        let probation = mine.is_boxes();
+        let of_cav = judgements.into_iter();
+        let of_cav: BTreeMap<_, _> = of_cav
+            .map(|(cav, found)| (cav, self.add_up(own.capture_nanos, cav, found, probation)))
+            .collect();
+        let assessments = neighbours
+            .iter()
+            .map(|(view, _)| of_cav[&view.cav])
+            .collect();
         for ((view, _), seen) in neighbours.iter().zip(all) {
             if let (Some(reputation), Some(pose)) =
                 (self.peers.get_mut(&view.cav), view.pose.world_from_cav())
             {
-                reputation.last = Some((view.capture_nanos, *pose, seen.fingerprint));
+                reputation.last[kind(view)] = Some((view.capture_nanos, *pose, seen.fingerprint));
             }
         }
         Ok(assessments)
     }
 
-    fn last_of(&self, cav: &CavId) -> Option<&(u64, Pose, Vec<f32>)> {
-        self.peers.get(cav)?.last.as_ref()
+    fn last_of(&self, view: &View) -> Option<&(u64, Pose, Vec<f32>)> {
+        self.peers.get(&view.cav)?.last[kind(view)].as_ref()
     }
 
     /// Evidence of a message except its similarity to those of other neighbours in the same frame.
@@ -187,13 +200,13 @@ impl MisbehaviourDetector {
         let mut evidence = Evidence::between(mine, seen, &relative, age_s);
         evidence.is_out_of_range = self.range.is_left_by(&seen.map);
         let others = self.peers.iter().filter(|(cav, _)| **cav != view.cav);
-        let earlier = others.filter_map(|(_, peer)| peer.last.as_ref());
+        let earlier = others.flat_map(|(_, peer)| peer.last.iter().flatten());
         let fingerprints = earlier.map(|(_, _, fingerprint)| fingerprint);
         let likeness = { fingerprints.chain([&mine.fingerprint]) }
             .map(|fingerprint| alike(&seen.fingerprint, fingerprint));
         evidence.like_another = likeness.fold(0.0, f64::max);
         if let (Some((capture_nanos, before, fingerprint)), Some(now)) =
-            (self.last_of(&view.cav), view.pose.world_from_cav())
+            (self.last_of(view), view.pose.world_from_cav())
         {
             let elapsed_s = (view.capture_nanos as f64 - *capture_nanos as f64).abs() * 1e-9;
             evidence.jumped = is_jump(before, now, elapsed_s);
@@ -233,7 +246,7 @@ impl MisbehaviourDetector {
             is_out: probation,
             reason: MisbehaviourReason::Probation,
             last_message_nanos: now_nanos,
-            last: None,
+            last: [None, None],
         });
         reputation.last_message_nanos = now_nanos;
         if let Some((log_odds, reason)) = judgement {
@@ -260,6 +273,11 @@ impl MisbehaviourDetector {
             misbehaviour: reputation.is_out.then_some(reason),
         }
     }
+}
+
+/// Index of the last judged message of its kind.
+fn kind(view: &View) -> usize {
+    usize::from(view.content.exchange() == Exchange::Boxes)
 }
 
 /// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where

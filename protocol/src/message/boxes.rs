@@ -28,7 +28,7 @@ pub struct PerceivedObject {
 /// Identity and motion of an object at the capture time of its detection.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ObjectTrack {
-    /// Identity, from 1 on; never used again by the same agent.
+    /// Identity, from 1 on; unique within a process instance (epoch) of its agent.
     pub id: u64,
     /// Velocity over ground along x, y of the sender's LiDAR frame, metres per second.
     pub velocity_mps: [f32; 2],
@@ -112,7 +112,7 @@ impl ObjectTrack {
 
 metadata_only!(Boxes, Boxes);
 
-/// An object as it is transmitted: 33 bytes, and with a track 21 more, or up to 29 where its number is large.
+/// An object as it is transmitted: 33 bytes, and with a track 21 to 29 more, as its id is large.
 #[derive(Serialize, Deserialize)]
 struct CompactBox {
     center_m: [f32; 3],

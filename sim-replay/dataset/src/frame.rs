@@ -2,20 +2,17 @@
 //!
 //! Every layout is read into this one frame: right-handed, metres, radians, nanoseconds (see [`protocol`]).
 
-use std::str::FromStr;
-
 use protocol::{AgentTruth, Camera, CavId, EgoMotion, Handedness, PointCloud, Pose, TrueObject};
 use serde::{Deserialize, Serialize};
-use strum::{IntoStaticStr, VariantArray};
+use strum::{EnumString, IntoStaticStr, VariantArray};
 
 use crate::Problem;
 
 /// Class of an annotated object.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, VariantArray, IntoStaticStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-#[strum(serialize_all = "snake_case")]
+#[derive(EnumString, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case", parse_err_ty = UnknownClass, parse_err_fn = UnknownClass::from)]
 pub enum ObjectClass {
     /// A passenger car; also every object of data sets without types.
     Car,
@@ -50,23 +47,18 @@ impl ObjectClass {
     }
 }
 
-impl FromStr for ObjectClass {
-    type Err = UnknownClass;
-
-    /// Reads [`ObjectClass::name`].
-    fn from_str(text: &str) -> Result<Self, UnknownClass> {
-        { Self::ALL.iter().copied() }
-            .find(|class| class.name() == text)
-            .ok_or_else(|| UnknownClass(text.to_owned()))
-    }
-}
-
 /// A text that names no class.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{0:?} is no class: expected vehicle, car, van, truck, bus, two_wheeler, pedestrian or other"
 )]
 pub struct UnknownClass(String);
+
+impl From<&str> for UnknownClass {
+    fn from(text: &str) -> Self {
+        Self(text.to_owned())
+    }
+}
 
 /// An annotated object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

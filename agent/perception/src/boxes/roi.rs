@@ -82,10 +82,8 @@ fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
         })
         .collect();
     let positions = tensor(&positions, &[1, -1, 1, 2], map.device())?;
-    let (bilinear, zeros) = (0, 0);
-    let sampled = map
-        .f_detach()?
-        .f_grid_sampler(&positions, bilinear, zeros, false)?;
+    // Bilinear between the cells, zeros beyond them.
+    let sampled = map.f_detach()?.f_grid_sampler(&positions, 0, 0, false)?;
     sampled.f_view([map.size4()?.1, -1])?.f_transpose(0, 1)
 }
 
@@ -148,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn places_lie_around_the_box_in_its_direction() {
+    fn sampling_positions_lie_along_the_axes_of_the_box() {
         let found: Vec<[f64; 2]> = sampling_positions(&car([0.0, 0.0, -1.0], FRAC_PI_2)).collect();
         assert_eq!(found.len(), POSITIONS);
         // The first is behind and to the right: turned by 90 degrees right is +x and behind is -y.

@@ -277,6 +277,8 @@ impl Arguments {
             "--neighbour-weights is for messages of neighbours: METHODS receives none"
         } else if self.latency_compensation && !boxes {
             "--latency-compensation is for boxes of neighbours: METHODS receives none"
+        } else if self.attack == Some(Falsification::FalseVelocity) && !boxes {
+            "--attack false_velocity is for boxes of neighbours: METHODS receives none"
         } else if listens && !messages {
             "--attack, --trust and --delay-ms are for messages of neighbours: METHODS uses none"
         } else {

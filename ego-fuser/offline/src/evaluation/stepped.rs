@@ -253,7 +253,7 @@ impl<'a> Run<'a> {
             let index = self.places.iter().position(|it| it == place);
             if let Some(participant) = index.and_then(|index| self.participants.get_mut(index)) {
                 // A replaying attacker repeats the message of the vehicle before it.
-                let captured = all.last().map(Sent::captured).unwrap_or_default();
+                let captured = || all.last().map(Sent::captured).unwrap_or_default();
                 participant.agent.capture(captured);
                 let exchange = exchange.map(|needed| participant.exchange(needed));
                 let exchange = exchange.unwrap_or_default();
