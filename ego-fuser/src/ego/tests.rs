@@ -24,7 +24,7 @@ pub(crate) const HERE: Pose = Pose {
 };
 
 /// The same network every time, with a head that detects vehicles everywhere, so that there is something to suppress.
-fn detector() -> Detector {
+pub(crate) fn detector() -> Detector {
     detector_with(None)
 }
 
@@ -705,4 +705,36 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
         );
         assert_eq!(from_boxes.detections, detect(true, &[&boxes]).detections);
     }
+}
+
+#[test]
+fn boxes_are_placed_where_the_ego_detects_them_too() {
+    let [_, ego] = egos_of_files(Method::MAX);
+    let own = view("a", HERE, Method::MAX, 0.0);
+    let Content::Features(map) = &own.content else {
+        panic!("{own:?}")
+    };
+    let map = ego.tensors(map, true).unwrap().0;
+    let seen = boxes_in(&map, &ego.detector).unwrap();
+    // What the ego detects, as a vehicle sends it that is 4 m ahead and states to be a metre off.
+    let ego_from_cav = Pose::from_xyz_yaw([4.0, 1.0, 0.0], 0.0);
+    let objects = seen.into_iter().map(|found| {
+        let box3d = found.box3d.transformed(&ego_from_cav.isometry().inverse());
+        PerceivedObject::from(Detection { box3d, ..found })
+    });
+    let sender = View {
+        cav: CavId::new("b").unwrap(),
+        content: Content::Boxes(objects.collect()),
+        ..own.clone()
+    };
+    let stated = Pose::from_xyz_yaw([4.8, 0.4, 0.0], 0.0);
+    let place = |view, ego_from_cav| Aligned { view, ego_from_cav };
+    let mut aligned = [place(&own, Pose::IDENTITY), place(&sender, stated)];
+    let mut stages = StageTimes::start();
+    ego.correct_poses_of_boxes(&mut aligned, &mut stages)
+        .unwrap();
+    let [x, y, _] = aligned[1].ego_from_cav.translation_m;
+    assert!((x - 4.0).abs() < 0.2 && (y - 1.0).abs() < 0.2, "{x} {y}");
+    assert_eq!(aligned[0].ego_from_cav, Pose::IDENTITY);
+    assert_eq!(stages.into_timings()[0].stage, "correct");
 }

@@ -318,7 +318,10 @@ fn is_jump(before: &Pose, now: &Pose, elapsed_s: f64) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use fusion::method::Method;
+
     use super::*;
+    use crate::ego::tests::{HERE, detector, near, view};
 
     fn trust() -> MisbehaviourDetector {
         MisbehaviourDetector {
@@ -451,5 +454,32 @@ mod tests {
             &Pose::from_xyz_yaw([140.0, 50.0, 2.0], 2.0),
             1.0
         ));
+    }
+    #[test]
+    fn map_and_boxes_of_a_neighbour_are_judged_together_and_each_compared_with_its_own_last_message()
+     {
+        let mut detector = detector();
+        let mut trust = MisbehaviourDetector::new(&mut detector).unwrap();
+        let own = view("a", HERE, Method::MAX, 0.0);
+        let sent = [Method::MAX, Method::LATE].map(|method| view("b", near(), method, 0.15));
+        let neighbours = [(&sent[0], near()), (&sent[1], near())];
+        let found = trust.judge(&own, &neighbours, &mut detector).unwrap();
+        assert_eq!(found[0], found[1]);
+        let empty = trust.empty.clone();
+        let mine = Observation::in_message(&own.content, &mut detector, &empty).unwrap();
+        for view in &sent {
+            let later = View {
+                capture_nanos: view.capture_nanos + 100_000_000,
+                ..view.clone()
+            };
+            let seen = Observation::in_message(&later.content, &mut detector, &empty).unwrap();
+            let evidence = trust.evidence(&own, &mine, &later, &near(), &seen);
+            let like_before = evidence.like_before.unwrap();
+            assert!(
+                (like_before - 1.0).abs() < 1e-6,
+                "{:?}: {like_before}",
+                later.content.exchange()
+            );
+        }
     }
 }
