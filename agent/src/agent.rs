@@ -57,7 +57,7 @@ pub struct Agent {
     pose_source: Box<dyn PoseSource>,
     detector: Option<Detector>,
     rate: RateControl,
-    tracker: Tracker,
+    object_tracker: Tracker,
     /// Falsifies everything that is published.
     attack: Option<Attack>,
     has_head: bool,
@@ -83,7 +83,7 @@ impl Agent {
             pose_source,
             detector: None,
             rate: RateControl::default(),
-            tracker: Tracker::default(),
+            object_tracker: Tracker::default(),
             attack: None,
             has_head: true,
             shares_encoder: false,
@@ -272,7 +272,7 @@ impl Agent {
         pose: PoseEstimate,
         detections: Vec<Detection>,
     ) -> Boxes {
-        let objects = self.tracker.objects(capture_nanos, &pose, detections);
+        let objects = (self.object_tracker).objects(capture_nanos, &pose, detections);
         let boxes = Boxes::new(pose, &objects);
         match &self.attack {
             Some(attack) => attack.boxes(boxes),

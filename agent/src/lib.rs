@@ -1,7 +1,7 @@
 //! Agent of one connected vehicle: pose and BEV features of each of its sweeps, published on the bus.
 //!
-//! - [`agent`]: the pipeline, synchronous and without a network; [`agent_loop`]: its decisions; [`node`]: the process
-//!   around it. [`input_log`] and [`loop_clock`]: what the processes of loops share.
+//! - [`agent`]: the pipeline, synchronous and without a network; [`agent_output`]: what it finds in one sweep;
+//!   [`agent_loop`]: its decisions; [`node`]: the process around it. [`input_log`] and [`loop_clock`]: what the processes of loops share.
 //! - [`rate`]: bytes per message under a byte budget; `sweep_pairing`: sweep and starting pose of one capture time.
 //! - [`attack`]: falsified messages, for experiments on misbehaviour detection.
 //!

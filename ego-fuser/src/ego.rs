@@ -636,7 +636,7 @@ struct Aligned<'a> {
 
 impl Aligned<'_> {
     /// True for a map of a neighbour whose boxes are newer by more than [`MAP_LAG_NANOS`]. Older boxes are read beside a
-    /// newer map: their tracks carry them to the time of the frame.
+    /// newer map: they are carried to the time of the frame by their velocities.
     fn is_outdated_beside(&self, all: &[Self]) -> bool {
         let is_map = |one: &Self| matches!(one.view.content, Content::Features(_));
         is_map(self)

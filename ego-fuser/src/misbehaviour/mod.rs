@@ -456,8 +456,7 @@ mod tests {
         ));
     }
     #[test]
-    fn map_and_boxes_of_a_neighbour_are_judged_together_and_each_compared_with_its_own_last_message()
-     {
+    fn map_and_boxes_are_judged_together_each_against_its_own_last_message() {
         let mut detector = detector();
         let mut trust = MisbehaviourDetector::new(&mut detector).unwrap();
         let own = view("a", HERE, Method::MAX, 0.0);
