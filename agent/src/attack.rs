@@ -131,10 +131,15 @@ impl Attack {
         }
     }
 
-    /// Stores another vehicle's messages, for [`Falsification::Copied`].
+    /// Stores another vehicle's messages, for [`Falsification::Copied`]; of what it did not send the last stay.
     pub fn capture(&mut self, captured: CapturedMessages) {
         if self.falsification == Falsification::Copied {
-            self.captured = captured;
+            let last = std::mem::take(&mut self.captured);
+            self.captured = CapturedMessages {
+                features: captured.features.or(last.features),
+                detections: captured.detections.or(last.detections),
+                points: captured.points.or(last.points),
+            };
         }
     }
 
@@ -441,7 +446,12 @@ mod tests {
         };
         attack.capture(captured);
         assert_eq!(attack.perception(truth()).features, later().features);
+        // Boxes of the other were never received: the own first ones stay.
+        let mut moved = truth();
+        moved.detections.clear();
+        assert_eq!(attack.perception(moved).detections, truth().detections);
     }
+
     #[test]
     fn a_flood_is_a_thousand_objects_of_the_highest_score() {
         let invented = |falsification| {

@@ -317,11 +317,27 @@ impl ProcessConfig for AgentConfig {
             false => self.models.validate()?,
         }
         self.settings.validate()?;
+        self.settings
+            .check_attack(&self.options().of_loop.publish)?;
         self.bus.validate()
     }
 }
 
 impl AgentSettings {
+    /// Checks that an attack has something to falsify among the streams that are sent.
+    ///
+    /// # Errors
+    /// [`FieldError`] when it has nothing.
+    pub fn check_attack(&self, sent: &[Stream]) -> Result<(), FieldError> {
+        match self.falsification {
+            Some(attack @ Falsification::FalseVelocity) if !sent.contains(&Stream::Boxes) => {
+                let rule = "needs boxes, which state velocities: the vehicle sends none";
+                Err(FieldError::new("agents.falsification", attack.name(), rule))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Streams that the vehicle publishes where a method needs `needed`, in this order.
     pub fn sent_for(&self, needed: Stream) -> Vec<Stream> {
         match (needed, self.boxes) {

@@ -93,10 +93,10 @@ pub struct EgoSettings {
     /// Leave out neighbours whose messages contradict what the ego perceives itself.
     #[arg(long)]
     pub trust: bool,
-    /// Carry the boxes of neighbours from their capture time to that of the ego's frame, by the velocities of their tracks
-    /// (`late`; boxes as an input of other methods always are).
+    /// Align the boxes of neighbours (`late`; boxes as an input of other methods always are): carried to the time of the
+    /// ego's frame by the velocities of their tracks, at a pose that the ego corrects by the boxes that it detects, too.
     #[arg(long)]
-    pub latency_compensation: bool,
+    pub box_alignment: bool,
     /// Track the detected objects, and publish their identities and velocities (stream `tracks`).
     #[arg(long)]
     pub tracks: bool,
@@ -128,7 +128,7 @@ impl Default for EgoSettings {
             max_age_ms: 150,
             pace: PaceMode::Auto,
             trust: false,
-            latency_compensation: false,
+            box_alignment: false,
             tracks: true,
             inbox: InboxConfig::default(),
         }

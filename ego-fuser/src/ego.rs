@@ -23,9 +23,9 @@ use support::stage_times::StageTimes;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use self::box_correction::{boxes_in, corrected};
-use self::latency_compensation::LatencyCompensation;
+use self::latency_compensation::{LatencyCompensation, probability_carried_right};
 use crate::misbehaviour::{Assessment, MisbehaviourDetector};
-use fusion::box_input::{MAX_BOXES, PlacedBox, placed};
+use fusion::box_input::{PlacedBox, placed};
 use fusion::f64_tensor;
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
@@ -39,6 +39,9 @@ pub use error::EgoError;
 /// Lag of a neighbour's newest map behind its newest boxes beyond which the boxes alone are fused, nanoseconds: at 10 Hz
 /// one sweep.
 const MAP_LAG_NANOS: i64 = 100_000_000;
+/// Boxes of one sender that are read beyond the number that the ego detects itself, so that no flood of them outweighs the
+/// ego's own. On validation scenes a sender has at most 6 more.
+const MORE_BOXES: usize = 32;
 
 /// Reason why a neighbour is not in a result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -156,9 +159,10 @@ impl Ego {
         Ok(self)
     }
 
-    /// The same with latency compensation, if it is enabled: boxes of neighbours are carried to the time of the ego's frame
-    /// by their velocities. Where the weights have a box input they always are.
-    pub fn with_latency_compensation(mut self, is_enabled: bool) -> Self {
+    /// The same with box alignment, if it is enabled: boxes of neighbours are carried to the time of the ego's frame by
+    /// their velocities, and placed by a pose that is corrected by the boxes that the ego detects, too. Where the weights
+    /// have a box input they always are.
+    pub fn with_box_alignment(mut self, is_enabled: bool) -> Self {
         if is_enabled {
             self.compensation = Some(LatencyCompensation::default());
         }
@@ -269,14 +273,17 @@ impl Ego {
             chosen.leave_out(&is_out, DropReason::Misbehaviour);
             stages.lap("trust");
         }
-        if self.reads_boxes() {
-            no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
+        let mut own_boxes = 0;
+        if self.compensation.is_some() {
+            own_boxes = no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
         }
         let aligned = &chosen.aligned;
         let detections = no_grad(|| match needed {
             Exchange::Boxes => Ok(self.merge_boxes(aligned, &mut stages)),
             Exchange::Points => self.merge_points(aligned, &mut stages),
-            Exchange::Features | Exchange::Nothing => self.merge_features(aligned, &mut stages),
+            Exchange::Features | Exchange::Nothing => {
+                self.merge_features(aligned, own_boxes, &mut stages)
+            }
         })?;
         Ok(EgoOutput {
             detections,
@@ -366,39 +373,41 @@ impl Ego {
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
 
-    /// Corrects the poses at which neighbours' boxes are placed by those that the ego detects itself. Their maps keep the
-    /// stated pose.
+    /// Corrects the poses at which neighbours' boxes are placed by those that the ego detects itself, and returns their
+    /// number. Maps keep the stated pose.
     fn correct_poses_of_boxes(
         &self,
         aligned: &mut [Aligned<'_>],
         stages: &mut StageTimes,
-    ) -> Result<(), EgoError> {
-        let Content::Features(own) = &aligned[0].view.content else {
-            return Ok(());
-        };
+    ) -> Result<usize, EgoError> {
         let has_boxes = |one: &Aligned<'_>| !one.view.content.objects().is_empty();
         if !aligned[1..].iter().any(has_boxes) {
-            return Ok(());
+            return Ok(0);
         }
-        let own = boxes_in(&self.tensors(own, true)?.0, &self.detector)?;
+        let own = match &aligned[0].view.content {
+            Content::Features(map) => boxes_in(&self.tensors(map, true)?.0, &self.detector)?,
+            own => own.detections().cloned().collect(),
+        };
         for sender in &mut aligned[1..] {
             let received: Vec<Detection> = sender.view.content.detections().cloned().collect();
             sender.ego_from_cav = corrected(sender.ego_from_cav, &received, &own);
         }
         stages.lap("correct");
-        Ok(())
+        Ok(own.len())
     }
 
     /// Intermediate fusion, and ego-only detection; boxes of neighbours change the output of the head.
     fn merge_features(
         &mut self,
         all: &[Aligned<'_>],
+        own_boxes: usize,
         stages: &mut StageTimes,
     ) -> Result<Vec<Detection>, EgoError> {
+        let most = own_boxes + MORE_BOXES;
         let boxes: Vec<PlacedBox> = (1..all.len())
-            .flat_map(|sender| all[sender].boxes(sender, all[0].view))
+            .flat_map(|sender| all[sender].boxes(sender, all[0].view, most))
             .collect();
-        self.name_senders_over_limit(all);
+        self.name_senders_over_limit(all, most);
         let has_map = |view: &&Aligned<'_>| matches!(view.view.content, Content::Features(_));
         let aligned: Vec<Aligned<'_>> = all.iter().filter(has_map).copied().collect();
         let aligned = aligned.as_slice();
@@ -450,11 +459,11 @@ impl Ego {
     }
 
     /// Names each sender of more boxes than are read, once.
-    fn name_senders_over_limit(&mut self, all: &[Aligned<'_>]) {
+    fn name_senders_over_limit(&mut self, all: &[Aligned<'_>], most: usize) {
         for Aligned { view, .. } in all {
             let boxes = view.content.objects().len();
-            if boxes > MAX_BOXES && self.over_limit.insert(view.cav.clone()) {
-                tracing::warn!(cav = %view.cav, boxes, "more than {MAX_BOXES} boxes: those of the lowest scores are left out");
+            if boxes > most && self.over_limit.insert(view.cav.clone()) {
+                tracing::warn!(cav = %view.cav, boxes, "more than {most} boxes: those of the lowest scores are left out");
             }
         }
     }
@@ -544,14 +553,20 @@ impl Ego {
     fn merge_boxes(&self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Vec<Detection> {
         let decoded: Vec<(Vec<Decoded>, Isometry3<f64>)> = (aligned.iter())
             .map(|Aligned { view, ego_from_cav }| {
-                let found = { view.content.detections() }
-                    .filter(|found| found.score > self.limits.score_threshold);
-                let boxes = found.map(|found| Decoded {
-                    anchor: 0,
-                    score: found.score,
-                    box3d: found.box3d,
+                let age_s = view.age_nanos(aligned[0].view) as f64 * 1e-9;
+                let boxes = view.content.objects().iter().map(|object| {
+                    let right = match &self.compensation {
+                        Some(_) => probability_carried_right(object, age_s),
+                        None => 1.0,
+                    };
+                    Decoded {
+                        anchor: 0,
+                        score: object.detection.score * right as f32,
+                        box3d: object.detection.box3d,
+                    }
                 });
-                (boxes.collect(), ego_from_cav.isometry())
+                let found = boxes.filter(|found| found.score > self.limits.score_threshold);
+                (found.collect(), ego_from_cav.isometry())
             })
             .collect();
         let boxes: Vec<AgentBoxes<'_>> = (decoded.iter())
@@ -646,8 +661,8 @@ impl Aligned<'_> {
             })
     }
 
-    /// Its boxes, if it has sent boxes; `sender` is its number.
-    fn boxes(&self, sender: usize, ego: &View) -> Vec<PlacedBox> {
+    /// Its best boxes, at most as many, if it has sent boxes; `sender` is its number.
+    fn boxes(&self, sender: usize, ego: &View, most: usize) -> Vec<PlacedBox> {
         let MapMetadata {
             ego_from_cav,
             confidence,
@@ -655,7 +670,9 @@ impl Aligned<'_> {
             ..
         } = self.metadata(0, ego);
         let found = self.view.content.detections();
-        placed(found, &ego_from_cav, sender, age_secs, confidence)
+        let mut boxes = placed(found, &ego_from_cav, sender, age_secs, confidence);
+        boxes.truncate(most);
+        boxes
     }
 
     fn metadata(&self, agent: usize, ego: &View) -> MapMetadata {

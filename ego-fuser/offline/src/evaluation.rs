@@ -88,7 +88,7 @@ impl Evaluator {
         let weights = Weights::load(&setup.models.weights)?.with_precision(setup.models.precision);
         let ego = Ego::from_weights(&weights, setup.method, Device::Cpu)?;
         let ego = ego
-            .with_latency_compensation(setup.ego.latency_compensation)
+            .with_box_alignment(setup.ego.box_alignment)
             .with_misbehaviour_detection(setup.ego.trust)?;
         let area = ego.detector().config();
         let rule = setup.protocol.as_ref().map_or_else(

@@ -74,7 +74,7 @@ pub(super) fn build(config: &EgoConfig) -> anyhow::Result<(CavId, Ego)> {
     let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
     let ego = ego
         .with_comm_range(config.comm_range_m)
-        .with_latency_compensation(config.ego.latency_compensation)
+        .with_box_alignment(config.ego.box_alignment)
         .with_misbehaviour_detection(config.ego.trust)?;
     Ok((cav, ego))
 }

@@ -202,19 +202,28 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
         ahead,
         vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)],
     );
-    let output = Ego::new(detector(), Method::LATE)
-        .unwrap()
-        .detect(&own, &[other])
-        .unwrap();
-    let seen: Vec<_> = (output.detections.iter())
-        .map(|found| {
-            (
-                found.box3d.center_m[0].round(),
-                found.source.as_ref().unwrap().as_str(),
-            )
-        })
-        .collect();
-    assert_eq!(seen, [(5.0, "b"), (-6.0, "b")]);
+    let seen = |is_aligned, other: &View| -> Vec<(f64, String)> {
+        let ego = Ego::new(detector(), Method::LATE).unwrap();
+        let mut ego = ego.with_box_alignment(is_aligned);
+        let output = ego.detect(&own, std::slice::from_ref(other)).unwrap();
+        let place = |found: &Detection| {
+            let source = found.source.as_ref().unwrap();
+            (found.box3d.center_m[0].round(), source.as_str().to_owned())
+        };
+        output.detections.iter().map(place).collect()
+    };
+    let box_of = |x: f64, cav: &str| (x, cav.to_owned());
+    for is_aligned in [false, true] {
+        let expected = [box_of(5.0, "b"), box_of(-6.0, "b")];
+        assert_eq!(seen(is_aligned, &other), expected);
+    }
+    // Aligned, a late box whose velocity nobody knows does not replace the ego's own.
+    let late = View {
+        capture_nanos: NOW - 400_000_000,
+        ..other
+    };
+    assert_eq!(seen(false, &late)[0], box_of(5.0, "b"));
+    assert_eq!(seen(true, &late), [box_of(5.0, "a")]);
 }
 
 #[test]
@@ -705,6 +714,43 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
         );
         assert_eq!(from_boxes.detections, detect(true, &[&boxes]).detections);
     }
+}
+
+#[test]
+fn of_a_flood_as_many_boxes_are_read_as_the_ego_detects_and_a_few_more() {
+    let [_, mut ego] = egos_of_files(Method::MAX);
+    let own = view("a", HERE, Method::MAX, 0.0);
+    let Content::Features(map) = &own.content else {
+        panic!("{own:?}")
+    };
+    let seen = boxes_in(&ego.tensors(map, true).unwrap().0, &ego.detector).unwrap();
+    let car = |number: u16| {
+        let [x, y] = [number % 16, number / 16 % 16].map(f64::from);
+        PerceivedObject::from(Detection {
+            box3d: protocol::Box3d {
+                center_m: [x - 8.0, y - 8.0, -1.0],
+                size_m: [4.0, 1.8, 1.6],
+                heading_rad: 0.4,
+            },
+            score: 1.0 - f32::from(number) / 2000.0,
+            source: None,
+        })
+    };
+    let mut detect = |count: u16| {
+        let sender = View {
+            cav: CavId::new("b").unwrap(),
+            content: Content::Boxes((0..count).map(car).collect()),
+            ..own.clone()
+        };
+        ego.forget();
+        let detections = ego.detect(&own, &[sender]).unwrap().detections;
+        (detections, ego.over_limit.len())
+    };
+    let most = u16::try_from(seen.len() + MORE_BOXES).unwrap();
+    let (read, named) = detect(most);
+    assert_eq!(named, 0);
+    assert_ne!(detect(16).0, read);
+    assert_eq!(detect(1000), (read, 1));
 }
 
 #[test]

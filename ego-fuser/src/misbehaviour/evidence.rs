@@ -2,8 +2,8 @@
 //!
 //! The weights are logarithms of the relative frequencies of such messages among honest neighbours and each type of
 //! attacker on the validation scenes (seed 910: 591 messages of honest neighbours, as many of each type of attack, maps
-//! and boxes of `max`), rounded. Attacks differ, and evidence against one is no evidence against another, so the
-//! strongest evidence counts.
+//! and boxes of `max`; 304 messages of boxes beside an own map), rounded. Attacks differ, and evidence against one is no
+//! evidence against another, so the strongest evidence counts.
 
 use nalgebra::{Isometry2, Point2};
 use protocol::MisbehaviourReason;
@@ -67,6 +67,8 @@ pub(super) struct Evidence {
     pub(super) is_blind: bool,
     /// True if all this is derived from boxes, which do not distinguish empty places from uncertain ones.
     pub(super) boxes_only: bool,
+    /// True for boxes that are judged by an own map, which has to agree with them in any case.
+    pub(super) beside_map: bool,
 }
 
 impl Evidence {
@@ -84,6 +86,7 @@ impl Evidence {
             it_sees_ego: theirs.sure_at(cav_from_ego.translation.vector.into(), radius_m),
             distance_m: ego_from_cav.translation.vector.norm(),
             boxes_only: own.is_boxes() || theirs.is_boxes(),
+            beside_map: !own.is_boxes() && theirs.is_boxes(),
             is_blind: theirs.is_blind && !own.vehicles.is_empty(),
             ..Self::default()
         };
@@ -164,10 +167,13 @@ impl Evidence {
             false => &[0.0, -0.6, -3.6, -5.0],
             // The nearer the two are, the more the areas that only one of them observes.
             true if self.distance_m < 30.0 => &[0.0, 0.0, -0.5, -3.0, -5.0],
+            // One object that the ego does not detect leaves none out that is right otherwise.
+            true if self.beside_map => &[0.0, -0.6, -4.0],
             true => &[0.0, -1.0, -4.0],
         };
         // Further away an honest neighbour may detect some objects that the ego does not, but few.
-        let enough = match (self.boxes_only, self.contradicted > 0) {
+        let unconfirmed = self.boxes_only && !self.beside_map;
+        let enough = match (unconfirmed, self.contradicted > 0) {
             (false, false) => 6,
             (false, true) | (true, false) => 3,
             (true, true) => 2,

@@ -46,7 +46,7 @@ const OF_ONE_TABLE: [&str; 20] = [
     "trust",
     "boxes",
     "neighbour_weights",
-    "latency_compensation",
+    "box_alignment",
     "feature_maps",
     "frames",
     "scenarios",
@@ -132,9 +132,9 @@ pub(crate) struct Arguments {
     /// Misbehaviour detection: excludes neighbours whose messages contradict the ego's own detections.
     #[arg(long)]
     trust: bool,
-    /// Latency compensation: the ego carries neighbours' boxes to the time of its frame.
+    /// Box alignment: the ego carries neighbours' boxes to the time of its frame and corrects their poses.
     #[arg(long)]
-    latency_compensation: bool,
+    box_alignment: bool,
     /// Keep the feature maps of the encoder in this folder, so that each is computed once for many evaluations.
     #[arg(long, value_name = "DIR")]
     feature_maps: Option<PathBuf>,
@@ -275,8 +275,8 @@ impl Arguments {
             "--boxes is for methods that exchange feature maps: METHODS does not"
         } else if self.neighbour_weights.is_some() && !messages {
             "--neighbour-weights is for messages of neighbours: METHODS receives none"
-        } else if self.latency_compensation && !boxes {
-            "--latency-compensation is for boxes of neighbours: METHODS receives none"
+        } else if self.box_alignment && !boxes {
+            "--box-alignment is for boxes of neighbours: METHODS receives none"
         } else if self.attack == Some(Falsification::FalseVelocity) && !boxes {
             "--attack false_velocity is for boxes of neighbours: METHODS receives none"
         } else if listens && !messages {
@@ -326,7 +326,7 @@ impl Arguments {
             deadline_ms: self.deadline_ms.unwrap_or(defaults.deadline_ms),
             max_age_ms: self.max_age_ms.unwrap_or(defaults.max_age_ms),
             trust: self.trust,
-            latency_compensation: self.latency_compensation,
+            box_alignment: self.box_alignment,
             ..defaults
         };
         ego.validate().map_err(BadInput::of)?;

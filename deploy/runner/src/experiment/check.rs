@@ -137,6 +137,8 @@ pub(super) fn check_scenes<'a>(
 /// Checks every axis on its own.
 fn axes(grid: &Grid) -> Result<(), String> {
     values("grid.method", Some(&grid.method), |_| Ok(()))?;
+    let all = [&grid.method[..], &grid.reference].concat();
+    values("grid.method with grid.reference", Some(&all), |_| Ok(()))?;
     values("grid.codec", grid.codec.as_ref(), codec)?;
     numbers("grid.latency_ms", &grid.latency_ms, 0.0, 600_000.0)?;
     numbers("grid.jitter_ms", &grid.jitter_ms, 0.0, 600_000.0)?;

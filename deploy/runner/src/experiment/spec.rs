@@ -117,6 +117,9 @@ pub struct Grid {
     /// Encodings of feature maps.
     #[serde(default)]
     pub codec: Option<Vec<CodecSpec>>,
+    /// Further methods, for comparison: with the first encoding only.
+    #[serde(default)]
+    pub reference: Vec<Method>,
     /// Mean delay after the last bit was sent, milliseconds.
     #[serde(default)]
     pub latency_ms: Option<Vec<f64>>,
@@ -238,9 +241,9 @@ pub struct Row {
     /// Weights of neighbours with a network of their own. Absent: that of the row.
     #[serde(default)]
     pub neighbour_weights: Option<PathBuf>,
-    /// Latency compensation of the ego.
+    /// Box alignment of the ego.
     #[serde(default)]
-    pub latency_compensation: bool,
+    pub box_alignment: bool,
 }
 
 /// Conditions of a column.

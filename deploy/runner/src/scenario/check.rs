@@ -47,8 +47,11 @@ impl Scenario {
         }
         scene.validate()?;
         self.ego.validate()?;
-        self.settings()
-            .try_for_each(|settings| settings.validate())?;
+        let needed = self.method.exchange().stream();
+        self.settings().try_for_each(|settings| {
+            settings.validate()?;
+            settings.check_attack(&settings.sent_for(needed))
+        })?;
         self.record
             .as_ref()
             .map_or(Ok(()), |record| record.validate())

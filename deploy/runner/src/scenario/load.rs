@@ -338,6 +338,10 @@ mod tests {
             ),
             ("scene: {dir: .}\nstepped: {}", "stepped is given"),
             (
+                "scene: {dir: .}\nvehicles: {a: {falsification: false_velocity}}",
+                "agents.falsification is false_velocity: needs boxes",
+            ),
+            (
                 "scene: {dir: .}\nclock: stepped\nstepped: {compute: {pose_ms: -1, map_ms: 0, fuse_ms: 0}}",
                 "pose_ms is -1",
             ),

@@ -20,7 +20,7 @@ use protocol::{BevGrid, Box3d};
 use tch::nn::{self, Module};
 use tch::{Kind, Result, Tensor};
 
-pub use placed::{MAX_BOXES, PlacedBox, placed};
+pub use placed::{PlacedBox, placed};
 
 use self::cells::{BoxCells, VALUES};
 use crate::layers::BARE;

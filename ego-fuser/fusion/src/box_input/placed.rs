@@ -5,9 +5,6 @@ use std::collections::BTreeMap;
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Detection, Pose};
 
-/// Boxes of one sender that are read at most, so that none takes long or crowds out the others.
-pub const MAX_BOXES: usize = 128;
-
 /// A neighbour's box in the frame of the ego.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlacedBox {
@@ -29,8 +26,7 @@ impl PlacedBox {
     }
 }
 
-/// The detections of a sender in the frame of the ego, at most [`MAX_BOXES`], those of the highest scores; `pose_confidence`
-/// is that of its pose.
+/// The detections of a sender in the frame of the ego, the highest score first; `pose_confidence` is that of its pose.
 pub fn placed<'a>(
     detections: impl Iterator<Item = &'a Detection>,
     ego_from_cav: &Pose,
@@ -48,7 +44,6 @@ pub fn placed<'a>(
     };
     let mut boxes: Vec<PlacedBox> = detections.map(place).collect();
     boxes.sort_by(|a, b| b.score.total_cmp(&a.score));
-    boxes.truncate(MAX_BOXES);
     boxes
 }
 
@@ -108,34 +103,22 @@ mod tests {
     }
 
     #[test]
-    fn of_too_many_boxes_the_least_confident_are_left_out() {
-        let many = (0..300_u16).map(|n| Detection {
-            box3d: car(0, 4.0, 0.8).box3d,
-            score: f32::from(n) / 300.0,
-            source: None,
-        });
-        let kept = placed(
-            many.collect::<Vec<_>>().iter(),
-            &Pose::IDENTITY,
-            1,
-            0.0,
-            1.0,
-        );
-        assert_eq!(kept.len(), MAX_BOXES);
-        assert!(kept.iter().all(|placed| placed.score * 300.0 > 171.5));
-    }
-
-    #[test]
     fn boxes_are_placed_by_the_pose_of_their_sender() {
         let detection = Detection {
             box3d: car(0, 4.0, 0.8).box3d,
             score: 0.8,
             source: None,
         };
-        let pose = Pose::from_xyz_yaw([1.0, 2.0, 0.0], FRAC_PI_2);
-        let [placed] = placed([&detection].into_iter(), &pose, 3, 0.2, 0.5)[..] else {
-            panic!("one box");
+        let best = Detection {
+            score: 0.9,
+            ..detection.clone()
         };
+        let pose = Pose::from_xyz_yaw([1.0, 2.0, 0.0], FRAC_PI_2);
+        let both = [&detection, &best].into_iter();
+        let [first, placed] = placed(both, &pose, 3, 0.2, 0.5)[..] else {
+            panic!("two boxes");
+        };
+        assert!(first.score > placed.score);
         let [x, y, _] = placed.box3d.center_m;
         assert!((x - 1.0).abs() < 1e-9 && (y - 6.0).abs() < 1e-9);
         assert!((placed.box3d.heading_rad - FRAC_PI_2).abs() < 1e-9);

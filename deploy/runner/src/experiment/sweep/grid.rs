@@ -41,9 +41,12 @@ pub struct Point {
 
 /// Number of values of each axis.
 pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
-    vec![
-        ("method", grid.method.len()),
-        ("codec", grid.codec.as_ref().map_or(1, Vec::len)),
+    let (methods, codecs) = (grid.method.len(), grid.codec.as_ref().map_or(1, Vec::len));
+    let mut sizes = match grid.reference.len() {
+        0 => vec![("method", methods), ("codec", codecs)],
+        others => vec![("method with codec", methods * codecs + others)],
+    };
+    sizes.extend([
         ("latency_ms", grid.latency_ms.as_ref().map_or(1, Vec::len)),
         ("jitter_ms", grid.jitter_ms.as_ref().map_or(1, Vec::len)),
         (
@@ -54,7 +57,8 @@ pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
         ("pose_noise", grid.pose_noise.as_ref().map_or(1, Vec::len)),
         ("vehicles", grid.vehicles.as_ref().map_or(1, Vec::len)),
         ("seed", grid.seed.as_ref().map_or(1, Vec::len)),
-    ]
+    ]);
+    sizes
 }
 
 /// Number of points of the grid.
@@ -71,7 +75,7 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
         dtype: experiment.dtype,
         ..CodecSpec::default()
     };
-    let methods = grid.method.iter().map(|&method| Point {
+    let point = |&method: &Method| Point {
         method,
         codec,
         latency_ms: None,
@@ -81,10 +85,14 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
         pose_noise: None,
         vehicles: None,
         seed: 0,
-    });
-    let points = spread(methods.collect(), &grid.codec, |point, codec| {
-        point.codec = codec
-    });
+    };
+    let of = |methods: &[Method], codecs: &Option<Vec<CodecSpec>>| {
+        let points = methods.iter().map(point).collect();
+        spread(points, codecs, |point, codec| point.codec = codec)
+    };
+    let first = { grid.codec.as_ref() }.map(|codecs| codecs.iter().take(1).copied().collect());
+    let mut points = of(&grid.method, &grid.codec);
+    points.extend(of(&grid.reference, &first));
     let points = spread(points, &grid.latency_ms, |point, ms| {
         point.latency_ms = Some(ms)
     });
@@ -240,6 +248,17 @@ mod tests {
             (points[11].method, points[11].latency_ms, points[11].seed),
             (Method::LATE, Some(100.0), 3)
         );
+    }
+
+    #[test]
+    fn methods_for_comparison_have_the_first_codec_alone() {
+        let codecs = "[{dtype: i8}, {dtype: i8, keep: 0.1}]";
+        let grid = format!("{{method: [max], reference: [late], codec: {codecs}, loss: [0, 0.5]}}");
+        let grid = experiment(&grid);
+        let points = points(&grid);
+        assert_eq!((points.len(), count(&grid.grid)), (6, 6));
+        assert!(points[4..].iter().all(|point| point.method == Method::LATE));
+        assert!(points[4..].iter().all(|point| point.codec.keep.is_none()));
     }
 
     #[test]

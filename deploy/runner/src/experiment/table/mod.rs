@@ -184,7 +184,7 @@ impl Run<'_> {
         setup.pool = row.vehicles.map_or(AgentPool::All, AgentPool::First);
         setup.agents.boxes = row.boxes;
         setup.agents.weights.clone_from(&row.neighbour_weights);
-        setup.ego.latency_compensation |= row.latency_compensation;
+        setup.ego.box_alignment |= row.box_alignment;
         setup.delay_ms = column.delay_ms;
         setup.attack = column.attack;
         setup.ego.trust |= column.trust;

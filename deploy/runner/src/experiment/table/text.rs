@@ -232,7 +232,7 @@ mod tests {
                 vehicles: None,
                 neighbour_weights: None,
                 boxes: None,
-                latency_compensation: false,
+                box_alignment: false,
             },
             cells: columns
                 .iter()
