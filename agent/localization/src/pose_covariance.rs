@@ -49,7 +49,7 @@ mod tests {
     use super::*;
     use crate::covariance_scale::CovarianceScale;
     use crate::pgc::pose_solver::PoseSolver;
-    use crate::pgc::synthetic::SyntheticScene;
+    use crate::pgc::test_scene::SyntheticScene;
 
     fn found() -> FoundPose {
         let coordinates = SyntheticScene::default().coordinates(1);

@@ -132,18 +132,24 @@ impl Followed {
         &self.objects
     }
 
-    /// Takes the stated tracks but for those whose velocity the ego's own contradicts.
+    /// Takes the stated tracks. Where the ego's own contradict most of them, its own stay: a single one is rather a box that
+    /// the ego has taken for another one after a lost message.
     fn take_stated(&mut self, cav: &CavId, sent: &[PerceivedObject]) {
-        let mut contradicted = 0_usize;
-        for (object, sent) in self.objects.iter_mut().zip(sent) {
-            match (&object.track, &sent.track) {
-                (Some(own), Some(stated)) if is_contradicted(stated, own) => contradicted += 1,
-                (_, Some(stated)) => object.track = Some(*stated),
-                (_, None) => {}
+        let pairs = { self.objects.iter() }.zip(sent);
+        let compared =
+            pairs.filter_map(|(object, sent)| sent.track.as_ref().zip(object.track.as_ref()));
+        let verdicts: Vec<bool> = compared
+            .map(|(stated, own)| is_contradicted(stated, own))
+            .collect();
+        let contradicted = verdicts.iter().filter(|is_so| **is_so).count();
+        if 2 * contradicted > verdicts.len() {
+            if !std::mem::replace(&mut self.is_contradicted, true) {
+                tracing::warn!(%cav, contradicted, of = verdicts.len(), "states velocities that its boxes contradict: the ego takes its own");
             }
+            return;
         }
-        if contradicted > 0 && !std::mem::replace(&mut self.is_contradicted, true) {
-            tracing::warn!(%cav, contradicted, boxes = sent.len(), "states velocities that its boxes contradict: the ego takes its own");
+        for (object, sent) in self.objects.iter_mut().zip(sent) {
+            object.track = sent.track.or(object.track);
         }
     }
 }

@@ -30,7 +30,7 @@ mod residual_group;
 mod scene_coordinates;
 pub(crate) mod scene_encoder;
 pub(crate) mod scene_regression;
-pub mod synthetic;
+pub mod test_scene;
 pub(crate) mod voxel_batch;
 pub(crate) mod voxelise;
 pub mod wrong_place;

@@ -174,7 +174,7 @@ fn first_std(coordinates: &SceneCoordinates, registration: &Registration) -> Pos
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pgc::synthetic::SyntheticScene;
+    use crate::pgc::test_scene::SyntheticScene;
     use crate::registration::ransac::{RansacConfig, solve};
 
     fn evidence(scene: &SyntheticScene) -> PoseEvidence {

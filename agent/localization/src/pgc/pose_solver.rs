@@ -207,7 +207,7 @@ pub fn estimate(solved: &Solved) -> PoseEstimate {
 mod tests {
     use super::*;
     use crate::pgc::confidence::ConfidenceModel;
-    use crate::pgc::synthetic::SyntheticScene;
+    use crate::pgc::test_scene::SyntheticScene;
 
     #[test]
     fn a_sweep_is_localized_far_from_the_origin_of_the_world() {

@@ -205,7 +205,7 @@ mod tests {
     use protocol::{CavId, EgoMotion, PointCloud, Pose};
 
     use super::*;
-    use crate::pgc::synthetic::SyntheticScene;
+    use crate::pgc::test_scene::SyntheticScene;
     use crate::pgc::{Localization, LocalizerError, LocalizerInput, stopwatch};
 
     fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {

@@ -289,7 +289,7 @@ fn outcome(estimate: &PoseEstimate) -> &'static str {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use localization::pgc::synthetic::SyntheticScene;
+    use localization::pgc::test_scene::SyntheticScene;
     use protocol::PointCloud;
 
     /// Sweeps of a scene of increasing difficulty; every tenth is empty.

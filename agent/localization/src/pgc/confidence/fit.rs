@@ -221,7 +221,7 @@ fn non_negative_regression(rows: &[[f64; FEATURES]], targets: &[f64]) -> (f64, [
 mod tests {
     use super::*;
     use crate::pgc::pose_solver::PoseSolver;
-    use crate::pgc::synthetic::SyntheticScene;
+    use crate::pgc::test_scene::SyntheticScene;
     use crate::statistics::spearman;
 
     /// Sweeps of a scene in which some places are hard and a few impossible to localize.

@@ -141,7 +141,7 @@ fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
 mod tests {
     use super::*;
     use crate::pgc::pose_solver::PoseSolver;
-    use crate::pgc::synthetic::SyntheticScene;
+    use crate::pgc::test_scene::SyntheticScene;
 
     #[test]
     fn sigma_decreases_with_evidence_against_a_pose() {

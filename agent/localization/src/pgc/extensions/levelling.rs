@@ -79,7 +79,7 @@ fn step(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pgc::synthetic::SyntheticScene;
+    use crate::pgc::test_scene::SyntheticScene;
 
     #[test]
     fn height_and_tilt_are_found_and_the_plane_is_left_alone() {
