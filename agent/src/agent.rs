@@ -5,15 +5,13 @@
 use std::time::{Duration, Instant};
 
 use protocol::{
-    BevFeatures, Boxes, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, Gnss,
-    PointCloud, Pose, PoseEstimate, StageTiming, WireError,
+    Boxes, CavId, Detection, EgoMotion, Gnss, PointCloud, Pose, PoseEstimate, StageTiming,
 };
 use support::stage_times::StageTimes;
 use tch::Tensor;
 
 use crate::agent_output::{AgentOutput, Perception};
 use crate::attack::{Attack, CapturedMessages};
-use crate::rate::{RateConfig, RateControl};
 use localization::pose_source::{PoseInput, PoseSource};
 use localization::tracker::PoseMeasurement;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
@@ -56,10 +54,11 @@ pub struct Agent {
     cav: CavId,
     pose_source: Box<dyn PoseSource>,
     detector: Option<Detector>,
-    rate: RateControl,
     object_tracker: Tracker,
     /// Falsifies everything that is published.
     attack: Option<Attack>,
+    /// Feature map of the next sweep, where it was computed before.
+    known_map: Option<Tensor>,
     has_head: bool,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
@@ -82,18 +81,12 @@ impl Agent {
             cav,
             pose_source,
             detector: None,
-            rate: RateControl::default(),
             object_tracker: Tracker::default(),
             attack: None,
+            known_map: None,
             has_head: true,
             shares_encoder: false,
         }
-    }
-
-    /// The same with feature maps that keep within `rate`, applied by [`Self::write_map`].
-    pub fn with_rate(mut self, rate: RateConfig) -> Self {
-        self.rate = RateControl::new(rate);
-        self
     }
 
     /// The same with an attack on everything that it publishes.
@@ -101,11 +94,22 @@ impl Agent {
         Self { attack, ..self }
     }
 
-    /// Passes on the last messages of another vehicle, which an attack may replay.
-    pub fn capture(&mut self, captured: impl FnOnce() -> CapturedMessages) {
+    /// Gives the feature map `[1, C, H, W]` of the next sweep as its encoder computed it before, and the last messages of
+    /// another vehicle, which an attack may repeat.
+    pub(crate) fn prepare(
+        &mut self,
+        map: Option<Tensor>,
+        captured: impl FnOnce() -> CapturedMessages,
+    ) {
+        self.known_map = map;
         if let Some(attack) = &mut self.attack {
             attack.capture(captured());
         }
+    }
+
+    /// True if it falsifies what it publishes.
+    pub(crate) fn falsifies(&self) -> bool {
+        self.attack.is_some()
     }
 
     /// An agent that computes neither confidence nor detections, for maps that are sent whole.
@@ -142,7 +146,9 @@ impl Agent {
     /// See [`Self::perceive`].
     pub(crate) fn warm_up(&mut self) -> Result<(), DetectorError> {
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
+        // Not `encode_sweep`, which refuses a sweep without points.
         let encoded = detector.encode(&PointCloud::default())?;
+        // Past the attack, which could store this empty map as its own first frame.
         self.own_perception(&encoded.features)?;
         Ok(())
     }
@@ -160,6 +166,7 @@ impl Agent {
             .filter(|_| is_needed)
             .and_then(|detector| detector.encode_sweep(input.cloud).ok());
         let sweep = EncodedSweep { began, encoded };
+        // The encoder's times are those of the perception: the time of the pose begins after it.
         let began = Instant::now();
         let levels = self.levels(&sweep);
         let pose = self
@@ -179,6 +186,10 @@ impl Agent {
         sweep: EncodedSweep,
     ) -> Result<(Perception, EncodedSweep), DetectorError> {
         let EncodedSweep { began, encoded } = sweep;
+        if let Some(map) = self.known_map.take() {
+            let perception = self.perceive_map(&map)?;
+            return Ok((perception, EncodedSweep { began, encoded }));
+        }
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
         let encoded = encoded.map_or_else(|| detector.encode_sweep(cloud), Ok)?;
         let perception = self.perceive_map(&encoded.features)?;
@@ -222,20 +233,8 @@ impl Agent {
         [&[whole][..], self.pose_source.stages()].concat()
     }
 
-    /// The pose of a sweep by itself, without the other steps.
-    pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        let pose = (self.pose_source).estimate(&pose_input(&self.cav, input, None));
-        self.published(pose)
-    }
-
     fn published(&self, pose: PoseEstimate) -> PoseEstimate {
         { self.attack.as_ref() }.map_or(pose, |attack| attack.pose(pose))
-    }
-
-    /// The measurement of a sweep for the poses of later ones by itself. True if it was measured.
-    pub fn observe(&mut self, input: &AgentInput<'_>) -> bool {
-        self.pose_source
-            .observe(&pose_input(&self.cav, input, None))
     }
 
     /// Starts the pose source anew at a pose that a person states, with its standard deviations. False if the source
@@ -247,22 +246,6 @@ impl Agent {
             position_std_m: stated.position_std_m,
             yaw_std_rad: stated.heading_std_rad,
         })
-    }
-
-    /// The feature map as `codec` specifies if there is no queue, or smaller if a limit requires it. A live
-    /// agent does this on its sending thread, with a `RateControl` of its own that measures the queue.
-    ///
-    /// # Errors
-    /// As `RateControl::encode`.
-    pub fn write_map(
-        &mut self,
-        features: BevFeatures,
-        confidence: &[f32],
-        codec: &CodecConfig,
-        capture_nanos: u64,
-    ) -> Result<EncodedFeatures, WireError> {
-        self.rate
-            .encode(features, codec, confidence, capture_nanos, None)
     }
 
     /// The message of a sweep's detections, with the tracks of objects that were detected before.
@@ -353,6 +336,7 @@ impl Agent {
             .map(|candidate| candidate.detection(Some(self.cav.clone())))
             .collect();
         let mut detections = detector.refined(map, detections)?;
+        // The refinement changes scores, so the threshold applies again.
         detections.retain(|detection| detection.score > settings.score_threshold);
         times.lap("boxes");
         Ok((heads.confidence, detections))
@@ -605,7 +589,11 @@ mod tests {
                 (&expected.features, stages(&expected.times))
             );
             // Levels are those of one sweep.
-            agent.observe(&input);
+            let later = EncodedSweep {
+                began: Instant::now(),
+                encoded: None,
+            };
+            agent.observe_encoded(&input, &later);
             assert_eq!(
                 *given.lock().unwrap(),
                 [steps.as_slice(), &[false]].concat()

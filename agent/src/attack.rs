@@ -107,8 +107,10 @@ pub struct Attack {
 impl Attack {
     /// The attack of the vehicle `cav` under `seed`.
     pub fn new(falsification: Falsification, cav: &CavId, seed: u64) -> Self {
+        // The id is part of the seed: several attackers of one run differ.
         let letters: Vec<u64> = cav.as_str().bytes().map(u64::from).collect();
         let mut random = SplitMix64::derived(seed, &letters);
+        // Drawn first: the offset depends on id and seed alone, whatever the falsification.
         let (distance_m, direction) = (
             random.between(5.0, 30.0),
             random.between(0.0, std::f64::consts::TAU),
@@ -182,6 +184,7 @@ impl Attack {
                     .captured
                     .features
                     .get_or_insert_with(|| falsified.features.clone());
+                // A map of another size would not be well-formed: the own one is sent then.
                 if features.values.len() == falsified.features.values.len() {
                     falsified.features = features.clone();
                 }
@@ -212,13 +215,14 @@ impl Attack {
         }
         let track = ObjectTrack {
             id: 1,
+            // The offset of a shifted pose, 5 to 30 m, serves as the velocity too.
             velocity_mps: self.offset_m.map(|per_second| per_second as f32),
             position_covariance: [0.0; 3],
             velocity_covariance: [0.0; 3],
         };
         let mut objects = truth.objects().to_vec();
-        for object in &mut objects {
-            object.track = Some(track);
+        for (object, id) in objects.iter_mut().zip(1..) {
+            object.track = Some(ObjectTrack { id, ..track });
         }
         Boxes::new(truth.pose, &objects)
     }
@@ -230,6 +234,7 @@ impl Attack {
             Falsification::Noise => {
                 let random = &mut self.random;
                 let any = |_: &[f32; 4]| {
+                    // Upper and lower bounds of x, y and z in metres, and of the intensity.
                     [(40.0, -40.0), (40.0, -40.0), (0.5, -2.5), (1.0, 0.0)]
                         .map(|(high, low)| random.between(low, high) as f32)
                 };
@@ -253,6 +258,7 @@ impl Attack {
 fn vehicle([x, y, heading_rad]: [f64; 3], score: f32) -> Detection {
     Detection {
         box3d: Box3d {
+            // The lower face is on the road: -1.1 - 1.6 / 2 = -1.9 m.
             center_m: [x, y, -1.1],
             size_m: [4.4, 1.9, 1.6],
             heading_rad,
@@ -267,6 +273,7 @@ fn points_of([x, y, heading]: [f64; 3], random: &mut SplitMix64, points: &mut Ve
     let (sin, cos) = heading.sin_cos();
     for _ in 0..150 {
         let (along, across) = (random.between(-2.2, 2.2), random.between(-0.95, 0.95));
+        // Moved to a side of the footprint: the long sides are 70 % of its perimeter.
         let (along, across) = if random.chance(0.7) {
             (along, 0.95_f64.copysign(across))
         } else {
@@ -308,8 +315,10 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
     let most_confident = (confidence.iter().enumerate())
         .max_by(|one, other| one.1.total_cmp(other.1))
         .map(|(cell, _)| cell as i64);
+    // Without a head there is no confidence, and no patch to copy.
     let Some(from) = most_confident else { return };
     let (from_row, from_column) = (from / width.max(1), from % width.max(1));
+    // Copied before the loop: patches may overlap the source and each other.
     let (original, original_confidence) = (features.values.clone(), confidence.to_vec());
     let mean = |channel: &[f32]| channel.iter().sum::<f32>() / cells.max(1) as f32;
     let means: Vec<f32> = original.chunks(cells.max(1)).map(mean).collect();

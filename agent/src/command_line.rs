@@ -53,6 +53,7 @@ impl Command {
     fn run(self) -> anyhow::Result<Outcome> {
         match self {
             Self::Run(args) => {
+                // It may execute the program again, so it comes before everything else.
                 malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
                     .context("cannot execute this program again")?;
                 command::run::run(*args)

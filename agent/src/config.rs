@@ -317,6 +317,7 @@ impl ProcessConfig for AgentConfig {
             false => self.models.validate()?,
         }
         self.settings.validate()?;
+        // Against the streams as they are sent: boxes may stand in for maps.
         self.settings
             .check_attack(&self.options().of_loop.publish)?;
         self.bus.validate()
@@ -338,6 +339,17 @@ impl AgentSettings {
         }
     }
 
+    /// Options of the loop of a vehicle that publishes these streams, and follows the pace of any ego.
+    pub fn loop_options(&self, publish: Vec<Stream>) -> LoopOptions {
+        LoopOptions {
+            publish,
+            codec: self.codec,
+            rate: self.rate,
+            egos: Vec::new(),
+            falsification: self.falsification,
+        }
+    }
+
     /// Streams that the vehicle publishes where a method needs `needed`, in this order.
     pub fn sent_for(&self, needed: Stream) -> Vec<Stream> {
         match (needed, self.boxes) {
@@ -356,19 +368,17 @@ impl AgentConfig {
 
     /// Options of the agent's node.
     pub fn options(&self) -> NodeOptions {
+        let publish = { self.publish.iter() }
+            .filter_map(|publish| publish.stream())
+            .flat_map(|stream| self.settings.sent_for(stream));
         NodeOptions {
             of_loop: LoopOptions {
-                publish: { self.publish.iter() }
-                    .filter_map(|publish| publish.stream())
-                    .flat_map(|stream| self.settings.sent_for(stream))
-                    .collect(),
-                codec: self.settings.codec,
-                rate: self.settings.rate,
                 egos: self.egos.clone(),
-                falsification: self.settings.falsification,
+                ..self.settings.loop_options(publish.collect())
             },
             keeps_running: self.keep_running || self.bus.supervised,
             sweep_log: self.sweep_log.clone(),
+            // The log holds the whole configuration: a replay builds the agent from it.
             inputs: { self.inputs.clone() }
                 .map(|path| (path, serde_json::to_string(self).unwrap_or_default())),
         }

@@ -59,6 +59,7 @@ impl<I: Serialize, P: Serialize> InputLog<I, P> {
             model_hash: detector.map(Detector::model_hash),
             version: env!("CARGO_PKG_VERSION").to_owned(),
         });
+        // The beginning is written at once: a log without it cannot be replayed.
         let created = RecordWriter::create(&path, kind).and_then(|mut writer| {
             writer.add(&start)?;
             Ok(writer)

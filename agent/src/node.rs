@@ -61,8 +61,10 @@ pub fn run(
     options: &NodeOptions,
     stop: &Stop,
 ) -> Result<LoopReport, BusError> {
-    let agent_loop = AgentLoop::new(agent, options.of_loop.clone());
+    let mut agent_loop = AgentLoop::new(agent, options.of_loop.clone());
+    agent_loop.warm_up();
     let mut node = Node::open(bus, agent_loop, options, stop)?;
+    // Not announced before all subscriptions exist.
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);
     let Node {
@@ -70,6 +72,7 @@ pub fn run(
         agent_loop,
         ..
     } = node;
+    // What is queued is sent before the presence ends.
     for (_, publisher) in publishers {
         publisher.finish();
     }
@@ -103,7 +106,9 @@ impl<'a> Node<'a> {
             stream,
         };
         // One slot: while a sweep is computed only the newest of those that arrive is kept.
+        // Topics: three sensors, and the pace of each ego.
         let inbox = bus.inbox(1, 3 + MAX_EGOS);
+        // The loop waits at the inbox: a request to stop has to wake it.
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
@@ -201,6 +206,7 @@ impl<'a> Node<'a> {
             Stream::Imu => {
                 { inbox.decode(arrival, limits) }.map(|motion| Input::Motion(capture_nanos, motion))
             }
+            // Only paces are left of what the node subscribes to.
             _ => { inbox.decode(arrival, limits) }.map(|pace| Input::Pace(cav.clone(), pace)),
         };
         let stats = self.bus.stats();
@@ -217,6 +223,7 @@ impl<'a> Node<'a> {
     /// Records an input, hands it to the loop and carries out what that decides.
     fn handle(&mut self, input: Input) {
         let now_nanos = self.clock.now_nanos();
+        // Recorded before it is handled: a replay takes it in before it publishes what follows from it.
         if let Some(log) = &self.log {
             let input = input.clone();
             log.add(&Record::Input { now_nanos, input });
@@ -232,6 +239,7 @@ impl<'a> Node<'a> {
                         stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
                     }
                 }
+                Output::Failed(error) => tracing::error!("cannot compute a sweep: {error}"),
                 Output::Computed {
                     capture_nanos,
                     arrived_nanos,
@@ -268,6 +276,7 @@ impl<'a> Node<'a> {
         };
         let (clock, encoder, log) = (self.clock, Arc::clone(&self.encoder), self.log.clone());
         let (stats, topic) = (self.bus.stats().clone(), publisher.topic().clone());
+        // Taken here and not on the sending thread: the wait in the queue counts.
         let submitted_nanos = clock.now_nanos();
         publisher.submit_encoded(message.capture_nanos, move |stamp| {
             let turn = Turn {
@@ -275,7 +284,8 @@ impl<'a> Node<'a> {
                 submitted_nanos,
                 begun_nanos: clock.now_nanos(),
             };
-            let encoded = encoder.encode(message, stamp, &turn);
+            let encoded = encoder.encode(message, stamp, Some(&turn));
+            // Recorded even if it could not be encoded: the replay must fail in the same way.
             if let Some(log) = log {
                 let bytes = encoded.as_ref().ok().map(|(encoded, _)| encoded);
                 log.add(&Record::Published(Published::new(

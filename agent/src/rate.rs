@@ -139,6 +139,7 @@ impl RateControl {
     /// The transmission time that belongs to a map; also where the clock of the scene jumps.
     fn nanos_since_last(&mut self, capture_nanos: u64) -> u64 {
         let last = self.last_capture_nanos.replace(capture_nanos);
+        // A capture time that stands still or goes back has a full period.
         let since = last
             .and_then(|last| capture_nanos.checked_sub(last))
             .filter(|nanos| *nanos > 0);
@@ -150,6 +151,7 @@ impl RateControl {
 
 /// Number of bytes that `bytes_per_second` allows in some nanoseconds.
 fn bytes_within(bytes_per_second: u64, nanos: u64) -> u64 {
+    // In 128 bits, so that no configured rate overflows.
     let bytes = u128::from(bytes_per_second) * u128::from(nanos) / 1_000_000_000;
     u64::try_from(bytes).unwrap_or(u64::MAX)
 }
@@ -175,12 +177,15 @@ struct QueueWatch {
 impl QueueWatch {
     /// Largest size of the next message, bytes.
     fn allow(&mut self, turn: &Turn, smallest: u64, largest: u64) -> u64 {
+        // Twice an empty message at least, so that there is room for cells.
         let floor = (largest as f64 * SMALLEST_SHARE).max(2.0 * smallest as f64);
         if let Some(last) = self.last.replace(*turn) {
             let submissions = turn.number.saturating_sub(last.number).max(1);
             let period = between(last.submitted_nanos, turn.submitted_nanos);
+            // Superseded maps were submitted in between: the period is that of a single one.
             let period = period.div_f64(submissions as f64);
             let waited = between(turn.submitted_nanos, turn.begun_nanos);
+            // A superseded map shows a blocked queue even if this one did not wait for long.
             self.allowed = if submissions > 1 || waited > period.mul_f64(BLOCKED_SHARE) {
                 let took = between(last.begun_nanos, turn.begun_nanos);
                 Some(self.backed_off(period, took).max(floor))
@@ -193,6 +198,7 @@ impl QueueWatch {
     }
 
     fn backed_off(&self, period: Duration, took: Duration) -> f64 {
+        // At the throughput of the last message this share of it leaves in one period.
         let sent_share = period.as_secs_f64() / took.as_secs_f64().max(1e-6);
         BACK_OFF * self.last_bytes as f64 * sent_share.min(1.0)
     }

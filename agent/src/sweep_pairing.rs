@@ -98,6 +98,7 @@ impl<S> SweepPairing<S> {
         }
         let (pose, poses) = self.poses.take(capture_nanos);
         let (motion, motions) = self.motions.take(capture_nanos);
+        // A pose of a later sweep shows a receiver, although the one of this sweep is lost.
         self.expects_pose = pose.is_some() || !self.poses.0.is_empty();
         self.expects_motion = motion.is_some();
         let (_, sweep, _) = self.waiting.take()?;

@@ -76,8 +76,10 @@ impl SweepSelection {
             is_active
         });
         let mut is_admitted = self.paces.is_empty();
+        // No early end: the interval of every ego has to be noted.
         for Followed { pace, last, .. } in self.paces.values_mut() {
             let interval = pace.interval_of(capture_nanos);
+            // Another interval and not a later one: the clock of the scene may be set back.
             if interval.is_none() || interval != *last {
                 is_admitted = true;
                 *last = interval;

@@ -16,6 +16,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use agent::agent::{Agent, AgentInput};
+use agent::agent_output::AgentOutput;
 use bus::malloc_settings;
 use clap::Parser;
 use dataset::frame::Frame;
@@ -27,6 +28,7 @@ use perception::detector::Detector;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use perception::weights::Weights;
+use protocol::codec::encode_features;
 use protocol::{CodecConfig, EncodedFeatures, Limits, Pose, PoseEstimate, StageTiming};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -264,7 +266,11 @@ fn message(
         measured_pose: frame.world_from_lidar.as_ref(),
         motion: frame.motion(),
     };
-    let mut pose = agent.estimate_pose(&input);
+    let AgentOutput {
+        mut pose,
+        perception,
+    } = agent.process(&input)?;
+    lower(sweep, perception.times.iter().map(in_ms));
     if let PoseEstimate::Pose {
         world_from_cav,
         confidence,
@@ -282,26 +288,20 @@ fn message(
         Exchange::Points => (Content::Points(agent.share_points(&frame.points)), None),
         Exchange::Boxes => (
             Content::Boxes(
-                { agent.perceive(&frame.points)?.detections.into_iter() }
+                { perception.detections.into_iter() }
                     .map(Into::into)
                     .collect(),
             ),
             None,
         ),
         Exchange::Features | Exchange::Nothing => {
-            let perception = agent.perceive(&frame.points)?;
-            lower(sweep, perception.times.iter().map(in_ms));
             let gate = method.gate().filter(|_| !is_ego);
             let codec = CodecConfig {
                 gate,
                 ..CodecConfig::default()
             };
-            let features = agent.write_map(
-                perception.features,
-                &perception.confidence,
-                &codec,
-                frame.capture_nanos,
-            )?;
+            let confidence = Some(&perception.confidence[..]);
+            let features = encode_features(perception.features, &codec, confidence)?;
             (Content::Boxes(Vec::new()), Some(features))
         }
     };

@@ -96,6 +96,7 @@ impl CaptureClocks {
         let mut changed = Vec::new();
         for (cav, clock) in &mut self.neighbours {
             while let Some(sweep) = clock.pending.front().copied() {
+                // Interpolation needs an own sweep of this time or later, which a later report brings.
                 if (self.own.back()).is_none_or(|own| own.arrived_nanos < sweep.arrived_nanos) {
                     break;
                 }
@@ -117,6 +118,7 @@ impl CaptureClocks {
         match self.neighbours.get(cav) {
             Some(clock) if clock.is_unsteady => None,
             Some(clock) => {
+                // In 128 bits: neither u64 nor i64 holds every difference of the two.
                 let corrected = i128::from(capture_nanos) - i128::from(clock.offset_nanos);
                 Some(u64::try_from(corrected.max(0)).unwrap_or(u64::MAX))
             }
@@ -188,6 +190,7 @@ impl Clock {
             least.max(most.saturating_neg()) < limit / 2 && high.saturating_sub(low) <= limit;
         let before = self.offset_nanos;
         let distance = |offset: i64| median.saturating_sub(offset).saturating_abs();
+        // A small change is believed only if the samples agree with each other.
         let is_certain = most.saturating_sub(least) <= limit || distance(before) > limit;
         self.offset_nanos = match before {
             _ if is_off && is_certain && distance(before) > limit / 5 => median,
@@ -222,6 +225,7 @@ fn own_capture(own: &VecDeque<SweepTime>, arrived_nanos: u64) -> Option<i128> {
     let Some(after) = own.get(next) else {
         return Some(capture);
     };
+    // `took` is not zero: `before` arrived by this time, `after` later.
     let [since, took] = [arrived_nanos, after.arrived_nanos]
         .map(|nanos| i128::from(nanos) - i128::from(before.arrived_nanos));
     let passed = i128::from(after.capture_nanos) - capture;

@@ -84,6 +84,7 @@ impl Neighbourhood {
                     changes.push(Input::Left(cav));
                 }
             }
+            // After each change, as a vehicle that has left makes room for one that waits.
             while let Some(cav) = self.queue.next(self.members.len()) {
                 self.subscribe(cav.clone(), bus, inbox)?;
                 changes.push(Input::Joined(cav));

@@ -71,6 +71,8 @@ impl PaceControl {
         let period_nanos = self.period_nanos.unwrap_or(gap_nanos).min(gap_nanos);
         self.period_nanos = Some(period_nanos);
         let intervals = [capture_nanos, last_nanos].map(|nanos| self.pace.interval_of(nanos));
+        // Agents compute one sweep of each interval, so that a skipped interval is a sweep left out.
+        // At every sweep there are no intervals: a gap of one and a half periods is one.
         let is_left_out = match intervals {
             [Some(interval), Some(last)] => interval > last + 1,
             _ => gap_nanos > period_nanos.saturating_add(period_nanos / 2),
@@ -90,6 +92,7 @@ impl PaceControl {
             self.judged.pop_front();
         }
         let computed = self.next_share(period_nanos, now_nanos)?;
+        // Frames of the old pace say nothing about the new one.
         self.judged.clear();
         self.quiet_since_nanos = now_nanos;
         self.pace = if computed == TENTHS {
@@ -110,12 +113,14 @@ impl PaceControl {
         let share = self.pace.computed * (TENTHS / self.pace.of);
         let overloaded = self.judged.iter().filter(|frame| frame.is_overloaded);
         let count = overloaded.count();
+        // Tenths at which computed sweeps are MAX_INTERVAL_NANOS apart on average.
         let lowest = period_nanos.saturating_mul(u64::from(TENTHS)) / MAX_INTERVAL_NANOS;
         let lowest = u8::try_from(lowest.max(1)).unwrap_or(TENTHS);
         if count >= TOO_MANY && share > lowest {
             let raised_at_nanos = self.raised_at_nanos.take();
             let [shortest, longest] = CALM_NANOS;
             let has_failed = |at: u64| now_nanos < at.saturating_add(shortest);
+            // Overloaded soon after a raise: the next one has to wait twice as long.
             self.calm_nanos = match raised_at_nanos.is_some_and(has_failed) {
                 true => (2 * self.calm_nanos).min(longest),
                 false => shortest,

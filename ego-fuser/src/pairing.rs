@@ -109,6 +109,7 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
         if queue.len() <= self.config.depth.max(1) {
             return None;
         }
+        // One that served a frame has been counted as received.
         let oldest = queue.pop_front().filter(|oldest| !oldest.is_used)?;
         dropped(oldest.capture_nanos, DropReason::Superseded)
     }
@@ -146,6 +147,7 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
                 && let Some(held) = queue.front_mut()
             {
                 let is_first_use = !std::mem::replace(&mut held.is_used, true);
+                // Negative for a message captured after the frame, within the lead.
                 let age_nanos = ego_capture_nanos as i64 - held.capture_nanos as i64;
                 paired.push(Paired {
                     sender,
@@ -186,6 +188,7 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
         let latest = now_nanos.saturating_add(ahead_nanos);
         let is_unused = |held: &&Waiting<T>| held.capture_nanos > latest && !held.is_used;
         let unused = queue.iter().filter(is_unused).count();
+        // One that served belongs to the run before, even if it is only a little later.
         queue.retain(|held| held.capture_nanos <= if held.is_used { now_nanos } else { latest });
         unused
     }

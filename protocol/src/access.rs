@@ -164,6 +164,7 @@ impl Principal {
         let [agents, egos, sensors] = [Role::Agent, Role::Ego, Role::Replay].map(sent_by::<S>);
         match self.role {
             Role::Agent => {
+                // Sensor streams that the ledger does not cover are previews, which are for viewers.
                 let sensors = sensors.into_iter().filter(|stream| stream.row().is_counted);
                 let repeated = egos.into_iter().filter(|stream| !stream.row().is_counted);
                 let subscribed = sensors.map(own).chain(repeated.map(everyones));
@@ -261,6 +262,7 @@ impl FromStr for Principal {
     type Err = PrincipalError;
 
     fn from_str(text: &str) -> Result<Self, PrincipalError> {
+        // At the first hyphen: no role has one, and an id may begin with one (`agent--1`).
         let (role, cav) = text
             .split_once('-')
             .map_or((text, None), |(role, cav)| (role, Some(cav)));

@@ -53,6 +53,7 @@ impl BevGrid {
         check_within("grid y_min_m", self.y_min_m, -MAX_EDGE_M, MAX_EDGE_M)?;
         check_within("grid cell_m", self.cell_m, cell_min, cell_max)?;
         let cells = u64::from(self.width) * u64::from(self.height);
+        // Cells are numbered in u32, whatever the limits permit.
         let max = limits.max_cells.min(u32::MAX.into());
         if cells == 0 {
             check_size("grid cells", cells, 1)?;

@@ -202,6 +202,7 @@ impl<'a> PayloadReader<'a> {
         let mut left = len;
         while left > 0 {
             let mut across = [[[0; 4]; N]];
+            // Whole values within the piece. Zero: the next value spans two pieces, or the piece is used up.
             let whole = self.piece.len().min(left).min(BLOCK_BYTES) / value_bytes * value_bytes;
             let block = if whole > 0 {
                 let (run, rest) = self.piece.split_at(whole);
@@ -217,6 +218,7 @@ impl<'a> PayloadReader<'a> {
             values.extend(block.iter().map(|value: &[[u8; 4]; N]| {
                 value.map(|bytes| {
                     let number = f32::from_le_bytes(bytes);
+                    // The sign bit collects the result of all values without a branch.
                     excess |= excess_over(headroom, number);
                     number
                 })
@@ -244,6 +246,7 @@ impl<'a> PayloadReader<'a> {
 
     /// The checksum over all bytes of the payload, including those not yet read.
     pub(crate) fn finish(mut self) -> u32 {
+        // After an error in the metadata the body is unread, but the checksum covers it too.
         while let Some(run) = self.next_run(usize::MAX) {
             self.crc.update(run);
         }

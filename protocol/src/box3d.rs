@@ -66,6 +66,7 @@ impl Box3d {
     pub fn transformed(&self, target_from_source: &Isometry3<f64>) -> Self {
         let center = target_from_source * Point3::from(self.center_m);
         let (sin, cos) = self.heading_rad.sin_cos();
+        // A vector, not a point: the translation does not apply.
         let forward = target_from_source * Vector3::new(cos, sin, 0.0);
         Self {
             center_m: center.into(),

@@ -97,6 +97,7 @@ impl Counts {
 
     /// Sent minus all messages that are accounted for; 0 if the account is balanced.
     pub(crate) fn missing(&self) -> i128 {
+        // In 128 bits: sums of hostile counters cannot overflow.
         let accounted = [self.received, self.in_flight]
             .into_iter()
             .chain(self.dropped.values().copied());
@@ -248,7 +249,7 @@ impl Ledger {
     /// counted as dropped for that reason, surplus messages as sent. Returns the number of messages exempted. All other
     /// accounts have to balance by themselves.
     pub fn exempt(&mut self, is_exempt: impl Fn(&Account) -> bool) -> u64 {
-        let mut exempted = 0;
+        let mut exempted = 0_u64;
         for Discrepancy {
             topic, to, missing, ..
         } in self.balance().discrepancies
@@ -260,11 +261,12 @@ impl Ledger {
             let counts = self.counts(&account);
             match u64::try_from(missing) {
                 Ok(missing) => {
-                    *counts.dropped.entry(DropReason::PeerOffline).or_default() += missing
+                    let dropped = counts.dropped.entry(DropReason::PeerOffline).or_default();
+                    *dropped = dropped.saturating_add(missing);
                 }
                 Err(_) => counts.sent = counts.sent.saturating_add(missing.unsigned_abs()),
             }
-            exempted += missing.unsigned_abs();
+            exempted = exempted.saturating_add(missing.unsigned_abs());
         }
         exempted
     }
@@ -290,6 +292,7 @@ impl Ledger {
     }
 
     fn counts(&mut self, account: &Account) -> &mut Counts {
+        // The entry API would clone the account for every message.
         if !self.accounts.contains_key(account) {
             self.accounts.insert(account.clone(), Counts::default());
         }

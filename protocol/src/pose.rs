@@ -75,6 +75,7 @@ impl Pose {
         let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
         let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
         let determinant = rotation.determinant();
+        // Orthonormal with a negative determinant is a mirror, as from left-handed axes.
         if deviation > UNIT_TOLERANCE || determinant < 0.0 {
             return Err(InvalidPose::NotRotation {
                 deviation,
@@ -115,6 +116,7 @@ impl Pose {
         let [tx, ty, tz] = self.translation_m;
         Isometry3::from_parts(
             Translation3::new(tx, ty, tz),
+            // `validate` permits a small deviation from length one.
             UnitQuaternion::new_normalize(Quaternion::new(w, x, y, z)),
         )
     }
@@ -124,6 +126,7 @@ impl Pose {
         let ([x, y, z], [qw, qx, qy, qz]) = (self.translation_m, self.rotation_wxyz);
         Self {
             translation_m: [x, -y, z],
+            // A rotation axis is an axial vector: only its part along the mirrored axis stays.
             rotation_wxyz: [qw, -qx, qy, -qz],
         }
     }

@@ -95,8 +95,8 @@ impl fmt::Display for Discrepancy {
         let counts = &self.counts;
         let to = (self.to.as_ref()).map_or(String::new(), |to| format!(" to {to}"));
         let (verb, count) = match self.missing {
-            missing @ 1.. => ("not accounted for", missing),
-            missing => ("received but never sent", -missing),
+            missing @ 1.. => ("not accounted for", missing.unsigned_abs()),
+            missing => ("received but never sent", missing.unsigned_abs()),
         };
         write!(
             f,

@@ -24,6 +24,7 @@ impl Polygon {
     /// A convex quadrilateral from its corners, in either direction around it.
     pub fn new(mut corners: Footprint) -> Self {
         let mut area = signed_area(&corners);
+        // Clipping keeps what is left of each edge: the inside, if corners are counter-clockwise.
         if area < 0.0 {
             corners.reverse();
             area = -area;
@@ -75,6 +76,7 @@ impl Polygon {
                 return 0.0;
             }
         }
+        // Rounding may give a little more than the smaller polygon, or less than nothing.
         signed_area(&clipped.corners[..clipped.len]).clamp(0.0, self.area.min(other.area))
     }
 
@@ -163,6 +165,7 @@ impl Clipped {
 fn signed_area(corners: &[[f64; 2]]) -> f64 {
     let [x0, y0] = corners[0];
     let mut doubled = 0.0;
+    // The pair from the last corner back to the first adds nothing: relative to the first it is zero.
     for pair in corners.windows(2) {
         doubled += (pair[0][0] - x0) * (pair[1][1] - y0) - (pair[1][0] - x0) * (pair[0][1] - y0);
     }

@@ -152,6 +152,7 @@ impl Topic {
                 let ids = CavId::new(ego).and_then(|ego| Ok((ego, CavId::new(cav)?)));
                 ids.map(|(ego, cav)| Self::Received { ego, cav, stream })
             }
+            // Last: the words above are reserved, so that no vehicle has one as its id.
             [cav, stream @ ..] => {
                 let stream = Stream::from_chunks(stream)?;
                 CavId::new(cav).map(|cav| Self::Stream { cav, stream })

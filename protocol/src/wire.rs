@@ -50,6 +50,7 @@ pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireErro
     let (metadata, body) = message.into_parts();
     let shape = M::check(&metadata, &Limits::SENDER)?;
     shape.check(body.len() as u64)?;
+    // Room for the header, which is written last: it states lengths and checksum of the rest.
     let mut head = vec![0; HEADER_LEN];
     let metadata_len = metadata::append(M::KIND, &metadata, &mut head)?;
     let mut crc = Hasher::new();
@@ -204,6 +205,7 @@ fn decode_payload<M: Payload>(
         });
     }
     let (metadata, body, valid) = parts?;
+    // A second pass over the body, to name the first bad value: only for messages that are refused.
     if !valid {
         check_body(&body, limits.max_abs_value)?;
     }

@@ -105,6 +105,7 @@ pub fn run(
     let ages = kept.values().map(|arrival| arrival.at.elapsed());
     let longest = ages.max().unwrap_or_default();
     report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
+    // Every message is accounted for: what the end of the run cuts off counts as stale.
     for topic in kept.values().map(|arrival| &arrival.topic) {
         bus.stats().dropped(topic, DropReason::Stale);
     }
@@ -156,6 +157,7 @@ impl<'a> Node<'a> {
         options: &'a NodeOptions,
         stop: &Stop,
     ) -> Result<Self, BusError> {
+        // One topic more per vehicle than streams: its GNSS.
         let inbox = bus.limited_inbox(
             PLACES,
             MAX_VEHICLES * (options.streams.len() + 1),
@@ -189,6 +191,7 @@ impl<'a> Node<'a> {
             self.update_membership()?;
             match self.inbox.take(Some(self.next_moment())) {
                 Pop::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => match stream {
+                    // GNSS is only read here, for losses that depend on distance. It is not forwarded.
                     Stream::Gnss => self.locate(&cav, &arrival),
                     _ => self.admit(cav, stream, arrival),
                 },
@@ -217,6 +220,7 @@ impl<'a> Node<'a> {
             streams.all(|stream| vehicle.ended.contains(stream))
         };
         !options.keeps_running
+            // Before the first sender joins, none can have ended.
             && senders.peek().is_some()
             && senders.all(|(_, vehicle)| has_ended(vehicle))
             && self.kept.is_empty()
@@ -329,6 +333,7 @@ impl<'a> Node<'a> {
             stream,
             sequence: arrival.header.stamp.sequence,
             bytes: arrival.wire_bytes(),
+            // Counted from its arrival at this process, so that the wait in the inbox is part of the delay.
             submitted_nanos: nanos::between(began, arrival.at),
             distance_m,
         });
@@ -382,6 +387,7 @@ impl<'a> Node<'a> {
             // A message without capture time.
             0 => publisher.relay(arrival),
             scene_nanos => {
+                // A wrong clock of the senders drifts from the first message on.
                 let began_nanos = *self.began_nanos.get_or_insert(scene_nanos);
                 publisher.relay_as(
                     arrival,
@@ -395,6 +401,7 @@ impl<'a> Node<'a> {
             self.report.arrived += 1;
             self.bus.stats().received(&arrival.topic);
         }
+        // A message that arrives twice is kept until its copy is sent.
         if !is_repeated {
             self.release(packet.id);
         }

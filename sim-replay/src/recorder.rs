@@ -184,6 +184,7 @@ impl Recorder<'_> {
         let mut flush_at = Instant::now() + FLUSH_PERIOD;
         let (mut stopping, mut last_message) = (None, Instant::now());
         loop {
+            // Wakes without messages too, to notice the silence after a stop.
             match subscriber.take(Some(flush_at.min(Instant::now() + SILENCE))) {
                 Pop::Item(topic, raw) => {
                     last_message = Instant::now();
@@ -198,6 +199,7 @@ impl Recorder<'_> {
             let now = Instant::now();
             if stop.requested() {
                 let since = *stopping.get_or_insert(now);
+                // Where messages never cease, LAST_WORDS ends the recording.
                 if now - last_message.max(since) >= SILENCE || now - since >= LAST_WORDS {
                     return;
                 }
@@ -237,6 +239,7 @@ impl Recorder<'_> {
             return;
         };
         let written = write(writer);
+        // Messages of an open chunk do not count yet: a crash loses them.
         if writer.whole_messages() > self.report.messages {
             self.report.messages = writer.whole_messages();
             self.report.seconds = self.span.map_or(0.0, |(first, last)| {
@@ -246,6 +249,7 @@ impl Recorder<'_> {
         if let Err(error) = written {
             tracing::error!("the recording ends here, the run continues: {error}");
             self.report.failure = Some(in_words(&error));
+            // The messages of the open chunk are lost with it.
             self.report.not_written = self.taken - self.report.messages;
             self.writer = None;
             (self.on_failure)(&self.report);
@@ -253,10 +257,12 @@ impl Recorder<'_> {
     }
 
     fn finish(mut self, overwritten: u64, undelivered: u64) -> RecordReport {
+        // Asked first: `attempt` drops the writer if finishing fails.
         let has_file = self.writer.is_some() || self.report.messages > 0;
         self.attempt(RecordingWriter::finish);
         self.report.overwritten = overwritten;
         self.report.undelivered = undelivered;
+        // Messages that arrived after a failure count too.
         self.report.not_written = self.taken - self.report.messages;
         if has_file && let Ok(file) = std::fs::metadata(&self.report.file) {
             self.report.bytes = file.len();

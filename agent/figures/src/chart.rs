@@ -187,6 +187,7 @@ impl Chart {
             context.draw_series(LineSeries::new(points(), colour.stroke_width(2)))?;
         }
         let radius = series.dot_radius();
+        // No dots for lines alone, but the empty series still carries the entry of the legend.
         let dots = radius
             .into_iter()
             .flat_map(|radius| points().map(move |at| Circle::new(at, radius, colour.filled())));

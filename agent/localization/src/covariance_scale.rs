@@ -62,6 +62,7 @@ impl PoseSample {
     /// Sample of a pose of a sweep that was taken at `truth`.
     pub fn of(pose: &Isometry3<f64>, covariance: [[f64; 6]; 6], truth: &Isometry3<f64>) -> Self {
         let off = pose.translation.vector - truth.translation.vector;
+        // On the left: the axis is in the world's frame, as that of the covariance.
         let turned = (pose.rotation * truth.rotation.inverse()).scaled_axis();
         Self {
             error: [off.x, off.y, off.z, turned.x, turned.y, turned.z],
@@ -122,6 +123,7 @@ impl CovarianceScale {
             bound: None,
         };
         scale.check()?;
+        // After the factors: the bound is in scaled standard deviations.
         let off_m = |sample: &PoseSample| sample.error[0].hypot(sample.error[1]);
         let ratios = (samples.iter())
             .map(|sample| off_m(sample) / worst_std_m(&scale.applied(&sample.covariance)));
@@ -176,6 +178,7 @@ fn limit(values: impl Iterator<Item = f64>, share: f64) -> Option<f64> {
     let beyond = |value: f64| if value.is_nan() { f64::INFINITY } else { value };
     let mut sorted: Vec<f64> = values.map(beyond).collect();
     sorted.sort_by(f64::total_cmp);
+    // A new value has each of n + 1 ranks with the same probability.
     let rank = ((sorted.len() + 1) as f64 * share).ceil() as usize;
     sorted.get(rank.checked_sub(1)?).copied()
 }

@@ -81,6 +81,7 @@ impl Localize for MapRegistration {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = stopwatch();
         let source = IcpSource::of_sweep(&sweep.cloud.xyzi, &self.config);
+        // Step: near the prediction. Where the map confirms it, the networks are not needed.
         let near = sweep.predicted.and_then(|start| self.fit(&source, &start));
         let registering = times.lap(REGISTER);
         if let Some(fit) = near.filter(|fit| fit.overlap_above_ground >= CONFIRMED) {
@@ -88,6 +89,7 @@ impl Localize for MapRegistration {
             return Ok(Localization::of_found(found, times));
         }
         let mut localization = self.localizer.localize(sweep)?;
+        // The localizer has a stopwatch of its own, which began after the failed registration.
         localization.times.add(REGISTER, registering);
         let published = localization.found.filter(|found| !found.is_rejected);
         if let Some(found) = published {
@@ -140,6 +142,7 @@ fn registered(fit: &IcpFit, covariance_scale: Option<CovarianceScale>) -> FoundP
     let least = Matrix6::from_diagonal(
         &[position, position, position, rotation, rotation, rotation].into(),
     );
+    // Added, not the larger entry of each: the sum of two covariances is a covariance.
     let covariance = fit.covariance * (STD_FACTOR * STD_FACTOR) + least;
     FoundPose {
         world_from_sensor: fit.target_from_source,

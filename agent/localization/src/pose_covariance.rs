@@ -32,6 +32,7 @@ pub fn unscaled_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
         ..
     } = PoseMeasurement::new(0, found);
     let shape = &found.cell_covariance;
+    // Cells that constrain nothing leave no shape to scale: their variance stays the largest.
     let factor = |wanted_std: f64, variance: f64| match variance > 0.0 && variance < MAX_VARIANCE {
         true => wanted_std / variance.sqrt(),
         false => 1.0,

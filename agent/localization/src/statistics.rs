@@ -12,16 +12,19 @@ pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
 pub fn share_limit(count: usize, all: usize) -> f64 {
     // Probability of at most `count`, at this share.
     let at_most = |share: f64| {
-        let mut term = (1.0 - share).powf(all as f64);
-        (0..count).fold(term, |sum, seen| {
-            term *= (all - seen) as f64 / (seen + 1) as f64 * share / (1.0 - share);
-            sum + term
+        // In logarithms: of many samples the first term is less than the smallest double.
+        let (odds, mut term) = ((share / (1.0 - share)).ln(), all as f64 * (-share).ln_1p());
+        (0..count).fold(term.exp(), |sum, seen| {
+            // Each binomial term from the one before, without factorials.
+            term += ((all - seen) as f64 / (seen + 1) as f64).ln() + odds;
+            sum + term.exp()
         })
     };
     if count >= all {
         return 1.0;
     }
     let (mut low, mut high) = (0.0, 1.0);
+    // The probability falls as the share grows: bisection, nearly to the precision of a double.
     for _ in 0..50 {
         let share = f64::midpoint(low, high);
         match at_most(share) > 0.05 {
@@ -86,6 +89,9 @@ mod tests {
             (0, 10, 0.258_9),
             (1, 10, 0.394_2),
             (5, 223, 0.046_5),
+            // Beyond the range of a double without logarithms.
+            (1000, 4000, 0.261_5),
+            (5000, 100_000, 0.051_15),
         ] {
             let found = share_limit(count, all);
             assert!(

@@ -82,6 +82,7 @@ pub fn read_map(
         for scenario in drives.scenarios {
             let mut last: Option<(usize, Isometry3<f64>)> = None;
             for (agent, tick) in present_sweeps(&scenario) {
+                // Only the pose at first: points of sweeps that are not used need not be read.
                 let without_points = LoadOptions {
                     points: false,
                     ..LoadOptions::default()
@@ -97,6 +98,7 @@ pub fn read_map(
                     continue;
                 };
                 let pose = pose.isometry();
+                // From the last sweep on the map, not from the one before: short steps add up.
                 let way_m = last
                     .filter(|(of, _)| *of == agent)
                     .map(|(_, last)| (last.translation.vector - pose.translation.vector).norm());

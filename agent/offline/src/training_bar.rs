@@ -110,6 +110,7 @@ impl TrainingBar {
         encoding.latest = done;
         let left = all.saturating_sub(done) as f64;
         let passed = encoding.began.elapsed();
+        // Maps that an earlier run stored took no time now and would make the estimate too short.
         let remaining_s = remaining_s((done - encoding.first) as f64, left, passed.as_secs_f64());
         let is_due = !encoding.is_estimated && passed >= ESTIMATE_AFTER;
         if let Some(remaining_s) = remaining_s.filter(|_| is_due) {

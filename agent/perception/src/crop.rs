@@ -54,8 +54,10 @@ impl Crop {
     fn is_kept(&self, &[x, y, z, intensity]: &[f32; 4]) -> bool {
         let inside =
             |axis: usize, value: f32| value > self.low_m[axis] && value < self.high_m[axis];
+        // Without an own body the box begins at infinity and holds no finite point.
         let [x_low, y_low, x_high, y_high] = self.own_body_m.unwrap_or([f32::INFINITY; 4]);
         let own = x >= x_low && x <= x_high && y >= y_low && y <= y_high;
+        // The comparisons exclude NaN and infinity in x, y and z, but intensity has no bounds.
         inside(0, x) && inside(1, y) && inside(2, z) && !own && intensity.is_finite()
     }
 }

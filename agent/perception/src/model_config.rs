@@ -196,6 +196,7 @@ impl DetectorConfig {
     pub fn pillar_grid(&self) -> [usize; 3] {
         std::array::from_fn(|axis| {
             let extent = self.lidar_range_m[axis + 3] - self.lidar_range_m[axis];
+            // Rounded and not truncated: 76.8 / 0.4 is 191.99999999999997 in floating point.
             (extent / self.voxel_size_m[axis]).round() as usize
         })
     }
@@ -207,6 +208,7 @@ impl DetectorConfig {
             Some(ShrinkConfig::Pointwise { .. }) | None => 1,
         };
         let first = |strides: &[i64]| strides.first().copied().unwrap_or(1);
+        // All levels are up-sampled to one BEV grid, so the first stands for all.
         first(&self.layer_strides) / first(&self.upsample_strides) * shrink
     }
 
@@ -252,6 +254,7 @@ impl DetectorConfig {
     /// [`ConfigError`] names the field, its value and what it must be.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.check_area()?;
+        // Before the sizes, whose check indexes these lists.
         self.check_levels()?;
         let points = i64::try_from(self.max_points_per_pillar).unwrap_or(0);
         for (field, value) in [
@@ -302,6 +305,7 @@ impl DetectorConfig {
                 BlockKind::Residual => 2 * layers - 1,
                 BlockKind::Plain => layers,
             };
+            // The first convolution of a level reads `input` channels, the others `filters`.
             count += 9 * filters * (input + more * filters);
             let edge = self.upsample_strides[level];
             count += edge.pow(2) * filters * self.num_upsample_filters[level];
@@ -329,6 +333,7 @@ impl DetectorConfig {
         require(is_area, "lidar_range_m", range, rule)?;
         let voxel_m = self.voxel_size_m;
         require_positive("voxel_size_m", voxel_m)?;
+        // `BevGrid` has one cell size for both axes.
         let is_square = (voxel_m[0] - voxel_m[1]).abs() <= 1e-9;
         let rule = "must be equal along x and y";
         require(is_square, "voxel_size_m", voxel_m, rule)?;
@@ -337,6 +342,7 @@ impl DetectorConfig {
         require(is_even, "lidar_range_m", range, rule)?;
         let [x, y, z] = self.pillar_grid();
         within("pillar layers along z", z, 1, 1)?;
+        // A wrong range has huge counts, whose product must not overflow.
         let cells = x.saturating_mul(y);
         within("cells of the pillar grid", cells, 1, MAX_CELLS)
     }
@@ -367,6 +373,7 @@ impl DetectorConfig {
     fn check_strides(&self) -> Result<(), FieldError> {
         let mut down = 1;
         for (stride, up) in self.layer_strides.iter().zip(&self.upsample_strides) {
+            // A level that passes has `down` at most 4096 * 4096, so the next product does not overflow.
             down *= stride;
             let fits =
                 down % up == 0 && down / up == self.layer_strides[0] / self.upsample_strides[0];

@@ -1,5 +1,6 @@
 //! Inputs and outputs of an agent's loop.
 
+use perception::detector::DetectorError;
 use protocol::message::StageTiming;
 use protocol::{CavId, DropReason, EgoMotion, Gnss, Pace, PointCloud, Stream};
 use serde::{Deserialize, Serialize};
@@ -54,6 +55,8 @@ pub enum Output {
         /// Arrival, nanoseconds on the Unix clock.
         arrived_nanos: u64,
     },
+    /// A sweep could not be computed.
+    Failed(DetectorError),
     /// The problem of the pose, in place of the one before, with the time of its beginning, nanoseconds; `None`: none.
     PoseProblem(Option<(String, u64)>),
 }

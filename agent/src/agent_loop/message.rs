@@ -57,7 +57,7 @@ impl MessageEncoder {
         }
     }
 
-    /// Encodes a message at its turn; returns the decision of the rate control too, where a map had to keep within a
+    /// Encodes a message at its turn, `None` where nothing queues; returns the decision of the rate control too, where a map had to keep within a
     /// limit.
     ///
     /// # Errors
@@ -66,7 +66,7 @@ impl MessageEncoder {
         &self,
         message: Box<Unsent>,
         stamp: &Stamp,
-        turn: &Turn,
+        turn: Option<&Turn>,
     ) -> Result<(Encoded, Option<RateChoice>), WireError> {
         let Unsent {
             capture_nanos,
@@ -79,14 +79,10 @@ impl MessageEncoder {
                 features,
                 confidence,
             } => {
+                // Held while the map is encoded: the next limit depends on the size of this map.
                 let mut rate = self.rate.lock().unwrap_or_else(PoisonError::into_inner);
-                let features = rate.encode(
-                    features,
-                    &self.codec,
-                    &confidence,
-                    capture_nanos,
-                    Some(turn),
-                )?;
+                let features =
+                    rate.encode(features, &self.codec, &confidence, capture_nanos, turn)?;
                 let choice = features.rate;
                 Ok((wire::encode(stamp, Bev { pose, features })?, choice))
             }

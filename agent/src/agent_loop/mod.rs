@@ -3,8 +3,8 @@
 //! A sweep waits for the pose and the motion of its capture time. Then it is computed in steps. The result of a step is
 //! published before the next one: the pose, the perception, and the measurement for the poses of later sweeps.
 //!
-//! The live process and the replay of recorded inputs are adapters: they bring inputs in order of time and carry out the
-//! outputs. The same inputs give the same outputs, but for measured durations.
+//! The live process, simulation time and the replay of recorded inputs are adapters: they bring inputs in order of time and
+//! carry out the outputs. The same inputs give the same outputs, but for measured durations.
 
 mod input;
 mod message;
@@ -16,10 +16,11 @@ use std::collections::BTreeMap;
 use protocol::codec::CodecConfig;
 use protocol::message::{Points, StageTiming};
 use protocol::{CavId, DropReason, Dtype, Gnss, GnssSource, Message, Pace, PoseEstimate, Stream};
+use tch::Tensor;
 
 use crate::agent::{Agent, AgentInput, EncodedSweep};
 use crate::agent_output::Perception;
-use crate::attack::{Attack, Falsification};
+use crate::attack::{Attack, CapturedMessages, Falsification};
 use crate::rate::RateConfig;
 use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
 use crate::sweep_selection::{MAX_EGOS, SweepSelection};
@@ -140,25 +141,22 @@ pub struct AgentLoop {
 }
 
 impl AgentLoop {
-    /// Loop of a vehicle before its first input. Its detector is warmed up.
+    /// Loop of a vehicle before its first input.
     pub fn new(agent: Agent, options: LoopOptions) -> Self {
-        let mut agent = if options.needs_head() {
-            agent
-        } else {
-            agent.without_head()
-        };
-        if options.needs_network()
-            && let Err(error) = agent.warm_up()
-        {
-            tracing::warn!("the detector is not warmed up: {error}");
-        }
         let attack = { options.falsification }
             .map(|falsification| Attack::new(falsification, agent.cav(), 0));
+        let mut agent = match attack {
+            Some(_) => agent.with_attack(attack),
+            None => agent,
+        };
+        if !options.needs_head() && !agent.falsifies() {
+            agent = agent.without_head();
+        }
         Self {
             pairing: SweepPairing::new(POSE_TIMEOUT_NANOS),
             selection: SweepSelection::of(&options.egos),
             reports: SweepReports::new(agent.detector(), &options),
-            agent: agent.with_attack(attack),
+            agent,
             options,
             step: Step::default(),
             numbers: BTreeMap::new(),
@@ -169,12 +167,28 @@ impl AgentLoop {
         }
     }
 
+    /// Computes without a sweep, so that the first one does not wait for the tensor library's preparations.
+    pub fn warm_up(&mut self) {
+        if self.options.needs_network()
+            && let Err(error) = self.agent.warm_up()
+        {
+            tracing::warn!("the detector is not warmed up: {error}");
+        }
+    }
+
+    /// Gives the feature map `[1, C, H, W]` of the next sweep as its encoder computed it before, and what another vehicle
+    /// sent last, which an attack may repeat.
+    pub fn prepare(&mut self, map: Option<Tensor>, captured: impl FnOnce() -> CapturedMessages) {
+        self.agent.prepare(map, captured);
+    }
+
     /// Takes an input in at `now_nanos`, which does not decrease. Only [`Input::Wake`] computes, and one step at most:
     /// the result of a step is published before the next one.
     pub fn handle(&mut self, input: Input, now_nanos: u64) -> Vec<Output> {
         match input {
             Input::Sweep(sweep) => self.admit(sweep, now_nanos),
             Input::Gnss(capture_nanos, gnss) if gnss.source == GnssSource::Stated => {
+                // A stated pose belongs to no sweep, so it is not paired.
                 self.start_at(capture_nanos, &gnss);
             }
             Input::Gnss(capture_nanos, gnss) => {
@@ -226,6 +240,7 @@ impl AgentLoop {
     /// A sweep that an ego has time for waits for its pose; others are left out.
     fn admit(&mut self, sweep: Sweep, now_nanos: u64) {
         let capture_nanos = sweep.capture_nanos;
+        // Sweeps that are left out are reported, too: their arrivals serve the capture clocks of egos.
         self.reports.note(capture_nanos, sweep.arrived_nanos);
         self.describe(now_nanos);
         if !self.selection.admits(capture_nanos, now_nanos) {
@@ -291,6 +306,7 @@ impl AgentLoop {
 
     fn wake(&mut self, now_nanos: u64) {
         self.describe(now_nanos);
+        // The default is the next sweep: after a step that failed there is none to continue.
         match std::mem::take(&mut self.step) {
             Step::Localize => {
                 // Nothing comes any more that a sweep may wait for.
@@ -314,6 +330,7 @@ impl AgentLoop {
             paired.pose.map(|_| Stream::Gnss),
             paired.motion.map(|_| Stream::Imu),
         ];
+        // Counted here and not on arrival: until now they could be superseded with their sweep.
         let received = used.into_iter().flatten().map(Output::Received);
         self.outputs.extend(received);
         let (pose, times, sweep) = self.agent.localize(&paired.input());
@@ -375,11 +392,11 @@ impl AgentLoop {
                 self.step = Step::Observe(paired, sweep);
             }
             Err(error) => {
-                tracing::error!(capture_nanos, "cannot compute a sweep: {error}");
                 self.report.failed += 1;
                 let first = &mut self.report.failure;
                 first.get_or_insert_with(|| error.to_string());
                 self.drop_messages(Stream::Lidar, 1, DropReason::NotFinite);
+                self.outputs.push(Output::Failed(error));
             }
         }
         self.outputs.push(Output::Computed {

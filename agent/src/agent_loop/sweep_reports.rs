@@ -81,6 +81,7 @@ impl SweepReports {
         if now_nanos < self.next_nanos {
             return None;
         }
+        // Without a description as well, or the loop would be woken again at once.
         self.next_nanos = now_nanos.saturating_add(PERIOD_NANOS);
         let newest = self.sweeps.back().map_or(0, |(capture, _)| *capture);
         let arrival = |(capture, arrived_nanos): (u64, u64)| SweepArrival {

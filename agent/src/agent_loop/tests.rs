@@ -176,7 +176,7 @@ fn the_same_inputs_give_the_same_bytes() {
                 publish_nanos: NOW,
             };
             let stream = message.stream;
-            let (encoded, _) = encoder.encode(message, &stamp, &turn).unwrap();
+            let (encoded, _) = encoder.encode(message, &stamp, Some(&turn)).unwrap();
             bytes.push((stream, encoded.to_vec()));
         }
         bytes

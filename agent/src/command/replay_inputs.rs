@@ -65,6 +65,7 @@ impl Arguments {
                         tracing::error!("the run published {recorded:?}, the replay {again:?}");
                     }
                 }
+                // Not yielded: a second beginning ends the records.
                 Record::Start(_) => {}
             }
         }
@@ -102,7 +103,7 @@ impl Replay {
         // Earlier ones were superseded in the queue.
         self.unsent
             .retain(|&(of, number), _| of != stream || number > turn.number);
-        let encoded = self.encoder.encode(message, stamp, &turn);
+        let encoded = self.encoder.encode(message, stamp, Some(&turn));
         let bytes = encoded.as_ref().ok().map(|(encoded, _)| encoded);
         Ok(Published::new(stream, turn, stamp, bytes))
     }

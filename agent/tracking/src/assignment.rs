@@ -90,9 +90,11 @@ impl<'a> Solver<'a> {
             from_row: vec![free_row; columns],
             is_final: vec![false; columns],
         };
+        // Step: cheapest path to a free column, by Dijkstra's algorithm on the reduced costs.
         let (mut row, mut reached) = (free_row, 0.0);
         let end = loop {
             let Some(nearest) = self.extend(&mut paths, row, reached) else {
+                // Only costs that are not finite reach no column.
                 return;
             };
             reached = paths.cost[nearest];
@@ -102,6 +104,7 @@ impl<'a> Solver<'a> {
                 None => break nearest,
             }
         };
+        // Step: prices that keep reduced costs non-negative and those of pairs at zero.
         self.row_price[free_row] += reached;
         for column in (0..columns).filter(|&column| paths.is_final[column]) {
             if let Some(owner) = self.row_of[column] {
@@ -109,6 +112,7 @@ impl<'a> Solver<'a> {
                 self.column_price[column] -= reached - paths.cost[column];
             }
         }
+        // Step: back along the path, each row gives up its column for the next one.
         let mut next = Some(end);
         while let Some(column) = next {
             let row = paths.from_row[column];

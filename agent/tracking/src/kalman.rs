@@ -59,6 +59,7 @@ impl ConstantVelocity {
         let mut transition = Matrix4::identity();
         (transition[(0, 2)], transition[(1, 3)]) = (elapsed_s, elapsed_s);
         let variance = acceleration_mps2 * acceleration_mps2;
+        // Noise: variance * G G^T with G = [t^2 / 2, t].
         let [of_position, mixed, of_velocity] = [
             elapsed_s.powi(4) / 4.0,
             elapsed_s.powi(3) / 2.0,
@@ -85,6 +86,7 @@ impl ConstantVelocity {
         let determinant = covariance.determinant();
         Some(Innovation {
             residual_m: position_m - self.position_m(),
+            // With a negative determinant there is an inverse, but no covariance.
             information: covariance.try_inverse().filter(|_| determinant > 0.0)?,
             log_determinant: determinant.ln(),
         })
@@ -92,6 +94,7 @@ impl ConstantVelocity {
 
     /// Takes a measured position in. The covariance is updated in Joseph's form, which keeps it symmetric and positive.
     pub fn correct(&mut self, innovation: &Innovation, noise_m2: &Matrix2<f64>) {
+        // Gain P H^T S^-1, where H = [I 0] measures the position.
         let gain = self.covariance.fixed_view::<4, 2>(0, 0) * innovation.information;
         let rest = Matrix4::identity() - gain * Matrix2x4::<f64>::identity();
         self.state += gain * innovation.residual_m;

@@ -72,10 +72,12 @@ fn of_pose(covariance: &PlanarCovariance, offset_m: Vector2<f64>) -> Matrix2<f64
         yaw_rad2,
     } = *covariance;
     let [xx, xy, yy, yaw] = [xx_m2, xy_m2, yy_m2, yaw_rad2].map(f64::from);
+    // The tolerance covers the rounding of numbers in single precision.
     let is_covariance = xx >= 0.0 && yy >= 0.0 && yaw >= 0.0 && xy * xy <= xx * yy * (1.0 + 1e-4);
     if !is_covariance || !(xx + yy + yaw).is_finite() {
         return Matrix2::zeros();
     }
+    // Displacement of the position per radian of yaw.
     let across = Vector2::new(-offset_m.y, offset_m.x);
     Matrix2::new(xx, xy, xy, yy) + across * across.transpose() * yaw
 }

@@ -98,6 +98,7 @@ impl TrackState {
 
     /// No detection in a frame whose area of view holds the object.
     pub(crate) fn miss(&mut self, config: &TrackerConfig) {
+        // Bayes' rule: exists and was missed, over was missed at all.
         let missed = 1.0 - config.detection_probability;
         self.existence *= missed / (1.0 - self.existence * config.detection_probability);
     }
@@ -126,6 +127,7 @@ impl TrackState {
 
     /// The track in the LiDAR frame of the ego.
     pub(crate) fn report(&self, ego_from_world: &Isometry3<f64>) -> Track {
+        // The yaw alone: velocity and covariance are in the ground plane.
         let axis = ego_from_world * Vector3::x();
         let turn = Rotation2::new(axis.y.atan2(axis.x));
         let mut both = Matrix4::zeros();

@@ -185,6 +185,7 @@ impl Tracker {
         covariance: Option<&PlanarCovariance>,
         detections: &[Detection],
     ) -> Result<Isometry3<f64>, TrackingError> {
+        // Before time advances: after an error everything is as it was.
         world_from_ego.validate()?;
         let elapsed_s = self.advance(capture_nanos)?;
         let world_from_ego = world_from_ego.isometry();
@@ -199,6 +200,7 @@ impl Tracker {
         let owners = self.assign(&measurements);
         let ego_from_world = world_from_ego.inverse();
         self.count_misses(&owners, &ego_from_world);
+        // After `count_misses`: owners are indices into the list of tracks.
         self.tracks.retain(|track| track.is_alive(&self.config));
         self.begin(&measurements, &owners);
         Ok(ego_from_world)
@@ -245,6 +247,7 @@ impl Tracker {
             })
             .collect();
         let found = self.config.detection_probability;
+        // Below this cost a pair is likelier than a miss and a new object or false alarm together.
         let unpaired = 2.0
             * (found / (1.0 - found) / (std::f64::consts::TAU * self.config.density_per_m2)).ln();
         let cost = |track: usize, column: usize| {

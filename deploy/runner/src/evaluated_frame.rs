@@ -17,6 +17,7 @@ pub(crate) fn judge(scores: &mut FrameScores, frame: EvaluatedFrame, is_timed: b
     scores.judge_whole(
         (frame.tick as u64, stamp.capture_nanos),
         latency_ms,
+        // A frame that failed counts as unanswered, whatever its result holds.
         frame.failure.is_none().then_some(frame.result),
         &frame.truth,
         &poses,

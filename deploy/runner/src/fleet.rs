@@ -91,6 +91,7 @@ impl Fleet {
         Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
         let loaded = scenario.poses().iter().try_for_each(load_networks);
         loaded.context("localizer")?;
+        // Opened only to refuse a faulty link before any process starts.
         if let Some(link) = &scenario.link {
             LinkEmulator::open(&link.model, link.seed)?;
         }
@@ -115,6 +116,7 @@ impl Fleet {
                 bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
             }
         }
+        // An empty list stands for all vehicles of the scenario.
         let chosen = |cav: &&CavId| scene.agents.is_empty() || scene.agents.contains(cav);
         let agents: Vec<CavId> = recorded.agents.iter().filter(chosen).cloned().collect();
         let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
@@ -132,13 +134,16 @@ impl Fleet {
             }
         }
         let scene = &mut scenario.scene;
+        // No underflow: scenario_of has refused a seek beyond the last tick.
         let left = recorded.ticks.len() - scene.seek;
+        // A repeated scene has no last tick of its own.
         let ticks = if scene.repeat {
             scene.frames
         } else {
             Some(scene.frames.map_or(left, |frames| frames.min(left)))
         };
         let findings = findings::sampled(std::slice::from_ref(recorded), scene.intensity_scale);
+        // What the file left open is filled in, so that the scenario.yaml of the run is complete.
         scene.scenario = Some(name);
         scene.agents.clone_from(&agents);
         scenario.ego.id = Some(ego.clone());
@@ -235,6 +240,7 @@ impl Fleet {
             .and_then(|link| LinkConfig::open(&link.model).ok());
         let link = link.as_ref().map(|(link, folder)| (link, folder.as_path()));
         let files = files_of(*method, models.weights.clone(), &vehicles, link);
+        // Only the frames and vehicles of the run are hashed: no others are read.
         let mut data = self.recorded.clone();
         data.agents.clone_from(&self.agents);
         data.ticks.drain(..scene.seek);

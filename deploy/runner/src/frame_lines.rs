@@ -54,10 +54,12 @@ impl FrameLines {
 
     fn write(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> io::Result<()> {
         let tick = Some(frame.tick as u64);
+        // A frame that failed has no result, but its truth is written all the same.
         if frame.failure.is_none() {
             let line = FrameReport::new(&frame.stamp, tick, &frame.result);
             write_line(&mut self.detections, &OfScenario { scenario, line })?;
         }
+        // An ego that does not track leaves no file: readers tell the two apart by that.
         if let Some(tracks) = &frame.tracks {
             let out = match &mut self.tracks {
                 Some(out) => out,

@@ -81,6 +81,7 @@ impl Command {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         use malloc_settings::{KEPT_MEMORY, ROUTER_THREADS};
         let settings = [KEPT_MEMORY.as_slice(), &[ROUTER_THREADS]].concat();
+        // Executes this program again where a setting is missing, so nothing may run before it.
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {
             Self::Report(arguments) => arguments.run(),
@@ -101,6 +102,7 @@ fn client(
     router: &Endpoint,
     keys: Option<&Path>,
 ) -> anyhow::Result<(Identity, BusOptions)> {
+    // A process without a vehicle has its role in place of the id.
     let cav = CavId::new(role.as_str())?;
     let identity = Identity::new(run.clone(), process_id(role, &cav), cav);
     let mut options = BusOptions::client(router.clone());

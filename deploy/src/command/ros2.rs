@@ -119,6 +119,7 @@ impl Arguments {
         let domain_id = self.network.domain_id()?;
         let stop = Stop::new();
         stop.on_signals()?;
+        // A network that does not answer must not keep the process after Ctrl-C.
         stop.enforce(STOP_LIMIT);
         let keys = self.keys.as_deref();
         let (identity, options) = client(&self.run, Role::Ros2, &self.connect, keys)?;
@@ -137,6 +138,7 @@ impl Arguments {
             self.run
         ));
         let report = run(&bus, &session, &self.options(), &stop)?;
+        // Withdraws the tokens, so that other nodes see this one leave.
         drop(session);
         if let Err(overdue) = bus.leave(STOP_LIMIT) {
             tracing::warn!("{overdue}");

@@ -78,6 +78,7 @@ impl Arguments {
             stop.on_end_of_input()?;
         }
         stop.enforce(STOP_LIMIT);
+        // Before the session opens, whose threads it watches.
         router_panic::watch(&stop);
         let session = open(&options)?;
         let endpoint = options.endpoint();
@@ -87,6 +88,7 @@ impl Arguments {
         let mut probe = self.probe(&session, &options);
         let failure = loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
+            // Also at the end, or refusals since the last report would be lost.
             if options.guard.is_some() && (ended || Instant::now() > report_at) {
                 report_at = Instant::now() + REPORT_ROUND;
                 refusals.update(&session);

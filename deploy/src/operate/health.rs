@@ -260,6 +260,7 @@ impl Usage {
         };
         let descriptors = fs::read_dir(format!("/proc/{pid}/fd")).ok();
         Some(Self {
+            // VmRSS counts units of 1024 bytes.
             resident_mib: field("VmRSS:").map(|kib| kib as f64 / 1024.0),
             threads: field("Threads:"),
             descriptors: descriptors.map(|entries| entries.count() as u64),

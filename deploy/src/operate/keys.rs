@@ -97,6 +97,7 @@ pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
     };
     let names = plan.principals.iter().map(ToString::to_string);
     let is_there = |name: &str| plan.folder.join(name).join(CERTIFICATE_FILE).exists();
+    // All are checked before any is written, so that a refusal changes nothing.
     if !plan.replace
         && let Some(taken) = names.clone().find(|name| is_there(name))
     {
@@ -132,6 +133,7 @@ impl KeyStore<'_> {
         let unusable = unusable(key_path.display().to_string());
         // An existing one stays valid for as long as the certificates that it signs.
         let mut params = params(AUTHORITY_NAME, self.plan.lifetime.max(DAY * 3650))?;
+        // Path length 0: what it signs cannot sign further certificates.
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
         params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
         let (pem, key) = if key_path.exists() {
@@ -193,6 +195,7 @@ impl KeyStore<'_> {
     /// Atomic write: leaves neither half a file nor a moment in which others can read a key.
     fn write(&mut self, path: PathBuf, text: &str, mode: u32) -> Result<(), KeyError> {
         let begun = path.with_extension("new");
+        // A file that an interrupted write has left would stop create_new.
         let _ = fs::remove_file(&begun);
         let mut options = OpenOptions::new();
         options.write(true).create_new(true).mode(mode);

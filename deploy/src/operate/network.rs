@@ -118,6 +118,7 @@ impl RouterEndpoint {
         run: &RunId,
         specs: &[ProcessSpec],
     ) -> Result<Vec<ProcessId>, BusError> {
+        // A router of our own is new, so nobody can be present on it.
         if network.connect.is_none() {
             return Ok(Vec::new());
         }
@@ -164,6 +165,7 @@ fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
     let host = place.split_once('/').map_or(place, |(_, host)| host);
     // If another program takes the port in between, the router reports the error.
     let any = format!("{host}:0");
+    // Free for the protocol in use: QUIC takes a port of UDP.
     let bound = match secured {
         true => UdpSocket::bind(any).and_then(|socket| socket.local_addr()),
         false => TcpListener::bind(any).and_then(|listener| listener.local_addr()),

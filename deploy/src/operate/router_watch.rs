@@ -80,6 +80,7 @@ impl RouterWatch {
         let now = Instant::now();
         let silence = { self.probe.as_mut() }.map_or(Duration::ZERO, |probe| probe.silence(now));
         let reported = reported.map_or(silence, |at| now.saturating_duration_since(at));
+        // Any message that came through shows that the router passes messages.
         self.judge(silence.min(reported), scorer.router_lost_since(), now)
     }
 
@@ -92,6 +93,7 @@ impl RouterWatch {
     ) -> Option<Finding> {
         let looked = self.looked.replace(now).unwrap_or(now);
         let pause = now.saturating_duration_since(looked);
+        // A gap in the own loop says nothing about the router.
         if pause > LIMIT {
             self.pauses.add(pause);
             let seconds = pause.as_secs_f64();
@@ -103,6 +105,7 @@ impl RouterWatch {
         if is_silent && self.is_here {
             return Some(Finding::Failed(in_words(silence)));
         }
+        // A router elsewhere may come back, so its silence is an outage and no failure.
         let since = lost_since.or_else(|| is_silent.then(|| now.checked_sub(silence))?);
         match (self.gone_since, since) {
             (None, Some(since)) => {

@@ -52,6 +52,7 @@ impl RunKeys {
             return Ok(Self { folder, is_own });
         }
         let (folder, is_own) = (run_folder.join("keys"), true);
+        // Held before the keys are made: dropped on an error, it removes those that were written.
         let own = Self { folder, is_own };
         keys::make(&KeyPlan::new(&own.folder, principals, DAYS_OF_A_RUN))?;
         Ok(own)
@@ -119,6 +120,7 @@ impl RefusalWatch {
         let look = move || {
             loop {
                 let ended = ending.wait_until(Instant::now() + LOOK_ROUND);
+                // Once more after the request, so that the last refusals count.
                 refusals.update(&session);
                 if ended {
                     return refusals;

@@ -114,6 +114,7 @@ impl RunStatus {
         })?;
         let mut status: Self = serde_json::from_str(&text).at(&path)?;
         let supervisor = Usage::of(status.pid);
+        // Another program may have the number of a supervisor that has ended, so the age counts too.
         if status.phase != Phase::Over && (supervisor.is_none() || status.age() > STALE) {
             let is_stopped = supervisor.is_some_and(|usage| usage.is_stopped);
             status.phase = if is_stopped {
@@ -166,6 +167,7 @@ impl RunStatus {
                 matches!(process.state, State::Ready | State::Ended) && process.problems.is_empty()
             }
             Phase::Ending | Phase::Over => process.state != State::Down,
+            // States of processes are from before that, so the run alone is named.
             Phase::Lost | Phase::Suspended => true,
         };
         let is_unwell = |process: &&ProcessStatus| !is_well(process) || process.failure.is_some();
@@ -343,6 +345,7 @@ impl StatusWriter {
             processes: processes(now),
         };
         let json = serde_json::to_string_pretty(&status).unwrap_or_default();
+        // Not synced to the disk: it is replaced twice a second.
         match atomic_file::write_volatile(&self.path, json) {
             Ok(()) => self.has_warned = false,
             Err(error) if !self.has_warned => {

@@ -61,6 +61,7 @@ impl StatusReporter {
         folder: &RunFolder,
         protocol: EvaluationProtocol,
     ) -> Self {
+        // A process that still loads its models gets no less time than one that computes.
         let [hang, start] =
             [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
         Self {
@@ -128,6 +129,7 @@ impl StatusReporter {
         display: &mut Display,
     ) -> Ending {
         loop {
+            // Before the request to stop, which such a panic makes too.
             if let Some(panic) = router_panic::first() {
                 let how = panic.to_owned();
                 return Ending::RouterFailed { how };
@@ -138,6 +140,7 @@ impl StatusReporter {
             }
             let progress = scorer.progress();
             display.update(&progress);
+            // The scorer is in this process, so its own reports prove nothing.
             let others = { progress.last_reports.iter() }.filter(|(name, _)| *name != SCORER);
             match self.router.look(scorer, others.map(|(_, at)| *at).max()) {
                 Some(Finding::Failed(how)) => return Ending::RouterFailed { how },

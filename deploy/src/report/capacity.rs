@@ -81,6 +81,7 @@ impl Capacity {
     /// Replay rate at which the machine is expected to keep up, relative to the current one: a multiple of 0.05 below
     /// the expected share.
     pub fn relative_rate(&self) -> f64 {
+        // In steps of 0.05, with 5 % in reserve.
         ((self.expected_share * 20.0 * 0.95).floor() / 20.0).max(0.05)
     }
 }

@@ -33,6 +33,7 @@ pub(super) fn others(neighbours: &BTreeMap<CavId, NeighbourRecord>) -> BTreeMap<
 
 impl fmt::Display for OtherClock {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // A long transit makes a clock seem behind, never ahead.
         let system = self.system_s.map(|offset_s| match offset_s > 0.0 {
             true => format!("clock {offset_s:.3} s ahead, durations from it not measurable"),
             false => format!("clock {:.3} s behind, or as long a transit", -offset_s),

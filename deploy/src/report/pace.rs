@@ -45,6 +45,7 @@ impl Pace {
         processes: &[ProcessStats],
     ) -> Self {
         let mut published_s: Vec<f64> = records.iter().filter_map(published_s).collect();
+        // Records are in the order of capture, not of publication.
         published_s.sort_by(f64::total_cmp);
         let intervals_ms = published_s.windows(2).map(|pair| (pair[1] - pair[0]) * 1e3);
         let intervals_ms: Vec<f64> = intervals_ms.collect();

@@ -103,6 +103,7 @@ pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessR
         sum.cpu_s += stats.usage.cpu_s;
         sum.playing_cpu_s += (stats.usage.cpu_s - stats.cpu_before_s).max(0.0);
         sum.peak_resident_bytes = sum.peak_resident_bytes.max(stats.usage.peak_resident_bytes);
+        // Sweeps add up over the instances. Answers and ticks are of the whole run already.
         *frames = match kind.as_str() {
             "agent" => *frames + sweeps(stats),
             "ego" => pace.answered,

@@ -94,6 +94,7 @@ impl TrackReport {
             match line.tick {
                 Some(tick) => {
                     let key = (scenario, line.result.ego.to_string(), tick);
+                    // Of several results of a tick the first counts, as in the scores of a run.
                     results.detections.entry(key).or_insert(line);
                 }
                 None => without_truth += 1,
@@ -127,6 +128,7 @@ impl TrackReport {
         for_each_line(&truth, |OfScenario { scenario, line }| {
             report.follow(&mut followed, scenario, &line, &mut results)
         })?;
+        // Results with a line of truth were taken out on the way.
         report.without_truth = without_truth + results.detections.len();
         let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
         report.quality = TrackQuality::of(&sequences);
@@ -205,6 +207,7 @@ fn frame(truth: &GroundTruth, tracks: Vec<Track>) -> TrackedFrame {
             let distances = others.iter().map(|other| distance_m(&other.box3d, box3d));
             distances.fold(f64::INFINITY, f64::min)
         };
+        // On an object that does not count only if none that counts is nearer.
         let to_ignored = distance(&truth.ignored);
         let is_on_ignored = to_ignored < MATCH_DISTANCE_M && to_ignored < distance(&truth.objects);
         corners_within(&box3d.corners(), truth.area_m) && !is_on_ignored
@@ -239,6 +242,7 @@ fn for_each_line<T: DeserializeOwned>(
     let mut line = Vec::new();
     for index in 1.. {
         line.clear();
+        // A longer line is cut here, and then refused as incomplete JSON.
         let mut bounded = reader.by_ref().take(MAX_LINE_BYTES);
         if bounded.read_until(b'\n', &mut line).at(path)? == 0 {
             break;

@@ -46,6 +46,7 @@ impl InitialPose {
         }
         self.is_published = true;
         let lidar_from_base = self.mount.base_from_lidar.isometry().inverse();
+        // The estimate is of the LiDAR: world_from_base = world_from_lidar * lidar_from_base.
         let world_from_base = (world_from_cav.isometry() * lidar_from_base).into();
         let covariance = estimate.covariance().unwrap_or(&DRAWN);
         Some(ros2::pose(

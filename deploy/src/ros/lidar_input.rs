@@ -110,6 +110,7 @@ impl LidarInputs {
             let starting_pose = starting_poses.find(|source| source.cav == *cav);
             let (queue, superseded) = (Arc::clone(&queue), Arc::clone(&superseded));
             let lane = cav.clone();
+            // Runs on zenoh's receive thread, so it only queues. Sweeps are decoded by the queue's reader.
             let receive =
                 move |sample: Sample| match queue.push(lane.clone(), sample.payload().clone()) {
                     PushOutcome::Queued | PushOutcome::Closed(_) => {}
@@ -172,6 +173,7 @@ impl Input {
                 return self.log.warn(&error);
             }
         };
+        // Read before the check, which replaces it.
         let previous_nanos = self.stamps.last_nanos;
         match self.stamps.take(sweep.capture_nanos, unix_nanos()) {
             Ok(odd) => {

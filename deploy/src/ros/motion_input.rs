@@ -135,6 +135,7 @@ impl Measurements {
     }
 
     fn motion(&self, previous_nanos: Option<u64>, capture_nanos: u64) -> EgoMotion {
+        // The first sweep has no interval before it: its yaw rate is that at its capture.
         let previous_nanos = previous_nanos.unwrap_or(capture_nanos);
         EgoMotion {
             speed_mps: self.speed_mps.at(capture_nanos),

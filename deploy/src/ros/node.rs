@@ -186,6 +186,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         members: &BoundedQueue<(), LivelinessEvent>,
     ) -> Result<NodeReport> {
         let ended = self.publish_all(subscriber, members);
+        // Also after an error, as the scope waits for every thread that it has started.
         self.sweeps.into_values().for_each(Forwarding::end);
         let left_out = self.left_out + subscriber.overwritten() + subscriber.undelivered();
         ended.map(|()| NodeReport {
@@ -201,6 +202,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         members: &BoundedQueue<(), LivelinessEvent>,
     ) -> Result<()> {
         loop {
+            // All changes first, so that a topic is there before its first message.
             while let Pop::Item((), event) = members.take(Some(Instant::now())) {
                 self.note(event)?;
             }
@@ -273,6 +275,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let frames: Vec<_> = self.agents.iter().filter_map(place).collect();
         // The stamp of a fixed transform has no meaning.
         let cdr = ros2::transforms(0, &frames);
+        // Only after a change: late subscribers get the last message anyway.
         if self.fixed == cdr || self.fixed.is_empty() && frames.is_empty() {
             return Ok(());
         }

@@ -145,6 +145,7 @@ impl RobotFrames {
                 match pose
                     .map(|pose| robot.map_from_odom(&state.tree, self.mount.as_ref(), nanos, &pose))
                 {
+                    // Its transforms may still come. Later poses wait behind it, in order.
                     Some(Err(NoPlace::NoTransform(NoTransform::Later { .. }))) => break,
                     Some(Ok(map_from_odom)) => robot.map_from_odom = Some(map_from_odom),
                     Some(Err(reason)) => {
@@ -220,6 +221,7 @@ impl Robot {
         let [_, base] = self.odom_and_base.as_ref()?;
         match mount {
             Some(mount) => Some((base, mount.base_from_lidar.isometry())),
+            // Without a mount tf has the LiDAR under its own name.
             None => Some((self.lidar.as_deref()?, Isometry3::identity())),
         }
     }
@@ -234,6 +236,7 @@ impl Robot {
         let [odom, _] = self.odom_and_base.as_ref().ok_or(NoPlace::NoOdometry)?;
         let (frame, frame_from_lidar) = self.lidar_place(mount).ok_or(NoPlace::NoOdometry)?;
         let odom_from_lidar = tree.at(nanos, odom, frame)? * frame_from_lidar;
+        // map_from_odom = map_from_lidar * lidar_from_odom, with the world frame as the map.
         Ok(world_from_lidar * odom_from_lidar.inverse())
     }
 

@@ -25,6 +25,7 @@ impl SceneClock {
             _ => None,
         };
         if previous.is_some_and(|previous| capture_nanos < previous) {
+            // The other vehicles' times are of the round before, and would set the clock back once more.
             self.sensors.retain(|_, nanos| *nanos <= capture_nanos);
             return Some(*self.now_nanos.insert(capture_nanos));
         }

@@ -98,6 +98,7 @@ impl RosSession {
         } else {
             Box::new(builder.wait().map_err(refused)?)
         };
+        // The token shows the subscription to other nodes, so it follows once messages are received.
         let token = self.endpoint_token(EndpointKind::Subscription, topic.clone(), ros_type, qos);
         Ok(RosSubscription {
             _subscriber: subscriber,

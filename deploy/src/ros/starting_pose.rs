@@ -36,6 +36,7 @@ impl StartingPose {
             Err(error) => lock(&log).warn(&error),
         };
         let subscription = session.subscribe(topic, ros_type, Qos::DEFAULT, receive)?;
+        // The agent takes a stated pose from its GNSS stream, where the source tells the two apart.
         let gnss = Topic::stream(cav, Stream::Gnss);
         Ok(Self {
             stated,

@@ -33,6 +33,7 @@ pub(super) fn forward(
             thread::sleep(POLL_PERIOD);
             continue;
         }
+        // One place: a slow network gets the newest sweep.
         let subscriber = bus.tap(std::slice::from_ref(&key), 1)?;
         while publisher.is_wanted() && !is_ending() {
             let Pop::Item(_, raw) = subscriber.take(Some(Instant::now() + POLL_PERIOD)) else {

@@ -37,6 +37,7 @@ impl<T: Copy> TimeSeries<T> {
             discarded += 1;
         }
         self.0.push_back((nanos, value));
+        // No underflow: measurements are in the order of time, and this one is the last.
         let is_old = |first: &(u64, T)| nanos - first.0 > KEPT_NANOS;
         while self.0.len() > MOST || self.0.front().is_some_and(is_old) {
             self.0.pop_front();
@@ -80,6 +81,7 @@ impl TimeSeries<f64> {
     pub(super) fn at(&self, nanos: u64) -> Option<f64> {
         let [before, after] = self.around(nanos);
         match (before, after) {
+            // The first is before the time and the second is not, so the interval is never 0.
             (Some((from, first)), Some((to, last))) if to - from <= MAX_GAP_NANOS => {
                 Some(first + (last - first) * seconds(nanos - from) / seconds(to - from))
             }
@@ -98,6 +100,7 @@ impl TimeSeries<f64> {
         let Some(first) = self.at(from).filter(|_| from < to) else {
             return Some(last);
         };
+        // Both ends have values of their own, so only what lies strictly between them is taken.
         let is_between = |(time, _): &(u64, f64)| (from + 1..to).contains(time);
         let between = self.0.iter().copied().filter(is_between);
         let (mut sum, mut previous) = (0.0, (from, first));

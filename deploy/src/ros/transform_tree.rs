@@ -76,9 +76,11 @@ impl TransformTree {
         }
         let frame = self.0.entry(child.clone());
         let frame = frame.or_insert_with(|| Frame::below(parent, origin));
+        // The frame has its place from a better origin: valid, but left out.
         if frame.origin > origin {
             return true;
         }
+        // Under another parent, or from a better origin, the old poses mean nothing.
         if frame.origin != origin || frame.parent != *parent {
             *frame = Frame::below(parent, origin);
         }
@@ -101,6 +103,7 @@ impl TransformTree {
                 return Ok(end_from_frame);
             }
             let Some(step) = self.0.get(end) else { break };
+            // From the frame upwards: parent_from_frame = parent_from_end * end_from_frame.
             end_from_frame = step.at(nanos, end)? * end_from_frame;
             end = &step.parent;
         }

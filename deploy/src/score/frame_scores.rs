@@ -161,6 +161,7 @@ impl FrameScores {
         let agents = truth.agents.iter();
         let world_from_lidar: Vec<(CavId, Pose)> =
             { agents.map(|agent| (agent.cav.clone(), agent.world_from_lidar)) }.collect();
+        // Poses count whether or not the ego has answered.
         self.judge_poses(&tick.poses, &world_from_lidar);
         let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
         if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
@@ -192,6 +193,7 @@ impl FrameScores {
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         self.judge_poses(poses, &world_from_lidar);
+        // Without a network a tick is published at its capture time.
         let at = (tick, capture_nanos, capture_nanos);
         let Some(result) = result else {
             return self.judge_unanswered(at, objects, &world_from_lidar);
@@ -314,6 +316,7 @@ impl FrameScores {
     ) {
         let best = self.best.as_ref();
         let best = best.map(|best| (best.result.fused.len(), best.truth.len()));
+        // Strictly better, so of equal frames the first one stays.
         if best.is_none_or(|best| (result.fused.len(), objects.objects.len()) > best) {
             self.best = Some(JudgedFrame {
                 tick,

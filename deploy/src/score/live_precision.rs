@@ -66,6 +66,7 @@ impl LivePrecision {
         self.answered += u64::from(answer.is_some());
         let detections = answer.as_ref().map_or(&[][..], |answer| answer.detections);
         self.all_ticks.add(detections, truth.truth);
+        // Before the result of this tick is added: it is published after the tick.
         let streamed = self.stream(truth);
         let Some(answer) = answer else {
             return streamed;
@@ -127,6 +128,7 @@ impl LivePrecision {
         let index = published.rposition(|published| published.nanos <= truth.began_nanos)?;
         self.published.drain(..index);
         let newest = self.published.front()?;
+        // Without both poses the motion is unknown, and the boxes stay where they are.
         let now_from_then = match (truth.world_from_ego, newest.world_from_ego) {
             (Some(now), Some(then)) => now.from_world(&then).isometry(),
             _ => Pose::IDENTITY.isometry(),

@@ -287,6 +287,7 @@ impl Communication {
         Self {
             payload_bytes_mean: payload,
             wire_bytes_mean: mean(bytes.iter().map(|(_, wire)| *wire as f64)),
+            // The logarithm of 0 is infinite, which JSON has no number for.
             log2_payload: payload.filter(|bytes| *bytes > 0.0).map(f64::log2),
             nominal_fp32_log2: (4.0 * nominal_values as f64).log2(),
         }

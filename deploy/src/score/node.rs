@@ -239,6 +239,7 @@ impl ScorerNode {
     /// When the scorer's own thread has panicked.
     pub fn finish(self) -> Scored {
         let (scored, connection) = self.scored();
+        // The bus demands that all subscriptions are ended before it leaves.
         drop((
             connection.subscriptions,
             connection.presence,
@@ -261,6 +262,7 @@ impl ScorerNode {
     }
 
     fn scored(self) -> (Scored, Connection) {
+        // A closed queue is still read to its end.
         self.inbox.close();
         let joined = self.thread.join();
         let (scores, stats, unwritten) =
@@ -394,6 +396,7 @@ impl Worker {
         let fused = result.fused.len();
         let wire_bytes = result.fused.iter().map(|neighbour| neighbour.wire_bytes);
         let bytes: u64 = wire_bytes.sum();
+        // The stamps may be of two clocks, but a duration cannot be negative.
         let latency = latency_ms.map(|ms| Duration::from_secs_f64(ms.max(0.0) / 1e3));
         self.bus_stats.answered(latency, fused);
         let at = arrival.at;

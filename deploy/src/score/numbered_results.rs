@@ -43,6 +43,7 @@ impl<T> NumberedResults<T> {
         let capture_nanos = self.waiting.front()?.capture_nanos;
         let tick = self.ticks.get(&capture_nanos).copied();
         let newest = self.ticks.last_key_value();
+        // Ticks are published in order, so behind a later truth an earlier one is lost.
         let is_past = newest.is_some_and(|(newest, _)| *newest > capture_nanos);
         if tick.is_none() && !is_past && !is_over && self.waiting.len() <= PLACES {
             return None;

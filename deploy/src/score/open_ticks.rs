@@ -42,8 +42,6 @@ impl OpenTicks {
         if { self.closed_until }.is_some_and(|closed| capture_nanos <= closed) {
             return None;
         }
-        let is_full = self.open.len() >= MOST_OPEN && !self.open.contains_key(&capture_nanos);
-        let closed = if is_full { self.close_oldest() } else { None };
         let tick = self.open.entry(capture_nanos).or_default();
         match part {
             Part::Truth(truth) => {
@@ -59,7 +57,9 @@ impl OpenTicks {
                 }
             }
         }
-        closed
+        // The oldest may be this one: closed ticks stay in order.
+        let is_full = self.open.len() > MOST_OPEN;
+        is_full.then(|| self.close_oldest()).flatten()
     }
 
     /// Removes the oldest tick.

@@ -62,6 +62,7 @@ impl StageStamps {
 }
 
 fn ms_between(began_nanos: u64, nanos: u64) -> f64 {
+    // Signed: the two times may be of two clocks.
     (nanos as f64 - began_nanos as f64) / 1e6
 }
 

@@ -9,5 +9,6 @@ pub(crate) fn ground_truth(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -
     let frames: Vec<Frame> = truth.agents.iter().map(Frame::of_truth).collect();
     let ego_index = frames.iter().position(|frame| frame.cav == *ego);
     let frames: Vec<&Frame> = frames.iter().collect();
+    // An index behind the last frame stands for no ego.
     GroundTruth::of_tick(&frames, ego_index.unwrap_or(frames.len()), rule)
 }

@@ -140,6 +140,7 @@ impl FrameAssembler {
         {
             self.track(at, cav, seen);
         }
+        // Frames are shown in the order of capture: a late message of an earlier one has no place.
         if self.shown_until.is_some_and(|shown| at <= shown) {
             return None;
         }
@@ -291,8 +292,10 @@ impl FrameAssembler {
             Stream::Pose => rank,
             _ => return,
         };
+        // Signed: sender and viewer may have two clocks.
         let latency_ms = (seen.arrived_nanos as f64 - seen.header.stamp.publish_nanos as f64) / 1e6;
         let arrivals = &mut self.frame(at).arrivals;
+        // Of equal rank the later message counts.
         if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
             let arrival = Arrival {
                 rank,
@@ -406,6 +409,7 @@ impl OpenFrame {
     fn vehicle(&self, cav: &CavId, points: &mut Vec<u8>) -> Vehicle {
         let truth = self.true_pose(cav);
         let own_result = self.result().filter(|result| result.ego == *cav);
+        // The ego's result repeats its pose, for ticks whose pose message is missing.
         let estimate = { self.poses.get(cav) }
             .map(|(_, estimate)| estimate)
             .or(own_result.map(|result| &result.pose));
@@ -428,6 +432,7 @@ impl OpenFrame {
             },
             truth: truth.map(Planar::of),
             error_m: pose.zip(truth).map(distance_m),
+            // Points of a vehicle without an estimate are shown where it truly is.
             world_from_lidar: pose.or(truth).copied(),
             points: sweep.len() / POINT_BYTES,
         }
@@ -533,6 +538,7 @@ impl OpenFrame {
                     .unwrap_or_else(|| new(&skipped.cav))
             });
         }
+        // From these something has arrived, but the result does not name them.
         all.extend(links.into_values());
         for link in &mut all {
             let mut neighbours = result.neighbours.iter();

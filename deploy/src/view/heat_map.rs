@@ -48,6 +48,7 @@ impl HeatMap {
 fn activations(features: &BevFeatures) -> Vec<f32> {
     let cells = features.grid.cells().max(1);
     let mut sums = vec![0.0_f32; cells];
+    // Values are in the order `[C, H, W]`: one plane per channel.
     for plane in features.values.chunks_exact(cells) {
         for (sum, value) in sums.iter_mut().zip(plane) {
             *sum += value.abs();
@@ -61,12 +62,14 @@ fn activations(features: &BevFeatures) -> Vec<f32> {
 /// Activations between those of empty ground and the brightest as 0..=255.
 fn levels(activations: &[f32]) -> Vec<u8> {
     let mut sorted = activations.to_vec();
+    // Infinite and undefined values would spoil the quantiles.
     sorted.retain(|value| value.is_finite());
     sorted.sort_by(f32::total_cmp);
     let [empty, brightest] = [EMPTY, BRIGHTEST].map(|share| {
         let rank = (share * sorted.len().saturating_sub(1) as f64).round();
         sorted.get(rank as usize).copied().unwrap_or(0.0)
     });
+    // Equal quantiles must not lead to a division by 0.
     let range = (brightest - empty).max(f32::MIN_POSITIVE);
     activations
         .iter()

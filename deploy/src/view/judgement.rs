@@ -89,6 +89,7 @@ impl Judge {
 
     fn rule(&self, area: &DetectionArea) -> GroundTruthRule {
         let ([x0, x1], [y0, y1]) = (area.x_m, area.y_m);
+        // Lower corner, then upper corner. The height is not limited.
         let area_m = [x0, y0, f64::NEG_INFINITY, x1, y1, f64::INFINITY];
         match &self.protocol {
             Some(protocol) => protocol.rule_within(area_m),

@@ -84,6 +84,8 @@ impl LinkSeries {
             from: from.clone(),
             sent_bytes: link.sent.get(&capture_nanos).copied().unwrap_or(0),
             transit_ms: link.transit_ms.get(&capture_nanos).copied(),
+            // What was published less what has arrived is on its way. With two clocks a message can arrive
+            // before it is published, and the difference stays at 0.
             waiting_bytes: began_nanos
                 .map(|now| until(&link.published, now).saturating_sub(until(&link.arrived, now))),
         };

@@ -185,6 +185,7 @@ impl LiveRun {
             if left == Some(0) {
                 return None;
             }
+            // The pause comes before the next frame is taken, so that the page gets the newest one then.
             sleep(pause).await;
             match timeout(HEARTBEAT, newest.changed()).await {
                 Err(_) => {
@@ -312,6 +313,7 @@ impl Listener {
     /// Receives the feature maps of the vehicles of which a page shows one.
     fn follow_maps(&self, maps: &mut Option<(BTreeSet<CavId>, PassiveSubscriber)>) {
         let wanted = self.shared.maps.wanted();
+        // Another selection of vehicles needs another subscription.
         maps.take_if(|(subscribed, _)| *subscribed != wanted);
         if wanted.is_empty() {
             return;
@@ -401,6 +403,7 @@ impl Listener {
                     .entry(cav.clone())
                     .or_insert_with(|| self.assembly.for_ego(ego.clone())),
             };
+            // Without a reader too: the assembler has to see every message.
             if let Some(frame) = assembly.add(&seen).filter(|_| frames.receiver_count() > 0) {
                 let frame = frame.to_bytes();
                 let len = (frame.len() as u32).to_le_bytes();

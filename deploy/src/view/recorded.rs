@@ -193,6 +193,7 @@ impl RecordedRun {
         let mut assembly = FrameAssembler::new(self.protocol.clone(), self.areas.clone())
             .for_ego(timeline.ego.clone());
         let arrivals = self.entries_of(moment).map(|entry| entry.arrived_nanos);
+        // Reports until the last message of the moment: what was known at that time.
         let until = arrivals.max().unwrap_or(0);
         // Results come last, and complete the scene frame.
         let is_of_result = |entry: &&usize| is_result(&self.entry(**entry).key.topic);

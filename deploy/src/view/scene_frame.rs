@@ -199,6 +199,7 @@ impl SceneFrame {
     pub fn clouds(&self) -> impl Iterator<Item = (&Vehicle, Vec<[f32; 3]>)> {
         let mut rest = self.points.as_slice();
         self.vehicles.iter().map(move |vehicle| {
+            // A frame that is cut off has fewer points, and is no reason to panic.
             let (points, behind) = rest.split_at((vehicle.points * POINT_BYTES).min(rest.len()));
             rest = behind;
             let points = points.chunks_exact(POINT_BYTES).map(|point| {
@@ -254,6 +255,7 @@ fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S
 
 /// The points of a sweep as sent to the page, evenly decimated if there are many.
 pub(super) fn decimate(points: &PointCloud) -> Vec<u8> {
+    // The cast saturates: beyond 327.67 m a coordinate stays at that limit.
     let centimetres = |metres: f32| ((metres * 100.0).round() as i16).to_le_bytes();
     let decimated = points.decimate(MAX_POINTS);
     let coordinates = { decimated.xyzi.iter() }.flat_map(|[x, y, z, _]| [*x, *y, *z]);

@@ -155,6 +155,7 @@ fn ego_of(query: &str) -> Option<CavId> {
 }
 
 fn text_of<'a>(name: &str, query: &'a str) -> Option<&'a str> {
+    // Values are not percent-decoded: ids and numbers need no escapes.
     query
         .split('&')
         .find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))

@@ -43,6 +43,7 @@ pub fn until_stopped(
         "http://{}/ (Ctrl-C ends it)",
         server.address()
     ));
+    // The wait needs a deadline, the loop makes it endless.
     while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
     let dropped = server.readers().dropped();
     if dropped > 0 {

@@ -25,6 +25,7 @@ impl Trails {
 
     /// Adds the tracks of a frame and returns them with their trails. Without the pose of the ego none has a place.
     pub(super) fn add(&mut self, capture_nanos: u64, tracks: &Tracks) -> Vec<ShownTrack> {
+        // Time goes back: the scene has begun again, and so do its trails.
         if capture_nanos <= self.newest_nanos {
             self.places.clear();
         }

@@ -30,6 +30,7 @@ impl Fusion for AttentionFusion {
 
 /// `[C, H, W]`: attention output of the ego at every cell.
 pub(super) fn attended(WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor, TchError> {
+    // The softmax over one map is 1, so the map passes through unchanged, without a copy of all its cells.
     if features.size4()?.0 == 1 {
         return features.f_get(0);
     }

@@ -44,6 +44,7 @@ impl BlockOrder {
             vec![channels],
         ]
         .concat();
+        // Row and column of a level side by side, the largest windows first: then each window is one run.
         let order = [vec![0], self.interleaved(), vec![2 * levels + 1]].concat();
         let channels_last = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         channels_last
@@ -65,6 +66,7 @@ impl BlockOrder {
             .zip(&columns)
             .flat_map(|(&row, &column)| [row, column]);
         let shape: Vec<i64> = [count].into_iter().chain(sizes).chain([channels]).collect();
+        // The inverse: the rows of all levels, which are the odd dimensions, then the columns of all levels.
         let halves = (0..levels).map(|level| 1 + 2 * level as i64);
         let order = [
             vec![0],
@@ -83,6 +85,7 @@ impl BlockOrder {
     pub fn places(&self, edge: i64) -> Vec<[i64; 2]> {
         let mut places = vec![[0, 0]];
         let mut covered = 1;
+        // Each level repeats the order inside the smaller window at every corner of the larger one.
         for &level in self.edges.iter().filter(|&&level| level <= edge) {
             let steps = level / covered;
             let corners = (0..steps)

@@ -52,6 +52,7 @@ impl ChannelMixing {
             });
         let matrices: Vec<Option<Tensor>> = matrices.collect::<Result<_, TchError>>()?;
         let learns = matrices.iter().flatten().any(Tensor::requires_grad);
+        // Products that are written into a prepared tensor have no gradient.
         if learns || !are_numbers(features) {
             let turned = (0..)
                 .zip(&matrices)

@@ -64,8 +64,10 @@ impl Fusion for Cobevt {
         let [features, mask] =
             [&maps.warped.features, &maps.warped.mask].map(|maps| maps.f_index_select(0, &order));
         let (features, mask) = (features?, mask?);
+        // Where all maps reach every cell, neither the product with the mask nor masked attention is needed.
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let features = if sees_all { features } else { features * &mask };
+        // For published weights: empty slots are maps of zeros that count in the mean at the end.
         let empty = if self.count_missing {
             (self.fusion.slots() - agents).max(0)
         } else {
@@ -93,6 +95,7 @@ impl Fusion for Cobevt {
 pub(super) fn nearest_first(metadata: &[MapMetadata]) -> Tensor {
     let distance = |index: &i64| {
         let [x, y, _] = metadata[*index as usize].ego_from_cav.translation_m;
+        // Below every distance: the ego stays first beside a neighbour at the same place.
         if *index == 0 { -1.0 } else { x.hypot(y) }
     };
     let mut order: Vec<i64> = (0..metadata.len() as i64).collect();

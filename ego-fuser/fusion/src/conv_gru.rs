@@ -117,6 +117,7 @@ impl ConvGru {
                     gates.weight.f_narrow(0, hidden, hidden)?,
                     candidate.weight.shallow_clone(),
                 ];
+                // Only the weights of the input: those of the state would multiply zeros.
                 let kernel = Tensor::f_cat(&kernels, 0)?.f_narrow(1, 0, input)?;
                 let bias = Tensor::f_cat(
                     &[

@@ -119,6 +119,7 @@ impl Fusion for DiscoNet {
             return Ok(features.f_get(0)?.into());
         }
         let scores = self.scores(features, maps.is_training)?;
+        // Over the agents. The ego reaches every cell, so no cell is masked for all, which would give NaN.
         let weights = scores
             .f_masked_fill(&maps.warped.mask.f_eq(0.0)?, f64::NEG_INFINITY)?
             .f_softmax(0, None)?;

@@ -23,6 +23,7 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
 
 /// Count of the numbers that are not below `least`, rounded up to a multiple of `step`.
 pub(crate) fn above(numbers: &[f32], least: f32, step: usize) -> usize {
+    // NaN is not below anything, so it counts.
     let is_above = |number: &&f32| number.partial_cmp(&&least) != Some(Ordering::Less);
     numbers
         .iter()
@@ -122,6 +123,7 @@ pub(crate) fn with_order(maps: &Tensor, order: Order) -> Result<Tensor, TchError
 
 /// `[1, C, H, W]` of a map `[C, H, W]` in its memory order, such that convolutions use that order.
 pub fn as_batch(map: &Tensor) -> Result<Tensor, TchError> {
+    // By way of [H, W, C]: a dimension in front of [C, H, W] gets the stride C, which hides its memory order.
     map.f_permute([1, 2, 0])?
         .f_unsqueeze(0)?
         .f_permute([0, 3, 1, 2])

@@ -80,6 +80,7 @@ impl History {
             return;
         }
         let maps = self.kept.entry(cav.clone()).or_default();
+        // Repeated or out of order: `before` relies on the order of capture times.
         if maps
             .back()
             .is_some_and(|last| last.capture_nanos >= kept.capture_nanos)
@@ -87,6 +88,7 @@ impl History {
             return;
         }
         maps.push_back(kept);
+        // One more than `before` gives: a map that serves another frame is itself among those kept.
         if maps.len() > self.frames {
             maps.pop_front();
         }

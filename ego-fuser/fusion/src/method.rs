@@ -212,6 +212,7 @@ impl TypedValueParser for MethodParser {
         argument: Option<&Arg>,
         value: &OsStr,
     ) -> Result<Method, clap::Error> {
+        // The parser below knows the names of the table only and would refuse that of a file.
         let script = value
             .to_str()
             .filter(|text| text.starts_with(script::PREFIX));
@@ -244,6 +245,7 @@ impl<'de> Deserialize<'de> for FusionConfig {
         let kind = fields
             .remove("kind")
             .ok_or_else(|| D::Error::missing_field("kind"))?;
+        // A script is not in the table, but its settings are stored like all others.
         let known = Method::ALL
             .into_iter()
             .map(|method| method.spec().fusion)

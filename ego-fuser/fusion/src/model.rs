@@ -160,6 +160,7 @@ impl CooperativeModel {
         let method = match (method, weights.metadata(METHOD_KEY)) {
             (Some(method), _) => method,
             (None, Some(name)) => name.parse()?,
+            // A file without a method is that of a detector alone.
             (None, None) => Method::NONE,
         };
         let config = weights.detector_config()?;
@@ -168,6 +169,7 @@ impl CooperativeModel {
             None => stored_config(weights, method, &config)?,
         };
         let mut model = Self::with_fusion(&config, method, &fusion, device)?;
+        // Variables must exist before weights are copied into them.
         if box_input::is_in(weights) {
             model.add_box_input();
         }
@@ -291,6 +293,7 @@ impl CooperativeModel {
         if views != described as i64 {
             return Err(ModelError::ViewCount { views, described });
         }
+        // One view per sample and no fusion: the views already are the batch of the head.
         if self.fusion.config().settings::<OwnConfig>().is_some() && described == facts.len() {
             let corrections = facts.iter().map(|_| None).collect();
             return Ok(CooperativeOutput {

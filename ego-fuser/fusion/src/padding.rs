@@ -40,6 +40,7 @@ impl Padding {
             return Ok(maps.shallow_clone());
         }
         maps.f_pad(
+            // Before and after, from the last dimension to the first: columns, rows, channels, maps.
             [0, self.right, 0, self.below, 0, 0, 0, slots],
             "constant",
             0.0,

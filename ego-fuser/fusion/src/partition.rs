@@ -18,6 +18,7 @@ impl Partition {
             return Err(shape_error(map));
         };
         let (rows, columns) = (height / window, width / window);
+        // A row is (window, cell) for windows and (cell, group) for grids, whose cells lie `rows` apart.
         let cut = match self {
             Self::Window => map
                 .f_view([slots, rows, window, columns, window, channels])?

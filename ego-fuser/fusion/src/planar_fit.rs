@@ -17,6 +17,7 @@ where
         .fold((Vector3::zeros(), Vector3::zeros()), |sums, pair| {
             (sums.0 + pair.0, sums.1 + pair.1)
         });
+    // NaN without pairs. The spread is then zero, and nothing is returned.
     let (from, to): (Vector3<f64>, Vector3<f64>) = (sums.0 / count, sums.1 / count);
     let (mut dot, mut cross, mut spread) = (0.0, 0.0, 0.0);
     for (source, target) in pairs.clone() {
@@ -28,6 +29,7 @@ where
     if spread.is_nan() || spread < MIN_SPREAD_M * MIN_SPREAD_M {
         return None;
     }
+    // Least squares in closed form: sine and cosine are in proportion to the sums of cross and dot products.
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), cross.atan2(dot));
     Some(Isometry3::from_parts(
         Translation3::from(to - rotation * from),

@@ -10,6 +10,7 @@ pub fn merge_points<'a>(
 ) -> PointCloud {
     let mut merged = PointCloud::default();
     for (cloud, pose) in clouds.into_iter().zip(ego_from_cav) {
+        // Points of the ego itself stay as they are, bit for bit.
         if *pose == Pose::IDENTITY {
             merged.xyzi.extend(&cloud.xyzi);
             continue;

@@ -128,6 +128,7 @@ impl ScriptFusion {
     /// [`TchError`] when there is no such file, or it is no TorchScript.
     pub(crate) fn load(file: &Path, device: Device) -> Result<Self, TchError> {
         let mut module = CModule::load_on_device(file, device)?;
+        // The module is constant: dropout and batch norm are those of inference, in training too.
         module.f_set_eval()?;
         Ok(Self {
             file: file.to_owned(),
@@ -155,6 +156,7 @@ impl Fusion for ScriptFusion {
             .module
             .forward_ts(&arguments)
             .map_err(|error| of_file(first_line(&error)))?;
+        // A map of another shape or kind would fail in the head only, without the name of the file.
         let (found, expected) = (fused.size(), &features.size()[1..]);
         if found != expected {
             return Err(of_file(format!(

@@ -294,6 +294,7 @@ impl MeanHead {
         let mean = match slots.reach {
             Some(reach) if !slots.count_missing => {
                 let reach = reach.f_unsqueeze(3)?.f_to_kind(x.kind())?;
+                // At least 1, as the first slot reaches every cell.
                 let count = reach.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
                 (x * reach).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / count
             }
@@ -422,6 +423,7 @@ impl SwapFusion {
         let total = rows.size()[0];
         let cells = self.window * self.window;
         let count = total / (size[0] * size[1]);
+        // Indices are rearranged instead of features: each chunk then gathers its rows once.
         let order = Tensor::f_arange(total, (Kind::Int64, Device::Cpu))?.f_to_device(x.device())?;
         let order = match lies_in {
             Some(partition) => {

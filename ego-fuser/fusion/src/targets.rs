@@ -154,6 +154,7 @@ impl TargetAssigner {
             let mut highest = (0.0f32, None);
             self.for_each_near(object, |index| {
                 let iou = self.standing[index].overlap(&target);
+                // Strictly larger: of equal overlaps the anchor with the lowest index is the best.
                 if iou > highest.0 {
                     highest = (iou, Some(index));
                 }
@@ -264,6 +265,7 @@ impl Standing {
             self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]) + 1.0
         };
         let (x, y) = (side(0), side(1));
+        // The added metre lets boxes overlap that are less than a metre apart.
         if x <= 0.0 || y <= 0.0 {
             return 0.0;
         }

@@ -174,6 +174,7 @@ impl V2vNet {
             let of_receiver = of_receivers.f_narrow(0, index as i64, 1)?;
             let messages = (self.message.part(&arrived, 0, false)? + of_receiver) * &incoming.mask;
             aggregated.push(match self.config.aggregation {
+                // Over all nodes: one that is out of reach counts as a message of zeros.
                 Aggregation::Mean => {
                     messages.f_mean_dim([0i64].as_slice(), true, messages.kind())?
                 }
@@ -255,6 +256,7 @@ impl Fusion for V2vNet {
         let device = warped.features.device();
         let index = Tensor::f_from_slice(&entries)?.f_to_device(device)?;
         let (maps, mask) = (
+            // As received: each node warps them to its own frame.
             aligned.received.maps.f_index_select(0, &index)?,
             warped.mask.f_index_select(0, &index)?,
         );

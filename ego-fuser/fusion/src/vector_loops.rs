@@ -12,7 +12,9 @@ const LEAST: f32 = -87.0;
 /// number takes ten times as long.
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
+    // Also minus infinity, the score of places without a token: the exponent below stays in range.
     let x = if x < LEAST { LEAST } else { x };
+    // At this magnitude the sum is rounded to a whole number, the power of two, in its lowest bits.
     let shifted = x * std::f32::consts::LOG2_E + WHOLE;
     let power = shifted - WHOLE;
     // The logarithm of 2 in two parts, of which the first has few digits.
@@ -30,6 +32,7 @@ pub(crate) fn exp(x: f32) -> f32 {
     let mantissa = series
         .into_iter()
         .fold(0.0, |sum, factor| sum * rest + factor);
+    // Times 2^power, by an addition to the bits of the exponent.
     f32::from_bits(mantissa.to_bits().wrapping_add(shifted.to_bits() << 23))
 }
 

@@ -102,6 +102,7 @@ impl AlignmentMeter {
         for scenario in scenarios {
             for tick in (0..scenario.ticks.len()).step_by(every.max(1)) {
                 for pair in self.pairs(scenario, tick, left_out)? {
+                    // Directions come from one generator: the order of these loops is part of the result.
                     for (offset, errors) in offsets.iter().zip(&mut errors) {
                         errors.push(self.around(&pair, offset, &mut rng)?);
                     }
@@ -125,6 +126,7 @@ impl AlignmentMeter {
         let agents = scenario.present_agents(tick);
         let loaded = scenario.load_tick(tick, agents, &LoadOptions::default());
         left_out.add_tick(&loaded);
+        // Agent 0 is the ego: without its frame there is no pair.
         let [(0, ego), others @ ..] = &loaded.frames[..] else {
             return Ok(Vec::new());
         };
@@ -198,13 +200,15 @@ impl AlignmentMeter {
 /// A pose shifted along the ego's axes and rotated about its own position.
 fn moved(pose: &Pose, [dx, dy, turn_rad]: [f64; 3]) -> Pose {
     let [x, y, z] = pose.translation_m;
+    // Roll and pitch are dropped: corrections are planar.
     Pose::from_xyz_yaw([x + dx, y + dy, z], pose.yaw_rad() + turn_rad)
 }
 
 /// Distance in the plane, metres, and angle, degrees.
 fn error(truth: &Pose, found: &Pose) -> [f64; 2] {
     let [dx, dy] = [0, 1].map(|axis| found.translation_m[axis] - truth.translation_m[axis]);
-    let turn_rad = (found.yaw_rad() - truth.yaw_rad()).sin().asin();
+    let (sin, cos) = (found.yaw_rad() - truth.yaw_rad()).sin_cos();
+    let turn_rad = sin.atan2(cos);
     [dx.hypot(dy), turn_rad.abs().to_degrees()]
 }
 

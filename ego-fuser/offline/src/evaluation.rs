@@ -11,13 +11,11 @@ mod sent;
 mod setup;
 pub mod stepped;
 mod sweeps;
-mod transmission;
 
 use std::ops::ControlFlow;
 
 use agent::agent::Agent;
 use agent::agent_loop::descriptor;
-use agent::attack::Attack;
 use agent::config::{AgentSettings, FleetPlace};
 use dataset::class_set::ClassSet;
 use dataset::evaluation_protocol::EvaluationProtocol;
@@ -171,17 +169,19 @@ impl Evaluator {
         scenario: &Scenario,
         on_frame: &mut dyn FnMut(EvaluatedFrame) -> ControlFlow<()>,
     ) -> Result<ControlFlow<()>, EvaluateError> {
+        // Maps and trust of the scene before mean nothing in this one.
         self.ego.forget();
         stepped::run(self, scenario, on_frame)
     }
 
     /// The vehicle at `place` among the agents of a scenario, with its pipeline: the `index`-th of those that take part.
+    /// `needed` is the stream that the method needs of it.
     fn participant(
         &self,
         settings: &AgentSettings,
         scenario: &Scenario,
         (place, index): (usize, usize),
-        is_ego: bool,
+        (is_ego, needed): (bool, Option<Stream>),
     ) -> Result<Participant, EvaluateError> {
         let settings = settings.clone().in_fleet(FleetPlace {
             scenario: &scenario.name,
@@ -191,14 +191,16 @@ impl Evaluator {
         });
         let detector = self.detector_of(&settings)?;
         let cav = &scenario.agents[place];
-        let attack = match settings.falsification {
-            Some(falsification) => Some(Attack::new(falsification, cav, 0)),
-            None => { self.setup.attack }.and_then(|attack| attack.of(place, cav)),
-        };
+        // A vehicle's own falsification takes precedence over the attack of the run.
+        let attack = { self.setup.attack }.and_then(|attack| attack.of(place, cav));
         let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
-        let agent = agent.with_rate(settings.rate).with_attack(attack);
-        Ok(Participant::new(agent, &settings))
+        let publish = needed.map_or_else(Vec::new, |stream| settings.sent_for(stream));
+        Ok(Participant::new(
+            agent.with_attack(attack),
+            settings.loop_options(publish),
+            settings.weights.is_some(),
+        ))
     }
 
     /// The detector of a vehicle: its own network, or that of the run.

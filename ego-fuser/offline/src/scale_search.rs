@@ -26,6 +26,7 @@ pub fn search_scales(
     let mut search = ScaleSearch::default();
     observe_detector(weights, scenarios, frames, &mut search, left_out)?;
     let mut setup = Setup::default();
+    // Scales that the file has already must not change what is observed.
     setup.models.precision = InferencePrecision::Float;
     setup.models.weights = weights.to_owned();
     let mut evaluator = Evaluator::new(setup)?;

@@ -58,6 +58,7 @@ impl Arguments {
         records.check_model(Some(ego.detector()), &config.models.weights)?;
         ego.warm_up(&cav)?;
         let mut ego_loop = EgoLoop::new(&cav, &ego, NodeOptions::from(&config).of_loop);
+        // Results wait for the record of their publication, since only the run knows its stamp and durations.
         let mut results: BTreeMap<u64, (Detections, Option<Tracks>)> = BTreeMap::new();
         for record in &mut records {
             let (now_nanos, input) = match record {
@@ -80,6 +81,7 @@ impl Arguments {
                         let tracks = tracks.with_context(missing)?;
                         FrameReport::new(&stamp, tick, tracks).to_json()
                     } else {
+                        // Durations as measured in the run, not those of the replay.
                         let result = Detections { stages, ..result };
                         FrameReport::new(&stamp, tick, result).to_json()
                     })?;

@@ -246,13 +246,14 @@ mod tests {
         };
         let mut compensation = LatencyCompensation::default();
         let mut carried_by_m = |tick| {
-            let mut liar = view(tick);
-            let Content::Boxes(objects) = &mut liar.content else {
-                panic!("{liar:?}");
+            let mut attacker = view(tick);
+            let Content::Boxes(objects) = &mut attacker.content else {
+                panic!("{attacker:?}");
             };
             objects[0].track = Some(lie);
-            let from = centers(&liar)[0];
-            let to = centers(&compensation.carried(&liar, liar.capture_nanos + 100_000_000))[0];
+            let from = centers(&attacker)[0];
+            let to =
+                centers(&compensation.carried(&attacker, attacker.capture_nanos + 100_000_000))[0];
             (to[0] - from[0]).hypot(to[1] - from[1])
         };
         assert!(

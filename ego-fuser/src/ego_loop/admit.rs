@@ -59,6 +59,7 @@ impl EgoLoop {
             }
             _ => {
                 let Bev { pose, features } = payload(pieces, limits)?;
+                // `decode` consumes the map, and a map that is malformed is reported as that first.
                 let fits = self.models.check(&features);
                 let map = features.decode(limits)?;
                 fits?;
@@ -92,6 +93,7 @@ impl EgoLoop {
         }
         let source = (cav.clone(), message.view.content.exchange().stream());
         self.note_stream(&cav, source.1);
+        // From here on the capture time is on the clock of the ego.
         match self.dated(&cav, source.1, stated_nanos) {
             Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,
             Err(reason) => return self.drop_message(source, reason),
@@ -159,6 +161,7 @@ impl EgoLoop {
         let Some(newest) = self.own_nanos else {
             return Ok(capture_nanos);
         };
+        // A frame that still waits may use what is too old for the newest.
         let oldest = { self.frames.front() }.map_or(newest, |frame| frame.view.capture_nanos);
         if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
             Err(DropReason::Future)
@@ -173,9 +176,11 @@ impl EgoLoop {
     fn keep_time(&mut self, ego: &mut Ego, capture_nanos: u64) {
         let max_age_nanos = self.options.pairing.max_age_nanos;
         let latest_nanos = capture_nanos.saturating_add(max_age_nanos);
+        // An own sweep that is older by less than the largest age is no restart.
         if self.own_nanos.is_some_and(|own| latest_nanos < own) {
             tracing::info!(capture_nanos, "the scene has restarted");
             for source in self.pairing.senders() {
+                // A neighbour may restart before the ego: its first messages after that stay.
                 let gone = self
                     .pairing
                     .turn_back(&source, capture_nanos, MAX_AHEAD_NANOS);
@@ -265,6 +270,7 @@ impl EgoLoop {
         capture_nanos: u64,
         reason: DropReason,
     ) -> DropReason {
+        // `None` is less than any time: nothing of this neighbour was fused.
         let is_fused = self.fused_nanos.get(cav) >= Some(&capture_nanos);
         match is_fused && *stream != self.stream {
             true => DropReason::Unneeded,

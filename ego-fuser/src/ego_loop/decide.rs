@@ -53,6 +53,7 @@ impl EgoLoop {
 
     /// Counts the messages that wait for a frame that will not come.
     fn finish(&mut self) {
+        // At the end of time every message is too old, so that all that were not used are returned.
         let (_, dropped) = self.pairing.pair(u64::MAX);
         for lost in dropped {
             self.drop_lost(lost);
@@ -203,6 +204,7 @@ impl EgoLoop {
             {
                 *frames = frames.saturating_add(1);
             }
+            // One message of any stream is enough: the neighbour is neither silent nor left out.
             if choice.views.iter().any(|view| view.cav == *cav) {
                 continue;
             }

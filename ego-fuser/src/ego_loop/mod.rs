@@ -171,10 +171,12 @@ impl EgoLoop {
                 self.members.insert(cav);
             }
             Input::Left(cav) => {
+                // Before the vehicle is forgotten, and with it whether it announced its end.
                 self.waits.left(&cav, self.ended.contains(&cav), now_nanos);
                 self.forget(&cav);
             }
             Input::Ended(cav) if cav == self.cav => {
+                // The last frames wait no less than others, even with a long deadline.
                 let wait_nanos = LAST_WAIT_NANOS.max(self.options.deadline_nanos);
                 self.ends_nanos = Some(now_nanos.saturating_add(wait_nanos));
             }

@@ -52,6 +52,7 @@ impl Waits {
     pub(super) fn described(&mut self, cav: &CavId, descriptor: &Descriptor, now_nanos: u64) {
         let streams = &descriptor.streams;
         self.gone.remove(cav);
+        // From the first sweep on: an agent without sweeps has nothing to send yet.
         if *cav == self.ego && !descriptor.sweeps.is_empty() {
             self.own_nanos.get_or_insert(now_nanos);
         }
@@ -78,6 +79,7 @@ impl Waits {
         let Self { ego, stream, .. } = self;
         let is_late = |since: u64| now_nanos.saturating_sub(since) > AFTER_NANOS;
         let no_own = { self.own_nanos }
+            // An agent that publishes other streams is named for that instead.
             .filter(|since| is_late(*since) && !self.without.contains_key(ego))
             .map(|since| (format!("no {stream} of agent {ego}"), since));
         let without = self.without.iter().map(|(cav, (published, since))| {

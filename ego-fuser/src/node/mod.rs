@@ -214,6 +214,7 @@ impl<'a> Node<'a> {
         let log = { options.inputs.as_ref() }
             .and_then(|file| InputLog::create(file, KIND, Some(ego.detector())));
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
+        // Ends the wait for the next message at once.
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
@@ -295,6 +296,7 @@ impl<'a> Node<'a> {
     /// Records an input without a message, hands it to the loop and carries out what that decides.
     fn handle(&mut self, input: Input) {
         let now_nanos = self.clock.now_nanos();
+        // Before the decision and with the time of it, so that a replay decides the same.
         if let Some(log) = &self.log
             && let Some(input) = input.without_message()
         {
@@ -350,6 +352,7 @@ impl<'a> Node<'a> {
         }
         // The ego does not know when the sensors of its vehicle measured.
         stats.answered(None, result.fused.len());
+        // On the Unix clock, as is the time of publication in the stamp.
         let (fused, log) = (unix_nanos(), self.log.clone());
         let complete = move |stamp: &Stamp, result: &mut Detections| {
             let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));

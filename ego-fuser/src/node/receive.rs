@@ -43,6 +43,7 @@ impl Node<'_> {
             let stage = format!("{stream} transport");
             stats.timed(&stage, transport);
         }
+        // Read after the decoding, and recorded: the replay gets the time that the loop gets.
         let now_nanos = self.clock.now_nanos();
         if let Some(log) = &self.log {
             let bytes = arrival.pieces().flatten().copied().collect();
@@ -62,6 +63,7 @@ impl Node<'_> {
         let offset_s = stats.system_clock_offset_s(cav, self.longest_transit_s());
         let offset_nanos = (offset_s * 1e9) as i64;
         let newest_nanos = arrival.header.stamp.capture_nanos;
+        // Arrivals are on the clock of the agent. Minus its lead they are on that of the ego.
         let sweeps = { descriptor.sweeps.iter() }
             .map(|sweep| SweepTime {
                 capture_nanos: newest_nanos.saturating_sub(sweep.before_nanos),

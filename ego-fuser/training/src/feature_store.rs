@@ -172,6 +172,7 @@ impl FeatureStore {
             let length = u32::try_from(message.len())
                 .map_err(|_| io::Error::from(io::ErrorKind::FileTooLarge))
                 .at(&self.path)?;
+            // In one write: an interruption truncates the last record only.
             let record = [&length.to_le_bytes()[..], &message].concat();
             self.file.write_all(&record).at(&self.path)?;
             self.starts.push(self.bytes() + record.len() as u64);
@@ -191,10 +192,12 @@ impl FeatureStore {
             return Ok(None);
         };
         let start = start + LENGTH_BYTES;
+        // An empty message stands for a sweep that could not be read or computed.
         if start == end {
             return Ok(None);
         }
         let mut bytes = vec![0; (end - start) as usize];
+        // At an offset of its own: threads share the file without moving a common position.
         self.file.read_exact_at(&mut bytes, start).at(&self.path)?;
         let decode = || -> Result<_, WireError> {
             let (_, message): (Header, Bev) = wire::decode([bytes.as_slice()], &Limits::default())?;
@@ -225,6 +228,7 @@ fn starts(file: &File) -> io::Result<Vec<u64>> {
     let mut starts = vec![0];
     loop {
         let start = starts[starts.len() - 1];
+        // The last record is incomplete where a process ended while it wrote.
         if start + LENGTH_BYTES > end {
             return Ok(starts);
         }

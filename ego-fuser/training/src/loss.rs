@@ -98,6 +98,7 @@ impl LabelTensors {
         let (mut index, mut code, mut box_weight) = (Vec::new(), Vec::new(), Vec::new());
         for (sample, labels) in samples.iter().enumerate() {
             let first = sample * anchors;
+            // Every sample has the same weight, however many objects are in it.
             let weight = 1.0 / labels.positives.len().max(1) as f32;
             score_weight[first..first + anchors].fill(weight);
             if unassigned == Unassigned::Ignored {
@@ -170,6 +171,7 @@ pub(crate) fn alignment_loss(
         let wanted = of_others.flat_map(|Offset(offset)| offset.map(|value| value as f32));
         let wanted = tensor(&wanted.collect::<Vec<f32>>(), &[-1, 3], device)?;
         let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(device)?;
+        // The largest of the three decides about a view as a whole.
         let left_m = off.f_abs()?.f_amax([1_i64].as_slice(), true)?;
         let off = off * left_m.f_le(RECOVERABLE_M)?;
         losses.push(off.f_smooth_l1_loss(&off.f_zeros_like()?, tch::Reduction::Mean, 1.0)?);
@@ -183,6 +185,7 @@ pub(crate) fn alignment_loss(
 /// Weighted focal loss of every anchor, `[B, H*W*A]`.
 fn focal_loss(scores: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor> {
     let target = &labels.positive;
+    // Labels have the anchors of a cell next to each other: `[B, H, W, A]`.
     let logits = scores.f_to_kind(Kind::Float)?.f_permute([0, 2, 3, 1])?;
     let logits = logits.f_reshape(target.size())?;
     let probability = logits.f_sigmoid()?;
@@ -202,6 +205,7 @@ fn box_loss(boxes: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Resul
     let predicted = predicted.f_index_select(0, &labels.index)?;
     let difference = predicted.f_to_kind(Kind::Float)? - &labels.code;
     let linear = difference.f_narrow(1, 0, code - 1)?;
+    // The sine is 0 for a heading and its opposite: a box turned by half a circle is the same box.
     let turn = difference.f_narrow(1, code - 1, 1)?.f_sin()?;
     let distance = Tensor::f_cat(&[linear, turn], 1)?.f_abs()?;
     let squared = distance.f_square()? * (0.5 / config.beta);

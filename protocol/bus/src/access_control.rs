@@ -112,6 +112,7 @@ fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
             ),
             Operation::Query => (&["query"], &[]),
         };
+        // Seen from the router: ingress comes from the principal, egress goes to it.
         for (flow, messages) in [("ingress", from), ("egress", to)] {
             if !messages.is_empty() {
                 rules.push(rule(act, flow, messages, &keys));

@@ -123,6 +123,7 @@ impl BusConfig {
     pub fn join(&self, stop: &Stop, run: &RunId, role: Role, cav: &CavId) -> Result<Bus, BusError> {
         let identity = Identity::new(run.clone(), process_id(role, cav), cav.clone());
         let options = self.options()?;
+        // Checked here: the router would deny the messages of another name, one by one.
         if let Some(credentials) = &options.credentials {
             credentials.check_name(identity.process.as_str())?;
         }

@@ -105,6 +105,7 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
         let mut state = self.lock();
         loop {
             if let Some((key, item)) = pop_oldest(&mut state.lanes) {
+                // All of them: producers and consumers wait on the same condition variable.
                 self.changed.notify_all();
                 return Pop::Item(key, item);
             }

@@ -317,6 +317,7 @@ impl Bus {
             ..
         } = self;
         drop(pool);
+        // Order: the final ledger goes out, then the flush is confirmed, then the session closes.
         status.close();
         shutdown::within(limit, "the zenoh session", move || {
             if status_thread.join().is_err() {

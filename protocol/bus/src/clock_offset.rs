@@ -44,14 +44,17 @@ impl ClockOffset {
         arrived_nanos: u64,
         now: Instant,
     ) -> Option<bool> {
+        // Two periods overlap: a new period does not begin with the estimate of a single message.
         if now.duration_since(self.begun) > WINDOW {
             self.begun = now;
             self.shortest = [i64::MAX, self.shortest[0]];
         }
+        // In 128 bits: the time of a foreign clock may differ by more than an i64 holds.
         let took = i128::from(arrived_nanos) - i128::from(sent_nanos);
         let took = i64::try_from(took).unwrap_or(if took < 0 { i64::MIN } else { i64::MAX });
         self.shortest[0] = self.shortest[0].min(took);
         let offset_s = self.seconds();
+        // Hysteresis: an offset at the bound does not alternate between warning and notice.
         let half = if self.was_far { 0.5 } else { 1.0 };
         let is_far = offset_s > AHEAD_S * half || offset_s < -LINK_TRANSIT_S * half;
         let has_changed = is_far != self.was_far;

@@ -32,6 +32,7 @@ pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, FileErro
             Ok(_) => (error, field_of_error::<T>(text)),
         };
         let fields = match &field {
+            // The hint about kinds of files concerns fields of the top level only.
             Some(nested) if nested.contains('.') => Vec::new(),
             _ => fields_of(text),
         };

@@ -129,6 +129,7 @@ fn name_of(path: &Path, now: SystemTime) -> Result<String, BusError> {
         .ok_or_else(|| bad(path, &"this certificate has no common name"))?
         .to_owned();
     let validity = certificate.validity();
+    // A clock before 1970 counts as 1970: the certificate is not valid yet then.
     let now = i64::try_from(now.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs())
         .unwrap_or(i64::MAX);
     let (from, until) = (validity.not_before, validity.not_after);

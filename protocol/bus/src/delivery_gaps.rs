@@ -39,6 +39,7 @@ impl DeliveryGaps {
             } else {
                 0
             };
+            // Numbers wrap around: more than half the range ahead is behind, as of a repeated message.
             let is_behind = skipped > u32::MAX / 2;
             if *known != publisher || !is_behind {
                 (*known, *next) = (publisher, after);

@@ -81,18 +81,21 @@ fn rules() -> Value {
     let others = [
         rule(
             "egress",
+            // What is still `block` here is no large tensor: the rules above have made those `block_first`.
             &json!({"congestion_control": "block"}),
             "drop",
             &json!({}),
         ),
         rule(
             "egress-here",
+            // For receivers on the loopback large tensors are dropped like all else.
             &json!({"congestion_control": "block_first"}),
             "drop",
             &json!({"interfaces": LOOPBACK}),
         ),
         rule(
             "egress-lossless",
+            // Last: it overrides the rules above for lossless publishers, which alone use this priority.
             &json!({"priority": "real_time"}),
             "block",
             &json!({}),

@@ -29,6 +29,7 @@ impl Endpoint {
             .strip_prefix(TCP)
             .or_else(|| text.strip_prefix(QUIC))
             .ok_or_else(bad)?;
+        // From the right: an IPv6 host has colons of its own.
         let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
         let bracketed = host.starts_with('[') && host.ends_with(']');
         let clean = |c: char| {

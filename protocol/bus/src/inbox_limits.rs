@@ -72,6 +72,7 @@ impl RateLimiter {
         }
         let mut meters = self.meters.lock().unwrap_or_else(PoisonError::into_inner);
         let own = Some(topic.clone());
+        // Topics beyond the limit share a meter: a flood of forged topics gets the rate of one sender.
         let key = if meters.len() < MAX_METERS || meters.contains_key(&own) {
             own
         } else {

@@ -41,6 +41,7 @@ pub const ROUTER_THREADS: Setting = (
 /// The error of the system when the program cannot be executed again.
 pub fn ensure(settings: &[Setting]) -> io::Result<()> {
     let missing: Vec<Setting> = missing(settings, |name| env::var_os(name).is_some());
+    // Also ends the second start: without it the process would replace itself for ever.
     if missing.is_empty() {
         return Ok(());
     }

@@ -179,6 +179,7 @@ impl MessageStats {
         let why = DropReason::Undelivered;
         self.note(topic, |state| {
             state.ledger.dropped_many(&here, why, messages);
+            // Passed as well: else the drops would hide as many messages that are still in flight.
             state.pass(here, messages);
         });
     }
@@ -239,6 +240,7 @@ impl MessageStats {
                 .entry(if has_room {
                     topic.clone()
                 } else {
+                    // Topics beyond the limit share one counter, that of the truth.
                     Topic::Truth
                 })
                 .or_default();
@@ -348,6 +350,7 @@ impl MessageStats {
     /// Records the duration of a stage for one frame.
     pub fn timed(&self, stage: &str, time: Duration) {
         let mut state = self.lock();
+        // The entry API would allocate the name at every call.
         if !state.stages.contains_key(stage) {
             state.stages.insert(stage.to_owned(), Timings::default());
         }
@@ -356,6 +359,7 @@ impl MessageStats {
         };
         timings.count += 1;
         timings.sum = timings.sum.saturating_add(time);
+        // Upper bounds are inclusive, as the buckets of Prometheus are.
         let bucket = BUCKETS_S.partition_point(|end| *end < time.as_secs_f64());
         if let Some(count) = timings.buckets.get_mut(bucket) {
             *count += 1;
@@ -409,6 +413,7 @@ impl MessageStats {
         for (account, counts) in state.ledger.iter() {
             let passed = state.passed.get(account).copied().unwrap_or(0);
             let in_flight = match account.to {
+                // A sender drops what has not passed its queue, a receiver what has.
                 None => counts.sent.saturating_sub(passed + counts.dropped_total()),
                 Some(_) => passed.saturating_sub(counts.received + counts.dropped_total()),
             };

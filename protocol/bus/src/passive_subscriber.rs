@@ -162,6 +162,7 @@ impl Shared {
 
     fn keep(&self, raw_message: RawMessage) {
         let len = raw_message.len();
+        // Added before the push: the consumer may take the message, and subtract its bytes, at once.
         let waiting = self.waiting_bytes.fetch_add(len, Ordering::Relaxed);
         let (left_out, is_lost) = if waiting + len > MAX_WAITING {
             (len, true)

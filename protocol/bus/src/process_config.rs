@@ -81,10 +81,12 @@ impl<C: ProcessConfig> FromArgMatches for Configured<C> {
             )
         };
         let file = matches.remove_one::<PathBuf>("config");
+        // Step 1: the file, or required options over the defaults.
         let mut config: C = match &file {
             Some(path) => config_file::read(path).map_err(|error| refused(&error))?,
             None => minimal(|option| text_of(matches, option)).map_err(|error| refused(&error))?,
         };
+        // Step 2: the options that are given override it, the others keep its values.
         config.update_from_arg_matches_mut(matches)?;
         Ok(Self { file, config })
     }
@@ -116,6 +118,7 @@ impl<C: ProcessConfig> Args for Configured<C> {
             .map(|field| field.rsplit('.').next().unwrap_or(field));
         let required: Vec<&str> = required.collect();
         let options =
+            // The help must not quote the placeholder of a required field as its default.
             options_of::<C>().filter(|option| !required.contains(&option.get_id().as_str()));
         let heading = None::<&str>;
         document(

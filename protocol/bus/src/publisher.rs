@@ -254,6 +254,7 @@ impl Publisher {
             .unwrap_or_default()
             .to_vec();
         let mut writer = ZBytes::writer();
+        // The checksum of the payload does not cover the header, which has a new one of its own.
         writer.append(header.to_bytes().to_vec().into());
         writer.append(rest.into());
         let bytes = writer.finish();
@@ -274,6 +275,7 @@ impl Publisher {
             Overflow::KeepLast(_) => self.queue.push((), submission),
             Overflow::Wait(_) => self.queue.push_waiting((), submission),
         };
+        // Replaced, or refused after the end: in either case one submitted message is not sent.
         if !matches!(pushed, PushOutcome::Queued) {
             self.stats.suppressed(&self.topic, DropReason::Superseded);
         }
@@ -324,6 +326,7 @@ impl Sender {
             self.notify(Control::Probe);
         }
         loop {
+            // The first message confirms the route as a probe does, so probes end with it.
             let probing = self.has_notifications && self.sequence == 0;
             match self
                 .queue
@@ -352,6 +355,7 @@ impl Sender {
         match encode(&self.stamp(capture_nanos), &self.pool) {
             Ok(bytes) => {
                 self.stats.timed("encode", began.elapsed());
+                // Only now: a message that cannot be encoded leaves no gap in the sequence.
                 self.sequence += 1;
                 let length = bytes.len();
                 let is_large = length >= SMALL_BYTES;
@@ -387,6 +391,8 @@ impl Sender {
     }
 
     fn put(&self, bytes: ZBytes) -> bool {
+        // Receivers count gaps by this number, not by that of the header.
+        // A relayed message keeps the header of its sender.
         let number = SourceInfo::new(self.publisher.id(), self.handed_over);
         let sent = self.publisher.put(bytes).source_info(number).wait();
         if let Err(cause) = &sent {
@@ -413,11 +419,13 @@ impl Sender {
 pub fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
     let has_subscribers = Arc::<AtomicBool>::default();
     let noted = Arc::clone(&has_subscribers);
+    // Listened before the query: a change between the two is not missed.
     let listener = publisher.matching_listener();
     listener
         .callback(move |status| noted.store(status.matching(), Ordering::Relaxed))
         .background()
         .wait()?;
+    // False is never stored here: it could overwrite a newer change.
     if publisher.matching_status().wait()?.matching() {
         has_subscribers.store(true, Ordering::Relaxed);
     }

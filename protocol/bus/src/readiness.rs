@@ -141,6 +141,7 @@ impl Barrier {
     }
 
     fn listen(&self, inbox: &Inbox) {
+        // Ends when the inbox is closed, with the `RoutesReady` that holds it.
         while let Pop::Item(topic, event) = inbox.take(None) {
             let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else {
                 continue;
@@ -201,6 +202,7 @@ impl Barrier {
                     waited,
                 });
             }
+            // Short waits: nothing wakes this thread when `given_up` becomes true.
             let pause = left.min(POLL_PERIOD);
             missing = wait_at_most(&self.changed, missing, pause);
         }

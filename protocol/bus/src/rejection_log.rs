@@ -79,6 +79,7 @@ impl RejectionLog {
                         .seen
                         .contains_key(&(rejection.clone(), connection.clone()))
                 {
+                    // A count of zenoh is the total of its connection so far: it replaces the one before.
                     self.seen.insert((rejection, connection), count);
                 }
             }
@@ -120,6 +121,7 @@ fn rejected(line: &str) -> Option<((Rejection, String), u64)> {
     let (labels, count) = rest.rsplit_once('}')?;
     let label = |wanted: &str| {
         let mut known = labels
+            // Split at quote and comma: a value may contain a comma.
             .split("\",")
             .filter_map(|label| label.split_once("=\""));
         known

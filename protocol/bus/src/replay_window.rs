@@ -71,6 +71,7 @@ impl ReplayWindow {
         if let Some(senders) = self.topics.get_mut(topic) {
             return senders.admit(epoch, sequence, now);
         }
+        // The topic that has been silent for longest gives up its place.
         if self.topics.len() >= TOPICS {
             let oldest = self
                 .topics
@@ -96,6 +97,7 @@ impl Senders {
     fn admit(&mut self, epoch: u64, sequence: u64, now: Instant) -> Admission {
         let was_quarantined = self.quarantined_until.is_some();
         self.quarantined_until = self.quarantined_until.filter(|until| now < *until);
+        // Judged under quarantine too: the last times of the senders show when one of them has gone.
         let dropped = self.judge(epoch, sequence, now);
         let is_quarantined = self.quarantined_until.is_some();
         let dropped = dropped.or(is_quarantined.then_some(DropReason::Identity));
@@ -141,6 +143,7 @@ impl Senders {
         now: Instant,
     ) -> Option<DropReason> {
         let sender = self.former.get_mut(place)?;
+        // A replayed message must neither renew the sender nor begin a quarantine.
         if let Some(repeated) = sender.numbers.note(sequence) {
             return Some(repeated);
         }
@@ -189,6 +192,7 @@ impl SequenceWindow {
     fn note(&mut self, sequence: u64) -> Option<DropReason> {
         if sequence > self.highest {
             let ahead = sequence - self.highest;
+            // Bit n stands for the number n below the highest. A shift by 64 or more would overflow.
             self.came = if ahead < 64 {
                 self.came << ahead | 1
             } else {
@@ -198,6 +202,7 @@ impl SequenceWindow {
             return None;
         }
         let behind = self.highest - sequence;
+        // Older than the window: whether it had come before is unknown, so it is refused.
         if behind >= 64 || self.came >> behind & 1 == 1 {
             return Some(DropReason::Duplicate);
         }

@@ -48,6 +48,7 @@ impl RouterProbe {
     /// [`BusError`], as [`open`].
     pub fn of_router(router: &Session, client: &BusOptions) -> Result<Self, BusError> {
         let probe = Self::begin(client, PROBE_KEY)?;
+        // A weak reference: the thread ends with the probe instead of keeping it alive.
         let (router, alive) = (router.clone(), Arc::downgrade(&probe.arrived));
         // On a thread: at a router that fails it waits for ever.
         let publish = move || {

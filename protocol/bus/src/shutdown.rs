@@ -32,6 +32,7 @@ impl Stop {
             state.requested = true;
             std::mem::take(&mut state.reactions)
         };
+        // The lock is free from here on: reactions may use this request.
         self.0.1.notify_all();
         for reaction in reactions {
             reaction();
@@ -48,6 +49,7 @@ impl Stop {
     pub fn on_request(&self, reaction: impl FnOnce() + Send + 'static) {
         let mut state = self.lock();
         if state.requested {
+            // Released first: the reaction may use this request, whose lock is not reentrant.
             drop(state);
             reaction();
         } else {
@@ -77,6 +79,7 @@ impl Stop {
             .worker_threads(1)
             .enable_all()
             .build()?;
+        // Installed here, not on the thread: a failure is an error of this call.
         let (mut interrupt, mut terminate) = {
             use tokio::signal::unix::{SignalKind, signal};
             let _inside = runtime.enter();

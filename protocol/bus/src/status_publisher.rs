@@ -139,6 +139,7 @@ impl StatusSender {
                     self.control(control, capture_nanos);
                 }
                 Pop::TimedOut => {
+                    // From now, not from the time due: no burst of heartbeats follows a stall.
                     next = Instant::now() + PERIOD;
                     self.ready(shared);
                     let watchdog = lock(&shared.watchdog).clone();

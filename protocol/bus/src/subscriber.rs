@@ -183,6 +183,7 @@ impl Inbox {
         };
         // Limit on the bytes of all topics together; a message beyond it is lost.
         let bytes = event.bytes();
+        // Added before the push: the consumer may take the event, and subtract its bytes, at once.
         let waiting = self
             .waiting_bytes
             .fetch_add(bytes, Ordering::Relaxed)
@@ -301,6 +302,7 @@ impl IngressFilter {
     }
 
     fn admit(&self, topic: Topic, payload: &ZBytes, source: Option<&SourceInfo>) {
+        // First: messages that are refused below have numbers too, and must not look like gaps.
         self.count_gap(&topic, payload, source);
         // Before the message is read: a flood must cost next to nothing.
         if !self
@@ -340,6 +342,7 @@ impl IngressFilter {
         if !has_notifications(topic) || source.is_none() {
             return;
         }
+        // A notification has the number of the message after it, so its kind has to be known here.
         let is_notice = payload.len() <= MAX_NOTICE_BYTES
             && header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header));
         let skipped = lock(&self.inbox.gaps).note(topic, source, is_notice);
@@ -391,6 +394,7 @@ impl IngressFilter {
             let problem = is_twice.then(|| (text.clone(), at));
             self.inbox.stats.set_problems(&text, problem);
         }
+        // Under quarantine two senders, each with a clock of its own, use the id.
         if dropped.is_none() {
             self.inbox
                 .stats
@@ -406,6 +410,7 @@ fn header_of(topic: &Topic, payload: &ZBytes) -> Result<Header, WireError> {
     if let Topic::Stream { cav, .. } | Topic::Received { cav, .. } = topic {
         header.check_sender(cav)?;
     }
+    // Probes and end notifications are of kind control on the keys of data.
     if let Some(expected) = topic.kind().filter(|_| header.kind != Kind::Control) {
         header.check_kind(expected)?;
     }

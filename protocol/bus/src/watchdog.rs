@@ -24,6 +24,7 @@ impl Watchdog {
     pub(super) fn wait<T>(&self, waiting: impl FnOnce() -> T) -> T {
         self.waits.store(true, Ordering::Relaxed);
         let found = waiting();
+        // The beat first: in the other order a check in between would find neither beat nor wait.
         self.beat();
         self.waits.store(false, Ordering::Relaxed);
         found

@@ -120,6 +120,7 @@ impl WebServer {
     ) -> io::Result<Self> {
         let mut builder = runtime::Builder::new_multi_thread();
         let runtime = builder
+            // One thread for all readers: the handlers run on blocking threads.
             .worker_threads(1)
             .max_blocking_threads(MAX_HANDLERS)
             .thread_name("web")
@@ -166,6 +167,7 @@ async fn accept(listener: TcpListener, handler: Arc<Handler>, readers: Arc<Reade
             tokio::time::sleep(PAUSE).await;
             continue;
         };
+        // Dropping the connection closes it: no answer has to wait for its reader.
         let Ok(place) = Arc::clone(&readers.places).try_acquire_owned() else {
             readers.dropped.fetch_add(1, Ordering::Relaxed);
             continue;
@@ -178,6 +180,7 @@ async fn accept(listener: TcpListener, handler: Arc<Handler>, readers: Arc<Reade
                 readers.dropped.fetch_add(1, Ordering::Relaxed);
                 tracing::warn!("a reader that does not read is disconnected");
             }
+            // The task owns the place: it is free only when the connection has ended.
             drop(place);
         });
     }
@@ -196,6 +199,7 @@ async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()
         .timer(TokioTimer::new())
         .header_read_timeout(READ_LIMIT)
         .max_buf_size(MAX_WAITING)
+        // One request per connection: an idle browser holds no place.
         .keep_alive(false)
         .serve_connection(TokioIo::new(Box::pin(connection)), service)
         .await
@@ -232,6 +236,7 @@ async fn answer(
         request.uri().path().to_owned(),
         request.uri().query().unwrap_or_default().to_owned(),
     );
+    // A slow handler must not hold the only worker thread, which serves all other readers.
     let answer = tokio::task::spawn_blocking(move || handler(&Request { path, query })).await;
     Ok(match answer {
         Ok(Answer::Page { content_type, body }) => {

@@ -46,6 +46,7 @@ pub(crate) fn average_precision<'py>(
             "iou: {bad}, expected more than 0, at most 1"
         )));
     }
+    // Without the lock of Python: nothing here is a Python object, and the matching takes time.
     let found = py.detach(|| {
         let mut scorer = Scorer::new(&thresholds);
         for (detections, truth) in &frames {
@@ -158,6 +159,7 @@ fn boxes_of(what: &str, frame: usize, boxes: &Bound<'_, PyAny>) -> PyResult<Vec<
             "{what} of frame {frame}: boxes of shape {shape:?}, expected (N, 7)"
         )));
     }
+    // In logical order: the array may be a transposed or strided view.
     let values: Vec<f64> = boxes.as_array().iter().copied().collect();
     if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
         return Err(error(format!("{what} of frame {frame}: a box with {bad}")));

@@ -46,6 +46,7 @@ impl DataSet {
         let mut tick = index;
         for scenario in &dataset.scenarios {
             let Some(at) = scenario.ticks.get(tick) else {
+                // The index runs over all scenarios, the tick over one.
                 tick -= scenario.ticks.len();
                 continue;
             };

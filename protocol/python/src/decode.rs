@@ -39,6 +39,7 @@ enum Content {
 impl Decoded {
     /// Decodes a message of a kind.
     fn of_kind(kind: Kind, bytes: &[u8]) -> Result<Self, protocol::WireError> {
+        // Before the payload: a message of another kind is refused without being decoded.
         wire::decode_header([bytes])?.check_kind(kind)?;
         let (header, message) = wire::decode_any([bytes], &Limits::DEFAULT)?;
         Self::new(header, message, bytes.len())
@@ -51,6 +52,7 @@ impl Decoded {
             let message = decode_stream(cav, *stream, [bytes])?;
             return Self::new(header, message, bytes.len());
         }
+        // Only a liveliness token has no kind here, and it carries no message.
         Self::of_kind(key.topic.kind().unwrap_or(Kind::Control), bytes)
     }
 
@@ -151,6 +153,7 @@ impl Message {
 #[pyfunction]
 pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<Message> {
     let named = |cause: &dyn std::fmt::Display| error(format!("{kind_or_key}: {cause}"));
+    // Every key has slashes, and no kind has one.
     if !kind_or_key.contains('/') {
         let kind = Kind::ALL
             .into_iter()

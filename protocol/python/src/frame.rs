@@ -138,6 +138,7 @@ impl Frame {
         for found in &parts.tracks {
             tracks.set_item(found.ego.as_str(), Tracks::new(py, found)?)?;
         }
+        // Without detections the first agent: the ego comes first in the order of a scene.
         let ego = (parts.detections)
             .first()
             .map(|result| &result.ego)

@@ -86,9 +86,10 @@ impl FrameParts {
 
     /// Agents are in the order of the scene: the ego comes first.
     fn add_truth(&mut self, truth: &Truth) {
-        if self.tick.replace(truth.tick).is_some() {
+        if self.tick.is_some() {
             return;
         }
+        self.tick = Some(truth.tick);
         let mut others = std::mem::take(&mut self.agents);
         for agent in &truth.agents {
             let truth = Frame::of_truth(agent);
@@ -169,10 +170,14 @@ impl AgentParts {
                 self.gnss_world_from_lidar =
                     self.gnss_world_from_lidar.or(Some(gnss.world_from_lidar));
             }
-            (Message::Imu(motion), _) => {
+            (Message::Imu(motion), _)
+                if frame.speed_mps.is_none() && frame.yaw_rate_rad_s.is_none() =>
+            {
                 (frame.speed_mps, frame.yaw_rate_rad_s) = (motion.speed_mps, motion.yaw_rate_rad_s);
             }
-            (Message::Camera(camera), Stream::Camera(number)) => {
+            (Message::Camera(camera), Stream::Camera(number))
+                if { frame.cameras.iter() }.all(|(known, _)| *known != number) =>
+            {
                 frame.cameras.push((number, camera))
             }
             (Message::Pose(pose), _) => self.pose = self.pose.or(Some(pose)),

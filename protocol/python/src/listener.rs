@@ -70,6 +70,7 @@ impl Listener {
             return Ok(Step::End);
         };
         let has_ended = self.is_over && self.last_data.elapsed() >= self.settle;
+        // After the end only what is queued is still handed out.
         let wait = if has_ended { Duration::ZERO } else { wait };
         match py.detach(|| subscriber.take(Some(Instant::now() + wait))) {
             // Its own status is no sign that the run is there.
@@ -138,6 +139,7 @@ impl Listener {
 
     fn disconnect(&mut self) {
         if let Some(Connection { bus, subscriber }) = self.connection.take() {
+            // Subscriptions have to end before the bus is left.
             drop(subscriber);
             // A connection that does not close in time closes with the process.
             let _ = bus.leave(CLOSE_LIMIT);
@@ -257,6 +259,7 @@ impl MessageIterator {
     }
 
     fn __next__(&self, py: Python<'_>) -> PyResult<Option<Message>> {
+        // An iterator on another thread may be inside: then this is an error of Python, not a deadlock.
         let mut listener: PyRefMut<'_, Listener> = self.listener.try_borrow_mut(py)?;
         listener.next_message(py)
     }

@@ -48,9 +48,11 @@ impl LiveFrames {
     pub(crate) fn add(&mut self, message: &RawMessage) -> Result<(), WireError> {
         let header = wire::decode_header(message.pieces())?;
         let at = header.stamp.capture_nanos;
+        // The replay publishes the truth, so a new epoch there is a new replay. Agents restart on their own.
         if message.key.topic == Topic::Truth {
             self.begin_again_with(header.stamp.epoch);
         }
+        // Frames are handed over by capture time: an older one would come out of order.
         if self.handed_over.is_some_and(|newest| at <= newest) {
             self.late += 1;
             return Ok(());

@@ -353,6 +353,7 @@ impl Objects {
             .collect();
         let speeds = objects
             .iter()
+            // NaN where unknown: an array of numbers has no `None`.
             .map(|object| object.speed_mps.unwrap_or(f64::NAN))
             .collect();
         let made = Self {
@@ -394,6 +395,7 @@ impl Camera {
     pub(crate) fn new(py: Python<'_>, camera: &protocol::Camera) -> PyResult<Py<Self>> {
         let metadata = &camera.metadata;
         let intrinsics = metadata.pinhole.map(|pinhole| {
+            // Rows of the camera matrix, which maps (x / z, y / z, 1) to column and row.
             let first = [pinhole.fx_px, 0.0, pinhole.cx_px];
             let second = [0.0, pinhole.fy_px, pinhole.cy_px];
             arrays::rows(py, vec![first, second, [0.0, 0.0, 1.0]])

@@ -66,6 +66,7 @@ pub(crate) fn selectors(
             _ => {}
         }
     }
+    // Control messages, with the end of the run, are not permitted to every principal.
     selectors.retain(|wanted| access.permits(run, wanted));
     Ok(selectors)
 }

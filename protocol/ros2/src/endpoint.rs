@@ -91,6 +91,7 @@ impl Node {
     /// Liveliness token of the node.
     pub fn token(&self) -> String {
         format!(
+            // Node 0, endpoint 0, and NN for a node.
             "{TOKEN_ROOT}/{}/{}/0/0/NN/{}",
             self.domain_id,
             self.zid,
@@ -221,6 +222,7 @@ impl Attachment {
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (sequence, rest) = bytes.split_first_chunk()?;
         let (source_nanos, rest) = rest.split_first_chunk()?;
+        // The length of the identifier stands before it, in one byte.
         let (16, gid) = rest.split_first()? else {
             return None;
         };

@@ -139,6 +139,8 @@ fn read_twist<BO: ByteOrder>(
 
 /// The values of `motion` that are measured by their variances.
 fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, MotionError> {
+    // Row-major 6 x 6: x is the first variance, the rotation about z the last.
+    // NaN is not below the bound.
     let [speed_variance, .., yaw_rate_variance] = covariance;
     let speed_mps = (motion.speed_mps).filter(|_| *speed_variance < UNMEASURED);
     let yaw_rate_rad_s = (motion.yaw_rate_rad_s).filter(|_| *yaw_rate_variance < UNMEASURED);

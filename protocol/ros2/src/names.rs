@@ -36,6 +36,7 @@ impl RosName {
             token
                 .bytes()
                 .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+                // An empty part has no first byte and is refused.
                 && token
                     .bytes()
                     .next()

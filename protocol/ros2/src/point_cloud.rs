@@ -230,6 +230,7 @@ fn intensity<'a>(
             .flatten()
     });
     Ok(colour.map(|(name, Column { offset, .. })| {
+        // The four bytes are read as an integer, also where the field is stated as a float.
         let datatype = Datatype::Uint32;
         (name, Column { offset, datatype }, IntensityKind::RedByte)
     }))
@@ -321,6 +322,7 @@ impl Layout {
         let needed = if self.height == 0 {
             0
         } else {
+            // The last row needs its points only, not the padding up to the next row.
             rows.saturating_mul(self.stride()).saturating_add(row)
         };
         at_least("length of data", data_len as u64, needed, "rows x row_step")
@@ -422,6 +424,7 @@ impl Sweep {
         } else {
             let intensity = match &columns.intensity {
                 Some((_, column, IntensityKind::RedByte)) => {
+                    // Bits 16 to 23 of `0x00RRGGBB`: a u32 is exact in f64.
                     let red = |colour: f64| (colour / 65_536.0).floor() % 256.0;
                     column.value::<BO>(point).map(red)
                 }

@@ -39,6 +39,7 @@ impl Qos {
     /// As `offered_qos_profiles` of a channel, in the numbers that rosbag2 of every distribution reads.
     pub fn offered_profiles(self) -> String {
         let (reliability, durability) = self.policies();
+        // i64::MAX nanoseconds in seconds and nanoseconds: no limit.
         let forever = "    sec: 9223372036\n    nsec: 854775807\n";
         format!(
             "- history: 1\n  depth: {depth}\n  reliability: {reliability}\n  durability: {durability}\n  deadline:\n{forever}  \

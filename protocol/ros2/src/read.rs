@@ -42,6 +42,7 @@ pub(crate) enum Body<'a> {
 impl<'a> Body<'a> {
     /// The body of a message with its encapsulation header.
     pub(crate) fn of(bytes: &'a [u8]) -> Result<Self, ReadError> {
+        // Values are aligned from the end of this header on, so the reader begins there.
         match bytes.split_first_chunk() {
             Some(([0, 0, _, _], body)) => Ok(Self::BigEndian(Reader::new(body))),
             Some(([0, 1, _, _], body)) => Ok(Self::LittleEndian(Reader::new(body))),

@@ -67,10 +67,12 @@ fn read<BO: ByteOrder>(mut message: Reader<'_, BO>) -> Result<StatedPose, Stated
     let [x, y, z, qx, qy, qz, qw] = message.f64s("pose")?;
     let world_from_base = Pose {
         translation_m: [x, y, z],
+        // ROS writes w last, `Pose` has it first.
         rotation_wxyz: [qw, qx, qy, qz],
     };
     world_from_base.validate()?;
     let covariance: [f64; 36] = message.f64s("covariance")?;
+    // Row-major 6 x 6: variances of x, y and yaw are at 0, 7 and 35.
     let [xx, .., yaw] = covariance;
     let [_, _, _, _, _, _, _, yy, ..] = covariance;
     Ok(StatedPose {

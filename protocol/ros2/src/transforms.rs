@@ -88,6 +88,7 @@ impl PoseType {
             child,
             parent_from_child: Pose {
                 translation_m: [x, y, z],
+                // ROS writes w last, `Pose` has it first.
                 rotation_wxyz: [qw, qx, qy, qz],
             },
         })

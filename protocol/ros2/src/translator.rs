@@ -155,6 +155,7 @@ impl Translator {
         let Some(pose) = estimate.world_from_cav() else {
             return Vec::new();
         };
+        // A motion of another capture time would state a speed that was not measured with this pose.
         let motion = self.motions.get(cav).filter(|(nanos, _)| *nanos == at);
         let motion = motion.map_or(EgoMotion::default(), |(_, motion)| *motion);
         let covariance = estimate.covariance();
@@ -196,6 +197,7 @@ impl Translator {
             .agents
             .iter()
             .flat_map(|agent| &agent.objects)
+            // Several agents annotate the same object, and its id is the same in all.
             .filter(|object| seen.insert(object.id));
         let boxes: Vec<Marked> = objects.map(encode::truth_marker).collect();
         let frames: Vec<_> = truth
@@ -217,6 +219,7 @@ impl Translator {
     fn status(&mut self, stats: &Stats) -> Status {
         let total = stats.ledger.total();
         let lost = total.dropped_total();
+        // The ledger of a restarted process begins at 0, below the losses before.
         let new = lost.saturating_sub(self.losses.insert(stats.process.clone(), lost).unwrap_or(0));
         let mut values = vec![
             ("messages sent".to_owned(), total.sent.to_string()),

@@ -52,6 +52,7 @@ impl Distribution {
 
 /// Hash of the type `own`, which contains the types `contained`, directly or not.
 pub(crate) fn type_hash(own: Definition, mut contained: Vec<Definition>) -> String {
+    // The hash depends on the order of the referenced types, which is by name.
     contained.sort_unstable_by_key(|(name, _)| *name);
     let references: Vec<String> = contained.into_iter().map(description).collect();
     let text = format!(
@@ -70,6 +71,7 @@ pub(crate) fn type_hash(own: Definition, mut contained: Vec<Definition>) -> Stri
 fn description((name, fields): Definition) -> String {
     let fields = fields
         .lines()
+        // A line with `=` defines a constant.
         .filter(|line| !line.contains('='))
         .filter_map(|line| line.split_once(' '));
     let fields: Vec<String> = fields

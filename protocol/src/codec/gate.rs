@@ -108,6 +108,7 @@ impl ConfidenceGate {
             })?,
             None => vec![1.0],
         };
+        // The sum over the square window is the square of the sum over one dimension.
         let highest = weights.iter().sum::<f32>().powi(2);
         if self.threshold < highest {
             return Ok(());
@@ -149,6 +150,7 @@ impl Smoothing {
     fn smooth(&self, values: &[f32], grid: &BevGrid) -> Result<Vec<f32>, WireError> {
         let weights = self.weights()?;
         let width = grid.width as usize;
+        // Step 1 of the separable window: along rows.
         let mut along_rows = vec![0f32; values.len()];
         for (row, smoothed) in values
             .chunks_exact(width)
@@ -156,6 +158,7 @@ impl Smoothing {
         {
             convolve(row, &weights, smoothed);
         }
+        // Step 2: along columns, a row at a time, so that memory is read in order.
         let mut smoothed = vec![0f32; values.len()];
         let half = weights.len() / 2;
         let height = values.len() / width;
@@ -200,6 +203,7 @@ impl Smoothing {
             return refuse("sigma of the confidence gate", f64::from(sigma), 1e3);
         }
         let (half, sigma) = (f64::from(kernel / 2), f64::from(sigma));
+        // Its square is the published factor 1 / (2 pi sigma).
         let scale = 1.0 / (std::f64::consts::TAU * sigma).sqrt();
         let weight =
             |cell: u32| scale * (-(f64::from(cell) - half).powi(2) / (2.0 * sigma * sigma)).exp();

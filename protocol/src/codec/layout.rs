@@ -41,6 +41,7 @@ impl Layout {
         }
         // A receiver always unpacks to the whole feature map, however few bytes claim it.
         let map_bytes = cells.saturating_mul(channel_count).saturating_mul(4);
+        // No allocation may exceed isize::MAX bytes. Products that saturate fail here too.
         let max_bytes = limits.max_body_bytes.min(isize::MAX as u64);
         check_limit("feature map bytes", map_bytes, max_bytes)?;
         let (selected, mask_bytes) = match codec.selection {

@@ -170,6 +170,7 @@ pub fn encode_features(
     let layout = Layout::new(&grid, channels, &dense, &Limits::SENDER)?;
     let expected = layout.cells * channels as usize;
     check_size("features", features.values.len() as u64, expected as u64)?;
+    // A budget that holds the dense map does not limit it.
     let budget = config
         .budget_bytes
         .filter(|budget| *budget < layout.len() as u64);
@@ -189,6 +190,7 @@ pub fn encode_features(
             selection::within_budget(confidence, gated.as_deref(), channels, config.dtype, budget)?
         }
         (Some(gated), None) if gated.len() < layout.cells => gated,
+        // All cells pass the gate: a mask would only add bytes.
         _ => return encode_selected(features, dense, None, config.zstd_level),
     };
     let codec = Codec {
@@ -385,6 +387,7 @@ impl EncodedFeatures {
             Selection::TopK { .. } => {
                 let selected =
                     selection::read_mask(part(&layout.mask)?, layout.cells, layout.selected)?;
+                // Freed before the map is allocated: a receiver holds two bodies at most (`Limits`).
                 drop(raw);
                 let (map, sent) =
                     selection::scatter(&values, channels as usize, layout.cells, &selected);

@@ -155,6 +155,7 @@ fn choose(
             return Ok((dtype, reduced_by));
         }
     }
+    // No format holds all wanted cells: the coarsest has room for the most of them.
     Ok((Dtype::I8, ReducedBy::Cells))
 }
 
@@ -164,6 +165,7 @@ fn wanted(
     config: &CodecConfig,
     confidence: Option<&[f32]>,
 ) -> Result<Selection> {
+    // A gate without a confidence is refused when the map is encoded.
     let (Some(gate), Some(confidence)) = (config.gate, confidence) else {
         return Ok(Selection::Dense);
     };

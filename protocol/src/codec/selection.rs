@@ -59,8 +59,10 @@ fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<
                 .total_cmp(&confidence[*a as usize])
                 .then(a.cmp(b))
         };
+        // In linear time: the order among the selected cells does not matter.
         cells.select_nth_unstable_by(count, descending);
         cells.truncate(count);
+        // Back to row-major order, in which the mask and the values are written.
         cells.sort_unstable();
     }
     cells
@@ -98,6 +100,7 @@ pub(super) fn append_mask(bytes: &mut Vec<u8>, cells: usize, selected: &[u32]) {
 /// [`WireError::Shape`] when the number of cells in the mask differs from the announced one, or a cell is beyond the
 /// last.
 pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<Vec<u32>> {
+    // Counted before the allocation, which then has the size of what is there.
     let found: u64 = mask.iter().map(|byte| u64::from(byte.count_ones())).sum();
     check_size("cells in the mask", found, announced as u64)?;
     let mut selected = Vec::with_capacity(announced);
@@ -113,6 +116,7 @@ pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<V
         );
     }
     match selected.last() {
+        // The last byte of the mask may have bits beyond the grid.
         Some(last) if *last as usize >= cells => Err(WireError::Shape {
             what: "last cell in the mask",
             expected: cells as u64 - 1,

@@ -105,6 +105,7 @@ fn names(defaults: &Value) -> BTreeMap<String, Value> {
                 .filter(|(other, _)| other.ends_with(name))
                 .count()
                 == 1;
+            // A short name that two sections share names neither. The whole path (start 0) is kept.
             if is_unique || start == 0 {
                 names.insert(name.join("_"), value.clone());
             }

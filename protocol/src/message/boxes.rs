@@ -57,6 +57,7 @@ impl Boxes {
     pub fn new(pose: PoseEstimate, objects: &[PerceivedObject]) -> Self {
         let round = |object: &PerceivedObject| {
             let PerceivedObject { detection, track } = CompactBox::of(object).object();
+            // Checked as rounded: a variance beyond half precision is infinite there.
             let track = track.filter(|track| track.check_values().is_ok());
             PerceivedObject { detection, track }
         };

@@ -49,6 +49,7 @@ impl Pace {
             self.phase_nanos,
         ]
         .map(i128::from);
+        // Euclidean: sweeps before the phase have negative numbers. A period of 0 gives `None`.
         let sweep = (capture + tolerance - phase).checked_div_euclid(period)?;
         (sweep * i128::from(self.computed)).checked_div_euclid(i128::from(self.of))
     }

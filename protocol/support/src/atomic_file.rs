@@ -39,6 +39,7 @@ impl Disk for System {
             .suffix(UNFINISHED)
             // The permissions of any other new file, less those that the user's mask excludes.
             .permissions(Permissions::from_mode(0o666))
+            // In the same folder: only within one file system a rename is atomic.
             .tempfile_in(folder_of(path))
     }
 
@@ -83,6 +84,7 @@ pub fn write_volatile(path: &Path, contents: impl AsRef<[u8]>) -> io::Result<()>
 pub fn sync(path: &Path) -> io::Result<()> {
     let file = File::open(path)?;
     if file.metadata()?.is_dir() {
+        // The whole file system at once, instead of each file below the folder.
         rustix::fs::syncfs(&file)?;
     }
     file.sync_all()?;

@@ -99,6 +99,7 @@ pub fn exit_code(
 /// True for a place that cannot be written, and for a full disk or quota, which no input causes.
 fn is_of_writing(error: &anyhow::Error) -> bool {
     let is_within = |cause: &(dyn Error + 'static)| match cause.downcast_ref() {
+        // `BadInput` is transparent: the chain of causes skips its inner error, which is looked at here.
         Some(BadInput(inner)) => is_of_writing(inner),
         None => {
             let of_system = cause.downcast_ref::<io::Error>();

@@ -21,6 +21,7 @@ pub fn parse_beside<P: Parser>(sibling: &Sibling) -> P {
     if env::var_os(GENERATE).is_some() {
         end_if_failed(Some(sibling.exec_generator()));
     }
+    // Before clap parses: it would print the help of a subcommand whose options it does not know.
     end_if_failed(sibling.exec_help(env::args_os()));
     let matches = matches(sibling.extend(P::command()));
     end_if_failed(sibling.exec_subcommand(&matches));

@@ -81,10 +81,12 @@ impl FileDigests {
             let reason = "not a regular file";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
         }
+        // Before the content: if the file changes while it is read, its next version is not known yet.
         let version = Version::of(&about);
         if let Some(digest) = lock(&self.known).get(&version) {
             return Ok(*digest);
         }
+        // Without the lock: two threads may hash one file at the same time, with the same result.
         let digest = digest(File::open(path)?)?;
         lock(&self.known).insert(version, digest);
         Ok(digest)

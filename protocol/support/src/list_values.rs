@@ -22,6 +22,7 @@ pub(crate) fn with_lists_joined(
             let mut named = of.get_arguments().filter(has_name);
             is_list = named.any(|arg| arg.get_value_delimiter() == Some(','));
             let is_value = is_list && !value.is_empty();
+            // The list continues in the next word after `--name` alone, and after a comma at the end.
             is_list &= value.is_empty() || value.trim_end().ends_with(',');
             joined.push(match is_value {
                 true => format!("--{name}={}", without_blanks(value)).into(),
@@ -30,6 +31,7 @@ pub(crate) fn with_lists_joined(
             continue;
         }
         if !is_list {
+            // Options after the name of a subcommand are those of the subcommand.
             of = of.find_subcommand(text).unwrap_or(of);
             joined.push(word);
             continue;

@@ -54,6 +54,7 @@ impl SplitMix64 {
         reason = "the product's upper half is below `count`"
     )]
     pub fn below(&mut self, count: usize) -> usize {
+        // Multiply and shift instead of a remainder: its bias is at most count / 2^64.
         ((u128::from(self.next_u64()) * count as u128) >> 64) as usize
     }
 
@@ -81,6 +82,7 @@ impl RngCore for SplitMix64 {
     }
 
     fn next_u64(&mut self) -> u64 {
+        // 2^64 divided by the golden ratio, odd: the state takes all 2^64 values.
         self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
         mix(self.state)
     }

@@ -48,6 +48,7 @@ impl<T: Serialize> RecordWriter<T> {
         self.out.write_all(&length.to_le_bytes())?;
         self.out.write_all(&crc32fast::hash(&bytes).to_le_bytes())?;
         self.out.write_all(&bytes)?;
+        // After each record: a process that is killed loses none that was added.
         self.out.flush()
     }
 }
@@ -84,12 +85,14 @@ impl<T: DeserializeOwned> RecordReader<T> {
     fn read(file: &mut impl Read) -> io::Result<Option<T>> {
         let (mut length, mut checksum) = ([0; 4], [0; 4]);
         let [first, rest @ ..] = &mut length;
+        // No byte at all is the regular end, fewer than a whole record a damaged one.
         match file.read(std::slice::from_mut(first))? {
             0 => return Ok(None),
             _ => file.read_exact(rest)?,
         }
         file.read_exact(&mut checksum)?;
         let length = u32::from_le_bytes(length);
+        // Grows with what is there: a damaged length reserves no memory.
         let mut bytes = Vec::new();
         file.take(u64::from(length.min(MAX_RECORD_BYTES)))
             .read_to_end(&mut bytes)?;

@@ -76,6 +76,7 @@ impl Sibling {
     }
 
     fn exec<'a>(&self, name: &str, arguments: impl Iterator<Item = &'a OsString>) -> io::Error {
+        // Options before the subcommand were parsed here: the sibling gets them again.
         let verbosity: &[&str] = match verbosity() {
             Verbosity::Quiet => &["--quiet"],
             Verbosity::Usual => &[],

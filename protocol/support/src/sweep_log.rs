@@ -32,6 +32,7 @@ impl SweepLog {
     /// # Errors
     /// The system's, if the file cannot be written.
     pub fn note(&mut self, capture_nanos: u64, arrived_nanos: u64) -> io::Result<()> {
+        // One write for each line, so that a killed process truncates the last one at most.
         self.0
             .write_all(format!("{capture_nanos},{arrived_nanos}\n").as_bytes())
     }

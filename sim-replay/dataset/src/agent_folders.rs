@@ -94,6 +94,7 @@ fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
             .filter_map(|folder| files::list(&dir.join(folder)).ok());
         below.any(|listing| is_whole(&listing))
     };
+    // In this order: the second test lists every folder below.
     is_whole(listing) && !holds_agents()
 }
 
@@ -146,6 +147,7 @@ impl ScenarioFolder {
                 .iter()
                 .any(|(_, listing)| holds_pairs(listing, suffix))
         };
+        // Bare floats are used only where no agent has a PCD: a scenario has one kind of sweeps.
         let suffix = if !has(PCD) && has(BIN) { BIN } else { PCD };
         let mut by_agent = BTreeMap::new();
         for (id, listing) in &listed {
@@ -177,6 +179,7 @@ impl ScenarioFolder {
         }
         let mut stems: Vec<String> = all.into_iter().cloned().collect();
         problems.extend(without_common_frame(dir, &agents, &by_agent));
+        // The set is in text order, where 10 comes before 9.
         stems.sort_by(|first, second| files::natural_order(first, second));
         let variants: BTreeSet<String> = by_agent
             .values()
@@ -235,6 +238,7 @@ impl ScenarioFolder {
             .map(|frame| (&frame.agent, frame.stem.as_str()))
             .collect();
         let of_agent = |agent: &CavId| {
+            // Missing files are left out first: they would use up the tries.
             let stems = self
                 .stems
                 .iter()
@@ -272,14 +276,16 @@ impl ScenarioFolder {
             (Some(numbers), None) => {
                 let step = numbers
                     .array_windows()
-                    .map(|[a, b]| b - a)
+                    .map(|[a, b]| b.saturating_sub(*a))
                     .filter(|&step| step > 0)
                     .min()
                     .unwrap_or(1);
                 let first = numbers.first().copied().unwrap_or(0);
                 numbers
                     .iter()
-                    .map(|number| ((number - first) / step).saturating_mul(period_nanos))
+                    .map(|number| {
+                        (number.saturating_sub(first) / step).saturating_mul(period_nanos)
+                    })
                     .collect()
             }
             (None, _) => (0..self.stems.len() as u64)

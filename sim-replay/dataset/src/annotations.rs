@@ -102,6 +102,7 @@ impl<'a> Annotations<'a> {
             self.left_out("list of objects", error);
             Vec::new()
         });
+        // Python keeps the last of equal keys. The others are reported.
         let last: HashMap<&str, usize> = entries
             .iter()
             .enumerate()
@@ -179,6 +180,7 @@ impl<'a> Annotations<'a> {
     }
 
     fn unknown_class(&mut self, key: &str, found: &str) {
+        // The scenario's folder: the same finding in several agents' frames is one then.
         let scenario = self
             .root
             .path()

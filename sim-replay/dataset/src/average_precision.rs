@@ -126,6 +126,7 @@ impl Tally {
     pub fn curve(&self, ordering: Ordering) -> Curve {
         let mut order: Vec<&Matched> = self.matched.iter().collect();
         if ordering == Ordering::Global {
+            // A stable sort: equal scores stay in the order of the frames.
             order.sort_by(|a, b| b.score.total_cmp(&a.score));
         }
         let mut recall = vec![0.0];
@@ -133,14 +134,17 @@ impl Tally {
         let mut found = 0usize;
         for (index, entry) in order.into_iter().enumerate() {
             found += usize::from(entry.is_true);
+            // Without objects nothing is found: 0 / 1 instead of NaN.
             recall.push(found as f64 / self.objects.max(1) as f64);
             precision.push(found as f64 / (index + 1) as f64);
         }
         recall.push(1.0);
         precision.push(0.0);
+        // Step: the envelope, from the right: no recall has a lower precision than a larger one.
         for index in (1..precision.len()).rev() {
             precision[index - 1] = precision[index - 1].max(precision[index]);
         }
+        // Step: the area under it. Where recall does not rise the width is 0.
         let steps = recall.windows(2).zip(&precision[1..]);
         let average_precision = steps
             .map(|(recall, precision)| (recall[1] - recall[0]) * precision)

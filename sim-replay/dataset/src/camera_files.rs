@@ -115,6 +115,7 @@ fn pinhole(field: &Field<'_>) -> Result<Pinhole> {
 
 /// The optical frame, z ahead, x right, y down, in the frame of a camera that looks along x, with y left and z up.
 pub fn body_from_optical() -> Isometry3<f64> {
+    // Columns: the optical x (right), y (down) and z (ahead) as -y, -z and x of the camera's body.
     let axes = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
     Isometry3::from_parts(nalgebra::Translation3::identity(), rotation)

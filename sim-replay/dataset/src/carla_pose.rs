@@ -93,6 +93,7 @@ impl CarlaPose {
     }
 
     fn from_parts(position_m: [f64; 3], rotation: &Matrix3<f64>) -> Self {
+        // Rounding may lift the sine above 1, where `asin` is NaN.
         let pitch = rotation[(2, 0)].clamp(-1.0, 1.0).asin();
         let roll = (-rotation[(2, 1)]).atan2(rotation[(2, 2)]);
         let yaw = rotation[(1, 0)].atan2(rotation[(0, 0)]);

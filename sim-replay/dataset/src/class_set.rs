@@ -68,6 +68,7 @@ fn bit(class: ObjectClass) -> u8 {
     ObjectClass::ALL
         .iter()
         .position(|known| *known == class)
+        // The bits follow the order of the enum, on which the constants above rely.
         .map_or(0, |index| 1 << index)
 }
 

@@ -82,6 +82,7 @@ fn of_library(name: &str) -> Option<ObjectClass> {
             // `vehicle.bus.rigid` and `vehicle.emergency.police` of nuScenes, or make and model.
             let class = listed(&BLUEPRINTS, &model)
                 .or_else(|| of_name(if kind == "emergency" { &model } else { kind }));
+            // Makes are not listed: what has no other class in the library of vehicles is a car.
             Some(class.unwrap_or(ObjectClass::Car))
         }
         _ => None,

@@ -74,6 +74,7 @@ fn listed(path: &Path) -> Result<Vec<Listed>> {
     let about = std::fs::metadata(path).map_err(|error| ReadError::io(path, error))?;
     let clouds = match about.is_dir() {
         true => clouds_in(path)?,
+        // A bag is a file with many sweeps: it is opened as a data set below.
         false if rosbag::is_bag(path) => Vec::new(),
         false => vec![path.to_owned()],
     };
@@ -157,6 +158,7 @@ impl Folders {
         };
         let known = scene_of(&path).and_then(|scene| {
             let frames = self.scenes.entry(scene.clone()).or_insert_with(|| {
+                // A folder may only look like a scene: then its files are read by themselves.
                 let scenarios = crate::open(&scene)
                     .map(|dataset| dataset.scenarios)
                     .unwrap_or_default();
@@ -166,6 +168,7 @@ impl Folders {
                     .map(|file| (canonical(&file.path), file))
                     .collect()
             });
+            // A relative path or a link may name the same file as the scene does.
             frames.get(&canonical(&path)).cloned()
         });
         let alone = self

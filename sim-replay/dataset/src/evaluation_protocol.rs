@@ -127,6 +127,7 @@ impl EvaluationProtocol {
             (AgentKinds::All, EgoKind::Vehicle) => [vehicles, units].concat(),
             (AgentKinds::All, EgoKind::Unit) => [units, vehicles].concat(),
         };
+        // From the end: the ego and the first agents stay.
         order.truncate(self.max_agents);
         if order.is_empty() {
             None

@@ -50,6 +50,7 @@ pub(super) fn list(dir: &Path) -> Result<Listing> {
 pub(super) fn natural_order(first: &str, second: &str) -> Ordering {
     parts(first)
         .cmp(parts(second))
+        // `7` and `07` are the same number: the shorter name comes first.
         .then_with(|| first.len().cmp(&second.len()))
 }
 
@@ -60,6 +61,7 @@ fn parts(name: &str) -> impl Iterator<Item = (usize, &[u8])> {
         .chunk_by(|a, b| a.is_ascii_digit() == b.is_ascii_digit());
     parts.map(|part| match part.first() {
         Some(b'0'..=b'9') => {
+            // Compared by length and digits, not parsed: a number of any length is in order.
             let zeros = part.iter().take_while(|&&digit| digit == b'0').count();
             (part.len() - zeros, part.get(zeros..).unwrap_or_default())
         }

@@ -2,7 +2,10 @@
 //!
 //! Every layout is read into this one frame: right-handed, metres, radians, nanoseconds (see [`protocol`]).
 
-use protocol::{AgentTruth, Camera, CavId, EgoMotion, Handedness, PointCloud, Pose, TrueObject};
+use protocol::{
+    AgentTruth, Camera, CavId, EgoMotion, Gnss, GnssSource, Handedness, PointCloud, Pose,
+    TrueObject,
+};
 use serde::{Deserialize, Serialize};
 use strum::{EnumString, IntoStaticStr, VariantArray};
 
@@ -131,6 +134,16 @@ impl Frame {
             speed_mps: self.speed_mps,
             yaw_rate_rad_s: self.yaw_rate_rad_s,
         }
+    }
+
+    /// Its pose as a measurement, where one is recorded.
+    pub fn gnss(&self) -> Option<Gnss> {
+        self.world_from_lidar.map(|world_from_lidar| Gnss {
+            world_from_lidar,
+            position_std_m: 0.0,
+            heading_std_rad: 0.0,
+            source: GnssSource::Recorded,
+        })
     }
 
     /// An empty frame.

@@ -51,6 +51,7 @@ pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str
         all.iter().partition(|stem| is_number(stem));
     let is_copy = |stem: &&&str| {
         let rest = stem.trim_start_matches(|letter: char| letter.is_ascii_digit());
+        // The removed digits are ASCII, so the cut lies between two characters.
         numbers.contains(&stem[..stem.len() - rest.len()])
     };
     let names = others.iter().filter(|stem| !is_copy(stem)).count();
@@ -84,6 +85,7 @@ impl AgentFolder {
         if is_without_yaml {
             // Sweeps alone are frames without poses and boxes.
             let sweeps = files::stems(&listing.files, suffix).into_iter();
+            // A name with an underscore is that of a variant, `<stem>_<variant>`, and no frame.
             listed.extend(sweeps.filter(|stem| !stem.contains('_')));
         }
         let (yamls, strays) = usual_stems(listed);
@@ -135,9 +137,11 @@ enum Sweep<'a> {
 
 impl<'a> Sweep<'a> {
     fn of(name: &'a str, yamls: &BTreeSet<&str>) -> Self {
+        // First the whole name: a stem may contain an underscore itself.
         if yamls.contains(name) {
             return Self::Plain;
         }
+        // At the first underscore: variants contain more of them, `fog_0.060` for example.
         match name.split_once('_') {
             Some((stem, RADAR)) if yamls.contains(stem) => Self::Radar,
             Some((stem, variant)) if yamls.contains(stem) => Self::Variant(variant),

@@ -30,6 +30,7 @@ impl Scenario {
         let points = self.points_path(0, 0, None)?;
         let folder = points
             .ancestors()
+            // `<scenario>/<agent>/<frame>`: the folder two levels above a sweep.
             .nth(2)
             .map(PathBuf::from)
             .unwrap_or_default();

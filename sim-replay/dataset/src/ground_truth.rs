@@ -46,6 +46,7 @@ impl GroundTruth {
     /// The ground truth of a tick for an ego, see [`merge`].
     pub fn of_tick(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule) -> Self {
         let ([x_low, x_high], [y_low, y_high]) = (rule.x_m, rule.y_m);
+        // Without the test of the range: an object at its border still excuses a detection.
         let ignored = select(
             frames_of_tick,
             (ego_index, rule.comm_range_m),
@@ -199,6 +200,7 @@ fn select<'a>(
         let listed = annotations.get(index).copied().unwrap_or_default();
         for object in listed.iter().filter(|object| is_of_class(object.class)) {
             let box3d = upright_box(object, &ego_from_world);
+            // In this order: a box that is not kept leaves its id to the annotation of another agent.
             if is_kept(&box3d) && seen.insert(object.id) {
                 merged.push((object, box3d));
             }

@@ -21,6 +21,7 @@ pub(super) fn read(path: &Path) -> Result<Value> {
 /// Parses JSON in which bare words may stand that are no JSON: `NaN` and `Infinity`, as Python writes them, or numbers
 /// beyond all floats. Each is read as a text of its letters, so that only the object that needs it is lost, and named.
 pub(super) fn parse(bytes: &[u8]) -> serde_json::Result<Value> {
+    // Sound files are parsed once. Only others pay for the search of bare words.
     serde_json::from_slice(bytes).or_else(|error| {
         let mended = with_quoted_words(bytes);
         serde_json::from_slice(&mended).map_err(|_| error)
@@ -39,6 +40,7 @@ pub(super) fn with_quoted_words(bytes: &[u8]) -> Vec<u8> {
             true => 1,
             false => rest.iter().take_while(|byte| is_word(byte)).count(),
         };
+        // Escaped quotes do not arrive here: they are the second byte of the token before.
         is_string ^= first == b'"';
         let (token, after) = rest.split_at_checked(end).unwrap_or((rest, &[]));
         let is_bare = !is_string && is_word(&first);
@@ -185,6 +187,7 @@ impl<'a> Field<'a> {
             let mut items = self.items()?;
             return items.try_for_each(|item| item.flatten(most, numbers));
         }
+        // Checked before the number is added: a long list must not be collected to be refused.
         if numbers.len() == most {
             return Err(self.error(format!("more than {most} numbers, expected {most}")));
         }

@@ -66,6 +66,7 @@ pub(super) fn read(
             Ok(()) => used += 1,
             Err(problem) => {
                 unusable += 1;
+                // A table has up to millions of rows: all their problems would fill the memory.
                 if first_problems.len() < MAX_PROBLEMS {
                     first_problems.push(problem);
                 }
@@ -140,6 +141,7 @@ impl RowSplitter {
             self.lines += u64::from(byte == b'\n');
             match byte {
                 _ if self.depth == 0 => self.outside(byte)?,
+                // Only commas of the list itself end an entry, not those in a row or in a text.
                 b',' | b']' if self.depth == 1 && !self.is_string => self.end(byte, entry)?,
                 _ => self.inside(byte)?,
             }
@@ -169,6 +171,7 @@ impl RowSplitter {
             (false, b'}' | b']') => self.depth = (self.depth - 1).max(1),
             _ => {}
         }
+        // A row whose brackets are never closed would take the rest of the file into memory.
         if self.entry.len() == MAX_ROW_BYTES {
             let count = self.count;
             return Err(format!(
@@ -183,6 +186,7 @@ impl RowSplitter {
     fn end(&mut self, byte: u8, entry: &mut impl FnMut(usize, &[u8])) -> Result<(), String> {
         let is_last = byte == b']';
         let is_blank = self.entry.iter().all(u8::is_ascii_whitespace);
+        // `[]` has no entry. A blank entry elsewhere is passed on, and its reader reports it.
         if !(is_last && is_blank && self.count == 0) {
             entry(self.count, &self.entry);
             self.count += 1;

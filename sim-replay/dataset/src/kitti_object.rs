@@ -88,6 +88,7 @@ impl FrameSource for Split {
         if self.has_labels {
             let calibration = Calibration::read(&self.calibration(tick))?;
             let rectified = calibration.rotation("R0_rect")?.isometry();
+            // Labels are in the frame of the rectified camera: R0_rect follows Tr_velo_to_cam.
             let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
             (frame.objects, frame.problems) =
                 objects(&self.labels(tick), &camera_from_lidar.inverse())?;
@@ -177,6 +178,7 @@ fn object(
         .filter(|_| has_score)
         .map_or(numbers, |(numbers, _)| numbers);
     let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(&field), numbers)?;
+    // KITTI has height, width, length. Sizes here are length, width, height.
     let [.., height, width, length, x, y, z, rotation_y] = values;
     let size_m = [length, width, height];
     if size_m.iter().any(|&size| size <= 0.0 || size > MAX_SIZE_M) {
@@ -208,6 +210,7 @@ fn camera_from_object(bottom: [f64; 3], height: f64, rotation_y: f64) -> Isometr
     let rotation =
         UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
     let [x, y, z] = bottom;
+    // y points down: the centre is above the bottom face by half the height.
     Isometry3::from_parts(Point3::new(x, y - height / 2.0, z).coords.into(), rotation)
 }
 

@@ -75,6 +75,7 @@ pub(super) fn open(
         joins.extend(is_joined.then_some(line));
     }
     let mut ticks: Vec<Tick> = scans.into_iter().map(tick).collect();
+    // Names without leading zeros are listed in another order than their numbers.
     ticks.sort_by_key(|tick| tick.capture_nanos);
     let files = ticks
         .iter()
@@ -126,6 +127,7 @@ fn of_lines<T>(
     let rows = kitti_text::rows(path, &mut faults, read)?;
     let numbers = scans.iter().map(|(scan, _)| *scan);
     let (first, last) = (numbers.clone().min(), numbers.max());
+    // As many lines as scans, but other numbers: by number, scans would get the lines of others.
     if let (Some(first), Some(last)) = (first, last)
         && rows.len() == scans.len()
         && last >= rows.len()
@@ -247,6 +249,7 @@ fn times(
     }
     let times = of_lines(&path, scans, problems, |line, text| {
         let [seconds] = kitti_text::numbers(&path, line, None, text)?;
+        // A NaN is in no range, so it is refused too.
         if !(0.0..=1e9).contains(&seconds) {
             let reason = format!("{seconds} s, expected 0 to 1e9");
             return Err(kitti_text::malformed(&path, line, None, reason));

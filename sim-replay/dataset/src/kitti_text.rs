@@ -75,6 +75,7 @@ pub(super) fn numbers<const N: usize>(
             let reason = format!("{:?} is no finite number", excerpt(word, 40));
             return Err(malformed(path, line, field, reason));
         };
+        // Counts on beyond `N`, so that the message states how many there are.
         if let Some(place) = numbers.get_mut(found) {
             *place = number;
         }
@@ -138,6 +139,7 @@ impl Calibration {
     /// A 3x3 rotation.
     pub(super) fn rotation(&self, name: &str) -> Result<Pose> {
         let (line, [a, b, c, d, e, f, g, h, i]) = self.numbers::<9>(name)?;
+        // Row-major, with a translation of zero in every fourth place.
         let rows = [a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0];
         rigid(&self.path, line, Some(name), &rows)
     }

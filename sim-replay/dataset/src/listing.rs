@@ -42,10 +42,12 @@ pub fn content_sha256<'a>(
         list(scenario, &mut hash);
         let files: Vec<PathBuf> = files_of(scenario, variant).into_iter().collect();
         let digests: Vec<Option<[u8; 32]>> =
+            // The results keep the order of the files, whichever is read first.
             files.par_iter().map(|file| digests.of(file).ok()).collect();
         for digest in digests {
             match digest {
                 Some(digest) => hash.update(digest),
+                // A mark instead of nothing: a file that becomes unreadable changes the hash.
                 None => hash.update("\nunreadable"),
             }
         }

@@ -195,6 +195,7 @@ fn poses(
     let middle = Isometry3::from(middle_m(dir, scene)?);
     let turn = half_turn();
     for pose in poses.values_mut() {
+        // The mean is in the axes of the file: it is subtracted before the turn.
         *pose = (turn * middle.inverse() * pose.isometry() * turn.inverse()).into();
     }
     Ok(Some(poses))
@@ -279,6 +280,7 @@ fn first_row(path: &Path) -> Result<[f64; 3]> {
 }
 
 fn own_name(dir: &Path) -> String {
+    // `.` or a link shows no day: the name of the folder behind it does.
     let name = dir
         .canonicalize()
         .ok()
@@ -309,6 +311,7 @@ impl FrameSource for Sequence {
             .sweeps
             .read(agent, &self.points_path(agent, tick, variant))?;
         for [_, y, z, _] in &mut cloud.points.xyzi {
+            // The half turn of the poses, for the points: `C = diag(1, -1, -1)`.
             (*y, *z) = (-*y, -*z);
         }
         Ok(cloud)

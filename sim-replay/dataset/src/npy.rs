@@ -40,6 +40,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         None => number_of(descr)?.size,
     };
     let (stated, found) = (product(size_of_one, &shape), body.len());
+    // Before anything is allocated by the shape. No product means that the shape overflows.
     if stated.is_none_or(|stated| found < stated) {
         return Err(format!(
             "shape {shape:?} stated, {found} bytes found: the file is cut off"
@@ -67,6 +68,7 @@ fn split(bytes: &[u8]) -> Result<(&str, &[u8]), String> {
         .strip_prefix(MAGIC)
         .ok_or("it does not begin as a NumPy file")?;
     let (length, rest) = match rest {
+        // Version 1 states the length of the header in two bytes, later ones in four.
         [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
         [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
         [version, ..] => return Err(format!("version {version} of the format, expected 1 to 3")),
@@ -206,6 +208,7 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
 fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns, String> {
     let fault = || format!("shape {shape:?}, expected N x 3 or N x 4 numbers");
     let (&last, before) = shape.split_last().ok_or_else(fault)?;
+    // 3 x 4 could be either: rows are points then.
     let is_by_component = matches!(before, [3 | 4]) && !COLUMNS.contains(&last);
     let (count, columns, is_planar) = match before {
         [components] if is_by_component => (last, *components, !is_fortran),
@@ -214,6 +217,7 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
         }
         _ => return Err(fault()),
     };
+    // C order by component and Fortran order by point are the same bytes: all x, then all y.
     let (column_step, point_step) = if is_planar { (count, 1) } else { (1, columns) };
     Ok(Columns {
         places: [0, 1, 2, 3].map(|column: usize| {

@@ -102,6 +102,7 @@ impl FrameSource for Opv2v {
 impl Opv2v {
     fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame> {
         let pose = |field: &Field<'_>| self.six_numbers(field);
+        // A faulty LiDAR pose is an error of the frame: all else in it is relative to it.
         let world_from_lidar = root
             .optional("lidar_pose")?
             .map(|field| pose(&field))

@@ -89,6 +89,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
 /// Storage, elements, and the bytes behind the header.
 fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     const END: &[u8] = b"end_header";
+    // A binary body may have no line end for long: the search for `end_header` is bounded.
     let start = bytes.get(..bytes.len().min(MAX_HEADER)).unwrap_or_default();
     if !start.starts_with(b"ply") {
         return Err("the first line is not ply".to_owned());
@@ -148,6 +149,7 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
         }
         None => return Err("no line format".to_owned()),
     };
+    // After all lines: `format` may come behind the elements.
     for (_, scalar) in elements
         .iter_mut()
         .flat_map(|element| &mut element.properties)
@@ -179,6 +181,7 @@ fn ascii(
     body: &[u8],
     columns: &[Option<usize>; 4],
 ) -> Result<Vec<[f32; 4]>, String> {
+    // ASCII has one line for each element, so those before the vertices are skipped by lines, lists too.
     let counts = before.iter().map(|element| element.count);
     let skipped = counts.fold(0, usize::saturating_add);
     let text = String::from_utf8_lossy(body);

@@ -104,6 +104,7 @@ impl Sweeps {
     /// [`ReadError`] for a file that cannot be read or is malformed, and for every file of an agent whose numbers are
     /// neither four nor five to a point.
     pub(super) fn read(&self, agent: &CavId, path: &Path) -> Result<PcdCloud> {
+        // An unknown agent has no samples: its floats count as four to a point.
         let unknown = AgentSweeps::default();
         let agent = self.agents.get(agent).unwrap_or(&unknown);
         let mut cloud = agent.read_stored(self.storage, path)?;
@@ -240,6 +241,7 @@ fn read_with(
 fn planar(bytes: &[u8]) -> Result<PcdCloud, String> {
     check_whole_points(bytes.len(), 16)?;
     let (numbers, _) = bytes.as_chunks::<4>();
+    // Four blocks of equal length: halved twice.
     let (xy, zi) = numbers.split_at(numbers.len() / 2);
     let ((x, y), (z, i)) = (xy.split_at(xy.len() / 2), zi.split_at(zi.len() / 2));
     let points = x.iter().zip(y).zip(z.iter().zip(i));
@@ -258,6 +260,7 @@ fn nclt_raw(bytes: &[u8]) -> Result<PcdCloud, String> {
     let (points, _) = bytes.as_chunks::<8>();
     let point = |&[x0, x1, y0, y1, z0, z1, intensity, _laser]: &[u8; 8]| {
         let [x, y, z] = [[x0, x1], [y0, y1], [z0, z1]]
+            // In double precision, rounded once: steps of 5 mm are no binary fractions.
             .map(|bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32);
         [x, y, z, f32::from(intensity)]
     };

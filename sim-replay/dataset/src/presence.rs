@@ -82,6 +82,7 @@ impl Scenario {
             .filter(|frame| Some(&frame.agent) == agents.first())
             .map(|frame| frame.stem.as_str())
             .collect();
+        // Not only the present ticks: the new ego may have frames where the old one has none.
         let moments = self.absent_at.moments.as_deref().unwrap_or(&self.ticks);
         let is_tick = |tick: &&Tick| !lacking.contains(tick.stem.as_str());
         let ticks: Vec<Tick> = moments.iter().filter(is_tick).cloned().collect();

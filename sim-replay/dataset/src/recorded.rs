@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use protocol::{
-    CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stream, Topic, Truth, wire,
+    CavId, EgoMotion, Gnss, GnssSource, Handedness, Lidar, Limits, Payload, Radar, Stream, Topic,
+    Truth, wire,
 };
 
 use super::layout::{LayoutRow, Reader};
@@ -113,6 +114,7 @@ impl Recorded {
                         .or_insert_with(|| entry.clone());
                 }
                 Topic::Truth => match first_epochs.get(&capture_nanos) {
+                    // In the same epoch it is the same replay: a repeated message, and nothing to report.
                     Some(first) => duplicates += u64::from(*first != epoch),
                     None => {
                         first_epochs.insert(capture_nanos, epoch);
@@ -171,6 +173,7 @@ impl Recorded {
         let keys = self.sensors.keys();
         let sweeps = keys.filter(|(_, _, stream)| *stream == Stream::Lidar);
         let mut captures: Vec<u64> = sweeps.map(|(at, _, _)| *at).collect();
+        // Keys are ordered by capture time first, so equal times are neighbours.
         captures.dedup();
         let (mut ticks, mut missing) = (Vec::new(), Vec::new());
         for capture_nanos in captures {
@@ -178,6 +181,7 @@ impl Recorded {
             let lacks = |cav: &&CavId| !self.has(cav, capture_nanos, Stream::Lidar);
             let lacking: Vec<&CavId> = self.agents.iter().filter(lacks).collect();
             missing.extend(lacking.iter().map(|cav| MissingFrame::new(cav, &stem)));
+            // The ego is the first of both lists: without its sweep there is no tick.
             if lacking.first() != self.agents.first().as_ref() {
                 ticks.push(Tick::new(stem, capture_nanos));
             }
@@ -223,7 +227,10 @@ impl FrameSource for Recorded {
         }
         if self.has(agent, tick.capture_nanos, Stream::Gnss) {
             let gnss: Gnss = self.sensor(agent, tick, Stream::Gnss)?;
-            frame.world_from_lidar = Some(gnss.world_from_lidar);
+            // A receiver errs, and a person states roughly: beside the truth they are no ground truth.
+            if gnss.source == GnssSource::Recorded || frame.world_from_lidar.is_none() {
+                frame.world_from_lidar = Some(gnss.world_from_lidar);
+            }
         }
         if self.has(agent, tick.capture_nanos, Stream::Imu) {
             let motion: EgoMotion = self.sensor(agent, tick, Stream::Imu)?;

@@ -70,6 +70,7 @@ fn contradiction(stretches: &[Speeds]) -> Option<Speeds> {
         .filter(|speeds| !speeds.agree())
         .map(|speeds| (speeds.recorded, speeds.of_poses))
         .unzip();
+    // A quarter of all stretches as well: an agent that hardly moves is not judged by a single one.
     (2 * recorded.len() > moving.len() && 4 * recorded.len() >= stretches.len()).then_some(Speeds {
         recorded: statistics::median(&recorded)?,
         of_poses: statistics::median(&of_poses)?,
@@ -78,6 +79,7 @@ fn contradiction(stretches: &[Speeds]) -> Option<Speeds> {
 
 impl Speeds {
     fn agree(self) -> bool {
+        // Infinite or NaN where the poses stand still: then the difference alone decides.
         let ratio = self.recorded / self.of_poses;
         (self.recorded - self.of_poses).abs() < LEAST_DIFFERENCE_MPS
             || (1.0 / MOST_RATIO..=MOST_RATIO).contains(&ratio)
@@ -117,6 +119,7 @@ fn speeds(scenario: &Scenario, agent: usize, ticks: [usize; 3]) -> Option<Speeds
     for tick in ticks {
         let frame = scenario.load(agent, tick, &options).ok()?;
         frames.push((
+            // The distance between poses has no sign: reversing is motion too.
             frame.speed_mps?.abs(),
             frame.world_from_lidar?.isometry().translation.vector,
             frame.capture_nanos,
@@ -133,6 +136,7 @@ fn speeds(scenario: &Scenario, agent: usize, ticks: [usize; 3]) -> Option<Speeds
     };
     Some(Speeds {
         recorded,
+        // The straight distance, which is shorter than the path of a turn.
         of_poses: (end - start).norm() / seconds,
     })
 }

@@ -53,6 +53,7 @@ impl Scalar {
             (ScalarKind::Float, 8) => Some(f64::from_bits(bits)),
             (ScalarKind::Unsigned, 1 | 2 | 4 | 8) => Some(bits as f64),
             (ScalarKind::Signed, 1 | 2 | 4 | 8) => {
+                // Up to the top and back: the arithmetic shift fills in the sign.
                 let unused = 64 - 8 * self.size;
                 Some((bits.cast_signed() << unused >> unused) as f64)
             }
@@ -74,6 +75,7 @@ fn half(bits: u16) -> f64 {
     let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };
     let (exponent, fraction) = (i32::from(bits >> 10 & 0x1f), f64::from(bits & 0x3ff));
     sign * match exponent {
+        // Subnormal numbers have no leading one, and the exponent -14 with ten bits of fraction.
         0 => fraction * 2f64.powi(-24),
         0x1f if fraction == 0.0 => f64::INFINITY,
         0x1f => f64::NAN,

@@ -18,6 +18,7 @@ pub(super) fn micros_per_unit(stamps: impl IntoIterator<Item = f64>) -> f64 {
         largest if largest > LEAST_NANOS => 1e-3,
         largest if has_fractions && largest < MOST_SECONDS => 1e6,
         largest if has_fractions && largest < MOST_MILLIS => 1e3,
+        // Whole stamps are microseconds however small, as those of a clock that starts at 0.
         _ => 1.0,
     }
 }

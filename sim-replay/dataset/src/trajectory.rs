@@ -24,6 +24,7 @@ impl Trajectory {
     /// The longest selection of `poses` whose times increase, and the indices of the others.
     pub(super) fn new(poses: Vec<(u64, Isometry3<f64>)>, max_gap: u64) -> (Self, Vec<usize>) {
         let times: Vec<u64> = poses.iter().map(|(time, _)| *time).collect();
+        // One time far ahead by mistake leaves itself out, not all poses after it.
         let mut kept = longest_increasing(&times).into_iter().peekable();
         let (mut in_order, mut out_of_order) = (Vec::with_capacity(kept.len()), Vec::new());
         for (index, pose) in poses.into_iter().enumerate() {
@@ -78,6 +79,7 @@ fn longest_increasing(values: &[u64]) -> Vec<usize> {
     let mut ends: Vec<usize> = Vec::new();
     let mut before: Vec<Option<usize>> = Vec::with_capacity(values.len());
     for (index, value) in values.iter().enumerate() {
+        // Bisection, because longer selections end in larger values.
         let length = ends.partition_point(|&end| values[end] < *value);
         before.push(length.checked_sub(1).map(|shorter| ends[shorter]));
         if length == ends.len() {

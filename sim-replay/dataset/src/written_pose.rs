@@ -25,9 +25,11 @@ impl WrittenPose {
         if let Some(number) = values.iter().find(|number| !number.is_finite()) {
             return Err(field.error(format!("{number}, expected finite numbers")));
         }
+        // Axes of length 1 say nothing: (6, 1) and (1, 6) are six numbers.
         let sizes: Vec<usize> = shape.iter().copied().filter(|&size| size != 1).collect();
         match (&sizes[..], values.first_chunk::<6>()) {
             ([6], Some(numbers)) => Ok(Self::SixNumbers(CarlaPose::from(*numbers))),
+            // Row by row in the file, while nalgebra stores columns.
             ([4, 4] | [16], _) => Ok(Self::Matrix(Matrix4::from_row_slice(&values))),
             _ if numpy_tags::is_call(field.node) => Err(field.error(format!(
                 "an array of shape {shape:?}, expected 6 numbers or a 4x4 matrix"

@@ -57,6 +57,7 @@ impl Capacity {
             (config, Some(Trace::Opportunities(times))) => {
                 let offset_nanos = config.trace().map_or(0, TraceConfig::offset_nanos);
                 let all = Self::Opportunities(times.clone());
+                // The trace repeats, so its part before the offset cannot be cut off as in a CSV trace.
                 let before = all.done_by(offset_nanos);
                 if offset_nanos == 0 {
                     all
@@ -75,6 +76,7 @@ impl Capacity {
     /// Work that could be done from time 0 to `nanos`.
     pub(super) fn done_by(&self, nanos: u64) -> u128 {
         match self {
+            // Never asked: the queue sends everything at once on an unlimited link.
             Self::Unlimited => 0,
             Self::Constant(rate) => u128::from(*rate) * u128::from(nanos),
             Self::Steps(steps) => {
@@ -89,6 +91,7 @@ impl Capacity {
             Self::Opportunities(times) => {
                 let Some(period) = times.last() else { return 0 };
                 let (rounds, rest) = (nanos / period, nanos % period);
+                // An opportunity counts from its own time on, so equality is included.
                 let passed = times.partition_point(|&time| time <= rest) as u128;
                 (u128::from(rounds) * times.len() as u128 + passed) * work(OPPORTUNITY_BYTES)
             }
@@ -104,6 +107,7 @@ impl Capacity {
     pub(super) fn time_of(&self, wanted: u128) -> Option<u64> {
         match self {
             Self::Unlimited => Some(0),
+            // Rounded up: before the last nanosecond has passed, the last bit is not sent.
             Self::Constant(rate) => u64::try_from(wanted.div_ceil(u128::from(*rate))).ok(),
             Self::Steps(steps) => {
                 let index = steps
@@ -114,12 +118,14 @@ impl Capacity {
                 if left == 0 {
                     return Some(step.from_nanos);
                 }
+                // A last step with rate 0 never finishes the work: the division has no result.
                 let nanos = left.checked_div(u128::from(step.bits_per_s))?;
                 let whole = nanos * u128::from(step.bits_per_s) == left;
                 step.from_nanos
                     .checked_add(u64::try_from(nanos + u128::from(!whole)).ok()?)
             }
             Self::Opportunities(times) => {
+                // Index of the opportunity that completes the work. A partly used one serves the next packet.
                 let count = wanted.div_ceil(work(OPPORTUNITY_BYTES)).max(1) - 1;
                 let (rounds, place) = (count / times.len() as u128, count % times.len() as u128);
                 let (period, time) = (times.last()?, times.get(usize::try_from(place).ok()?)?);

@@ -22,6 +22,7 @@ pub(super) struct Chance {
 impl Chance {
     pub(super) fn new(seed: u64, from: &CavId, to: &CavId) -> Self {
         Self {
+            // From names, not from indices: another vehicle does not change the draws of this pair.
             seed: derive_seed(seed, &[from, to].map(|cav| label(cav.as_str()))),
         }
     }

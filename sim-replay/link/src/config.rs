@@ -277,6 +277,7 @@ impl LinkConfig {
             LatencyModel::ConstantMs(ms) => time("latency", ms)?,
             LatencyModel::UniformMs([low, high]) => {
                 time("latency", low)?;
+                // The lower bound is the limit: a reversed pair is refused instead of being swapped.
                 within("latency", high, low, MAX_MS)?;
             }
             LatencyModel::Normal { mean_ms, std_ms } => {
@@ -313,6 +314,7 @@ impl LinkConfig {
                 probability("loss.loss_bad", *loss_bad)?;
             }
             LossModel::Distance(points) => {
+                // The interpolation searches the points by bisection, so distances must not decrease.
                 let mut last_m = 0.0;
                 for &[distance_m, share] in points {
                     within("loss.distance", distance_m, last_m, 1e6)?;
@@ -360,6 +362,7 @@ impl LinkConfig {
                 Some(Trace::read_mahimahi(&folder.join(path))?)
             }
         };
+        // Delivery opportunities (mahimahi) state times only: neither delay nor loss can be read from them.
         let has_steps = matches!(trace, Some(Trace::Steps(_)));
         if self.latency == LatencyModel::Trace && !has_steps {
             return Err(FieldError::new("latency", "trace", NO_COLUMN).into());

@@ -45,6 +45,7 @@ impl DeviceClock {
         reason = "a cast from a float saturates"
     )]
     fn ahead_nanos(&self, since_nanos: u64) -> i128 {
+        // The step is at a time of the scene, not of the clock, which would reach it twice after a step back.
         let set = self
             .step
             .filter(|step| since_nanos as f64 >= step.at_s * 1e9);

@@ -105,6 +105,7 @@ impl LinkEmulator {
 
     /// Submits a packet. Time never goes back: a packet earlier than the last one counts as submitted with it.
     pub fn submit(&mut self, mut packet: Packet) {
+        // Outcomes up to now may have been handed out: a packet in the past could change them.
         packet.submitted_nanos = packet.submitted_nanos.max(self.now_nanos);
         self.run(packet.submitted_nanos);
         let key = match self.config.medium {
@@ -118,6 +119,7 @@ impl LinkEmulator {
             .or_default()
             .submit(packet, &rules, &mut left);
         left.into_iter().for_each(|left| self.settle(left));
+        // An unlimited link without delay delivers at once, and a full queue drops at once.
         self.collect(self.now_nanos);
     }
 
@@ -134,6 +136,7 @@ impl LinkEmulator {
             .lines
             .values()
             .filter_map(|line| line.next_nanos(&rules));
+        // Outcomes that were collected but not fetched yet come before everything in flight.
         let known = self.outcomes.first().map(|outcome| outcome.nanos);
         let ahead = self.under_way.keys().next().map(|(nanos, _)| *nanos);
         sent.chain(known).chain(ahead).min()
@@ -193,6 +196,7 @@ impl LinkEmulator {
             directions,
             ..
         } = self;
+        // By direction even on a shared medium: losses and order concern one pair of vehicles.
         let direction = directions
             .entry((packet.from.clone(), packet.to.clone()))
             .or_insert_with(|| Direction {
@@ -207,6 +211,7 @@ impl LinkEmulator {
             distance_m: packet.distance_m,
             sent_nanos: end_nanos,
         };
+        // Drawn for every sent message, also during an outage: the Markov chain takes one step for each.
         let is_lost = direction.loss.loses(
             &config.loss,
             config.loss_unit,
@@ -228,17 +233,20 @@ impl LinkEmulator {
             end_nanos.saturating_add(delay_nanos),
         );
         let mut arrival_nanos = arrival_nanos.max(end_nanos);
+        // A late message holds back those behind it in its stream, as in a transport that delivers in order.
         if config.keep_order {
             let latest = direction.latest_nanos.entry(packet.stream).or_default();
             arrival_nanos = arrival_nanos.max(*latest);
             *latest = arrival_nanos;
         }
+        // After the order was kept, and not entered in `latest_nanos`: only this message is late.
         if let Some(reorder) = config.reorder
             && random(Purpose::Reorder).chance(reorder.probability)
         {
             arrival_nanos = arrival_nanos.saturating_add(nanos::of_ms(reorder.extra_ms));
         }
         let mut twice = random(Purpose::Duplicate);
+        // The delay of the copy has a stream of its own too, so that it differs from the first delay.
         let is_repeated = config.duplicate > 0.0 && twice.chance(config.duplicate);
         let again_nanos =
             is_repeated.then(|| config.latency.draw(&mut twice, trace.as_ref(), &message));
@@ -262,6 +270,7 @@ impl LinkEmulator {
             packet,
             delivery,
         };
+        // The number keeps outcomes of the same time apart, in the order of their decisions.
         self.under_way.insert((nanos, self.next), outcome);
         self.next += 1;
     }
@@ -273,6 +282,7 @@ impl LinkConfig {
         let nanos = |seconds: f64| nanos::of_ms(1e3 * seconds);
         self.outages
             .iter()
+            // Half-open: a message that starts at the end of the outage passes.
             .any(|outage| start_nanos < nanos(outage.to_s) && end_nanos >= nanos(outage.from_s))
     }
 

@@ -14,6 +14,7 @@ impl LatencyModel {
         trace: Option<&Trace>,
         message: &SentMessage,
     ) -> u64 {
+        // Negative draws of the normal distribution become 0 in the conversion.
         nanos::of_ms(match self {
             Self::None => 0.0,
             Self::ConstantMs(ms) => ms,
@@ -26,6 +27,7 @@ impl LatencyModel {
                 fixed_ms,
             } => {
                 let bits = 8.0 * message.bytes as f64;
+                // 1 Mbit/s is 1000 bits per millisecond.
                 random.between(0.0, overhead_ms) + bits / (1e3 * bandwidth_mbps) + fixed_ms
             }
             Self::Trace => trace

@@ -30,11 +30,13 @@ impl LossState {
     ) -> bool {
         let units = match unit {
             LossUnit::Message => 1,
+            // An empty message is one fragment too: without any it could never be lost.
             LossUnit::Fragment => message.bytes.div_ceil(FRAGMENT_BYTES).max(1),
         };
         // Independent losses of all units at once.
         let mut any = |share: f64| {
             let survives = (1.0 - share).powi(i32::try_from(units).unwrap_or(i32::MAX));
+            // `unit` is below 1: a share of 0 never loses, and a share of 1 always does.
             random.unit() >= survives
         };
         match law {
@@ -52,6 +54,7 @@ impl LossState {
             } => {
                 let mut is_lost = false;
                 for _ in 0..units {
+                    // First the transition, then the loss in the state that it leads to.
                     let leaves = if self.is_bad { *to_good } else { *to_bad };
                     self.is_bad ^= random.chance(leaves);
                     is_lost |= random.chance(if self.is_bad { *loss_bad } else { *loss_good });

@@ -46,6 +46,7 @@ impl LinkConfig {
     pub fn open(name: &str) -> Result<(Self, PathBuf), LinkError> {
         let names = PRESETS.map(|(preset, _)| preset);
         if names.contains(&name) {
+            // No preset refers to a file, so its folder is never used.
             return Ok((Self::preset(name)?, PathBuf::from(".")));
         }
         let path = PathBuf::from(name);

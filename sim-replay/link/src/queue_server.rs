@@ -66,6 +66,7 @@ impl QueueServer {
             });
             return;
         }
+        // Before the limits of the queue: an idle sender takes a packet of any size.
         if self.sending.is_none() {
             self.send(packet, nanos, rules);
             return;
@@ -74,11 +75,13 @@ impl QueueServer {
             self.cut_in(packet, rules);
             return;
         }
+        // Before the queue is measured: the bytes of the replaced message make room for the new one.
         if rules.queue.keep_last {
             self.supersede(&packet, left);
         }
         let is_full =
             |line: &Self| line.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes;
+        // A packet larger than the whole queue empties it and is dropped itself below.
         while rules.queue.drop == QueueDrop::Head && is_full(self) {
             let Some(oldest) = self.waiting.pop_front() else {
                 break;
@@ -113,6 +116,7 @@ impl QueueServer {
                 start_nanos: sent.start_nanos,
                 end_nanos,
             });
+            // Urgent packets share the rate with the one being sent and do not free the sender.
             if !is_urgent && let Some(next) = self.waiting.pop_front() {
                 self.waiting_bytes -= next.bytes;
                 self.send(next, end_nanos, rules);
@@ -129,6 +133,7 @@ impl QueueServer {
     fn next(&self, rules: &Rules<'_>) -> Option<(u64, bool)> {
         let end = |sending: &Sending| {
             let nanos = rules.capacity.time_of(sending.end)?;
+            // With a burst the work may have been available before the packet was submitted.
             Some(nanos.max(sending.start_nanos))
         };
         let urgent = self.urgent.front().and_then(end).map(|nanos| (nanos, true));
@@ -159,6 +164,7 @@ impl QueueServer {
         let nanos = packet.submitted_nanos;
         let added = work(packet.bytes);
         self.urgent_used = self.urgent_used.max(rules.capacity.done_by(nanos)) + added;
+        // The capacity that the urgent packet takes is missing to all others: no rate is created.
         self.used += added;
         if let Some(sending) = &mut self.sending {
             sending.end += added;

@@ -51,6 +51,7 @@ impl Trace {
             let step = step(&row)?;
             let is_later = steps
                 .last()
+                // The first step must cover the beginning of the link: before it there is no rate.
                 .map_or(step.from_nanos <= offset_nanos, |last| {
                     step.from_nanos > last.from_nanos
                 });
@@ -60,6 +61,7 @@ impl Trace {
             }
             steps.push(step);
         }
+        // The last step has no end, so any offset would do: one behind the last line counts as a mistake.
         let is_past = steps
             .last()
             .is_some_and(|last| last.from_nanos < offset_nanos);
@@ -68,6 +70,7 @@ impl Trace {
             let problem = format_args!("offset_s is {offset_s}, behind the last line");
             return Err(FileError::new(path, problem));
         }
+        // The step in force at the offset becomes the first one, and its start is clipped to 0 by the shift.
         let begin = steps
             .partition_point(|step| step.from_nanos <= offset_nanos)
             .saturating_sub(1);
@@ -99,6 +102,7 @@ impl Trace {
                 .ok()
                 .and_then(|ms| ms.checked_mul(1_000_000));
             match time {
+                // Equal times are several packets in one millisecond.
                 Some(time) if times.last().is_none_or(|&last| time >= last) => times.push(time),
                 _ => {
                     return Err(wrong(

@@ -56,6 +56,7 @@ impl JsonSchema for TraceConfig {
 
 impl<'de> Deserialize<'de> for TraceConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        // YAML describes its own types, so a text and a map can be told apart without a tag.
         deserializer.deserialize_any(PathOrFields)
     }
 }

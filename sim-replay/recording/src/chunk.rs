@@ -112,6 +112,7 @@ fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
     let begin = number(0);
     let len = footer_begin
         .checked_sub(begin)
+        // A position of 0 means that the file has no summary.
         .filter(|len| begin > 0 && *len <= MAX_SUMMARY_BYTES);
     let Some(len) = len.filter(|_| head.first() == Some(&op::FOOTER) && magic == MAGIC) else {
         return Ok(None);
@@ -121,6 +122,7 @@ fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
     let mut crc = crc32fast::Hasher::new();
     crc.update(&summary);
     crc.update(head);
+    // The checksum covers the summary and the footer up to itself. 0 means that it was not computed.
     let (summed, stated) = footer.split_at(FOOTER_LEN - 4);
     crc.update(summed);
     Ok((stated == [0; 4] || stated == crc.finalize().to_le_bytes()).then_some(summary))
@@ -139,6 +141,7 @@ pub(super) struct UnpackedChunk {
 /// Unpacks a chunk and verifies its checksum; its channels are added to `channels`.
 pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<UnpackedChunk> {
     lengths::check(op::CHUNK, body)?;
+    // The parser takes whole records, so the chunk gets its opcode and length back.
     let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
     let options = LinearReaderOptions::default()
         .with_skip_start_magic(true)
@@ -146,6 +149,7 @@ pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<Unpacke
     let mut chunk = UnpackedChunk::default();
     for_each_record(head.chain(body), options, |opcode, data| {
         chunk.bytes += data.len();
+        // Counted while unpacking: a few compressed bytes may unpack to any number.
         if chunk.bytes > MAX_RECORD_BYTES {
             return Err(McapError::ChunkTooLarge(chunk.bytes as u64));
         }

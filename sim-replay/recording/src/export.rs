@@ -70,6 +70,7 @@ pub fn export_ros2(
         .iter()
         .filter_map(|entry| vehicle(&entry.key.topic))
         .collect();
+    // The mounts come before the first sweep, whose frame refers to them.
     if let Some((first, _)) = timed.first().filter(|_| !vehicles.is_empty()) {
         writer.write_static_transforms(*first, &vehicles, mount)?;
     }
@@ -98,6 +99,7 @@ fn in_order<'a>(
         (latest, *entry)
     });
     let mut timed: Vec<_> = timed.collect();
+    // A stable sort: messages of the same time keep the order of the recording.
     timed.sort_by_key(|(nanos, _)| *nanos);
     timed
 }

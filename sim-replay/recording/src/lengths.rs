@@ -47,8 +47,10 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
     };
     let rest = match opcode {
         op::HEADER | op::METADATA => texts(0, 2),
+        // The text of the schema has the same kind of length as its name and encoding.
         op::SCHEMA => texts(2, 3),
         op::CHANNEL => texts(4, 3),
+        // The payload has no length of its own: any rest is valid.
         op::MESSAGE => return record.len() >= MESSAGE_HEAD,
         op::CHUNK => texts(CHUNK_HEAD, 1).and_then(long),
         op::MESSAGE_INDEX => texts(2, 1),
@@ -71,6 +73,7 @@ pub(super) fn is_chunk_head(bytes: &[u8], len: u64) -> bool {
     let Some((&records_len, _)) = rest.split_first_chunk() else {
         return false;
     };
+    // 4 and 8 are the lengths written before the compression and before the records.
     let head_len = (CHUNK_HEAD + 4 + compression.len() + 8) as u64;
     COMPRESSIONS.contains(&compression)
         && u64::from_le_bytes(records_len).checked_add(head_len) == Some(len)

@@ -148,6 +148,7 @@ impl McapFile {
     }
 
     fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
+        // Held while the chunk is read: two readers of the same chunk would unpack it twice.
         let mut unpacked = self.unpacked.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
             return Ok(Arc::clone(messages));
@@ -209,6 +210,7 @@ impl Contents<'_> {
             let begin = records.at;
             let taken = match records.next()? {
                 Ok(Some(record)) => self.take(&record),
+                // A damaged part that reaches the end of the file is reported already.
                 Ok(None) if self.lost.last().is_some_and(|lost| lost.end == size) => return Ok(()),
                 Ok(None) => {
                     self.lose((begin, begin), "the file ends without an index".into());
@@ -227,6 +229,7 @@ impl Contents<'_> {
                     return Ok(());
                 }
                 Err(reason) => {
+                    // The search begins at the next byte: a damaged record's length is not to be trusted.
                     let has_chunks = self.has_chunks();
                     let is_own = |id| {
                         self.channels
@@ -259,6 +262,7 @@ impl Contents<'_> {
                 return Ok(ControlFlow::Break(crc));
             }
             op::CHUNK => {
+                // Each chunk has a limit of its own. This one is for all of them together.
                 if self.unpacked_bytes > self.most_unpacked {
                     return Err(format!(
                         "a chunk after others that unpack to {} bytes, {} at most are read of a file of this size",
@@ -269,6 +273,7 @@ impl Contents<'_> {
                 self.unpacked_bytes += chunk.bytes as u64;
                 self.add(begin, body.len(), true, &chunk.messages);
                 if chunk.orphans > 0 {
+                    // An empty range: the chunk itself was read. It does not merge with a neighbour.
                     let orphans = chunk.orphans;
                     let what = format!("{orphans} messages of channels that are described nowhere");
                     self.lose((begin, begin), what);
@@ -336,6 +341,7 @@ impl Contents<'_> {
 
     /// Verifies the checksum of all data, for files without checksums of chunks.
     fn check_whole(&mut self, end: u64, stated: u32, found: u32) {
+        // 0 means that no checksum was computed. After a skipped part it differs in any case.
         if stated != 0
             && stated != found
             && self.lost.is_empty()
@@ -350,6 +356,7 @@ impl Contents<'_> {
 
     fn damage(&self) -> Vec<Damage> {
         let first = self.arrivals.first().map_or(0, |nanos| *nanos);
+        // Floats, because arrivals may go back in time. Their error is below 0.3 us.
         let seconds = |nanos: &u64| (*nanos as f64 - first as f64) * 1e-9;
         let damage = |lost: &Lost| Damage {
             begin_bytes: lost.begin,

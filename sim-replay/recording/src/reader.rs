@@ -33,6 +33,7 @@ impl Recording {
     /// # Errors
     /// [`RecordingError`] if the file cannot be read or is no recording of this program.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
+        // Reads the summary alone, where opening scans the whole file.
         if is_foreign(path)? {
             return Err(RecordingError::foreign(path, String::new()));
         }
@@ -62,6 +63,7 @@ impl Recording {
                 .damage()
                 .first()
                 .map_or(String::new(), |damage| format!("; {damage}"));
+            // Messages of other programs, or none in a whole file: foreign. Else damage may have taken ours.
             return Err(match has_any || file.damage().is_empty() {
                 true => RecordingError::foreign(path, what),
                 false => {

@@ -44,6 +44,7 @@ impl<'a> Records<'a> {
             file.read_exact_at(&mut found, at)?;
             Ok(found == *mcap::MAGIC)
         };
+        // One of the two suffices: the first bytes may be damaged, and the last ones cut off.
         if size < magic_len || !has_magic(0)? && !has_magic(size - magic_len)? {
             return Ok(None);
         }
@@ -80,6 +81,7 @@ impl<'a> Records<'a> {
                 "a record of kind {opcode:#04x} where none can be"
             )));
         }
+        // Checked before the buffer grows: a damaged length must not reserve memory.
         let len = match usize::try_from(claimed) {
             Ok(len) if len <= MAX_RECORD_BYTES => len,
             _ => {
@@ -99,6 +101,7 @@ impl<'a> Records<'a> {
                 "a record of kind {opcode:#04x} differs in length from its contents"
             )));
         }
+        // The checksum in this record covers everything before it.
         if opcode != op::DATA_END {
             self.crc.update(&head);
             self.crc.update(&self.body);
@@ -118,6 +121,7 @@ impl<'a> Records<'a> {
         let mut begin = from;
         while begin < self.size {
             let left = self.size - begin;
+            // Windows overlap by the bytes that recognise a record: one at their border is found.
             let len = usize::try_from(left)
                 .unwrap_or(usize::MAX)
                 .min(WINDOW + KNOWN_BY);
@@ -181,6 +185,7 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
             let payload_len = len.saturating_sub(lengths::MESSAGE_HEAD as u64);
             is_own(channel) && lengths::own_message(payload) == Some(payload_len)
         }),
+        // Too short to be told from other data by itself: a summary has to follow.
         op::DATA_END => {
             len == lengths::DATA_END_LEN as u64
                 && begins_summary(body.get(lengths::DATA_END_LEN..).unwrap_or_default())

@@ -96,7 +96,9 @@ impl<S: Store> RecordingWriter<S> {
             .compression(options.zstd_level.map(|_| Compression::Zstd))
             .compression_level(options.zstd_level.unwrap_or_default())
             .compression_threads(0)
+            // Chunks end at a flush only: by it this writer counts the messages that can be read back.
             .chunk_size(None)
+            // The sink appends and cannot go back to fill in the length of a chunk.
             .disable_seeking(true)
             // Each chunk has its own checksum.
             .calculate_data_section_crc(false);
@@ -112,6 +114,7 @@ impl<S: Store> RecordingWriter<S> {
             unconverted: BTreeSet::new(),
             ended: None,
         };
+        // A store that cannot be written fails here, not at the end of the first chunk.
         writer.flush()?;
         Ok(writer)
     }
@@ -144,6 +147,7 @@ impl<S: Store> RecordingWriter<S> {
         if self.options.contents != Contents::Ros2 {
             let publish_time = header
                 .as_ref()
+                // Without a valid header the arrival is the only time that is known.
                 .map_or(arrived_nanos, |header| header.stamp.publish_nanos);
             let channel_id = self.own_channel(key)?;
             let head = MessageHeader {
@@ -203,6 +207,7 @@ impl<S: Store> RecordingWriter<S> {
         self.check_open()?;
         let flushed = self.mcap.flush();
         self.checked(flushed)?;
+        // After the flush has succeeded: messages of a chunk that was cut off do not count.
         self.whole_messages += std::mem::take(&mut self.open).0;
         Ok(())
     }

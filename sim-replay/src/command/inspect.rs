@@ -33,6 +33,7 @@ pub(crate) struct Args {
 
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    // The folder of a data set may end in .xodr too.
     if args
         .dir
         .extension()

@@ -43,6 +43,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         .join(&stop, &config.run, Role::Replay, &CavId::new("replay")?)?;
     let replay = match Replay::prepare(&bus, &scenario, config.options(), &stop) {
         Ok(replay) => replay,
+        // Faults of the input, exit code 2. All other errors are failures of the run.
         Err(
             error @ (StreamError::NoAgent { .. }
             | StreamError::NoTick { .. }

@@ -91,6 +91,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
             print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
+        // The options are valid here: the disk, or the traffic of this seed, is the cause.
         Err(error @ (SynthError::Write(_) | SynthError::TooFewCompanions { .. })) => {
             Err(error.into())
         }

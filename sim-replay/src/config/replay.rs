@@ -164,6 +164,7 @@ impl ProcessConfig for ReplayConfig {
                 "must be left out without a link: give latency_ms, bandwidth_mbps or loss",
             ));
         }
+        // `options` takes lockstep from the egos alone, so they must not be named without it.
         if let (false, [ego, ..]) = (self.scene.lockstep, &self.wait.egos[..]) {
             return Err(FieldError::new(
                 "wait.egos",

@@ -74,7 +74,7 @@ impl SceneConfig {
     /// # Errors
     /// [`FieldError`] for the first invalid value.
     pub fn validate(&self) -> Result<(), FieldError> {
-        within("scene.rate", self.rate, 0.0, 1e6)?;
+        within("scene.rate", self.rate, 0.0, 1e3)?;
         within("scene.frames", self.frames.unwrap_or(1), 1, usize::MAX)
     }
 }

@@ -172,6 +172,7 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
 
 fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey, Option<Frame>) {
     let mut survey = FrameSurvey::default();
+    // The sweep is read by `survey_points`, which also counts the points that are not finite.
     let without_points = dataset::LoadOptions {
         points: false,
         cameras: true,
@@ -181,6 +182,7 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey,
     let frame = frame
         .map_err(|error| survey.problems.push(Problem::from(&error)))
         .ok();
+    // Read apart from the frame: a fault of the annotations must not hide one of the sweep.
     let sweep = survey_points(scenario, agent, tick, None, &mut survey.problems);
     for variant in &scenario.lidar_variants {
         survey_points(scenario, agent, tick, Some(variant), &mut survey.problems);
@@ -261,6 +263,7 @@ fn merged_counts(
         let alone = ground_truth::merge(&[ego], 0, rule).len();
         merged.push(report(&ego.cav, vec![ego.cav.clone()], alone));
         let contributors = ground_truth::contributors(frames, index, rule.comm_range_m);
+        // Contributors include the ego: alone it would only repeat the entry above.
         if contributors.len() > 1 {
             let agents = contributors
                 .iter()
@@ -282,11 +285,13 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         .iter()
         .map(|tick| tick.capture_nanos)
         .collect();
+    // Times of a faulty data set may fall: a step back counts as 0.
     let mut steps: Vec<u64> = times
         .windows(2)
         .map(|pair| pair[1].saturating_sub(pair[0]))
         .collect();
     steps.sort_unstable();
+    // The median step, since a gap in the recording would lower a mean rate.
     let median = steps.get(steps.len() / 2).copied().filter(|&step| step > 0);
     let span = times
         .last()

@@ -52,6 +52,7 @@ impl Place {
         };
         let place: Self = serde_json::from_str(&text)
             .map_err(|source| CheckpointError::Text { path: at(), source })?;
+        // A next tick equal to `ticks` is valid: the scene was played to its end.
         if place.scenario != scenario || place.position.next_tick > ticks {
             let position = format!(
                 "is tick {} of scenario {}",
@@ -138,12 +139,14 @@ impl Checkpoint {
 
     /// Queues a state for writing; one that still waits for the disk is replaced.
     pub(super) fn note(&self, place: Place) {
+        // A replaced place is no loss: only the newest counts.
         let _ = self.newest.push((), place);
     }
 }
 
 impl Drop for Checkpoint {
     fn drop(&mut self) {
+        // The thread still writes the last place, since a closed queue gives out what it holds.
         self.newest.close();
         if self
             .writing

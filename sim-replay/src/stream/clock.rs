@@ -51,6 +51,7 @@ impl ReplayClock {
 
     /// Halts, but allows `ticks` more, each at once.
     pub(crate) fn step(&mut self, ticks: u64) {
+        // Steps that are asked for in quick succession add up.
         let steps = match self.state {
             State::Halted { steps } => steps,
             State::Running => 0,

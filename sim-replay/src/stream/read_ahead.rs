@@ -49,6 +49,7 @@ impl ReadAhead {
             let shared = Arc::clone(&shared);
             move || {
                 while let Some(tick) = next_wanted(&shared) {
+                    // Reading takes long, so the lock is not held meanwhile.
                     let frames = agents
                         .iter()
                         .map(|&agent| scenario.load(agent, tick, &options))

@@ -194,6 +194,7 @@ impl<'a> Replay<'a> {
         reading.want(&schedule.ahead(READ_AHEAD));
 
         let inbox = bus.inbox(COMMANDS, 16);
+        // A halted clock waits without a deadline: only the closed inbox lets it notice a stop.
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
@@ -287,9 +288,11 @@ impl<'a> Replay<'a> {
             self.publish(planned, due);
             last = Instant::now();
             self.wait_for_answers(&planned);
+            // Noted last: a process that dies before this plays the tick once more.
             self.note_place();
         }
         self.await_the_last();
+        // The loop has ended: otherwise the process would count as stalled while it sends its queues.
         drop(working);
         let Self {
             bus,
@@ -348,11 +351,13 @@ impl<'a> Replay<'a> {
                 }
                 _ => {}
             }
+            // While halted nothing is due: then only an arrival, a command or a stop wakes the loop.
             let until = due.into_iter().chain(self.next_arrival()).min();
             match self.inbox.take(until) {
                 Pop::Item(_, Event::Message(arrival)) => {
                     if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
                         self.apply(command);
+                        // A pause or a seek must survive a restart, even if no further tick is played.
                         self.note_place();
                     }
                 }
@@ -413,6 +418,7 @@ impl<'a> Replay<'a> {
             Control::Seek { tick } => match usize::try_from(tick) {
                 Ok(index) if index < self.tick_count => {
                     self.schedule.seek(index);
+                    // A jump ahead is a jump in capture time too, which would otherwise be waited out.
                     self.clock.rebase();
                     self.reading.want(&self.schedule.ahead(READ_AHEAD));
                 }
@@ -430,6 +436,7 @@ impl<'a> Replay<'a> {
         } = planned;
         let frames: TickFrames = self.reading.take(tick_index);
         self.reading.want(&self.schedule.ahead(READ_AHEAD));
+        // Taken before the frames are handed over. The truth takes no link: it is sent even if they are lost.
         let agents = truth_of(&frames.iter().flatten().collect::<Vec<_>>());
         self.present = frames
             .iter()
@@ -481,6 +488,7 @@ impl<'a> Replay<'a> {
             match self.inbox.take(deadline) {
                 Pop::Item(Topic::Stream { cav, .. }, Event::Message(arrival)) => {
                     self.bus.stats().received(&arrival.topic);
+                    // Late answers to earlier ticks do not count.
                     if arrival.header.stamp.capture_nanos >= capture_nanos {
                         missing.remove(&cav);
                     }
@@ -515,6 +523,7 @@ fn end_of(timeout: Duration) -> Option<Instant> {
 }
 
 fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError> {
+    // NaN lies in no range, so it is refused too.
     if !(0.0..=1e3).contains(&options.rate) {
         return Err(StreamError::Rate(options.rate));
     }

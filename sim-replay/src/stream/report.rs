@@ -114,6 +114,7 @@ impl Lateness {
         if late > LATE {
             self.late_ticks += 1;
         }
+        // The maximum covers all ticks, the quantiles only the samples that are kept.
         self.max_ms = self.max_ms.max(late.as_secs_f64() * 1e3);
         if self.samples.len() < Self::KEPT {
             self.samples.push(late);

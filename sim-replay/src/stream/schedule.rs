@@ -84,6 +84,7 @@ impl Schedule {
             .windows(2)
             .map(|pair| pair[1].saturating_sub(pair[0]))
             .collect();
+        // The median, so that a gap in the recording does not become the pace after a jump back.
         steps.sort_unstable();
         steps
             .get(steps.len() / 2)

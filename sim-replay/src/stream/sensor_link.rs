@@ -85,6 +85,7 @@ impl SensorLink {
             sequence,
             bytes,
             submitted_nanos: nanos::between(self.began, now),
+            // Sensor and agent are on one vehicle.
             distance_m: 0.0,
         });
         self.held.insert(id, held);
@@ -109,6 +110,7 @@ impl SensorLink {
                     self.held.remove(&packet.id);
                     *self.report.dropped.entry(reason).or_default() += 1;
                 }
+                // Its copy follows, so the frame stays held.
                 Delivery::Arrived {
                     is_repeated: true, ..
                 } => arrived.extend(self.held.get(&packet.id).cloned()),

@@ -1,7 +1,7 @@
 //! Publishers of a replayed scene: each vehicle's sensors, and the ground truth.
 
 use protocol::message::{AgentTruth, TrueObject};
-use protocol::{CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount, Truth};
+use protocol::{CavId, Lidar, Radar, Stream, Topic, TopicCount, Truth};
 
 use bus::{Bus, BusError, Publisher, PublisherOptions};
 use dataset::LoadOptions;
@@ -69,12 +69,14 @@ impl SensorPublisher {
                         ))
                     })
                     .collect::<Result<_, BusError>>()?,
+                // Never paced: a slow viewer must not hold back the replay.
                 preview: bus.publisher(
                     Topic::stream(cav, Stream::Preview),
                     PublisherOptions::PREVIEW,
                 )?,
             })
         });
+        // Waits for a place even in a replay that is not paced: a tick without truth cannot be scored.
         let truth = bus.publisher(
             Topic::Truth,
             PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES),
@@ -91,21 +93,15 @@ impl SensorPublisher {
         let Some(sensors) = self.sensors.get(agent) else {
             return;
         };
-        if let Some(world_from_lidar) = frame.world_from_lidar {
+        if let Some(gnss) = frame.gnss() {
             // The pose is sent first: it is small, and the sweep cannot be used without it.
-            let source = GnssSource::Recorded;
-            let gnss = Gnss {
-                world_from_lidar,
-                position_std_m: 0.0,
-                heading_std_rad: 0.0,
-                source,
-            };
             sensors.gnss.submit(capture_nanos, gnss);
             count(&mut self.sent, sensors.gnss.topic());
         }
         // Empty where nothing is recorded: the agent need not wait for it.
         sensors.imu.submit(capture_nanos, frame.motion());
         count(&mut self.sent, sensors.imu.topic());
+        // Not counted as sent, since zenoh may drop previews.
         if sensors.preview.is_wanted() {
             let points = frame.points.decimate(PREVIEW_POINTS);
             sensors.preview.submit(capture_nanos, Lidar { points });

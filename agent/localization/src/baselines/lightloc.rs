@@ -25,6 +25,7 @@ impl LightLoc {
 impl Localize for LightLoc {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let (mut coordinates, mut times) = self.localizer.scene_coordinates(sweep)?;
+        // A predicted error of 0 gives every cell weight 1 (Eq. 6).
         coordinates.epsilon_m.fill(0.0);
         let solved = self.solver.solve(&coordinates);
         times.lap(SOLVE);

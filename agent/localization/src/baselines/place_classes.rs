@@ -76,6 +76,7 @@ impl PlaceClasses {
     /// # Errors
     /// Those of the tensor library.
     pub fn absolute(&self, relative: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+        // Headings are absolute already: only positions are relative to the class.
         let position = relative.f_narrow(1, 0, 3)? * UNIT_M + self.positions(classes)?;
         Tensor::f_cat(&[position, relative.f_narrow(1, 3, 2)?], 1)
     }

@@ -41,7 +41,7 @@ impl ScanContext {
             let ring = (x.hypot(y) / Self::RANGE_M * Self::RINGS as f32) as usize;
             let turn = f64::from(y.atan2(x)) / TAU + 0.5;
             let sector = ((turn * Self::SECTORS as f64) as usize).min(Self::SECTORS - 1);
-            if ring < Self::RINGS && z.is_finite() {
+            if ring < Self::RINGS && [x, y, z].iter().all(|at| at.is_finite()) {
                 let height = &mut heights[sector * Self::RINGS + ring];
                 *height = height.max(z + Self::SENSOR_M);
             }
@@ -113,6 +113,7 @@ impl PolarRetrieval {
     fn nearest(&self, descriptor: &Tensor) -> Result<Isometry3<f64>, TchError> {
         let descriptor = normalised(descriptor)?;
         let sectors = descriptor.size()[0];
+        // A sensor turned k sectors to the left sees all things k sectors further right: a roll undoes it.
         let turned = (0..sectors).map(|turn| descriptor.f_roll(turn, 0)?.f_view([-1]));
         let turned: Vec<Tensor> = turned.collect::<Result<_, _>>()?;
         let alike = self.descriptors.f_matmul(&Tensor::f_stack(&turned, 1)?)?;

@@ -103,6 +103,7 @@ impl<N: RegressPose> PoseRegressor<N> {
     pub fn load(path: &Path, device: Device) -> Result<Self, LocalizerError> {
         let weights = Weights::load(path)?;
         let kind = weights.metadata(KIND_KEY);
+        // Without this check the error would be of a missing field and not say what to do.
         if kind == Some(N::KIND)
             && (weights.config::<serde_json::Value>()?)
                 .get("encoder")
@@ -189,6 +190,7 @@ const LEAST_HEADING: f64 = 1e-3;
 fn upright(answer: [f32; 5], origin_m: [f64; 3]) -> Option<Isometry3<f64>> {
     let [x, y, z, cosine, sine] = answer.map(f64::from);
     let is_pose = [x, y, z].iter().all(|axis| axis.is_finite());
+    // Also false of NaN. Only the direction of the vector is used, not its length.
     (is_pose && cosine.hypot(sine) >= LEAST_HEADING).then(|| {
         let position = Vector3::new(x, y, z) + Vector3::from(origin_m);
         let heading = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine));

@@ -29,6 +29,7 @@ const LEAST: f64 = 1e-4;
 
 /// Token of a point in the sensor frame, metres, and its direction within the sector, -1..=1.
 pub fn token_of([x, y, _]: [f32; 3]) -> (usize, f32) {
+    // Straight behind is both -pi and pi: the latter gives SECTORS, which the next line bounds.
     let turn = ((y.atan2(x) + PI) / TAU * SECTORS as f32).max(0.0);
     let sector = (turn as usize).min(SECTORS as usize - 1);
     let ring = usize::from(x.hypot(y) >= RING_EDGE_M);
@@ -65,6 +66,7 @@ pub fn pool(cells: &[Cell], features: &Tensor) -> Result<Tensor, TchError> {
                 let [_, ranges, nearest, heights, top, directions] = *of;
                 let means = [ranges, heights, directions].map(|sum| sum / count);
                 [
+                    // Counts span orders of magnitude. Never 0 in an occupied token, which marks it as such.
                     count.ln_1p() / 3.0,
                     means[0],
                     nearest,
@@ -114,6 +116,7 @@ impl TokenProjection {
     pub fn fit(&mut self, pooled: &Tensor) -> Result<(), TchError> {
         let (channels, components) = self.basis.size2()?;
         let pooled = pooled.f_reshape([-1, channels + GEOMETRY])?;
+        // Empty tokens are all 0 and would pull the mean towards it.
         let is_occupied = pooled.f_select(1, channels)?.f_gt(0.0)?;
         let rows = is_occupied.f_nonzero()?.f_view([-1])?;
         let features = pooled.f_index_select(0, &rows)?.f_narrow(1, 0, channels)?;
@@ -126,11 +129,13 @@ impl TokenProjection {
         let covariance = normal.f_tr()?.f_matmul(&normal)? / (rows.size()[0].max(1) as f64);
         let (variances, vectors) = covariance.f_linalg_eigh("L")?;
         let least = LEAST * variances.f_max()?.f_double_value(&[])?.max(LEAST);
+        // Eigenvalues ascend: the last components are the principal ones.
         let first = channels - components;
         let variances = variances
             .f_narrow(0, first, components)?
             .f_clamp_min(least)?;
         let vectors = vectors.f_narrow(1, first, components)?;
+        // Whitening: one product standardises the channels, turns them and scales the components to 1.
         let basis = vectors
             .f_div(&deviation.f_view([-1, 1])?)?
             .f_div(&variances.f_sqrt()?)?;

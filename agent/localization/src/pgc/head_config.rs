@@ -73,6 +73,7 @@ impl RefinerConfig {
     pub fn corners(&self) -> [i64; 2] {
         std::array::from_fn(|axis| {
             let steps = ((self.high_m[axis] - self.low_m[axis]) / self.spacing_m).ceil() as i64;
+            // At least one whole window: the refiner clamps windows onto the grid.
             (steps + 1).max(2 * self.reach + 1)
         })
     }
@@ -97,6 +98,7 @@ impl RefinerConfig {
         };
         let [columns, rows] = cropped.corners();
         let row = |x: i64, y: i64| {
+            // A part smaller than a window has corners beyond the full grid: they repeat its last ones.
             (first[1] + y).min(whole[1] - 1) * whole[0] + (first[0] + x).min(whole[0] - 1)
         };
         let kept = (0..rows)

@@ -115,6 +115,7 @@ fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>> {
         let stem = file.file_stem().and_then(|stem| stem.to_str());
         !stem.is_some_and(|stem| stem.contains("encoder"))
     };
+    // Files with an encoder's name first: each one is read and hashed until the digest fits.
     files.sort_by_key(is_other);
     let is_named = |file: &PathBuf| {
         Weights::load(file).is_ok_and(|weights| CellEncoder::sha256_of(&weights) == sha256)

@@ -41,6 +41,7 @@ impl Int8Levels {
         }
         let mut coarse = None;
         for (group, input) in &self.coarse {
+            // The first group takes the output of the convolutions, which is quantised already.
             if let Some(before) = &coarse {
                 x = input.quantise(before)?;
             }

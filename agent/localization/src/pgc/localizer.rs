@@ -84,10 +84,12 @@ impl Localizer {
         let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
         let build = |path: &nn::Path<'_>, config: SceneHeadConfig| {
+            // Before the layers are built: a wrong encoder is named as such, not by a shape.
             config.check_encoder(head, encoder, &encoder_sha256)?;
             SceneHead::new(path, &config)
         };
         let mut scene_head = weights.network(SceneHead::KIND, device, build)?;
+        // The head's file has the scales of both networks.
         if let Some(scales) = weights.activation_scales()? {
             let quantised = network
                 .quantise(&scales)

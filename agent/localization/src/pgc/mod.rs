@@ -69,6 +69,7 @@ impl Localize for Localizer {
             let solved = self.solver.solve(&SceneCoordinates::default());
             return Ok(Localization::new(&solved, times));
         };
+        // A prediction that the sweep does not confirm is dropped: the search is as without one.
         if let Some(predicted) = &sweep.predicted
             && let Some(found) = self.refine_near(&encoded, predicted, &mut times)?
         {
@@ -116,6 +117,7 @@ impl Localizer {
             return Ok(best);
         }
         let search = self.search(encoded);
+        // The first part is the one that was searched, now with its logit raised above all others.
         for part in other_parts::logits_by_part(logits, self.most_parts)? {
             let there = self.regress(encoded, CELLS, &part, times)?;
             let next = search.attempt(&there, other_parts::WIDENING, times)?;
@@ -139,6 +141,7 @@ impl Localizer {
     ) -> Result<Option<FoundPose>, LocalizerError> {
         let origin_m = Vector3::from(self.head.config().origin_m);
         let mut origin_from_sensor = *world_from_sensor;
+        // Subtracted in double precision before positions become single.
         origin_from_sensor.translation.vector -= origin_m;
         // The refinement hardly corrects height and tilt: a few scene coordinates do it first.
         let few = self.regress(encoded, levelling::CELLS, &self.classify(encoded)?, times)?;

@@ -65,12 +65,14 @@ pub(super) fn refine(
     let mut answer = None;
     let wide_rounds = if is_wide { 2 } else { 0 };
     for scales_m in std::iter::repeat_n(WIDE_ROUND_M, wide_rounds).chain(ROUNDS_M) {
+        // Step: positions and heading that the pose of the round before gives the cells.
         let mut assumed = Vec::with_capacity(3 * sensor_m.len());
         for point in sensor_m {
             let point = pose * Point3::from(point.map(f64::from));
             assumed.extend([point.x, point.y, point.z].map(|axis| axis as f32));
         }
         let ahead = pose.rotation * Vector3::x();
+        // Without the tilt: cosine and sine of the heading in the plane.
         let norm = ahead.xy().norm().max(1e-6);
         let heading = [(ahead.x / norm) as f32, (ahead.y / norm) as f32];
         let heading = tensor(&heading, &[1, 2], device)?;
@@ -79,6 +81,7 @@ pub(super) fn refine(
         let seen = no_grad(|| refiner.look(&cells, &assumed, &heading, kind))?;
         let world = values(&seen.coordinates_m)?;
         let epsilon_m = values(&seen.epsilon_m)?;
+        // Step: robust fit to the predictions, each weighted by its predicted error.
         let pairs: Vec<Correspondence> = (sensor_m.iter().zip(world.as_chunks().0).zip(&epsilon_m))
             .map(|((&source_m, &target_m), &epsilon_m)| Correspondence {
                 source_m,
@@ -96,6 +99,7 @@ pub(super) fn refine(
             Ok(fitted) => pose = fitted,
             Err(_) => return Ok(None),
         }
+        // Step: evidence, with the weights that the pairs have at the fitted pose.
         let scale_m = scales_m.last().copied().unwrap_or(INLIER_M);
         let weigh = |pair: &Correspondence| {
             f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m)

@@ -110,6 +110,7 @@ impl PoseSolver {
                 config.inlier_threshold_m,
             ),
         };
+        // A wider search counts with a wider threshold: ratios of searches must be comparable.
         let is_wider = factor > 1.0;
         Ok(if is_wider {
             Registration::judge(&pairs, found.target_from_source, threshold_m)
@@ -142,6 +143,7 @@ impl PoseSolver {
         let sigma = self.confidence.sigma(&evidence);
         let last = second.map_or(registration, |second| &second.registration);
         let mut world_from_sensor = last.target_from_source;
+        // Added in double precision: the coordinates are single and relative to the origin.
         world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
         let cell_covariance = std_of(coordinates, registration, second).covariance;
         let is_rejected = self.confidence.rejects(sigma) || sigma < self.min_confidence;

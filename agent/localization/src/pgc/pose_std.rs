@@ -59,6 +59,7 @@ impl PoseStd {
         let covariance = inverse * gradients * inverse;
         let bounded = |variance: f64, most: f64| {
             let std = variance.sqrt();
+            // NaN, of a variance that rounding left below zero, counts as unbounded too.
             if std.is_finite() { std.min(most) } else { most }
         };
         let variance = |from: usize| (from..from + 3).map(|axis| covariance[(axis, axis)]).sum();

@@ -88,6 +88,7 @@ impl Refiner {
         let hidden = self.inward.forward(&input)?.f_relu()?;
         let query = self.query.forward(&hidden)?.f_to_kind(Kind::Float)?;
 
+        // Step: attention over the corners of the window, each with its learnt key.
         let window = self.window(assumed_m)?;
         let keys = gather(&self.keys, &window.corners)?;
         let similarity = keys.f_bmm(&query.f_unsqueeze(2)?)?.f_squeeze_dim(2)? * &self.sharpness;
@@ -115,6 +116,7 @@ impl Refiner {
         let (spacing_m, reach, low_m) = (config.spacing_m, config.reach, config.low_m);
         let [columns, rows] = config.corners();
         let device = assumed_m.device();
+        // The whole window stays on the grid: a cell beyond the edge gets the outermost one.
         let axis = |axis: usize, size: i64| {
             let steps = (assumed_m.f_select(1, axis as i64)? - low_m[axis]) / spacing_m;
             steps
@@ -123,6 +125,7 @@ impl Refiner {
         };
         let (column, row) = (axis(0, columns)?, axis(1, rows)?);
         let middle = [&column * spacing_m + low_m[0], &row * spacing_m + low_m[1]];
+        // Row by row. Single precision holds whole numbers up to 2^24 exactly.
         let first = (row * columns as f64 + column).f_to_kind(Kind::Int64)?;
         let (mut shifts, mut places) = (Vec::new(), Vec::new());
         for y in -reach..=reach {

@@ -77,6 +77,7 @@ impl ResidualGroup {
         let inward = scales.get(&inward_activation(name))?;
         let middle = scales.get(&middle_activation(name))?;
         let linear = |weight: &Tensor, bias: Option<&Tensor>, format| {
+            // Stored `[C_in, C_out]`: integer layers take the transpose.
             Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
         };
         let (bias, hidden) = (&self.middle_bias, LayerFormat::hidden(inward, middle));

@@ -137,6 +137,7 @@ impl SceneEncoder {
         on_activation(&level_activation(0), &x)?;
         let mut fine = None;
         for (level, conv) in self.down.iter().enumerate() {
+            // The fine group takes the input of the last convolution, the level before the last.
             if level + 1 == self.down.len()
                 && let (Some(group), Some(index)) = (&self.fine, &batch.fine)
             {
@@ -208,6 +209,7 @@ impl SceneEncoder {
         let sweep = |rows: &std::ops::Range<i64>| {
             let own = (local.coarse).f_narrow(0, rows.start, rows.end - rows.start)?;
             let own = own.f_to_kind(Kind::Float)?;
+            // The mean of no rows is NaN, and their maximum an error.
             if own.size()[0] == 0 {
                 return own.f_new_zeros([2 * own.size()[1]], (Kind::Float, own.device()));
             }
@@ -313,6 +315,7 @@ impl Plane {
             values.f_avg_pool2d(size, [1; 2], size.map(|n| n / 2), false, true, None::<i64>)
         };
         let pooled = |values: &Tensor| along(&along(values, [window, 1])?, [1, window]);
+        // Sums over counts: the area of the window, with the padding, cancels. Empty windows are 0 / 1e-6.
         let mean = pooled(&self.sum)? / pooled(&self.count)?.f_clamp_min(1e-6)?;
         let channels = mean.size()[1];
         mean.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])

@@ -136,6 +136,7 @@ impl SceneHead {
             Some(blocks) => (blocks.iter()).try_fold(inward, |x, block| block.forward(&x))?,
             None => self.hidden(inward, &mut |_, _| Ok(()))?,
         };
+        // Half precision would round positions beyond 256 m to quarters of a metre.
         let output = self.outward.forward(&hidden)?.f_to_kind(Kind::Float)?;
         let centres = self.config.centres;
         let log_shares = output.f_narrow(1, 0, centres)?;
@@ -191,6 +192,7 @@ impl SceneHead {
             let layers = [
                 first.int8(LayerFormat::hidden(before, inner))?,
                 second.int8(LayerFormat::hidden(inner, innermost))?,
+                // In floating point, since the skip connection is added before the ReLU.
                 third.int8(LayerFormat::last(innermost))?,
             ];
             let input = before;
@@ -204,6 +206,7 @@ impl SceneHead {
     /// `[N, cell_channels + classes]`: features of cells beside the normalised logits of their sweeps.
     fn input(&self, cells: &Tensor, logits: &Tensor) -> tch::Result<Tensor> {
         let squares = (logits.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+        // To length 1: the regressor sees which classes are likely, not how large the logits are.
         let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
         Tensor::f_cat(&[cells, &(logits / norm)], 1)
     }

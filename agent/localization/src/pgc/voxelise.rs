@@ -57,6 +57,7 @@ impl SweepVoxels {
         let (voxels, voxel_of_point) = Sites::collect(
             points
                 .iter()
+                // Rounded down: a cast alone would merge the voxels on both sides of 0.
                 .map(|point| point.map(|axis| (axis / voxel_m).floor() as i32)),
         );
         let input = describe(&points, &voxel_of_point, &voxels, config);
@@ -111,6 +112,7 @@ impl SweepVoxels {
 
 /// Edge of the square of coarse cells that a sweep lies in.
 pub(super) fn plane_edge(config: &SceneEncoderConfig) -> i32 {
+    // One cell of margin: a point exactly at the range lies in the next one.
     2 * ((config.range_m / config.coarse_cell_m()).ceil() as i32 + 1)
 }
 

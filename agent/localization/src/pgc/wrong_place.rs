@@ -43,6 +43,7 @@ pub fn other_lidar_hint(head_points: Option<usize>, points: &[usize]) -> Option<
 /// Height that 5 % of the points of a cloud are below, metres: mostly that of the ground; `None` of an empty cloud.
 pub fn lowest_m(cloud: &PointCloud) -> Option<f32> {
     let mut heights: Vec<f32> = cloud.xyzi.iter().map(|point| point[2]).collect();
+    // NaN would take part in the order and shift the rank.
     heights.retain(|height| height.is_finite());
     let rank = heights.len() / 20;
     (!heights.is_empty()).then(|| *heights.select_nth_unstable_by(rank, f32::total_cmp).1)

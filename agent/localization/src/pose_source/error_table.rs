@@ -57,11 +57,13 @@ impl ErrorTable {
     /// The row of a step if the first step has row `start`; after the last row comes the first one.
     pub fn row(&self, start: u64, step: u64) -> TableRow {
         let length = self.rows.len() as u64;
+        // Both are reduced first: `start` is a hash of 64 bits, and the plain sum can overflow.
         self.rows[((start % length + step % length) % length) as usize]
     }
 }
 
 fn parse_row(row: CsvRow<'_>) -> Result<TableRow, FileError> {
+    // Such a line has one field only: it is read before the number of fields is checked.
     if row.field(0) == "no_pose" {
         return Ok(TableRow::NoPose);
     }

@@ -171,6 +171,7 @@ impl PoseSource for LocalizedPose {
                 confidence,
                 ..
             } => {
+                // A jump is published, with less confidence: the accepted pose may be the wrong one.
                 let verdict = self
                     .motion_gate
                     .judge(input.capture_nanos, &world_from_cav.isometry());

@@ -208,6 +208,7 @@ impl PoseSourceConfig {
             .flat_map(|settings| settings.files())
         {
             let changed = change(file);
+            // A single word may be a file or a released head: the file wins.
             let is_path = changed.exists() || !is_name(file);
             if is_path && !file.as_os_str().is_empty() {
                 *file = changed;

@@ -122,14 +122,17 @@ impl MotionGate {
             self.accept(pose);
             return Verdict::Reachable;
         };
+        // The speed is that of earlier poses, this one not among them: a jump must not explain itself.
         if self.can_reach(&last, &pose, self.speed_mps()) {
             self.accept(pose);
             return Verdict::Reachable;
         }
         self.jumps += 1;
+        // At any speed: the accepted poses, which would give it, are the ones in doubt.
         let follows = self.elsewhere.last().is_some_and(|before| {
             self.remembers(before, &pose) && self.can_reach(before, &pose, None)
         });
+        // A jump to yet another place starts a new row: scattered wrong poses never agree.
         if !follows {
             self.elsewhere.clear();
         }
@@ -137,6 +140,7 @@ impl MotionGate {
         if self.elsewhere.len() < self.config.agreeing {
             return Verdict::Jump;
         }
+        // All of the row, so that a speed at the new place can follow from it.
         self.accepted = std::mem::take(&mut self.elsewhere).into();
         Verdict::NewPlace
     }

@@ -28,6 +28,7 @@ impl PlanarError {
     /// The pose with this error added to its position in the world and to its yaw, as the reference does.
     pub(crate) fn added_in_world(&self, pose: &Pose) -> Pose {
         let exact = pose.isometry();
+        // On the left: about the vertical of the world, however the vehicle is tilted.
         let rotation =
             UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw_rad) * exact.rotation;
         let translation = exact.translation.vector + Vector3::from(self.position_m);
@@ -89,6 +90,7 @@ impl PoseNoise {
             0
         };
         let mut sum = [0.0; 4];
+        // With this first weight the variance of the sum is 1 for any rho.
         let mut weight = (1.0 - rho * rho).sqrt();
         for back in 0..=depth {
             // Steps before the scene's zero have innovations too: the error starts in its stationary state.
@@ -125,6 +127,7 @@ pub(super) fn key(seed: u64, cav: &CavId) -> [u8; 32] {
 /// Four standard normals, those of `step`.
 fn draw(random: &ChaCha8Rng, step: u64) -> [f64; 4] {
     let mut random = random.clone();
+    // The generator goes to any step at once: no draw depends on those before it.
     random.set_word_pos(u128::from(step) * WORDS_PER_DRAW);
     std::array::from_fn(|_| random.sample(StandardNormal))
 }

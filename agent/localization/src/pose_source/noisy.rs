@@ -196,6 +196,7 @@ impl NoisyPose {
 
     /// The pose of a vehicle at a capture time when the true one is `pose`.
     pub fn disturbed(&self, cav: &CavId, capture_nanos: u64, pose: &Pose) -> PoseEstimate {
+        // To the nearest step: capture times that jitter about a step keep its error.
         let step = (capture_nanos as f64 / self.step_nanos).round() as u64;
         let error = match &self.kind {
             Kind::Fixed(noise) => noise.fixed(),

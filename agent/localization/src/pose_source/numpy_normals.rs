@@ -50,6 +50,7 @@ impl NumpyNormals {
 
     /// A number in 0..1 of 53 bits.
     fn unit(&mut self) -> f64 {
+        // 27 and 26 bits of two words, the high ones first, divided by 2^53.
         let (high, low) = (self.word() >> 5, self.word() >> 6);
         (f64::from(high) * 67_108_864.0 + f64::from(low)) / 9_007_199_254_740_992.0
     }
@@ -60,6 +61,7 @@ impl NumpyNormals {
         }
         let mut word = self.words[self.next];
         self.next += 1;
+        // Tempering. The state itself stays as it is.
         word ^= word >> 11;
         word ^= (word << 7) & 0x9d2c_5680;
         word ^= (word << 15) & 0xefc6_0000;
@@ -68,6 +70,7 @@ impl NumpyNormals {
 
     fn turn(&mut self) {
         for index in 0..WORDS {
+            // In place, as in the reference: where the index wraps round, the other words are new already.
             let mixed =
                 (self.words[index] & 0x8000_0000) | (self.words[(index + 1) % WORDS] & 0x7fff_ffff);
             let odd = if mixed & 1 == 1 { 0x9908_b0df } else { 0 };

@@ -35,6 +35,7 @@ pub(super) fn of<S: Args>() -> Vec<Arg> {
 /// Adds the options of a source, with their defaults.
 pub(super) fn augment<S: PoseSettings + Args + Default + Serialize>(command: Command) -> Command {
     let defaults = serde_json::json!({ S::option_prefix(): S::default() });
+    // For an update no option is required: those of sources that are not chosen stay absent.
     let command = S::augment_args_for_update(command);
     document(command, options_of::<S>(), &defaults)
 }
@@ -73,6 +74,7 @@ pub(super) fn refuse_useless(
     let is_useless = |option: &&Arg| {
         let id = option.get_id();
         let is_own = own.iter().any(|own| own.get_id() == id);
+        // Options with a default always have a value: only those that were typed count.
         matches.value_source(id.as_str()) == Some(ValueSource::CommandLine)
             && !(is_own && settings.has_use_for(id.as_str()))
     };

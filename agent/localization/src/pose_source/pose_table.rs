@@ -1,7 +1,7 @@
 //! Table of poses on disk, one row per sweep, found by scenario, vehicle and capture time.
 
 use std::collections::HashMap;
-use std::fs::OpenOptions;
+use std::fs::{self, OpenOptions};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -59,6 +59,7 @@ impl PoseTable {
         for row in CsvFile::read(path, HEADER, MAX_BYTES)?.rows() {
             let row = row.complete()?;
             let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
+            // Two rows of one sweep, as in a table that was appended to twice: neither can be preferred.
             if of_scenario
                 .insert(sweep_key(&row)?, estimate(&row)?)
                 .is_some()
@@ -96,10 +97,10 @@ impl PoseTable {
     /// # Errors
     /// [`FileError`] when the file cannot be written.
     pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<()> {
-        let mut text = if path.exists() {
-            CsvText::headless()
-        } else {
-            CsvText::new(HEADER)
+        let is_begun = fs::metadata(path).is_ok_and(|file| file.len() > 0);
+        let mut text = match is_begun {
+            true => CsvText::headless(),
+            false => CsvText::new(HEADER),
         };
         rows.iter()
             .for_each(|row| text.row(fields(last_part(scenario), row)));
@@ -218,6 +219,7 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
             confidence,
             ..
         } => {
+            // To a hundredth of a millimetre. The covariance is not stored: a cached pose has none.
             fields[3..6].clone_from_slice(&translation_m.map(|metres| format!("{metres:.5}")));
             fields[6..10].clone_from_slice(&rotation_wxyz.map(|part| format!("{part:.9}")));
             fields[10] = format!("{confidence:.6}");

@@ -83,6 +83,7 @@ macro_rules! pose_sources {
 
             /// Options of a source that is not chosen are refused.
             fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+                // The source of a file keeps its values where the command line names the same one.
                 let requested = matches.get_one::<Kind>(options::CHOICE).copied();
                 if let Some(kind) = requested.filter(|kind| *kind != self.kind()) {
                     *self = Self::of_kind(kind);

@@ -171,6 +171,7 @@ impl TrackedPose {
         let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         localizer.set_most_parts(MOST_PARTS);
         localizer.set_min_confidence(config.min_confidence);
+        // Outermost: near a prediction the registration alone may suffice, without the networks.
         Ok(MapRegistration::of(
             Box::new(localizer),
             &config.surfel_map,
@@ -225,6 +226,7 @@ impl TrackedPose {
 
     /// Corrects the tracker by the pose of a sweep, if it has one.
     fn correct(&mut self, capture_nanos: u64, localization: &Localization) {
+        // A pose that the localizer rejects is `found` as well and must not correct the tracker.
         let published = localization.estimate.world_from_cav();
         let Some(found) = published.and(localization.found.as_ref()) else {
             return;
@@ -262,6 +264,7 @@ impl TrackedPose {
             return no_pose(NoPoseReason::Failed);
         };
         self.correct(input.capture_nanos, &localization);
+        // Without a pose the tracker has not started: what the localizer gives as the reason is published.
         match self.tracker.state() {
             Some(state) => published(&state),
             None => localization.estimate,
@@ -271,14 +274,17 @@ impl TrackedPose {
     /// True if the sweep is one of those that are measured.
     fn is_due(&self, motion: &EgoMotion) -> bool {
         let interval = u64::from(self.config.measuring_interval(motion));
+        // Sweeps count from 1: with phase 0 the first one is due.
         let turn = self.sweeps + interval - 1 + u64::from(self.config.phase);
         self.tracker.needs_measurement() || turn.is_multiple_of(interval)
     }
 
     /// True if the sweep is measured without the prediction.
     fn is_global_due(&self, capture_nanos: u64) -> bool {
+        // In floating point: the difference is negative after a restart of the scene, which is not recent.
         let since_s = |nanos: u64| (capture_nanos as f64 - nanos as f64) * 1e-9;
         let is_recent = |nanos: u64| (0.0..self.config.global_period_s).contains(&since_s(nanos));
+        // A prediction that a measurement contradicts is no place to search near.
         self.tracker.is_contradicted() || !self.global_nanos.is_some_and(is_recent)
     }
 }

@@ -76,6 +76,7 @@ pub(super) fn leading_eigenvectors(matrices: &[f32], size: usize, iterations: us
         let stands_still = next
             .iter()
             .zip(&vectors)
+            // The default tolerances of torch.allclose.
             .all(|(a, b)| (a - b).abs() <= 1e-8 + 1e-5 * b.abs());
         vectors = next;
         if stands_still {
@@ -94,6 +95,7 @@ fn normalised(mut vector: Vec<f32>) -> Vec<f32> {
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     let (a_blocks, a_rest) = a.as_chunks::<LANES>();
     let (b_blocks, b_rest) = b.as_chunks::<LANES>();
+    // One sum per lane: floating-point addition has an order that the compiler must not change.
     let mut sums = [0.0_f32; LANES];
     for (a, b) in a_blocks.iter().zip(b_blocks) {
         for lane in 0..LANES {

@@ -75,6 +75,7 @@ impl PairMoments {
         }
         let from = source / (weight + epsilon);
         let to = target / (weight + epsilon);
+        // Sum of w (a - from) (b - to)^T, multiplied out. With a bias its last three terms do not merge.
         let covariance = cross - from * target.transpose() - source * to.transpose()
             + from * to.transpose() * weight;
         let rotation = rotation_of(&(covariance / weight))?;
@@ -102,6 +103,7 @@ fn rotation_of(covariance: &Matrix3<f64>) -> Result<Rotation3<f64>, Degenerate> 
     if ratio <= COLLINEAR {
         return Err(Degenerate::Collinear(ratio));
     }
+    // With H = U S V^T the rotation is R = V U^T.
     let mut v = v_t.transpose();
     if (v * u.transpose()).determinant() < 0.0 {
         // The best orthogonal matrix is a reflection: negating its weakest axis gives the best rotation.

@@ -47,6 +47,7 @@ impl Pairs {
     pub(super) fn new(pairs: &[Correspondence], random: &mut ChaCha8Rng) -> Self {
         let mut usable: Vec<&Correspondence> = pairs.iter().filter(|pair| pair.usable()).collect();
         usable.shuffle(random);
+        // The sort is stable: the shuffled order stays among equal weights.
         usable.sort_by(|a, b| b.weight.total_cmp(&a.weight));
         let mean = |axis: usize| {
             let values = usable.iter().map(|pair| f64::from(pair.target_m[axis]));
@@ -54,6 +55,7 @@ impl Pairs {
         };
         let origin = Vector3::new(mean(0), mean(1), mean(2));
         let column = |value: &dyn Fn(&Correspondence) -> f32| -> Column {
+            // Padding has weight 0 and adds nothing to a score.
             let padded = |block: &[&Correspondence]| {
                 std::array::from_fn(|lane| block.get(lane).map_or(0.0, |p| value(p)))
             };
@@ -102,6 +104,7 @@ impl Pairs {
             let squared = self.squared_residuals(&model, block);
             for (lane, squared) in squared.into_iter().enumerate() {
                 let index = block * LANES + lane;
+                // Padded pairs may lie near as well: their weight of 0 does not exclude them here.
                 if squared < limit && index < self.count {
                     let weight = f64::from(self.weight[block][lane]);
                     near.push((self.source(index), self.target(index), weight));

@@ -125,6 +125,7 @@ impl RansacConfig {
     /// Number of draws after which a motion with `inliers` of `count` would have been found.
     fn draws_needed(&self, inliers: usize, count: usize) -> u32 {
         let ratio = inliers as f64 / count.max(1) as f64;
+        // n = ln(1 - confidence) / ln(1 - hit). The clamps keep both logarithms finite and other than 0.
         let hit = (SAMPLE_YIELD * ratio.powi(self.sample_size())).clamp(1e-12, 1.0 - 1e-12);
         let draws = (1.0 - self.confidence).max(1e-12).ln() / (1.0 - hit).ln();
         (draws.ceil().min(f64::from(self.max_draws)) as u32).max(self.min_draws)
@@ -165,11 +166,13 @@ pub fn solve(
     };
     let refined = refine::converge(&near, &best, scale_m, FINAL_STEPS);
     let refined = refined.map_err(degenerate)?;
+    // The fit has six degrees of freedom and may tilt beyond the limit.
     let motion = match config.allows_tilt_of(&refined) {
         true => refined,
         false => best,
     };
     let motion = pairs.to_target_frame(&motion);
+    // Inliers are counted on the given pairs: their indices are those of the caller, not of the sorted ones.
     Registration::judge(correspondences, motion, config.inlier_threshold_m)
         .with_at_least(required, correspondences.len())
 }
@@ -194,6 +197,7 @@ impl Search<'_> {
                 MinimalSolver::UprightTwoPoint => sampling::two_points(pairs, draw, &test, random),
                 MinimalSolver::ThreePoint => sampling::three_points(pairs, draw, &test, random),
             };
+            // Inconsistent samples count as draws too: a hopeless sweep would be searched forever otherwise.
             draw += 1;
             let Some(motion) = drawn else { continue };
             let Some(gain) = self.gain(&motion, &best_drawn) else {

@@ -71,6 +71,7 @@ fn step(
     let mut moments = PairMoments::default();
     for (source_m, target_m, weight) in pairs {
         let residual = rotation * source_m + motion.translation.vector - target_m;
+        // The weights are those of the motion before the step, so that the fit has a closed form.
         let kernel = forgiveness(residual.norm(), scale_m);
         if kernel > 0.0 {
             moments.add(source_m, target_m, weight * kernel);

@@ -33,13 +33,16 @@ pub(super) fn three_points(
     let [a, b, c] = draw_distinct(pairs.len(), draw, random);
     let source = [a, b, c].map(|index| pairs.source(index));
     let target = [a, b, c].map(|index| pairs.target(index));
+    // A rigid motion keeps lengths: samples with an outlier are rejected before anything is solved.
     for (from, to) in [(0, 1), (0, 2), (1, 2)] {
         let lengths = [&source, &target].map(|points| (points[to] - points[from]).norm());
         if lengths[0] < test.min_edge_m || (lengths[0] - lengths[1]).abs() > test.edge_tolerance_m {
             return None;
         }
     }
+    // Both bases are right-handed and orthonormal: the product is a rotation.
     let rotation = Rotation3::from_matrix_unchecked(axes(&target)? * axes(&source)?.transpose());
+    // The entry is the cosine of the angle between both z axes.
     if rotation[(2, 2)] < test.max_tilt_rad.cos() {
         return None;
     }
@@ -57,6 +60,7 @@ pub(super) fn two_points(
     let source = [a, b].map(|index| pairs.source(index));
     let target = [a, b].map(|index| pairs.target(index));
     let [from, to] = [source[1] - source[0], target[1] - target[0]];
+    // In the plane: a rotation about the vertical keeps horizontal lengths. Heights are compared below.
     let lengths = [from.xy().norm(), to.xy().norm()];
     if lengths[0] < test.min_edge_m || (lengths[0] - lengths[1]).abs() > test.edge_tolerance_m {
         return None;

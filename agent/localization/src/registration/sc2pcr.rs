@@ -148,11 +148,13 @@ pub fn consensus(
     let source_distances = distances(&points.source);
     let changes = changes(&source_distances, &distances(&points.target));
 
+    // Step: first-order compatibility, its leading eigenvector as confidence, and the seeds.
     let first_order = changes.iter().map(|&change| soft(change, threshold));
     let first_order: Vec<f32> = first_order.collect();
     let confidence = leading_eigenvectors(&first_order, count, config.power_iterations);
     let seeds = pick_seeds(&source_distances, &confidence, config);
 
+    // Step: second order. Common neighbours count at half the threshold, the pair itself at the full one.
     let tight = Bits::where_true(&changes, count, |change| change < threshold / 2.0);
     let sets: Vec<Vec<usize>> = (seeds.iter())
         .map(|&seed| {
@@ -164,6 +166,7 @@ pub fn consensus(
             points.consensus_set(&(0..count).map(score).collect::<Vec<u32>>(), config)
         })
         .collect();
+    // Step: one fit per seed. Without a seed, in tiny sets, there is none.
     let best = points.best_fit(&sets, config);
     let Some((target_from_source, inlier_count)) = best else {
         return Err(NoRegistration::TooFewInliers {
@@ -234,6 +237,7 @@ fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfi
     };
     let strengths: Vec<f32> = (0..count).map(strength).collect();
     let mut order = descending(&strengths);
+    // Rounded down: fewer than 1 / ratio correspondences have no seed.
     order.truncate((count as f64 * config.seed_ratio) as usize);
     order
 }

@@ -34,6 +34,7 @@ impl PoseMeasurement {
         if found.is_registered {
             return Self::registered(capture_nanos, found);
         }
+        // Eq. 6 solved for the error. The clamp keeps a sigma of 0 finite.
         let error_m: f64 = (1.0 / found.sigma.clamp(1e-6, 1.0) - 1.0).sqrt();
         let [least, most] = YAW_STD_RAD;
         Self {

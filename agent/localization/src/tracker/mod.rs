@@ -161,6 +161,7 @@ impl PoseTracker {
         if self.rejected.len() < AGREEING {
             return Correction::Rejected;
         }
+        // The rejected pose before this one, not the last accepted one, gives the speed at the new place.
         self.accepted = self.rejected.iter().rev().nth(1).copied();
         self.start(measurement);
         Correction::Relocated
@@ -196,12 +197,14 @@ fn seconds(from_nanos: u64, to_nanos: u64) -> f64 {
 fn can_follow(from: &PoseMeasurement, to: &PoseMeasurement) -> bool {
     let time_s = seconds(from.capture_nanos, to.capture_nanos);
     let off = to.world_from_lidar.translation.vector - from.world_from_lidar.translation.vector;
+    // After a second the reach is 52 m already: over a longer time nearly any place could follow.
     time_s > 0.0 && time_s <= SPEED_BASE_S && off.norm() <= SLACK_M + MAX_SPEED_MPS * time_s
 }
 
 /// Speed along the heading from one pose to the next, metres per second.
 fn speed_mps(from: &PoseMeasurement, to: &PoseMeasurement) -> f64 {
     let moved = from.world_from_lidar.inv_mul(&to.world_from_lidar);
+    // Along the heading of the earlier pose: x is ahead, and reversing is negative.
     moved.translation.x / seconds(from.capture_nanos, to.capture_nanos).max(1e-3)
 }
 

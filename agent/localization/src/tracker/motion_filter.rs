@@ -109,6 +109,7 @@ impl MotionFilter {
         let time_s = capture_nanos.saturating_sub(self.capture_nanos) as f64 * 1e-9;
         self.capture_nanos = capture_nanos;
         let measured = measured_yaw_rate_rad_s.filter(|rate| rate.is_finite());
+        // Before the state moves: the rate is that of the interval which ends now.
         if let Some(rate) = measured {
             self.set_yaw_rate(rate);
         }
@@ -134,6 +135,7 @@ impl MotionFilter {
         self.state[Y] += moved_y;
         self.state[YAW] = wrapped_rad(yaw + yaw_rate * time_s);
 
+        // Step: Jacobian of the motion. The yaw rate enters the heading half way with half of the time.
         let mut step = Covariance::identity();
         step[(X, YAW)] = -moved_y;
         step[(Y, YAW)] = moved_x;
@@ -145,6 +147,7 @@ impl MotionFilter {
         step[(Y, LEVER)] = cos * yaw_rate * time_s;
         step[(YAW, YAW_RATE)] = time_s;
         let half_square = time_s * time_s / 2.0;
+        // Step: process noise. An acceleration is constant within a step: its effects are fully correlated.
         let pushed = State::from([
             half_square * cos,
             half_square * sin,
@@ -157,6 +160,7 @@ impl MotionFilter {
         ]) * ACCELERATION_STD;
         let turned =
             State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0, 0.0]) * yaw_acceleration_std;
+        // A random walk: its variance, not its deviation, grows with time.
         let slipped =
             State::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
         self.covariance = step * self.covariance * step.transpose()
@@ -180,6 +184,7 @@ impl MotionFilter {
     /// Replaces the yaw rate by a measured one less the bias: their errors are the same, beside the noise.
     fn set_yaw_rate(&mut self, measured_rad_s: f64) {
         self.state[YAW_RATE] = measured_rad_s - self.state[BIAS];
+        // Error of the rate = noise - error of the bias: its covariances are those of the bias, negated.
         let mut of_bias = -self.covariance.column(BIAS);
         of_bias[YAW_RATE] = self.covariance[(BIAS, BIAS)] + YAW_RATE_STD * YAW_RATE_STD;
         self.covariance.set_column(YAW_RATE, &of_bias);
@@ -206,6 +211,7 @@ impl MotionFilter {
         selects[SPEED] = 1.0;
         selects[SCALE] = -speed_mps;
         let off = speed_mps * (1.0 + self.state[SCALE]) - self.state[SPEED];
+        // The noise is that of the measurement alone: the error of the scale is in the covariance.
         let variance =
             (selects * self.covariance * selects.transpose())[0] + SPEED_STD_MPS * SPEED_STD_MPS;
         (off, variance, selects)
@@ -230,6 +236,7 @@ impl MotionFilter {
         selects.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
         self.move_by(&(gain * off), &(Covariance::identity() - gain * selects));
 
+        // The height has a filter of its own: its errors count as independent of those in the plane.
         let off_m = measurement.world_from_lidar.translation.z - self.height[0];
         let variance = self.height_covariance[(0, 0)] + measurement.position_std_m.powi(2);
         let gain = self.height_covariance.column(0) / variance;
@@ -293,6 +300,7 @@ impl MotionFilter {
         let off = Vector3::new(
             pose.translation.x - self.state[X],
             pose.translation.y - self.state[Y],
+            // Wrapped: at a heading of 180 degrees both signs are the same direction.
             wrapped_rad(pose.rotation.euler_angles().2 - self.state[YAW]),
         );
         let [position, yaw] =

@@ -97,6 +97,7 @@ impl Track {
         };
         match (is_expected(&self.filter), is_expected(&self.unaided)) {
             (false, false) => return false,
+            // The pose corrects this copy below as well.
             (false, true) => self.filter = self.unaided.clone(),
             (true, _) => {}
         }

@@ -190,6 +190,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if args.seed.is_some() && args.solver == Search::Sc2pcr {
         return Err(BadInput::new("--seed is for --solver ransac: sc2pcr draws nothing").into());
     }
+    // The default head is not looked for where no head is used.
     let heads = match args.uses_head() {
         true => with_files(&args.head)?,
         false => args.head.clone(),
@@ -209,6 +210,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             tracked.extend(args.evaluate(args.tracking(head)?, scenes)?.sweeps);
         }
     }
+    // Before anything is written or printed: the fit judges the sweeps anew.
     if let ([(head, _)], true) = (&groups[..], args.fits()) {
         args.fit(head, &mut sweeps)?;
     }
@@ -318,6 +320,7 @@ impl Args {
             ..PoseSolver::default()
         };
         let drives = &self.retrieval;
+        // Methods without a head come first: the default head need not exist for them.
         if self.by == RetrievalBy::ScanContext {
             return retrieval::by_descriptor(drives, Box::new(ScanContext), left_out);
         }
@@ -328,6 +331,7 @@ impl Args {
         if let Some(weights) = &self.baseline {
             return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
         }
+        // A stored model may be of an earlier version with other features: a new fit does not read it.
         let load = match self.fit_confidence {
             true => Localizer::load_without_confidence,
             false => Localizer::load,
@@ -379,6 +383,7 @@ impl Args {
         bar.finish_and_clear();
         match evaluated {
             Ok(evaluated) => Ok(evaluated),
+            // A network that fails is no fault of the input: exit code 1, not 2.
             Err(error @ Error::Localizer(_)) => Err(error.into()),
             Err(error) => Err(BadInput::of(error).into()),
         }
@@ -399,10 +404,12 @@ impl Args {
     /// Fits confidence, threshold and covariance, as far as the options ask for, and writes them.
     fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<()> {
         let mut fitted = None;
+        // --max-wrong alone keeps the stored model and chooses its threshold anew.
         if self.fit_confidence || self.max_wrong.is_some() {
             let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
             let (model, report) = self.fit_confidence(head, &labelled)?;
             let confidence = Confidence::Calibrated(model.clone());
+            // Covariances are fitted below to the poses that the new threshold leaves.
             for sweep in &mut *sweeps {
                 sweep.judge_again(&confidence);
             }

@@ -138,6 +138,7 @@ impl Args {
                 source.observe(&input);
             }
         }
+        // Appended as a whole: an interrupted scenario is not in the table and is done again.
         PoseTable::append(&self.out, &scenario.name, &rows)?;
         let poses = rows
             .iter()

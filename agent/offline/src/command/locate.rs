@@ -150,6 +150,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
         match args.json {
             true => output::line(serde_json::to_string(&located)?)?,
+            // Faults go to standard error, so that standard output has results alone.
             false if located.error.is_some() => output::note(located.text()),
             false => output::line(located.text())?,
         }
@@ -203,6 +204,7 @@ impl Args {
         let mut points = read.points;
         let count = points.len();
         sweeps.push(read.findings);
+        // The reader of a data set has removed its handedness already.
         let y_axis = match read.is_of_data_set {
             true => YAxis::Left,
             false => self.y_axis,
@@ -212,6 +214,7 @@ impl Args {
         }
         let mut localization = localizer.localize(LocalizerInput::of(&points))?;
         let mut is_mirrored = y_axis == YAxis::Right;
+        // A mirrored cloud looks like another place, so a pose tells which direction y has.
         if y_axis == YAxis::Auto && published(&localization).is_none() {
             mirror(&mut points);
             let other = localizer.localize(LocalizerInput::of(&points))?;
@@ -300,6 +303,7 @@ impl Located {
             return format!("{cloud}: no pose, {reason} ({inliers} inliers, {points} points)");
         };
         let ([x, y, z], [roll, pitch, yaw]) = (pose.position_m, pose.roll_pitch_yaw_deg);
+        // Root mean square of the standard deviations along x and y.
         let std_m = f64::midpoint(pose.covariance[0][0], pose.covariance[1][1]).sqrt();
         let confidence = pose.confidence;
         format!(

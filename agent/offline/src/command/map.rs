@@ -88,6 +88,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    // The surfel map is made last: its options are refused before the training, not after it.
     check_spacing(args.surfel_spacing_m).map_err(BadInput::of)?;
     check_voxel(args.surfel_voxel_m).map_err(BadInput::of)?;
     if args.surfels_only {
@@ -96,6 +97,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         std::fs::create_dir_all(&args.out).at(&args.out)?;
         return Ok(args.write_surfels()?.print());
     }
+    // This may execute the program again: before anything is read or written.
     malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS)
         .context("cannot execute this program again")?;
     let config = args.config()?;

@@ -38,9 +38,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let (mut search, mut left_out, mut observed) = (ScaleSearch::default(), LeftOut::default(), 0);
     for folder in &args.dataset {
         for scenario in dataset::open(folder).map_err(BadInput::of)?.scenarios {
-            let all = scenario.ticks.len() * scenario.agents.len();
-            for sweep in (0..all).step_by(all.div_ceil(usize::from(args.sweeps)).max(1)) {
-                let (tick, agent) = (sweep / scenario.agents.len(), sweep % scenario.agents.len());
+            let (ticks, agents) = (scenario.ticks.len(), scenario.agents.len());
+            let count = (ticks * agents).min(args.sweeps.into());
+            for number in 0..count {
+                // Vehicles take turns: a stride over all sweeps could meet the same one each time.
+                let (tick, agent) = (number * ticks / count, number % agents);
                 let loaded = scenario.load_tick(tick, agent..agent + 1, &LoadOptions::default());
                 left_out.add_tick(&loaded);
                 for (_, frame) in &loaded.frames {

@@ -194,6 +194,7 @@ pub fn evaluate_nearest(
             .world_from_lidar
             .map(|pose| pose.isometry().translation.vector);
         let distance = |pose: &Isometry3<f64>| {
+            // A frame without a true pose is refused before this is asked: the 0 is never used.
             truth.map_or(0.0, |truth| {
                 (pose.translation.vector - truth).norm_squared()
             })
@@ -240,6 +241,7 @@ fn evaluate_with(
         on_sweep(place + 1, chosen.len());
         let frame = match scenario.load(agent, tick, &load) {
             Ok(frame) => frame,
+            // A variant that does not exist is missing from every sweep: the option is wrong, not the data.
             Err(error @ ReadError::NoSuch { .. }) => return Err(error.into()),
             Err(error) => {
                 let problem = Problem::from(&error);

@@ -132,6 +132,7 @@ impl LocalizationSummary {
         let judged = judged(sweeps);
         let (sigmas, errors): (Vec<f64>, Vec<f64>) =
             (judged.iter().map(|pose| (pose.sigma, pose.error_m))).unzip();
+        // Every found pose has an error, so these pair with `errors`.
         let ratios: Vec<f64> = (sweeps.iter().filter_map(|sweep| sweep.localization.found))
             .map(|found| found.evidence.inlier_ratio)
             .collect();
@@ -250,6 +251,7 @@ fn integrity(judged: impl Iterator<Item = (f64, f64)>) -> Option<IntegritySummar
     let exceeded = judged.iter().filter(|(error_m, bound_m)| error_m > bound_m);
     let exceeded = exceeded.count();
     let bounds: Vec<f64> = judged.iter().map(|(_, bound_m)| *bound_m).collect();
+    // Without any bound the median is `None`, and the share of 0 / 0 is not returned.
     Some(IntegritySummary {
         poses: judged.len(),
         exceeded,
@@ -287,6 +289,7 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     };
     let cloud = |name: &str, is_rejected: bool| {
         let poses = judged.iter().filter(|pose| pose.is_rejected == is_rejected);
+        // The axis is logarithmic: errors beyond its ends are drawn there.
         let points = poses.map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)));
         series(name, points.collect(), Mark::Dots)
     };

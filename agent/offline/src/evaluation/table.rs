@@ -51,8 +51,10 @@ fn row(sweep: &EvaluatedSweep) -> Vec<String> {
         fields.push(outcome);
         fields.extend(evidence_fields(&found.evidence));
     } else {
+        // As many empty fields as pose (4), errors (2) and sigma (1) take.
         fields.resize(fields.len() + 7, String::new());
         fields.push(outcome);
+        // All of the evidence.
         fields.resize(fields.len() + 15, String::new());
     }
     let total_ms = localization.times.total().as_secs_f64() * 1e3;

@@ -46,6 +46,7 @@ pub(super) fn check(
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     for number in 0..copies * list.len() {
         let (copy, index) = (number / list.len(), number % list.len());
+        // Every sweep is checked as it is, however late; only copies depend on the time.
         if copy > 0 && Instant::now() > deadline {
             break;
         }

@@ -53,6 +53,7 @@ impl Coverage {
         let cell_m = CELL_M.max((edge_m / MOST_CELLS / CELL_M).ceil() * CELL_M);
         let mut counts: BTreeMap<[i64; 2], usize> = BTreeMap::new();
         for position in all() {
+            // Floor, as coordinates may be negative: a cast alone rounds towards zero.
             *counts
                 .entry([0, 1].map(|axis| (position[axis] / cell_m).floor() as i64))
                 .or_default() += 1;

@@ -21,10 +21,12 @@ pub(super) fn held_out(positions_m: &[Vector3<f64>]) -> Vec<bool> {
     if count < LEAST_SWEEPS {
         return is_held_out;
     }
+    // One at least: a share of few sweeps rounds to none.
     let wanted = ((count as f64 * SHARE).round() as usize).max(1);
     let piece = piece_sweeps(positions_m).min(wanted);
     let pieces = wanted.div_ceil(piece);
     for number in 0..pieces {
+        // Pieces lie around the middles of equal parts, so both ends of a drive are trained on.
         let middle = (2 * number + 1) * count / (2 * pieces);
         let first = middle.saturating_sub(piece / 2);
         let end = (first + piece).min(count);
@@ -39,6 +41,7 @@ fn piece_sweeps(positions_m: &[Vector3<f64>]) -> usize {
         .windows(2)
         .map(|pair| (pair[1] - pair[0]).norm())
         .collect();
+    // A vehicle that stands has steps of 0, by which the length would be divided.
     let step_m = support::statistics::median(&steps)
         .unwrap_or(PIECE_M)
         .max(1e-3);

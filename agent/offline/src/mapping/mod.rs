@@ -93,17 +93,21 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
     let (summary, run) = map.train(&training, &plan)?;
     map.copy_encoder()?;
     let weights = summary.trained.weights.clone();
-    let activation_scales = map.quantise(&weights, &training, plan.scale_sweeps)?;
+    // Scales come first: the check, and what is fitted to it, is then of 8-bit inference as in a vehicle.
+    let (activation_scales, scaled) = map.quantise(&weights, &training, plan.scale_sweeps)?;
     let mut checked = map.check(&weights, &held_out)?;
     let (confidence, sha256) = map.fit(&weights, &mut checked)?;
     let (mut data, more) = (training.data(), held_out.data().problems.into_iter());
-    data.problems.extend(more.skip(data.problems.len()));
+    // Problems of the data set itself are in both.
+    data.problems
+        .extend(more.skip(sweeps.list.data().problems.len()));
     data.without_pose += sweeps.without_pose;
     let accuracy = (!checked.sweeps.is_empty())
         .then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
     Ok(MapReport {
         place: config.place.clone(),
-        sha256: sha256.unwrap_or_else(|| summary.trained.sha256.clone()),
+        sha256: { sha256.or(scaled) }.unwrap_or_else(|| summary.trained.sha256.clone()),
+        // The cache counts every copy as a sweep.
         training_sweeps: summary.sweeps / plan.copies.max(1),
         copies: plan.copies,
         cell_error_m: summary.error_m,
@@ -188,6 +192,7 @@ impl Map<'_> {
             .collect();
         let (mut training, mut held) = (Vec::new(), Vec::new());
         let last = positions.iter().map(|(drive, _)| *drive).max();
+        // Drive by drive: the step from the end of one to the start of the next is no part of a path.
         for drive in 0..last.map_or(0, |last| last + 1) {
             let of_drive = { positions.iter().enumerate() }.filter(|(_, (of, _))| *of == drive);
             let known: Vec<(usize, Vector3<f64>)> = of_drive
@@ -218,6 +223,7 @@ impl Map<'_> {
     fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan> {
         let run = &self.config.run;
         let with_pose = sweeps.training.len() + sweeps.held_out.len();
+        // A new measurement could give another plan, and with it another batch, which the checkpoint refuses.
         if run.resume {
             let plan = StoredPlan::read(&run.out, with_pose)?;
             let (encoded, encoding_s) = (plan.training * plan.copies, plan.encoding_s);
@@ -234,6 +240,7 @@ impl Map<'_> {
         let began = Instant::now();
         // The first sweeps are slower: they are not counted, unless there are no others.
         let mut first_s = 0.0;
+        // The cache reports after every batch of 4 sweeps, so this number is met exactly.
         let first = 4.min(probes.len());
         let mut progress = |done: usize, _: usize| {
             if done == first {
@@ -297,6 +304,7 @@ impl Map<'_> {
         training: &Arc<SweepList>,
         plan: &Plan,
     ) -> Result<(SceneSummary, RunConfig)> {
+        // Above 0 however long the preparation took: a negative duration would panic.
         let left_s =
             (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
         let run = RunConfig {
@@ -355,6 +363,7 @@ impl Map<'_> {
     /// Copies the encoder beside the head, so that the folder is all that is needed.
     fn copy_encoder(&self) -> Result<()> {
         let path = self.config.run.out.join(ENCODER_FILE);
+        // The encoder may lie in the folder already: a file that is copied onto itself would be emptied.
         let is_there = path.canonicalize().ok() == self.config.encoder.canonicalize().ok();
         if !is_there {
             std::fs::copy(&self.config.encoder, &path).at(&path)?;
@@ -362,8 +371,13 @@ impl Map<'_> {
         Ok(())
     }
 
-    /// Searches the scales of activations; their number.
-    fn quantise(&mut self, weights: &Path, training: &SweepList, sweeps: usize) -> Result<usize> {
+    /// Searches the scales of activations: their number, and the digest of the weights with them, if there are any.
+    fn quantise(
+        &mut self,
+        weights: &Path,
+        training: &SweepList,
+        sweeps: usize,
+    ) -> Result<(usize, Option<String>)> {
         self.at("scales for 8-bit inference".to_owned());
         let localizer =
             Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
@@ -375,11 +389,12 @@ impl Map<'_> {
             }
         }
         let scales = search.scales();
-        if !scales.is_empty() {
-            let text = serde_json::to_string(&scales).expect("scales are numbers");
-            annotate(weights, SCALES_KEY, &text)?;
+        if scales.is_empty() {
+            return Ok((0, None));
         }
-        Ok(scales.len())
+        let text = serde_json::to_string(&scales).expect("scales are numbers");
+        let sha256 = annotate(weights, SCALES_KEY, &text)?;
+        Ok((scales.len(), Some(sha256)))
     }
 
     fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check> {
@@ -408,6 +423,7 @@ impl Map<'_> {
                 let text = serde_json::to_string(&model).expect("a model is numbers");
                 let mut sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
                 let confidence = Confidence::Calibrated(model);
+                // Judged by the new model first: rejected poses are no samples for the covariances.
                 for sweep in checked.sweeps.iter_mut().chain(&mut checked.copies) {
                     sweep.judge_again(&confidence);
                 }

@@ -77,6 +77,7 @@ impl Plan {
         let affordable =
             ((total_s - check_s - scales_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
         let copies = (ENOUGH_SWEEPS / training.max(1)).clamp(1, MOST_COPIES);
+        // Copies take what is left once every sweep is encoded.
         let copies = copies.min((affordable / training.max(1)).max(1));
         let training = training.min(affordable.max(1));
         let encoding_s = (training * copies) as f64 * sweep_s;

@@ -107,6 +107,7 @@ impl Contrast {
         let embed = |x: &Tensor| {
             let y = self.embedding.forward(x);
             let squares = y.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+            // The small number is added under the root, whose gradient is infinite at 0.
             let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
             Ok::<_, TchError>(y / norm)
         };
@@ -127,6 +128,7 @@ impl Contrast {
             for (anchor, &partner) in pair.anchor.places_m.iter().zip(&pair.matches) {
                 let partner = pair.partner.places_m[partner];
                 let offset: [f32; 3] = std::array::from_fn(|axis| partner[axis] - anchor[axis]);
+                // Into the frame of the anchor's sensor, the only one that its features know.
                 for row in rotation.as_chunks::<3>().0 {
                     targets.push((0..3).map(|axis| row[axis] * offset[axis]).sum::<f32>());
                 }
@@ -157,11 +159,13 @@ fn neither(pairs: &[Pair], device: Device) -> Result<Tensor, TchError> {
     let cells = |side: &ChosenCells| side.rows.len() as i64;
     let anchors: i64 = pairs.iter().map(|pair| cells(&pair.anchor)).sum();
     let partners: i64 = pairs.iter().map(|pair| cells(&pair.partner)).sum();
+    // Cells of other pairs stay at 0: all of them are negatives.
     let mask = Tensor::f_zeros([anchors, partners], (Kind::Float, device))?;
     let places = |side: &ChosenCells| tensor(side.places_m.as_flattened(), &[-1, 3], device);
     let (mut row, mut column) = (0, 0);
     for pair in pairs {
         let (anchor, partner) = (places(&pair.anchor)?, places(&pair.partner)?);
+        // Mode 2 takes differences: by a matrix product short distances would be rounded.
         let distance = Tensor::f_cdist(&anchor, &partner, 2.0, 2_i64)?;
         let near = distance.f_lt(NEITHER_M)?.f_to_kind(Kind::Float)? * NEVER;
         // The match itself is near too, and must stay a candidate.

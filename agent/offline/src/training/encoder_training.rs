@@ -80,6 +80,7 @@ pub fn train_encoder(
     let (maker, store) = read(&config.scenes, run.seed)?;
     let validation = match config.validation.as_slice() {
         [] => None,
+        // Other random numbers than those of the training pairs.
         folders => Some(read(folders, u64::MAX - run.seed)?.0),
     };
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
@@ -87,6 +88,7 @@ pub fn train_encoder(
     let mut training = Training {
         config,
         observe,
+        // Batches are numbered by steps: a resumed training goes on with the next one.
         loader: Prefetch::start(run.loader_threads, trainer.steps(), move |number| {
             let pairs = number * batch..(number + 1) * batch;
             pairs.map(|pair| maker.pair(pair)).collect()
@@ -187,6 +189,7 @@ impl Task for Training<'_> {
         };
         let mut means = Means::default();
         for number in 0..VALIDATION_PAIRS {
+            // Two pairs together, as cells of another pair are negatives too.
             let pairs = [maker.pair(2 * number)?, maker.pair(2 * number + 1)?];
             means.add(no_grad(|| self.loss_of(&pairs))?.1);
         }

@@ -82,11 +82,13 @@ impl FeatureCache {
                 number as usize % source.len(),
             );
             let sweep = source.posed_sweep(index, format.range_m())?;
+            // A stream for each number: augmentation does not depend on the number of threads.
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             rng.set_stream(number);
             let (turn, keep) = match copy {
                 0 => (Isometry3::identity(), 1.0),
                 _ => {
+                    // Never 0: nothing can be drawn from an empty range.
                     let angle = augmentation.turn_rad.clamp(1e-6, PI);
                     let turn = yaw(rng.random_range(-angle..angle));
                     (turn, rng.random_range(augmentation.keep..=1.0))
@@ -127,6 +129,7 @@ impl FeatureCache {
 
     /// Lets the regression targets be relative to another origin, metres in the world.
     pub(crate) fn move_origin(&mut self, origin_m: [f64; 3]) -> Result<(), TchError> {
+        // The difference is taken in f64; what remains is small enough for f32.
         let moved: [f32; 3] =
             std::array::from_fn(|axis| (self.origin_m[axis] - origin_m[axis]) as f32);
         let moved = tensor(&moved, &[3], self.targets_m.device())?;
@@ -196,6 +199,7 @@ impl Builder {
         for (cell, &sweep) in self.places.iter().zip(&self.sweep_of_cell) {
             let [x, y, z] = cell.centroid_m.map(f64::from);
             let place = self.poses[sweep as usize] * Point3::new(x, y, z);
+            // Subtracted in f64: world coordinates are too large for f32.
             targets.extend((0..3).map(|axis| (place[axis] - origin_m[axis]) as f32));
         }
         let sensor: Vec<[f32; 3]> = self.places.iter().map(|cell| cell.centroid_m).collect();

@@ -106,6 +106,7 @@ impl PairMaker {
     /// [`Error::NoMatches`] when neighbouring sweeps have no matching cells, for example because they are
     /// empty.
     pub(crate) fn pair(&self, number: u64) -> Result<Pair, Error> {
+        // A stream for each number: a pair does not depend on the thread that makes it.
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(number);
         for _ in 0..TRIES {
@@ -127,6 +128,7 @@ impl PairMaker {
     }
 
     fn build(&self, anchor: usize, partner: usize, rng: &mut ChaCha8Rng) -> Pair {
+        // Positions near the anchor are small enough for f32.
         let origin = self.store.sweeps[anchor].world_from_sensor.translation;
         let mut turned = |index: usize| {
             let stored = &self.store.sweeps[index];
@@ -150,6 +152,7 @@ impl PairMaker {
         // The partners of the anchor's cells, and others as negatives.
         let mut rows: Vec<usize> = matched.iter().map(|&(_, partner)| partner).collect();
         rows.extend(choose(sweep.cells(), CELLS, rng));
+        // Each candidate occurs once: the map has its index among the distinct rows.
         let mut seen = HashMap::new();
         let mut distinct = Vec::new();
         for row in rows {
@@ -235,6 +238,7 @@ impl<'a> Grid<'a> {
     fn nearest(&self, point: [f32; 3]) -> Option<usize> {
         let [x, y, z] = cube(point);
         let mut best = (MATCH_M * MATCH_M, None);
+        // Cubes have the search radius as edge: these 27 hold all positions within it.
         let cubes = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| [dx, dy]));
         let cubes = cubes.flat_map(|[dx, dy]| (-1..=1).map(move |dz| [x + dx, y + dy, z + dz]));
         for &index in cubes.filter_map(|cube| self.cubes.get(&cube)).flatten() {
@@ -273,6 +277,7 @@ fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
             .flatten()
             .copied();
         let in_range = candidates.filter(|&other| {
+            // A bridge and the road below it are near in the plane alone.
             let other_m = store.sweeps[other as usize].world_from_sensor.translation;
             let offset = other_m.vector - own.world_from_sensor.translation.vector;
             other as usize != index && offset.xy().norm() <= PAIR_RANGE_M && offset.z.abs() <= 2.0

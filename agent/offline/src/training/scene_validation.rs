@@ -88,6 +88,7 @@ pub(super) fn validate(
             kind,
         };
         let found = wider_search::search(&search, &coordinates, &mut stopwatch())?;
+        // A missing pose is infinitely far off: it counts in the medians and is no success.
         let (metres, degrees) = found.solved.map_or((f64::INFINITY, 180.0), |found| {
             let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
             (error.distance_m, error.angle_deg)

@@ -44,6 +44,7 @@ impl StoredSweep {
             world,
             drive,
             world_from_sensor,
+            // The cast saturates: coordinates beyond 327 m stay at the end of the range of i16.
             points: points
                 .iter()
                 .map(|point| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16))
@@ -238,6 +239,7 @@ impl SweepList {
     pub(super) fn posed_sweep(&self, index: usize, range_m: f64) -> Option<PosedSweep> {
         let (frame, world_from_sensor) = self.posed_frame(index)?;
         let (mut points, range) = (frame.points.xyzi, range_m as f32);
+        // A NaN in x or y fails the comparison and is left out too.
         points.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
         Some(PosedSweep {
             points,
@@ -282,6 +284,7 @@ impl SweepStore {
         let source = Arc::clone(&list);
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
         let mut reader = Prefetch::start(threads, 0, move |number: u64| {
+            // The threads also ask for numbers beyond the end.
             let is_known = (number as usize) < count;
             is_known.then(|| source.read(number as usize, range_m))?
         });

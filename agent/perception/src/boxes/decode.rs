@@ -63,11 +63,14 @@ pub fn decode(
     let per_cell = anchors.yaws_rad.len();
     let cells = anchors.len() / per_cell.max(1);
     // The sigmoid is increasing: a logit clearly below the threshold's needs no exponential.
+    // The margin covers the rounding of this logit.
     let lowest = logit(threshold) - 1e-3;
     let mut decoded = Vec::new();
     for cell in 0..cells {
         for anchor in 0..per_cell {
+            // The head is channel by channel, `[A, H, W]`, while anchors are numbered cell by cell.
             let logit = scores[anchor * cells + cell];
+            // Both comparisons are false for NaN.
             if logit < lowest || sigmoid(logit) <= threshold || logit.is_nan() {
                 continue;
             }
@@ -99,6 +102,7 @@ pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
     };
     Some(Box3d {
         center_m: [dx * diagonal + x, dy * diagonal + y, dz * h + z],
+        // The code is in the order h, w, l, the box in the order l, w, h.
         size_m: [size(5, l), size(4, w), size(3, h)],
         heading_rad: dyaw + yaw,
     })

@@ -102,8 +102,10 @@ pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec
     let candidates = agents.iter().enumerate();
     let candidates = candidates.flat_map(|(agent, boxes)| project(agent, boxes));
     let mut candidates: Vec<Candidate> = candidates.collect();
+    // Before the suppression: an implausible box must not remove a good one.
     candidates.retain(|candidate| is_vehicle_sized(&candidate.corners, config));
     let mut kept = suppress(&candidates, config);
+    // After the suppression: a box beyond the range still removes those that it overlaps.
     kept.retain(|candidate| corners_within(&candidate.corners, config.keep_range_m));
     kept
 }
@@ -152,6 +154,7 @@ pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
         |from: usize, to: usize| [0, 1].map(|axis: usize| corners[to][axis] - corners[from][axis]);
     let mean_length =
         |edges: [[f64; 2]; 4]| edges.iter().map(|[x, y]| x.hypot(*y)).sum::<f64>() / 4.0;
+    // Edges from rear to front, then from right to left, in the order of `Box3d::corners`.
     let along = [edge(3, 0), edge(2, 1), edge(7, 4), edge(6, 5)];
     let across = [edge(0, 1), edge(3, 2), edge(4, 5), edge(7, 6)];
     let heights = (0..4).map(|corner| (corners[corner + 4][2] - corners[corner][2]).abs());

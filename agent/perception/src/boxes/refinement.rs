@@ -105,6 +105,7 @@ impl BoxRefinement {
     fn values(&self, box3d: &Box3d, score: f32) -> [f32; VALUES] {
         let [x_m, y_m, z_m] = box3d.center_m;
         let [length, width, height, sin, cos] = roi::shape(box3d, self.usual_size_m);
+        // A logit is at most 9.2 in magnitude, so that all inputs stay within about 2.3 of zero.
         [
             logit(score) / 4.0,
             (x_m.hypot(y_m) / 50.0).min(2.0),
@@ -134,6 +135,7 @@ pub fn corrected(mut detections: Vec<Detection>, corrections: &[f32]) -> Vec<Det
             heading_rad,
         } = &mut detection.box3d;
         let (sin, cos) = heading_rad.sin_cos();
+        // In sizes of the uncorrected box, so positions come before sizes.
         let [along_m, across_m, up_m] = [0, 1, 2].map(|axis| at(axis) * size_m[axis]);
         center_m[0] += cos * along_m - sin * across_m;
         center_m[1] += sin * along_m + cos * across_m;

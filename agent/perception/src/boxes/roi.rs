@@ -75,6 +75,7 @@ fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
     };
     let positions: Vec<f32> = { boxes.iter().flat_map(sampling_positions) }
         .flat_map(|[x_m, y_m]| {
+            // x comes first, although the map is `[1, C, H, W]`.
             [
                 normalised(x_m, grid.x_min_m, grid.width),
                 normalised(y_m, grid.y_min_m, grid.height),
@@ -83,6 +84,7 @@ fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
         .collect();
     let positions = tensor(&positions, &[1, -1, 1, 2], map.device())?;
     // Bilinear between the cells, zeros beyond them.
+    // Without aligned corners: -1 and 1 are the outer edges of the outer cells.
     let sampled = map.f_detach()?.f_grid_sampler(&positions, 0, 0, false)?;
     sampled.f_view([map.size4()?.1, -1])?.f_transpose(0, 1)
 }

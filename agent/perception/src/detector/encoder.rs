@@ -100,6 +100,7 @@ impl BevEncoder {
                 quantisation,
                 ..
             } => {
+                // Pillar features end with a ReLU, so that their zero point is 0.
                 canvas.fill(0);
                 projection.scatter_quantised(pillars, pillar_grid, *quantisation, canvas);
                 Tensor::f_from_slice(canvas)

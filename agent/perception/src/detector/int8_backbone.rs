@@ -137,6 +137,7 @@ pub(super) fn observe_backbone(
         upsampled.push(deblock.forward(&x, false));
     }
     let wide = Tensor::f_cat(&upsampled, 1)?;
+    // The output of the last layer is `f32` and has no scale.
     let hidden = shrink
         .layers
         .split_last()

@@ -85,6 +85,7 @@ impl Detector {
         let pillars = PointPillars::new(&network.root(), config)?;
         let refinement =
             refinement::is_in(weights).then(|| BoxRefinement::new(&network.root(), config));
+        // When all networks are built: it fills every variable that exists.
         weights.copy_into(&network)?;
         let (sha256, encoder_sha256) = (weights.sha256().to_owned(), encoder_sha256(weights));
         let detector = Self {
@@ -93,6 +94,7 @@ impl Detector {
             refinement,
             ..Self::from_network(pillars)
         };
+        // The integer operators are for the CPU: elsewhere the scales are ignored.
         match weights.activation_scales()? {
             Some(scales) if device == Device::Cpu => {
                 let quantised = detector.quantised(&scales);
@@ -228,6 +230,7 @@ impl Detector {
     }
 
     fn checked_sweep(&self, encoded: Encoded, cloud: &PointCloud) -> Result<Encoded> {
+        // The map of an empty sweep is valid and would pass for an empty road.
         if encoded.points == 0 {
             return Err(DetectorError::NoPoints {
                 points: cloud.len(),
@@ -235,6 +238,7 @@ impl Detector {
             });
         }
         check_values("the feature map of the sweep", &encoded.features)?;
+        // A scale that is far too small leaves the map finite, and wrong.
         for (level, values) in encoded.levels.iter().enumerate() {
             if values.is_saturated()? {
                 return Err(DetectorError::Saturated { level });
@@ -263,6 +267,7 @@ impl Detector {
     fn pillars(&mut self, crop: &Crop, cloud: &PointCloud) -> Pillars {
         self.cropped.clear();
         crop.keep(&cloud.xyzi, &mut self.cropped);
+        // After the crop, which is in the vehicle's frame.
         if self.config.y_axis == YAxis::Right {
             for point in &mut self.cropped {
                 point[1] = -point[1];

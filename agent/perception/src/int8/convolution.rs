@@ -82,6 +82,7 @@ fn cells_to_squares(y: &Tensor, edge: i64) -> Result<Tensor, TchError> {
     let (_, _, height, width) = y.size4()?;
     let cells = y.f_permute([0, 2, 3, 1])?;
     let cells = cells.f_reshape([height, width, edge, edge, -1])?;
+    // From `[H, W, row, column, C]` to `[H, row, W, column, C]`: the rows of the up-sampled map.
     let rows = cells.f_permute([0, 2, 1, 3, 4])?.f_contiguous()?;
     let map = rows.f_view([1, height * edge, width * edge, -1])?;
     map.f_permute([0, 3, 1, 2])

@@ -83,6 +83,7 @@ impl Layer {
             tensor(&self.quantised.scales),
             tensor(&self.quantised.zero_points),
             self.bias.as_ref().map_or(IValue::None, tensor),
+            // An output scale of 1 leaves `f32` results as they are.
             IValue::Double(output.map_or(1.0, Scale::step)),
             IValue::Int(if output.is_some() { U8 } else { F32 }),
             IValue::String(if relu { "relu" } else { "none" }.to_owned()),

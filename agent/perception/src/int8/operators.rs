@@ -33,6 +33,7 @@ impl Operators {
         if let Some(operators) = OPERATORS.get() {
             return Ok(operators);
         }
+        // Outside of `get_or_init`, as it may fail: of two threads that load at once one drops its module.
         let module = CModule::load_data(&mut Cursor::new(archive()?))?;
         Ok(OPERATORS.get_or_init(|| Self(module)))
     }

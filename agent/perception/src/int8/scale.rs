@@ -72,6 +72,7 @@ impl Quantisation {
     /// # Errors
     /// Those of the tensor library.
     pub fn quantise(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        // The reciprocal of a power of two is exact.
         let mut steps = x.f_mul_scalar(self.scale.step().recip())?.f_round_()?;
         if self.zero_point != 0 {
             steps = steps.f_add_scalar_(i64::from(self.zero_point))?;
@@ -86,6 +87,7 @@ impl Quantisation {
         let (factor, zero) = (self.scale.step().recip() as f32, f32::from(self.zero_point));
         for (step, value) in steps.iter_mut().zip(values) {
             // A sum with this number is rounded to a whole one, half to even; rounding by the processor needs SSE 4.1.
+            // The clamp keeps the sum in the range in which `f32` are whole numbers.
             let rounded = (value * factor).clamp(-256.0, 256.0) + WHOLE - WHOLE;
             let place = (rounded + zero).clamp(0.0, MAX_ACTIVATION) + WHOLE;
             // The whole number is in the lowest bits of the sum.

@@ -45,13 +45,16 @@ impl ScaleSearch {
         let count = values.numel() as f64;
         for exponent in EXPONENTS {
             let scale = Scale::of_exponent(exponent);
+            // Infinite where all values are 0: any scale has the error 0 then.
             let reach = scale.step() * f64::from(MAX_ACTIVATION) / largest;
             // Measured where the best scale can be. Finer steps clamp nearly all; coarser ones err evenly.
             let error = |zero_point| match reach {
                 ..0.03 => Ok(power),
                 0.03..4.0 => squared_error(values, Quantisation { scale, zero_point }),
+                // Rounding to steps of width s errs evenly by up to s / 2: s^2 / 12 in the mean square.
                 _ => Ok(power.min(count * scale.step().powi(2) / 12.0)),
             };
+            // Both are summed up: the first negative value may come with a later sweep.
             *observed.unsigned.entry(exponent).or_default() += error(0)?;
             *observed.centred.entry(exponent).or_default() += error(MIDDLE)?;
         }

@@ -23,6 +23,7 @@ pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchEr
         Some(valid) => scores.f_masked_fill(&valid.f_logical_not()?, f64::NEG_INFINITY)?,
         None => scores,
     };
+    // Over the agents. Cells that no agent covers would be NaN, but the ego covers all.
     let weights = scores.f_softmax(0, Kind::Float)?.f_unsqueeze(1)?;
     (maps * weights).f_sum_dim_intlist([0_i64].as_slice(), false, Kind::Float)
 }

@@ -71,6 +71,7 @@ impl Norm {
 
     /// The norm with its running statistics as `x * scale + shift`, both `[C]`.
     pub(crate) fn scale_shift(&self) -> (Tensor, Tensor) {
+        // weight * (x - mean) / sqrt(var + eps) + bias, written as a line in x.
         let scale = &self.weight / (&self.running_var + self.eps).sqrt();
         let shift = &self.bias - &self.running_mean * &scale;
         (scale, shift)
@@ -233,9 +234,11 @@ impl ConvLayer {
         let (true, Some(bias), None) = (pointwise, &self.bias, &self.norm) else {
             return self.forward(x, false).f_contiguous();
         };
+        // A view if the channels are innermost in memory, as in the maps of inference.
         let cells = x.f_permute([0, 2, 3, 1])?;
         let cells = cells.f_reshape([height * width, input])?;
         let weight = self.weight.f_reshape([kernel[0], input])?;
+        // `[C_out, C_in]` times `[C_in, H * W]`: the channels of the result are outermost.
         let mut rows = bias.f_unsqueeze(1)?.f_addmm(&weight, &cells.f_tr()?)?;
         let rows = if self.relu { rows.f_relu_()? } else { rows };
         rows.f_view([1, kernel[0], height, width])
@@ -263,6 +266,7 @@ impl ConvLayer {
             Direction::Up => {
                 let (input, output, edge, _) = self.weight.size4()?;
                 (geometry.stride, geometry.upsampling) = (1, edge);
+                // Output channels become `[edge, edge, C_out]`: biases repeat for each cell of the square.
                 bias = bias.map(|bias| bias.f_repeat([edge * edge])).transpose()?;
                 let rows = self.weight.f_permute([2, 3, 1, 0])?;
                 rows.f_reshape([edge * edge * output, input, 1, 1])?
@@ -285,6 +289,7 @@ impl ConvLayer {
                 let (scale, shift) = norm.scale_shift();
                 let mut shape = [1_i64; 4];
                 shape[output_dim] = -1;
+                // The norm comes after the bias and scales it, too.
                 let shift = match bias {
                     Some(bias) => bias * &scale + &shift,
                     None => shift,

@@ -94,6 +94,7 @@ impl DetectionHead {
 impl HeadOutput {
     /// Confidence of a vehicle around each cell: `[B, H, W]`, 0..1, the best of its anchors.
     pub fn confidence(&self) -> Tensor {
+        // The sigmoid is increasing: the best logit gives the best probability.
         self.scores.amax([1], false).sigmoid().to_kind(Kind::Float)
     }
 }

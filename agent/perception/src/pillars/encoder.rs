@@ -32,6 +32,7 @@ impl PillarEncoder {
     /// Features of every pillar: `[M, C]`.
     pub fn forward(&self, batch: &PillarBatch, train: bool) -> Tensor {
         let points = batch.points();
+        // It passes through the same layer and becomes the floor of pillars with a free slot.
         let zero_row = batch.features.new_zeros(
             [1, POINT_FEATURES as i64],
             (batch.features.kind(), batch.device()),

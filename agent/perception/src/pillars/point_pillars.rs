@@ -36,6 +36,7 @@ impl PointPillars {
     /// # Errors
     /// [`ConfigError`] when no network can be built from `config`.
     pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Result<Self, ConfigError> {
+        // Before anything is allocated: the numbers may come from any file.
         config.validate()?;
         let channels = config.feature_channels();
         Ok(Self {

@@ -55,12 +55,14 @@ impl PillarProjection {
                 .collect()
         };
         let bias_of = |channel: usize| bias.get(channel).copied().unwrap_or(0.0);
+        // x, y, z are in the position and in both offsets, so their three weights add up.
         let position = axes(|row, axis| row[axis] + row[4 + axis] + row[7 + axis]);
         Self {
             channels,
             point: (position.into_iter().enumerate())
                 .map(|(block, [x, y, z])| [x, y, z, lanes(block, &|row| row[3])])
                 .collect(),
+            // Point - mean = (point - centre) - (mean - centre): hence the sign.
             mean: axes(|row, axis| -row[4 + axis]),
             center: axes(|row, axis| row[axis]),
             bias: (0..blocks)

@@ -110,6 +110,7 @@ impl Voxeliser {
         let mut pillars = self.assign(points);
         let starts = self.gather(points, &mut pillars);
         debug_assert_eq!(starts, pillars.points.len());
+        // Only cells with a pillar are reset, not the whole grid.
         for coord in &pillars.coords {
             let [z, y, x] = coord.map(|index| index as usize);
             self.pillar_of_cell[(z * self.grid[1] + y) * self.grid[0] + x] = NONE;
@@ -153,6 +154,7 @@ impl Voxeliser {
         let cell = (z as usize * self.grid[1] + y as usize) * self.grid[0] + x as usize;
         let mut pillar = self.pillar_of_cell[cell];
         if pillar == NONE {
+            // No new pillar, but those that exist still take points.
             if pillars.len() >= self.max_pillars {
                 return NONE;
             }

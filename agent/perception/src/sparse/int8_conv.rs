@@ -35,6 +35,7 @@ impl Int8SparseConv {
     pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor> {
         let channels = x.size2()?.1;
         // The library gathers rows of floats many times faster than rows of bytes; nothing is computed with them here.
+        // The zeros of missing neighbours are the quantised zero, as features are never negative.
         let words = index.gather(&x.f_view_dtype(Kind::Float)?)?;
         self.linear.forward(
             &words

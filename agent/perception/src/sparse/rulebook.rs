@@ -46,6 +46,7 @@ impl Rulebook {
         let mut rows = vec![NONE; halved.len() * KERNEL_VOLUME];
         for (row, coord) in sites.coords().iter().enumerate() {
             // An even coordinate is the centre of one output; an odd one lies between two.
+            // The shift rounds negative coordinates down, too, unlike a division.
             let choices = coord.map(|axis| match axis & 1 {
                 0 => [Some((axis >> 1, 0)), None],
                 _ => [Some((axis >> 1, 1)), Some(((axis >> 1) + 1, -1))],
@@ -92,6 +93,7 @@ impl Rulebook {
         for book in rulebooks {
             index.extend(book.rows.iter().map(|&row| {
                 if row == NONE {
+                    // One beyond the last input: the row of zeros that `gather` appends.
                     inputs as i64
                 } else {
                     first + i64::from(row)

@@ -63,11 +63,13 @@ impl Sites {
         self.rows
             .get(&key(coord))
             .copied()
+            // The key of a coordinate out of range is that of another site.
             .filter(|_| Self::holds(coord))
     }
 
     /// The sites of the next level, one for every 2x2x2 voxels with a site in them, and the row in it of each site.
     pub fn halved(&self) -> (Self, Vec<u32>) {
+        // The shift rounds down: voxels -2 and -1 share one, as 0 and 1 do.
         Self::collect(self.coords.iter().map(|coord| coord.map(|axis| axis >> 1)))
     }
 }
@@ -93,6 +95,7 @@ impl Hasher for KeyHasher {
 
     fn write_u64(&mut self, value: u64) {
         let mixed = (self.0 ^ value).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        // Low bits of a product depend on low bits alone: the high ones are mixed into them.
         self.0 = mixed ^ (mixed >> 32);
     }
 

@@ -98,12 +98,15 @@ impl AdamW {
             if !norm.is_finite() {
                 return Ok(Step::Skipped);
             }
+            // The small term keeps a gradient of zero from a division by zero.
             let scale = (self.config.max_gradient_norm / (norm + 1e-6)).min(1.0);
             self.steps += 1;
             let (config, steps) = (self.config, self.steps as f64);
+            // The moments start at zero: without these corrections the first steps are biased.
             let mean_correction = 1.0 - config.beta1.powf(steps);
             let square_correction = 1.0 - config.beta2.powf(steps);
             for (entry, gradient) in self.entries.iter_mut().zip(&gradients) {
+                // A variable that is not part of the loss does not decay either.
                 if !gradient.defined() {
                     continue;
                 }
@@ -115,6 +118,7 @@ impl AdamW {
                 let _ = mean.f_mul_scalar_(config.beta1)?.f_add_(&change)?;
                 let mut root = (&*square / square_correction).f_sqrt_()?;
                 let deviation = root.f_add_scalar_(config.eps)?;
+                // Decoupled: on the variable itself, not through the gradient and its moments.
                 if entry.decays {
                     let kept = 1.0 - learning_rate * config.weight_decay;
                     let _ = entry.variable.f_mul_scalar_(kept)?;

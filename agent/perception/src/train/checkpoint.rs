@@ -90,6 +90,7 @@ pub(crate) fn restore<P: DeserializeOwned>(
         .restore(&tensors, steps)
         .map_err(|name| format!("no {name:?} of the right shape"))
         .at(path)?;
+    // Parameters last: the optimizer may still refuse the file.
     for (mut variable, stored) in targets {
         no_grad(|| variable.f_copy_(stored)).at(path)?;
     }
@@ -103,7 +104,9 @@ fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorErro
         let shape: Vec<i64> = view.shape().iter().map(|&size| size as i64).collect();
         (name.to_owned(), Tensor::from_slice(&values).reshape(shape))
     };
-    Ok(file.iter().map(read).collect())
+    // Tensors of another type are none of a checkpoint: they are missed by name.
+    let all = { file.iter() }.filter(|(_, view)| view.dtype() == Dtype::F32);
+    Ok(all.map(read).collect())
 }
 
 #[cfg(test)]

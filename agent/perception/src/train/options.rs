@@ -137,6 +137,7 @@ impl TrainingOptions {
         match (self.steps, self.epochs, self.minutes) {
             (Some(steps), _, _) if steps > 0 => Ok(Length::Steps(steps)),
             (_, Some(epochs), _) if epochs > 0.0 => Ok(Length::Epochs(epochs)),
+            // The conversion refuses NaN, infinity and negative numbers.
             (_, _, Some(minutes)) => match Duration::try_from_secs_f64(60.0 * minutes) {
                 Ok(time) if !time.is_zero() => Ok(Length::Time(time)),
                 _ => Err(OptionsError::Length),

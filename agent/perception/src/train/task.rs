@@ -101,6 +101,7 @@ impl Trainer {
         while task.share_done(self) < 1.0 {
             let loss = task.loss(self)?;
             let is_taken = self.step(&loss, task.share_done(self))?;
+            // Right after the step, before a report or a validation that may take long.
             self.check_interruption(task.variables())?;
             task.stepped(self, is_taken)?;
             if task.is_report_due(self) {

@@ -118,6 +118,7 @@ impl Trainer {
         }
         let seconds_before = progress.seconds;
         progress.preparing_seconds += started.elapsed().as_secs_f64();
+        // Last: until here a signal ends the process at once.
         let steps = run.interruption.steps();
         Ok(Self {
             run: run.clone(),
@@ -183,6 +184,7 @@ impl Trainer {
         if self.skipped >= MAX_SKIPPED {
             return Err(TrainingError::Diverged(self.skipped));
         }
+        // A skipped step counts, too: length and learning rate go on.
         self.progress.step += 1;
         Ok(taken)
     }

@@ -22,6 +22,7 @@ const METADATA: &str = "__metadata__";
 /// [`FileError`] when the file is missing, not a complete safetensors file or not writable.
 pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, FileError> {
     let old = bounded_file::read(path, MAX_BYTES).at(path)?;
+    // `with_header` relies on a valid length and header.
     SafeTensors::deserialize(&old).map_err(|error| incomplete(path, old.len(), error))?;
     let new = with_header(&old, |entries| {
         let metadata = entries.entry(METADATA.to_owned());

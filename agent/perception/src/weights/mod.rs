@@ -102,6 +102,7 @@ impl Weights {
         for (name, tensor) in self.tensors.iter().filter(|(name, _)| wanted(name)) {
             hash.update(format!("{name} {:?}\n", tensor.shape));
             for value in &tensor.values {
+                // As `f32`: the number format of the file does not matter.
                 hash.update(value.to_le_bytes());
             }
         }
@@ -239,6 +240,7 @@ impl Weights {
     pub fn copy_some_into(&self, network: &VarStore, wanted: impl Fn(&str) -> bool) -> Result<()> {
         let mut variables: BTreeMap<_, _> = network.variables().into_iter().collect();
         variables.retain(|name, _| wanted(name));
+        // All are checked before the first is copied: after an error the network is as it was.
         for (name, variable) in &variables {
             self.checked(name, variable.size())?;
         }
@@ -281,6 +283,7 @@ fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<
         Dtype::F16 => numbers(data, |bytes| f16::from_le_bytes(bytes).to_f32()),
         Dtype::BF16 => numbers(data, |bytes| bf16::from_le_bytes(bytes).to_f32()),
         Dtype::F32 => numbers(data, f32::from_le_bytes),
+        // Beyond the range of `f32` it becomes infinite, which the check below refuses.
         Dtype::F64 => numbers(data, |bytes| f64::from_le_bytes(bytes) as f32),
         Dtype::I64 | Dtype::I32 => return Ok(None),
         dtype => {

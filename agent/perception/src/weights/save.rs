@@ -67,6 +67,7 @@ pub fn with_header(
     file: &[u8],
     change: impl FnOnce(&mut BTreeMap<String, Value>),
 ) -> Result<Vec<u8>, serde_json::Error> {
+    // Length of the header (8 bytes, little endian), header, data. Offsets count from the data.
     let length: [u8; 8] = std::array::from_fn(|byte| file.get(byte).copied().unwrap_or(0));
     let (header, data) = file[8..].split_at(u64::from_le_bytes(length) as usize);
     let mut entries = serde_json::from_slice(header)?;

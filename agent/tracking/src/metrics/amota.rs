@@ -50,6 +50,7 @@ impl Amota {
                 amotp_m += MATCH_DISTANCE_M;
                 continue;
             };
+            // With few matches several recalls have the same threshold: their counts are made once.
             let point = match last.take().filter(|last| last.min_score == min_score) {
                 Some(same) => same,
                 None => OperatingPoint::of(&sequences, min_score),
@@ -57,6 +58,7 @@ impl Amota {
             amota += motar(&point.counts);
             amotp_m += point.counts.motp_m().unwrap_or(MATCH_DISTANCE_M);
             let clipped = |point: &OperatingPoint| point.counts.mota().unwrap_or(0.0).max(0.0);
+            // Recalls fall: of equal values the first, that of the highest recall, stays.
             if best
                 .as_ref()
                 .is_none_or(|best| clipped(&point) > clipped(best))

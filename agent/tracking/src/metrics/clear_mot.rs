@@ -102,6 +102,7 @@ impl ClearMot {
             };
             let matched = &frame.tracks[track];
             self.distance_sum_m += frame.distance_m(index, track);
+            // The last track outlives misses: a return under another id is a switch.
             match history.last_track.replace(matched.id) {
                 Some(last) if last != matched.id => self.switches += 1,
                 _ => {
@@ -146,6 +147,7 @@ fn pairs(
             .get(&object.id)
             .and_then(|history| history.last_track);
         let track = last.and_then(|last| frame.tracks.iter().position(|track| track.id == last));
+        // Two objects may have had the same track last: the first one in the frame keeps it.
         if let Some(track) =
             track.filter(|&track| !is_taken.1[track] && near(index, track).is_some())
         {

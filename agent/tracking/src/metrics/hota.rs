@@ -80,8 +80,10 @@ fn add(sequence: &Sequence, sums: &mut [Sums; THRESHOLDS]) {
             let aligned = alignment.get(&ids(object, track)).copied().unwrap_or(0.0);
             -aligned * similarity[(object, track)]
         });
+        // One assignment for all thresholds, as its costs do not depend on them.
         let pairs = assignment::of_lowest_cost(&costs);
         for (index, (sums, matches)) in sums.iter_mut().zip(&mut matches).enumerate() {
+            // A similarity that equals the threshold has to pass in spite of rounding.
             let threshold = 0.05 * (index + 1) as f64 - f64::EPSILON;
             let near = pairs.iter().filter(|&&pair| similarity[pair] >= threshold);
             let before = sums.matches;
@@ -106,6 +108,7 @@ fn alignment(sequence: &Sequence, lengths: &(Lengths<i64>, Lengths<u64>)) -> Pai
     let mut weights = Pairs::new();
     for frame in sequence.frames() {
         let similarity = similarities(frame);
+        // The sum of all columns: one number per row, that is per object.
         let of_object = similarity.column_sum();
         let of_track = similarity.row_sum();
         for (object, true_point) in frame.objects.iter().enumerate() {

@@ -89,6 +89,7 @@ fn print(capacity: &Capacity, is_first: bool) -> anyhow::Result<()> {
             format!("{units:.2}"),
         ]);
     };
+    // The sums are means over all processes, the stages are those of the first one alone.
     let sums = [("agent", capacity.agent_ms), ("ego", capacity.fuse_ms)];
     for ((part, sum), stages) in sums.into_iter().zip(&capacity.stages) {
         for (stage, ms) in stages {

@@ -77,6 +77,7 @@ impl Arguments {
         for &method in &self.method {
             scenario.method = method;
             scenario.run = Some(RunId::new(&format!("{name}-{method}")).map_err(BadInput::of)?);
+            // Only the last run is shown, so only that one needs a recording.
             if self.view && Some(&method) == self.method.last() {
                 scenario.record.get_or_insert_default();
             }

@@ -222,6 +222,7 @@ impl Arguments {
         };
         let intensity_scale = self.intensity.scale;
         Ok(Trial {
+            // Required unless --table is given, which does not come here.
             dataset: self.dataset.clone().unwrap_or_default(),
             scenarios: self.scenarios.map(at_most),
             intensity_scale,
@@ -251,6 +252,7 @@ impl Arguments {
             maps: self.feature_maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: self.codec.0.dtype,
+                // The folder was asked for by name, so its size has no limit.
                 limit_bytes: u64::MAX,
                 intensity_scale,
             }),
@@ -269,6 +271,7 @@ impl Arguments {
         let maps = any_exchanges(Exchange::Features);
         let boxes = any_exchanges(Exchange::Boxes) || self.boxes.is_some();
         let messages = !{ self.method.iter() }.all(|one| one.exchange() == Exchange::Nothing);
+        // With --feature-maps the codec also sets the format of kept maps, whatever is sent.
         let rule = if encodes && self.feature_maps.is_none() && !maps {
             "options of the codec and of the rate are for feature maps: METHODS sends none"
         } else if self.boxes.is_some() && !maps {
@@ -376,6 +379,7 @@ impl TableObserver for TableProgress {
             "{table}: {row}, {column}{}",
             if known { ", known" } else { "" }
         );
+        // Without a terminal the spinner shows nothing, so each cell gets a line of its own.
         if self.0.is_hidden() {
             output::note(&text);
         }

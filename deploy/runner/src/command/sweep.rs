@@ -40,6 +40,7 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Runs the experiment and prints its table.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        // One thread for each process: parallel work comes from --jobs alone.
         tch::set_num_threads(1);
         let name = sweep::read(&self.experiment).map_err(BadInput::of)?.name;
         let out = self
@@ -58,6 +59,7 @@ impl Arguments {
             return Ok(Outcome::Done);
         }
         let sweep = Sweep::open(&self.experiment, &out).map_err(BadInput::of)?;
+        // Before the slice: a worker of a Slurm task inherits the variables of its array.
         if self.worker {
             sweep.work()?;
             return Ok(Outcome::Done);

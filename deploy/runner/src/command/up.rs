@@ -66,6 +66,7 @@ impl Arguments {
             scenario.record.get_or_insert_default();
         }
         scenario.network.metrics = self.metrics.or(scenario.network.metrics);
+        // Only now: options may fill in or replace what the file says.
         scenario.check(&self.scenario).map_err(BadInput::of)?;
         let result = run_scenario(
             &scenario,

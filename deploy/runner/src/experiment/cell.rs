@@ -43,6 +43,7 @@ pub struct Cell {
 impl CellKey {
     /// Cache file of the cell.
     fn file(&self, folder: &Path) -> PathBuf {
+        // 24 of 64 hex digits name the file. The whole key is compared after reading.
         let digits: String = self.sha256.chars().take(NAME_DIGITS).collect();
         folder.join(format!("{}-{digits}.json", file_name(self.method)))
     }
@@ -66,6 +67,7 @@ impl Cell {
                 path.display()
             )
         })?;
+        // Another key with the same first digits is no hit.
         Ok((cell.key.sha256 == key.sha256).then_some(cell))
     }
 

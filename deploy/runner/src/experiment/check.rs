@@ -137,6 +137,7 @@ pub(super) fn check_scenes<'a>(
 /// Checks every axis on its own.
 fn axes(grid: &Grid) -> Result<(), String> {
     values("grid.method", Some(&grid.method), |_| Ok(()))?;
+    // A reference is a method of the same grid, so it may not repeat one of them.
     let all = [&grid.method[..], &grid.reference].concat();
     values("grid.method with grid.reference", Some(&all), |_| Ok(()))?;
     values("grid.codec", grid.codec.as_ref(), codec)?;
@@ -146,6 +147,7 @@ fn axes(grid: &Grid) -> Result<(), String> {
         "grid.bandwidth_mbps",
         grid.bandwidth_mbps.as_ref(),
         |mbps| match *mbps {
+            // Infinity stands for an unlimited link and is in no range of numbers.
             f64::INFINITY => Ok(()),
             mbps => number("grid.bandwidth_mbps", mbps, 1e-6, 1e6),
         },
@@ -164,6 +166,7 @@ fn axes(grid: &Grid) -> Result<(), String> {
 }
 
 fn codec(codec: &CodecSpec) -> Result<(), String> {
+    // Written as a negation, so that NaN is refused too.
     if let Some(keep) = codec.keep.filter(|keep| !(*keep > 0.0 && *keep <= 1.0)) {
         return Err(format!(
             "grid.codec: keep is {keep}, must be above 0 and at most 1"
@@ -221,6 +224,8 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     {
         return Err("grid.codec.fit is a share of grid.bandwidth_mbps, which is left out".into());
     }
+    // A map captured at t can be fused until t + max_age_ms + deadline_ms: in the last frame that
+    // still accepts its age, at the end of that frame's wait.
     let oldest_ms = ego.max_age_ms as f64 + ego.deadline_ms as f64;
     if let Some(ms) = { grid.latency_ms.iter().flatten() }.find(|ms| **ms > oldest_ms) {
         return Err(format!(
@@ -247,6 +252,7 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     }
     let (mut loss, mut noise) = (grid.loss.iter().flatten(), grid.pose_noise.iter().flatten());
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
+    // A loss of 0 or 1 is certain, whatever the seed.
     let loses = loss.any(|share| *share > 0.0 && *share < 1.0);
     let errs = noise.any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
     let is_random = jitters || loses || errs || is_random(link);
@@ -284,6 +290,7 @@ fn values<T: PartialEq + Debug>(
 }
 
 fn number(field: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
+    // NaN is in no range, so it is refused here.
     match (low..=high).contains(&value) {
         true => Ok(()),
         false => Err(format!("{field} is {value}, must be {low} to {high}")),

@@ -133,6 +133,7 @@ impl Trial {
         provenance: Provenance,
         began: Instant,
     ) -> Metrics {
+        // Over a link the time of the scene passes. Without one only the time of computing is known.
         let (clock, seconds) = match self.setup.link {
             Some(_) => ("stepped", scores.seconds()),
             None => ("offline", began.elapsed().as_secs_f64()),
@@ -162,11 +163,13 @@ impl Trial {
         let Setup {
             agents, vehicles, ..
         } = &mut settings.setup;
+        // Only whether a vehicle has weights of its own counts here: their contents are in the provenance.
         for settings in std::iter::once(agents).chain(vehicles.values_mut()) {
             settings.weights = settings.weights.take().map(|_| PathBuf::new());
         }
         Ok(CellKey {
             method,
+            // The debug text has every field, so a new setting changes the key by itself.
             sha256: provenance.key(&format!("{method} {settings:?}")),
             provenance,
         })
@@ -279,6 +282,7 @@ fn judged(
     let precision = setup.models.precision;
     let mut evaluator = Evaluator::new(setup)?;
     let kept = trial.maps.as_ref();
+    // Early fusion encodes merged clouds, for which maps of single sweeps are of no use.
     if let Some(kept) = kept.filter(|_| method.exchange() != Exchange::Points) {
         evaluator = evaluator.with_maps(maps(kept, &weights, precision, data)?);
     }
@@ -301,6 +305,7 @@ fn judged(
             "scenario {} has no true poses of the ego {ego}: its results cannot be evaluated",
             scenario.name
         );
+        // One set of scores over all scenarios: AP orders the detections of all frames together.
         let scores = scores
             .get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
         scores.change_ego(ego);
@@ -314,6 +319,7 @@ fn judged(
                 false => ControlFlow::Break(()),
             }
         })?;
+        // A file could not be written. finish returns the error.
         if judged.is_break() {
             break;
         }

@@ -30,6 +30,7 @@ impl Experiment {
         for place in std::iter::once(&mut self.dataset).chain(&mut self.weights) {
             *place = folder.join(&place);
         }
+        // A name that is no preset is the path of a file.
         let is_file = |link: &&mut String| LinkConfig::preset(link).is_err();
         if let Some(link) = self.link.as_mut().filter(is_file) {
             *link = folder.join(&link).to_string_lossy().into_owned();

@@ -128,6 +128,7 @@ pub fn table(all: &[Metrics]) -> String {
         column("method", Left, &|metrics| metrics.method.clone()),
         column("poses", Left, &|metrics| metrics.pose_source.clone()),
     ];
+    // Streaming AP exists only where results have a time of publication.
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
     let name = if is_live { "answered" } else { "frames" };
     columns.push(column(name, Right, &frames));

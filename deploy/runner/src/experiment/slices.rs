@@ -44,6 +44,7 @@ impl Slice {
     /// Places of the cells of this slice, of `cells` in the order of the experiment. Cells of one encoder are
     /// neighbours in that order, so that most are in one slice.
     pub fn part(self, cells: usize) -> Range<usize> {
+        // Both ends are rounded down alike, so that neighbouring slices meet without a gap.
         cells * (self.number - 1) / self.count..cells * self.number / self.count
     }
 }
@@ -109,6 +110,7 @@ fn slurm(command: &str, count: usize) -> String {
 }
 
 fn parallel(command: &str, count: usize) -> String {
+    // GNU parallel hands its words to a shell once more, so the quoted command is quoted again.
     format!(
         "#!/usr/bin/env bash\n\
          set -euo pipefail\n\

@@ -280,6 +280,7 @@ impl Experiment {
     /// # Errors
     /// [`LinkError`] when the link cannot be read.
     pub fn trial(&self) -> Result<Trial, LinkError> {
+        // A grid replaces this seed by that of each point.
         let link = self.link().map(|link| EmulatedLink::open(link, 0));
         let mut setup = Setup {
             ego: self.ego.clone(),

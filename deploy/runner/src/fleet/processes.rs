@@ -140,6 +140,7 @@ impl Fleet {
         if let Some(weights) = settings.weights.take() {
             models.weights = weights;
         }
+        // Sweeps arrive on the wall clock only, and frames.csv has those of the ego alone.
         let notes_sweeps = *cav == self.ego && self.scenario.clock == Clock::Wall;
         AgentConfig {
             run: context.run.clone(),
@@ -204,6 +205,7 @@ impl Fleet {
         ReplayConfig {
             run: context.run.clone(),
             scene: scene.clone(),
+            // The clock starts when every route exists, or the first messages would reach nobody.
             wait: WaitConfig {
                 expect: self.recorded(self.routes()),
                 ready_timeout_s: self.scenario.timeouts.ready_s,

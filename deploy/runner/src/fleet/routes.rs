@@ -28,6 +28,7 @@ impl Fleet {
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
         }
+        // The ego hears its own agent directly, also where others are behind an emulated link.
         routes.push(route(&self.ego, self.needed().stream(), &ego));
         // Ego-only: the ego subscribes to its own agent and to no other.
         if self.scenario.method.exchange() == Exchange::Nothing {
@@ -42,6 +43,7 @@ impl Fleet {
         let sources =
             { self.neighbours() }.flat_map(|cav| sent(cav).map(move |stream| (cav, stream)));
         for (cav, stream) in sources {
+            // Over an emulated link a message takes two hops, and both have to be there.
             if self.is_over_link() {
                 routes.push(route(cav, stream, &link));
                 routes.push(Route {

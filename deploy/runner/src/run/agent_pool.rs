@@ -54,6 +54,7 @@ impl CrewProcesses {
             programs,
             folder,
         })?;
+        // Before any process starts: receivers reject the messages of two fleets of one name.
         check_free(&place, &fleet.scenario.network, run, &specs)?;
         let identity = Identity {
             run: run.clone(),
@@ -65,6 +66,7 @@ impl CrewProcesses {
         // A restarted agent has lost its state, and the result would depend on the time of the crash.
         let supervisor = Supervisor::start(specs, &folder.log_dir(), 0, &events)?;
         let stop = Stop::new();
+        // Ends the wait for an agent that has crashed and is not started again.
         thread::spawn({
             let stop = stop.clone();
             move || {

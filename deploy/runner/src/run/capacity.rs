@@ -53,11 +53,13 @@ pub fn estimate(fleet: &Fleet, programs: &Path, budget: Duration) -> io::Result<
         return Ok(None);
     };
     let program = programs.join(RUNNER);
+    // Measured alone, before the other processes load the cores.
     let unit = Command::new(&program)
         .args(["capacity", "--unit"])
         .envs(AVX2)
         .output()?;
     let machine = this_machine();
+    // As many as compute at once in the run: an agent for each local vehicle, and the ego.
     let beside = machine.cores.min(local_vehicles(fleet) + 1);
     let children: Vec<Child> = (0..beside)
         .map(|_| start(&program, fleet, budget))
@@ -114,9 +116,11 @@ pub fn measure(fleet: &Fleet, budget: Duration) -> Result<Measured, RunError> {
     let mut evaluator = Evaluator::new(setup(fleet)?)?;
     let (began, before_s) = (Instant::now(), process_cpu_s());
     let estimated = evaluator.estimate(&fleet.recorded, fleet.agents.len(), budget)?;
+    // Bounded: several threads give more than 1, and 0 would make a frame endless later on.
     let free_share =
         ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
     let steps = estimated.steps;
+    // Wall time times this share is CPU time.
     Ok(Measured {
         agent_ms: (steps.pose_ms + steps.map_ms) * free_share,
         fuse_ms: steps.fuse_ms * free_share,
@@ -146,6 +150,7 @@ fn period_ms(fleet: &Fleet) -> Option<f64> {
         .ticks
         .windows(2)
         .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+    // The shortest step is the hardest to keep up with.
     let least = steps.min().filter(|_| has_pace)?;
     Some(least as f64 * 1e-6 / scene.rate)
 }
@@ -153,6 +158,7 @@ fn period_ms(fleet: &Fleet) -> Option<f64> {
 /// Megabytes of a frame: of each vehicle its sweep, and its map if it sends maps.
 fn frame_mb(fleet: &Fleet) -> Result<f64, RunError> {
     let is_recorded = |tick: &usize| fleet.recorded.is_present(0, *tick);
+    // One sweep stands for those of all vehicles: the first that vehicle 0 has.
     let sweep = (0..fleet.recorded.ticks.len())
         .find(is_recorded)
         .map(|tick| fleet.recorded.load(0, tick, &LoadOptions::default()))
@@ -193,6 +199,7 @@ fn capacity_of(
     let needed_ms = local_vehicles as f64 * agent_ms + fuse_ms + messages_ms;
     let available_ms = machine.cores as f64 * free_share * period_ms;
     // Neither an agent nor the ego computes two frames at once.
+    // CPU time divided by the free share is the time that passes.
     let longest_ms = agent_ms.max(fuse_ms) / free_share;
     let expected_share = (available_ms / needed_ms)
         .min(period_ms / longest_ms)

@@ -48,6 +48,7 @@ fn try_draw(
             continue;
         };
         let recorded = scenario.load(index, usize::try_from(frame.tick)?, &options)?;
+        // By the true poses, so that the points show no errors of localization.
         let ego_from_cav = world_from_ego.from_world(&world_from_cav);
         loaded.push((cav.to_string(), ego_from_cav, recorded.points.xyzi));
     }

@@ -61,6 +61,7 @@ fn help(result: &RunResult) -> Option<String> {
     let count = |reason: &DropReason| dropped.get(reason).copied().unwrap_or(0);
     let log = |folder: &Path| format!("see {}", folder.join("log").display());
     let mut causes = result.causes.clone();
+    // A failure is listed among the reasons already.
     causes.retain(|cause| !result.failures.contains(cause));
     if result.interrupted && result.metrics.ticks > 0 {
         causes.push("the run was ended before its time".into());

@@ -80,6 +80,7 @@ fn has_amx() -> bool {
 
 /// The unit of compute times: the shortest of some convolutions on one thread of this process, milliseconds.
 pub fn unit_ms() -> f64 {
+    // One thread, so that the unit does not depend on the number of cores.
     tch::set_num_threads(1);
     let options = (Kind::Float, Device::Cpu);
     let (map, kernel) = (Tensor::ones(MAP, options), Tensor::ones(KERNEL, options));

@@ -105,6 +105,7 @@ impl Picture<'_> {
         image.fill(&BACKGROUND)?;
         let (map, legend) = image.split_vertically(height);
         let (x, y) = (self.x_m[0]..self.x_m[1], self.y_m[0]..self.y_m[1]);
+        // Rows of pixels count downwards, so the range of the y axis is reversed.
         let plane =
             map.apply_coord_spec(Cartesian2d::new(x, y, (0..width as i32, height as i32..0)));
         self.draw_grid(&plane)?;
@@ -178,6 +179,7 @@ impl Picture<'_> {
         {
             return Ok(());
         }
+        // Corners 0 to 3 are the bottom face, and 0 and 1 its front edge.
         let outline = [0, 1, 2, 3, 0].map(|index: usize| (corners[index][0], corners[index][1]));
         plane.draw(&PathElement::new(outline, stroke(colour)))?;
         let front = [0, 1].map(|axis| (corners[0][axis] + corners[1][axis]) / 2.0);
@@ -215,6 +217,7 @@ impl Picture<'_> {
         if !self.is_near(x, y, 0.0) {
             return Ok(());
         }
+        // Pixels, with y downwards: to the right of the centre and above it.
         let text = Text::new(format!("{score:.2}"), (10, -20), text(14, DETECTION));
         Ok(plane.draw(&(EmptyElement::at((x, y)) + text))?)
     }

@@ -121,6 +121,7 @@ pub(super) fn in_folder(
     let run = named.unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&run, &folder);
+    // After a failure in the run the folder stays: it holds the logs.
     if result.as_ref().is_err_and(RunError::is_refusal) {
         folder.remove();
     }
@@ -152,6 +153,7 @@ fn go(
 ) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
+    // Before the router opens, whose threads it watches.
     router_panic::watch(&stop);
     // Before anything else of the run takes the cores.
     let capacity = announce_capacity(fleet, &options.programs);
@@ -175,6 +177,7 @@ fn go(
     let [detections, truth, tracks] = LINES.map(|name| folder.file(name));
     let tracks = fleet.scenario.ego.tracks.then_some(tracks);
     let session = place.session.clone();
+    // The scorer subscribes before any process starts, so that it misses none of their messages.
     let mut scorer = ScorerNode::start(
         session,
         run,
@@ -193,6 +196,7 @@ fn go(
         };
         scorer.serve_metrics(address, specs.iter().filter_map(peer).collect())?;
     }
+    // Not returned at once on an error: scorer and router have to be ended first.
     let watched = watch(fleet, &context, specs, &place, &scorer, &stop);
     let has_router = !{ watched.as_ref() }.is_ok_and(|watched| watched.router_failed());
     let (scored, refused) = if has_router {
@@ -210,6 +214,7 @@ fn go(
     };
     let watched = watched?;
 
+    // Also after a failure: the folder gets what was computed until then.
     let result = write(
         fleet,
         (run, folder.clone()),
@@ -325,18 +330,22 @@ fn watch(
     if let Ending::RouterFailed { how } = &ending {
         display.print_line(&format!("{ROUTER_FAILED}: {how}"));
     }
+    // Messages of any process may have been lost in that time.
     if watch.had_outages() || matches!(ending, Ending::RouterFailed { .. }) {
         offline.extend(everyone);
     }
     watch.end(matches!(ending, Ending::RouterFailed { .. }));
     watch.write_status(Phase::Ending, &scorer.progress());
     let limits = Limits::of(fleet, &ending);
+    // In the order of the data flow, so that messages on their way still arrive.
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay);
     drain(&supervisor, scorer, limits.drain, &mut display);
     killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all));
     killed.extend(supervisor.end(|name| name != RECORDER, limits.all));
+    // The recorder last, as it takes down what the others send until their end.
     killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE));
     display.finish();
+    // Events that came while the processes were ended, which nobody has read.
     while let Ok(event) = happened.try_recv() {
         watch.note(&event);
     }
@@ -372,9 +381,11 @@ impl Limits {
         let timeouts = &fleet.scenario.timeouts;
         let (drain_s, stop_s) = (timeouts.drain_s, timeouts.stop_s);
         let limits_s = match ending {
+            // The replay has ended by itself.
             Ending::Over => [0.0, drain_s, drain_s + stop_s],
             Ending::Asked => [stop_s * REPLAY_SHARE, stop_s * DRAIN_SHARE, stop_s],
             Ending::RouterFailed { .. } => [0.0, 0.0, stop_s],
+            // The run has failed, so no further results are waited for.
             Ending::Failed { .. } => [stop_s, 0.0, stop_s],
         };
         let now = Instant::now();
@@ -422,6 +433,7 @@ fn write(
         let file = folder.file(name);
         unwritten.push(format!("{lines} lines are missing in {}", file.display()));
     }
+    // Lines are appended without waiting for the disk. Only now do they have to be on it.
     for file in LINES.map(|name| folder.file(name)) {
         if let Err(error) = atomic_file::sync(&file) {
             unwritten.push(format!("{}: {error}", file.display()));
@@ -436,6 +448,7 @@ fn write(
     for process in &stats {
         sum.merge(&process.ledger);
     }
+    // Before the balance, which accounts of offline processes cannot meet.
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
     let balance = sum.balance();
     let missed = missed(fleet, &board, &watched.ending);
@@ -496,6 +509,7 @@ fn write(
 /// their number only, once the scene is over.
 fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
     let (reported, _) = board.ticks();
+    // After an early end it is unknown how many ticks were due.
     let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over));
     board.missed() + (played.unwrap_or(0) as u64).saturating_sub(reported)
 }

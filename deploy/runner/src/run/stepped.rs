@@ -37,10 +37,12 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     fleet.scenario.models.threads.apply();
     let mut evaluator = Evaluator::new(setup(&fleet)?)?;
     let stepped = fleet.scenario.stepped.get_or_insert_default();
+    // Measured once before the run, so that all frames take the same times.
     let compute = match stepped.compute {
         Some(compute) => compute,
         None => evaluator.measure(&fleet.recorded)?,
     };
+    // Written into scenario.yaml with the rest, so that the run can be repeated with these times.
     stepped.compute = Some(compute);
     evaluator.set_compute(compute);
     in_folder(&fleet, options, |run, folder| {
@@ -85,6 +87,7 @@ pub(super) fn setup(fleet: &Fleet) -> Result<Setup, RunError> {
         stepped,
         ..
     } = &fleet.scenario;
+    // Without a link in the scenario messages take the ideal one.
     let link = link.clone().unwrap_or_default();
     let link = EmulatedLink::open(&link.model, link.seed);
     let own = |(cav, own): (&CavId, &AgentOverrides)| (cav.clone(), own.over(agents));
@@ -157,6 +160,7 @@ fn write(
         ..metrics
     };
     folder.write_json(deploy::score::metrics::FILE, &metrics)?;
+    // Times of processes on the wall clock say nothing here, so none are reported.
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
     folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;

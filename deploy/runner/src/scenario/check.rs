@@ -63,6 +63,7 @@ impl Scenario {
         for (field, text) in listen.chain(connect) {
             let rule = match Endpoint::new(text) {
                 Err(_) => "must read tcp/ADDRESS:PORT or quic/ADDRESS:PORT",
+                // QUIC needs the certificates of the security section.
                 Ok(endpoint) if endpoint.is_secured() && self.security.is_none() => {
                     "must begin with tcp/, or security must be given"
                 }

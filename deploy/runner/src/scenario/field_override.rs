@@ -16,6 +16,7 @@ impl FromStr for FieldOverride {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
+        // At the first sign only: the value may have further ones.
         let (path, value) = text.split_once('=').ok_or_else(|| {
             format!("{text:?} is not FIELD=VALUE, for example scene.lockstep=true")
         })?;

@@ -59,6 +59,7 @@ impl Scenario {
             ..
         } = &mut scenario;
         let keys = security.iter_mut().flat_map(|security| &mut security.keys);
+        // An empty path is one that is left out. Joined, it would name the folder of the file.
         for place in [&mut scene.dir, &mut models.weights]
             .into_iter()
             .chain(keys)
@@ -107,6 +108,7 @@ fn without_dots(path: &Path) -> PathBuf {
     for component in path.components() {
         match component {
             Component::CurDir => {}
+            // By the text alone: symbolic links are not resolved. Above the root there is nothing to drop.
             Component::ParentDir => {
                 clean.pop();
             }

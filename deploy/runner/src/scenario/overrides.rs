@@ -14,6 +14,7 @@ pub struct AgentOverrides(Map<String, Value>);
 impl<'de> Deserialize<'de> for AgentOverrides {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let fields = Map::deserialize(deserializer)?;
+        // Parsed only to refuse unknown fields and wrong types.
         serde_json::from_value::<AgentSettings>(Value::Object(fields.clone()))
             .map_err(D::Error::custom)?;
         Ok(Self(fields))
@@ -54,6 +55,7 @@ impl AgentOverrides {
         let changed = change(self.over(&AgentSettings::default()))?;
         if let Ok(serde_json::Value::Object(changed)) = serde_json::to_value(changed) {
             for (field, value) in changed {
+                // Only fields that the vehicle states: defaults must not replace those of all vehicles.
                 self.0.entry(field).and_modify(|own| *own = value);
             }
         }

@@ -26,6 +26,7 @@ pub(crate) fn weights_of(
     method: Method,
     reads_boxes: bool,
 ) -> Result<PathBuf, FileError> {
+    // Only a method that fuses feature maps needs a box input beside them.
     if !reads_boxes || method.exchange() != Exchange::Features {
         return one_of(path, method);
     }
@@ -33,7 +34,11 @@ pub(crate) fn weights_of(
         false => path.to_path_buf(),
         true => match &files_of(path, &format!("{method}-boxes"))?[..] {
             [file] => file.clone(),
-            _ => one_of(path, method)?,
+            [] => one_of(path, method)?,
+            several => {
+                let problem = format!("{} files are {method}-boxes, expected one", several.len());
+                return Err(FileError::new(path, problem));
+            }
         },
     };
     if !box_input::is_in(&Weights::load(&file)?) {
@@ -55,6 +60,7 @@ fn one_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
         match (files.pop(), files.len()) {
             (Some(file), 0) => return Ok(file),
             (None, _) => last = (name, 0),
+            // Several files of a better name are an error, which a worse name must not hide.
             (Some(_), others) => {
                 last = (name, others + 1);
                 break;

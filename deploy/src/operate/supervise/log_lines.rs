@@ -20,6 +20,7 @@ pub(super) async fn follow(
         // A full disk takes no log; the process goes on.
         let _ = log.write_all(bytes);
         for part in bytes.split_inclusive(|byte| *byte == b'\n') {
+            // A process without line ends must not fill the memory.
             let room = MAX_LINE.saturating_sub(line.len());
             line.extend_from_slice(&part[..part.len().min(room)]);
             if part.ends_with(b"\n") {

@@ -200,11 +200,13 @@ impl Supervisor {
     pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> Vec<String> {
         let is_chosen = |watched: &mut Watched| which(&watched.name);
         let chosen: Vec<Watched> = self.watched.extract_if(.., is_chosen).collect();
+        // All are asked before any is waited for, so that they end at the same time.
         for watched in &chosen {
             watched.stop.send_replace(Some(deadline));
         }
         let mut killed = Vec::new();
         for watched in chosen {
+            // A watcher that panicked has dropped its child, which kills it.
             if self.runtime.block_on(watched.task).unwrap_or(true) {
                 killed.push(watched.name);
             }

@@ -103,6 +103,8 @@ impl Watcher {
                             Ok(status) if is_done(status) => "ended without a request".into(),
                             Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&describe(status)),
                             Ok(status) => {
+                                // A task that reports its own failure would fail again.
+                                // One that was struck down can resume.
                                 may_restart &= self.spec.life == RestartPolicy::Service || is_struck(status);
                                 describe(status)
                             }
@@ -123,6 +125,7 @@ impl Watcher {
             if !may_restart || self.crashes > self.restarts {
                 return self.give_up(&how);
             }
+            // The exponent is bounded, as the number of crashes is not.
             let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.crashes - 1).min(5)));
             self.restarted += 1;
             self.report(ProcessEventKind::Crashed {
@@ -139,6 +142,7 @@ impl Watcher {
 
     fn spawn(&self) -> std::io::Result<Child> {
         let mut command = Command::new(&self.spec.program);
+        // The many threads are for the router in this program. A value of the user's own is passed on.
         let (name, of_router) = malloc_settings::ROUTER_THREADS;
         if std::env::var_os(name).is_some_and(|value| value == of_router) {
             command.env_remove(name);

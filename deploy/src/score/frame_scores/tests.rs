@@ -250,6 +250,20 @@ fn poses_of_all_vehicles_are_judged() {
 }
 
 #[test]
+fn an_older_tick_that_comes_late_is_closed_in_order() {
+    let mut scores = scores();
+    for tick in (0..1_000).filter(|tick| *tick != 700) {
+        scores.truth(&stamp("replay", tick, 0), truth(tick));
+        if tick == 900 {
+            scores.truth(&stamp("replay", 700, 0), truth(700));
+        }
+    }
+    scores.close();
+    let ticks: Vec<u64> = scores.records().iter().map(|record| record.tick).collect();
+    assert!(ticks.is_sorted(), "{ticks:?}");
+}
+
+#[test]
 fn a_long_run_keeps_few_ticks_open() {
     let mut scores = scores();
     for tick in 0..1_000 {

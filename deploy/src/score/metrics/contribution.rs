@@ -1,5 +1,7 @@
 //! Contribution of the neighbours to the frames of a run.
 
+use std::collections::BTreeMap;
+
 use protocol::{Account, CavId, Counts, Ledger, ProcessId, Role, Stream, Topic};
 use serde::{Deserialize, Serialize};
 
@@ -28,9 +30,20 @@ impl Contribution {
     ) -> Self {
         let is_shared = |(account, _): &(&Account, &Counts)| shares(&account.topic, ego);
         let shared = || ledger.iter().filter(is_shared);
+        // Counted at the sender: what comes out of a link is the same message on another topic.
         let is_sent = |account: &Account| matches!(account.topic, Topic::Stream { .. });
         let of_senders = shared().filter(|(account, _)| is_sent(account));
-        let sent = of_senders.map(|(_, counts)| counts.sent).sum();
+        // Beside a map boxes are a second message of the same frame.
+        let mut sent_frames = BTreeMap::<&CavId, u64>::new();
+        let mut sent = 0;
+        for (account, counts) in of_senders {
+            sent += counts.sent;
+            if let Topic::Stream { cav, .. } = &account.topic {
+                let frames = sent_frames.entry(cav).or_default();
+                *frames = counts.sent.max(*frames);
+            }
+        }
+        let sent_frames: u64 = sent_frames.values().sum();
         let ego_process = format!("{}-", Role::Ego);
         let is_ego = |to: &ProcessId| to.as_str().starts_with(&ego_process);
         let of_egos = shared().filter(|(account, _)| account.to.as_ref().is_some_and(is_ego));
@@ -40,7 +53,7 @@ impl Contribution {
             sent,
             used,
             sent_bytes_mean: { sent_bytes.filter(|_| sent > 0) }
-                .map(|bytes| bytes as f64 / sent as f64),
+                .map(|bytes| bytes as f64 / sent_frames as f64),
         }
     }
 }
@@ -91,6 +104,23 @@ mod tests {
         assert_eq!(
             (contribution.fused_per_frame, contribution.sent_bytes_mean),
             (Some(0.5), Some(100.0))
+        );
+    }
+
+    #[test]
+    fn boxes_beside_a_map_are_of_the_same_frame() {
+        let (mut ledger, ego) = ledger();
+        for cav in ["2", "3"].map(|name| CavId::new(name).unwrap()) {
+            let boxes = Topic::Stream {
+                cav,
+                stream: Stream::Boxes,
+            };
+            (0..3).for_each(|_| ledger.sent(&Account::published(boxes.clone())));
+        }
+        let contribution = Contribution::of(4, 2, &ego, &ledger, Some(800));
+        assert_eq!(
+            (contribution.sent, contribution.sent_bytes_mean),
+            (14, Some(100.0))
         );
     }
 

@@ -55,6 +55,7 @@ fn values(placed: &PlacedBox, support: f64, anchors: &Anchors) -> [f32; VALUES] 
     let [_, _, height] = anchors.size_lwh_m;
     let [length, width, high, sin, cos] = shape(&placed.box3d, anchors.size_lwh_m);
     [
+        // Bounded, since a neighbour may state a box of any age, place and height.
         placed.age_secs.clamp(-1.0, 1.0),
         placed.score,
         placed.pose_confidence,
@@ -96,10 +97,12 @@ fn covered(box3d: &Box3d, grid: &BevGrid) -> Vec<(usize, f64)> {
     let size = [i64::from(grid.width), i64::from(grid.height)];
     let low_m = [grid.x_min_m, grid.y_min_m];
     let range = |axis: usize| {
+        // The first four corners are the bottom face.
         let along = corners[..4].iter().map(|corner| corner[axis]);
         let (low, high) = along.fold((f64::MAX, f64::MIN), |(low, high), at| {
             (low.min(at), high.max(at))
         });
+        // Casts saturate, and the range is half-open: a box beyond the grid, or one of NaN, covers no cells.
         let cell = |at: f64| ((at - low_m[axis]) / grid.cell_m).floor() as i64;
         cell(low).max(0)..cell(high).saturating_add(1).min(size[axis])
     };

@@ -122,6 +122,7 @@ impl BoxInput {
         let around = self.roi.forward(fused, &placed, &values)?;
         let input = [
             &by_cell.f_index_select(0, &pairs.cell_of)?,
+            // The logits of the head have no bound, and beyond 8 they mean no more than certainty.
             &pairs.own.f_clamp(-8.0, 8.0)?,
             &pairs.code.f_flatten(1, 2)?,
             &pairs.difference.f_flatten(1, 2)?,
@@ -184,6 +185,7 @@ impl Pairs {
     /// the head's own output has the weight 1.
     fn apply(&self, head: HeadOutput, changes: &Tensor) -> Result<HeadOutput> {
         let (_, anchors, height, width) = head.scores.size4()?;
+        // The last column is the logarithm of the weight of the whole box, those before it are by anchor.
         let last = anchors * CHANGES;
         let limit = MAX_LOG_WEIGHT;
         let weight = changes
@@ -206,6 +208,7 @@ impl Pairs {
         let sum = |count: i64, values: &Tensor| {
             Tensor::f_zeros([height * width, count], options)?.f_index_add(0, &self.cell_of, values)
         };
+        // The head itself has change 0 and weight 1, so the denominator is at least 1 at every cell.
         let mean = sum(numbers, &change)? / (sum(1, &weight)? + 1.0);
         let mean = mean
             .f_view([height, width, anchors, 1 + BOX_CODE as i64])?

@@ -57,6 +57,7 @@ pub(super) fn support(boxes: &[PlacedBox]) -> Vec<f64> {
         for (other, overlapping) in boxes.iter().zip(&footprints) {
             if other.sender != own.sender {
                 let iou = footprint.iou(overlapping);
+                // One value per sender: a sender that repeats a box adds no further support.
                 let best: &mut f64 = by_sender.entry(other.sender).or_default();
                 *best = best.max(iou * other.confidence());
             }

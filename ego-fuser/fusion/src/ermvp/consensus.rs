@@ -61,6 +61,7 @@ impl Consensus {
     ) -> Result<Option<Motion>, TchError> {
         let (height, width, channels) = ego.size3()?;
         let count = self.cells.min(height * width);
+        // Step: the cells that count most for both. Their choice has no gradient, their weights have.
         let (_, best) = weight
             .f_detach()?
             .f_view([-1])?
@@ -69,6 +70,7 @@ impl Consensus {
         if weight.f_sum(Kind::Float)?.f_double_value(&[])? < TOO_LITTLE {
             return Ok(None);
         }
+        // Step: the same search window around each of these cells, in the map of the ego.
         let offsets = self.offsets(ego)?;
         let rows = best.f_divide_scalar_mode(width, "floor")?;
         let columns = best.f_remainder(width)?;
@@ -80,6 +82,7 @@ impl Consensus {
         let places = around(&rows, 1, height)? * width + around(&columns, 0, width)?;
         let keys = |cells: &Tensor| {
             let key = self.key.forward(cells)?;
+            // Keys of unit length make the similarity a cosine. The constant keeps keys of zeros finite.
             let norm = key
                 .f_square()?
                 .f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?
@@ -95,10 +98,13 @@ impl Consensus {
         let share = similarity
             .f_mul(&self.sharpness.f_exp()?)?
             .f_softmax(1, None::<Kind>)?;
+        // Step: mean offset within the window, weighted by similarity, is the correspondence of a cell.
         let moved = share.f_matmul(&offsets.f_to_kind(ego.kind())?)?;
+        // Positions count from the centre of the map, in cells, columns first.
         let middle = Tensor::from_slice(&[(width - 1) as f32 / 2.0, (height - 1) as f32 / 2.0])
             .f_to_device(ego.device())?;
         let from = Tensor::f_stack(&[columns, rows], 1)?.f_to_kind(ego.kind())? - middle;
+        // A cell with one clear match counts more than one that is similar everywhere.
         let certain = share.f_amax([1i64].as_slice(), false)?;
         Ok(Some(self.fit(&from, &moved, &(weight * certain))?))
     }
@@ -124,6 +130,7 @@ impl Consensus {
             |x: &Tensor| (x * &weight).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>);
         let (centre, step) = (mean(from)?, mean(moved)?);
         let (one, other) = (from - &centre, from + moved - &centre - &step);
+        // Step: planar least squares in closed form, by the sums of cross products and of dot products.
         let [x, y] = [one.f_select(1, 0)?, one.f_select(1, 1)?];
         let [to_x, to_y] = [other.f_select(1, 0)?, other.f_select(1, 1)?];
         let flat = weight.f_squeeze_dim(1)?;
@@ -133,6 +140,7 @@ impl Consensus {
         let trust = self.trust.f_sigmoid()?;
         let angle = sine.f_atan2(&cosine)? * &trust;
         let turned = rotated(&angle, &centre)?;
+        // About the weighted centre c of the cells: R (p - c) + c + step, with R c in `turned`.
         let shift = &centre + step * trust - turned;
         Ok(Motion { angle, shift })
     }
@@ -147,6 +155,7 @@ impl Motion {
         let from = -rotated(&back, &self.shift)?;
         let (sine, cosine) = (back.f_sin()?, back.f_cos()?);
         let (height_m, width_m) = (height as f64, width as f64);
+        // Coordinates are -1..1 along each edge, so a term across axes is scaled by the ratio of the edges.
         let entries = [
             cosine.shallow_clone(),
             -&sine * (height_m / width_m),
@@ -160,6 +169,7 @@ impl Motion {
             Tensor::f_affine_grid_generator(&theta, [1, channels, height, width], false)?;
         let maps = map.f_permute([2, 0, 1])?.f_unsqueeze(0)?;
         let maps = maps.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)?;
+        // The nearest cell, so that the mask stays 0 or 1.
         let mask = mask.f_view([1, 1, height, width])?;
         let mask = mask
             .f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?

@@ -45,6 +45,7 @@ impl Extract {
         let seen = x
             .f_conv2d(&self.depthwise, None::<Tensor>, one, one, one, channels)?
             .f_gelu("none")?;
+        // Squeeze and excitation: a gate for each channel, from the mean over the map.
         let mean = seen.f_mean_dim([2i64, 3].as_slice(), false, None::<Kind>)?;
         let gate = self
             .excite

@@ -170,6 +170,7 @@ impl Ermvp {
         for agent in 1..agents {
             let kept = kept.f_get(agent)?;
             let score = scores.f_get(agent)? * &kept;
+            // Times the score, which gives the sampler a gradient: the choice of the cells has none.
             let sent = maps.f_get(agent)? * score.f_unsqueeze(2)?;
             let (sent, kept) = match self.consensus.motion(&ego, &sent, &(&ego_score * &score))? {
                 Some(motion) => motion.apply(&sent, &kept)?,
@@ -188,6 +189,7 @@ impl Fusion for Ermvp {
         let order = nearest_first(&aligned.metadata).to_device(warped.features.device());
         let features = warped.features.f_index_select(0, &order)?;
         let mask = warped.mask.f_index_select(0, &order)?;
+        // Global queries come from a map reduced by REDUCTION, which needs whole windows too.
         let padding = Padding::to_multiples(&features, self.window * REDUCTION)?;
         let maps = padding
             .maps(&features, 0)?

@@ -61,6 +61,7 @@ impl Sampler {
         Tensor::f_cat(
             &[
                 reach.f_narrow(0, 0, 1)?,
+                // Where fewer cells are in reach than are kept, topk has filled up with others.
                 kept.f_to_kind(Kind::Float)? * reach_of_others,
             ],
             0,

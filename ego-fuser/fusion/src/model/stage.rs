@@ -134,6 +134,7 @@ impl FusionStage {
         if !weights.contains(channel_mixing::WEIGHT) {
             stage.mixing = None;
         }
+        // On the CPU only: the operators in integers are those of oneDNN.
         if let Some(scales) = weights
             .activation_scales()?
             .filter(|_| device == Device::Cpu)
@@ -187,6 +188,7 @@ impl FusionStage {
             (None, _) => Ok(head),
             (Some(input), YAxis::Left) => input.change(fused, head, boxes),
             (Some(input), YAxis::Right) => {
+                // The maps of such a network are mirrored, so boxes have to be mirrored to lie on them.
                 let mirrored = boxes.iter().map(|placed| PlacedBox {
                     box3d: placed.box3d.mirrored_y(),
                     ..*placed
@@ -221,6 +223,7 @@ impl FusionStage {
             return self.align_with(received, None, metadata);
         }
         let earlier = received.only(newest, count)?;
+        // As live, where a map at full resolution is kept in the axes that the ego had when the map was new.
         let then = then_from_cav(&self.of_network(metadata), newest as usize);
         let turned = ReceivedMaps::new(
             self.turned(&earlier.maps, &then, self.order())?,
@@ -315,6 +318,7 @@ impl FusionStage {
         }
         let earlier = match (self.requirements.history.earlier_cells, earlier) {
             (Some(cells), Some(earlier)) => {
+                // The outer `metadata` keeps those of the newest maps only.
                 let metadata = metadata.split_off(count as usize);
                 let (_, warped) =
                     self.warped(&earlier, &metadata, &with_cells_of(&self.grid, cells))?;
@@ -400,6 +404,7 @@ impl FusionStage {
 
     /// Metadata in the frame of the network: a mirrored network has mirrored poses.
     fn of_network<'a>(&self, metadata: &'a [MapMetadata]) -> Cow<'a, [MapMetadata]> {
+        // y to the left is the convention of all poses: nothing to mirror.
         if self.y_axis == YAxis::Left {
             return Cow::Borrowed(metadata);
         }
@@ -436,6 +441,7 @@ fn newest(facts: &[MapMetadata]) -> usize {
 /// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents. The
 /// ego's own entry of the same time step gives that frame; without one the ego counts as stationary.
 fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
+    // Index of the time step: how many newer maps of the same agent are listed before it.
     let step = |entry: usize| {
         facts[..entry]
             .iter()
@@ -451,6 +457,7 @@ fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
                 return Pose::IDENTITY;
             }
             let ego = ego_of(step(entry)).map_or(Pose::IDENTITY, |ego| facts[ego].ego_from_cav);
+            // then_from_cav = now_from_then^-1 now_from_cav: the current frame is the common world.
             ego.from_world(&facts[entry].ego_from_cav)
         })
         .collect()

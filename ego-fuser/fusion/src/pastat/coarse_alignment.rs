@@ -60,6 +60,7 @@ impl CoarseAlignment {
         let padding_cells = config.padding_cells();
         Self {
             padding_cells,
+            // Both grids cover the same area after padding: tokens of all ages lie in the same places.
             earlier_padding_cells: padding_cells / config.earlier_cells,
         }
     }
@@ -181,6 +182,7 @@ pub(super) fn steps_back(agent: &[usize], age_secs: &[f64]) -> Vec<usize> {
 /// Some entries, as floats.
 fn rows_of(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<WarpedMaps, TchError> {
     let index = Tensor::f_from_slice(entries)?.f_to_device(features.device())?;
+    // Selection copies. Entries are distinct, so as many as there are rows are all, in order.
     let is_all = entries.len() as i64 == features.size()[0];
     let pick = |tensor: &Tensor| match is_all {
         true => tensor.f_to_kind(Kind::Float),

@@ -36,6 +36,7 @@ pub(super) struct Confidences {
 impl ConfidenceEmbedding {
     /// Its variable is `ce.weight` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        // One over the root of the fan-in of the patch embedding, of which this is one more input channel.
         let deviation = ((config.channels * config.patch * config.patch) as f64)
             .sqrt()
             .recip();
@@ -80,6 +81,7 @@ pub(super) fn shares(confidence: &[f64], steps_back: &[usize]) -> Vec<f32> {
     let mut sums: BTreeMap<usize, (f64, usize)> = BTreeMap::new();
     for (&sigma, &step) in confidence.iter().zip(steps_back) {
         let (sum, count) = sums.entry(step).or_default();
+        // `max` also turns NaN into 0.
         *sum += sigma.max(0.0);
         *count += 1;
     }

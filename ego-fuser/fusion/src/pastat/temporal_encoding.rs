@@ -80,6 +80,7 @@ fn encoding(age_secs: f64, config: &PastatConfig) -> Vec<f32> {
     let dim = config.dim as f64;
     (0..config.dim)
         .map(|channel| {
+            // Even channels 2k have the sine, odd channels 2k + 1 the cosine, each with its own exponent.
             let angle = t / 10_000_f64.powf(channel as f64 / dim);
             (if channel % 2 == 1 {
                 angle.cos()

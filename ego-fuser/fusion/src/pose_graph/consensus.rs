@@ -38,6 +38,7 @@ pub(super) fn consensus(
     let best = motions
         .iter()
         .max_by(|one, other| one.score.total_cmp(&other.score))?;
+    // A different motion that fits almost as well makes the match ambiguous: then none is used.
     let rival = motions
         .iter()
         .filter(|other| search.differ(&best.motion, &other.motion))
@@ -111,12 +112,14 @@ impl Search<'_> {
         if first.0 == second.0 || first.1 == second.1 {
             return None;
         }
+        // Rigid motion keeps distances: pairs of clearly different length are not the same two objects.
         let edge = self.objects[second.0] - self.objects[first.0];
         let seen = self.prior.rotation * (self.boxes[second.1] - self.boxes[first.1]);
         let fits = (edge.norm() - seen.norm()).abs() < self.config.fit_tolerance_m;
         if !fits || edge.norm().min(seen.norm()) < MIN_EDGE_M {
             return None;
         }
+        // Relative to the prior, whose rotation `seen` has already.
         let turn = seen.xy().perp(&edge.xy()).atan2(seen.dot(&edge));
         if turn.abs() > self.config.max_turn_deg.to_radians() {
             return None;
@@ -158,6 +161,7 @@ impl Search<'_> {
         let fit = |&(object, index): &(usize, usize)| {
             1.0 - (self.apart(motion, object, index) / self.config.fit_tolerance_m).powi(2)
         };
+        // A weak prior: moving the boxes by the whole search range costs as much as one exact match.
         let off = self.off(motion, self.prior) / self.config.search_m;
         matches.iter().map(fit).sum::<f64>() - off * off
     }

@@ -57,6 +57,7 @@ impl ObservedBox {
         let center = Vector3::new(x, y, 0.0);
         let heading_rad = found.box3d.heading_rad;
         let is_sound =
+            // NaN and infinity fail the comparison too.
             center.norm() < 1e4 && heading_rad.is_finite() && found.score >= config.min_score;
         let scale =
             (1.0 + center.norm() / HALF_EXACT_M) / f64::from(found.score.clamp(0.1, 1.0)).sqrt();
@@ -113,6 +114,7 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
         if moved_by(&seen[agent], &priors[agent], &solved) < config.dead_zone_m {
             continue;
         }
+        // The planar correction is applied from the left, so height, roll and pitch of the pose are kept.
         let moved = solved * priors[agent].inverse();
         corrected[agent].ego_from_agent = (moved * agents[agent].ego_from_agent.isometry()).into();
         corrected[agent].shared = shared;
@@ -136,6 +138,7 @@ fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<ObservedBox
     sorted
         .into_iter()
         .filter_map(|found| ObservedBox::new(found, config))
+        // After the filter: boxes that are not sound do not use up the limit.
         .take(config.max_boxes)
         .collect()
 }

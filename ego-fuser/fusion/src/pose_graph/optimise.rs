@@ -74,13 +74,14 @@ impl Graph {
             let before = (self.agents.clone(), self.objects.clone());
             self.step(&agents, &objects);
             let now = self.cost();
-            if now > cost {
+            if now.is_nan() || now > cost {
                 (self.agents, self.objects) = before;
                 damping *= 10.0;
                 continue;
             }
             let gained = cost - now;
             cost = now;
+            // Bounded below, so that a few rejected steps raise it again.
             damping = (damping / 10.0).max(1e-12);
             if gained <= CONVERGED * cost {
                 break;
@@ -89,6 +90,7 @@ impl Graph {
     }
 
     fn step(&mut self, agents: &DVector<f64>, objects: &[Vector3<f64>]) {
+        // The ego is fixed, so the unknowns begin with the second agent.
         for (row, agent) in self.agents[1..].iter_mut().enumerate() {
             *agent = agent.moved(&agents.fixed_rows::<3>(3 * row).into_owned());
         }
@@ -120,6 +122,7 @@ impl Graph {
         );
         let (sin, cos) = agent.heading_rad.sin_cos();
         let (dx, dy) = (object.x_m - agent.x_m, object.y_m - agent.y_m);
+        // R^T (object - agent) - seen, in the frame of the agent.
         let residual = Vector3::new(
             cos * dx + sin * dy - observation.seen.x_m,
             -sin * dx + cos * dy - observation.seen.y_m,
@@ -155,20 +158,24 @@ impl Graph {
         let (sin, cos) = agent.heading_rad.sin_cos();
         let (dx, dy) = (object.x_m - agent.x_m, object.y_m - agent.y_m);
         let (residual, square) = self.weighed(observation);
+        // Huber loss by iteratively reweighted least squares.
         let robust = if square.sqrt() <= HUBER {
             1.0
         } else {
             HUBER / square.sqrt()
         };
         let information = Matrix3::from_diagonal(&Vector3::from(observation.information)) * robust;
+        // Jacobian by the object: R^T, and 1 for the heading.
         let by_object = Matrix3::new(cos, sin, 0.0, -sin, cos, 0.0, 0.0, 0.0, 1.0);
         let weighed = by_object.transpose() * information;
         let (block, gradient) = &mut equations.objects[observation.object];
         *block += weighed * by_object;
         *gradient += weighed * residual;
+        // The ego is no unknown: its observations hold the objects.
         let Some(row) = observation.agent.checked_sub(1) else {
             return;
         };
+        // Jacobian by the agent: -R^T, the derivative of R^T by the heading, and -1.
         let by_agent = Matrix3::new(
             -cos,
             -sin,
@@ -198,6 +205,7 @@ impl Equations {
 
     /// Steps of agents and objects; `None` where a block cannot be inverted.
     fn solve(mut self, damping: f64) -> Option<(DVector<f64>, Vec<Vector3<f64>>)> {
+        // Marquardt: damping in proportion to the diagonal does not depend on units.
         for entry in 0..self.agents.nrows() {
             self.agents[(entry, entry)] *= 1.0 + damping;
         }
@@ -213,6 +221,7 @@ impl Equations {
             })
             .collect();
         let inverses = inverses?;
+        // Step: Schur complement, which eliminates the objects.
         for (row, object, block) in &self.mixed {
             let through = block * inverses[*object];
             let mut place = self.agent_gradient.fixed_rows_mut::<3>(3 * row);
@@ -223,6 +232,7 @@ impl Equations {
             }
         }
         let agents = -self.agents.cholesky()?.solve(&self.agent_gradient);
+        // Step: the objects by back-substitution.
         let mut pulled: Vec<Vector3<f64>> =
             self.objects.iter().map(|(_, gradient)| *gradient).collect();
         for (row, object, block) in &self.mixed {

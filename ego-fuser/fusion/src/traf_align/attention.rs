@@ -48,6 +48,7 @@ impl TrajectoryAttention {
         let read = projected.f_narrow(1, dim, 2 * dim)?;
         let read = read.f_grid_sampler(points, BILINEAR, PADDING_ZEROS, false)?;
         let per_head = dim / self.heads;
+        // The points of all tokens are stacked along the rows: [K h, w].
         let count = points.size()[1] / height;
         let split = |first: i64| {
             let part = read.f_narrow(1, first, dim)?;

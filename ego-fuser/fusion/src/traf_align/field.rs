@@ -85,6 +85,7 @@ impl Trajectories {
         let along = |size: i64, view: [i64; 4]| -> Result<Tensor, TchError> {
             Tensor::f_arange(size, options)?.f_view(view)
         };
+        // Point k is in row k / kernel and column k % kernel of the square.
         let of_points = |repeat_inner: bool| -> Result<Tensor, TchError> {
             let [rows, columns] = if repeat_inner {
                 [self.kernel, 1]
@@ -101,6 +102,7 @@ impl Trajectories {
         let y = offsets.f_narrow(1, points, points)?
             + of_points(false)?
             + along(height, [1, 1, height, 1])?;
+        // -1 and 1 are the edges of the outer tokens, so the centre of the first is half a token from -1.
         let scaled = |place: Tensor, size: i64| (place + 0.5) * (2.0 / size as f64) - 1.0;
         let sampling_grid = Tensor::f_stack(&[scaled(x, width), scaled(y, height)], -1)?;
         sampling_grid.f_view([agents, points * height, width, 2])

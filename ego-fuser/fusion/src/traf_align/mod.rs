@@ -133,6 +133,7 @@ impl TrafAlign {
             .ages(&agents.age_secs)?
             .f_unsqueeze(-1)?
             .f_unsqueeze(-1)?;
+        // Masked after the addition: tokens out of reach would otherwise consist of the code of their age.
         let tokens = (self.tokeniser.forward(maps, train) + ages) * seen;
         let mut size = tokens.size();
         size[0] = agents.newest.len() as i64;
@@ -167,6 +168,7 @@ impl TrafAlign {
             [1, 1],
         )?;
         let newest = Tensor::f_from_slice(&agents.newest)?.f_to_device(maps.device())?;
+        // Padding is out of reach of all maps and becomes minus infinity, which is cropped below.
         let out_of_reach = mask.f_index_select(0, &newest)?.f_eq(0.0)?;
         let fused = (maps.f_index_select(0, &newest)? + gathered)
             .f_masked_fill(&out_of_reach, f64::NEG_INFINITY)?;

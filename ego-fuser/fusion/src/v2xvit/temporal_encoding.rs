@@ -43,6 +43,7 @@ impl TemporalEncoding {
         let rows: Vec<f64> = rows
             .iter()
             .map(|row| {
+                // `clamp` passes NaN on, which would spread over the whole code.
                 if row.is_nan() {
                     0.0
                 } else {

@@ -26,6 +26,7 @@ pub struct WindowBranch {
 impl WindowBranch {
     fn new(path: &nn::Path<'_>, channels: i64, config: &WindowConfig, order: &BlockOrder) -> Self {
         let (edge, inner) = (config.edge, config.heads * config.head_channels);
+        // The tokens of a window are in block order, not row by row.
         let places = order.places(edge);
         let span = 2 * edge - 1;
         let offset = |[row, column]: [i64; 2], to: [i64; 2]| {

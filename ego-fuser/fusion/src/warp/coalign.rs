@@ -15,6 +15,7 @@ use super::{BILINEAR, PADDING_ZEROS};
 /// [`tch::TchError`] when the last two sizes are not 4.
 pub fn normalized(pairwise: &Tensor, height: i64, width: i64, pixel_m: f64) -> Result<Tensor> {
     let (height, width) = (height as f64, width as f64);
+    // Terms across axes by the ratio of the edges, translations from metres to half edges of the map.
     let scale = [
         1.0,
         height / width,
@@ -28,6 +29,7 @@ pub fn normalized(pairwise: &Tensor, height: i64, width: i64, pixel_m: f64) -> R
         .f_to_kind(pairwise.kind())?
         .f_to_device(pairwise.device())?;
     let rows = pairwise.f_narrow(-2, 0, 2)?;
+    // Columns of x, y and the translation: height is left out.
     let planar = Tensor::f_cat(&[rows.f_narrow(-1, 0, 2)?, rows.f_narrow(-1, 3, 1)?], -1)?;
     planar.f_mul(&scale)
 }

@@ -212,6 +212,7 @@ fn place_of(
     [xx, xy, x0, yx, yy, y0]: [f32; 6],
     grid: &BevGrid,
 ) -> [f32; 2] {
+    // Centre of a cell, -1 and 1 being the edges of the outer cells.
     let middle = |cell: usize, count: u32| (2 * cell + 1) as f32 / count as f32 - 1.0;
     let (x, y) = (middle(column, grid.width), middle(row, grid.height));
     [xx * x + xy * y + x0, yx * x + yy * y + y0]
@@ -247,6 +248,7 @@ fn read_by_tensors(
     let mask = sent
         .f_grid_sampler(sampling_grid, NEAREST, PADDING_ZEROS, false)?
         .f_to_kind(map.kind())?;
+    // `grid_sampler` needs positions of the kind of the values that it reads.
     let sampling_grid = sampling_grid.f_to_kind(map.kind())?;
     Ok((
         map.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)? * &mask,

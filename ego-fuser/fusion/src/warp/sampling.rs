@@ -50,6 +50,7 @@ impl Cells {
         let cells = (rows * columns) as usize;
         let (mut read, mut reached) = (vec![0.0; self.channels * cells], vec![0.0; cells]);
         let mut block = vec![0.0; BLOCK * self.channels];
+        // Block by block: read cell by cell, then written plane by plane while the block is in the cache.
         for (index, (sampling_grid, reached)) in sampling_grid
             .chunks(2 * BLOCK)
             .zip(reached.chunks_mut(BLOCK))
@@ -153,6 +154,7 @@ impl Samples {
             self.first.push(self.cells.len() as i32);
             self.valid.push(valid);
             for (cell, weight) in place.cells.into_iter().zip(place.weights) {
+                // Cells without weight are left out. A sum of no cells is zero.
                 if valid * weight != 0.0 {
                     self.cells.push((first + cell) as i32);
                     self.weights.push(weight * share);
@@ -227,6 +229,7 @@ impl Pair {
             first
         };
         Self {
+            // Beyond the edge the weight is zero, and the clamped index can still be read.
             places: [first, second].map(|cell| cell.clamp(0, last) as usize),
             weights: [weight(first, 1.0 - share), weight(second, share)],
             nearest: on_map(nearest).then_some(nearest as usize),

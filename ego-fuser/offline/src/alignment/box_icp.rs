@@ -39,6 +39,7 @@ pub fn align(
     }
     let mut motion = *start;
     for _ in 0..MAX_ROUNDS {
+        // Lazy: the fit walks the pairs several times, always with the motion of this round.
         let pairs = neighbour.iter().filter_map(|centre| {
             let moved = motion.rotation * centre + motion.translation.vector;
             let apart = |other: &&Vector3<f64>| (*other - moved).xy().norm_squared();
@@ -52,6 +53,7 @@ pub fn align(
         };
         let off = motion.inv_mul(&next);
         motion = next;
+        // A radian counts as 100 m, the way of a centre that far from the vehicle.
         if off.translation.vector.norm() + 100.0 * off.rotation.angle() < CONVERGED_M {
             break;
         }

@@ -81,6 +81,7 @@ impl AlignmentMethod for BoxIcp {
 fn message(boxes: &[Box3d]) -> Message {
     let detection = |box3d: &Box3d| Detection {
         box3d: *box3d,
+        // The order of the boxes is their confidence: scores are not read.
         score: 1.0,
         source: None,
     };

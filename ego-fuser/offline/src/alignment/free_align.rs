@@ -155,6 +155,7 @@ pub fn align(
             rival,
         });
     }
+    // Some boxes may not be nodes: back to the indices of the given lists.
     let given = |&(a, b): &(usize, usize)| (ego.given[a], neighbour.given[b]);
     Ok(BoxAlignment {
         matches: best.matches.iter().map(given).collect(),
@@ -163,6 +164,7 @@ pub fn align(
 }
 
 fn same_motion(a: &Isometry3<f64>, b: &Isometry3<f64>, tolerance_m: f64) -> bool {
+    // The length of its translation is the distance between the neighbour's two positions.
     let off = a.inv_mul(b);
     off.translation.vector.norm() < 2.0 * tolerance_m && off.rotation.angle() < SAME_HEADING_RAD
 }
@@ -178,6 +180,7 @@ struct Graph {
 
 impl Graph {
     fn new(boxes: &[Box3d], config: &FreeAlignConfig) -> Self {
+        // NaN fails the comparison and is left out too.
         let nodes = boxes
             .iter()
             .enumerate()
@@ -208,6 +211,7 @@ impl Graph {
     /// Distance of `node` to the left of the line from `a` to `b`, metres.
     fn left_of(&self, (a, b): (usize, usize), node: usize) -> f64 {
         let way: Vector2<f64> = (self.centres[b] - self.centres[a]).xy();
+        // Cross product over the length of the base: positive to the left.
         way.perp(&(self.centres[node] - self.centres[a]).xy()) / way.norm()
     }
 }
@@ -235,6 +239,7 @@ impl Search<'_> {
                 for &(_, second) in candidates.iter().filter(|(_, second)| second.0 > a) {
                     let matches = self.grown((a, b), second, &candidates);
                     self.largest = self.largest.max(matches.len());
+                    // Two anchors agree by construction: only further nodes are evidence.
                     if matches.len() >= self.config.min_matches.max(3) {
                         self.note(&matches);
                     }
@@ -259,6 +264,7 @@ impl Search<'_> {
                 }
             }
         }
+        // Growing is greedy: the closest lengths come first.
         found.sort_by(|a, b| a.0.total_cmp(&b.0));
         found
     }
@@ -271,6 +277,7 @@ impl Search<'_> {
             // A mirror image has the same distances and the other sign.
             let sides = self.ego.left_of((first.0, second.0), k)
                 - self.neighbour.left_of((first.1, second.1), l);
+            // Near the line the sign is uncertain: within the tolerance either side fits.
             if matches.iter().all(|&(a, b)| {
                 a != k
                     && b != l
@@ -319,6 +326,7 @@ impl Search<'_> {
 
     fn settled(&self, start: &Isometry3<f64>) -> Option<BoxAlignment> {
         let mut motion = *start;
+        // Inliers change with the motion: it is fitted to them twice.
         for _ in 0..2 {
             motion = self.fit(&self.together(&motion))?;
         }

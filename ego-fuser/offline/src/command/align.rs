@@ -131,6 +131,7 @@ impl Arguments {
         let scenarios = self.data.scenarios(&mut left_out)?;
         let mut rows = Vec::new();
         for (number, &boxes) in self.boxes.iter().enumerate() {
+            // Maps are read for every source of boxes; what they leave out is counted once.
             let mut of_maps = LeftOut::default();
             let mut methods = self.methods(&mut of_maps)?;
             if number == 0 {
@@ -202,6 +203,7 @@ impl Arguments {
     }
 
     fn box_source(&self, boxes: Boxes, methods: &[AlignmentSpec]) -> Result<BoxSource> {
+        // Where no method needs boxes nothing is detected, and no weights are needed.
         if boxes == Boxes::Annotated || !methods.iter().any(|method| method.needs_boxes) {
             return Ok(BoxSource::Annotated);
         }
@@ -246,6 +248,7 @@ fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let NamedSource { name, file } = source;
     let config: PoseSourceConfig = config_file::read(file).map_err(BadInput::of)?;
     let config = config.with_networks().at(file).map_err(BadInput::of)?;
+    // Built once already here: a source that cannot be built is an error before the comparison.
     let built = config.build(Inference::default());
     built.at(file).map_err(BadInput::of)?;
     Ok(Poses::spec(name.clone(), Measured::True, move || {

@@ -129,6 +129,7 @@ impl Arguments {
                 let loaded =
                     scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
                 left_out.add_tick(&loaded);
+                // The protocol puts the ego first: without its frame there is nothing to detect in.
                 if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
                     continue;
                 }
@@ -209,6 +210,7 @@ fn evaluate(setup: &Setup, data: &[Data], json: bool) -> Result<(Value, LeftOut)
         let frames = data.scenarios.iter().map(|scenario| scenario.ticks.len());
         let bar = progress::bar(frames.sum(), "frames").with_message(name);
         for scenario in &data.scenarios {
+            // The callback never ends the run.
             let _ = evaluator.run(scenario, &mut |frame| {
                 tally.add(&frame);
                 bar.inc(1);

@@ -297,6 +297,7 @@ impl Arguments {
         if self.without.is_empty() && self.time_steps.is_none() {
             return Ok(None);
         }
+        // With --init the sizes of maps are those of its network.
         let detector = match &self.init {
             Some(init) => {
                 let config = Weights::load(init).and_then(|weights| weights.config());

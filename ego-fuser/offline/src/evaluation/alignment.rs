@@ -13,7 +13,7 @@ use nalgebra::Isometry3;
 use protocol::message::Message;
 use protocol::{Box3d, HEADER_LEN, wire};
 
-use super::transmission::stamp;
+use super::participant::stamp;
 use crate::alignment::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 use ego_fuser::ego::Ego;
 
@@ -116,6 +116,7 @@ fn moment(
     on_outcome: &mut dyn FnMut(PairOutcome),
 ) -> Result<(), AlignError> {
     let ego_from = |index: usize| truth[0].inv_mul(&truth[index]);
+    // The ego is at distance 0, so it is always the first.
     let near: Vec<usize> = (0..frames.len())
         .filter(|&index| ego_from(index).translation.vector.norm() <= Ego::COMM_RANGE_M)
         .collect();

@@ -53,14 +53,3 @@ pub enum EvaluateError {
         period_ms: f64,
     },
 }
-
-impl EvaluateError {
-    /// True if one frame cannot be computed, and others may be, see [`DetectorError::is_of_frame`].
-    pub(super) fn is_of_frame(&self) -> bool {
-        match self {
-            Self::Detector(error) => error.is_of_frame(),
-            Self::Ego(error) => error.is_of_frame(),
-            _ => false,
-        }
-    }
-}

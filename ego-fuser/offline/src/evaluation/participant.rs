@@ -1,105 +1,120 @@
-//! Participant of an evaluation: an agent with its settings.
+//! Participant of an evaluation: the [loop](AgentLoop) of a vehicle, the same as in the live process, at given times.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use agent::agent::{Agent, AgentInput};
-use agent::agent_output::Perception;
-use agent::config::AgentSettings;
+use agent::agent::Agent;
+use agent::agent_loop::{AgentLoop, Input, LoopOptions, MessageEncoder, Output, Sweep};
+use agent::attack::CapturedMessages;
 use dataset::frame::Frame;
-use fusion::method::Exchange;
-use perception::detector::DetectorError;
-use protocol::{CodecConfig, EncodedFeatures, PoseEstimate, StageTiming, Stream, WireError};
+use protocol::{CavId, Limits, StageTiming, Stamp, Stream, wire};
 use tch::Tensor;
 
-#[derive(Debug)]
+use super::EvaluateError;
+use super::sent::{Answer, Sent};
+
 pub(super) struct Participant {
-    pub(super) agent: Agent,
+    agent_loop: AgentLoop,
+    encoder: MessageEncoder,
+    /// Streams that it publishes, in the order of sending.
+    streams: Vec<Stream>,
     /// True if its network is not that of the run.
     has_own_network: bool,
-    /// Encoding of its maps.
-    codec: CodecConfig,
-    /// Content that it publishes where a method needs feature maps.
-    in_place_of_maps: Vec<Exchange>,
-    /// Durations of the last sweep's pose.
-    pub(super) times: PoseTimes,
-    /// Stages of the last sweep's perception.
-    pub(super) stages: Vec<StageTiming>,
-}
-
-/// Durations of the last sweep's pose.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct PoseTimes {
-    /// Until the pose is published.
-    pub(super) estimate: Duration,
-    /// For the poses of later sweeps, after everything is published.
-    pub(super) observe: Duration,
+    /// Time of its last step, nanoseconds.
+    now_nanos: u64,
+    /// Durations of the stages of each step of the last sweep. The first of a step is the whole step.
+    steps: Vec<Vec<StageTiming>>,
 }
 
 impl Participant {
-    pub(super) fn new(agent: Agent, settings: &AgentSettings) -> Self {
+    pub(super) fn new(agent: Agent, options: LoopOptions, has_own_network: bool) -> Self {
         Self {
-            agent,
-            has_own_network: settings.weights.is_some(),
-            codec: settings.codec,
-            in_place_of_maps: { settings.sent_for(Stream::Bev).into_iter() }
-                .map(|stream| match stream {
-                    Stream::Boxes => Exchange::Boxes,
-                    _ => Exchange::Features,
-                })
-                .collect(),
-            times: PoseTimes::default(),
-            stages: Vec::new(),
+            encoder: MessageEncoder::new(&options),
+            streams: options.publish.clone(),
+            agent_loop: AgentLoop::new(agent, options),
+            has_own_network,
+            now_nanos: 0,
+            steps: Vec::new(),
         }
     }
 
-    /// Content that it publishes where a method needs `needed`, in the order of sending.
-    pub(super) fn exchange(&self, needed: Exchange) -> Vec<Exchange> {
-        match needed {
-            Exchange::Features => self.in_place_of_maps.clone(),
-            needed => vec![needed],
-        }
-    }
-
-    /// The published pose.
-    pub(super) fn pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        let began = Instant::now();
-        let pose = self.agent.estimate_pose(input);
-        self.times.estimate = began.elapsed();
-        pose
-    }
-
-    /// Last step of a sweep.
-    pub(super) fn observe(&mut self, input: &AgentInput<'_>) {
-        let began = Instant::now();
-        self.agent.observe(input);
-        self.times.observe = began.elapsed();
-    }
-
-    /// The published map, confidence and detections, from a map `[1, C, H, W]` of the run's encoder where there is one.
-    pub(super) fn perceive(
+    /// Messages of a sweep, from a map `[1, C, H, W]` of the run's encoder where there is one. A sweep that cannot be
+    /// computed has a pose alone. `captured` is what another vehicle sent, for an attack.
+    ///
+    /// # Errors
+    /// [`EvaluateError`] when no sweep can be computed, or a message cannot be encoded or decoded.
+    pub(super) fn compute(
         &mut self,
         frame: &Frame,
         map: Option<&Tensor>,
-    ) -> Result<Perception, DetectorError> {
-        let perception = match map.filter(|_| !self.has_own_network) {
-            Some(map) => self.agent.perceive_map(map),
-            None => self.agent.perceive(&frame.points),
-        }?;
-        self.stages.clone_from(&perception.times);
-        Ok(perception)
+        captured: impl FnOnce() -> CapturedMessages,
+    ) -> Result<Sent, EvaluateError> {
+        let capture_nanos = frame.capture_nanos;
+        self.steps.clear();
+        self.now_nanos = self.now_nanos.max(capture_nanos);
+        let map = map.filter(|_| !self.has_own_network);
+        self.agent_loop
+            .prepare(map.map(Tensor::shallow_clone), captured);
+        let sweep = Sweep {
+            capture_nanos,
+            arrived_nanos: capture_nanos,
+            cloud: frame.points.clone(),
+        };
+        let measured = [
+            frame.gnss().map(|gnss| Input::Gnss(capture_nanos, gnss)),
+            Some(Input::Motion(capture_nanos, frame.motion())),
+            Some(Input::Sweep(sweep)),
+        ];
+        let mut answer = Answer::default();
+        let mut is_over = false;
+        for input in measured.into_iter().flatten() {
+            is_over |= self.handle(input, &mut answer)?;
+        }
+        while !is_over || self.agent_loop.is_computing() {
+            // A sweep without a recorded pose waits for one as long as in a live run.
+            self.now_nanos = self.now_nanos.max(self.agent_loop.wakes_nanos());
+            is_over |= self.handle(Input::Wake, &mut answer)?;
+        }
+        Ok(answer.into_sent(frame, &self.streams))
     }
 
-    /// As [`Agent::write_map`].
-    pub(super) fn write_map(
-        &mut self,
-        perception: Perception,
-        capture_nanos: u64,
-    ) -> Result<EncodedFeatures, WireError> {
-        self.agent.write_map(
-            perception.features,
-            &perception.confidence,
-            &self.codec,
-            capture_nanos,
-        )
+    /// Hands an input to the loop and carries out what that decides. True if the sweep is computed, or left out.
+    fn handle(&mut self, input: Input, answer: &mut Answer) -> Result<bool, EvaluateError> {
+        let mut is_over = false;
+        for output in self.agent_loop.handle(input, self.now_nanos) {
+            match output {
+                Output::Publish(message) if message.stream != Stream::Descriptor => {
+                    let stamp = stamp(self.agent_loop.agent().cav(), message.capture_nanos);
+                    let (encoded, _) = self.encoder.encode(message, &stamp, None)?;
+                    let (_, message) = wire::decode_any(encoded.pieces(), &Limits::default())?;
+                    answer.note(message, encoded.wire_bytes() as u64)?;
+                }
+                Output::Timed(stages) => self.steps.push(stages),
+                Output::Failed(error) if error.is_of_frame() => answer.fail(&error),
+                Output::Failed(error) => return Err(error.into()),
+                Output::Computed { .. } | Output::Dropped(Stream::Lidar, _) => is_over = true,
+                _ => {}
+            }
+        }
+        Ok(is_over)
+    }
+
+    /// Durations of a step of the last sweep: the whole step, and its stages; of a step that was not made nothing.
+    pub(super) fn step(&self, name: &str) -> (Duration, &[StageTiming]) {
+        let mut steps = self.steps.iter().filter_map(|stages| stages.split_first());
+        let step = steps.find(|(whole, _)| whole.stage == name);
+        step.map_or((Duration::ZERO, &[]), |(whole, stages)| {
+            (Duration::from_nanos(whole.nanos), stages)
+        })
+    }
+}
+
+/// Sender and capture time of a sweep's messages, stamped at the capture time.
+pub(super) fn stamp(cav: &CavId, capture_nanos: u64) -> Stamp {
+    Stamp {
+        cav: cav.clone(),
+        epoch: 0,
+        sequence: 0,
+        capture_nanos,
+        publish_nanos: capture_nanos,
     }
 }

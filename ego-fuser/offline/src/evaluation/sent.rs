@@ -1,7 +1,12 @@
 //! Messages of a vehicle for a frame, as the ego receives them.
 
+use std::collections::BTreeMap;
+
 use agent::attack::CapturedMessages;
-use protocol::{CavId, PoseEstimate, RateChoice};
+use dataset::frame::Frame;
+use localization::pose_source::NO_SOURCE;
+use perception::detector::DetectorError;
+use protocol::{CavId, Limits, Message, PoseEstimate, RateChoice, Stream, WireError};
 
 use ego_fuser::ego::{Content, View};
 
@@ -29,13 +34,63 @@ pub(super) struct SentMessage {
     pub(super) rate: Option<RateChoice>,
 }
 
-impl SentMessage {
-    /// A message that had to keep within no limit.
-    pub(super) fn new(content: Content, bytes: u64) -> Self {
-        Self {
+/// The messages of a sweep as they come in.
+#[derive(Default)]
+pub(super) struct Answer {
+    pose: Option<(PoseEstimate, u64)>,
+    messages: BTreeMap<Stream, SentMessage>,
+    failure: Option<String>,
+}
+
+impl Answer {
+    /// Takes a message of so many bytes on the wire.
+    pub(super) fn note(&mut self, message: Message, bytes: u64) -> Result<(), WireError> {
+        let mut rate = None;
+        let (stream, content) = match message {
+            Message::Bev(message) => {
+                rate = message.features.rate;
+                let map = message.features.decode(&Limits::default())?;
+                (Stream::Bev, Content::Features(map))
+            }
+            Message::Boxes(message) => (Stream::Boxes, Content::Boxes(message.into_objects())),
+            Message::Points(message) => (Stream::Points, Content::Points(message.points)),
+            Message::Pose(pose) => {
+                self.pose = Some((pose, bytes));
+                return Ok(());
+            }
+            _ => return Ok(()),
+        };
+        let message = SentMessage {
             content,
             bytes,
-            rate: None,
+            rate,
+        };
+        self.messages.insert(stream, message);
+        Ok(())
+    }
+
+    /// Notes that the sweep cannot be computed.
+    pub(super) fn fail(&mut self, error: &DetectorError) {
+        self.failure = Some(error.to_string());
+    }
+
+    /// True with a pose and a message of each of these streams.
+    pub(super) fn is_complete(&self, streams: &[Stream]) -> bool {
+        self.pose.is_some() && { streams.iter() }.all(|stream| self.messages.contains_key(stream))
+    }
+
+    /// The answer with its messages in the order of these streams, whatever the order of their arrival.
+    pub(super) fn into_sent(mut self, frame: &Frame, streams: &[Stream]) -> Sent {
+        let (pose, pose_bytes) = self.pose.unwrap_or((NO_SOURCE, 0));
+        Sent {
+            cav: frame.cav.clone(),
+            capture_nanos: frame.capture_nanos,
+            pose,
+            pose_bytes,
+            messages: { streams.iter() }
+                .filter_map(|stream| self.messages.remove(stream))
+                .collect(),
+            failure: self.failure,
         }
     }
 }

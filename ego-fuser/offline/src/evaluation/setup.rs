@@ -95,12 +95,14 @@ impl Setup {
     /// The link of a scenario.
     pub(super) fn emulator(&self, scenario: &Scenario) -> Result<LinkEmulator, LinkError> {
         let Some(link) = &self.link else {
+            // Without an emulated link there is the delay alone, which no seed changes.
             let config = LinkConfig {
                 latency: LatencyModel::ConstantMs(self.delay_ms as f64),
                 ..LinkConfig::default()
             };
             return LinkEmulator::new(config, Path::new("."), 0);
         };
+        // By name: the result of a scenario does not depend on those before it.
         let seed_words: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
         let seed = derive_seed(link.seed, &seed_words);
         LinkEmulator::new(link.config.clone(), &link.folder, seed)
@@ -120,6 +122,7 @@ impl Setup {
             delay => delay.saturating_add(longest.max().unwrap_or(1).saturating_sub(1)),
         };
         LoopOptions {
+            // The ego waits for none, and takes none that was captured after its own sweep.
             deadline_nanos: 0,
             pairing: PairingConfig {
                 max_lead_nanos: 0,

@@ -19,10 +19,9 @@ use protocol::{CavId, Detections, PoseEstimate, StageTiming, Stream, Tracks};
 pub use compute::{ComputeTimes, EstimatedTimes};
 pub use remote::{RemoteError, RemotePool};
 
-use super::participant::Participant;
+use super::participant::{Participant, stamp};
 use super::sent::Sent;
 use super::sweeps::Sweep;
-use super::transmission::{stamp, view};
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
@@ -109,7 +108,15 @@ impl<'a> Run<'a> {
             let index = places.iter().filter(|other| **other < place).count();
             let own = setup.vehicles.get(&scenario.agents[place]);
             let (settings, is_ego) = (own.unwrap_or(&setup.agents), place == ego_place);
-            let participant = evaluator.participant(settings, scenario, (place, index), is_ego)?;
+            // Without an exchange, neighbours send their pose only.
+            let method = evaluator.ego.method();
+            let needed = match method.exchange() {
+                Exchange::Nothing if !is_ego => None,
+                _ => Some(method.own_content().stream()),
+            };
+            let places = (place, index);
+            let participant =
+                evaluator.participant(settings, scenario, places, (is_ego, needed))?;
             participants.push(participant);
         }
         let begin = setup.seek.min(scenario.ticks.len());
@@ -245,19 +252,14 @@ impl<'a> Run<'a> {
             let frames: Vec<&Frame> = sweeps.iter().map(|sweep| &sweep.frame).collect();
             return Ok(remote.request(&frames).map_err(Box::new)?);
         }
-        let method = self.evaluator.ego.method();
         let mut all: Vec<Sent> = Vec::with_capacity(sweeps.len());
         for Sweep { place, frame, map } in sweeps {
-            let is_needed = all.is_empty() || method.exchange() != Exchange::Nothing;
-            let exchange = is_needed.then(|| method.own_content());
             let index = self.places.iter().position(|it| it == place);
             if let Some(participant) = index.and_then(|index| self.participants.get_mut(index)) {
                 // A replaying attacker repeats the message of the vehicle before it.
                 let captured = || all.last().map(Sent::captured).unwrap_or_default();
-                participant.agent.capture(captured);
-                let exchange = exchange.map(|needed| participant.exchange(needed));
-                let exchange = exchange.unwrap_or_default();
-                all.push(view(participant, frame, map.as_ref(), &exchange)?);
+                let sent = participant.compute(frame, map.as_ref(), captured)?;
+                all.push(sent);
             }
         }
         Ok(all)

@@ -65,6 +65,7 @@ pub fn fuse_levels(
             let (_, _, height, width) = maps.size4()?;
             maps = maps.f_mul(&resized(sent, [height, width])?)?;
         }
+        // Each agent's own map goes on to the next level, not the fused one.
         fused.push(fuse_samples(&maps, levels)?);
     }
     Ok(backbone.upsampled(&fused, false))

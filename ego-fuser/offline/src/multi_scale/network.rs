@@ -143,6 +143,7 @@ impl MultiScaleNetwork {
         );
         let (sent, rate) = match &self.communication {
             Some(communication) => {
+                // Which cells an agent sends depends on the scores of its own map.
                 let alone = network.heads(&network.features_of_canvas(&canvas, false))?;
                 let masks = communication.masks(&alone.scores)?;
                 let rate = mean_rate(&masks, samples)?;
@@ -177,12 +178,14 @@ impl MultiScaleNetwork {
         let (pillar_grid, config) = (self.network.pillar_grid(), &self.network.config);
         let stride = config.layer_strides[0];
         let [height, width] = [pillar_grid.height, pillar_grid.width].map(|extent| extent as u64);
+        // A strided convolution with padding rounds up.
         let [height, width] = [height, width].map(|extent| extent.div_ceil(stride.unsigned_abs()));
         let (cells, cell_bytes) = (height * width, 4 * config.num_filters[0].unsigned_abs());
         let agents = samples.iter().map(|sample| sample.agents).sum::<i64>();
         let Some(sent) = sent else {
             return Ok(vec![cells * cell_bytes; agents.unsigned_abs() as usize]);
         };
+        // Interpolation spreads a sent cell over its neighbours: all with a part of it are sent.
         let selected = resized(sent, [height as i64, width as i64])?.f_gt(0.0)?;
         let selected: Vec<i64> = Vec::try_from(&selected.f_sum_dim_intlist(
             [1i64, 2, 3].as_slice(),

@@ -83,14 +83,17 @@ impl OfflineDetector {
 
     /// The pillars of a vehicle's sweep, in the frame that its network encodes in.
     fn pillars(&mut self, cloud: &PointCloud, ego_from_cav: &Pose) -> Pillars {
+        // A vehicle's own body is where its sensor is: removed before its cloud is moved.
         let cloud = self.crop.without_own_body(cloud);
         let cloud = if self.network.config().one_frame {
             merge_points([&cloud], &[*ego_from_cav])
         } else {
             cloud
         };
+        // The area is that of the frame in which the network encodes: cropped after the move.
         let mut kept = Vec::new();
         self.crop.range_only().keep(&cloud.xyzi, &mut kept);
+        // Weights from CARLA have y to the right: clouds are mirrored on the way in, boxes on the way out.
         if self.is_mirrored() {
             kept.iter_mut().for_each(|point| point[1] = -point[1]);
         }

@@ -66,7 +66,9 @@ impl SweepEncoder {
     /// The message of a sweep: by agent, then by tick within its scenario. Empty for a sweep that is absent, or that
     /// cannot be read or computed, and beyond the last.
     pub(super) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, Error> {
+        // The last scenario that begins at or before the sweep: those without ticks are passed over.
         let scenario = self.first.partition_point(|&first| first <= sweep) - 1;
+        // The end is one more entry of `first`: threads ask for numbers beyond it.
         let Some(of) = self.scenarios.get(scenario) else {
             return Ok(Vec::new());
         };

@@ -70,6 +70,7 @@ impl ViewAugment {
         );
         let side = if self.mirrored { -1.0f32 } else { 1.0 };
         for [x, y, z, _] in points {
+            // Mirrored before it is rotated, as boxes and poses are.
             let (old_x, old_y) = (*x, *y * side);
             *x = cos * old_x - sin * old_y;
             *y = sin * old_x + cos * old_y;
@@ -95,11 +96,13 @@ impl ViewAugment {
             self.turn() * Vector3::from(self.mirror(ego_from_cav.translation_m)) * self.scale;
         let mut rotation = *isometry.rotation.to_rotation_matrix().matrix();
         if self.mirrored {
+            // S R S with S = diag(1, -1, 1): the product of two reflections and a rotation is a rotation.
             let side = Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, 1.0));
             rotation = side * rotation * side;
         }
         let rotation =
             UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        // From right to left: old frame of the other from its new one, the pose, new ego from old.
         Isometry3::from_parts(
             translation.into(),
             self.turn() * rotation * cav.turn().inverse(),

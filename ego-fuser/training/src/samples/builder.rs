@@ -218,6 +218,7 @@ impl SampleBuilder {
                 true => now.tick,
                 false => self.config.moments.draw_newest(ticks, now.tick, rng),
             };
+            // Vehicles without a pose get no number: numbers have no gaps.
             let place = newest.len();
             let steps = self.config.moments.steps(ticks, now.tick, last, gap);
             for (step, tick) in steps.into_iter().enumerate() {
@@ -229,6 +230,7 @@ impl SampleBuilder {
                     ..
                 } = pose
                 else {
+                    // Without its newest view a vehicle has no part; an older one may be missing.
                     match step {
                         0 => break,
                         _ => continue,
@@ -305,6 +307,7 @@ impl SampleBuilder {
         if self.config.kind == SampleKind::Merged {
             let poses: Vec<Pose> = facts.iter().map(|facts| facts.ego_from_cav).collect();
             clouds = vec![merge_points(&clouds, &poses)];
+            // One view is left: that of the ego.
             facts.truncate(1);
         }
         let pillars = clouds.iter();
@@ -329,6 +332,7 @@ impl SampleBuilder {
             let Some(frame) = frame else { continue };
             let [x, y, _] = self.world_from_lidar(tick, frame)?.translation_m;
             let in_reach = (x - ego_x).hypot(y - ego_y) <= self.config.comm_range_m;
+            // Drawn for every vehicle, in reach or not: later draws do not depend on distances.
             let dropped = rng.random_bool(self.config.drop_neighbour);
             if agent != ego && in_reach && !dropped && agents.len() < self.config.max_agents {
                 agents.push(agent);
@@ -365,6 +369,7 @@ impl SampleBuilder {
             object.box3d = ego_view.box3d(&object.box3d);
         }
         truth.objects.retain(|object| {
+            // By its centre: a box across the edge of the grid is still a target.
             let center = object.box3d.center_m;
             (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&center[axis]))
         });

@@ -113,6 +113,7 @@ pub fn batches(
         let sample = |index| {
             let mut rng = ChaCha8Rng::seed_from_u64(order.seed);
             // Streams are independent sequences of one seed.
+            // Stream 0 is that of the order of the first epoch.
             rng.set_stream(index + 1);
             builder.build(order.tick(index), &mut rng)
         };
@@ -145,6 +146,7 @@ impl Order {
         let epoch = index / count;
         if self.epoch != Some(epoch) {
             self.shuffled.clone_from(&self.ticks);
+            // The factor is 2^64 over the golden ratio: seeds of successive epochs lie far apart.
             let mut rng = ChaCha8Rng::seed_from_u64(
                 self.seed
                     .wrapping_add(epoch.wrapping_mul(0x9E37_79B9_7F4A_7C15)),

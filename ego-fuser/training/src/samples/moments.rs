@@ -33,6 +33,7 @@ impl Moments {
     pub(super) fn draw_newest(&self, ticks: &[Tick], now: usize, rng: &mut impl Rng) -> usize {
         let is_young =
             |tick: &&Tick| ticks[now].capture_nanos - tick.capture_nanos <= self.max_delay_nanos;
+        // Ticks ascend in time, so those that are young enough are the last ones.
         let arrived = ticks[..=now].iter().rev().take_while(is_young).count();
         now - rng.random_range(0..arrived.max(1))
     }

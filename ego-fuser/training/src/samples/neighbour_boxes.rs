@@ -74,6 +74,7 @@ impl Batch {
             return Err(Error::NothingToFreeze);
         };
         let maps = maps.f_to_device(model.device())?;
+        // Maps are stored as they are before the compressor.
         let maps = model.network().through_compressor(&maps, false);
         let mut first = 0;
         let (mut samples, mut refinement_losses) = (Vec::new(), Vec::new());
@@ -121,6 +122,7 @@ fn sample(
     mut rng: Option<&mut impl Rng>,
 ) -> Result<SampleWithBoxes, Error> {
     let agents = found.len();
+    // The ego always has its own map.
     let sends_boxes: Vec<bool> = (0..agents)
         .map(|agent| {
             agent > 0 && { rng.as_deref_mut() }.is_none_or(|rng| rng.random_bool(BOXES_ONLY))
@@ -173,6 +175,7 @@ fn carry(placed: &mut PlacedBox, age_secs: f64, rng: &mut impl Rng) {
         false => tracked_mps,
     };
     let off_m = rng.random_range(-most_mps..most_mps) * age_secs;
+    // Along the heading, in which a vehicle moves; forwards or backwards.
     let (sin, cos) = placed.box3d.heading_rad.sin_cos();
     placed.box3d.center_m[0] += off_m * cos;
     placed.box3d.center_m[1] += off_m * sin;
@@ -228,6 +231,7 @@ impl Shift {
     /// The errors of all vehicles of a sample.
     fn draw_all(agents: usize, rng: &mut impl Rng) -> Vec<Self> {
         let [of_each, of_all] = SHIFTED;
+        // One draw decides among errors of each, a common error and none.
         let draw: f64 = rng.random();
         if draw < of_each {
             return (0..agents).map(|_| Self::draw(rng)).collect();
@@ -260,6 +264,7 @@ impl Shift {
     fn placed(&self, found: &[Detection], sender: usize, fact: &MapMetadata) -> Vec<PlacedBox> {
         let pose = &fact.ego_from_cav;
         let translation_m = std::array::from_fn(|axis| pose.translation_m[axis] + self.by_m[axis]);
+        // Without a turn roll and pitch are kept; a planar pose has none.
         let moved = match self.turn_rad == 0.0 {
             true => Pose {
                 translation_m,

@@ -45,6 +45,7 @@ impl SamplePoses {
         let is_lost = self.lost_share > 0.0 && rng.random_bool(self.lost_share);
         let lost = is_lost.then(|| Lost::draw(rng));
         let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share);
+        // Drawn in any case: later draws are the same with and without noise.
         let seed = rng.random();
         let mut drawn = DrawnError {
             lost,
@@ -80,6 +81,7 @@ impl Offset {
     pub fn between(reported: &Pose, real: &Pose) -> Self {
         let along = |axis: usize| real.translation_m[axis] - reported.translation_m[axis];
         let turn_rad = real.yaw_rad() - reported.yaw_rad();
+        // Sine and cosine wrap the difference into half a turn to either side.
         Self([along(0), along(1), turn_rad.sin().atan2(turn_rad.cos())])
     }
 }
@@ -112,6 +114,7 @@ impl Lost {
             false => 0.0,
         };
         Self {
+            // The number of neighbours is not known yet: reduced to it later.
             draw: rng.random_range(0..usize::MAX),
             shift_m: [distance_m * cos, distance_m * sin],
             turn_rad,
@@ -131,6 +134,7 @@ impl DrawnError {
         [agent, agents]: [usize; 2],
     ) -> PoseEstimate {
         let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
+        // The ego is never lost; where there is a neighbour, the divisor is 1 or more.
         let is_lost = |lost: &&Lost| agent > 0 && lost.draw % (agents - 1) == agent - 1;
         let (Some(lost), Some((pose, confidence))) =
             (self.lost.as_ref().filter(is_lost), known(&noisy))

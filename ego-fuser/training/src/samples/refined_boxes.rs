@@ -37,6 +37,7 @@ pub(super) fn refined_boxes(
         return Ok((found, None));
     };
     let corrections = refinement.corrections(map, &found)?;
+    // Plain numbers: no gradient flows through the IoU of a corrected box.
     let mut refined = corrected(found.clone(), &values(&corrections)?);
     let targets = Targets::new(&found, &refined, ego_from_cav, truth);
     let loss = targets.loss(&corrections, &found)?;
@@ -79,6 +80,7 @@ impl Targets {
         for (detection, refined) in found.iter().zip(refined) {
             let object = best(&detection.box3d).filter(|(_, iou)| *iou >= LEAST_IOU);
             let wanted = object.map(|(index, _)| correction(&detection.box3d, &objects[index]));
+            // A correction beyond the limits cannot be applied: its detection counts as one of no object.
             let wanted = wanted.filter(is_within_limits);
             let numbers = wanted.unwrap_or_default();
             targets
@@ -88,6 +90,7 @@ impl Targets {
                 .is_object
                 .push(f32::from(u8::from(wanted.is_some())));
             let [least, most] = SCORED_IOU;
+            // The score is that of the box after its correction.
             let iou = best(&refined.box3d).map_or(0.0, |(_, iou)| iou);
             targets
                 .score
@@ -96,6 +99,7 @@ impl Targets {
                 .box3d
                 .transformed(&ego_from_cav.isometry())
                 .center_m;
+            // Objects beyond the area are not in the truth: nothing can be said about detections there.
             let [x0, y0, x1, y1] = truth.area_m;
             let is_known = (x0..=x1).contains(&x) && (y0..=y1).contains(&y);
             targets.is_known.push(f32::from(u8::from(is_known)));
@@ -111,9 +115,11 @@ impl Targets {
         let off = corrections.f_narrow(1, 0, OF_BOX)?;
         let boxes = off.f_smooth_l1_loss(&wanted, Reduction::None, BETA)?;
         let boxes = boxes.f_mul(&column(&self.is_object)?)?.f_sum(Kind::Float)?;
+        // Scores of exactly 0 or 1 have no finite logit.
         let before: Vec<f32> = { found.iter() }
             .map(|detection| detection.score.clamp(1e-4, 1.0 - 1e-4))
             .collect();
+        // A score is corrected by a sum of logits, as in inference.
         let logit = column(&before)?.f_logit(None)? + corrections.f_narrow(1, OF_BOX, 1)?;
         let (none, each) = (None::<&Tensor>, Reduction::None);
         let score = column(&self.score)?;

@@ -57,6 +57,7 @@ impl SceneSet {
             let sampled = findings::sampled(&dataset.scenarios, options.intensity_scale);
             findings::note(&sampled);
             let protocol = protocol.resolve(dataset.layout);
+            // Samples have a limit of their own, counted from an ego that is drawn.
             let protocol = EvaluationProtocol {
                 max_agents: usize::MAX,
                 ..protocol.map_err(|error| Error::Data(format!("evaluation protocol: {error}")))?
@@ -107,6 +108,7 @@ impl SceneSet {
     /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; `None` for
     /// those that are absent or whose file cannot be read.
     pub fn annotations(&self, tick: TickRef) -> Arc<Vec<Option<Frame>>> {
+        // The lock is not held while files are read: two threads may read the same tick.
         let known = lock(&self.known).get(&tick).cloned();
         if let Some(frames) = known {
             return frames;

@@ -32,6 +32,7 @@ impl<'a> FrozenEncoder<'a> {
                 let _ = variable.f_set_requires_grad(false)?;
             }
         }
+        // In floating point, also where the file has scales for 8-bit inference.
         let weights = Weights::load(init)
             .map_err(ModelError::from)?
             .with_precision(InferencePrecision::Float);

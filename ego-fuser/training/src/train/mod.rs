@@ -20,7 +20,7 @@ use perception::weights::Weights;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tch::nn::VarStore;
-use tch::{Device, Kind, Tensor};
+use tch::Tensor;
 
 pub use accuracy::Accuracy;
 pub use config::TrainConfig;
@@ -69,12 +69,6 @@ fn first_model(config: &TrainConfig) -> Result<CooperativeModel> {
     })
 }
 
-/// A seed from the generator of the tensor library, which the training's own seed has set.
-fn random_seed() -> Result<u64> {
-    let drawn = Tensor::f_randint(i64::MAX, [1], (Kind::Int64, Device::Cpu))?;
-    Ok(drawn.f_int64_value(&[0])?.unsigned_abs())
-}
-
 struct Training<'a> {
     config: &'a TrainConfig,
     observer: &'a mut dyn Observer,
@@ -97,9 +91,11 @@ impl<'a> Training<'a> {
             config.samples.merged_truth,
         )?;
         let run = &config.run;
+        // Seeds the tensor library: before the first variable is made.
         run.start()?;
         let mut model = first_model(config)?;
         let frozen = frozen::FrozenEncoder::of(config, &model)?;
+        // Before the optimizer is made, which takes the variables that are trained by then.
         if config.box_input {
             model.train_box_input_only()?;
         }
@@ -127,6 +123,7 @@ impl<'a> Training<'a> {
             }
         }
         let method = Some(config.method.name());
+        // The time of the training begins here: encoding maps does not count.
         let trainer = Trainer::begin(run, &model.variables, method, Instant::now())?;
         let curve = DetectorCurve::open(&trainer)?;
         observer.opened(&scenes.data());
@@ -135,6 +132,7 @@ impl<'a> Training<'a> {
             config,
             observer,
             scenes,
+            // A resumed training goes on with the next batch.
             loader: batches(&builder, pillar_grid, run, trainer.steps()),
             model,
             validator,
@@ -190,7 +188,7 @@ impl Task for Training<'_> {
         (steps * self.config.run.batch as u64) as f64 / self.scenes.ticks().len() as f64
     }
 
-    fn loss(&mut self, _: &Trainer) -> Result<Tensor> {
+    fn loss(&mut self, trainer: &Trainer) -> Result<Tensor> {
         let asked = Instant::now();
         let batch = self.loader.next_batch()??;
         self.window.waited += asked.elapsed();
@@ -198,7 +196,9 @@ impl Task for Training<'_> {
         let device = self.config.run.device;
         let labels = LabelTensors::gather(&batch.labels, config.unassigned, device);
         if self.config.box_input {
-            let mut rng = ChaCha8Rng::seed_from_u64(random_seed()?);
+            // Of the step, so that a resumed training repeats none.
+            let mut rng = ChaCha8Rng::seed_from_u64(self.config.run.seed);
+            rng.set_stream(trainer.steps());
             let with_boxes = batch.with_boxes(&self.model, Some(&mut rng))?;
             let head = self.model.detect_with_boxes(&with_boxes.samples)?;
             let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
@@ -237,6 +237,7 @@ impl Task for Training<'_> {
 
     fn report(&mut self, trainer: &Trainer) -> Result<()> {
         let window = std::mem::replace(&mut self.window, Window::new());
+        // A window without a finite step gives NaN, which the picture leaves out.
         let [score_loss, box_loss] = window.losses.map(|sum| sum / window.finite as f64);
         let seconds = window.since.elapsed().as_secs_f64().max(1e-9);
         let share_done = self.share_done(trainer);

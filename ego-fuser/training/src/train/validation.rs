@@ -71,6 +71,7 @@ impl Validator {
         let mut scorer = Scorer::default();
         let limits = model.limits();
         for (number, &tick) in self.ticks.iter().enumerate() {
+            // Seeded by the number of the frame: its ego is the same vehicle in every validation.
             let mut rng = ChaCha8Rng::seed_from_u64(number as u64);
             let sample = self.builder.build(tick, &mut rng)?;
             // The ground truth has the same limits as the detections.

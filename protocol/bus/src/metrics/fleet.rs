@@ -22,6 +22,7 @@ pub struct MetricsPeer {
 
 /// One document of the own series and those of the others, with `v2vloc_process_up` for each of the others.
 pub(super) fn fleet_exposition(own: &str, others: &[MetricsPeer]) -> String {
+    // All at once: slow processes delay the document by one limit, not by one limit each.
     let texts: Vec<Option<String>> = thread::scope(|scope| {
         let fetch = |peer: &MetricsPeer| {
             let (status, body) = web::fetch_within(peer.address, "/metrics", WAIT_LIMIT).ok()?;
@@ -66,6 +67,7 @@ fn merged<'a>(texts: impl Iterator<Item = &'a str>) -> String {
         let (mut family, mut is_known) = ("", false);
         for line in text
             .lines()
+            // Each document ends in this line, which may occur only once in the merged one.
             .filter(|line| !line.is_empty() && *line != "# EOF")
         {
             if let Some(described) = line.strip_prefix("# ") {

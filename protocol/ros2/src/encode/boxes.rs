@@ -32,6 +32,7 @@ pub(crate) fn detections(nanos: u64, frame_id: &str, detections: &[Detection]) -
 /// Tracks in the frame `frame_id`, each with its identity and the covariance of its place. The type has no velocity.
 pub(crate) fn tracks(nanos: u64, frame_id: &str, tracks: &[Track]) -> Vec<u8> {
     let found = tracks.iter().map(|track| {
+        // Rows of x, y, z and the rotations: a track has a covariance of x and y only.
         let mut covariance = [[0.0; 6]; 6];
         let [[xx, xy, ..], [_, yy, ..], ..] = track.covariance.map(|row| row.map(f64::from));
         (covariance[0][0], covariance[0][1]) = (xx, xy);
@@ -51,6 +52,7 @@ fn array(nanos: u64, frame_id: &str, found: impl ExactSizeIterator<Item = Found>
         for (box3d, score, covariance, id) in found {
             let pose = Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad);
             cdr::header(cdr, nanos, frame_id);
+            // One hypothesis with its pose, then the box, whose centre is the same pose.
             cdr.write_sequence_length(1);
             cdr.write_string(CLASS);
             cdr.write_f64(score);
@@ -143,6 +145,7 @@ pub(crate) fn markers(
             marker(
                 cdr,
                 (frame_id, ns, nanos),
+                // A marker replaces one of the same namespace and id: without an id its place serves.
                 (marked.id.unwrap_or(place), ADD),
                 rgb,
                 marked,
@@ -176,6 +179,7 @@ fn marker(
     cdr.write_sequence_length(0); // points
     cdr.write_sequence_length(0); // colours
     cdr.write_string(""); // texture
+    // Texture: an empty `sensor_msgs/CompressedImage`.
     cdr::header(cdr, 0, "");
     cdr.write_string("");
     cdr.write_sequence_length(0);

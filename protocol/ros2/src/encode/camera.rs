@@ -23,6 +23,7 @@ pub(crate) fn camera_info(
 ) -> Vec<u8> {
     let [fx, fy] = [pinhole.fx_px, pinhole.fy_px];
     let [cx, cy] = [pinhole.cx_px, pinhole.cy_px];
+    // K (3 x 3), R (3 x 3) and P (3 x 4), row-major.
     let intrinsic = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0];
     let rectification = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
     let projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0];
@@ -31,6 +32,7 @@ pub(crate) fn camera_info(
         cdr.write_u32(metadata.height_px);
         cdr.write_u32(metadata.width_px);
         cdr.write_string("plumb_bob");
+        // A sequence with its length; the matrices after it have fixed sizes, and no length on the wire.
         let distortion = [0.0; 5];
         cdr.write_sequence_length(distortion.len());
         for number in distortion

@@ -44,6 +44,7 @@ pub(crate) fn odometry(
 
 /// Covariance of a pose of which position and yaw in the plane are measured.
 fn pose_covariance(planar: Option<&PlanarCovariance>) -> [[f64; 6]; 6] {
+    // Height, roll and pitch have no variance in a planar covariance.
     let mut rows = diagonal([UNMEASURED; 6]);
     let [x, y, _, _, _, yaw] = &mut rows;
     if let Some(planar) = planar {

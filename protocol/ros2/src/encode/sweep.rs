@@ -16,6 +16,7 @@ pub(crate) fn point_cloud(nanos: u64, frame_id: &str, cloud: &PointCloud) -> Vec
         cdr.buffer_mut()
             .reserve(cloud.len() * POINT_STEP as usize + 256);
         cdr::header(cdr, nanos, frame_id);
+        // Height 1: a cloud without an order in rows.
         cdr.write_u32(1);
         cdr.write_u32(count);
         let fields = ["x", "y", "z", "intensity"];
@@ -31,6 +32,7 @@ pub(crate) fn point_cloud(nanos: u64, frame_id: &str, cloud: &PointCloud) -> Vec
         cdr.write_u32(count.saturating_mul(POINT_STEP));
         // All supported machines are little-endian, as the header states.
         cdr.write_bytes(bytemuck::cast_slice(&cloud.xyzi));
+        // `is_dense`: no point without coordinates, as decoding refuses them.
         cdr.write_bool(true);
     })
 }

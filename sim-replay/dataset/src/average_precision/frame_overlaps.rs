@@ -56,7 +56,9 @@ impl FrameOverlaps {
     /// Verdicts on all detections, in their order, for a part of the objects.
     pub(super) fn judge(&self, part: &Selection, iou_threshold: f64) -> Vec<Verdict> {
         let threshold = iou_threshold as f32;
+        // Detections beyond the range are no candidates, so they keep this verdict.
         let mut verdicts = vec![Verdict::Ignored; self.detections];
+        // Objects outside of the part count as taken: nothing matches them.
         let mut taken: Vec<bool> = part.objects.iter().map(|is_in| !is_in).collect();
         for candidate in &self.by_score {
             let overlaps = candidate.overlaps.iter().zip(&part.objects);
@@ -64,6 +66,7 @@ impl FrameOverlaps {
                 .any(|(overlap, is_in)| !is_in && *overlap >= threshold);
             verdicts[candidate.index] = match take_best(&candidate.overlaps, &mut taken, threshold)
             {
+                // A match wins: only a detection without one may be excused by another object.
                 Some(object) => Verdict::Match(object),
                 None if is_on_other || !part.detections[candidate.index] => Verdict::Ignored,
                 None => Verdict::FalsePositive,
@@ -112,6 +115,7 @@ fn take_best(overlaps: &[f32], taken: &mut [bool], threshold: f32) -> Option<usi
             best = Some((index, overlap));
         }
     }
+    // The best free object decides, as in the reference: it is not taken below the threshold.
     let (index, _) = best.filter(|(_, overlap)| *overlap >= threshold)?;
     taken[index] = true;
     Some(index)

@@ -183,11 +183,13 @@ fn role(name: &str) -> Role {
     let (Some(last), false) = (words.last(), has(&words, OTHER_WORDS)) else {
         return Role::Other;
     };
+    // Axes first: `t_x` is a position, though `t` alone is a time.
     if let Some(axis) = axis(last, &words) {
         return axis;
     }
     let stated = self::words(bracket).find_map(unit);
     match unit(last) {
+        // `sec` may be one half of `sec, nsec`, which `time_of` decides.
         Some(Unit::Seconds) if *last != "s" && stated.is_none() => return Role::Seconds,
         Some(Unit::Nanoseconds) if *last != "ns" && stated.is_none() => return Role::Nanos,
         _ => {}
@@ -196,6 +198,7 @@ fn role(name: &str) -> Role {
         let of_name = (*last == "utime").then_some(Unit::Microseconds);
         return Role::Time(stated.or(of_name).or_else(|| unit(last)));
     }
+    // `header.frame_id` names a frame of coordinates.
     if has(&[last], NUMBER_WORDS) && !words.contains(&"header") {
         return Role::Number;
     }
@@ -211,6 +214,7 @@ fn axis(last: &str, words: &[&str]) -> Option<Role> {
     let index = ['x', 'y', 'z', 'w']
         .iter()
         .position(|axis| *axis == letter)?;
+    // `qx` has the letter at the end of the word, `q_x` apart from it.
     let fused = last.strip_suffix(letter)?;
     let stem = [fused];
     let stems = if fused.is_empty() { words } else { &stem };

@@ -46,6 +46,7 @@ pub(super) fn join(stems: &[&str], clouds: &Keys, poses: &PoseFile) -> Result<Jo
         let joined = match (clouds, keys) {
             (_, Keys::Names(names)) => by_name(stems, names),
             (Keys::Numbers(clouds), Keys::Numbers(rows)) => {
+                // Before the join: shifted numbers would join most clouds, each to the pose of a neighbour.
                 if let Some(contradiction) = shift(clouds, rows) {
                     return Err(contradiction);
                 }
@@ -70,6 +71,7 @@ fn by_name(stems: &[&str], names: &[String]) -> Join {
             let name = name.trim_matches('"');
             let name = name.rsplit(['/', '\\']).next().unwrap_or(name);
             match name.rsplit_once('.') {
+                // A stem may contain a dot itself: then it has no ending to remove.
                 Some((stem, _)) if !known.contains(name) => stem,
                 _ => name,
             }
@@ -135,6 +137,7 @@ fn by_order(clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
         Some(row) => format!("clouds have {cloud}, poses {row}"),
         None => format!("clouds have {cloud}, poses no key"),
     };
+    // The order is the weakest key: each check below excludes a contradiction.
     if let Keys::Names(_) = clouds
         && !clouds.have_one_form()
     {
@@ -190,6 +193,7 @@ fn is_without_gap(clouds: &Keys, times: Option<&[u64]>) -> bool {
         let step = end.saturating_sub(start) as f64 / (last - first) as f64;
         numbers.iter().zip(times).all(|(number, time)| {
             let expected = step * (number - first) as f64;
+            // A missing cloud shifts all later ones by a whole step.
             (time.saturating_sub(start) as f64 - expected).abs() < 0.5 * step
         })
     })

@@ -51,6 +51,7 @@ impl Unit {
             .map(|(value, next)| (next - value).abs())
             .collect();
         steps.sort_unstable_by(f64::total_cmp);
+        // The median: a pause in the drive does not decide.
         let step = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
         Self::iter().find(|unit| {
             most * unit.seconds() < MOST_SECONDS && step * unit.seconds() <= MOST_STEP_S
@@ -59,6 +60,7 @@ impl Unit {
 
     /// Nanoseconds of values in this unit.
     pub(super) fn nanos(self, values: &[f64]) -> Vec<u64> {
+        // Doubles keep times since 1970 to a quarter of a microsecond.
         let scale = self.seconds() * 1e9;
         values
             .iter()

@@ -101,6 +101,7 @@ fn open(
         place_of(dir).ok_or_else(|| ReadError::malformed(dir, "no clouds with poses"))?;
     let mut faults = Faults::default();
     let poses = PoseFile::read(&path, &mut faults)?;
+    // Natural order compares fractions as whole numbers: 1.5 would come before 1.25.
     if let Keys::Times(times) = Keys::of_stems(&stems_of(&files)) {
         let mut timed: Vec<(u64, PathBuf)> = times.into_iter().zip(files).collect();
         timed.sort();
@@ -124,6 +125,7 @@ fn open(
         let nanos = capture_nanos(&keys, &poses, (index, *row))
             .unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
         let cloud = ((*stem).to_owned(), (file.clone(), world_from_lidar));
+        // The index keeps clouds of equal times apart.
         timed.insert((nanos, index), cloud);
     }
     without.report("cloud", problems);
@@ -174,6 +176,7 @@ fn stems_of(files: &[PathBuf]) -> Vec<&str> {
 
 /// Refuses two clouds of one number, time or stem: one pose cannot be that of both.
 fn no_two_alike(files: &[PathBuf], keys: &Keys) -> Result<()> {
+    // The files are in order, so equal keys are neighbours.
     for (pair, index) in files.windows(2).zip(0..) {
         if keys.are_equal(index, index + 1)
             && let [first, second] = pair

@@ -146,6 +146,7 @@ fn keys(rows: &[Row<'_>], columns: &Columns) -> PoseFile {
 
 impl<'a> Row<'a> {
     fn of(line: u64, text: &'a str) -> Self {
+        // With a byte order mark the first word would be no number.
         let text = text.trim_start_matches('\u{feff}').trim();
         let mut words: Vec<&str> = match text.contains([',', ';']) {
             true => text.split([',', ';']).map(str::trim).collect(),
@@ -237,6 +238,7 @@ impl<'a> Row<'a> {
 }
 
 fn of_quaternion([x, y, z, qx, qy, qz, qw]: [f64; 7]) -> Result<Pose, String> {
+    // TUM writes w last, nalgebra takes it first.
     let stored = Quaternion::new(qw, qx, qy, qz);
     if (stored.norm() - 1.0).abs() > 0.01 {
         return Err(format!(

@@ -54,6 +54,7 @@ pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64
     let (world_from_lidar, own_offset_m) = read_transform(&path)?;
     let [x_m, y_m] = pair.offset_m.unwrap_or(own_offset_m);
     let offset = Translation3::new(x_m, y_m, 0.0);
+    // Without an offset the files of the vehicle are not needed.
     if sides.kind == Kind::Dair || [x_m, y_m] == [0.0; 2] {
         return Ok(offset * world_from_lidar);
     }
@@ -95,6 +96,7 @@ fn nearest_rotation(field: &Field<'_>) -> Result<UnitQuaternion<f64>> {
     let (Some(u), Some(v_transposed)) = (parts.u, parts.v_t) else {
         return Err(field.error("no rotation"));
     };
+    // U V^T is the nearest rotation. The determinant was checked, so it is no reflection.
     let rotation = Rotation3::from_matrix_unchecked(u * v_transposed);
     Ok(UnitQuaternion::from_rotation_matrix(&rotation))
 }

@@ -81,6 +81,7 @@ pub(super) fn in_frame(
         valid.map_err(|error| location.error(error.to_string()))?;
         let track = label.optional("track_id")?;
         let track = track.and_then(|track| i64::try_from(track.count().ok()?).ok());
+        // A larger track id would reach into the ids of another list.
         let number = track.filter(|track| *track < BLOCK).unwrap_or(number);
         Ok(Some(Object {
             id: block.id(number),
@@ -180,6 +181,7 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>> {
         )));
     }
     let x = ahead.normalize();
+    // Not from `aside`: right-handed on whichever side the first corner is.
     let y = above.cross(&x).normalize();
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
     let center = (0..8).map(corner).sum::<Vector3<f64>>() / 8.0;
@@ -215,6 +217,7 @@ pub(super) fn share_ids(
             }
         }
     }
+    // Step: greedy assignment, the largest overlap first.
     overlaps.sort_by(|(a, ..), (b, ..)| b.total_cmp(a));
     let (mut is_named, mut is_given) = (vec![false; own.len()], vec![false; theirs.len()]);
     for (_, index, other) in overlaps {

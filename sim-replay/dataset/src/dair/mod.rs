@@ -264,10 +264,12 @@ impl Source {
         let own = labels::in_frame(&path, &world_from_lidar, Block::Vehicle);
         frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
         let path = self.sides.cooperative_labels(pair);
+        // DAIR-V2X has these labels in the world, V2X-Seq in the frame of the vehicle's LiDAR.
         let cooperative = match self.sides.kind {
             Kind::Dair => labels::in_world(&path),
             Kind::V2xSeq => labels::in_frame(&path, &world_from_lidar, Block::Cooperative),
         };
+        // Without a readable list the annotations of the two sides are merged instead.
         frame.cooperative_objects = usable(cooperative, &mut frame.problems);
         Ok(frame)
     }

@@ -24,6 +24,7 @@ impl Cells {
     pub(super) fn new(cloud: &PointCloud) -> Self {
         let mut begins = vec![0; ACROSS * ACROSS + 1];
         for point in &cloud.xyzi {
+            // Step: counting sort. One place behind, so that the sums are the beginnings.
             begins[cell_of(point) + 1] += 1;
         }
         for cell in 1..begins.len() {
@@ -47,6 +48,7 @@ impl Cells {
         let columns = index(center.x - radius)..=index(center.x + radius);
         let mut rows = index(center.y - radius)..=index(center.y + radius);
         rows.any(|row| {
+            // Neighbouring columns of a row are neighbours in memory: one range of points.
             let (first, last) = (row * ACROSS + columns.start(), row * ACROSS + columns.end());
             self.points[self.begins[first]..self.begins[last + 1]]
                 .iter()

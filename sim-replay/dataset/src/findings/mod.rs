@@ -147,6 +147,7 @@ pub fn sampled(scenarios: &[Scenario], scale: IntensityScale) -> Vec<Problem> {
     let ticks = (FRAMES / agents.max(1)).max(LEAST_TICKS);
     let problems = scenarios.into_iter().flat_map(|scenario| {
         let ticks: Vec<usize> = evenly(scenario.ticks.len(), ticks).collect();
+        // Agent by agent, so that the results below fall into the lists of agents in order of time.
         let places: Vec<(usize, usize)> = (0..scenario.agents.len())
             .flat_map(|agent| ticks.iter().map(move |&tick| (agent, tick)))
             .collect();

@@ -47,6 +47,7 @@ impl SweepFindings {
     /// Findings of a sweep with intensities from 0 to 1.
     pub fn of(cloud: &PcdCloud) -> Self {
         let values = || cloud.points.xyzi.iter().map(|point| point[3]);
+        // Evenly picked: the first points may all be of one laser.
         let step = cloud.points.len().div_ceil(MEDIAN_OF).max(1);
         let median = median(&values().step_by(step).collect::<Vec<_>>());
         let range = median.map(|median| {

@@ -211,6 +211,7 @@ fn read_shape(field: &Field<'_>) -> Result<Vec<usize>> {
             usize::try_from(item.integer()?).map_err(|_| item.error("a shape is not negative"))
         })
         .collect::<Result<_, _>>()?;
+    // Checked here: readers multiply the sizes without a check.
     let count = shape
         .iter()
         .try_fold(1usize, |count, &size| count.checked_mul(size));

@@ -99,6 +99,7 @@ fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Obje
             "{edges:?} are no sizes in metres, expected up to {MAX_SIZE_M}"
         )));
     }
+    // nuScenes has the width first. Sizes here begin with the length.
     let [width, length, height] = edges;
     let world_from_object: Pose = transform(row)?.into();
     Ok(Object {
@@ -125,6 +126,7 @@ pub(super) fn seen<'a>(
         let lidar = object_from_lidar.translation.vector;
         let half_m = object.size_m.map(|size| size / 2.0);
         let roof_m = [0.0, 0.0, MAX_MOUNT_M];
+        // The mount is added at both ends of z: the test is symmetric about the centre of the box.
         let carries_lidar = (0..3).all(|axis| lidar[axis].abs() <= half_m[axis] + roof_m[axis]);
         let reach_m = half_m.map(|half| half + HIT_MARGIN_M);
         !carries_lidar && is_hit(points, &object_from_lidar, reach_m)

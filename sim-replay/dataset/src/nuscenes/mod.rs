@@ -179,6 +179,7 @@ impl Builder<'_> {
         let mut scenario = Parts::default();
         for ((sample, objects), capture_nanos) in samples.into_iter().zip(capture_nanos) {
             let mut channels = agents.iter().map(|(_, channel)| channel);
+            // The first sweep in the order of the agents gives the name: the ego may lack one.
             let stem = channels.find_map(|channel| Some(sample.sweeps.get(channel)?.stem()));
             let stem = stem.unwrap_or_else(|| sample.micros.to_string());
             let tick = Tick::new(stem, capture_nanos);
@@ -370,6 +371,7 @@ impl FrameSource for Source {
     fn points(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> Result<PcdCloud> {
         let (_, sweep) = self.sweep(agent, tick)?;
         let mut cloud = self.sweeps.read(agent, &self.root.join(&sweep.file))?;
+        // By the turns that `Sweep::world_from_lidar` takes back in the pose.
         sweep.turns().apply(&mut cloud.points);
         Ok(cloud)
     }

@@ -48,6 +48,7 @@ impl QuarterTurns {
 
     /// The transform from the turned frame to the LiDAR's own.
     pub(super) fn lidar_from_turned(self) -> Isometry3<f64> {
+        // The inverse of the turns that `apply` gives the points.
         let angle = -f64::from(self.0) * FRAC_PI_2;
         Isometry3::from_parts(
             Default::default(),

@@ -173,6 +173,7 @@ fn read_sweeps(
 ) -> Result<HashMap<String, Vec<SweepRow>>> {
     let mut sweeps: HashMap<String, Vec<SweepRow>> = HashMap::new();
     let is_needed = |keys: &Keys<'_>| {
+        // A row without this key counts as one of a key frame.
         keys.is_key_frame != Some(false) && mounts.contains_key(&*keys.calibrated_sensor_token)
     };
     read_rows(version, "sample_data.json", problems, is_needed, |row| {
@@ -183,6 +184,7 @@ fn read_sweeps(
         let file = row.required("filename")?;
         let name = file.text()?;
         let mut parts = Path::new(name).components();
+        // An absolute path or `..` would lead out of the data set.
         if !parts.all(|part| matches!(part, Component::Normal(_))) {
             return Err(file.error(format!("{name:?}, expected a path below the data set")));
         }

@@ -118,6 +118,7 @@ fn pairs(scenario: &Scenario, agent: usize) -> Vec<Pair> {
         .step_by(step)
         .filter_map(|first| pair(scenario, agent, &ticks, first))
         .collect();
+    // Step: pairs spread evenly over the drive, from the middle of each part.
     let step = candidates.len().div_ceil(SPREAD).max(1);
     let mut chosen: Vec<Pair> = candidates
         .iter()
@@ -125,6 +126,7 @@ fn pairs(scenario: &Scenario, agent: usize) -> Vec<Pair> {
         .step_by(step)
         .copied()
         .collect();
+    // Step: of the others, those with the largest turn.
     candidates.retain(|pair| chosen.iter().all(|known| known.ticks != pair.ticks));
     candidates.sort_by(|a, b| {
         let [a, b] = [a, b].map(|pair| pair.stated.rotation.angle());
@@ -181,6 +183,7 @@ fn judge(scenario: &Scenario, agent: usize, pair: Pair) -> Option<Option<Contrad
     let is_other =
         between.translation.vector.norm() > OTHER_M || between.rotation.angle() > OTHER_RAD;
     let is_better = best.overlap > CLEAR.max(BETTER_RATIO * overlap).max(overlap + BETTER_BY);
+    // No motion overlaps, although the poses are close: the sweeps are of two places.
     let is_elsewhere = moved_m < NEAR_M && overlap.max(best.overlap) < LEAST_OVERLAP;
     Some(
         ((is_better && is_other) || is_elsewhere).then_some(Contradiction {

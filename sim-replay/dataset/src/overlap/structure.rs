@@ -54,6 +54,7 @@ impl Structure {
         let side = SIDE / PER_COLUMN;
         let mut columns = vec![(f32::INFINITY, f32::NEG_INFINITY); side * side];
         let positions = points.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
+        // The vehicle's own body moves with the sensor, and would confirm no motion.
         let near = positions.filter(|[x, y, _]| x.hypot(*y) > OWN_M);
         for [x, y, z] in near.clone() {
             if let Some(column) = index(x, y, PER_COLUMN).and_then(|place| columns.get_mut(place)) {
@@ -64,11 +65,13 @@ impl Structure {
         let mut field = vec![(0.0, f32::INFINITY, f32::NEG_INFINITY); SIDE * SIDE];
         for [x, y, z] in near {
             let column = index(x, y, PER_COLUMN).and_then(|place| columns.get(place));
+            // Step: columns that are high enough, without a model of the ground.
             let Some((low, high)) = column.filter(|(low, high)| high - low > HEIGHT_M) else {
                 continue;
             };
             let sample = index(x, y, 1).and_then(|place| samples.get_mut(place));
             if let Some(sample) = sample
+                // The foot of a column is ground, which coincides at any motion.
                 && z > low + ABOVE_FOOT_M
                 && sample.is_none()
             {
@@ -111,6 +114,7 @@ impl Structure {
         };
         let steps = (0_u16..).map(|step| 2.0 * CELL_M * f32::from(step) - radius_m);
         let offsets: Vec<f32> = steps.take_while(|&offset| offset <= radius_m).collect();
+        // Step: a coarse grid of planar motions.
         for degrees in (-MOST_TURN_DEG..=MOST_TURN_DEG).step_by(TURN_STEP) {
             for x in &offsets {
                 for y in &offsets {
@@ -118,6 +122,7 @@ impl Structure {
                 }
             }
         }
+        // Step: the neighbourhood of the best one, with smaller and smaller steps.
         for (step_m, step_deg) in REFINEMENTS {
             let around = best.first_from_second;
             for turn in [-step_deg, 0.0, step_deg] {

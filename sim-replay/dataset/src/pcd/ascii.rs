@@ -97,6 +97,7 @@ impl<'a> Lines<'a> {
                     return Err(self.wrong_count());
                 }
                 match column {
+                    // Not parsed: a field that is not read need not be a number.
                     Column::Ignored => drop(self.token()),
                     Column::Component(component) => {
                         let value = self.float(index)?;
@@ -202,6 +203,7 @@ impl<'a> Lines<'a> {
         let mut end = 0;
         let field = self.header.fields.iter().find(|field| {
             end += field.count;
+            // With too many values the last field is named.
             found.min(expected.saturating_sub(1)) < end
         });
         let name = field.map_or("", |field| &field.name);
@@ -248,6 +250,7 @@ fn short_token(text: &[u8]) -> Option<(u128, usize)> {
     // The top bit of the first byte below 0x21, a separator, is set; bits behind it have no meaning.
     let separators = word.wrapping_sub(ONES * 0x21) & !word & (ONES << 7);
     let bits = (separators.trailing_zeros() / 8) * 8;
+    // Without a separator in 16 bytes the token is too long for a key.
     let token = word & !u128::MAX.checked_shl(bits).filter(|_| separators != 0)?;
     Some((token, (bits / 8) as usize))
 }

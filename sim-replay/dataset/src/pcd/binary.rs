@@ -75,6 +75,7 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
     let unpacked = lzf::decompress(packed, unpacked_len)
         .map_err(|error| PcdError::of("DATA", error.to_string()))?;
     Ok(gather(header, &unpacked, |field, first| {
+        // A field begins behind the numbers of all points of those before it.
         column_of(field, first * points, field.size * field.count)
     }))
 }

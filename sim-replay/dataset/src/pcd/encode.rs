@@ -58,6 +58,7 @@ pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<
         Encoding::Ascii => {
             let mut text = header;
             text.reserve(points * bytes_per_point);
+            // With exponents: colours are subnormal numbers, whose plain decimals have over 40 digits.
             for [x, y, z, fourth] in stored {
                 // Writing to a String does not fail.
                 let _ = writeln!(text, "{x:e} {y:e} {z:e} {fourth:e}");

@@ -117,6 +117,7 @@ impl Header {
     /// Splits a file into its header and the rest.
     pub(super) fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), PcdError> {
         let mut entries = Entries::default();
+        // The byte order mark of UTF-8 would be part of the first key.
         let mut rest = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
         let mut line = 0;
         while !entries.has("DATA") {
@@ -210,6 +211,7 @@ impl Header {
                     );
                     return Err(PcdError::at(kinds.line, "TYPE", reason));
                 }
+                // Ahead of the types: a packed colour has four bytes, as a float and as an integer.
                 _ if self.intensity == IntensitySource::Red(index) => &[4],
                 Kind::Float => &[4, 8],
                 Kind::Signed | Kind::Unsigned => &[1, 2, 4, 8],
@@ -232,6 +234,7 @@ fn without_comment(line: &[u8]) -> &[u8] {
     let begin = line
         .iter()
         .zip(before)
+        // Only after a blank: a sign within a word is part of it.
         .position(|(&byte, before)| byte == b'#' && before.is_ascii_whitespace());
     begin.and_then(|begin| line.get(..begin)).unwrap_or(line)
 }

@@ -22,6 +22,7 @@ pub(super) enum LzfError {
 
 /// Unpacks exactly `unpacked_len` bytes.
 pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, LzfError> {
+    // Before the reservation: a false length must not claim the memory.
     if packed.len().saturating_mul(MAX_RATIO) < unpacked_len {
         return Err(LzfError::Ratio {
             packed: packed.len(),
@@ -69,6 +70,7 @@ fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&
             .ok_or(LzfError::CutOff)
     };
     let mut count = (control >> 5) + 2;
+    // 7 in the three bits: one more byte of the length, before that of the distance.
     if count == 9 {
         count += byte()?;
     }

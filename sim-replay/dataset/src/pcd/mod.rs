@@ -174,6 +174,7 @@ impl PcdCloud {
             points.iter().position(|point| !is_finite(point)),
         );
         if first.is_some() {
+            // Labels first, while the points still show which of them stay.
             let mut kept = points.iter().map(is_finite);
             labels.retain(|_| kept.next().unwrap_or(false));
             points.retain(is_finite);

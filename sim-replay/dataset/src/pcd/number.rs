@@ -53,6 +53,7 @@ pub(super) fn ordinary(text: &[u8]) -> Option<(f32, usize)> {
         digits += fraction;
         exponent = -i32::try_from(fraction).ok()?;
     }
+    // More digits have overflowed the mantissa.
     if digits == 0 || digits > MOST_DIGITS {
         return None;
     }
@@ -146,6 +147,7 @@ fn leading_digits(bytes: [u8; 8]) -> (u64, usize) {
     let bits = (others.trailing_zeros() / 8) * 8;
     // Leading zeros take the place of what follows. In two steps: without any digit all 64 bits are moved out.
     let ones = (word << ((64 - bits) / 2)) << ((64 - bits) / 2);
+    // The first digit is in the lowest byte: it weighs ten times its neighbour.
     let twos = (ones.wrapping_mul(10) + (ones >> 8)) & 0x00ff_00ff_00ff_00ff;
     let fours = (twos * 100 + (twos >> 16)) & 0x0000_ffff_0000_ffff;
     (

@@ -93,9 +93,11 @@ impl FloatForm {
         };
         let others: Vec<(usize, f64)> = OTHER_NUMBERS
             .into_iter()
+            // With few points the entropy of a wide form is small by chance.
             .filter(|step| numbers.len() >= LEAST_OTHER_POINTS * step)
             .map(|step| (step, column_entropy(&numbers, step)))
             .collect();
+        // Multiples of the right number are as good as it: the first within `EQUAL` of the best is right.
         let least = (others.iter()).fold(entropy - MUCH_LESS, |least, other| least.min(other.1));
         let right =
             |(_, other): &&(usize, f64)| *other < entropy - MUCH_LESS && *other <= least + EQUAL;
@@ -112,6 +114,7 @@ impl FloatForm {
     /// # Errors
     /// If the content has another form, or the file ends within a point.
     pub(super) fn decode(self, bytes: &[u8]) -> Result<PcdCloud, String> {
+        // Each file is checked against its content: one of another form would give scattered points.
         let own = Self::of_sample(bytes).transpose()?;
         if let Some(own) = own.filter(|own| *own != self) {
             return Err(format!(
@@ -160,6 +163,7 @@ fn column_entropy(numbers: &[f32], step: usize) -> f64 {
         let shares = counts.into_iter().filter(|&count| count > 0);
         let shares: Vec<f64> = shares.map(|count| f64::from(count) / points).collect();
         let entropy: f64 = shares.iter().map(|share| -share * share.ln()).sum();
+        // The correction is (occupied bins - 1) / 2n: a small sample underestimates the entropy.
         entropy + (shares.len() - 1) as f64 / (2.0 * points)
     };
     (0..step).map(of_column).sum::<f64>() / step as f64

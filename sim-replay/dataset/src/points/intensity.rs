@@ -59,6 +59,7 @@ impl FromStr for IntensityScale {
         let divisor = text
             .parse()
             .ok()
+            // Neither 0 nor NaN, infinite or subnormal: intensities stay finite.
             .filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0);
         divisor
             .map(|divisor| Self {
@@ -158,10 +159,12 @@ impl LiveIntensities {
         points: &mut PointCloud,
         field: Option<(String, IntensityKind)>,
     ) -> Option<String> {
+        // As stored: taken before the division below.
         let largest = (points.xyzi.iter()).fold(0.0, |largest: f32, point| largest.max(point[3]));
         let finding = match field {
             None => Some(NO_INTENSITY.to_owned()),
             Some((name, kind)) => {
+                // The range is fixed after some sweeps: a later change would shift all intensities.
                 if self.samples < SAMPLES && !points.is_empty() {
                     self.samples += 1;
                     self.largest = self.largest.max(largest);
@@ -177,6 +180,7 @@ impl LiveIntensities {
                 }))
             }
         };
+        // Filtered last: only a finding sets the flag.
         finding.filter(|_| !std::mem::replace(&mut self.has_finding, true))
     }
 }

@@ -35,6 +35,7 @@ impl Plausibility {
     /// The fault that no point is a return of a sensor: there is none, or all are too far away or at the origin.
     pub fn nothing_in_range(&self) -> Option<String> {
         let points = self.points;
+        // No point is both: the origin is within the range.
         (points == self.beyond_range + self.at_origin).then(|| match points {
             0 => "the sweep has no point".to_owned(),
             _ => format!("none of the {points} points is a return within {RANGE_M} m"),
@@ -67,6 +68,7 @@ impl Plausibility {
     pub fn fault(&self) -> Option<String> {
         let of = |count: usize, all: usize| count as f64 / all.max(1) as f64;
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+        // First: integers read as floats also lie within the range, close to the origin.
         let tiny = of(self.tiny, 3 * self.points);
         if tiny > TINY_SHARE {
             return Some(format!(

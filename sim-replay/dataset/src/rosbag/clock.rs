@@ -39,12 +39,14 @@ pub(super) fn longest_steady(stamps: &[u64]) -> SteadyPart {
             .copied()
             .is_some_and(|next| Some(next) <= before)
         {
+            // Two in a row that are not later: the clock was set back, and a part begins.
             parts.push(vec![index]);
         } else {
             strays += 1;
         }
     }
     let total: usize = parts.iter().map(Vec::len).sum();
+    // `max_by_key` takes the last of equals: reversed, that is the first part.
     let longest = (0..parts.len())
         .rev()
         .max_by_key(|&part| parts.get(part).map_or(0, Vec::len));

@@ -86,6 +86,7 @@ impl Contents {
 
     /// Orders everything by the time of recording, and reports messages that could not be read.
     pub(super) fn finish(&mut self, problems: &mut Vec<ReadError>) {
+        // Several topics feed one list, and SQLite is scanned topic by topic.
         let poses = self.poses.values_mut();
         for poses in poses.chain([&mut self.moving, &mut self.fixed]) {
             poses.sort_by_key(|pose| pose.recorded_nanos);
@@ -148,6 +149,7 @@ impl Contents {
         if !is_tf {
             self.poses.entry(topic.to_owned()).or_default().push(pose);
         } else if topic.rsplit('/').next() == Some(FIXED_TRANSFORMS) {
+            // Told by the last part of the topic: a robot may have a namespace, `/robot/tf_static`.
             self.fixed.push(pose);
         } else {
             self.moving.push(pose);
@@ -157,6 +159,7 @@ impl Contents {
 
 impl Scan for Contents {
     fn declare(&mut self, topic: &Topic) -> bool {
+        // MCAP declares a topic with each message: its fault is reported once.
         if !self.topics.contains(topic) {
             self.topics.push(topic.clone());
             if Use::of(topic).is_some() && !topic.is_cdr() {

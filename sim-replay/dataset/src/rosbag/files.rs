@@ -172,6 +172,7 @@ impl Unpacked {
 fn unpacked_copy(path: &Path) -> io::Result<TempPath> {
     let file = bounded_file::open(path)?;
     let most = bounded_file::most_unpacked(file.metadata()?.len());
+    // One byte more than allowed shows that there is more.
     let mut unpacked = zstd::stream::Decoder::new(file)?.take(most.saturating_add(1));
     let mut copy = tempfile::NamedTempFile::new()?;
     if io::copy(&mut unpacked, copy.as_file_mut())? > most {

@@ -38,6 +38,7 @@ pub(super) struct PoseSource {
 impl PoseSource {
     /// `world_from_lidar` at a time, nanoseconds.
     pub(super) fn at(&self, transforms: &Transforms, nanos: u64) -> Result<Isometry3<f64>, NoPose> {
+        // At the time of the sweep too: joints between body and LiDAR may move.
         let rest = transforms.along(&self.route, nanos)?;
         Ok(match &self.world_from_child {
             Some(poses) => poses.at(nanos)? * rest,
@@ -73,6 +74,7 @@ impl PoseSources {
         let chains: Vec<PoseSource> = chains
             .into_iter()
             .map(|(world, route)| {
+                // A chain has no more poses than its sparsest trajectory.
                 let sparsest = sources.transforms.sparsest(&route);
                 PoseSource {
                     name: format!("transforms ({} in {world})", sweeps.frame),

@@ -24,7 +24,9 @@ impl SqliteFile {
         problems: &mut Vec<ReadError>,
     ) -> std::result::Result<Self, ReadError> {
         let fault = |error| ReadError::malformed(name, format!("SQLite: {error}"));
+        // SQLite's own mutex is not needed: the connection is behind one here.
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        // Refuses pipes and devices before SQLite opens them.
         bounded_file::open(path).map_err(|error| ReadError::io(name, error))?;
         let connection = Connection::open_with_flags(path, flags).map_err(fault)?;
         for (id, topic) in topics(&connection).map_err(fault)? {
@@ -77,6 +79,7 @@ fn messages(
         let data = row.get_ref(2)?.as_blob()?;
         scan.take(Message {
             topic,
+            // SQLite has signed numbers only. A negative time counts as 0.
             recorded_nanos: u64::try_from(recorded_nanos).unwrap_or(0),
             data: unpacked_message(data).map_err(|error| error.to_string()),
             place: Place {

@@ -82,6 +82,7 @@ impl Transforms {
     /// The shortest way from `target` to `source`; `None` if they are not connected.
     pub(super) fn route(&self, target: &str, source: &str) -> Option<Route> {
         let mut reached: BTreeMap<&str, Option<(&str, Step)>> = BTreeMap::from([(target, None)]);
+        // Breadth first, over transforms in both directions: the first way found is the shortest.
         let mut open = VecDeque::from([target]);
         while let Some(frame) = open.pop_front().filter(|frame| *frame != source) {
             for (edge, Edge { parent, child, .. }) in self.edges.iter().enumerate() {
@@ -112,6 +113,7 @@ impl Transforms {
                 Some(Motion::Moving(poses)) => poses.at(nanos)?,
                 None => return Err(NoPose::Outside),
             };
+            // On the right: the route leads from the target to the source.
             target_from_source *= match step.is_down {
                 true => parent_from_child,
                 false => parent_from_child.inverse(),

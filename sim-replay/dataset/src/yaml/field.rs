@@ -141,6 +141,7 @@ impl<'a> Field<'a> {
                 }
                 for (index, (number, item)) in numbers.iter_mut().zip(items).enumerate() {
                     *number = match item.value {
+                        // The usual case, without the name of the item, which is a new text.
                         Value::Float(value) if value.is_finite() => value,
                         _ => self.child(&index.to_string(), item).number()?,
                     };

@@ -106,6 +106,7 @@ impl<'t> Builder<'t> {
         let (anchor, tag, value) = match event {
             Event::Scalar(text, style, anchor, tag) => {
                 let tag = tag.as_deref().map(tag_text);
+                // Quoted scalars are texts, unless a tag says that they are numbers.
                 let is_resolved = match tag.as_deref() {
                     None => style == ScalarStyle::Plain,
                     Some(tag) => matches!(
@@ -132,6 +133,7 @@ impl<'t> Builder<'t> {
         let node = Node { line, tag, value };
         if anchor > 0 {
             let size = size(&node);
+            // The copy that is kept for aliases costs as much as one of them.
             self.count_aliased(size)?;
             self.anchors.insert(anchor, (node.clone(), size));
         }
@@ -168,6 +170,7 @@ impl<'t> Builder<'t> {
             }
         }
         if !merged.is_empty() {
+            // A merge key (`<<`): own entries win, and of the merged ones the first.
             let mut known: HashSet<String> = entries.iter().map(|(key, _)| key.clone()).collect();
             merged.retain(|(key, _)| known.insert(key.clone()));
             entries.append(&mut merged);

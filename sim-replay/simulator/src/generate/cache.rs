@@ -103,6 +103,7 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
 /// As [`generate`].
 pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary> {
     let unfinished = options.out.with_added_extension("unfinished");
+    // What an interrupted run has left.
     remove_folder(&unfinished)?;
     let aside = SynthOptions {
         out: unfinished.clone(),

@@ -88,11 +88,13 @@ pub fn convert(
 fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthError> {
     let capture_nanos = scenario.ticks.iter().map(|tick| tick.capture_nanos);
     let capture_nanos: Vec<u64> = capture_nanos.collect();
+    // The coarsest tick that divides all times. File names of OPV2V count ticks.
     let tick_nanos = TICKS_NANOS
         .into_iter()
         .find(|tick| capture_nanos.iter().all(|nanos| nanos % tick == 0));
     let tick_nanos = tick_nanos.unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
     let mut pairs = capture_nanos.windows(2);
+    // Two moments within one tick would share a file name.
     if let Some(pair) = pairs.find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos) {
         let reason = format!(
             "scenario {}: two moments at {} and {} ns: times do not rise",

@@ -122,6 +122,7 @@ impl Lidar {
                 let [x, y, z] = column.point_m(elevation, range_m);
                 self.points.push([x, y, z, intensity]);
                 self.labels.push(u8::from(hit == MISS));
+                // GROUND and MISS lie beyond the list.
                 if let Some(count) = self.hits.get_mut(hit as usize) {
                     *count += 1;
                 }

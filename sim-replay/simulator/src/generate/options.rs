@@ -107,6 +107,7 @@ impl SynthOptions {
     /// [`FieldError`] with the first invalid option.
     pub fn validate(&self) -> Result<(), FieldError> {
         let steps = self.period_s / STEP_S;
+        // 0.15 / 0.05 is not exactly 3 in binary, hence the tolerance.
         let is_multiple = (1.0..=1e4).contains(&steps) && (steps - steps.round()).abs() < 1e-6;
         let rule = "must be a multiple of 0.05 s up to 500 s";
         require(is_multiple, "--period-s", self.period_s, rule)?;

@@ -77,6 +77,7 @@ fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Plac
         y + along * sin + aside * cos,
         z + aside * spot.roll_rad.tan(),
     ];
+    // Turned round, the vehicle has its left side where its right side was.
     let (turn, roll_rad) = match is_reversed {
         true => (std::f64::consts::PI, -spot.roll_rad),
         false => (0.0, spot.roll_rad),

@@ -84,6 +84,7 @@ impl Positioning {
         };
 
         let measured = planar_m * planar_m;
+        // One variance for both axes: noise of motion and of GNSS is the same along x and y.
         let (position, variance) = match self.state {
             None => ([gnss_m[0], gnss_m[1]], measured),
             Some((position, variance)) => {
@@ -99,6 +100,7 @@ impl Positioning {
             }
         };
         self.state = Some((position, variance));
+        // The filter is planar: the height is that of GNSS.
         let estimate = Placement::level([position[0], position[1], gnss_m[2]], heading_rad);
         let yaw_rate_radps = self.gyroscope.measured(true_radps);
         Fix {

@@ -69,6 +69,7 @@ impl Radar {
     ) -> &[[f32; 4]] {
         let mount_m = [half_length_m + 0.05, 0.0, HEIGHT_M];
         let moved = vehicle.mounted(mount_m);
+        // Of the mount and not of the vehicle's centre: a turn moves the front sideways.
         let own_velocity = (moved.end.position_m - moved.start.position_m) / sweep_s;
         let sensor = Sweep::still(moved.end);
         self.caster.cast(&sensor, ground, bodies);
@@ -86,16 +87,19 @@ impl Radar {
                 }
                 let velocity = match hit {
                     GROUND => Vector3::zeros(),
+                    // The velocity of the centre stands for the whole body, whose turn is neglected.
                     body => velocity_mps(&bodies[body as usize].motion, sweep_s),
                 };
                 let exact =
                     Vector3::from(column.point_m(elevation, image.depths_m[ray])).cast::<f64>();
                 let direction = exact / exact.norm();
+                // Doppler: the part of the relative velocity along the ray.
                 let radial = (rotation.transpose() * (velocity - own_velocity)).dot(&direction);
                 let mut noise = |deviation: f64| deviation * random.normal();
                 let aside = Vector3::new(noise(1.0), noise(1.0), noise(1.0))
                     * DIRECTION_NOISE_RAD
                     * exact.norm();
+                // `shift` moves the point from the radar's mount to the reference. Both have the same axes.
                 let point = exact + direction * noise(RANGE_NOISE_M) + aside + shift;
                 let radial = radial + noise(VELOCITY_NOISE_MPS);
                 let [x, y, z]: [f32; 3] = point.map(|metres| metres as f32).into();

@@ -79,6 +79,7 @@ type Attempt = (f64, Vec<Vehicle>, Vec<RecordedFrame>, Vec<usize>);
 
 /// Simulates a scene; tries others of the same seed if too few vehicles stay near the ego.
 pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
+    // Labels of the streams: 1 parked vehicles, 2 traffic, 3 choice of agents, and 4 positioning in `scenes`.
     let seed = derive_seed(spec.seed, &[1]);
     let parked = park(world.map_model, &world.lane_index, seed);
     let mut best: Option<Attempt> = None;
@@ -90,6 +91,7 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, S
         // A drive that ends in a permanent jam shows one place again and again.
         let standing_s = longest_stand_s(&frames);
         let quality = match standing_s > LONGEST_STAND_S {
+            // Below every drive that goes on, and the lower the longer it stands.
             true => together.min(0.0) - standing_s,
             false => together,
         };
@@ -185,6 +187,7 @@ fn choose_agents(
     };
     let mut agents: Vec<usize> = together.into_iter().map(|(_, vehicle)| vehicle).collect();
     agents.push(0);
+    // The ego is vehicle 0, so sorting puts it first.
     agents.sort_unstable();
     (quality, agents)
 }
@@ -215,6 +218,7 @@ fn longest_stand_s(frames: &[RecordedFrame]) -> f64 {
         .filter_map(|frame| Some((frame, frame.of(0)?)));
     for (frame, own) in own {
         match since {
+            // Compared with the beginning of the stand, so that slow creeping ends it in time.
             Some((before, tick)) if distance_m(&before.motion.end, &own.motion.end) < 0.1 => {
                 longest = longest.max(frame.tick - tick);
             }

@@ -71,6 +71,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
         total.findings.extend(map_model.findings.iter().cloned());
         let world = World::new(&map_model);
         let places = sources(options).len();
+        // Numbers alternate between the maps. All scenes of one map go together, so that it is built once.
         for number in (place..options.scenes).step_by(places) {
             let before = total.scenarios as u64 * 1000;
             let scene = Scene {
@@ -83,6 +84,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
             })?);
         }
     }
+    // The mark goes last: until then readers report the folder as unfinished.
     writer.finish()?;
     unfinished.clear()?;
     total.omitted = omitted.into_counts();
@@ -209,6 +211,7 @@ impl Scene<'_, '_> {
                 match (&mut *total, result) {
                     (Ok(total), Ok(summary)) => total.add(&summary),
                     (Ok(_), Err(error)) => *total = Err(error),
+                    // Another thread has failed: the other frames need not be written.
                     (Err(_), _) => return,
                 }
                 drop(total);
@@ -216,6 +219,7 @@ impl Scene<'_, '_> {
             }
         };
         std::thread::scope(|scope| {
+            // One thread fewer, as this one works too.
             for _ in 1..self.options.threads.min(moments) {
                 scope.spawn(work);
             }

@@ -99,10 +99,12 @@ impl Scene<'_, '_> {
         bench: &mut Bench<'_>,
     ) -> AgentFrame {
         let moment = &recording.frames[index];
+        // Vehicles come first in the list: hits and paints are matched to annotations by place.
         let (mut bodies, seen) = vehicles_around(recording, moment, agent.vehicle);
         let here = own.motion.end.position_m;
         bodies.extend(self.world.standing_near([here.x, here.y], SIGHT_M));
 
+        // One stream per sensor, agent and tick, so that no draw depends on other sensors or on threads.
         let noise =
             |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, moment.tick]);
         let (points, variants, hits) = self.lidar_sweeps(&own.motion, &bodies, bench, &noise);
@@ -114,6 +116,7 @@ impl Scene<'_, '_> {
 
         let cameras = self.images(&own.motion.end, &bodies, &seen, bench, noise(8));
 
+        // Only vehicles with a point in the plain sweep are annotated.
         let mut hits = hits.iter();
         let mut annotations = seen;
         annotations.retain(|_| hits.next().is_some_and(|hits| *hits > 0));
@@ -179,6 +182,7 @@ impl Scene<'_, '_> {
             return Vec::new();
         };
         let standing = bodies.iter().skip(seen.len()).map(|body| {
+            // Standing objects have no id. Their position serves as one and is the same in every frame.
             let place = body.motion.end.position_m;
             let [x, y] = [place.x, place.y].map(f64::to_bits);
             camera::of_shape(body.shape, x ^ y.rotate_left(17))
@@ -268,6 +272,7 @@ fn vehicles_around<'a>(
 ) -> (Vec<Body<'a>>, Vec<Annotation<'a>>) {
     let here = frame.of(own).map(|moving| moving.motion.end.position_m);
     let here = here.unwrap_or_default();
+    // Positions are centres: the margin covers half of the longest vehicle.
     let near = |motion: &Sweep| (motion.end.position_m - here).xy().norm() < SIGHT_M + 10.0;
     let moving = frame.moving.iter();
     let moving = moving.filter(|moving| moving.vehicle != own && near(&moving.motion));

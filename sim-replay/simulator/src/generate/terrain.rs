@@ -94,6 +94,7 @@ impl Tops {
 
 impl TerrainSurface {
     pub(crate) fn new(grid: &HeightGrid) -> Self {
+        // With the eight around it, a square of this size covers AROUND_M around any place in it.
         let wide = (AROUND_M / grid.cell_m).ceil().max(1.0) as usize;
         Self {
             cell_tops: Tops::of_squares(grid, 1),
@@ -121,7 +122,9 @@ impl TerrainSurface {
         let mut at = from_m;
         loop {
             let axis = usize::from(leaves[1] < leaves[0]);
+            // Rounding may put the border slightly behind the ray.
             let exit = leaves[axis].max(at).min(limit_m);
+            // The ray is straight, so its lowest place in the cell is one of the two ends.
             if ray.height(at).min(ray.height(exit)) <= self.cell_tops.at(cell[0], cell[1])
                 && let Some(hit) = self.meet_in_cell(ray, cell, at, exit)
             {
@@ -154,9 +157,12 @@ impl TerrainSurface {
             ray.height(at) - ground
         };
         let meet = |from: f64, to: f64| {
+            // The middle decides on the triangle, since either end may lie on the diagonal.
             let (u, v) = local(0.5 * (from + to));
             let (start, end) = (above(from, u >= v), above(to, u >= v));
+            // Rays that come out of the ground from below do not hit it.
             (end <= 0.0 && start >= end).then(|| {
+                // Already below at its start: the seam between two pieces leaves no gap.
                 if start <= 0.0 {
                     from
                 } else {
@@ -175,6 +181,7 @@ impl TerrainSurface {
 
     fn node_m(&self, column: i64, row: i64) -> f64 {
         self.grid
+            // Beyond the edge the height of the edge holds. The grid clamps the upper end itself.
             .node_m(column.max(0) as usize, row.max(0) as usize)
     }
 }
@@ -199,6 +206,7 @@ impl Surface for TerrainSurface {
         let cell_m = self.grid.cell_m;
         let [x, y] = self.grid.origin_m;
         let origin = [rays.origin.x - x, rays.origin.y - y].map(|metres| metres / cell_m);
+        // The ground is cast before all bodies, so the depths still are the range of the sensor.
         let range_m = depth.iter().copied().fold(0.0, f32::max);
         let mut strip = Strip::new(self, rays, origin, f64::from(range_m));
         for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
@@ -244,6 +252,7 @@ impl<'a> Strip<'a> {
         let along: Vector3<f64> = rays.forward.cast();
         let step = along.xy() / along.xy().norm().max(1e-6) / surface.grid.cell_m;
         let tilt = f64::from(rays.up.xy().norm());
+        // Half a piece, and the sideways drift of the steepest ray of a tilted sensor over the range.
         let aside_m = 0.5 * PIECE_M + range_m * tilt * STEEPEST;
         let mut angles = rays.sin.iter().zip(rays.cos);
         let is_steep = angles.any(|(sin, cos)| f64::from(sin.abs()) > STEEPEST * f64::from(*cos));
@@ -297,12 +306,14 @@ pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
     let normal = (local[1] - local[0])
         .cross(&(local[2] - local[0]))
         .try_normalize(1e-9)?;
+    // The top of a deck faces up, whatever the order of its corners.
     let normal = if normal.z < 0.0 { -normal } else { normal };
     let plane = |normal: &Vector3<f64>, point: &Vector3<f64>| {
         let [x, y, z]: [f32; 3] = normal.map(|part| part as f32).into();
         [x, y, z, normal.dot(point) as f32]
     };
     let top = plane(&normal, &local[0]);
+    // The second plane is the underside, DECK_M below the top.
     let mut planes = vec![top, [-top[0], -top[1], -top[2], DECK_M - top[3]]];
     for (from, to, opposite) in [(0, 1, 2), (1, 2, 0), (2, 0, 1)] {
         let outward = (local[to] - local[from])

@@ -113,6 +113,7 @@ impl Vehicle {
             draw -= weight(stock);
             draw < 0.0
         });
+        // Rounding may leave a rest after the last weight.
         let stock = chosen.unwrap_or(&STOCK[0]);
         let size_m = std::array::from_fn(|axis| {
             stock.size_m[axis] * (1.0 + stock.spread[axis] * random.between(-1.0, 1.0))
@@ -278,6 +279,7 @@ fn frustum(
         let (norm, back) = (rise.hypot(at0 - at1), at0 - at1);
         [rise, back, rise * at0 + back * bottom].map(|value| value / norm)
     };
+    // The rear is a front seen backwards: its `at` grows towards negative x.
     let [front, rear] = [slant(front0, front1), slant(-rear0, -rear1)];
     let left = slant(side0, side1);
     let planes = vec![
@@ -298,6 +300,7 @@ fn frustum(
 
 /// An upright octagon that stands on the ground.
 fn wheel(center: [f32; 3], radius: f32, half_width: f32) -> Part {
+    // Four faces are perpendicular to x or z, so the octagon reaches exactly to its bounds.
     let rim = (0..8).map(|face| {
         let (sin, cos) = (face as f32 * PI / 4.0).sin_cos();
         [cos, 0.0, sin, cos * center[0] + sin * center[2] + radius]

@@ -79,6 +79,7 @@ impl Weather {
         if random.chance(if target.is_some() { 0.04 } else { 0.30 }) {
             // A gamma law of shape 3 is the sum of three exponential ones.
             let product: f64 = (0..3).map(|_| 1.0 - random.unit()).product();
+            // A scale of 1.8 m gives the mean of 5.4 m, counted from the first metre on.
             let range_m = (1.0 - 1.8 * product.ln()) as f32;
             if target_m.is_none_or(|target_m| range_m < target_m) {
                 return Echo::Backscatter(range_m, random.between(0.02, 0.12) as f32);
@@ -88,6 +89,7 @@ impl Weather {
     }
 
     fn snow(target_m: Option<f32>, reflectivity: f32, random: &mut SplitMix64) -> Echo {
+        // An exponential law by inversion. `1 - u` is never 0, so the logarithm is finite.
         let flake_m = (1.5 - 110.0 * (1.0 - random.unit()).ln()) as f32;
         if flake_m < 30.0
             && target_m.is_none_or(|target_m| flake_m < target_m)

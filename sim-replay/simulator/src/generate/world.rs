@@ -24,6 +24,7 @@ struct Standing {
 
 impl<'t> World<'t> {
     pub(crate) fn new(map_model: &'t MapModel) -> Self {
+        // Decks are bodies, since the ground has only one height at a place.
         let decks = map_model.ground.decks.iter().filter_map(deck_shape);
         let decks =
             decks.map(|(shape, center_m)| Standing::new(shape, Placement::level(center_m, 0.0)));

@@ -59,6 +59,7 @@ impl MapModel {
                     if !clear && overlap(&outlines[number as usize], &piece) {
                         found.push((lane.id, number as usize));
                     }
+                    // False goes on to the next solid.
                     false
                 });
             }

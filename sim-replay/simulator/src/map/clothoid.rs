@@ -23,6 +23,7 @@ pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
         return Curve::new(s_m, from, distance, CurveShape::Line);
     }
     let delta = phi1 - phi0;
+    // The root for small angles, where sin x = x.
     let mut a = 3.0 * (phi0 + phi1);
     for _ in 0..30 {
         let (offset, slope, _) = integrals(phi0, delta, a);

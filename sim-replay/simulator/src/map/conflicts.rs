@@ -48,6 +48,7 @@ fn in_conflict(a: &Lane, b: &Lane) -> bool {
 
 fn crosses(a: &Lane, b: &Lane) -> bool {
     let near = OVERLAP * (a.width_m + b.width_m) / 2.0;
+    // Points are about 1 m apart, closer than lanes are wide.
     a.centerline.iter().any(|p| {
         b.centerline
             .iter()

@@ -80,6 +80,7 @@ fn separated_by_edge_of(a: &[[f64; 2]], b: &[[f64; 2]]) -> bool {
     (0..a.len()).any(|i| {
         let (from, to) = (a[i], a[(i + 1) % a.len()]);
         let normal = [to[1] - from[1], from[0] - to[0]];
+        // Corners may coincide, and an edge without length separates nothing.
         if normal == [0.0, 0.0] {
             return false;
         }

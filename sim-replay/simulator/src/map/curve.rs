@@ -146,6 +146,7 @@ fn clothoid(k: f64, rate: f64, s: f64) -> (f64, f64, f64) {
         };
         return (chord * (turn / 2.0).cos(), chord * (turn / 2.0).sin(), turn);
     }
+    // The curvature is linear, so one of its ends bounds the turn.
     let turned = s.abs() * k.abs().max((k + rate * s).abs());
     let pieces = (turned / GAUSS_ANGLE_RAD).ceil().clamp(1.0, 1e5) as u32;
     let half = s / f64::from(pieces) / 2.0;

@@ -65,6 +65,7 @@ impl FindingLog {
     }
 
     pub(super) fn add(&mut self, line: u32, element: &str, found: &str, action: &str) {
+        // Without the value found: the same fault with other numbers counts as one finding.
         let key = [
             self.within.clone().unwrap_or_default(),
             shortened(element),
@@ -87,6 +88,7 @@ impl FindingLog {
             self.places.insert(key, self.list.len());
             self.list.push(finding);
         } else if let Some(last) = self.list.get_mut(MAX_FINDINGS) {
+            // The entry behind the limit counts all further ones.
             last.count += 1;
         } else {
             let (found, action) = ("and more findings".to_owned(), "counted only".to_owned());

@@ -57,6 +57,7 @@ impl LaneIndex {
                 ));
             }
         }
+        // By lane and point within a cell, so that ties are decided the same way each time.
         tagged.sort_unstable();
         let mut filled = 0;
         for cell in 0..=index.columns * index.rows {
@@ -108,6 +109,7 @@ impl LaneIndex {
         let low = self.cell(x - radius_m, y - radius_m);
         let high = self.cell(x + radius_m, y + radius_m);
         let clamp = |value: i64, count: usize| value.clamp(0, count as i64 - 1) as usize;
+        // Wholly outside the grid, where clamping would visit the cells at its edge.
         if self.entries.is_empty() || high[0] < 0 || high[1] < 0 {
             return;
         }

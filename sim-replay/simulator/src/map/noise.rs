@@ -3,6 +3,7 @@
 /// Height of the hills at a place, metres; from about -3 to 9, features of some 60 to 150 m.
 pub(crate) fn hills_m(x: f64, y: f64, seed: u64) -> f64 {
     let coarse = value_noise(x / 140.0, y / 140.0, seed);
+    // Another seed, so that the fine hills do not repeat the coarse ones.
     let fine = value_noise(x / 55.0, y / 55.0, seed ^ 0x5bd1_e995);
     9.0 * coarse + 3.0 * fine - 3.0
 }

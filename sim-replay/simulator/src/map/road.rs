@@ -286,6 +286,7 @@ impl Road {
         let left = t_m > 0.0;
         match self.level_from_m(section, s_m, left) {
             Some(edge_m) if t_m != edge_m && (t_m > edge_m) == left => {
+                // Beyond the edge the surface is level, so distances count flat from there.
                 let [aside_m, height_m] = self.lateral.at(s_m, edge_m);
                 [aside_m + t_m - edge_m, height_m]
             }
@@ -322,6 +323,7 @@ impl Road {
             .get(section)
             .and_then(|section| section.lane(id));
         let reversed = lane.is_some_and(|lane| lane.reversed);
+        // Right lanes lead along the road in right-hand traffic. Each further condition turns that round.
         ((id < 0) != self.left_hand) != reversed
     }
 
@@ -348,7 +350,9 @@ impl Road {
     pub(crate) fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
         let section = &self.sections[section];
         let side = section.side(id > 0);
+        // Cubics of a map may fall below zero or diverge.
         let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).clamp(0.0, MAX_WIDTH_M);
+        // Never 0: the reference line is no lane.
         let place = id.unsigned_abs() as usize;
         let inner: f64 = side.iter().take(place - 1).map(width).sum();
         let outer = inner + side.get(place - 1).map_or(0.0, width);
@@ -365,6 +369,7 @@ impl Road {
         let after = self
             .speed_limits
             .partition_point(|&(start, _)| start <= s_m);
+        // The first limit also holds before its start.
         let limit = self.speed_limits.get(after.saturating_sub(1));
         limit.map(|&(_, limit)| limit)
     }

@@ -153,11 +153,13 @@ impl Surface {
                 let [from, to] = [pair[0], pair[1]];
                 let before = patches.len();
                 let mut strip = |a: [f64; 2], b: [f64; 2], carriageway| {
+                    // Strips of less than a centimetre are rounding.
                     if a[1] - a[0] > 0.01 || b[1] - b[0] > 0.01 {
                         strips(road, [(from, a), (to, b)], most_pieces, |quad, z_m| {
                             patches.push(Patch {
                                 quad,
                                 z_m,
+                                // Set below, once all pieces of the strip are known.
                                 top_m: f64::NAN,
                                 road: place as u32,
                                 carriageway,
@@ -228,6 +230,7 @@ fn most_pieces(network: &RoadNetwork) -> f64 {
     let cuts: f64 = banked
         .map(|road| road.length_m / STEP_M + road.sections.len() as f64)
         .sum();
+    // Each cut begins three strips: the carriageway and both sides.
     (MAX_ALL_PIECES / (3.0 * cuts).max(1.0))
         .floor()
         .clamp(1.0, MAX_PIECES)

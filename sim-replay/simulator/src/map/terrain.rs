@@ -84,6 +84,7 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
         }
     }
     for (height, &lowest) in grid.heights_m.iter_mut().zip(&lowest_m) {
+        // Where no road is near, the height is NaN and the comparison false.
         if *height > lowest + LEVELS_M {
             *height = lowest;
         }
@@ -136,6 +137,7 @@ fn distance_m(place: [f64; 2], quad: &Quad) -> f64 {
     let (mut inside, mut least) = (true, f64::INFINITY);
     for (a, b) in sides {
         let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
+        // Corners run anticlockwise: a place inside lies to the left of every side.
         let (px, py) = (place[0] - a[0], place[1] - a[1]);
         inside &= dx * py - dy * px >= 0.0;
         let share = ((px * dx + py * dy) / (dx * dx + dy * dy).max(1e-12)).clamp(0.0, 1.0);
@@ -172,6 +174,7 @@ fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) 
     for row in 0..rows {
         for column in 0..columns {
             let place = row * columns + column;
+            // Open nodes are still NaN here.
             if fixed[place] {
                 let (sum, count) = &mut sums[row / 2 * half_columns + column / 2];
                 (*sum, *count) = (*sum + heights[place], *count + 1);
@@ -237,6 +240,7 @@ fn raise_hills(grid: &mut HeightGrid, fixed: &[bool], seed: u64) {
                 grid.origin_m[0] + column as f64 * grid.cell_m,
                 grid.origin_m[1] + row as f64 * grid.cell_m,
             );
+            // Smoothstep: hills begin and end without a kink.
             grid.heights_m[place] +=
                 (share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed)) as f32;
         }
@@ -259,6 +263,7 @@ fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
         }
     };
     const DIAGONAL: f32 = std::f32::consts::SQRT_2;
+    // Step: forward sweep, from the neighbours at lower columns and rows.
     for row in 0..rows {
         for column in 0..columns {
             let back = [
@@ -270,6 +275,7 @@ fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
             relax(row * columns + column, column, row, back);
         }
     }
+    // Step: backward sweep, from the neighbours at higher columns and rows.
     for row in (0..rows).rev() {
         for column in (0..columns).rev() {
             let ahead = [
@@ -302,6 +308,7 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
         ];
         for [i, j, k] in [[0, 1, 2], [0, 2, 3]] {
             let (p, q, r): ([f64; 3], [f64; 3], [f64; 3]) = (corners[i], corners[j], corners[k]);
+            // Strips without width, or turned over in a tight bend, give no triangle.
             let area = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]);
             if area > 1e-6 {
                 triangles.push([p, q, r]);
@@ -315,6 +322,7 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
 fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
     let [a, b, c, d] = patch.quad;
     let middle = |p: [f64; 2], q: [f64; 2]| [(p[0] + q[0]) / 2.0, (p[1] + q[1]) / 2.0];
+    // A wide patch spans several cells of the terrain, so its corners alone do not tell.
     let probes = [
         a,
         b,

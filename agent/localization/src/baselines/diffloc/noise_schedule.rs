@@ -72,6 +72,7 @@ impl NoiseSchedule {
         velocity: &Tensor,
         steps: &Tensor,
     ) -> Result<Tensor, TchError> {
+        // sqrt(kept) noisy - sqrt(1 - kept) velocity: the form of `add_noise` with the sign reversed.
         self.add_noise(noisy, &velocity.f_neg()?, steps)
     }
 

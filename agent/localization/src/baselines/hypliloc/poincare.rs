@@ -12,6 +12,7 @@ const TINY: f64 = 1e-12;
 /// Exponential map at the origin: tangent vectors along the last dimension to points of the ball.
 pub(super) fn expmap0(tangent: &Tensor) -> Result<Tensor, TchError> {
     let scaled = scaled_norm(tangent)?;
+    // In single precision the hyperbolic tangent reaches 1, where the inverse is infinite.
     let share = scaled.f_tanh()?.f_clamp_max(MAX_SHARE)?;
     tangent.f_mul(&(share / scaled))
 }

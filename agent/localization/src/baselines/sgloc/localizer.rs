@@ -67,6 +67,7 @@ impl SgLocLocalizer {
             values(&(self.network).coordinates(&cells, &places, Kind::Float, false)?)
         })?;
         Ok(SceneCoordinates {
+            // Weight 1 for every cell (Eq. 6), so that the plain confidence is the inlier ratio.
             epsilon_m: vec![0.0; sensor_m.len()],
             sensor_m,
             world_m: world.as_chunks().0.to_vec(),

@@ -110,6 +110,7 @@ impl BackboneEncoder {
 /// Mean of a map `[1, C, H, W]` over a window of an odd height and width around each cell, as far as it is on the map.
 fn mean_over(map: &Tensor, [height, width]: [i64; 2]) -> Result<Tensor, TchError> {
     // One row after one column of the window: a fraction of the additions.
+    // Padding is not counted: the counts of both passes multiply, so the mean of means is exact.
     let along = |map: &Tensor, size: [i64; 2]| {
         map.f_avg_pool2d(
             size,

@@ -95,6 +95,7 @@ impl BevFormat {
     pub(super) fn windows(&self) -> impl Iterator<Item = [i64; 2]> + '_ {
         let cell_m = self.levels.last().map_or([1.0; 2], |level| level.cell_m);
         let window = move |edge_m: f64| {
+            // Height first: maps are `[.., H, W]`, and y is along H.
             [1, 0].map(|axis| 2 * (edge_m / f64::from(cell_m[axis]) / 2.0).round() as i64 + 1)
         };
         CONTEXT_M.into_iter().map(window)
@@ -109,6 +110,7 @@ impl LevelGrid {
     /// Column and row of the cell under a place (metres from the grid's corner); the last where rounding leads beyond.
     fn cell(&self, [x_m, y_m]: [f32; 2]) -> [usize; 2] {
         let index =
+            // The cast saturates: a place that rounding leaves below the corner is in cell 0.
             |place_m: f32, edge_m: f32, count: usize| ((place_m / edge_m) as usize).min(count - 1);
         [
             index(x_m, self.cell_m[0], self.width),
@@ -134,6 +136,7 @@ impl BevCells {
         for &[x, y, z, _] in &cloud.xyzi {
             let [low_x, low_y] = format.low_m;
             let [column, row] = finest.cell([x - low_x, y * format.y_sign - low_y]);
+            // The row follows the network's y axis. The points of the cell stay in the sensor frame.
             columns[row * finest.width + column].add([x, y, z]);
         }
         let occupied = (columns.iter().enumerate()).filter(|(_, column)| column.points > 0);

@@ -98,6 +98,7 @@ impl ConfidenceModel {
         if sweeps.len() < MIN_SWEEPS {
             return Err(FitError::TooFew(sweeps.len()));
         }
+        // Bounded from below: the logarithm of an error of 0 would make the sums infinite.
         let log_error = |error_m: f64| error_m.max(SMALLEST_ERROR_M).ln();
         let (rows, targets): (Vec<[f64; FEATURES]>, Vec<f64>) = (sweeps.iter())
             .map(|sweep| (features(&sweep.evidence), log_error(sweep.error_m)))
@@ -109,6 +110,7 @@ impl ConfidenceModel {
             sigma: MonotoneMap::falling(Vec::new()),
             reject_below: 0.0,
         };
+        // The weights are fitted first: sigma is a function of the log error that they predict.
         let samples = sweeps
             .iter()
             .map(|sweep| (model.log_error(&sweep.evidence), observed(sweep.error_m)));
@@ -166,6 +168,7 @@ fn threshold(sigmas: &[(f64, bool)], good_loss: f64) -> f64 {
     let good = sigmas.iter().filter(|(_, is_good)| *is_good);
     let mut good: Vec<f64> = good.map(|(sigma, _)| *sigma).collect();
     good.sort_by(f64::total_cmp);
+    // The pose at the threshold itself is accepted: so many good ones are rejected, or fewer.
     let lost = (good_loss * good.len() as f64).floor() as usize;
     good.get(lost).copied().unwrap_or(1.0)
 }
@@ -183,6 +186,7 @@ fn threshold_of_risk(sigmas: &[(f64, bool)], max_wrong: f64) -> f64 {
             continue;
         }
         let limit = share_limit(wrong, index + 1);
+        // Within the allowed share the lower threshold wins, beyond it only a smaller limit does.
         if limit <= best.0.max(max_wrong) {
             best = (limit, *sigma);
         }
@@ -207,8 +211,10 @@ fn non_negative_regression(rows: &[[f64; FEATURES]], targets: &[f64]) -> (f64, [
     let mut weights = SVector::<f64, FEATURES>::zeros();
     for _ in 0..ROUNDS {
         for feature in 0..FEATURES {
+            // The penalty is on standardised weights, the weights here are of raw features.
             let ridge = RIDGE * scale[feature] * scale[feature];
             let curvature = square[(feature, feature)] + ridge + 1e-12;
+            // Coordinate descent: the exact minimum along this weight, the others held.
             let slope = cross[feature] - square.row(feature).transpose().dot(&weights)
                 + square[(feature, feature)] * weights[feature];
             weights[feature] = (slope / curvature).max(0.0);

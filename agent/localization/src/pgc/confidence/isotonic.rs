@@ -28,6 +28,7 @@ impl MonotoneMap {
         let mut pools: Vec<Pool> = Vec::new();
         let (whole, rest) = samples.split_at(samples.len() - samples.len() % size);
         for (index, group) in whole.chunks(size).enumerate() {
+            // The remainder joins the last group: alone it would be a group of too few samples.
             let is_last = (index + 1) * size == whole.len();
             let mut pool = Pool::of(group);
             if is_last {
@@ -85,6 +86,7 @@ impl MonotoneMap {
         if x >= last.0 {
             return last.1 * (last.0 - x).exp();
         }
+        // x0 <= x < x1: knots of equal x are no division by zero.
         let above = self.knots.partition_point(|knot| knot.0 <= x);
         let ((x0, y0), (x1, y1)) = (self.knots[above - 1], self.knots[above]);
         y0 + (y1 - y0) * (x - x0) / (x1 - x0)

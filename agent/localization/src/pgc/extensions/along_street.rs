@@ -29,6 +29,7 @@ pub(crate) fn search(
         if best.is_sufficient() {
             break;
         }
+        // On the right: along the vehicle's own x axis, which is its heading.
         let start = origin_from_sensor * Translation3::new(ahead_m, 0.0, 0.0);
         let start = search.solver.registration_at(coordinates, start);
         best = best.or_better(search.refined(coordinates, &start, true, times)?);

@@ -31,6 +31,7 @@ pub(crate) fn level(
     for scale_m in SCALES_M {
         match step(coordinates, &pose, scale_m) {
             Some(next) => pose = next,
+            // Not the pose of an earlier, wider scale, which outliers may have pulled.
             None => return *origin_from_sensor,
         }
     }
@@ -68,6 +69,7 @@ fn step(
         return None;
     }
     let [dz, roll, pitch] = (information.try_inverse()? * moment).data.0[0];
+    // About horizontal axes of the world: at small angles the heading stays as predicted.
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(roll, pitch, 0.0)) * pose.rotation;
     let position = pose.translation.vector + Vector3::new(0.0, 0.0, dz);
     Some(Isometry3::from_parts(

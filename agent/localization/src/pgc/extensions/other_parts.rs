@@ -29,6 +29,7 @@ pub(crate) fn logits_by_part(logits: &Tensor, most: usize) -> Result<Vec<Tensor>
         if total > SUFFICIENT_PROBABILITY {
             break;
         }
+        // After the check: the part that passes the limit is still tried.
         total += probability;
         let class = order.f_narrow(0, rank as i64, 1)?;
         parts.push(lowered.f_index_copy(1, &class, &(&highest + LEAD).f_view([1, 1])?)?);

@@ -110,6 +110,7 @@ impl IcpTarget {
     pub fn add(&mut self, xyzi: &[[f32; 4]], target_from_sensor: &Isometry3<f64>) {
         let rotation = target_from_sensor.rotation.to_rotation_matrix();
         let sensor = target_from_sensor.translation.vector;
+        // World coordinates of a map may be large: sums of their squares would lose precision.
         let shift = sensor - *self.origin_m.get_or_insert(sensor);
         for point in within(xyzi, self.range_m) {
             let moved = rotation * point + shift;
@@ -237,13 +238,16 @@ pub fn register(
     let stride = source.points_m.len().div_ceil(config.max_points.max(1));
     let points: Vec<&Vector3<f64>> = source.points_m.iter().step_by(stride).collect();
     let origin = Translation3::from(target.origin_m.unwrap_or_default());
+    // The planes lie relative to the origin, so the motion does too until the end.
     let (mut motion, mut steps) = (origin.inverse() * start, 0);
     let mut last = NormalEquations::default();
     for (index, level) in config.levels.iter().enumerate() {
+        // A surfel map has one grid: its later levels differ by their kernel only.
         let Some(planes) = target.levels.get(index).or(target.levels.last()) else {
             break;
         };
         for _ in 0..level.max_steps {
+            // The sums that judge the result are those at the pose before its last step.
             last = NormalEquations::gather(&points, planes, &motion, level);
             let Some(step) = last.step() else { break };
             motion = moved(&motion, &step);
@@ -253,12 +257,14 @@ pub fn register(
             }
         }
     }
+    // `last` is of the finest level by now: the wide kernel of a coarse one would overstate the overlap.
     last.judge(points.len(), config)?;
     let points = points.len() as f64;
     let mean_square_m2 = last.squares / last.pairs;
     Ok(IcpFit {
         target_from_source: origin * motion,
         overlap: last.pairs / points,
+        // A partner on level ground takes its point out of the numerator and the denominator.
         overlap_above_ground: (last.pairs - last.ground_pairs)
             / (points - last.ground_pairs).max(1.0),
         rms_m: mean_square_m2.sqrt(),
@@ -271,6 +277,7 @@ pub fn register(
 fn moved(motion: &Isometry3<f64>, step: &Vector6<f64>) -> Isometry3<f64> {
     let turn = Vector3::new(step[0], step[1], step[2]) / LEVER_M;
     let shift = Vector3::new(step[3], step[4], step[5]);
+    // On the left: the step turns about the axes of the target. It does not move the sensor.
     let rotation = UnitQuaternion::from_scaled_axis(turn) * motion.rotation;
     Isometry3::from_parts((motion.translation.vector + shift).into(), rotation)
 }
@@ -300,6 +307,7 @@ impl NormalEquations {
         let sensor = motion.translation.vector;
         let mut sums = Self::default();
         for point in points {
+            // From the sensor: a turn about a distant origin would shift all points as well.
             let arm = rotation * *point;
             let moved = arm + sensor;
             let Some(plane) = planes.near(&moved) else {
@@ -307,6 +315,7 @@ impl NormalEquations {
             };
             let distance = plane.normal.dot(&(moved - plane.centre_m));
             let scaled = (distance / level.scale_m).powi(2);
+            // Three scales, squared. Pairs beyond have less than a hundredth of the weight: no overlap.
             if scaled < 9.0 {
                 sums.pairs += 1.0;
                 if plane.normal.z.abs() > LEVEL_NORMAL_Z {
@@ -315,6 +324,7 @@ impl NormalEquations {
                 sums.squares += distance * distance;
             }
             let weight = 1.0 / ((1.0 + scaled) * (1.0 + scaled));
+            // d(distance) = n . (dw x arm + dt) = (arm x n) . dw + n . dt. The lever gives both one unit.
             let (normal, turn) = (plane.normal, arm.cross(&plane.normal) / LEVER_M);
             let row = Vector6::new(turn.x, turn.y, turn.z, normal.x, normal.y, normal.z);
             sums.weight += weight;
@@ -326,6 +336,7 @@ impl NormalEquations {
 
     /// The step, `None` without any pair. Unconstrained directions are not changed.
     fn step(&self) -> Option<Vector6<f64>> {
+        // Makes the matrix positive definite, and relative to the weights hardly changes a step.
         let damped = self.hessian + Matrix6::identity() * (1e-6 * self.weight);
         let step = damped.cholesky()?.solve(&-self.gradient);
         step.iter().all(|value| value.is_finite()).then_some(step)
@@ -333,6 +344,7 @@ impl NormalEquations {
 
     /// Covariance of position and rotation, in this order, of pairs with this mean squared distance.
     fn covariance(&self, mean_square_m2: f64) -> Matrix6<f64> {
+        // Damped far less than a step: damping states a constraint that the pairs do not give.
         let damped = self.hessian + Matrix6::identity() * (1e-9 * self.weight);
         let inverse = damped.try_inverse().unwrap_or_else(Matrix6::identity) * mean_square_m2;
         // Rotation is first there, in units of 1 / LEVER_M radians.

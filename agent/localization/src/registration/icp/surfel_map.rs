@@ -114,6 +114,7 @@ impl SurfelMap {
                     FileError::new(path, "the place is wider than 32,767 voxels of the map")
                 })?;
                 voxels.extend(held.to_le_bytes());
+                // 0 to 1 within the voxel. The cast below saturates: a centre on the upper face becomes 255.
                 let inside = centre_m / surfels.voxel_m - f64::from(*index);
                 centres.push((inside * 256.0) as u8);
                 normals.push((normal * 127.0).round() as i8 as u8);
@@ -199,9 +200,11 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
             let at = 2 * of(axis);
             i32::from(i16::from_le_bytes([voxels[at], voxels[at + 1]]))
         });
+        // Half a step is added because the writer rounds down.
         let inside = Vector3::from_fn(|axis, _| (f64::from(centres[of(axis)]) + 0.5) / 256.0);
         let centre_m = (Vector3::from(voxel.map(f64::from)) + inside) * config.voxel_m;
         let normal = Vector3::from_fn(|axis, _| f64::from(normals[of(axis)] as i8));
+        // Bytes have rounded the length. A file may hold a zero normal, which has no direction.
         let normal = normal.try_normalize(0.5).unwrap_or_else(Vector3::z);
         (voxel, Surfel { centre_m, normal })
     });

@@ -66,6 +66,7 @@ impl Moments {
         let eigen = SymmetricEigen::new(self.outer / self.count - mean * mean.transpose());
         let mut order = [0, 1, 2];
         order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
+        // Rounding can leave the smallest variance of an exact plane below zero.
         let [thin, middle, wide] = order.map(|axis| eigen.eigenvalues[axis].max(0.0));
         let flat = thin <= MAX_THICKNESS * middle && middle >= MIN_WIDTH * wide && wide > 0.0;
         flat.then(|| eigen.eigenvectors.column(order[0]).into_owned())
@@ -123,6 +124,7 @@ impl Surfels {
         };
         let plane = |(coord, own): (&[i32; 3], &Moments)| {
             let plane = Surfel {
+                // Of its own points: the mean over all 27 voxels may lie outside this one.
                 centre_m: own.mean(),
                 normal: around(coord).normal()?,
             };

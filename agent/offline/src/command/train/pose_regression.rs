@@ -66,6 +66,7 @@ pub(crate) fn run(args: &Args, name: &str, train: Train) -> anyhow::Result<()> {
 impl Args {
     fn config(&self) -> anyhow::Result<PoseRegressionConfig> {
         let turn_deg = self.turn_deg;
+        // A range, so that NaN is refused too.
         if !(0.0..=180.0).contains(&turn_deg) {
             return Err(bad(&format!(
                 "--turn-deg is {turn_deg}, must be 0 to 180 degrees"

@@ -113,6 +113,7 @@ fn denoising_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Res
     let (denoiser, windows) = (&network.denoiser, Windows::Joint(&joint));
     let velocity = denoiser.forward(&noisy, &steps, &features, windows)?;
     let error = schedule.poses(&noisy, &velocity, &steps)?.f_sub(&poses)?;
+    // The difference of two errors is the error of the difference.
     let differences = error.f_diff::<Tensor>(1, 1, None, None)?.f_abs()?;
     let differences = differences.f_mean_dim([1_i64, 2].as_slice(), false, Kind::Float)?;
     let differences = differences.f_mul(&joint)?.f_mean(Kind::Float)?;
@@ -146,9 +147,11 @@ impl PoseLoss for HypLiLoc {
             true => self.log_variances.f_detach()?,
             false => self.log_variances.shallow_clone(),
         };
+        // Error * exp(-s) + s, where s is the learnt logarithm of the variance.
         let weighted = &errors * (-&log_variances).f_exp()? + log_variances;
         Ok(Losses {
             total: weighted.f_sum(Kind::Float)? + &place * PLACE_WEIGHT,
+            // The third branch, the fusion, gives the result.
             pose: errors.f_detach()?.f_get(2)?.f_mean(Kind::Float)?,
             place: place.f_detach()? / 3.0,
         })

@@ -131,7 +131,9 @@ fn train<N: PoseLoss>(
     let validation = validation
         .map(|of| of.cache(&network.projection, network_config.origin_m))
         .transpose()?;
+    // Only tokens are needed from here on: the memory of the pooled features is freed.
     drop(sweeps);
+    // The time of the training begins here: reading and encoding do not count.
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     let mut training = Training {
         run,
@@ -198,6 +200,7 @@ impl<N: PoseLoss> Task for Training<'_, N> {
     /// Order, augmentation and noise follow from seed and step, so a resumed training is the uninterrupted one.
     fn loss(&mut self, trainer: &Trainer) -> Result<Tensor, Error> {
         let run = self.run;
+        // Seed in the upper half, step in the lower one: no two steps draw the same.
         tch::manual_seed(run.seed.wrapping_shl(32).wrapping_add(trainer.steps()) as i64);
         let windows = (run.batch as i64 / N::FRAMES).max(1);
         let batch = self.cache.draw(windows, N::FRAMES)?;
@@ -230,6 +233,7 @@ impl<N: PoseLoss> Task for Training<'_, N> {
         let text = format!("poses {pose_l1:.3} places {place_loss:.2}, batch {found}");
         let mut row = [vec![trainer.steps() as f64, seconds], means.clone()].concat();
         (self.observe)(&trainer.step_report(share_done, means, &text));
+        // As the trainer decides: a checkpoint follows after this report.
         let is_saved_next = trainer.steps().is_multiple_of(CHECKPOINT_EVERY) || share_done >= 1.0;
         if let (true, Some(cache)) = (is_saved_next, &self.validation) {
             let found = accuracy(&self.network, &cache.sweeps, kind)?;

@@ -75,6 +75,7 @@ impl PooledSweeps {
         let total = list.len();
         let (source, config) = (Arc::clone(list), encoder.config().clone());
         let prepare = move |batch: u64| -> Vec<Prepared> {
+            // The threads also ask for batches beyond the end: their range is empty.
             let numbers = batch * BATCH..((batch + 1) * BATCH).min(total as u64);
             let one = |number| Prepared::read(&source, number as usize, &config);
             numbers.filter_map(one).collect()
@@ -91,6 +92,7 @@ impl PooledSweeps {
                 for (number, sweep) in sweeps.iter().enumerate() {
                     let rows = batch.cell_rows(number);
                     let own = cells.f_narrow(0, rows.start, rows.end - rows.start)?;
+                    // Half precision: the pooled features of all sweeps lie on the device at once.
                     parts.push(pool(sweep.voxels.cells(), &own)?.f_to_kind(Kind::Half)?);
                 }
             }
@@ -127,6 +129,7 @@ impl PooledSweeps {
     ) -> Result<TokenCache, TchError> {
         let device = self.pooled.device();
         let pose = |pose: &Isometry3<f64>| {
+            // The difference is taken in f64: world coordinates are too large for f32.
             let position = pose.translation.vector - Vector3::from(origin_m);
             let (sin, cos) = heading_rad(pose).sin_cos();
             [position.x, position.y, position.z, cos, sin].map(|value| value as f32)
@@ -178,6 +181,7 @@ fn static_tokens(
     let boxes = objects.iter().map(|object| {
         let world_from_object = object.world_from_object.isometry();
         let [length, width, height] = object.size_m.map(|size| size / 2.0);
+        // No margin in height: a vehicle moves along the road.
         let half_m = [length + BOX_MARGIN_M, width + BOX_MARGIN_M, height];
         (world_from_object.inv_mul(world_from_sensor), half_m)
     });
@@ -191,6 +195,7 @@ fn static_tokens(
         });
         balance[token_of(cell.centroid_m).0] += if is_movable { 1 } else { -1 };
     }
+    // A token without cells has balance 0 and counts as static.
     balance.map(|balance| f32::from(u8::from(balance <= 0)))
 }
 
@@ -227,6 +232,7 @@ impl TokenSweeps {
         let (count, _, channels) = self.tokens.size3()?;
         let size = [count / frames];
         let turns = Tensor::f_randint_low(-sectors, sectors + 1, size, (Kind::Int64, device))?;
+        // All sweeps of a window turn alike: their relative poses stay.
         let turns = turns.f_repeat_interleave_self_int(frames, 0, count)?;
         let turned = self.turned(&turns)?;
         let on = (Kind::Float, device);

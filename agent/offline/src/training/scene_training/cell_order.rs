@@ -46,6 +46,7 @@ impl CellOrder {
             passes: steps as f64 * batch as f64 / cache.cell_count() as f64,
             passes_before: 0.0,
             watched: Vec::new(),
+            // A resumed training gets an order of its own, not that of the first pass again.
             rng: ChaCha8Rng::seed_from_u64(seed ^ steps),
         })
     }
@@ -59,6 +60,7 @@ impl CellOrder {
     pub(super) fn next_batch(&mut self, share_done: f64) -> Result<Tensor, TchError> {
         let redundancy = self.redundancy.as_ref();
         let wants_all = redundancy.is_some_and(|of| of.is_time_for_all(share_done));
+        // What is left of a pass and fills no batch is not shown: the next order mixes it in.
         if wants_all || self.place + self.batch > self.order.len() {
             self.next_pass(share_done)?;
         }

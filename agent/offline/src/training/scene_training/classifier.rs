@@ -37,6 +37,7 @@ pub(super) fn train_classifier(
         let of_time = limit.map_or(0.0, |limit| {
             started.elapsed().as_secs_f64() / limit.as_secs_f64().max(1e-3)
         });
+        // Time or steps, whichever ends first; the learning rate follows the same share.
         let share_done = of_time.max(step as f64 / STEPS as f64);
         if share_done >= 1.0 {
             break;
@@ -48,6 +49,7 @@ pub(super) fn train_classifier(
         let logits = head.classify(&cache.sweeps.f_index_select(0, &rows)?, true)?;
         let log_shares = logits.f_log_softmax(1, Kind::Float)?;
         let wanted = classes.f_index_select(0, &rows)?;
+        // Cross entropy with label smoothing: a share of it is the mean over all classes.
         let hit = log_shares
             .f_gather(1, &wanted.f_unsqueeze(1)?, false)?
             .f_mean(Kind::Float)?;

@@ -74,6 +74,7 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
     let logits = head.classify(&cache.sweeps, false)?;
     let classes = Vec::try_from(&logits.f_argmax(1, false)?)?;
     let sweep_of_cell: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
+    // Cells are stored sweep after sweep, so these numbers ascend.
     let first_cell = |sweep: usize| sweep_of_cell.partition_point(|&of| of < sweep as i64) as i64;
     let errors = (0..cache.sweep_count()).map(|sweep| {
         let rows = first_cell(sweep)..first_cell(sweep + 1);
@@ -83,6 +84,7 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
         }
         let on = (Kind::Double, cache.cells.device());
         let (first, last) = (rows.start as f64, (rows.end - 1) as f64);
+        // Evenly over the cells of the sweep, first and last included.
         let rows = Tensor::f_linspace(first, last, count, on)?.f_to_kind(Kind::Int64)?;
         let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
         let of_cells = logits

@@ -54,6 +54,7 @@ pub(super) fn crop(
     };
     let bound = |share: f64, axis: i64| -> Result<f64, TchError> {
         let values = targets_m.f_select(1, axis)?;
+        // `kthvalue` counts from 1.
         let rank = ((values.size()[0] - 1) as f64 * share).round() as i64 + 1;
         values.f_kthvalue(rank, 0, false)?.0.f_double_value(&[])
     };
@@ -67,6 +68,7 @@ pub(super) fn crop(
     let trained = variables.variables();
     for (name, mut variable) in kept.variables() {
         let source = &trained[&name];
+        // Only these have a row for each corner of the grid.
         let is_key_grid = matches!(name.as_str(), "refiner.keys" | "refiner.heights");
         let source = if is_key_grid {
             source.f_index_select(0, &rows)?

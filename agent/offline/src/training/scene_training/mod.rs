@@ -111,6 +111,7 @@ impl<'a> Training<'a> {
     ) -> Result<(Self, Trainer)> {
         let started = Instant::now();
         let run = &config.run;
+        // Seeds the tensor library: before the first variable is made.
         run.start()?;
         let features = Features::compute(config, sweeps, observe)?;
         let load =
@@ -139,6 +140,7 @@ impl<'a> Training<'a> {
                 kmeans(&cache.positions_m(), config.classes as usize, run.seed).1
             }
         };
+        // A resumed training has its classifier in the checkpoint.
         if !run.resume {
             let (classes, limit) = (&class_of_sweep, classifier_time(run.length));
             let share = train_classifier(&head, &variables, &cache, classes, run.seed, limit)?;
@@ -147,6 +149,7 @@ impl<'a> Training<'a> {
                 100.0 * share
             )));
         }
+        // After the classifier: where a checkpoint is resumed, it replaces all variables.
         let trainer = Trainer::begin(run, &variables, None, started)?;
         let redundancy =
             (config.redundancy).map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
@@ -224,6 +227,7 @@ impl Task for Training<'_> {
         // Cells of a batch come from many sweeps; each needs the class of its own sweep.
         let sweeps = cache.sweep_of_cell.f_index_select(0, &rows)?;
         let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
+        // The classifier is not trained here: its logits of all sweeps serve for several steps.
         let logits = match self.logits.take() {
             Some(logits) if !trainer.steps().is_multiple_of(LOGITS_EVERY) => logits,
             // Dropout here too: in places without training data the classifier is less certain than on its training

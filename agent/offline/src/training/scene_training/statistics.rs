@@ -21,6 +21,7 @@ pub(super) fn set_statistics(head: &mut SceneHead, cache: &FeatureCache, seed: u
     let places = places.as_chunks::<3>().0.iter();
     let places: Vec<[f64; 3]> = places.map(|place| place.map(f64::from)).collect();
     let (mut centres, _) = kmeans(&places, centre_count, seed);
+    // With more centres than sampled cells the rest of them stays at the origin.
     centres.resize(centre_count, [0.0; 3]);
     let centres: Vec<f32> = (centres.as_flattened().iter())
         .map(|&axis| axis as f32)

@@ -101,6 +101,7 @@ fn codec(point: &Point) -> Option<String> {
 
 /// A figure for each field with several values, AP at 0.5 and at 0.7 side by side; means over seeds.
 pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
+    // Compared by their labels: the bytes of a message are known only after a run, its codec before.
     let varying: Vec<&Dimension> = { DIMENSIONS.iter() }
         .filter(|dimension| {
             let texts = runs.iter().filter_map(|run| (dimension.text)(&run.point));
@@ -149,6 +150,7 @@ fn chart(
             series.push((name.clone(), BTreeMap::new()));
             series.len() - 1
         });
+        // Runs that differ in nothing but their seed share a key and become one point.
         let key = (dimension.text)(point).map_or(Key::Value(x.to_bits()), Key::Text);
         series[known].1.entry(key).or_default().push((x, y));
     }
@@ -159,6 +161,7 @@ fn chart(
     let (low, high) = xs.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
     let x = if dimension.name == BANDWIDTH {
         let first = low.log10().floor();
+        // At least one decade, so that the axis has a width where all values are equal.
         let decades = [first, high.log10().ceil().max(first + 1.0)];
         Axis::logarithmic(dimension.label, decades.map(|decade| 10f64.powf(decade)))
     } else {
@@ -191,6 +194,7 @@ fn line(name: String, points: Points) -> Series {
         .values()
         .map(|values| (mean(values, |value| value.0), mean(values, |value| value.1)))
         .collect();
+    // The keys are in the order of bits or letters, not of values.
     points.sort_by(|a, b| a.0.total_cmp(&b.0));
     Series {
         name,

@@ -40,10 +40,12 @@ pub(in crate::experiment) fn generate(experiment: &Experiment) -> Result<()> {
     // Of two slices that start together one generates, the other waits for it.
     let path = options.out.with_added_extension("lock");
     let lock = lock(&path).with_context(|| path.display().to_string())?;
+    // Looked at again under the lock: the other slice may have made it meanwhile.
     if !is_generated(experiment)? {
         generate_now(&options)?;
     }
     drop(lock);
+    // A process that waits at the removed file still gets its lock, and finds the data then.
     match fs::remove_file(&path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             Err(error).with_context(|| path.display().to_string())

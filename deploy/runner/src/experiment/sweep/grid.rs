@@ -44,6 +44,7 @@ pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
     let (methods, codecs) = (grid.method.len(), grid.codec.as_ref().map_or(1, Vec::len));
     let mut sizes = match grid.reference.len() {
         0 => vec![("method", methods), ("codec", codecs)],
+        // References come with the first encoding only, so they add up and do not multiply.
         others => vec![("method with codec", methods * codecs + others)],
     };
     sizes.extend([
@@ -65,6 +66,7 @@ pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
 pub(in crate::experiment) fn count(grid: &Grid) -> usize {
     sizes(grid)
         .into_iter()
+        // Too many values have to end in a refusal of the grid, not in an overflow.
         .fold(1, |product, (_, size)| product.saturating_mul(size))
 }
 
@@ -100,6 +102,7 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
         point.jitter_ms = Some(ms)
     });
     let points = spread(points, &grid.bandwidth_mbps, |point, mbps| {
+        // JSON has no infinity, so an unlimited rate is an absent one.
         point.bandwidth_mbps = Some(mbps).filter(|mbps| mbps.is_finite());
     });
     let points = spread(points, &grid.loss, |point, share| point.loss = Some(share));
@@ -152,6 +155,7 @@ impl Point {
             link.seed = self.seed;
         }
         setup.pool = self.vehicles.map_or(AgentPool::All, AgentPool::First);
+        // Kept in 32 bits whatever is sent: one cache serves all encodings of the grid.
         trial.maps = Some(experiment.kept_maps(maps, Dtype::F32));
         Ok(trial)
     }
@@ -203,6 +207,7 @@ impl Point {
         let cells = grid.cells() as u64;
         let budget = |keep: f64| {
             let kept = (keep * cells as f64).ceil() as u64;
+            // Layout of a sparse map: scales (4 bytes per channel of I8), mask (1 bit per cell), values.
             let scales = if dtype == Dtype::I8 { 4 * channels } else { 0 };
             scales + cells.div_ceil(8) + kept * channels * dtype.size()
         };
@@ -220,6 +225,7 @@ impl Point {
     fn rate(&self) -> RateConfig {
         let share = self.codec.fit.zip(self.bandwidth_mbps);
         RateConfig {
+            // 1 Mbit/s is 1e6 bits per second, and the codec counts bytes.
             bytes_per_second: share.map(|(share, mbps)| (share * mbps * 1e6 / 8.0) as u64),
             ..RateConfig::default()
         }

@@ -96,6 +96,7 @@ fn runs_table(table: &VaryingTable) -> String {
 
 /// Text with the special characters of markup escaped.
 fn escaped(text: &str) -> String {
+    // The ampersand first, or those of the other entities would be escaped once more.
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")

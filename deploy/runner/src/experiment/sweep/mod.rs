@@ -188,12 +188,14 @@ impl Sweep {
     pub fn run(&self, jobs: usize, keep_maps: bool) -> Result<SweepResult> {
         let keys = self.keys()?;
         self.compute_missing(&keys, 0..keys.len(), jobs)?;
+        // Read back from the cache, as other processes may have computed them.
         let cells: Option<Vec<Cell>> = self.known(&keys)?.into_iter().collect();
         let cells = cells.ok_or_else(|| WorkerError("a run that was done is not there".into()))?;
         let runs: Vec<Run> = (self.points.iter().cloned().zip(cells))
             .map(|(point, cell)| Run { point, cell })
             .collect();
         let table = self.write(&runs)?;
+        // After the results are written: a failed write must not cost the maps too.
         if !keep_maps {
             self.remove_maps()?;
         }
@@ -207,6 +209,7 @@ impl Sweep {
         let known = self.known(keys)?;
         let missing = missing(&known, part);
         self.print_estimate(&known, &missing, jobs)?;
+        // Maps before runs, so that every worker finds them in the cache.
         self.encode(&missing, jobs)?;
         let missing: Vec<(usize, &CellKey)> = missing
             .into_iter()
@@ -231,6 +234,7 @@ impl Sweep {
         let done: Vec<&Cell> = known.iter().flatten().collect();
         let seconds: f64 = done.iter().map(|cell| cell.wall_seconds).sum();
         let judged: f64 = done.iter().map(|cell| cell.metrics.frames as f64).sum();
+        // Times of cached runs cost nothing and are nearer to the truth than those of a few frames.
         let per_frame = if judged > 0.0 {
             seconds / judged
         } else {
@@ -251,6 +255,7 @@ impl Sweep {
         trial.scenarios = Some(1);
         let frames = self.experiment.frames.unwrap_or(PROBED_TICKS);
         trial.setup.frames = Some(frames.min(PROBED_TICKS));
+        // Opened again, as the ticks of a scenario are cut when it is opened.
         let data = OpenedData::open(&trial)?;
         let began = Instant::now();
         let metrics = evaluate(&trial, &data, point.method, &mut || {})?;
@@ -356,6 +361,7 @@ impl Sweep {
         for line in io::stdin().lock().lines() {
             let request: Option<(usize, CellKey)> =
                 serde_json::from_str(&line.context(PARENT)?).ok();
+            // A line that is no request is answered too, or the parent would wait for ever.
             let Some((index, key)) = request.filter(|(index, _)| *index < self.points.len()) else {
                 let answer = format!("{} that is no point of the grid", workers::FAILED);
                 reply(&answer).context(PARENT)?;
@@ -381,6 +387,7 @@ impl Sweep {
             let path = self.out.join(figure.name);
             write(&path.with_extension("svg"), &figures::svg(&figure.charts)?)?;
             figures::save_png(&figure.charts, &path.with_extension("png"))?;
+            // On the page each chart is an image of its own, so that they wrap on a narrow screen.
             let each = figure.charts.chunks(1).map(figures::svg);
             drawings.push(each.collect::<Result<Vec<_>, _>>()?);
         }

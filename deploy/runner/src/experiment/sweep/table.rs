@@ -44,7 +44,9 @@ pub(super) fn rows(experiment: &Experiment, runs: &[Run]) -> (Vec<&'static str>,
 fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
     let (metrics, used, messages) = (&cell.metrics, cell.used, &cell.messages);
     let codec = (point.method.exchange() == Exchange::Features).then_some(point.codec);
+    // The size of a compressed or fitted map has no fixed ratio to that in 32 bits.
     let is_plain = codec.is_some_and(|codec| codec.fit.is_none() && codec.zstd_level.is_none());
+    // A point has no rate where it is unlimited, and where the grid does not vary it.
     let bandwidth = match point.bandwidth_mbps {
         None if experiment.grid.bandwidth_mbps.is_some() => "inf".into(),
         mbps => plain(mbps),

@@ -71,6 +71,7 @@ impl VaryingTable {
         let column = self.columns.iter().position(|column| column == MAIN)?;
         let (low, high) = self.range(column).filter(|(low, high)| low < high)?;
         let run_with = |value: f64| {
+            // Both numbers were read from the same text, so they are equal bit by bit.
             (0..self.lines.len()).find(|&line| self.number(line, column) == Some(value))
         };
         let [worst, best] = [run_with(low)?, run_with(high)?].map(|run| self.settings_of(run));
@@ -93,6 +94,7 @@ impl VaryingTable {
         for place in
             (self.settings..self.columns.len()).filter(|&place| KEY_RESULTS.contains(&name(place)))
         {
+            // Once a column has no room, those behind it are left out too.
             used += width(place);
             if used <= TERMINAL {
                 shown.push(place);

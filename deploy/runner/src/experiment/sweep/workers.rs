@@ -57,11 +57,13 @@ fn serve<'r>(
     on_frame: &dyn Fn(),
     on_done: &dyn Fn(),
 ) -> Result<()> {
+    // Wrapped at once, so that no early return leaves the process behind.
     let mut worker = Worker(start(file, out)?);
     let silent = || WorkerError("it ended without an answer".into());
     let mut input = worker.0.stdin.take().ok_or_else(silent)?;
     let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
     loop {
+        // After a failure of one worker the others finish their current run and take no other.
         let has_failed = lock(failure).is_some();
         let request = lock(queue).next();
         let Some(request) = request.filter(|_| !has_failed) else {
@@ -91,6 +93,7 @@ fn start(file: &Path, out: &Path) -> Result<Child> {
         .arg("--out")
         .arg(out)
         .arg("--worker");
+    // Standard error stays that of the sweep, so that warnings of workers are seen.
     let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
     child.with_context(|| program.display().to_string())
 }

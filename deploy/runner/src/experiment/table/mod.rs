@@ -77,6 +77,7 @@ pub fn run(
     for place in &places[part] {
         cells.push(run.cell(place, observer)?);
     }
+    // Cells of other slices may still be missing, so no table can be filled.
     if slice.is_some() {
         return Ok(Vec::new());
     }
@@ -184,11 +185,13 @@ impl Run<'_> {
         setup.pool = row.vehicles.map_or(AgentPool::All, AgentPool::First);
         setup.agents.boxes = row.boxes;
         setup.agents.weights.clone_from(&row.neighbour_weights);
+        // The setting of the experiment holds too: row and column only switch it on.
         setup.ego.box_alignment |= row.box_alignment;
         setup.delay_ms = column.delay_ms;
         setup.attack = column.attack;
         setup.ego.trust |= column.trust;
         let folder = self.experiment.feature_maps.as_ref();
+        // All cells send one number format, unlike those of a sweep, so maps are kept in that.
         trial.maps = folder.map(|folder| self.experiment.kept_maps(folder, self.experiment.dtype));
         Ok(trial)
     }

@@ -35,6 +35,7 @@ impl ConfidenceGate {
         let part = |first: i64| self.hidden.ws.f_narrow(1, first, dim);
         let hidden = others.f_linear(&part(0)?, None::<&Tensor>)?
             + ego.f_linear(&part(dim)?, self.hidden.bs.as_ref())?;
+        // The last layer is zero at first, of which the sigmoid is a half: the factor makes it 1.
         let weight = self.out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
         let (maps, rows, columns, _) = weight.size4()?;
         let weight = weight.f_view([maps, 1, rows, columns])?;

@@ -90,6 +90,7 @@ impl Decoder {
             .f_view([1, rows, columns, patch, patch, channels].as_slice())?;
         let fused = fused.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let mut by_patch = fused.f_view([1, rows, patch, columns, patch, channels].as_slice())?;
+        // [1, h, w, p, p, C] to [1, h, p, w, p, C], the order of rows and columns of the map.
         let cells = cells.f_permute([0, 1, 3, 2, 4, 5])?;
         let changed = match are_numbers(&by_patch) && are_numbers(&cells) {
             true => by_patch.f_add_(&cells)?,

@@ -78,6 +78,7 @@ fn compare_there(
     (searched, far): (&[i64], &Tensor),
     area: &Area,
 ) -> Result<Displacements> {
+    // Where the search ends at the pose, `near` already is the comparison there.
     let moved = rows_where(&far.f_count_nonzero_dim_intlist([1_i64].as_slice())?)?;
     if moved.is_empty() {
         return Ok(near);
@@ -131,6 +132,7 @@ fn large_only(deltas: &Tensor) -> Result<Tensor> {
 ///
 /// The maps are on the grid of `area`.
 fn offsets(pairs: &Pairs, area: &Area, config: SearchConfig, train: bool) -> Result<Tensor> {
+    // The settings count cells of the ego's grid, those of `area` may be pooled already.
     let (cells, radius) = (config.cells / area.cells, config.radius);
     let (edges, none): ([i64; 2], [i64; 2]) = ([cells; 2], [0; 2]);
     let large = |maps: &Tensor| {
@@ -141,6 +143,7 @@ fn offsets(pairs: &Pairs, area: &Area, config: SearchConfig, train: bool) -> Res
     let cell_m = area.cell_m * cells as f64;
     let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
     if train {
+        // The middle column is no shift: a map stays unless it fits better elsewhere by the margin.
         let _ = fit
             .f_select(1, fit.size2()?.1 / 2)?
             .f_add_scalar_(config.margin)?;

@@ -106,6 +106,7 @@ impl Strip<'_> {
                 .for_each(|(sum, value)| *sum += value)
         });
         mean.iter_mut().for_each(|sum| *sum /= channels);
+        // Squares of deviations in a second pass: a difference of large sums would lose digits in f32.
         self.rows(entry).for_each(|row| {
             for ((sum, value), mean) in scale.iter_mut().zip(row).zip(&mean) {
                 *sum += (value - mean) * (value - mean);
@@ -124,6 +125,7 @@ impl Strip<'_> {
                 *score += asked * (value - mean);
             }
         }
+        // The scale is the same for all channels, so the sum is scaled and not each term.
         score
             .iter_mut()
             .zip(scale)
@@ -139,6 +141,7 @@ impl Strip<'_> {
         for cell in 0..self.count {
             let is_any = (0..scores.len()).any(|entry| valid(entry, cell));
             for (entry, scores) in scores.iter_mut().enumerate() {
+                // Without any valid token all scores are equal: minus infinity for all would give NaN.
                 scores[cell] = match (is_any, valid(entry, cell)) {
                     (false, _) => 0.0,
                     (true, true) => scores[cell],
@@ -170,6 +173,7 @@ impl Strip<'_> {
     fn mean(&self, entries: &[&[f32]], normal: &[Normal], weights: &[Row], gathered: &mut [f32]) {
         let cells = self.first..self.first + self.count;
         for ((entry, Normal { mean, scale }), weight) in entries.iter().zip(normal).zip(weights) {
+            // A normalised token is (value - mean) * scale, so the scale goes into the weight.
             let mut share = *weight;
             share
                 .iter_mut()

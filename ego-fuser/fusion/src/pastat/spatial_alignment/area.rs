@@ -43,6 +43,7 @@ impl Area {
     pub(crate) fn with_cells_of(self, cells: i64) -> Self {
         let (cell_m, radius) = (
             self.cell_m * cells as f64,
+            // Rounded up: larger cells do not shorten the range.
             (self.radius + cells - 1) / cells,
         );
         let size = self.size.map(|count| count / cells);
@@ -141,6 +142,7 @@ fn places(
     let at = |axis: usize| Ok::<_, TchError>(origin.f_select(1, axis as i64)? - on.middle_m[axis]);
     let ([half_x, half_y], [on_x, on_y]) = (area.half_m, on.half_m);
     let (from_x, from_y) = (from(0)?, from(1)?);
+    // R^T (p - pose) + origin, with p and the result scaled to -1..1 over their areas.
     let x0 = (&cos * &from_x + &sin * &from_y + at(0)?) / on_x;
     let y0 = (&cos * &from_y - &sin * &from_x + at(1)?) / on_y;
     let (xx, xy) = (&cos * (half_x / on_x), &sin * (half_y / on_x));
@@ -165,6 +167,7 @@ pub(crate) fn resample(
     valid: &Tensor,
     sampling_grid: &Tensor,
 ) -> Result<(Tensor, Tensor), TchError> {
+    // Validity is a step function of the position and has no gradient.
     let valid = valid
         .f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?
         .f_to_kind(Kind::Float)?;

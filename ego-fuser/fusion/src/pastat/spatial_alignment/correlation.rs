@@ -85,6 +85,7 @@ impl Shifted {
         let over_parts =
             |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
         let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
+        // Normalised by the ego's unshifted map: what a shift moves across the edges of a part is neglected.
         let energy = length(self.squares.f_unsqueeze(1)? * &theirs)?;
         let whole_energy = length(self.squares.f_sum(None::<Kind>)? * over_parts(&theirs)?)?;
         Ok(Correlation {
@@ -139,6 +140,7 @@ impl Shifted {
                         continue;
                     }
                     for (down, sums) in sums.chunks_exact_mut(edge).enumerate() {
+                        // `own` has `radius` more rows above, so `down` 0 is the shift by -radius.
                         let row =
                             (channel * (height + 2 * radius) + row + down) * (width + 2 * radius);
                         let own = &own[row + left..][..columns + 2 * radius];

@@ -203,6 +203,7 @@ fn moved_maps(
     if count == 0 {
         return Ok(NeighbourMaps::still(coarse.newest.only(1, 1)?));
     }
+    // Maps as received are not padded, unlike the grid onto which they are sampled.
     let own = Area::new(
         grid,
         [i64::from(grid.height), i64::from(grid.width)],

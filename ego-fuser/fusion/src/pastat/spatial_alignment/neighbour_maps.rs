@@ -69,6 +69,7 @@ impl NeighbourMaps {
                     let [places, shares] =
                         [places, weight].map(|tensor| numbers(&tensor.f_get(map)?));
                     let CellSamples { mut features, mask } = cells.at(&places?, Some(&shares?))?;
+                    // Zeros could win the maximum: out of reach the value of the ego has to remain.
                     let out_of_reach = mask.f_squeeze_dim(1)?.f_eq(0.0)?.f_nonzero()?;
                     features
                         .f_index_fill_(0, &out_of_reach.f_squeeze_dim(1)?, f64::NEG_INFINITY)?

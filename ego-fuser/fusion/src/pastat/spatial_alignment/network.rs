@@ -122,6 +122,7 @@ impl AlignmentNetwork {
         let [fit, similarity] =
             [&found.parts, &found.whole].map(|found| found.f_amax([-1_i64].as_slice(), false));
         let (fit, similarity) = (fit?, similarity?);
+        // Parts count by how well and by how much they match. Negative correlation counts as none.
         let weight = fit.f_relu()?.f_square()? * &found.energy;
         let senders =
             area.places_of(ego_from_cav)?.f_to_device(device)? + deltas.f_narrow(1, 0, 2)?;
@@ -154,6 +155,7 @@ impl AlignmentNetwork {
         let shift_m = self.config.max_shift_m as f32;
         let bounds = Tensor::f_from_slice(&[shift_m, shift_m, self.config.max_turn_rad as f32])?;
         let bounds = bounds.f_to_device(motion.device())?;
+        // In units of the bounds, as the tanh takes it: with share 1 a small motion passes unchanged.
         let raw = learnt.f_narrow(1, 0, 3)? + motion / &bounds * learnt.f_narrow(1, 3, 3)?;
         Ok(raw.f_tanh()? * bounds)
     }
@@ -171,6 +173,7 @@ impl AlignmentNetwork {
 /// Compared form of others, moved by `deltas` `[K, 3]`.
 fn moved(pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor> {
     let shown = &pairs.shown;
+    // Usual outside training, whose first comparison is at the poses: resampling would change nothing.
     if deltas.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
         return Ok(shown.shallow_clone());
     }
@@ -205,6 +208,7 @@ fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) 
         &middles - middle.f_unsqueeze(0)?,
     );
     let column = |tensor: &Tensor, axis: i64| tensor.f_narrow(2, axis, 1);
+    // Least squares for a small angle: the sum of arm x shift over the sum of |arm|^2.
     let turning = column(&arm, 0)? * column(&shift, 1)? - column(&arm, 1)? * column(&shift, 0)?;
     let inertia = over_parts(
         &(arm

@@ -86,12 +86,14 @@ impl AgentAttention {
             norm.ws.as_ref().unwrap_or(&one),
             norm.bs.as_ref().unwrap_or(&none),
         );
+        // Query of each head led back through the weights of the key and the gain of the norm.
         let asked = (by_head(&self.key)? * gain)
             .f_transpose(1, 2)?
             .f_matmul(&query)?;
         let gathered = others.gather(&numbers(&asked)?, &numbers(&by_channel(ego)?)?);
         let gathered = Tensor::f_from_slice(&gathered)?.f_view([self.heads, dim, cells])?;
         let values = by_head(&self.value)?;
+        // The weights of a head add up to 1, so the shift of the norm passes through the values once.
         let mixed = (&values * gain).f_matmul(&gathered)?
             + values.f_matmul(&shift.f_expand([dim], false)?.f_unsqueeze(1)?)?;
         Ok(self.out.forward(
@@ -152,6 +154,7 @@ impl WindowAttention {
         let (entries, height, width, dim) = tokens.size4()?;
         let share = dim / self.sizes.len() as i64;
         let projected = self.query_key_value.forward(tokens);
+        // The loops over plain floats know no mask.
         let hides = valid.f_eq(0.0)?.f_any()?.f_int64_value(&[])? != 0;
         if entries == 1 && are_numbers(&projected) && !hides {
             let (projected, mut seen) = (numbers(&projected)?, vec![0.0; tokens.numel()]);
@@ -171,6 +174,7 @@ impl WindowAttention {
         }
         let mut parts = Vec::with_capacity(self.sizes.len());
         for (index, size) in self.sizes.iter().enumerate() {
+            // Channels are queries, keys, values: in each, every size of window has its share.
             let of_size =
                 |which: i64| projected.f_narrow(3, which * dim + index as i64 * share, share);
             parts.push(self.within(size, [of_size(0)?, of_size(1)?, of_size(2)?], valid)?);

@@ -30,6 +30,7 @@ pub(super) fn attend(windows: &Windows, projected: &[f32], out: &mut [f32]) {
     let (tokens, scale) = (edge * edge, (each as f32).sqrt().recip());
     // Blocks of tokens, and of channels, of which the last are none.
     let [length, wide] = [tokens, each].map(|size| size.div_ceil(LANES));
+    // Lanes are tokens in the keys and channels in the values: both products fill whole lanes.
     let mut keys = vec![[0.0; LANES]; length * each];
     let mut values = vec![[0.0; LANES]; wide * length * LANES];
     let mut scores = vec![0.0; length * LANES];
@@ -40,6 +41,7 @@ pub(super) fn attend(windows: &Windows, projected: &[f32], out: &mut [f32]) {
         for (head, preference) in windows.preference.chunks_exact(tokens * tokens).enumerate() {
             let channel = first + head * each;
             for token in 0..tokens {
+                // A token has query, key and value in turn: this begins at its key.
                 let of = &projected[place(token) * 3 * dim + dim..][..2 * dim];
                 for at in 0..each {
                     keys[token / LANES * each + at][token % LANES] = of[channel + at];
@@ -49,6 +51,7 @@ pub(super) fn attend(windows: &Windows, projected: &[f32], out: &mut [f32]) {
             }
             for (token, preference) in preference.chunks_exact(tokens).enumerate() {
                 scores[..tokens].copy_from_slice(preference);
+                // The last block may reach beyond the window: its other places get no weight.
                 scores[tokens..].fill(f32::NEG_INFINITY);
                 let query = &projected[place(token) * 3 * dim + channel..][..each];
                 for (scores, keys) in scores.chunks_exact_mut(LANES).zip(keys.chunks_exact(each)) {

@@ -83,6 +83,7 @@ impl Tally {
             pairs,
             time_s: self.seconds / pairs.max(1) as f64,
             bytes_mean,
+            // Nothing sent gives 0 instead of minus infinity.
             log2_bytes: bytes_mean.max(1.0).log2(),
             success_3m: within(3.0),
             success_1m: within(1.0),

@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 use support::nanos;
 use support::statistics::median;
 
-use super::super::transmission::view;
 use super::super::{EvaluateError, Evaluator};
 
 /// Ticks that times are measured over.
@@ -71,6 +70,7 @@ impl ComputeTimes {
 
     /// In simulation time every sweep is processed: a process that is slower than the scene is rejected.
     pub(super) fn check(&self, scenario: &Scenario) -> Result<(), EvaluateError> {
+        // Time that goes backwards gives a period of 0 rather than an overflow.
         let steps = scenario
             .ticks
             .windows(2)
@@ -166,9 +166,11 @@ impl Evaluator {
         let samples = self.samples(scenario, vehicles, &|ticks| {
             ticks < ESTIMATED_TICKS || (ticks < MOST_ESTIMATED_TICKS && began.elapsed() < budget)
         });
+        // Restored before an error is returned.
         self.setup.agents.pose = source;
         let samples = samples?;
         let warm = |sample: &[f64]| median(&sample[sample.len() / 2..]).unwrap_or(0.0);
+        // A live vehicle measures one sweep in `interval`: an observation counts as that share.
         let interval = f64::from(self.setup.agents.pose.measuring_interval(&samples.motion));
         let steps = ComputeTimes {
             pose_ms: warm(&samples.pose) + warm(&samples.observe) / interval,
@@ -190,11 +192,15 @@ impl Evaluator {
         vehicles: usize,
         is_needed: &dyn Fn(usize) -> bool,
     ) -> Result<Samples, EvaluateError> {
-        let exchange = self.ego.method().own_content();
+        let stream = self.ego.method().own_content().stream();
         let mut participants = (0..scenario.agents.len().min(MEASURED_VEHICLES))
-            .map(|place| self.participant(&self.setup.agents, scenario, (place, place), place == 0))
+            .map(|place| {
+                let needed = (place == 0, Some(stream));
+                self.participant(&self.setup.agents, scenario, (place, place), needed)
+            })
             .collect::<Result<Vec<_>, EvaluateError>>()?;
         let mut samples = Samples::default();
+        // Maps of an earlier run are no history of these ticks.
         self.ego.forget();
         for tick in (0..scenario.ticks.len()).take_while(|tick| is_needed(*tick)) {
             let (mut own, mut neighbour) = (None, Vec::new());
@@ -208,20 +214,20 @@ impl Evaluator {
                 };
                 samples.motion = frame.motion();
                 let began = Instant::now();
-                let forms = participant.exchange(exchange);
-                let sent = view(participant, &frame, None, &forms)?.into_views();
+                let sent = participant.compute(&frame, None, Default::default)?;
+                let sent = sent.into_views();
                 match place {
                     0 => own = sent.into_iter().next(),
                     _ => neighbour = sent,
                 }
                 let all = began.elapsed();
-                let times = participant.times;
-                samples.pose.push(ms(times.estimate));
-                samples.observe.push(ms(times.observe));
-                samples.add(0, &participant.stages);
-                samples
-                    .map
-                    .push(ms(all.saturating_sub(times.estimate + times.observe)));
+                let [(pose, _), (observe, _), (_, stages)] =
+                    ["pose", "pose measurement", "agent"].map(|name| participant.step(name));
+                samples.pose.push(ms(pose));
+                samples.observe.push(ms(observe));
+                samples.add(0, stages);
+                // The rest of the time is the map's: pose and observation are measured by themselves.
+                samples.map.push(ms(all.saturating_sub(pose + observe)));
             }
             let Some(own) = own else { continue };
             let others = scenario.agents.iter().take(vehicles).skip(1);

@@ -100,6 +100,7 @@ impl DelayedDelivery {
                 self.ledger.adapted(&Account::published(topic), reason);
             }
             let mut view = sent.view(message.content);
+            // The sender stamps by its own clock, which may be wrong.
             let clock = self.link.clock();
             view.capture_nanos = clock.shown_since(self.began_nanos, sent.capture_nanos);
             let sweep = SweepTime {
@@ -110,6 +111,7 @@ impl DelayedDelivery {
                 reception: exact_reception(&view.cav, 0),
                 view,
                 sequence: 0,
+                // The payload is without the header; on the wire the pose message counts too.
                 payload_bytes: message.bytes - HEADER_LEN as u64,
                 wire_bytes: message.bytes + sent.pose_bytes,
             };
@@ -123,6 +125,7 @@ impl DelayedDelivery {
         self.next_id += 1;
         let topic = topic(&packet.from, packet.stream);
         self.kept.insert(packet.id, Kept { topic, envelope });
+        // By time, then by number: messages of one time keep their order.
         self.pending
             .insert((packet.submitted_nanos, packet.id), packet);
     }
@@ -168,6 +171,7 @@ impl DelayedDelivery {
             }
             Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.envelope),
         };
+        // A pose has no envelope: its arrival is only counted.
         if envelope.is_none() {
             self.ledger.received(&account);
         }
@@ -197,6 +201,7 @@ impl DelayedDelivery {
     /// Counts the messages of a vehicle's stream that neither arrived nor were lost; `waiting` of them have arrived and
     /// were never used.
     pub(super) fn close(&mut self, (cav, stream): &Source, waiting: u64) {
+        // Handed over ahead but not submitted by the end: these count as not sent.
         let not_sent: BTreeSet<u64> = self.pending.values().map(|packet| packet.id).collect();
         let topic = topic(cav, *stream);
         let is_under_way =

@@ -12,17 +12,13 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{
-    Arrival, Barrier, Bus, BusError, Event, Inbox, NotReady, Publisher, PublisherOptions, Route,
+    Barrier, Bus, BusError, Event, Inbox, NotReady, Publisher, PublisherOptions, Route,
     Subscription, process_id,
 };
 use dataset::frame::Frame;
-use protocol::message::{Bev, Boxes, GnssSource, Points};
-use protocol::{
-    CavId, Gnss, Lidar, Limits, PoseEstimate, ProcessId, Role, Stream, Topic, WireError,
-};
+use protocol::{CavId, Lidar, Limits, ProcessId, Role, Stream, Topic, WireError, wire};
 
-use super::super::sent::{Sent, SentMessage};
-use ego_fuser::ego::Content;
+use super::super::sent::{Answer, Sent};
 
 /// Timeout of all vehicles together for a tick: for a busy machine, but not for one that has lost a process.
 const TIMEOUT: Duration = Duration::from_secs(120);
@@ -78,13 +74,6 @@ impl fmt::Debug for RemotePool {
     }
 }
 
-/// The messages of an answer so far.
-#[derive(Default)]
-struct Answer {
-    pose: Option<(PoseEstimate, u64)>,
-    messages: BTreeMap<Stream, SentMessage>,
-}
-
 impl RemotePool {
     /// Waits until the process of every vehicle has joined, for `timeout` at most. Each sends the streams named beside
     /// it. The wait ends when `stop` is requested.
@@ -133,6 +122,7 @@ impl RemotePool {
                 routes.push(route(stream, &here));
             }
         }
+        // No sweep is sent before both directions are connected: nothing would receive it.
         Barrier::new(routes).await_routes(bus)?.wait(timeout)?;
         Ok(Self {
             inbox,
@@ -156,14 +146,8 @@ impl RemotePool {
             let Some(Sensors { gnss, imu, lidar }) = self.sensors.get(&frame.cav) else {
                 continue;
             };
-            if let Some(world_from_lidar) = frame.world_from_lidar {
-                let source = GnssSource::Recorded;
-                let measured = Gnss {
-                    world_from_lidar,
-                    position_std_m: 0.0,
-                    heading_std_rad: 0.0,
-                    source,
-                };
+            // As in this process: the measurement is the recorded pose, without error.
+            if let Some(measured) = frame.gnss() {
                 gnss.submit(frame.capture_nanos, measured);
             }
             imu.submit(frame.capture_nanos, frame.motion());
@@ -180,22 +164,24 @@ impl RemotePool {
             .map(|frame| (&frame.cav, Answer::default()))
             .collect();
         let is_open = |(cav, answer): &(&&CavId, &Answer)| {
-            let mut streams = self.streams.get(**cav).into_iter().flatten();
-            answer.pose.is_none() || streams.any(|stream| !answer.messages.contains_key(stream))
+            let streams = self.streams.get(**cav);
+            !answer.is_complete(streams.map_or(&[], Vec::as_slice))
         };
         while answers.iter().any(|entry| is_open(&entry)) {
             match self.inbox.take(Some(deadline)) {
                 Pop::Item(topic, Event::Message(arrival)) => {
-                    let Topic::Stream { cav, stream } = &topic else {
+                    let Topic::Stream { cav, .. } = &topic else {
                         continue;
                     };
+                    // A late answer to an earlier sweep is none to this one.
                     let asked = frames.iter().any(|frame| {
                         frame.cav == *cav
                             && frame.capture_nanos == arrival.header.stamp.capture_nanos
                     });
                     if let Some(answer) = answers.get_mut(cav).filter(|_| asked) {
-                        answer
-                            .note(*stream, &arrival)
+                        let message = wire::decode_any(arrival.pieces(), &Limits::default());
+                        message
+                            .and_then(|(_, message)| answer.note(message, arrival.wire_bytes()))
                             .map_err(|source| RemoteError::Unsound {
                                 topic: topic.clone(),
                                 source,
@@ -220,55 +206,8 @@ impl RemotePool {
             .iter()
             .filter_map(|frame| {
                 let streams = self.streams.get(&frame.cav)?;
-                answers.remove(&frame.cav)?.into_sent(frame, streams)
+                Some(answers.remove(&frame.cav)?.into_sent(frame, streams))
             })
             .collect())
-    }
-}
-
-impl Answer {
-    fn note(&mut self, stream: Stream, arrival: &Arrival) -> Result<(), WireError> {
-        let (limits, bytes) = (Limits::default(), arrival.wire_bytes());
-        let (content, rate) = match stream {
-            Stream::Bev => {
-                let message: Bev = arrival.decode(&limits)?;
-                let rate = message.features.rate;
-                (Content::Features(message.features.decode(&limits)?), rate)
-            }
-            Stream::Boxes => {
-                let message: Boxes = arrival.decode(&limits)?;
-                (Content::Boxes(message.into_objects()), None)
-            }
-            Stream::Points => {
-                let message: Points = arrival.decode(&limits)?;
-                (Content::Points(message.points), None)
-            }
-            Stream::Pose => {
-                self.pose = Some((arrival.decode(&limits)?, bytes));
-                return Ok(());
-            }
-            _ => return Ok(()),
-        };
-        let message = SentMessage {
-            content,
-            bytes,
-            rate,
-        };
-        self.messages.insert(stream, message);
-        Ok(())
-    }
-
-    /// The answer with its messages in the order of these streams, whatever the order of their arrival.
-    fn into_sent(mut self, frame: &Frame, streams: &[Stream]) -> Option<Sent> {
-        let (pose, pose_bytes) = self.pose?;
-        let messages = streams.iter().map(|stream| self.messages.remove(stream));
-        Some(Sent {
-            cav: frame.cav.clone(),
-            capture_nanos: frame.capture_nanos,
-            pose,
-            pose_bytes,
-            messages: messages.collect::<Option<_>>()?,
-            failure: None,
-        })
     }
 }

@@ -134,9 +134,11 @@ impl MountedCamera {
         };
         let yaw_rad = yaw_deg.to_radians();
         let step_rad = 1.0 / (RAYS_PER_PIXEL * focal_px);
+        // Two rays beyond the edge, as the shading takes normals from neighbouring rays.
         let half_rad = [width, height].map(|edge| (edge / 2.0 / focal_px).atan() + 2.0 * step_rad);
         let count = |half_rad: f64| (2.0 * half_rad / step_rad).ceil() as usize + 1;
         let pattern = RayPattern {
+            // Columns run to the right in the image, so azimuths, positive to the left, fall.
             first_azimuth_rad: (yaw_rad + half_rad[0]) as f32,
             azimuth_step_rad: -step_rad as f32,
             columns: count(half_rad[0]),

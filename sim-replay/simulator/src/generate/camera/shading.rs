@@ -63,6 +63,7 @@ impl<'a> Shader<'a> {
             if self.weather == Weather::Snow && random.chance(FLAKES) {
                 colour = mix(colour, SNOW, 0.7);
             }
+            // Light adds up linearly, the values of an image do not: gamma 1.8.
             rgb.extend(
                 colour.map(|part| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8),
             );
@@ -145,6 +146,7 @@ impl<'a> Shader<'a> {
         let here = self.point(column, channel, self.image.depths_m[ray]);
         let towards = |(column, channel): (usize, usize)| {
             let other = self.ray(column, channel);
+            // At the edge of the pattern the neighbour is the ray itself.
             let is_same = other != ray && self.image.hits[other] == self.image.hits[ray];
             is_same.then(|| self.point(column, channel, self.image.depths_m[other]) - here)
         };
@@ -153,10 +155,12 @@ impl<'a> Shader<'a> {
         };
         let across = along((column + 1, channel), (column.saturating_sub(1), channel));
         let up = along((column, channel + 1), (column, channel.saturating_sub(1)));
+        // Too few rays on the body for a plane: it counts as level.
         let (Some(across), Some(up)) = (across, up) else {
             return Vector3::z();
         };
         let normal = across.cross(&up);
+        // The cross product may point either way. The visible side faces the sensor.
         let towards_sensor = if normal.dot(&here) > 0.0 {
             -normal
         } else {

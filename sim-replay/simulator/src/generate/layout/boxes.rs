@@ -76,6 +76,7 @@ pub(super) fn world_corners(object: &Object) -> [[f64; 3]; 8] {
 
 /// Number of points of the sweep in the object's box.
 pub(super) fn points_in(frame: &AgentFrame, object: &Object) -> usize {
+    // Multiplied in f64: positions in the world are large.
     let object_from_lidar: Isometry3<f32> =
         (object.world_from_object.isometry().inverse() * frame.world_from_lidar()).cast();
     let half = object.size_m.map(|size| (size / 2.0) as f32);

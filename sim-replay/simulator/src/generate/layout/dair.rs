@@ -163,6 +163,7 @@ impl Dair {
     fn write_vehicle_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
         let world_from_lidar = frame.world_from_lidar();
         let vehicle = frame.frame.world_from_vehicle;
+        // Without a pose of the vehicle, the LiDAR takes its place and the mount is the identity.
         let world_from_novatel = vehicle.map_or(world_from_lidar, |pose| pose.isometry());
         let novatel_from_lidar: Pose = world_from_novatel.inv_mul(&world_from_lidar).into();
         let mount = json!({ "transform": transform(&novatel_from_lidar) });
@@ -234,6 +235,7 @@ impl SceneWriter for Dair {
             return Ok(());
         };
         let what = "frames of agents beyond one vehicle and one roadside unit";
+        // Both were found above, so there are at least two.
         omitted.add(what, frames - 2);
         let number = batch.first_frame + moment.index;
         let [id, unit_id] =
@@ -265,6 +267,7 @@ impl SceneWriter for Dair {
 
     fn finish(&mut self) -> Result<(), SynthError> {
         let mut rows = std::mem::take(&mut *locked(&self.rows));
+        // Moments are written by several threads, in any order.
         rows.sort_by_key(|(number, _)| *number);
         let list = |of: fn(&Rows) -> &Value| {
             Value::Array(rows.iter().map(|(_, rows)| of(rows).clone()).collect())

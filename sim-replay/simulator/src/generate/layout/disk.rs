@@ -55,6 +55,7 @@ fn flat_name(name: &str) -> String {
         .chars()
         .map(|letter| if allowed(letter) { letter } else { '_' })
         .collect();
+    // A leading dot would hide the file.
     text.trim_start_matches('.').to_owned()
 }
 

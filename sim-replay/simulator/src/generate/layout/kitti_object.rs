@@ -71,6 +71,7 @@ impl SceneWriter for KittiObject {
 
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         for frame in &moment.frames {
+            // One block of numbers per agent: a number does not depend on which agents are present.
             let number = self.first_frame + frame.agent * self.moments + moment.index;
             let points = float_bytes(frame.frame.points.xyzi.iter().copied());
             write_file(&self.file("velodyne", number, ".bin"), points)?;
@@ -87,6 +88,7 @@ fn labels(frame: &AgentFrame) -> String {
     for object in &frame.frame.objects {
         let upright = upright_in(frame, object);
         let ([length, width, height], [x, y, z]) = (upright.size_m, upright.center_m);
+        // KITTI gives the middle of the bottom face.
         let bottom = camera_from_lidar() * Point3::new(x, y, z - height / 2.0);
         // The camera's x points to the right of the LiDAR's x.
         let rotation_y_rad = -upright.heading_rad - std::f64::consts::FRAC_PI_2;

@@ -75,6 +75,7 @@ fn pose_lines(sequence: &Sequence<'_>) -> String {
             .partition_point(|sweep| sweep.moment <= moment);
         let sweep = &sequence.sweeps[next.saturating_sub(1)];
         let first_from_lidar = first_from_world * sweep.world_from_lidar.isometry();
+        // The same motion in the camera's axes: C T C^-1 with C = camera_from_lidar.
         let pose =
             (camera_from_lidar * first_from_lidar * camera_from_lidar.inverse()).to_homogeneous();
         let row: [String; 12] =

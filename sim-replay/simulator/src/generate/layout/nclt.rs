@@ -40,6 +40,7 @@ fn points(points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8> {
             continue;
         };
         bytes.extend([x, y, z].into_iter().flat_map(u16::to_le_bytes));
+        // The ring is computed in the original axes, where z points up.
         bytes.extend([byte(intensity), ring(point)]);
     }
     let what = "points beyond the coordinates that can be written (-100 m to 227 m)";

@@ -152,6 +152,7 @@ impl Tables {
                 // The mount is that of the first sweep, so that one row serves the whole scene.
                 let world_from_vehicle: Pose =
                     (sweep.world_from_lidar * mount.vehicle_from_lidar.inverse()).into();
+                // One pose for each sweep, so both rows share a token.
                 let row = json!({
                     "token": token, "timestamp": sample.micros,
                     "rotation": world_from_vehicle.rotation_wxyz, "translation": world_from_vehicle.translation_m,
@@ -216,6 +217,7 @@ impl Tables {
                 chain.iter().zip(linked(&tokens))
             {
                 let pose = &annotation.object.world_from_object;
+                // Sizes of nuScenes are width, length, height.
                 let [length, width, height] = annotation.object.size_m;
                 let row = json!({
                     "token": token, "sample_token": sample_token, "instance_token": instance,

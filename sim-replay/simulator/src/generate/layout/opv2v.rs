@@ -60,6 +60,7 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
         let Some(pose) = pose else { continue };
         let numbers: [f64; 6] = CarlaPose::from_pose(&pose).into();
         write_list(yaml, "", key, &numbers)?;
+        // Keys of the file are in alphabetical order, and this one comes next.
         if key == "lidar_pose" {
             writeln!(yaml, "plan_trajectory: []")?;
         }
@@ -89,6 +90,7 @@ fn write_camera(
     let [world_from_body_left, world_from_lidar_left] =
         [&world_from_body, &CarlaPose::from_pose(world_from_lidar)]
             .map(CarlaPose::left_handed_matrix);
+    // camera_from_lidar, in left-handed axes.
     let extrinsic = world_from_body_left.try_inverse().unwrap_or_default() * world_from_lidar_left;
     writeln!(yaml, "camera{number}:")?;
     let cords: [f64; 6] = world_from_body.into();

@@ -149,6 +149,7 @@ impl SceneWriter for Sequences {
                 sweeps: &own,
             };
             (self.style.write_poses)(&self.root, &sequence)?;
+            // Cleared after the poses, without which the sequence is incomplete.
             mark.clear()?;
         }
         Ok(())

@@ -79,6 +79,7 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
             object,
             angle_deg: CarlaPose::from_right_handed(&lidar_from_object).roll_yaw_pitch_deg,
             location_m: lidar_from_object.translation_m,
+            // The location already is the centre of the box.
             center_m: [0.0; 3],
             more: &more,
         };

@@ -32,6 +32,7 @@ pub(crate) struct RayPattern {
 impl RayPattern {
     /// True if the columns go all the way round.
     pub(crate) fn is_full_turn(&self) -> bool {
+        // Half a step of tolerance against rounding.
         self.azimuth_step_rad.abs() * self.columns as f32 > TAU - 0.5 * self.azimuth_step_rad.abs()
     }
 

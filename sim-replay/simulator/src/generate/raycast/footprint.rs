@@ -53,6 +53,7 @@ impl SensorFrames {
         if nearest_m > pattern.range_m {
             return None;
         }
+        // Next to the sensor the azimuths have no bounds.
         if nearest_m < TOUCHING_M {
             return Some(Footprint {
                 first_column: 0,
@@ -128,6 +129,7 @@ fn channels(
     let heights = || corners.iter().map(|corner| corner.z);
     let low = heights().fold(f32::MAX, f32::min) - BEND_M;
     let high = heights().fold(f32::MIN, f32::max) + BEND_M;
+    // For each sign of the height, the distance that gives the outermost elevation.
     let steepest = |height: f32, falling: bool| {
         let is_near = (height < 0.0) == falling;
         (height / if is_near { nearest_m } else { farthest_m }).atan()
@@ -160,6 +162,7 @@ fn columns(
     let interval = |turn: f32| {
         let a = index(middle + low - margin + turn);
         let b = index(middle + high + margin + turn);
+        // One column more at either end against rounding.
         (a.min(b).floor() as i64 - 1, a.max(b).ceil() as i64 + 1)
     };
     let count = pattern.columns as i64;
@@ -168,6 +171,7 @@ fn columns(
         return Some((first, (last - first + 1).min(count) as usize));
     }
     debug_assert!(middle.abs() <= PI + 1e-3);
+    // An azimuth beyond half a turn may meet the pattern a full turn away.
     let intervals = [-TAU, 0.0, TAU].map(interval).into_iter();
     let clipped = intervals.filter(|(first, last)| *last >= 0 && *first < count);
     let (first, last) = clipped.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;

@@ -94,6 +94,7 @@ impl Surface for Plane {
     fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]) {
         let drop = (self.0 - rays.origin.z) as f32;
         for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
+            // A ray along the plane gives an infinite distance or NaN, and neither is nearer.
             let at = drop / (rays.forward.z * cos + rays.up.z * sin);
             let nearer = (at > 0.0) & (at < *depth);
             *depth = if nearer { at } else { *depth };
@@ -238,13 +239,16 @@ impl Caster {
             let body_from_world = placement.rotation().transpose().cast();
             (body_from_world, (placement.position_m - anchor).cast())
         };
+        // Most bodies stand still: one frame serves all columns.
         let still = body.motion.is_still().then(|| frame(1.0));
         for column in footprint.first_column..footprint.first_column + footprint.columns as i64 {
+            // A footprint may reach over the seam of a full turn.
             let column = column.rem_euclid(count) as usize;
             let offset = column * self.pattern.channels;
             let range = offset + channels.start..offset + channels.end;
             let depths = &mut self.image.depths_m[range.clone()];
             let farther = |far: f32, &depth: &f32| if depth > far { depth } else { far };
+            // All rays of the column already end nearer, so the body is hidden here.
             if depths.iter().fold(0.0, farther) < footprint.nearest_m {
                 continue;
             }

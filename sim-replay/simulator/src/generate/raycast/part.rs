@@ -81,6 +81,7 @@ impl Bounds {
 
     /// True if the plane through `origin` with unit normal `normal` touches the box.
     fn meets_plane(&self, origin: &[f32; 3], normal: &[f32; 3]) -> bool {
+        // One millimetre against rounding.
         let (mut distance, mut reach) = (0.0f32, 1e-3f32);
         for axis in 0..3 {
             distance += normal[axis] * ((self.min_m[axis] + self.max_m[axis]) * 0.5 - origin[axis]);
@@ -107,6 +108,7 @@ impl Part {
     /// Shortens the depths of a column to this part where it is hit from outside, and writes `id` there.
     pub(super) fn cast(&self, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
         let rays = &rays.cut(depth.len());
+        // All rays of a column lie in one plane: a part beside it is not hit.
         if !self.bounds().meets_plane(&rays.origin, &rays.normal()) {
             return;
         }
@@ -131,6 +133,7 @@ impl Part {
 /// Written with selects instead of a branch so that the loops around it become vector code.
 #[inline(always)]
 fn shorten(enter: f32, is_hit: bool, depth: &mut f32, hit: &mut u32, id: u32) {
+    // Entries behind the origin do not count: a sensor inside a solid does not see it.
     let nearer = is_hit & (enter > 0.0) & (enter < *depth);
     *depth = if nearer { enter } else { *depth };
     *hit = if nearer { id } else { *hit };
@@ -157,6 +160,7 @@ fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, (depth, hit, id): Pixels<'_>
     let high: [f32; 3] = std::array::from_fn(|axis| bounds.max_m[axis] - rays.origin[axis]);
     let (h, u) = (rays.forward, rays.up);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
+        // Slab test: the ray is inside between its last entry and its first exit.
         let slab = |axis: usize| {
             let inverse = 1.0 / off_zero(h[axis] * cos + u[axis] * sin);
             let (a, b) = (low[axis] * inverse, high[axis] * inverse);
@@ -187,6 +191,7 @@ fn cast_hull(planes: &[[f32; 4]], rays: &ColumnRays<'_>, (depth, hit, id): Pixel
                 let slope = off_zero(along * cos + rise * sin);
                 let at = inside / slope;
                 let (latest, earliest) = (greater(*enter, at), lesser(*exit, at));
+                // Against the normal the ray enters through the plane, along the normal it leaves.
                 *enter = if slope < 0.0 { latest } else { *enter };
                 *exit = if slope < 0.0 { *exit } else { earliest };
             }
@@ -239,6 +244,7 @@ fn cast_ellipsoid(
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
         let d = [0, 1, 2].map(|axis| h[axis] * cos + u[axis] * sin);
         let square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+        // From the place nearest to the centre, since b^2 - ac would cancel for a small ellipsoid far away.
         let middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / square;
         let [x, y, z] = [0, 1, 2].map(|axis| o[axis] + middle * d[axis]);
         let room = 1.0 - (x * x + y * y + z * z);

@@ -32,6 +32,7 @@ impl Placement {
     pub fn rotation(&self) -> Matrix3<f64> {
         let (sy, cy) = self.yaw_rad.sin_cos();
         let (sp, cp) = self.pitch_rad.sin_cos();
+        // Rz(yaw) Ry(-pitch): a positive pitch lifts the x axis.
         let rotation = Matrix3::new(cy * cp, -sy, -cy * sp, sy * cp, cy, -sy * sp, sp, 0.0, cp);
         if self.roll_rad == 0.0 {
             return rotation;
@@ -83,6 +84,7 @@ impl Sweep {
     /// The placement at a time between 0 (start) and 1 (end).
     pub fn at(&self, time: f64) -> Placement {
         let mix = |a: f64, b: f64| a + (b - a) * time;
+        // The short way round, also across the step from pi to -pi.
         let turn = wrapped(self.end.yaw_rad - self.start.yaw_rad);
         Placement {
             position_m: self.start.position_m

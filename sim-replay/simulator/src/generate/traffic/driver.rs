@@ -63,6 +63,7 @@ impl Driver {
         let interactions = obstacles
             .iter()
             .map(|obstacle| self.interaction(speed_mps, obstacle));
+        // The strongest interaction counts: several obstacles do not add up.
         let most = interactions.fold(0.0, f64::max);
         (free - self.acceleration_mps2 * most).max(-EMERGENCY_MPS2)
     }
@@ -70,6 +71,7 @@ impl Driver {
     fn interaction(&self, speed_mps: f64, obstacle: &Obstacle) -> f64 {
         let closing = speed_mps - obstacle.speed_mps;
         let braking = 2.0 * (self.acceleration_mps2 * self.comfort_mps2).sqrt();
+        // A leader that pulls away must not reduce the gap below that of standing vehicles.
         let wanted_gap =
             self.jam_gap_m + (speed_mps * self.headway_s + speed_mps * closing / braking).max(0.0);
         // Overlapping vehicles have a gap below zero and must brake too.
@@ -94,6 +96,7 @@ pub(crate) fn bend_speeds_mps(lane: &Lane) -> Vec<f32> {
             // Curvature of the circle through the three points.
             let is_triangle = product > 1e-6;
             let curvature = if is_triangle {
+                // k = 4 A / (a b c), with A half of the doubled area.
                 2.0 * doubled_area / product
             } else {
                 0.0

@@ -29,6 +29,7 @@ impl Explorer {
     /// No lane is visited except the one it starts on.
     pub(super) fn new(roads: &Roads<'_>, start: LaneId) -> Self {
         let lanes = &roads.graph.lanes;
+        // Edges point backwards, as the search starts at the targets.
         let mut onto = vec![Vec::new(); lanes.len()];
         for lane in lanes {
             let length_m = lane.length_m.ceil() as u64;
@@ -71,6 +72,7 @@ impl Explorer {
     /// Keeps the lanes with the shortest distance to a least visited one.
     pub(super) fn keep_best(&mut self, lanes: &mut Vec<LaneId>) {
         let distances: Vec<Option<u64>> = lanes.iter().map(|&lane| self.unknown_m(lane)).collect();
+        // No least visited lane can be reached: all lanes stay.
         let Some(least) = distances.iter().flatten().min() else {
             return;
         };
@@ -105,6 +107,7 @@ impl Explorer {
             .map(|lane| Reverse((0, lane)))
             .collect();
         while let Some(Reverse((distance_m, lane))) = open.pop() {
+            // A shorter way was found before.
             if unknown_m[lane].is_some() {
                 continue;
             }

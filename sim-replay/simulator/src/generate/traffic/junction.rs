@@ -30,6 +30,7 @@ impl RightOfWay {
         }
         if roads.graph.lane(lane).conflicts.iter().any(|other| {
             let mut holders = self.holders[other.0 as usize].iter();
+            // A vehicle that holds several lanes does not block itself.
             holders.any(|&holder| holder != index)
         }) {
             return false;

@@ -151,6 +151,7 @@ impl Traffic<'_> {
             car.driver
                 .acceleration_mps2(car.speed_mps, wanted_mps, leader.as_slice())
         };
+        // The leader of the last step: those of this step are found after the changes.
         with(self.leader_on(index, path)) - with(car.leader)
     }
 
@@ -166,6 +167,7 @@ impl Traffic<'_> {
         }
         let brakes_softly = |car: &Car, ahead: Obstacle| {
             let speed_mps = car.speed_mps;
+            // With its own speed as the desired one, the free term of the model is 0 and the braking remains.
             let braking = -car.driver.acceleration_mps2(speed_mps, speed_mps, &[ahead]);
             ahead.gap_m > SAFE_GAP_M && braking < SAFE_MPS2
         };
@@ -271,6 +273,7 @@ fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     let mut left = car.path.lane();
     let mut lane = side.of(graph.lane(left))?;
     let s_m = car.path.s_m / graph.lane(left).length_m * graph.lane(lane).length_m;
+    // The curve begins at the front axle, and the front bumper is half a length ahead of the centre.
     let needed_m = change_m(car) + 0.5 * car.wheelbase_m() + car.half_length_m();
     let (mut beside, mut reach_m) = (Vec::new(), -s_m);
     loop {
@@ -295,6 +298,7 @@ fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
 /// True if a vehicle may change from one neighbour to the other anywhere along them.
 fn lies_beside(lane: LaneId, left: LaneId, roads: &Roads<'_>) -> bool {
     let (to, from) = (roads.graph.lane(lane), roads.graph.lane(left));
+    // Never from a lane that goes on to one that ends.
     let leads_on = roads.is_endless(lane) || !roads.is_endless(left);
     let is_even = (to.length_m / from.length_m - 1.0).abs() < LENGTH_SHARE;
     let is_wide = to.widths_m.iter().all(|&width_m| width_m > LEAST_WIDTH_M);

@@ -94,6 +94,7 @@ impl Traffic<'_> {
             }
             let exit = ahead.get(place + 1).map(|(next, _)| *next);
             let is_inside = start_m < self.cars[index].half_length_m();
+            // Room first: `take` reserves the lane, which a waiting vehicle must not keep closed.
             let has_room = is_inside || self.has_exit_room(index, exit);
             let car = &mut self.cars[index];
             // Already across the line: wait in the lane for the others by the swept way alone.
@@ -115,6 +116,7 @@ impl Traffic<'_> {
             return true;
         };
         let mut occupants = self.occupants[exit.0 as usize].iter();
+        // The list is sorted by position, so its first entry is the vehicle nearest to the junction.
         let Some(&(s_m, last)) = occupants.find(|(_, other)| *other as usize != index) else {
             return true;
         };
@@ -142,8 +144,10 @@ impl Traffic<'_> {
             let offset = other_car.motion.end.position_m - here.position_m;
             let turned = wrapped(other_car.motion.end.yaw_rad - here.yaw_rad).abs();
             other as usize != index
+                // Vehicles on a road above or below are not in the way.
                 && offset.z.abs() < 3.0
                 && offset.x * cos + offset.y * sin > 0.0
+                // Oncoming vehicles (turned by more than 100 degrees) keep to lanes of their own.
                 && turned < 1.75
                 // A vehicle that drives just ahead on the same lane is the leader already.
                 && (other_car.path.lane() != car.path.lane())
@@ -174,6 +178,7 @@ impl Traffic<'_> {
     fn end_of_the_way(&self, index: usize) -> Option<Obstacle> {
         let car = &self.cars[index];
         let left_m = car.path.remaining_m(self.roads.graph);
+        // `decide_ways` makes every path at least this long, unless its road ends.
         (left_m < super::DECIDED_M).then(|| Obstacle {
             gap_m: left_m - car.half_length_m(),
             speed_mps: 0.0,

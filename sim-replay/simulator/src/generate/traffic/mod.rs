@@ -74,6 +74,7 @@ impl<'t> Traffic<'t> {
         self.change_lanes(&mut near);
         // The look-ahead of this step needs the next lanes of every vehicle.
         self.decide_ways();
+        // By rising index: a vehicle sees those before it where they are after this step.
         for index in self.present() {
             let acceleration = self.acceleration_mps2(index, &mut near);
             let car = &self.cars[index];
@@ -127,6 +128,7 @@ impl<'t> Traffic<'t> {
 
     /// True if no vehicle except `index` touches a footprint.
     fn is_free(&self, index: usize, footprint: &Rectangle, near: &mut Vec<u32>) -> bool {
+        // Entries are centres: 9 m exceeds the radius of the longest vehicle.
         let radius_m = footprint.radius_m() + 9.0;
         self.index.near(footprint.center_m, radius_m, near);
         let mut others = near
@@ -177,6 +179,7 @@ impl<'t> Traffic<'t> {
         if let Some(explorer) = &mut explorer {
             explorer.keep_best(&mut onward);
         }
+        // At the end of a road the list is empty, and `get` finds nothing.
         let next = *onward.get(self.random.below(onward.len()))?;
         if let Some(explorer) = explorer {
             explorer.choose(next);

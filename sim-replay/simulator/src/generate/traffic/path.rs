@@ -90,6 +90,7 @@ impl Path {
         length_m: f64,
         wheelbase_m: f64,
     ) {
+        // The lanes behind stay: the rear may still be on them.
         self.lanes.truncate(self.current);
         self.lanes.extend(beside.iter().map(|pair| pair.lane));
         self.s_m = s_m;
@@ -141,6 +142,7 @@ impl Path {
         if let Some(change) = &mut self.change {
             change.done_m += distance_m;
         }
+        // Ends when the rear axle has left the curve too.
         self.change
             .take_if(|change| change.done_m > change.length_m + 0.5 * change.wheelbase_m);
         while self.s_m > graph.lane(self.lane()).length_m && self.current + 1 < self.lanes.len() {
@@ -148,6 +150,7 @@ impl Path {
             self.current += 1;
         }
         let behind = |path: &Self| -> f64 {
+            // Distance from the end of the first lane to the centre of the vehicle.
             let lanes = path.lanes.iter().take(path.current).skip(1);
             lanes.map(|&lane| graph.lane(lane).length_m).sum::<f64>() + path.s_m
         };
@@ -240,6 +243,7 @@ impl Path {
         let (rise, flat) = roll_rad.sin_cos();
         let aside_flat_m = aside_m * flat;
         let position = [
+            // (-dy, dx) points to the left of the heading.
             middle[0] - aside_flat_m * dy / base,
             middle[1] + aside_flat_m * dx / base,
             middle[2] + aside_m * rise,

@@ -47,6 +47,7 @@ impl Rectangle {
     /// True if both lie on one level and share a point (separating axes).
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
         let offset = [0, 1].map(|axis| other.center_m[axis] - self.center_m[axis]);
+        // Level and circles first: they settle most pairs cheaply.
         if (self.z_m - other.z_m).abs() > LEVEL_M
             || offset[0].hypot(offset[1]) > self.radius_m() + other.radius_m()
         {

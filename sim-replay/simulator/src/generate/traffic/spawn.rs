@@ -66,11 +66,13 @@ impl<'t> Traffic<'t> {
     fn fill(&mut self, center_m: [f64; 2]) {
         let radius_m = self.options.radius_m;
         let mut spawns: Vec<Spawn> = self.spawns_between(center_m, 0.0, radius_m);
+        // Spawn places are 4 m apart (SPAWN_STEP_M of `roads`).
         let lane_km = spawns.len() as f64 * 4.0 / 1000.0;
         let wanted = (lane_km * self.options.vehicles_per_km).round() as usize;
         self.random.shuffle(&mut spawns);
         let mut near = Vec::new();
         for spawn in spawns {
+            // The focus comes on top of the wanted density.
             if self.cars.len() > wanted {
                 return;
             }
@@ -140,12 +142,14 @@ impl<'t> Traffic<'t> {
             if car.is_present {
                 let point_m = car.point_m();
                 let distance_m = (point_m[0] - center_m[0]).hypot(point_m[1] - center_m[1]);
+                // Just before the end, where it would otherwise stop for good.
                 let is_at_an_end =
                     car.path.remaining_m(self.roads.graph) < car.half_length_m() + 3.0;
                 if distance_m > self.options.radius_m || is_at_an_end || Some(index) == stuck {
                     self.index.remove(index as u32, point_m);
                     let car = &mut self.cars[index];
                     car.is_present = false;
+                    // Its lanes must not stay closed for others.
                     self.right_of_way
                         .release_behind(index as u32, car, self.roads);
                 }
@@ -168,6 +172,7 @@ impl<'t> Traffic<'t> {
     /// vehicles around it leave one by one.
     fn longest_stuck(&self) -> Option<usize> {
         let over_s = self.cars[0].standing_s - STUCK_S;
+        // True in one step of each interval, so that one vehicle leaves at a time.
         if over_s > 0.0 && over_s % NEXT_LEAVES_S < STEP_S {
             let center_m = self.cars[0].point_m();
             let distance_m =

@@ -154,6 +154,7 @@ impl Builder {
             records: vec![Profile::hermite(0.0, length_m, from, to)],
         };
         let elevation = cubic([exit.height_m, exit.slope], [entry.height_m, entry.slope]);
+        // No slope at either end: the edges of the lanes join without a kink.
         let width = cubic([exit.width_m, 0.0], [entry.width_m, 0.0]);
         let mut only = RoadLane::new(LaneKind::Driving, width);
         (only.predecessor, only.successor) = (Some(from.lane), Some(to.lane));
@@ -203,6 +204,7 @@ impl Builder {
 
     fn driving_lanes(&self, end: RoadEnd, along: bool) -> Vec<LaneEnd> {
         let section = &self.network.roads[end.road].sections[0];
+        // Right-hand traffic: lanes with negative ids lead along the road.
         let sign = if along { -1 } else { 1 };
         let lanes = (1..).zip(section.side(!along));
         let driving = lanes.filter(|(_, lane)| lane.kind == LaneKind::Driving);

@@ -72,6 +72,7 @@ fn full_grid(
     rng: &mut ChaCha8Rng,
 ) -> StreetGraph {
     let rows = spread(0.0, 1.0, plan.rows, 0.2 * calm, rng);
+    // A range without width cannot be drawn from.
     let jitter = (plan.jitter_m * calm).max(1e-3);
     let mut graph = StreetGraph::default();
     let ranges: Vec<[f64; 2]> = plan.columns_m.iter().map(|&x| y_range(x)).collect();
@@ -129,6 +130,7 @@ fn leave_out(graph: &mut StreetGraph, share: f64, rng: &mut ChaCha8Rng) {
         if removed == wanted {
             break;
         }
+        // A node with two streets would become a dead end.
         if edge.iter().any(|&node| graph.degree(node) <= 2) {
             continue;
         }

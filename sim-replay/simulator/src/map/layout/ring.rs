@@ -100,6 +100,7 @@ impl Ring {
     pub(super) fn height_m(&self, s_m: f64) -> f64 {
         let total = self.length_m();
         let height = |bump: &Bump| {
+            // The shorter way round the closed line, with a sign.
             let away = (s_m - bump.middle_m + total / 2.0).rem_euclid(total) - total / 2.0;
             let share =
                 ((bump.reach_m - away.abs()) / (bump.reach_m - bump.plateau_m)).clamp(0.0, 1.0);
@@ -125,6 +126,7 @@ impl Ring {
 
     /// The two lengths at which the line crosses itself.
     fn crossing(&self) -> [f64; 2] {
+        // The line crosses itself near the parameters 0 and pi.
         let window = SAMPLES / 16;
         let mut best = (f64::INFINITY, [0, 0]);
         for a in (0..window).chain(SAMPLES - window..SAMPLES).step_by(2) {

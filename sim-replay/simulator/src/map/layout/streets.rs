@@ -122,6 +122,7 @@ fn join(builder: &mut Builder, junction: usize, ends: &[RoadEnd], limit_mps: f64
                 continue;
             }
             let [from_rad, to_rad] = [from, to].map(|end| builder.outward_pose(end).heading_rad);
+            // Both poses face into the junction, so the way out is the opposite heading of `to`.
             let turn = wrap_angle(to_rad + std::f64::consts::PI - from_rad);
             // Turning traffic slows down.
             let is_turn = turn.abs() > 0.5;
@@ -214,8 +215,10 @@ fn junction_radius_m(arms: &[(f64, f64)]) -> f64 {
     let mut radius = arms.iter().map(|&(_, half)| half).fold(0.0, f64::max) + KERB_RADIUS_M;
     for (i, &(angle_a, half_a)) in arms.iter().enumerate() {
         for &(angle_b, half_b) in &arms[i + 1..] {
+            // Two neighbouring streets may wiggle towards each other.
             let between = wrap_angle(angle_b - angle_a).abs() - 2.0 * WIGGLE_RAD;
             if between < 1.5 {
+                // w (1 + cos) / sin = w / tan(angle / 2): where the edges of two arms of half width w meet.
                 let corner = (half_a.max(half_b) * (1.0 + between.cos())) / between.max(0.4).sin();
                 radius = radius.max(corner + 2.0);
             }

@@ -27,6 +27,7 @@ const LINK_LIMIT_MPS: f64 = 15.65;
 
 /// Lays out the map of a seed.
 pub(crate) fn lay_out(seed: u64) -> Layout {
+    // Other random numbers than those of town1 for the same seed.
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x7465_776e_3474_6f77);
     let mut builder = Builder::default();
     let ring = Ring::random(&mut rng);

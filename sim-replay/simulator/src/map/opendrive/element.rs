@@ -194,6 +194,7 @@ impl<'a, 'input> Element<'a, 'input> {
     ) -> Result<T> {
         let text = self.text(attribute)?;
         match text.trim().parse() {
+            // NaN can be parsed, but lies within no bounds.
             Ok(value) if low <= value && value <= high => Ok(value),
             Ok(_) => Err(self.error_range(attribute, text, low, high)),
             Err(_) => Err(self.error_value(attribute, text, what)),

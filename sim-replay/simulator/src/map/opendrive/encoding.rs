@@ -21,6 +21,7 @@ pub(super) fn decode<'a>(bytes: &'a [u8], log: &mut FindingLog) -> Cow<'a, str> 
         return text;
     }
     let found = format!("holds bytes that are not {}", encoding.name());
+    // Read as windows-1252, every second character of UTF-16 would be NUL.
     if encoding == UTF_16LE || encoding == UTF_16BE {
         log.add(1, "OpenDRIVE", &found, "replaced by U+FFFD");
         return encoding.decode_without_bom_handling(bytes).0;

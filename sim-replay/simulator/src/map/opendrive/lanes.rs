@@ -57,6 +57,7 @@ pub(super) fn read_sections(
 /// Refuses sections whose width polynomials exceed the limits of a road.
 fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Result<()> {
     for lane in section.left.iter().chain(&section.right) {
+        // A peak between the samples is clamped by `Road::lane_span_m`.
         let widths = (0..=20).map(|i| lane.width.at(length_m * f64::from(i) / 20.0));
         let widest = widths.fold(0.0, f64::max);
         if widest > MAX_WIDTH_M {

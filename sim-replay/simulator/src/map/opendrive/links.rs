@@ -16,6 +16,7 @@ pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut Findi
     };
     (road.predecessor, road.successor) = (end("predecessor"), end("successor"));
     road.junction = match element.optional_text("junction").map(str::trim) {
+        // -1 stands for a road outside junctions.
         None | Some("-1" | "") => None,
         Some(id) => {
             let junction = ids.junctions.get(id).copied();

@@ -144,6 +144,7 @@ fn read_roads<'a, 'input>(
             Ok(road) => {
                 total_m += road.length_m;
                 lanes_m += lanes_length_m(&road);
+                // Beyond a limit the whole map is refused, as no single road is at fault.
                 check_total(element, "all roads so far", total_m, MAX_TOTAL_M)?;
                 check_total(element, "all lanes so far", lanes_m, MAX_LANES_M)?;
                 roads.push(road);

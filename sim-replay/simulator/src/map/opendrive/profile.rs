@@ -74,6 +74,7 @@ fn slope(
     };
     let mut wanted = children(parent, name).map(|record| is_wanted(&record));
     profile.records.retain(|_| wanted.next().unwrap_or(false));
+    // Records of zeros only would make a level road count as banked.
     if is_zero(&profile) {
         return Profile::default();
     }

@@ -77,6 +77,7 @@ fn slab(from: &CrossSection, to: &CrossSection, thickness_m: f64) -> Solid {
     let middle = |cut: &CrossSection| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0);
     let (a, b) = (middle(from), middle(to));
     let width = (from.paved_m[1] - from.paved_m[0]).max(to.paved_m[1] - to.paved_m[0]);
+    // Below the lowest edge, so that the slab does not stick out of the road.
     let top = from.range_m()[0].min(to.range_m()[0]) - 0.06;
     let z = [top - thickness_m, top];
     wall(SolidKind::BridgeDeck, a, b, z, width + 0.3, 0.35)
@@ -150,6 +151,7 @@ fn retaining_walls(site: &mut Site, road: usize) {
                 if z > road_z + 3.0 {
                     above = above.min(z);
                 }
+                // False goes on to the next patch: all of them are visited.
                 false
             });
             let kind = match above.is_finite() {

@@ -192,6 +192,7 @@ fn block(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let height = f64::from(floors) * 3.0 + rng.random_range(0.5..1.5);
     let bar = depth * rng.random_range(0.45..0.6);
     let bar = bar.max(8.0).min(depth - 1.2);
+    // The first 1.2 m of the lot are left for balconies.
     let front = -depth / 2.0 + 1.2;
     draft.body(0.0, front + bar / 2.0, [width, bar, height]);
     let wing = (width * 0.35).min(10.0);
@@ -243,6 +244,7 @@ fn tower(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         }
         z += height;
         let next = size.map(|size| size * rng.random_range(0.6..0.9));
+        // At most half of the difference: each stage stays within the one below.
         u += rng.random_range(-0.5..0.5) * (size[0] - next[0]);
         v += rng.random_range(-0.5..0.5) * (size[1] - next[1]);
         size = next;

@@ -44,6 +44,7 @@ pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
         for sign in [-1.0, 1.0] {
             let zone = zone(road);
             let has_lanes = if sign < 0.0 { right } else { left };
+            // A side without lanes borders the traffic of the other side.
             let along = (sign < 0.0) == (has_lanes != road.left_hand);
             let median = !has_lanes && zone == Zone::Motorway;
             sides.push(Side {
@@ -80,6 +81,7 @@ impl Side {
             return z_m;
         }
         let cut = site.cut_at(self.road, s_m);
+        // The elevation at `s_m` itself, since the cut may lie up to a step before it.
         z_m + cut.height_m(cut.carriageway_m[usize::from(self.sign > 0.0)]) - cut.z_m
     }
 

@@ -83,6 +83,7 @@ impl MapRefinement {
         let (input, hidden) = (scales.get(INPUT)?, scales.get(HIDDEN)?);
         let [first, second] = &self.convolutions;
         let quantised = |convolution: &nn::Conv2D, format| {
+            // Tiles come with the cells around them, so nothing is padded.
             let geometry = ConvGeometry {
                 stride: 1,
                 padding: 0,
@@ -126,6 +127,7 @@ impl Int8Refinement {
         let [first, second] = &self.convolutions;
         let cut = tiles.cut(&cells.f_view([-1, channels])?)?;
         let hidden = first.forward(&self.input.quantise(&cut)?)?;
+        // Beyond the edge of the map the second convolution reads zeros, not what the first computes there.
         let hidden = hidden.f_mul(&tiles.hidden_mask()?)?;
         let refined = cells.f_permute([0, 3, 1, 2])?;
         tiles.add_to(&refined, &second.forward(&hidden)?)?;

@@ -30,6 +30,7 @@ impl Tiles {
     /// `[1, 1, H, W]`, and at least [`LEAST_LIKELY`].
     pub(super) fn most_likely(likely: &Tensor, share: f64) -> Result<Self, TchError> {
         let (_, _, height, width) = likely.size4()?;
+        // Windows overlap by the margin. The padding of a maximum is minus infinity and never wins.
         let window = EDGE + 2 * NEAR;
         let by_tile = likely.f_max_pool2d([window; 2], [EDGE; 2], [NEAR; 2], [1, 1], false)?;
         let by_tile: Vec<f32> = Vec::try_from(by_tile.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;

@@ -111,6 +111,7 @@ impl TemporalMemory {
             .iter()
             .enumerate()
             .filter_map(|(index, &entry)| {
+                // Step 0 is an earlier map whose agent has no newest map in reach. It takes no part.
                 let step = origins.steps_back[first + index]
                     .checked_sub(1)
                     .filter(|step| *step < steps)?;
@@ -168,6 +169,7 @@ impl TemporalMemory {
         likely: &Tensor,
     ) -> Result<Tensor> {
         let (_, channels, height, width) = now.size4()?;
+        // Where a gradient flows, or on a GPU, only the share limits the number of cells.
         let least = if are_numbers(now) {
             LEAST_LIKELY
         } else {
@@ -246,6 +248,7 @@ fn settled(origins: &Origins, corrections: &Tensor, first: usize) -> Result<Vec<
     Ok((first..all.len())
         .map(|entry| {
             let is_same_agent = |newest: &usize| origins.agent[*newest] == origins.agent[entry];
+            // For earlier maps of the ego this is the first entry, whose correction is zero.
             let newest = (0..first).find(is_same_agent).map(|newest| all[newest]);
             newest
                 .filter(|newest| {
@@ -302,6 +305,7 @@ impl Around {
     /// beyond the edge.
     fn of(around: &Tensor) -> Result<Self> {
         let options = (Kind::Int64, around.device());
+        // The k-th cell around contributes its result of weight k: row 9 * cell + k.
         let results = (around * AROUND + Tensor::f_arange(AROUND, options)?).f_flatten(0, 1)?;
         Ok(Self {
             first: Tensor::f_arange(around.size2()?.0, options)? * AROUND,
@@ -316,7 +320,9 @@ impl Around {
 /// features of nine cells.
 fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<Tensor> {
     let hidden = convolution.ws.size4()?.0;
+    // [hidden, C, 3, 3] to [9 * hidden, C], weights in the order of the cells around.
     let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?;
+    // One row of zeros for cells beyond the edge, whose index is that after the last.
     let shown = shown.f_constant_pad_nd([0, 0, 0, 1])?;
     let results = shown
         .f_linear(&weight, None::<&Tensor>)?

@@ -63,6 +63,7 @@ impl Selection {
                 .flat_map(move |row| (column..column + patch).map(move |column| [row, column]))
         };
         let cells: Vec<[usize; 2]> = patches.iter().flat_map(cells_of).collect();
+        // Offsets count from the cell above and to the left, hence one less.
         let on_map = |[row, column]: [usize; 2], [down, right]: [usize; 2]| {
             let [row, column] = [
                 (row + down).checked_sub(1)?,
@@ -71,6 +72,7 @@ impl Selection {
             (row < height && column < width).then_some(row * width + column)
         };
         let beside = |&cell: &[usize; 2]| BESIDE.map(|step| on_map(cell, step));
+        // First marked, then numbered in the order of the grid, so that shared neighbours are read once.
         let mut place = vec![None; height * width];
         for cell in cells.iter().flat_map(beside).flatten() {
             place[cell] = Some(0);
