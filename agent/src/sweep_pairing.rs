@@ -100,7 +100,7 @@ impl<S> SweepPairing<S> {
         let (motion, motions) = self.motions.take(capture_nanos);
         // A pose of a later sweep shows a receiver, although the one of this sweep is lost.
         self.expects_pose = pose.is_some() || !self.poses.0.is_empty();
-        self.expects_motion = motion.is_some();
+        self.expects_motion = motion.is_some() || !self.motions.0.is_empty();
         let (_, sweep, _) = self.waiting.take()?;
         Some(PairedSweep {
             capture_nanos,

@@ -52,7 +52,7 @@ struct Sender {
     replaced: Instant,
 }
 
-/// Sequence numbers received: the highest, and a bit mask of the 64 before it.
+/// Sequence numbers received: the highest, and a bit mask of it and the 63 before it.
 #[derive(Debug)]
 struct SequenceWindow {
     highest: u64,

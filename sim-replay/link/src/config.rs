@@ -215,7 +215,7 @@ pub struct ReorderConfig {
     pub extra_ms: f64,
 }
 
-/// A time without any transmission, from the beginning of the scene, seconds. Messages in flight are lost.
+/// A time without any transmission, from the beginning of the scene, seconds. Messages whose transmission it cuts are lost; those that were sent before arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Outage {

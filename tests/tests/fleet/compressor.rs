@@ -15,10 +15,11 @@ use ego_fuser::node as ego_node;
 use fusion::Method;
 use localization::pose_source::RecordedPose;
 use perception::detector::Detector;
+use protocol::codec::encode_features;
 use protocol::message::Bev;
 use protocol::{
-    CavId, DecodedFeatures, Detection, Detections, DropReason, HEADER_LEN, Ledger, Limits, Stream,
-    Topic,
+    CavId, CodecConfig, DecodedFeatures, Detection, Detections, DropReason, HEADER_LEN, Ledger,
+    Limits, Stream, Topic,
 };
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
@@ -211,9 +212,8 @@ fn the_message_of_a_code_names_its_channels() {
             xyzi: vec![[5.0, 1.0, -1.0, 0.5]],
         })
         .unwrap();
-    let features = agent
-        .write_map(seen.features, &seen.confidence, &Default::default(), 0)
-        .unwrap();
+    let codec = CodecConfig::default();
+    let features = encode_features(seen.features, &codec, Some(&seen.confidence)).unwrap();
     let (grid, pose) = (
         features.grid,
         protocol::PoseEstimate::new(protocol::Pose::IDENTITY, 1.0),

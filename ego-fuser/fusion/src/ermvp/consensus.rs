@@ -154,15 +154,15 @@ impl Motion {
         let back = -&self.angle;
         let from = -rotated(&back, &self.shift)?;
         let (sine, cosine) = (back.f_sin()?, back.f_cos()?);
-        let (height_m, width_m) = (height as f64, width as f64);
+        let (rows, columns) = (height as f64, width as f64);
         // Coordinates are -1..1 along each edge, so a term across axes is scaled by the ratio of the edges.
         let entries = [
             cosine.shallow_clone(),
-            -&sine * (height_m / width_m),
-            from.f_get(0)? * (2.0 / width_m),
-            sine * (width_m / height_m),
+            -&sine * (rows / columns),
+            from.f_get(0)? * (2.0 / columns),
+            sine * (columns / rows),
             cosine,
-            from.f_get(1)? * (2.0 / height_m),
+            from.f_get(1)? * (2.0 / rows),
         ];
         let theta = Tensor::f_stack(&entries, 0)?.f_view([1, 2, 3])?;
         let sampling_grid =

@@ -69,7 +69,7 @@ impl ErmvpConfig {
         }
     }
 
-    /// For live traffic on two cores; cells are half as large, so the search range is twice as many cells.
+    /// For live traffic on two cores; cells are half as large, so the search covers more of them.
     pub fn lean(channels: i64) -> Self {
         Self {
             layers: SwapFusionConfig::lean(channels),

@@ -37,12 +37,12 @@ impl ConfidenceEmbedding {
     /// Its variable is `ce.weight` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         // One over the root of the fan-in of the patch embedding, of which this is one more input channel.
-        let deviation = ((config.channels * config.patch * config.patch) as f64)
+        let bound = ((config.channels * config.patch * config.patch) as f64)
             .sqrt()
             .recip();
         let weight = config
             .ce
-            .then(|| (path / "ce").var("weight", &[config.dim], uniform(deviation)));
+            .then(|| (path / "ce").var("weight", &[config.dim], uniform(bound)));
         Self {
             weight,
             device: path.device(),

@@ -19,8 +19,8 @@ use perception::train::{ComputePrecision, Prefetch, SaveEvery, Task, Trainer};
 use perception::weights::Weights;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use tch::nn::VarStore;
 use tch::Tensor;
+use tch::nn::VarStore;
 
 pub use accuracy::Accuracy;
 pub use config::TrainConfig;

@@ -6,7 +6,7 @@
 //!   least the return of a target of 10 % in clear air at the sensor's range of 120 m. `a` is 0.06 per metre in fog
 //!   (visibility 50 m) and 0.008 per metre in snow.
 //! - Fog also returns light: a beam without a detected target, and sometimes one with a target, returns a point from
-//!   the first metres of the fog (gamma law of shape 3, mean 5.4 m).
+//!   the first metres of the fog (gamma law of shape 3, mean 5.4 m beyond the first metre).
 //! - In snow a beam hits a flake after an exponential distance; a flake within 30 m that is nearer than the target
 //!   replaces it.
 //! - The intensity of the remaining returns is reduced by the same two-way loss; fog and flakes have low intensities.

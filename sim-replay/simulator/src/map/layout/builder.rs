@@ -28,7 +28,6 @@ pub(super) struct LaneEnd {
     pub lane: i32,
 }
 
-/// A road network under construction.
 impl RoadEnd {
     pub(super) fn start(road: usize) -> Self {
         Self {

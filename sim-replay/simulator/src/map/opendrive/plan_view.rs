@@ -92,7 +92,7 @@ fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
     checked(element, curve(shape), log)
 }
 
-/// Curvatures of an element; where one is tighter than any road bends, all are NaN: the element becomes a straight
+/// Curvatures of an element; `None` where one is tighter than any road bends: the element becomes a straight
 /// line.
 fn curvatures<const N: usize>(
     element: Element,

@@ -15,9 +15,9 @@ use super::trees::{Species, tree};
 const BAY_M: [f64; 2] = [5.2, 2.6];
 /// Width of the lane between two rows of bays, metres.
 const AISLE_M: f64 = 6.4;
-/// Depth of a lot with two rows, metres.
 /// Height up to which a lot is kept free, metres.
 pub(super) const LOT_HEIGHT_M: f64 = 40.0;
+/// Depth of a lot with two rows, metres.
 pub(super) const DEPTH_M: f64 = 2.0 * BAY_M[0] + AISLE_M + 1.4;
 
 /// Fills `lot` (free ground of at least [`DEPTH_M`] depth) with two rows of bays, lamps or trees between them and a
