@@ -54,9 +54,9 @@ const OF_AN_EVALUATION: [Row; 26] = [
         "--boxes is for methods that exchange feature maps: late",
     ),
     (
-        "--latency-compensation",
+        "--box-alignment",
         2,
-        "--latency-compensation is for boxes of neighbours",
+        "--box-alignment is for boxes of neighbours",
     ),
     ("--latency-ms -3", 2, "latency is -3"),
     ("--link nolink", 2, "neither a preset of a link"),
