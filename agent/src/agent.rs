@@ -94,14 +94,13 @@ impl Agent {
         Self { attack, ..self }
     }
 
-    /// Gives the feature map `[1, C, H, W]` of the next sweep as its encoder computed it before, and the last messages of
-    /// another vehicle, which an attack may repeat.
-    pub(crate) fn prepare(
-        &mut self,
-        map: Option<Tensor>,
-        captured: impl FnOnce() -> CapturedMessages,
-    ) {
+    /// Sets the feature map `[1, C, H, W]` of the next sweep, if its encoder computed it before.
+    pub(crate) fn set_known_map(&mut self, map: Option<Tensor>) {
         self.known_map = map;
+    }
+
+    /// Passes on the last messages of another vehicle, which an attack may replay.
+    pub(crate) fn capture(&mut self, captured: impl FnOnce() -> CapturedMessages) {
         if let Some(attack) = &mut self.attack {
             attack.capture(captured());
         }

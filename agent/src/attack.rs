@@ -133,7 +133,7 @@ impl Attack {
         }
     }
 
-    /// Stores another vehicle's messages, for [`Falsification::Copied`]; of what it did not send the last stay.
+    /// Stores another vehicle's messages, for [`Falsification::Copied`]. What is absent replaces nothing.
     pub fn capture(&mut self, captured: CapturedMessages) {
         if self.falsification == Falsification::Copied {
             let last = std::mem::take(&mut self.captured);

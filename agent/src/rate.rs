@@ -139,7 +139,7 @@ impl RateControl {
     /// The transmission time that belongs to a map; also where the clock of the scene jumps.
     fn nanos_since_last(&mut self, capture_nanos: u64) -> u64 {
         let last = self.last_capture_nanos.replace(capture_nanos);
-        // A capture time that stands still or goes back has a full period.
+        // A repeated or earlier capture time counts as a full period.
         let since = last
             .and_then(|last| capture_nanos.checked_sub(last))
             .filter(|nanos| *nanos > 0);

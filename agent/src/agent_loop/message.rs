@@ -57,8 +57,8 @@ impl MessageEncoder {
         }
     }
 
-    /// Encodes a message at its turn, `None` where nothing queues; returns the decision of the rate control too, where a map had to keep within a
-    /// limit.
+    /// Encodes a message at its turn, `None` without a queue. Returns also the decision of the rate control, if a map had
+    /// to keep within a limit.
     ///
     /// # Errors
     /// As [`wire::encode`] and [`encode_within`](protocol::codec::encode_within).

@@ -176,10 +176,14 @@ impl AgentLoop {
         }
     }
 
-    /// Gives the feature map `[1, C, H, W]` of the next sweep as its encoder computed it before, and what another vehicle
-    /// sent last, which an attack may repeat.
-    pub fn prepare(&mut self, map: Option<Tensor>, captured: impl FnOnce() -> CapturedMessages) {
-        self.agent.prepare(map, captured);
+    /// Sets the feature map `[1, C, H, W]` of the next sweep, if its encoder computed it before.
+    pub fn set_known_map(&mut self, map: Option<Tensor>) {
+        self.agent.set_known_map(map);
+    }
+
+    /// Passes on the last messages of another vehicle, which an attack may replay.
+    pub fn capture(&mut self, captured: impl FnOnce() -> CapturedMessages) {
+        self.agent.capture(captured);
     }
 
     /// Takes an input in at `now_nanos`, which does not decrease. Only [`Input::Wake`] computes, and one step at most:

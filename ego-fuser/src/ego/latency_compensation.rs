@@ -1,7 +1,7 @@
 //! Latency compensation: carries neighbours' boxes from their capture time to that of the ego's frame.
 //!
-//! A box moves with the velocity that its sender states. The ego tracks the boxes itself, too: its own velocity is taken
-//! where a sender states none, or one that its successive boxes contradict.
+//! A box moves with the velocity in the message. The ego also tracks the boxes itself: it uses its own velocity if the message
+//! has none, or if the positions of the boxes in successive messages contradict it.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -21,11 +21,6 @@ const FORGOTTEN_NANOS: u64 = 10_000_000_000;
 const MAX_TRACKED: usize = 64;
 /// Standard deviation of a stated velocity that is true, metres per second: other trackers weigh other noise.
 const STATED_SIGMA_MPS: f64 = 1.0;
-/// Squared Mahalanobis distance of velocities beyond which boxes contradict the stated one: 99.9 % of the chi-square
-/// distribution with two degrees of freedom.
-const GATE: f64 = 13.816;
-/// Standard deviation of a velocity that nobody knows, metres per second.
-const UNKNOWN_SIGMA_MPS: f64 = 10.0;
 /// A box whose centre is this near is a vehicle found, metres. Chosen on validation scenes.
 const FOUND_M: f64 = 0.7;
 
@@ -96,7 +91,8 @@ pub(super) fn probability_carried_right(object: &PerceivedObject, age_s: f64) ->
             track.velocity_covariance[0].into(),
             track.velocity_covariance[2].into(),
         ),
-        None => UNKNOWN_SIGMA_MPS.powi(2),
+        // As uncertain as the velocity of a new track.
+        None => TrackerConfig::default().initial_sigma_mps.powi(2),
     };
     let error_m2 = variance * age_s.powi(2);
     1.0 - (-0.5 * FOUND_M.powi(2) / error_m2.max(f64::MIN_POSITIVE)).exp()
@@ -161,7 +157,9 @@ fn is_contradicted(stated: &ObjectTrack, own: &ObjectTrack) -> bool {
     let covariance = Matrix2::new(xx, xy, xy, yy) + Matrix2::identity() * STATED_SIGMA_MPS.powi(2);
     let error = velocity(stated) - velocity(own);
     let solved = covariance.cholesky().map(|factors| factors.solve(&error));
-    solved.is_none_or(|solved| error.dot(&solved) > GATE)
+    // The gate of the tracker itself: both have two degrees of freedom.
+    let gate = TrackerConfig::default().gate;
+    solved.is_none_or(|solved| error.dot(&solved) > gate)
 }
 
 #[cfg(test)]

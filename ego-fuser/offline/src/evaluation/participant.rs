@@ -53,7 +53,8 @@ impl Participant {
         self.now_nanos = self.now_nanos.max(capture_nanos);
         let map = map.filter(|_| !self.has_own_network);
         self.agent_loop
-            .prepare(map.map(Tensor::shallow_clone), captured);
+            .set_known_map(map.map(Tensor::shallow_clone));
+        self.agent_loop.capture(captured);
         let sweep = Sweep {
             capture_nanos,
             arrived_nanos: capture_nanos,

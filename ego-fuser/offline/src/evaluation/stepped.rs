@@ -114,9 +114,8 @@ impl<'a> Run<'a> {
                 Exchange::Nothing if !is_ego => None,
                 _ => Some(method.own_content().stream()),
             };
-            let places = (place, index);
-            let participant =
-                evaluator.participant(settings, scenario, places, (is_ego, needed))?;
+            let at = (place, index);
+            let participant = evaluator.participant(settings, scenario, at, (is_ego, needed))?;
             participants.push(participant);
         }
         let begin = setup.seek.min(scenario.ticks.len());
