@@ -63,6 +63,10 @@ pub struct EgoOutput {
     pub skipped: Vec<(usize, Skipped)>,
     /// Assessment of each neighbour that could be fused; empty without misbehaviour detection.
     pub beliefs: Vec<(usize, Assessment)>,
+    /// Boxes of neighbours beyond the limit, which were not read.
+    pub refused_boxes: usize,
+    /// Messages of boxes whose velocities were not taken.
+    pub refused_velocities: usize,
     /// Durations of the stages.
     pub stages: Vec<StageTiming>,
 }
@@ -273,11 +277,14 @@ impl Ego {
             chosen.leave_out(&is_out, DropReason::Misbehaviour);
             stages.lap("trust");
         }
+        let compensation = self.compensation.as_mut();
+        let refused_velocities = compensation.map_or(0, LatencyCompensation::take_refused);
         let mut own_boxes = 0;
         if self.compensation.is_some() {
             own_boxes = no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
         }
         let aligned = &chosen.aligned;
+        let refused_boxes = self.boxes_over_limit(aligned, own_boxes + MORE_BOXES);
         let detections = no_grad(|| match needed {
             Exchange::Boxes => Ok(self.merge_boxes(aligned, &mut stages)),
             Exchange::Points => self.merge_points(aligned, &mut stages),
@@ -290,6 +297,8 @@ impl Ego {
             fused: chosen.fused,
             skipped: chosen.skipped,
             beliefs,
+            refused_boxes,
+            refused_velocities,
             stages: stages.into_timings(),
         })
     }
@@ -407,7 +416,6 @@ impl Ego {
         let boxes: Vec<PlacedBox> = (1..all.len())
             .flat_map(|sender| all[sender].boxes(sender, all[0].view, most))
             .collect();
-        self.name_senders_over_limit(all, most);
         let has_map = |view: &&Aligned<'_>| matches!(view.view.content, Content::Features(_));
         let aligned: Vec<Aligned<'_>> = all.iter().filter(has_map).copied().collect();
         let aligned = aligned.as_slice();
@@ -458,14 +466,20 @@ impl Ego {
         Ok(detections)
     }
 
-    /// Names each sender of more boxes than are read, once.
-    fn name_senders_over_limit(&mut self, all: &[Aligned<'_>], most: usize) {
-        for Aligned { view, .. } in all {
+    /// Number of boxes beyond `most` of a sender, which are not read. Names each such sender once.
+    fn boxes_over_limit(&mut self, all: &[Aligned<'_>], most: usize) -> usize {
+        if self.method.own_content() != Exchange::Features || self.compensation.is_none() {
+            return 0;
+        }
+        let mut refused = 0;
+        for Aligned { view, .. } in &all[1..] {
             let boxes = view.content.objects().len();
+            refused += boxes.saturating_sub(most);
             if boxes > most && self.over_limit.insert(view.cav.clone()) {
                 tracing::warn!(cav = %view.cav, boxes, "more than {most} boxes: those of the lowest scores are left out");
             }
         }
+        refused
     }
 
     /// A feature map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`.

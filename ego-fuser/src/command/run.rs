@@ -44,6 +44,8 @@ impl Arguments {
                 frames,
                 fused,
                 fused_boxes,
+                refused_boxes,
+                refused_velocities,
                 at_deadline,
                 failed,
                 failure,
@@ -54,8 +56,14 @@ impl Arguments {
                 0 => String::new(),
                 boxes => format!(" ({boxes} of them boxes)"),
             };
+            let refused = match (refused_boxes, refused_velocities) {
+                (0, 0) => String::new(),
+                (boxes, velocities) => {
+                    format!(", {boxes} boxes and the velocities of {velocities} messages refused")
+                }
+            };
             output::line(format_args!(
-                "{frames} frames, {fused} neighbours' messages fused{boxes}, {at_deadline} at the deadline, {failed} failed{reason}"
+                "{frames} frames, {fused} neighbours' messages fused{boxes}{refused}, {at_deadline} at the deadline, {failed} failed{reason}"
             ))?;
         }
         Ok(Outcome::of(report.failed > 0))

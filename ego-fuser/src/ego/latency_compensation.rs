@@ -28,6 +28,8 @@ const FOUND_M: f64 = 0.7;
 #[derive(Debug, Default)]
 pub(super) struct LatencyCompensation {
     of_cav: BTreeMap<CavId, Followed>,
+    /// Messages whose velocities were not taken.
+    refused: usize,
 }
 
 #[derive(Debug)]
@@ -47,7 +49,7 @@ impl LatencyCompensation {
             return Cow::Borrowed(view);
         };
         let followed = self.of_cav.entry(view.cav.clone()).or_default();
-        let objects = followed.objects(view, sent);
+        let objects = followed.objects(view, sent, &mut self.refused);
         let age_s = (now_nanos as f64 - view.capture_nanos as f64) * 1e-9;
         let age_s = age_s.clamp(-MAX_AGE_S, MAX_AGE_S);
         let carried = objects
@@ -57,6 +59,11 @@ impl LatencyCompensation {
             content: Content::Boxes(carried.collect()),
             ..view.clone()
         })
+    }
+
+    /// Number of messages whose velocities were not taken, since the last call.
+    pub(super) fn take_refused(&mut self) -> usize {
+        std::mem::take(&mut self.refused)
     }
 
     /// Removes the tracks of neighbours that have not sent for long.
@@ -116,21 +123,26 @@ impl Default for Followed {
 
 impl Followed {
     /// The objects of a message with their tracks; it is taken once and may serve several frames.
-    fn objects(&mut self, view: &View, sent: &[PerceivedObject]) -> &[PerceivedObject] {
+    fn objects(
+        &mut self,
+        view: &View,
+        sent: &[PerceivedObject],
+        refused: &mut usize,
+    ) -> &[PerceivedObject] {
         if self.capture_nanos != Some(view.capture_nanos) {
             let found: Vec<Detection> = { sent.iter() }
                 .map(|object| object.detection.clone())
                 .collect();
             self.objects = self.tracker.objects(view.capture_nanos, &view.pose, found);
             self.capture_nanos = Some(view.capture_nanos);
-            self.take_stated(&view.cav, sent);
+            *refused += usize::from(!self.takes_stated(&view.cav, sent));
         }
         &self.objects
     }
 
     /// Takes the stated tracks. Where the ego's own contradict most of them, its own stay: a single one is rather a box that
     /// the ego has taken for another one after a lost message.
-    fn take_stated(&mut self, cav: &CavId, sent: &[PerceivedObject]) {
+    fn takes_stated(&mut self, cav: &CavId, sent: &[PerceivedObject]) -> bool {
         let pairs = { self.objects.iter() }.zip(sent);
         let compared =
             pairs.filter_map(|(object, sent)| sent.track.as_ref().zip(object.track.as_ref()));
@@ -142,11 +154,12 @@ impl Followed {
             if !std::mem::replace(&mut self.is_contradicted, true) {
                 tracing::warn!(%cav, contradicted, of = verdicts.len(), "states velocities that its boxes contradict: the ego takes its own");
             }
-            return;
+            return false;
         }
         for (object, sent) in self.objects.iter_mut().zip(sent) {
             object.track = sent.track.or(object.track);
         }
+        true
     }
 }
 
@@ -259,6 +272,7 @@ mod tests {
             "nothing contradicts it"
         );
         assert!((1..10).all(|tick| carried_by_m(tick) < 0.1));
+        assert_eq!(compensation.take_refused(), 9);
     }
 
     #[test]

@@ -743,14 +743,14 @@ fn of_a_flood_as_many_boxes_are_read_as_the_ego_detects_and_a_few_more() {
             ..own.clone()
         };
         ego.forget();
-        let detections = ego.detect(&own, &[sender]).unwrap().detections;
-        (detections, ego.over_limit.len())
+        let output = ego.detect(&own, &[sender]).unwrap();
+        (output.detections, output.refused_boxes)
     };
     let most = u16::try_from(seen.len() + MORE_BOXES).unwrap();
-    let (read, named) = detect(most);
-    assert_eq!(named, 0);
+    let (read, refused) = detect(most);
+    assert_eq!(refused, 0);
     assert_ne!(detect(16).0, read);
-    assert_eq!(detect(1000), (read, 1));
+    assert_eq!(detect(1000), (read, 1000 - usize::from(most)));
 }
 
 #[test]

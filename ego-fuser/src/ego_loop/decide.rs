@@ -108,8 +108,12 @@ impl EgoLoop {
                 fused,
                 skipped,
                 beliefs,
+                refused_boxes,
+                refused_velocities,
                 stages,
             }) => {
+                self.report.refused_boxes += refused_boxes;
+                self.report.refused_velocities += refused_velocities;
                 let neighbours = self.neighbour_reports(&beliefs, &choice.views);
                 self.outputs.push(Output::Received(self.own_source()));
                 self.leave_out(&skipped, &fused, &mut choice);

@@ -74,6 +74,10 @@ pub struct LoopReport {
     pub fused: u64,
     /// Of these, messages of boxes, in place of a feature map or beside it.
     pub fused_boxes: u64,
+    /// Boxes of neighbours beyond the limit, which were not read.
+    pub refused_boxes: usize,
+    /// Messages of boxes whose velocities were not taken, as successive boxes contradict them.
+    pub refused_velocities: usize,
     /// Frames that were decided at the deadline.
     pub at_deadline: u64,
     /// Frames that could not be fused.

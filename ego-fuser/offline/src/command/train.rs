@@ -1,6 +1,6 @@
 //! `ego-fuser train`: arguments, and a progress bar or plain lines.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use agent_offline::TrainingBar;
@@ -23,7 +23,11 @@ use training::samples::{Augmentation, Moments, SampleConfig, SampleKind, SampleP
 use training::train::{self, Accuracy, Observer, StepReport, TrainConfig};
 
 use super::DataSets;
+use support::bounded_file;
 use support::cli::BadInput;
+
+/// Largest file of a network, bytes.
+const MAX_NETWORK_BYTES: u64 = 1 << 20;
 
 /// Trains a method on scenes; writes checkpoint, curve.csv and curve.png, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
@@ -37,8 +41,8 @@ pub(crate) struct Arguments {
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value_t = Method::NONE)]
     method: Method,
-    /// Network, lean or full; with --init it is that of the weights.
-    #[arg(long, value_name = "NAME", default_value = "lean", conflicts_with = "init", value_parser = parse_network)]
+    /// Network: lean, full or a JSON file of its fields; with --init it is that of the weights.
+    #[arg(long, value_name = "NAME|FILE", default_value = "lean", conflicts_with = "init", value_parser = parse_network)]
     network: DetectorConfig,
     /// Weights to begin with, for example those of `none`.
     #[arg(long, value_name = "FILE")]
@@ -139,7 +143,14 @@ pub(crate) struct Arguments {
 }
 
 fn parse_network(name: &str) -> Result<DetectorConfig, String> {
-    DetectorConfig::preset(name).ok_or_else(|| "there are lean and full".to_owned())
+    if let Some(preset) = DetectorConfig::preset(name) {
+        return Ok(preset);
+    }
+    let text = bounded_file::read_text(Path::new(name), MAX_NETWORK_BYTES)
+        .map_err(|error| format!("neither lean, full nor a file that can be read: {error}"))?;
+    let network: DetectorConfig = serde_json::from_str(&text).map_err(|error| error.to_string())?;
+    network.validate().map_err(|error| error.to_string())?;
+    Ok(network)
 }
 
 impl Arguments {

@@ -35,6 +35,8 @@ const OTHER_RAD: f32 = 0.035;
 const NEAR_M: f64 = 3.0;
 /// Share of the structure that sweeps of one place have in common at least.
 const LEAST_OVERLAP: f32 = 0.2;
+/// The same for sweeps that are farther apart than the search reaches.
+const FAR_OVERLAP: f32 = 0.1;
 
 /// Two sweeps of an agent, by their ticks.
 #[derive(Debug, Clone, Copy)]
@@ -183,10 +185,12 @@ fn judge(scenario: &Scenario, agent: usize, pair: Pair) -> Option<Option<Contrad
     let is_other =
         between.translation.vector.norm() > OTHER_M || between.rotation.angle() > OTHER_RAD;
     let is_better = best.overlap > CLEAR.max(BETTER_RATIO * overlap).max(overlap + BETTER_BY);
+    // The search does not reach a long motion: sweeps this far apart look alike at a wrong motion, too.
+    let is_judged = moved_m <= SEARCH_M[1] || overlap < FAR_OVERLAP;
     // No motion overlaps, although the poses are close: the sweeps are of two places.
     let is_elsewhere = moved_m < NEAR_M && overlap.max(best.overlap) < LEAST_OVERLAP;
     Some(
-        ((is_better && is_other) || is_elsewhere).then_some(Contradiction {
+        ((is_better && is_other && is_judged) || is_elsewhere).then_some(Contradiction {
             pair,
             overlap,
             best,
