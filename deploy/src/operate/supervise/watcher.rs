@@ -82,13 +82,13 @@ impl Watcher {
                 Ok(mut child) => {
                     // Taken out, as waiting for a child closes the input that it still holds.
                     let _parent_death_pipe = child.stdin.take();
+                    // Requests for the previous instance; who knows of this one may already ask for its end.
+                    while self.replace.try_recv().is_ok() {}
                     self.report(ProcessEventKind::Started {
                         pid: child.id().unwrap_or(0),
                     });
                     let report = self.follow(&mut child);
                     let stop = self.stop.clone();
-                    // A request for the previous instance.
-                    while self.replace.try_recv().is_ok() {}
                     tokio::select! {
                         Some(why) = self.replace.recv() => {
                             // It cannot fail to end; an error means that the process has ended already.
