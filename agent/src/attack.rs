@@ -115,13 +115,12 @@ impl Attack {
             random.between(5.0, 30.0),
             random.between(0.0, std::f64::consts::TAU),
         );
-        let place = |random: &mut SplitMix64| {
-            let reach =
-                |random: &mut SplitMix64| random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
-            [reach(random), reach(random), random.between(-0.2, 0.2)]
-        };
         let invented = [INVENTED, FLOOD][usize::from(falsification == Falsification::Flood)];
-        let places = (0..invented).map(|_| place(&mut random)).collect();
+        let places = (0..invented).map(|_| {
+            let [x, y] = invented_position(&mut random);
+            [x, y, random.between(-0.2, 0.2)]
+        });
+        let places = places.collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
         tracing::warn!(%cav, falsification = falsification.name(), "ATTACK: this vehicle falsifies its messages");
         Self {
@@ -146,8 +145,7 @@ impl Attack {
     }
 
     fn random_detection(&mut self) -> Detection {
-        let mut reach = || self.random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
-        let (x, y) = (reach(), reach());
+        let [x, y] = invented_position(&mut self.random);
         let heading = self.random.between(-3.1, 3.1);
         vehicle([x, y, heading], self.random.between(0.3, 1.0) as f32)
     }
@@ -232,14 +230,13 @@ impl Attack {
         match self.falsification {
             Falsification::ShiftedPose | Falsification::FalseVelocity => truth,
             Falsification::Noise => {
-                let random = &mut self.random;
-                let any = |_: &[f32; 4]| {
+                let points = truth.xyzi.iter().map(|_| {
                     // Upper and lower bounds of x, y and z in metres, and of the intensity.
                     [(40.0, -40.0), (40.0, -40.0), (0.5, -2.5), (1.0, 0.0)]
-                        .map(|(high, low)| random.between(low, high) as f32)
-                };
+                        .map(|(high, low)| self.random.between(low, high) as f32)
+                });
                 PointCloud {
-                    xyzi: truth.xyzi.iter().map(any).collect(),
+                    xyzi: points.collect(),
                 }
             }
             Falsification::Copied => self.captured.points.get_or_insert(truth).clone(),
@@ -252,6 +249,11 @@ impl Attack {
             }
         }
     }
+}
+
+/// x and y of a synthetic object in the attacker's frame, metres.
+fn invented_position(random: &mut SplitMix64) -> [f64; 2] {
+    std::array::from_fn(|_| random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M))
 }
 
 /// A car on the road at this pose, for a sensor 1.9 m above it.
@@ -320,23 +322,22 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
     let (from_row, from_column) = (from / width.max(1), from % width.max(1));
     // Copied before the loop: patches may overlap the source and each other.
     let (original, original_confidence) = (features.values.clone(), confidence.to_vec());
-    let mean = |channel: &[f32]| channel.iter().sum::<f32>() / cells.max(1) as f32;
-    let means: Vec<f32> = original.chunks(cells.max(1)).map(mean).collect();
-    let index = |row: i64, column: i64| {
-        ((0..height).contains(&row) && (0..width).contains(&column))
-            .then(|| (row * width + column) as usize)
-    };
+    let means: Vec<f32> = { original.chunks(cells.max(1)) }
+        .map(|channel| channel.iter().sum::<f32>() / cells.max(1) as f32)
+        .collect();
     for [x, y, _] in places {
         let column = ((x - features.grid.x_min_m) / features.grid.cell_m).floor() as i64;
         let row = ((y - features.grid.y_min_m) / features.grid.cell_m).floor() as i64;
         for (down, right) in (-PATCH_CELLS..=PATCH_CELLS)
             .flat_map(|down| (-PATCH_CELLS..=PATCH_CELLS).map(move |right| (down, right)))
         {
-            let (source, target) = (
-                index(from_row + down, from_column + right),
-                index(row + down, column + right),
-            );
-            let (Some(source), Some(target)) = (source, target) else {
+            let [Some(source), Some(target)] =
+                [[from_row, from_column], [row, column]].map(|[row, column]| {
+                    let (row, column) = (row + down, column + right);
+                    let is_inside = (0..height).contains(&row) && (0..width).contains(&column);
+                    is_inside.then(|| (row * width + column) as usize)
+                })
+            else {
                 continue;
             };
             confidence[target] = original_confidence[source];

@@ -132,7 +132,6 @@ impl<I: DeserializeOwned, P: DeserializeOwned> RecordedInputs<I, P> {
     /// # Errors
     /// They are different: names both, and the file of the weights.
     pub fn check_model(&self, detector: Option<&Detector>, weights: &Path) -> anyhow::Result<()> {
-        let name = |hash: Option<ModelHash>| hash.map_or("none".into(), |hash| hash.to_string());
         let found = detector.map(Detector::model_hash);
         ensure!(
             found == self.start.model_hash,
@@ -148,6 +147,10 @@ impl<I: DeserializeOwned, P: DeserializeOwned> RecordedInputs<I, P> {
     pub fn outcome(&self) -> Outcome {
         Outcome::of(!self.is_whole)
     }
+}
+
+fn name(hash: Option<ModelHash>) -> String {
+    hash.map_or("none".into(), |hash| hash.to_string())
 }
 
 impl<I: DeserializeOwned, P: DeserializeOwned> Iterator for RecordedInputs<I, P> {

@@ -101,10 +101,6 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         let agent = agent_loop.agent();
-        let topic = |stream| Topic::Stream {
-            cav: agent.cav().clone(),
-            stream,
-        };
         // One slot: while a sweep is computed only the newest of those that arrive is kept.
         // Topics: three sensors, and the pace of each ego.
         let inbox = bus.inbox(1, 3 + MAX_EGOS);
@@ -113,20 +109,19 @@ impl<'a> Node<'a> {
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let is_published = |stream: &Stream| match stream {
+        let published = STREAMS.into_iter().filter(|(stream, _)| match stream {
             Stream::Pose => true,
             // No ego can use the messages of a vehicle without a detector.
             Stream::Descriptor => agent.detector().is_some(),
             other => options.of_loop.publish.contains(other),
-        };
-        let publishers = (STREAMS.into_iter())
-            .filter(|(stream, _)| is_published(stream))
-            .map(|(stream, how)| Ok((stream, bus.publisher(topic(stream), how)?)))
+        });
+        let publishers = published
+            .map(|(stream, how)| Ok((stream, bus.publisher(topic(agent, stream), how)?)))
             .collect::<Result<_, BusError>>()?;
         let subscriptions = [
-            bus.subscribe_keeping(topic(Stream::Gnss), POSE_SLOTS, &inbox)?,
-            bus.subscribe_keeping(topic(Stream::Imu), POSE_SLOTS, &inbox)?,
-            bus.subscribe(topic(Stream::Lidar), &inbox)?,
+            bus.subscribe_keeping(topic(agent, Stream::Gnss), POSE_SLOTS, &inbox)?,
+            bus.subscribe_keeping(topic(agent, Stream::Imu), POSE_SLOTS, &inbox)?,
+            bus.subscribe(topic(agent, Stream::Lidar), &inbox)?,
             bus.subscribe_all(&KeyExpr::stream(&bus.identity().run, Stream::Pace), &inbox)?,
         ];
         let sweep_log = options.sweep_log.as_deref().map(SweepLog::open).transpose();
@@ -229,11 +224,11 @@ impl<'a> Node<'a> {
             log.add(&Record::Input { now_nanos, input });
         }
         for output in self.agent_loop.handle(input, now_nanos) {
-            let stats = self.bus.stats();
+            let (stats, agent) = (self.bus.stats(), self.agent_loop.agent());
             match output {
                 Output::Publish(message) => self.publish(message),
-                Output::Received(stream) => stats.received(&self.topic(stream)),
-                Output::Dropped(stream, reason) => stats.dropped(&self.topic(stream), reason),
+                Output::Received(stream) => stats.received(&topic(agent, stream)),
+                Output::Dropped(stream, reason) => stats.dropped(&topic(agent, stream), reason),
                 Output::Timed(stages) => {
                     for stage in stages {
                         stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
@@ -245,17 +240,11 @@ impl<'a> Node<'a> {
                     arrived_nanos,
                 } => self.log_sweep(capture_nanos, arrived_nanos),
                 Output::PoseProblem(problem) => {
-                    let moment = |(problem, since)| (problem, self.clock.moment(since));
-                    stats.set_problems("no pose", problem.map(moment));
+                    let problem =
+                        problem.map(|(problem, since)| (problem, self.clock.moment(since)));
+                    stats.set_problems("no pose", problem);
                 }
             }
-        }
-    }
-
-    fn topic(&self, stream: Stream) -> Topic {
-        Topic::Stream {
-            cav: self.agent_loop.agent().cav().clone(),
-            stream,
         }
     }
 
@@ -298,5 +287,12 @@ impl<'a> Node<'a> {
             }
             Ok(encoded)
         });
+    }
+}
+
+fn topic(agent: &Agent, stream: Stream) -> Topic {
+    Topic::Stream {
+        cav: agent.cav().clone(),
+        stream,
     }
 }

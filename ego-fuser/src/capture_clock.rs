@@ -162,10 +162,10 @@ impl CaptureClocks {
 impl Clock {
     fn add(&mut self, arrived_nanos: u64, ahead_nanos: i64) {
         self.samples.push_back((arrived_nanos, ahead_nanos));
-        let is_old = |&(at, _): &(u64, i64)| at.saturating_add(WINDOW_NANOS) < arrived_nanos;
         // Few sweeps of a slow scene are kept for longer.
-        while self.samples.len() > MAX_KEPT
-            || self.samples.len() > 3 && self.samples.front().is_some_and(is_old)
+        while let Some(&(at, _)) = self.samples.front()
+            && (self.samples.len() > MAX_KEPT
+                || self.samples.len() > 3 && at.saturating_add(WINDOW_NANOS) < arrived_nanos)
         {
             self.samples.pop_front();
         }
@@ -175,8 +175,8 @@ impl Clock {
     fn judge(&mut self, cav: &CavId, pace: f64) -> bool {
         let mut sorted: Vec<i64> = self.samples.iter().map(|(_, ahead)| *ahead).collect();
         sorted.sort_unstable();
-        let quartile = |quarter: usize| sorted.get(quarter * sorted.len() / 4).copied();
-        let [Some(low), Some(median), Some(high)] = [1, 2, 3].map(quartile) else {
+        let quartiles = [1, 2, 3].map(|quarter| sorted.get(quarter * sorted.len() / 4).copied());
+        let [Some(low), Some(median), Some(high)] = quartiles else {
             return false;
         };
         let [Some(&least), Some(&most)] = [sorted.first(), sorted.last()] else {
@@ -189,23 +189,23 @@ impl Clock {
         let agrees =
             least.max(most.saturating_neg()) < limit / 2 && high.saturating_sub(low) <= limit;
         let before = self.offset_nanos;
-        let distance = |offset: i64| median.saturating_sub(offset).saturating_abs();
+        let wrong_by = distance(median, before);
         // A small change is believed only if the samples agree with each other.
-        let is_certain = most.saturating_sub(least) <= limit || distance(before) > limit;
+        let is_certain = most.saturating_sub(least) <= limit || wrong_by > limit;
         self.offset_nanos = match before {
-            _ if is_off && is_certain && distance(before) > limit / 5 => median,
+            _ if is_off && is_certain && wrong_by > limit / 5 => median,
             0 => 0,
             _ if agrees => 0,
             _ => before,
         };
         let is_unsteady =
-            high.saturating_sub(low) > unsteady || distance(self.offset_nanos) > unsteady;
+            high.saturating_sub(low) > unsteady || distance(median, self.offset_nanos) > unsteady;
         if is_unsteady && !self.is_unsteady {
             let spread_s = most.saturating_sub(least) as f64 * 1e-9;
             tracing::warn!(%cav, spread_s, "capture clock of the vehicle is unsteady: its messages are left out");
         }
         self.is_unsteady = is_unsteady;
-        let change = self.offset_nanos.saturating_sub(before).saturating_abs();
+        let change = distance(self.offset_nanos, before);
         if before != 0 && self.offset_nanos == 0 {
             tracing::info!(%cav, "capture clock of the vehicle agrees with the ego's again");
         } else if change > limit {
@@ -230,6 +230,10 @@ fn own_capture(own: &VecDeque<SweepTime>, arrived_nanos: u64) -> Option<i128> {
         .map(|nanos| i128::from(nanos) - i128::from(before.arrived_nanos));
     let passed = i128::from(after.capture_nanos) - capture;
     Some(capture + passed * since / took)
+}
+
+fn distance(one: i64, other: i64) -> i64 {
+    one.saturating_sub(other).saturating_abs()
 }
 
 fn saturated(nanos: i128) -> i64 {

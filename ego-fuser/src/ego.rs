@@ -218,16 +218,15 @@ impl Ego {
                 })
             }
         };
-        let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
-        let view = |capture_nanos| View {
-            cav: cav.clone(),
-            pose,
-            capture_nanos,
-            content: content.clone(),
-        };
         // Twice: methods with a history use the first frame in the second.
         for capture_nanos in [0, 100_000_000] {
-            self.detect(&view(capture_nanos), &[view(capture_nanos)])?;
+            let view = View {
+                cav: cav.clone(),
+                pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
+                capture_nanos,
+                content: content.clone(),
+            };
+            self.detect(&view, std::slice::from_ref(&view))?;
         }
         self.forget();
         Ok(())
@@ -389,8 +388,8 @@ impl Ego {
         aligned: &mut [Aligned<'_>],
         stages: &mut StageTimes,
     ) -> Result<usize, EgoError> {
-        let has_boxes = |one: &Aligned<'_>| !one.view.content.objects().is_empty();
-        if !aligned[1..].iter().any(has_boxes) {
+        let mut others = aligned[1..].iter();
+        if others.all(|other| other.view.content.objects().is_empty()) {
             return Ok(0);
         }
         let own = match &aligned[0].view.content {
@@ -416,8 +415,7 @@ impl Ego {
         let boxes: Vec<PlacedBox> = (1..all.len())
             .flat_map(|sender| all[sender].boxes(sender, all[0].view, most))
             .collect();
-        let has_map = |view: &&Aligned<'_>| matches!(view.view.content, Content::Features(_));
-        let aligned: Vec<Aligned<'_>> = all.iter().filter(has_map).copied().collect();
+        let aligned: Vec<Aligned<'_>> = all.iter().filter(|one| one.has_map()).copied().collect();
         let aligned = aligned.as_slice();
         let (mut maps, mut sent) = (
             Vec::with_capacity(aligned.len()),
@@ -503,13 +501,14 @@ impl Ego {
         let Some(world_from_ego) = aligned[0].view.pose.world_from_cav() else {
             return Vec::new();
         };
-        let of_agent = |(agent, Aligned { view, .. }): (usize, &Aligned<'_>)| {
-            let place = |kept: &KeptMap| world_from_ego.from_world(&kept.world_from_cav);
-            let kept = self.history.before(&view.cav, view.capture_nanos);
-            kept.map(|kept| (agent, kept, place(kept)))
-                .collect::<Vec<_>>()
-        };
-        aligned.iter().enumerate().flat_map(of_agent).collect()
+        let mut earlier = Vec::new();
+        for (agent, Aligned { view, .. }) in aligned.iter().enumerate() {
+            for kept in self.history.before(&view.cav, view.capture_nanos) {
+                let ego_from_cav = world_from_ego.from_world(&kept.world_from_cav);
+                earlier.push((agent, kept, ego_from_cav));
+            }
+        }
+        earlier
     }
 
     /// Keeps the maps of this frame for later frames.
@@ -664,14 +663,17 @@ struct Aligned<'a> {
 }
 
 impl Aligned<'_> {
+    fn has_map(&self) -> bool {
+        matches!(self.view.content, Content::Features(_))
+    }
+
     /// True for a map of a neighbour whose boxes are newer by more than [`MAP_LAG_NANOS`]. Older boxes are read beside a
     /// newer map: they are carried to the time of the frame by their velocities.
     fn is_outdated_beside(&self, all: &[Self]) -> bool {
-        let is_map = |one: &Self| matches!(one.view.content, Content::Features(_));
-        is_map(self)
+        self.has_map()
             && all[1..].iter().any(|other| {
                 let lag_nanos = self.view.age_nanos(other.view);
-                other.view.cav == self.view.cav && !is_map(other) && lag_nanos > MAP_LAG_NANOS
+                other.view.cav == self.view.cav && !other.has_map() && lag_nanos > MAP_LAG_NANOS
             })
     }
 

@@ -95,15 +95,11 @@ impl Neighbourhood {
 
     fn subscribe(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
         tracing::info!(%cav, "a neighbour has joined");
-        let subscribe = |&stream: &Stream| {
+        let subscriptions = self.streams.iter().map(|&stream| {
             let topic = topic_of(&self.ego, &cav, stream, self.over_link);
             bus.subscribe(topic, inbox)
-        };
-        let subscriptions = self
-            .streams
-            .iter()
-            .map(subscribe)
-            .collect::<Result<_, _>>()?;
+        });
+        let subscriptions = subscriptions.collect::<Result<_, _>>()?;
         self.members.insert(cav, subscriptions);
         Ok(())
     }

@@ -117,11 +117,11 @@ impl PaceControl {
         let lowest = period_nanos.saturating_mul(u64::from(TENTHS)) / MAX_INTERVAL_NANOS;
         let lowest = u8::try_from(lowest.max(1)).unwrap_or(TENTHS);
         if count >= TOO_MANY && share > lowest {
-            let raised_at_nanos = self.raised_at_nanos.take();
+            let raised_at = self.raised_at_nanos.take();
             let [shortest, longest] = CALM_NANOS;
-            let has_failed = |at: u64| now_nanos < at.saturating_add(shortest);
+            let has_failed = raised_at.is_some_and(|at| now_nanos < at.saturating_add(shortest));
             // Overloaded soon after a raise: the next one has to wait twice as long.
-            self.calm_nanos = match raised_at_nanos.is_some_and(has_failed) {
+            self.calm_nanos = match has_failed {
                 true => (2 * self.calm_nanos).min(longest),
                 false => shortest,
             };

@@ -43,6 +43,16 @@ pub struct Dropped<K> {
     pub reason: DropReason,
 }
 
+impl<K: Clone> Dropped<K> {
+    fn of(sender: &K, capture_nanos: u64, reason: DropReason) -> Self {
+        Self {
+            sender: sender.clone(),
+            capture_nanos,
+            reason,
+        }
+    }
+}
+
 /// A message that belongs to the ego's frame.
 #[derive(Debug, PartialEq)]
 pub struct Paired<'a, K, T> {
@@ -83,20 +93,13 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
     /// duplicate or older than one that served already, or the oldest of the queue when that is full.
     #[must_use = "what was dropped has to be counted"]
     pub fn insert(&mut self, sender: &K, capture_nanos: u64, message: T) -> Option<Dropped<K>> {
-        let dropped = |capture_nanos, reason| {
-            Some(Dropped {
-                sender: sender.clone(),
-                capture_nanos,
-                reason,
-            })
-        };
         let queue = self.waiting.entry(sender.clone()).or_default();
         if queue.iter().any(|held| held.capture_nanos == capture_nanos) {
-            return dropped(capture_nanos, DropReason::Duplicate);
+            return Some(Dropped::of(sender, capture_nanos, DropReason::Duplicate));
         }
-        let is_later = |held: &Waiting<T>| held.is_used && held.capture_nanos > capture_nanos;
-        if queue.iter().any(is_later) {
-            return dropped(capture_nanos, DropReason::Superseded);
+        let mut used = queue.iter().filter(|held| held.is_used);
+        if used.any(|held| held.capture_nanos > capture_nanos) {
+            return Some(Dropped::of(sender, capture_nanos, DropReason::Superseded));
         }
         // Messages may be reordered by the channel.
         let place = queue.partition_point(|held| held.capture_nanos < capture_nanos);
@@ -111,7 +114,8 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
         }
         // One that served a frame has been counted as received.
         let oldest = queue.pop_front().filter(|oldest| !oldest.is_used)?;
-        dropped(oldest.capture_nanos, DropReason::Superseded)
+        let capture_nanos = oldest.capture_nanos;
+        Some(Dropped::of(sender, capture_nanos, DropReason::Superseded))
     }
 
     /// The messages that belong to the ego's frame, by sender, and those that will never be used.
@@ -133,14 +137,11 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
             // All before the newest that is due have missed their frame; without one young enough, so have all.
             for held in queue.drain(..newest.unwrap_or(due)) {
                 if !held.is_used {
-                    dropped.push(Dropped {
-                        sender: sender.clone(),
-                        capture_nanos: held.capture_nanos,
-                        reason: match held.capture_nanos < earliest {
-                            true => DropReason::Stale,
-                            false => DropReason::Superseded,
-                        },
-                    });
+                    let reason = match held.capture_nanos < earliest {
+                        true => DropReason::Stale,
+                        false => DropReason::Superseded,
+                    };
+                    dropped.push(Dropped::of(sender, held.capture_nanos, reason));
                 }
             }
             if newest.is_some()
@@ -186,8 +187,8 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
             return 0;
         };
         let latest = now_nanos.saturating_add(ahead_nanos);
-        let is_unused = |held: &&Waiting<T>| held.capture_nanos > latest && !held.is_used;
-        let unused = queue.iter().filter(is_unused).count();
+        let later = queue.iter().filter(|held| held.capture_nanos > latest);
+        let unused = later.filter(|held| !held.is_used).count();
         // One that served belongs to the run before, even if it is only a little later.
         queue.retain(|held| held.capture_nanos <= if held.is_used { now_nanos } else { latest });
         unused

@@ -76,33 +76,22 @@ impl Principal {
 
     /// All permissions in `runs`.
     pub fn rights(&self, runs: &RunScope) -> Vec<Permission> {
-        let keys = |topic: &dyn fmt::Display| KeyExpr::within(runs, topic);
-        let control = |verb| keys(&Topic::Control(verb));
-        let everyones = |streams: &[Stream]| -> Vec<KeyExpr> {
-            streams
-                .iter()
-                .map(|stream| everyones(runs, *stream))
-                .collect()
-        };
         let [mut publish, mut subscribe] = self.streams::<Stream>(runs);
         match self.role {
             Role::Agent | Role::Ego => {}
-            Role::Link => subscribe.extend(everyones(&[Stream::Gnss])),
+            Role::Link => subscribe.extend(streams_of(runs, &["*"], [Stream::Gnss])),
             Role::Replay => {
-                publish.extend([keys(&Topic::Truth), control(Verb::End)]);
-                subscribe.extend(["control/*", "ready/*"].map(|topic| keys(&topic)));
-                subscribe.extend(everyones(&[Stream::Detections]));
+                publish.extend(keys_of(runs, [Topic::Truth, Topic::Control(Verb::End)]));
+                subscribe.extend(keys_of(runs, ["control/*", "ready/*"]));
+                subscribe.extend(streams_of(runs, &["*"], [Stream::Detections]));
             }
             Role::Scorer => {
-                publish.push(keys(&"control/*"));
-                subscribe.extend(["truth", "stats/*", "control/*"].map(|topic| keys(&topic)));
-                subscribe.extend(everyones(&[
-                    Stream::Detections,
-                    Stream::Tracks,
-                    Stream::Pose,
-                ]));
+                let streams = [Stream::Detections, Stream::Tracks, Stream::Pose];
+                publish.extend(keys_of(runs, ["control/*"]));
+                subscribe.extend(keys_of(runs, ["truth", "stats/*", "control/*"]));
+                subscribe.extend(streams_of(runs, &["*"], streams));
             }
-            Role::Recorder => subscribe.push(keys(&"**")),
+            Role::Recorder => subscribe.extend(keys_of(runs, ["**"])),
             Role::Viewer => {
                 use Stream::{Bev, Boxes, Camera, Descriptor, Detections, Pose, Preview, Tracks};
                 let shown = [
@@ -115,26 +104,28 @@ impl Principal {
                     Bev,
                     Camera(0),
                 ];
-                subscribe.extend(everyones(&shown));
+                subscribe.extend(streams_of(runs, &["*"], shown));
                 let rest = ["rx/*/*/pose", "truth", "stats/*", "control/*"];
-                subscribe.extend(rest.map(|topic| keys(&topic)));
+                subscribe.extend(keys_of(runs, rest));
             }
             Role::Ros2 => {
                 use Stream::{Detections, Gnss, Imu, Lidar, Pose, Tracks};
-                publish.extend(everyones(&[Lidar, Imu, Gnss]));
-                subscribe.extend(everyones(&[Lidar, Imu, Pose, Detections, Tracks]));
-                subscribe.push(keys(&"stats/*"));
+                let streams = [Lidar, Imu, Pose, Detections, Tracks];
+                publish.extend(streams_of(runs, &["*"], [Lidar, Imu, Gnss]));
+                subscribe.extend(streams_of(runs, &["*"], streams));
+                subscribe.extend(keys_of(runs, ["stats/*"]));
             }
         }
-        publish.extend(
-            [Topic::Ready(self.name()), Topic::Stats(self.name())].map(|topic| keys(&topic)),
-        );
-        let own_token = keys(&Topic::Alive {
+        let own = [Topic::Ready(self.name()), Topic::Stats(self.name())];
+        publish.extend(keys_of(runs, own));
+        let own_token = Topic::Alive {
             role: self.role,
             cav: self.cav.clone(),
-        });
+        };
+        let own_token = KeyExpr::within(runs, &own_token);
         // A process looks for its own token before it declares it: another may have its name.
-        let watched = self.watched().map(|topic| keys(&topic));
+        let watched = self.watched().map(|topic| KeyExpr::within(runs, &topic));
+        let undeclared = KeyExpr::within(runs, &crate::key::UNDECLARED);
         let operations = [
             (Operation::Publish, publish),
             (Operation::Subscribe, subscribe),
@@ -144,44 +135,37 @@ impl Principal {
                 Operation::SubscribeLiveliness,
                 watched.into_iter().collect(),
             ),
-            (Operation::Query, vec![keys(&crate::key::UNDECLARED)]),
+            (Operation::Query, vec![undeclared]),
         ];
-        let permissions = |(act, keys): (Operation, Vec<KeyExpr>)| {
-            keys.into_iter().map(move |keys| Permission { act, keys })
-        };
-        operations.into_iter().flat_map(permissions).collect()
+        let permissions = operations
+            .into_iter()
+            .flat_map(|(act, keys)| keys.into_iter().map(move |keys| Permission { act, keys }));
+        permissions.collect()
     }
 
     /// Keys of streams on which it publishes, and those to which it subscribes, as far as they follow from the senders:
     /// sensors go to the vehicle's own agent, streams of agents to egos and links, and what egos repeat to all agents.
     pub(crate) fn streams<S: StreamTable>(&self, runs: &RunScope) -> [Vec<KeyExpr>; 2] {
-        let of = |vehicle: &dyn fmt::Display, stream: S| {
-            KeyExpr::within(runs, &format_args!("{vehicle}/{}", stream.selector()))
-        };
-        let own = |stream| of(&self.cav, stream);
-        let over_link = |stream| of(&format_args!("rx/{}/*", self.cav), stream);
-        let everyones = |stream| everyones(runs, stream);
+        let (own, over_link) = (self.cav.as_str(), format!("rx/{}/*", self.cav));
         let [agents, egos, sensors] = [Role::Agent, Role::Ego, Role::Replay].map(sent_by::<S>);
         match self.role {
             Role::Agent => {
                 // Sensor streams that the ledger does not cover are previews, which are for viewers.
                 let sensors = sensors.into_iter().filter(|stream| stream.row().is_counted);
                 let repeated = egos.into_iter().filter(|stream| !stream.row().is_counted);
-                let subscribed = sensors.map(own).chain(repeated.map(everyones));
-                [agents.into_iter().map(own).collect(), subscribed.collect()]
+                let mut subscribed = streams_of(runs, &[own], sensors);
+                subscribed.extend(streams_of(runs, &["*"], repeated));
+                [streams_of(runs, &[own], agents), subscribed]
             }
-            Role::Ego => {
-                let both = |stream| [everyones(stream), over_link(stream)];
-                [
-                    egos.into_iter().map(own).collect(),
-                    agents.into_iter().flat_map(both).collect(),
-                ]
-            }
-            Role::Link => [
-                agents.iter().copied().map(over_link).collect(),
-                agents.into_iter().map(everyones).collect(),
+            Role::Ego => [
+                streams_of(runs, &[own], egos),
+                streams_of(runs, &["*", over_link.as_str()], agents),
             ],
-            Role::Replay => [sensors.into_iter().map(everyones).collect(), Vec::new()],
+            Role::Link => [
+                streams_of(runs, &[over_link.as_str()], agents.iter().copied()),
+                streams_of(runs, &["*"], agents),
+            ],
+            Role::Replay => [streams_of(runs, &["*"], sensors), Vec::new()],
             Role::Scorer | Role::Recorder | Role::Viewer | Role::Ros2 => Default::default(),
         }
     }
@@ -217,15 +201,29 @@ fn sent_by<S: StreamTable>(sender: Role) -> Vec<S> {
     streams
 }
 
-/// One stream of every vehicle, before the link.
-fn everyones<S: StreamTable>(runs: &RunScope, stream: S) -> KeyExpr {
-    KeyExpr::within(runs, &format_args!("*/{}", stream.selector()))
+fn keys_of<const N: usize>(runs: &RunScope, topics: [impl fmt::Display; N]) -> [KeyExpr; N] {
+    topics.map(|topic| KeyExpr::within(runs, &topic))
+}
+
+/// Keys of each stream below some vehicles; `*`: of every vehicle, before the link.
+fn streams_of<S: StreamTable>(
+    runs: &RunScope,
+    vehicles: &[&str],
+    streams: impl IntoIterator<Item = S>,
+) -> Vec<KeyExpr> {
+    let mut keys = Vec::new();
+    for stream in streams {
+        for vehicle in vehicles {
+            let topic = format!("{vehicle}/{}", stream.selector());
+            keys.push(KeyExpr::within(runs, &topic));
+        }
+    }
+    keys
 }
 
 /// Limits of message sizes, bytes, by key, in any run.
 pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
-    let keys =
-        ["control/*", "ready/*", "stats/*"].map(|keys| KeyExpr::within(&RunScope::Any, &keys));
+    let keys = keys_of(&RunScope::Any, ["control/*", "ready/*", "stats/*"]);
     let metadata_only = (keys.into(), 2 * Limits::HARD_METADATA_BYTES as usize);
     size_limits_of::<Stream>().chain([metadata_only]).collect()
 }
@@ -243,9 +241,8 @@ pub(crate) fn size_limits_of<S: StreamTable>() -> impl Iterator<Item = (Vec<KeyE
         (most_bytes, sender == Role::Ego, sender, is_counted)
     });
     limited.into_iter().filter_map(|stream| {
-        let topics = ["*", "rx/*/*"].map(|vehicles| format!("{vehicles}/{}", stream.selector()));
-        let keys = topics.map(|topic| KeyExpr::within(&RunScope::Any, &topic));
-        Some((keys.into(), stream.row().most_bytes?))
+        let keys = streams_of(&RunScope::Any, &["*", "rx/*/*"], [stream]);
+        Some((keys, stream.row().most_bytes?))
     })
 }
 
@@ -266,11 +263,10 @@ impl FromStr for Principal {
         let (role, cav) = text
             .split_once('-')
             .map_or((text, None), |(role, cav)| (role, Some(cav)));
-        let unknown = || PrincipalError::Role(text.chars().take(2 * ProcessId::MAX_LEN).collect());
-        let role = Role::ALL
-            .into_iter()
-            .find(|known| known.as_str() == role)
-            .ok_or_else(unknown)?;
+        let role = Role::ALL.into_iter().find(|known| known.as_str() == role);
+        let role = role.ok_or_else(|| {
+            PrincipalError::Role(text.chars().take(2 * ProcessId::MAX_LEN).collect())
+        })?;
         match cav {
             Some(cav) => Ok(Self {
                 role,

@@ -24,11 +24,12 @@ impl Box3d {
         let (sin, cos) = self.heading_rad.sin_cos();
         let [x, y, z] = self.center_m;
         let [half_l, half_w, half_h] = self.size_m.map(|size| size / 2.0);
-        let corner = |(sign_l, sign_w): (f64, f64), h: f64| {
-            let (l, w) = (sign_l * half_l, sign_w * half_w);
-            [x + cos * l - sin * w, y + sin * l + cos * w, z + h]
-        };
-        let [bottom, top] = [-half_h, half_h].map(|h| [a, b, c, d].map(|signs| corner(signs, h)));
+        let [bottom, top] = [-half_h, half_h].map(|h| {
+            [a, b, c, d].map(|(sign_l, sign_w): (f64, f64)| {
+                let (l, w) = (sign_l * half_l, sign_w * half_w);
+                [x + cos * l - sin * w, y + sin * l + cos * w, z + h]
+            })
+        });
         let ([a, b, c, d], [e, f, g, h]) = (bottom, top);
         [a, b, c, d, e, f, g, h]
     }

@@ -130,17 +130,18 @@ impl Header {
         if found != expected {
             return Err(WireError::HeaderChecksum { expected, found });
         }
-        let number = |offset| u64::from_le_bytes(take(bytes, offset));
+        let [epoch, sequence, capture_nanos, publish_nanos, body_len] =
+            [40, 48, 56, 64, 72].map(|offset| u64::from_le_bytes(take(bytes, offset)));
         Ok(Self {
             kind: Kind::from_wire(bytes[6])?,
             stamp: Stamp {
                 cav: cav_from_wire(bytes[7], &take(bytes, 8))?,
-                epoch: number(40),
-                sequence: number(48),
-                capture_nanos: number(56),
-                publish_nanos: number(64),
+                epoch,
+                sequence,
+                capture_nanos,
+                publish_nanos,
             },
-            body_len: number(72),
+            body_len,
             metadata_len: u32::from_le_bytes(take(bytes, 80)),
             payload_crc: u32::from_le_bytes(take(bytes, 84)),
         })
@@ -187,13 +188,12 @@ fn take<const N: usize>(bytes: &[u8; HEADER_LEN], offset: usize) -> [u8; N] {
 fn cav_from_wire(len: u8, field: &[u8; CavId::MAX_LEN]) -> Result<CavId, WireError> {
     let (name, padding) = field.split_at(usize::from(len).min(field.len()));
     let text = String::from_utf8_lossy(name);
-    let malformed = || IdError::Malformed {
-        kind: "CAV id",
-        text: text.clone().into_owned(),
-        max_len: CavId::MAX_LEN,
-    };
     if usize::from(len) > field.len() || padding.iter().any(|byte| *byte != 0) {
-        return Err(WireError::Cav(malformed()));
+        return Err(WireError::Cav(IdError::Malformed {
+            kind: "CAV id",
+            text: text.into_owned(),
+            max_len: CavId::MAX_LEN,
+        }));
     }
     CavId::new(&text).map_err(WireError::Cav)
 }

@@ -42,10 +42,11 @@ fn check(
     max_len: usize,
     reserved: &[&str],
 ) -> Result<Box<str>, IdError> {
-    let allowed = |byte: u8| {
-        byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_' || byte == b'-'
-    };
-    if !(1..=max_len).contains(&text.len()) || !text.bytes().all(allowed) {
+    let is_valid = (1..=max_len).contains(&text.len())
+        && text
+            .bytes()
+            .all(|byte| matches!(byte, b'a'..=b'z' | b'0'..=b'9' | b'_' | b'-'));
+    if !is_valid {
         // A hostile name must not fill the log.
         let text = text.chars().take(2 * max_len).collect();
         return Err(IdError::Malformed {

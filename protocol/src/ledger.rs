@@ -152,7 +152,8 @@ impl From<Vec<Line>> for Ledger {
 
 impl From<Ledger> for Vec<Line> {
     fn from(ledger: Ledger) -> Self {
-        let line = |(Account { topic, to }, counts): (_, Counts)| Line {
+        let accounts = ledger.accounts.into_iter();
+        let lines = accounts.map(|(Account { topic, to }, counts)| Line {
             topic,
             to,
             sent: counts.sent,
@@ -160,8 +161,8 @@ impl From<Ledger> for Vec<Line> {
             in_flight: counts.in_flight,
             dropped: counts.dropped,
             adapted: counts.adapted,
-        };
-        ledger.accounts.into_iter().map(line).collect()
+        });
+        lines.collect()
     }
 }
 

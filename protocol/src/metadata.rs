@@ -45,17 +45,15 @@ pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>)
 /// # Errors
 /// [`WireError::Metadata`] when they do not decode or leave bytes over.
 pub(crate) fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<T> {
-    let refuse = |detail: String| WireError::Metadata { kind, detail };
-    let (metadata, used) = bincode::serde::decode_from_slice(bytes, CONFIG)
-        .map_err(|error| refuse(excerpt(&error.to_string(), 200)))?;
-    if used != bytes.len() {
-        return Err(refuse(format!(
-            "{} of {} bytes are left over",
-            bytes.len() - used,
-            bytes.len()
-        )));
-    }
-    Ok(metadata)
+    let detail = match bincode::serde::decode_from_slice(bytes, CONFIG) {
+        Ok((metadata, used)) if used == bytes.len() => return Ok(metadata),
+        Ok((_, used)) => {
+            let left = bytes.len() - used;
+            format!("{left} of {} bytes are left over", bytes.len())
+        }
+        Err(error) => excerpt(&error.to_string(), 200),
+    };
+    Err(WireError::Metadata { kind, detail })
 }
 
 #[cfg(test)]

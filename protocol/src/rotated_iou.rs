@@ -29,18 +29,16 @@ impl Polygon {
             corners.reverse();
             area = -area;
         }
-        let bound = |pick: fn(f64, f64) -> f64| {
+        let [low, high]: [[f64; 2]; 2] = [f64::min as fn(f64, f64) -> f64, f64::max].map(|pick| {
             std::array::from_fn(|axis| {
-                corners
-                    .iter()
-                    .map(|corner| corner[axis])
-                    .fold(corners[0][axis], pick)
+                let along = corners.iter().map(|corner| corner[axis]);
+                along.fold(corners[0][axis], pick)
             })
-        };
+        });
         Self {
             corners,
-            low: bound(f64::min),
-            high: bound(f64::max),
+            low,
+            high,
             area,
         }
     }
@@ -58,10 +56,10 @@ impl Polygon {
 
     /// Area of overlap of the axis-aligned bounds, square metres: never less than that of the polygons.
     fn bounds_overlap(&self, other: &Self) -> f64 {
-        let side = |axis: usize| {
+        let [x, y] = [0, 1].map(|axis: usize| {
             self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis])
-        };
-        side(0).max(0.0) * side(1).max(0.0)
+        });
+        x.max(0.0) * y.max(0.0)
     }
 
     /// Area of the intersection, square metres.
@@ -128,15 +126,14 @@ impl Clipped {
     /// A cut is on the segment between its two corners whatever the rounding, so touching and coinciding edges cannot
     /// move a corner far away.
     fn keep_left_of(&self, a: [f64; 2], b: [f64; 2]) -> Self {
-        let side = |p: [f64; 2]| (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]);
         let mut kept = Self {
             corners: [[0.0; 2]; MAX_CORNERS],
             len: 0,
         };
         let mut previous = self.corners[self.len - 1];
-        let mut previous_side = side(previous);
+        let mut previous_side = side(previous, a, b);
         for &corner in &self.corners[..self.len] {
-            let corner_side = side(corner);
+            let corner_side = side(corner, a, b);
             if (previous_side < 0.0) != (corner_side < 0.0) {
                 let t = previous_side / (previous_side - corner_side);
                 kept.push(std::array::from_fn(|axis| {
@@ -158,6 +155,11 @@ impl Clipped {
             self.len += 1;
         }
     }
+}
+
+/// Positive for a point to the left of the line from `a` to `b`.
+fn side(p: [f64; 2], a: [f64; 2], b: [f64; 2]) -> f64 {
+    (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])
 }
 
 /// Area of a polygon, positive if counter-clockwise. Coordinates are taken relative to the first corner: far from the

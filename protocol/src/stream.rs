@@ -148,8 +148,9 @@ impl Stream {
 /// True if the chunks are those of a name, whose number may be any text.
 fn is_named(chunks: &[&str], name: &str) -> bool {
     let names = name.split('/');
-    let is_chunk = |(name, chunk): (&str, &&str)| name == *chunk || name.starts_with('{');
-    names.clone().count() == chunks.len() && names.zip(chunks).all(is_chunk)
+    let mut pairs = names.clone().zip(chunks);
+    names.count() == chunks.len()
+        && pairs.all(|(name, chunk)| name == *chunk || name.starts_with('{'))
 }
 
 /// The number in the last chunk. One stream has one spelling: no sign, no leading zero.

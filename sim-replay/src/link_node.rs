@@ -215,14 +215,13 @@ impl<'a> Node<'a> {
         let options = self.options;
         let vehicles = self.vehicles.iter();
         let mut senders = vehicles.filter(|(cav, _)| **cav != options.ego).peekable();
-        let has_ended = |vehicle: &Vehicle| {
-            let mut streams = options.streams.iter();
-            streams.all(|stream| vehicle.ended.contains(stream))
-        };
         !options.keeps_running
             // Before the first sender joins, none can have ended.
             && senders.peek().is_some()
-            && senders.all(|(_, vehicle)| has_ended(vehicle))
+            && senders.all(|(_, vehicle)| {
+                let mut streams = options.streams.iter();
+                streams.all(|stream| vehicle.ended.contains(stream))
+            })
             && self.kept.is_empty()
     }
 
@@ -275,13 +274,14 @@ impl<'a> Node<'a> {
     }
 
     fn attach(&self, cav: &CavId) -> Result<Vehicle, BusError> {
-        let subscribe = |stream| self.bus.subscribe(Topic::stream(cav, stream), &self.inbox);
-        let mut subscriptions = vec![subscribe(Stream::Gnss)?];
+        let gnss = Topic::stream(cav, Stream::Gnss);
+        let mut subscriptions = vec![self.bus.subscribe(gnss, &self.inbox)?];
         let mut publishers = BTreeMap::new();
         // The link does not apply to the ego's own agent.
         let is_ego = *cav == self.options.ego;
         for &stream in self.options.streams.iter().filter(|_| !is_ego) {
-            subscriptions.push(subscribe(stream)?);
+            let topic = Topic::stream(cav, stream);
+            subscriptions.push(self.bus.subscribe(topic, &self.inbox)?);
             let topic = Topic::Received {
                 ego: self.options.ego.clone(),
                 cav: cav.clone(),
@@ -343,12 +343,8 @@ impl<'a> Node<'a> {
 
     /// Distance between a sender and the ego, metres; 0 while either position is unknown.
     fn distance_m(&self, from: &CavId) -> f64 {
-        let position = |cav: &CavId| {
-            self.vehicles
-                .get(cav)
-                .and_then(|vehicle| vehicle.position_m)
-        };
-        match (position(from), position(&self.options.ego)) {
+        let [from, to] = [from, &self.options.ego].map(|cav| self.vehicles.get(cav)?.position_m);
+        match (from, to) {
             (Some(from), Some(to)) => (from[0] - to[0]).hypot(from[1] - to[1]),
             _ => 0.0,
         }

@@ -113,12 +113,12 @@ impl Axis {
 
     /// Position of a value: 0 at the lower end, 1 at the upper.
     fn share(&self, value: f64) -> f64 {
-        let scale = |value: f64| match self.is_logarithmic {
+        let [low, high] = self.drawn_range();
+        let [low, high, value] = [low, high, value].map(|value| match self.is_logarithmic {
             true => value.ln(),
             false => value,
-        };
-        let [low, high] = self.drawn_range().map(scale);
-        (scale(value) - low) / (high - low)
+        });
+        (value - low) / (high - low)
     }
 
     fn contains(&self, value: f64) -> bool {
@@ -182,20 +182,16 @@ impl Chart {
         colour: RGBColor,
         context: &mut Context<'a, DB>,
     ) -> Drawn<DB> {
-        let points = || series.points_on(&self.x, &self.y);
+        let points = series.points_on(&self.x, &self.y);
         if series.mark != Mark::Dots {
-            context.draw_series(LineSeries::new(points(), colour.stroke_width(2)))?;
+            context.draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?;
         }
         let radius = series.dot_radius();
         // No dots for lines alone, but the empty series still carries the entry of the legend.
-        let dots = radius
-            .into_iter()
-            .flat_map(|radius| points().map(move |at| Circle::new(at, radius, colour.filled())));
-        let swatch = move |(x, y)| Rectangle::new([(x, y - 5), (x + 10, y + 5)], colour.filled());
-        context
-            .draw_series(dots)?
-            .label(&series.name)
-            .legend(swatch);
+        let dots =
+            points.flat_map(|at| radius.map(|radius| Circle::new(at, radius, colour.filled())));
+        let entry = context.draw_series(dots)?.label(&series.name);
+        entry.legend(move |(x, y)| Rectangle::new([(x, y - 5), (x + 10, y + 5)], colour.filled()));
         Ok(())
     }
 
@@ -214,19 +210,14 @@ impl Chart {
     fn emptiest_corner(&self) -> SeriesLabelPosition {
         use SeriesLabelPosition::{LowerLeft, LowerRight, UpperLeft, UpperRight};
         let points = { self.series.iter() }.flat_map(|series| series.points_on(&self.x, &self.y));
-        let corner_of = |(x, y)| match (self.x.share(x) > 0.5, self.y.share(y) > 0.5) {
-            (false, true) => 0,
-            (true, true) => 1,
-            (false, false) => 2,
-            (true, false) => 3,
-        };
         let mut counts = [0_usize; 4];
-        points.for_each(|point| counts[corner_of(point)] += 1);
+        for (x, y) in points {
+            let (is_right, is_upper) = (self.x.share(x) > 0.5, self.y.share(y) > 0.5);
+            counts[usize::from(is_right) + 2 * usize::from(!is_upper)] += 1;
+        }
         let corners = [UpperLeft, UpperRight, LowerLeft, LowerRight];
-        let fewest = corners
-            .into_iter()
-            .zip(counts)
-            .min_by_key(|(_, count)| *count);
+        let counted = corners.into_iter().zip(counts);
+        let fewest = counted.min_by_key(|(_, count)| *count);
         fewest.map_or(UpperLeft, |(corner, _)| corner)
     }
 }

@@ -79,16 +79,15 @@ impl PoseSample {
     /// and yaw.
     pub fn beyond_95(&self) -> [(&'static str, bool); 5] {
         let [axis, ellipse] = SHARE_STD;
-        // A singular covariance is exceeded by any error.
-        let exceeds = |deviations: f64, limit: f64| deviations.is_nan() || deviations > limit;
-        let along = |of: usize| exceeds(self.deviations(of), axis);
         [
-            ("plane", exceeds(self.planar_deviations(), ellipse)),
-            ("z", along(2)),
-            ("roll", along(3)),
-            ("pitch", along(4)),
-            ("yaw", along(5)),
+            ("plane", self.planar_deviations(), ellipse),
+            ("z", self.deviations(2), axis),
+            ("roll", self.deviations(3), axis),
+            ("pitch", self.deviations(4), axis),
+            ("yaw", self.deviations(5), axis),
         ]
+        // A singular covariance is exceeded by any error.
+        .map(|(of, deviations, limit)| (of, deviations.is_nan() || deviations > limit))
     }
 
     /// Mahalanobis distance of x and y.
@@ -109,24 +108,20 @@ impl CovarianceScale {
         if samples.len() < MIN_POSES {
             return Err(NoScale::TooFew(samples.len()));
         }
-        let axes = |axes: &[usize]| {
-            let all = samples.iter();
-            let all = all.flat_map(|sample| axes.iter().map(move |&axis| sample.deviations(axis)));
-            limit(all, SHARE).unwrap_or(f64::INFINITY) / SHARE_STD[0]
-        };
         let planar = limit(samples.iter().map(PoseSample::planar_deviations), SHARE);
         let scale = Self {
             planar: planar.unwrap_or(f64::INFINITY) / SHARE_STD[1],
-            height: axes(&[2]),
-            tilt: axes(&[3, 4]),
-            yaw: axes(&[5]),
+            height: axes_factor(samples, &[2]),
+            tilt: axes_factor(samples, &[3, 4]),
+            yaw: axes_factor(samples, &[5]),
             bound: None,
         };
         scale.check()?;
         // After the factors: the bound is in scaled standard deviations.
-        let off_m = |sample: &PoseSample| sample.error[0].hypot(sample.error[1]);
-        let ratios = (samples.iter())
-            .map(|sample| off_m(sample) / worst_std_m(&scale.applied(&sample.covariance)));
+        let ratios = samples.iter().map(|sample| {
+            let off_m = sample.error[0].hypot(sample.error[1]);
+            off_m / worst_std_m(&scale.applied(&sample.covariance))
+        });
         Ok(Self {
             bound: limit(ratios, BOUND_SHARE).filter(|bound| *bound <= MAX_FACTOR),
             ..scale
@@ -171,12 +166,19 @@ impl CovarianceScale {
     }
 }
 
+/// Factor of the standard deviations of these axes, fitted to the errors of all of them.
+fn axes_factor(samples: &[PoseSample], axes: &[usize]) -> f64 {
+    let all = samples.iter();
+    let all = all.flat_map(|sample| axes.iter().map(move |&axis| sample.deviations(axis)));
+    limit(all, SHARE).unwrap_or(f64::INFINITY) / SHARE_STD[0]
+}
+
 /// Smallest value that a new one does not exceed with a probability of `share`, if it is of the same distribution;
 /// `None` of too few values.
 fn limit(values: impl Iterator<Item = f64>, share: f64) -> Option<f64> {
     // A singular covariance states that there is no error: any error is beyond it.
-    let beyond = |value: f64| if value.is_nan() { f64::INFINITY } else { value };
-    let mut sorted: Vec<f64> = values.map(beyond).collect();
+    let values = values.map(|value| if value.is_nan() { f64::INFINITY } else { value });
+    let mut sorted: Vec<f64> = values.collect();
     sorted.sort_by(f64::total_cmp);
     // A new value has each of n + 1 ranks with the same probability.
     let rank = ((sorted.len() + 1) as f64 * share).ceil() as usize;

@@ -32,13 +32,17 @@ pub fn unscaled_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
         ..
     } = PoseMeasurement::new(0, found);
     let shape = &found.cell_covariance;
+    let position = f64::midpoint(shape[0][0], shape[1][1]);
+    let stds = [(position_std_m, position), (yaw_std_rad, shape[5][5])];
     // Cells that constrain nothing leave no shape to scale: their variance stays the largest.
-    let factor = |wanted_std: f64, variance: f64| match variance > 0.0 && variance < MAX_VARIANCE {
-        true => wanted_std / variance.sqrt(),
-        false => 1.0,
-    };
-    let position = factor(position_std_m, f64::midpoint(shape[0][0], shape[1][1]));
-    let rotation = factor(yaw_std_rad, shape[5][5]);
+    let [position, rotation] = stds.map(|(std, variance)| {
+        let is_constrained = variance > 0.0 && variance < MAX_VARIANCE;
+        if is_constrained {
+            std / variance.sqrt()
+        } else {
+            1.0
+        }
+    });
     let factors = [position, position, position, rotation, rotation, rotation];
     scaled(shape, &Vector6::from(factors))
 }

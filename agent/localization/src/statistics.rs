@@ -10,16 +10,6 @@ pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
 
 /// Upper 95 % confidence limit of a share of which `count` of `all` were seen (Clopper and Pearson 1934); 1 of none.
 pub fn share_limit(count: usize, all: usize) -> f64 {
-    // Probability of at most `count`, at this share.
-    let at_most = |share: f64| {
-        // In logarithms: of many samples the first term is less than the smallest double.
-        let (odds, mut term) = ((share / (1.0 - share)).ln(), all as f64 * (-share).ln_1p());
-        (0..count).fold(term.exp(), |sum, seen| {
-            // Each binomial term from the one before, without factorials.
-            term += ((all - seen) as f64 / (seen + 1) as f64).ln() + odds;
-            sum + term.exp()
-        })
-    };
     if count >= all {
         return 1.0;
     }
@@ -27,7 +17,15 @@ pub fn share_limit(count: usize, all: usize) -> f64 {
     // The probability falls as the share grows: bisection, nearly to the precision of a double.
     for _ in 0..50 {
         let share = f64::midpoint(low, high);
-        match at_most(share) > 0.05 {
+        // In logarithms: of many samples the first term is less than the smallest double.
+        let (odds, mut term) = ((share / (1.0 - share)).ln(), all as f64 * (-share).ln_1p());
+        // Probability of at most `count`, at this share.
+        let at_most = (0..count).fold(term.exp(), |sum, seen| {
+            // Each binomial term from the one before, without factorials.
+            term += ((all - seen) as f64 / (seen + 1) as f64).ln() + odds;
+            sum + term.exp()
+        });
+        match at_most > 0.05 {
             true => low = share,
             false => high = share,
         }

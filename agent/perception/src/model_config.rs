@@ -207,9 +207,10 @@ impl DetectorConfig {
             Some(ShrinkConfig::DoubleConv { stride, .. }) => stride,
             Some(ShrinkConfig::Pointwise { .. }) | None => 1,
         };
-        let first = |strides: &[i64]| strides.first().copied().unwrap_or(1);
         // All levels are up-sampled to one BEV grid, so the first stands for all.
-        first(&self.layer_strides) / first(&self.upsample_strides) * shrink
+        let [down, up] = [&self.layer_strides, &self.upsample_strides]
+            .map(|strides| strides.first().copied().unwrap_or(1));
+        down / up * shrink
     }
 
     /// Channels of the concatenated backbone levels.

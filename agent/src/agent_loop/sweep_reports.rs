@@ -84,11 +84,11 @@ impl SweepReports {
         // Without a description as well, or the loop would be woken again at once.
         self.next_nanos = now_nanos.saturating_add(PERIOD_NANOS);
         let newest = self.sweeps.back().map_or(0, |(capture, _)| *capture);
-        let arrival = |(capture, arrived_nanos): (u64, u64)| SweepArrival {
+        let sweeps = { self.sweeps.drain(..) }.map(|(capture, arrived_nanos)| SweepArrival {
             before_nanos: newest.saturating_sub(capture),
             arrived_nanos,
-        };
-        let sweeps = self.sweeps.drain(..).map(arrival).collect();
+        });
+        let sweeps = sweeps.collect();
         let descriptor = self.description.clone()?;
         Some((
             newest,

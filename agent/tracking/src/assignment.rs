@@ -29,18 +29,15 @@ pub fn of_allowed(
     columns: usize,
     cost: impl Fn(usize, usize) -> Option<f64>,
 ) -> Vec<(usize, usize)> {
-    let cost = |row, column| cost(row, column).filter(|cost| cost.is_finite());
-    let largest = (0..rows)
-        .flat_map(|row| (0..columns).map(move |column| (row, column)))
-        .filter_map(|(row, column)| cost(row, column))
-        .fold(0.0_f64, |largest, cost| largest.max(cost.abs()));
+    let costs = DMatrix::from_fn(rows, columns, |row, column| {
+        cost(row, column).filter(|cost| cost.is_finite())
+    });
+    let allowed = costs.iter().flatten();
+    let largest = allowed.fold(0.0_f64, |largest, cost| largest.max(cost.abs()));
     // No saving among the other pairs makes up for one pair that is forbidden.
     let forbidden = (largest + 1.0) * (2 * rows.min(columns) + 1) as f64;
-    let costs = DMatrix::from_fn(rows, columns, |row, column| {
-        cost(row, column).unwrap_or(forbidden)
-    });
-    let mut pairs = of_lowest_cost(&costs);
-    pairs.retain(|&(row, column)| cost(row, column).is_some());
+    let mut pairs = of_lowest_cost(&costs.map(|cost| cost.unwrap_or(forbidden)));
+    pairs.retain(|&pair| costs[pair].is_some());
     pairs
 }
 

@@ -67,7 +67,6 @@ impl TrackState {
     /// Takes a detection in.
     pub(crate) fn hit(&mut self, innovation: &Innovation, measured: &Measurement) {
         self.filter.correct(innovation, &measured.noise_m2);
-        let smooth = |old: &mut f64, new: f64| *old += SMOOTHING * (new - *old);
         smooth(&mut self.z_m, measured.box3d.center_m[2]);
         for (old, new) in self.size_m.iter_mut().zip(measured.box3d.size_m) {
             smooth(old, new);
@@ -158,6 +157,10 @@ impl TrackState {
             velocity_covariance: [u[2], u[3], v[3]],
         }
     }
+}
+
+fn smooth(old: &mut f64, new: f64) {
+    *old += SMOOTHING * (new - *old);
 }
 
 /// The angle within half a turn of 0, radians.

@@ -250,17 +250,16 @@ impl Tracker {
         // Below this cost a pair is likelier than a miss and a new object or false alarm together.
         let unpaired = 2.0
             * (found / (1.0 - found) / (std::f64::consts::TAU * self.config.density_per_m2)).ln();
-        let cost = |track: usize, column: usize| {
+        // A column for each track that stays without a detection.
+        let columns = measurements.len() + self.tracks.len();
+        let pairs = assignment::of_allowed(self.tracks.len(), columns, |track, column| {
             if column >= measurements.len() {
                 return Some(unpaired);
             }
             let innovation = innovations[track][column].as_ref()?;
             let distance = innovation.mahalanobis_squared();
             (distance <= self.config.gate).then_some(distance + innovation.log_determinant)
-        };
-        // A column for each track that stays without a detection.
-        let columns = measurements.len() + self.tracks.len();
-        let pairs = assignment::of_allowed(self.tracks.len(), columns, cost);
+        });
         let mut owners = vec![None; measurements.len()];
         for (track, column) in pairs {
             let Some(measured) = measurements.get(column) else {

@@ -117,8 +117,8 @@ impl Fleet {
             }
         }
         // An empty list stands for all vehicles of the scenario.
-        let chosen = |cav: &&CavId| scene.agents.is_empty() || scene.agents.contains(cav);
-        let agents: Vec<CavId> = recorded.agents.iter().filter(chosen).cloned().collect();
+        let mut agents = recorded.agents.clone();
+        agents.retain(|cav| scene.agents.is_empty() || scene.agents.contains(cav));
         let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
         for cav in &agents {
             let pose = scenario.settings_of(cav).pose;

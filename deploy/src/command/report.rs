@@ -28,10 +28,9 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Prints the report of the run, or a comparison of several.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let folder = |run| RunStatus::folder(run, &self.runs).map_err(BadInput::of);
-        let named = self.named.iter().cloned().map(Some);
         let newest = self.named.is_empty().then_some(None);
-        let folders = named.chain(newest).map(folder);
+        let runs = self.named.iter().cloned().map(Some).chain(newest);
+        let folders = runs.map(|run| RunStatus::folder(run, &self.runs).map_err(BadInput::of));
         match folders.collect::<Result<Vec<_>, _>>()?.as_slice() {
             folders if self.tracks => self.track(folders),
             [folder] => self.print(folder),
@@ -53,9 +52,9 @@ impl Arguments {
     }
 
     fn track(&self, folders: &[PathBuf]) -> anyhow::Result<Outcome> {
-        let read = |folder: &PathBuf| TrackReport::read(folder).map_err(BadInput::of);
-        let reports = folders.iter().map(read).collect::<Result<Vec<_>, _>>()?;
-        match reports.as_slice() {
+        let reports =
+            { folders.iter() }.map(|folder| TrackReport::read(folder).map_err(BadInput::of));
+        match reports.collect::<Result<Vec<_>, _>>()?.as_slice() {
             [report] if self.json => output::line(serde_json::to_string_pretty(report)?)?,
             reports if self.json => output::line(serde_json::to_string_pretty(reports)?)?,
             reports => output::text(TrackTable(reports))?,

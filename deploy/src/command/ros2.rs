@@ -213,9 +213,9 @@ impl Sensors {
                 }
             }
         }
-        let has_lidar = |cav: &CavId| self.lidar.iter().any(|lidar| lidar.cav == *cav);
-        let mut others = speeds.iter().chain(&self.imu).chain(&self.starting_pose);
-        if let Some(AgentTopic { topic, cav }) = others.find(|source| !has_lidar(&source.cav)) {
+        let others = speeds.iter().chain(&self.imu).chain(&self.starting_pose);
+        let mut blind = others.filter(|of| self.lidar.iter().all(|lidar| lidar.cav != of.cav));
+        if let Some(AgentTopic { topic, cav }) = blind.next() {
             bail!(BadInput::new(format!(
                 "{topic}={cav}: an agent's motion and starting pose go with its sweeps; name its --lidar too"
             )));

@@ -124,13 +124,14 @@ impl Arguments {
     /// A second session that has to receive what the router's own publishes; `None`, with a warning, if the router cannot
     /// be reached at its address.
     fn probe(&self, router: &Session, options: &BusOptions) -> Option<RouterProbe> {
-        let endpoint = from_here(options.endpoint());
-        let client = |endpoint| BusOptions {
-            connect_timeout: PROBE_LIMIT,
-            credentials: options.credentials.clone(),
-            ..BusOptions::client(endpoint)
-        };
-        let probe = endpoint.and_then(|at| RouterProbe::of_router(router, &client(at)));
+        let probe = from_here(options.endpoint()).and_then(|endpoint| {
+            let client = BusOptions {
+                connect_timeout: PROBE_LIMIT,
+                credentials: options.credentials.clone(),
+                ..BusOptions::client(endpoint)
+            };
+            RouterProbe::of_router(router, &client)
+        });
         probe
             .inspect_err(|error| tracing::warn!("the router is not watched: {error}"))
             .ok()

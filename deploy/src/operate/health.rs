@@ -201,20 +201,19 @@ impl Health {
 
     /// Ends of processes that were unexpected, as text: `agent-4288 was ended by signal 9`.
     pub(crate) fn ends(&self) -> Vec<String> {
-        let end = |(name, noted): (&String, &Noted)| {
+        let ends = self.processes.iter().filter_map(|(name, noted)| {
             let times = match noted.restarts {
                 0 | 1 => String::new(),
                 restarts => format!(", restarted {restarts} times"),
             };
             { noted.last_fall.as_ref() }.map(|how| format!("{name} {how}{times}"))
-        };
-        self.processes.iter().filter_map(end).collect()
+        });
+        ends.collect()
     }
 
     /// Status of every process; `progress` has what they reported.
     pub(crate) fn statuses(&self, progress: &Progress, now: Instant) -> Vec<ProcessStatus> {
-        let seconds = |at: Instant| now.saturating_duration_since(at).as_secs_f64();
-        let status = |(name, noted): (&String, &Noted)| {
+        let statuses = self.processes.iter().map(|(name, noted)| {
             let usage = noted.pid.and_then(Usage::of).unwrap_or_default();
             let runs = noted.pid.is_some();
             let problems = progress.problems.get(name).filter(|_| runs);
@@ -222,19 +221,23 @@ impl Health {
                 name: name.clone(),
                 state: noted.state,
                 pid: noted.pid,
-                up_s: if runs { seconds(noted.started) } else { 0.0 },
+                up_s: noted.pid.map_or(0.0, |_| elapsed_s(noted.started, now)),
                 restarts: noted.restarts,
                 last_fall: noted.last_fall.clone(),
                 failure: noted.failure.clone(),
                 problems: problems.cloned().unwrap_or_default(),
-                silent_s: noted.last_report.filter(|_| runs).map(seconds),
+                silent_s: { noted.last_report.filter(|_| runs) }.map(|at| elapsed_s(at, now)),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,
                 descriptors: usage.descriptors,
             }
-        };
-        self.processes.iter().map(status).collect()
+        });
+        statuses.collect()
     }
+}
+
+fn elapsed_s(since: Instant, now: Instant) -> f64 {
+    now.saturating_duration_since(since).as_secs_f64()
 }
 
 /// Resources of a process, from `/proc`.
@@ -254,19 +257,20 @@ impl Usage {
     /// Of the process `pid`; empty when it has ended.
     pub fn of(pid: u32) -> Option<Self> {
         let text = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
-        let field = |name: &str| {
-            let line = text.lines().find_map(|line| line.strip_prefix(name))?;
-            line.split_whitespace().next()?.parse::<u64>().ok()
-        };
         let descriptors = fs::read_dir(format!("/proc/{pid}/fd")).ok();
         Some(Self {
             // VmRSS counts units of 1024 bytes.
-            resident_mib: field("VmRSS:").map(|kib| kib as f64 / 1024.0),
-            threads: field("Threads:"),
+            resident_mib: number_after("VmRSS:", &text).map(|kib| kib as f64 / 1024.0),
+            threads: number_after("Threads:", &text),
             descriptors: descriptors.map(|entries| entries.count() as u64),
             is_stopped: text.contains("\nState:\tT"),
         })
     }
+}
+
+fn number_after(name: &str, text: &str) -> Option<u64> {
+    let line = text.lines().find_map(|line| line.strip_prefix(name))?;
+    line.split_whitespace().next()?.parse().ok()
 }
 
 #[cfg(test)]

@@ -60,6 +60,11 @@ impl KeyPlan {
             replace: false,
         }
     }
+
+    /// File of a process's certificate.
+    fn certificate(&self, name: &str) -> PathBuf {
+        self.folder.join(name).join(CERTIFICATE_FILE)
+    }
 }
 
 /// Reason why no keys could be made.
@@ -96,16 +101,14 @@ pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
         written: Vec::new(),
     };
     let names = plan.principals.iter().map(ToString::to_string);
-    let is_there = |name: &str| plan.folder.join(name).join(CERTIFICATE_FILE).exists();
     // All are checked before any is written, so that a refusal changes nothing.
     if !plan.replace
-        && let Some(taken) = names.clone().find(|name| is_there(name))
+        && let Some(taken) = names.clone().find(|name| plan.certificate(name).exists())
     {
-        let taken = plan.folder.join(taken).join(CERTIFICATE_FILE);
-        return Err(KeyError::There(taken));
+        return Err(KeyError::There(plan.certificate(&taken)));
     }
     let authority = store.authority()?;
-    let router = (plan.replace || !is_there(ROUTER)).then(|| ROUTER.to_owned());
+    let router = (plan.replace || !plan.certificate(ROUTER).exists()).then(|| ROUTER.to_owned());
     for name in names.chain(router) {
         store.certify(&authority, &name)?;
     }

@@ -123,11 +123,11 @@ impl RouterEndpoint {
             return Ok(Vec::new());
         }
         let scorer = process_id(Role::Scorer, &scorer_cav());
-        let is_ours = |process: &ProcessId| {
-            *process == scorer || specs.iter().any(|spec| spec.name == process.as_str())
-        };
         let present = present(&self.session, KeyExpr::everyone_alive(run).as_str())?;
-        Ok(present.into_iter().filter(is_ours).collect())
+        let ours = present.into_iter().filter(|process| {
+            *process == scorer || specs.iter().any(|spec| spec.name == process.as_str())
+        });
+        Ok(ours.collect())
     }
 
     /// Closes the session.

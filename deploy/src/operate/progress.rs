@@ -23,9 +23,9 @@ pub struct Display {
 impl Display {
     /// A display for `ticks` ticks, or for a run without end.
     pub fn new(ticks: Option<usize>) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
-            let spinner = || progress::spinner("frames");
-            ticks.map_or_else(spinner, |ticks| progress::bar(ticks, "frames"))
+        let bar = std::io::stderr().is_terminal().then(|| match ticks {
+            Some(ticks) => progress::bar(ticks, "frames"),
+            None => progress::spinner("frames"),
         });
         Self {
             bar,

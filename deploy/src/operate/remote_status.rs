@@ -104,14 +104,14 @@ impl RemoteStatus {
         if self.processes.is_empty() {
             return vec!["no process of it is connected to this router".to_owned()];
         }
-        let troubles = |process: &RemoteProcess| match process.state {
+        let troubles = { self.processes.iter() }.flat_map(|process| match process.state {
             RemoteState::Alive => { process.problems.iter() }
                 .map(|problem| format!("{}: {problem}", process.name))
                 .collect(),
             RemoteState::Silent => vec![format!("{} is silent", process.name)],
             RemoteState::Gone => vec![format!("{} has left", process.name)],
-        };
-        self.processes.iter().flat_map(troubles).collect()
+        });
+        troubles.collect()
     }
 
     /// The status as text for a terminal.
@@ -119,14 +119,15 @@ impl RemoteStatus {
         let numbers = ["cores", "MiB", "sent", "dropped"];
         let mut table = table_with_note(&["process", "state"], &numbers, "problem");
         for process in &self.processes {
-            let count = |count: Option<u64>| number(count.map(|count| count as f64), 0);
+            let [sent, dropped] = [process.sent, process.dropped]
+                .map(|count| number(count.map(|count| count as f64), 0));
             table.row([
                 process.name.clone(),
                 name_of(&process.state),
                 number(process.cores, 2),
                 number(process.resident_mib, 0),
-                count(process.sent),
-                count(process.dropped),
+                sent,
+                dropped,
                 process.problems.join("; "),
             ]);
         }
@@ -202,7 +203,7 @@ impl Seen {
     fn status(self, run: String, time: Duration, alive: &BTreeSet<String>) -> RemoteStatus {
         let observed_s = time.as_secs_f64();
         let names: BTreeSet<&String> = self.reports.keys().chain(alive).collect();
-        let process = |name: &&String| {
+        let processes = names.iter().map(|name| {
             let reports = self.reports.get(*name);
             let last = reports.map(|[_, (_, last)]| last);
             RemoteProcess {
@@ -219,8 +220,7 @@ impl Seen {
                 dropped: last.map(|stats| stats.ledger.total().dropped_total()),
                 problems: last.map_or(Vec::new(), |stats| stats.problems.clone()),
             }
-        };
-        let processes = names.iter().map(process).collect();
+        });
         let egos = self.results.into_values().map(|(count, ego)| RemoteEgo {
             rate_hz: count as f64 / observed_s,
             ..ego
@@ -228,7 +228,7 @@ impl Seen {
         RemoteStatus {
             run,
             observed_s,
-            processes,
+            processes: processes.collect(),
             egos: egos.collect(),
         }
     }

@@ -118,10 +118,10 @@ impl RunFolder {
     ) -> Result<PathBuf, RunFolderError> {
         let name = format!("config/{process}.yaml");
         let path = self.file(&name);
-        let unwritable = |source| RunFolderError::write(path.clone(), source);
         let text = serde_saphyr::to_string(config)
-            .map_err(|error| unwritable(io::Error::other(error.to_string())))?;
-        fs::create_dir_all(self.file("config")).map_err(unwritable)?;
+            .map_err(|error| io::Error::other(error.to_string()))
+            .and_then(|text| fs::create_dir_all(self.file("config")).map(|()| text))
+            .map_err(|source| RunFolderError::write(path.clone(), source))?;
         self.write(&name, &text)?;
         Ok(path)
     }

@@ -117,7 +117,8 @@ impl RefusalWatch {
         }
         let (session, ending) = (place.session.clone(), stop.clone());
         let mut refusals = RejectionLog::of(&place.endpoint);
-        let look = move || {
+        let builder = thread::Builder::new().name("refusals".into());
+        let thread = builder.spawn(move || {
             loop {
                 let ended = ending.wait_until(Instant::now() + LOOK_ROUND);
                 // Once more after the request, so that the last refusals count.
@@ -126,8 +127,7 @@ impl RefusalWatch {
                     return refusals;
                 }
             }
-        };
-        let thread = thread::Builder::new().name("refusals".into()).spawn(look);
+        });
         let thread = thread.map_err(|cause| BusError::Thread {
             what: "refusals".into(),
             cause,

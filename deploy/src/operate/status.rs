@@ -148,11 +148,10 @@ impl RunStatus {
     /// [`StatusError::NoRun`] when no run has one.
     pub fn newest(runs: &Path) -> Result<PathBuf, StatusError> {
         let entries = fs::read_dir(runs).into_iter().flatten().flatten();
-        let written = |folder: PathBuf| {
-            let file = fs::metadata(folder.join(FILE)).ok()?;
-            Some((file.modified().ok()?, folder))
-        };
-        let folders = entries.filter_map(|entry| written(entry.path()));
+        let folders = entries.filter_map(|entry| {
+            let file = fs::metadata(entry.path().join(FILE)).ok()?;
+            Some((file.modified().ok()?, entry.path()))
+        });
         let newest = folders.max_by_key(|(written, _)| *written);
         newest.map_or_else(
             || Err(StatusError::NoRun(runs.to_owned())),
@@ -162,20 +161,11 @@ impl RunStatus {
 
     /// Problems as text: of processes during the run; of failed or crashed ones when it is over.
     pub fn troubles(&self) -> Vec<String> {
-        let is_well = |process: &&ProcessStatus| match self.phase {
-            Phase::Running => {
-                matches!(process.state, State::Ready | State::Ended) && process.problems.is_empty()
-            }
-            Phase::Ending | Phase::Over => process.state != State::Down,
-            // States of processes are from before that, so the run alone is named.
-            Phase::Lost | Phase::Suspended => true,
-        };
-        let is_unwell = |process: &&ProcessStatus| !is_well(process) || process.failure.is_some();
-        let sick = self.processes.iter().filter(is_unwell);
-        let describe = |process: &ProcessStatus| {
+        let sick = { self.processes.iter() }.filter(|process| self.is_sick(process));
+        let sick = sick.map(|process| {
             let why = why(process).map_or(String::new(), |why| format!(": {why}"));
             format!("{} is {}{why}", process.name, name_of(&process.state))
-        };
+        });
         let age_s = self.age().as_secs_f64();
         let run = match (self.phase, self.router_gone_s) {
             (Phase::Lost, _) => Some("the supervisor has ended".to_owned()),
@@ -183,7 +173,19 @@ impl RunStatus {
             (Phase::Running, Some(seconds)) => Some(format!("router gone for {seconds:.1} s")),
             _ => None,
         };
-        run.into_iter().chain(sick.map(describe)).collect()
+        run.into_iter().chain(sick).collect()
+    }
+
+    fn is_sick(&self, process: &ProcessStatus) -> bool {
+        let is_well = match self.phase {
+            Phase::Running => {
+                matches!(process.state, State::Ready | State::Ended) && process.problems.is_empty()
+            }
+            Phase::Ending | Phase::Over => process.state != State::Down,
+            // States of processes are from before that, so the run alone is named.
+            Phase::Lost | Phase::Suspended => true,
+        };
+        !is_well || process.failure.is_some()
     }
 
     /// Time since it was written.
@@ -318,8 +320,8 @@ impl StatusWriter {
         processes: impl FnOnce(Instant) -> Vec<ProcessStatus>,
     ) {
         let now = Instant::now();
-        let is_recent = |written| now.duration_since(written) < PERIOD;
-        if phase == Phase::Running && self.written.is_some_and(is_recent) {
+        let is_recent = { self.written }.is_some_and(|last| now.duration_since(last) < PERIOD);
+        if phase == Phase::Running && is_recent {
             return;
         }
         self.written = Some(now);

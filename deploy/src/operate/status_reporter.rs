@@ -114,8 +114,8 @@ impl StatusReporter {
     /// Writes the status of the run.
     pub fn write_status(&mut self, phase: Phase, progress: &Progress) {
         let (health, causes) = (&self.health, (self.causes(), self.router.gone_s()));
-        let processes = |now| health.statuses(progress, now);
-        self.status.write(phase, progress, causes, processes);
+        let status = &mut self.status;
+        status.write(phase, progress, causes, |at| health.statuses(progress, at));
     }
 
     /// Displays events and replaces hung processes until the scene is over, the user ends the run, or a process stays

@@ -88,16 +88,16 @@ impl Capacity {
 
 impl fmt::Display for Capacity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let plural = |count: usize| if count == 1 { "" } else { "s" };
         let (cores, vehicles) = (self.machine.cores, self.vehicles);
+        let plurals = [cores, vehicles].map(|count| if count == 1 { "" } else { "s" });
         write!(
             f,
             "{cores} core{}, {}; {} with {vehicles} vehicle{} needs about {:.0} ms of CPU per frame of {:.0} available: \
              expect about {} of 10 frames answered",
-            plural(cores),
+            plurals[0],
             self.machine.instructions,
             self.method,
-            plural(vehicles),
+            plurals[1],
             self.needed_ms,
             self.available_ms,
             (10.0 * self.expected_share).round()

@@ -20,15 +20,15 @@ pub struct OtherClock {
 
 /// Neighbours with another clock than the ego.
 pub(super) fn others(neighbours: &BTreeMap<CavId, NeighbourRecord>) -> BTreeMap<CavId, OtherClock> {
-    let other = |(cav, record): (&CavId, &NeighbourRecord)| {
-        let is_other = |offset_s: &f64| !is_same_clock(*offset_s, NETWORK_TRANSIT_S);
+    let others = neighbours.iter().filter_map(|(cav, record)| {
         let clock = OtherClock {
-            system_s: record.clock_offset_s.filter(is_other),
+            system_s: { record.clock_offset_s }
+                .filter(|offset_s| !is_same_clock(*offset_s, NETWORK_TRANSIT_S)),
             capture_s: record.capture_offset_s,
         };
         (clock != OtherClock::default()).then(|| (cav.clone(), clock))
-    };
-    neighbours.iter().filter_map(other).collect()
+    });
+    others.collect()
 }
 
 impl fmt::Display for OtherClock {

@@ -61,11 +61,10 @@ impl Comparison {
     /// # Errors
     /// [`ReportError`] names the file.
     pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, ReportError> {
-        let read = |folder: &Path| {
-            let metrics = read_json(folder.join(metrics::FILE));
-            Ok((RunReport::read(folder)?, metrics?))
-        };
-        let runs = folders.iter().map(|folder| read(folder.as_ref()));
+        let runs = folders.iter().map(|folder| {
+            let metrics = read_json(folder.as_ref().join(metrics::FILE));
+            Ok((RunReport::read(folder.as_ref())?, metrics?))
+        });
         runs.collect::<Result<_, _>>().map(Self)
     }
 }

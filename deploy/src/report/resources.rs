@@ -84,8 +84,8 @@ pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
 fn kind_of(process: &str) -> (usize, String) {
     use Role::{Agent, Ego, Link, Replay, Scorer};
     const ORDER: [Role; 5] = [Replay, Agent, Link, Ego, Scorer];
-    let is_of = |role: Role| process.split('-').next() == Some(role.as_str());
-    match ORDER.into_iter().position(is_of) {
+    let name = process.split('-').next();
+    match { ORDER.into_iter() }.position(|role| name == Some(role.as_str())) {
         Some(place) => (place, ORDER[place].to_string()),
         None => (ORDER.len(), process.to_owned()),
     }
@@ -110,12 +110,12 @@ pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessR
             _ => pace.ticks,
         };
     }
-    let finished = |(sum, frames): (ProcessResources, u64)| ProcessResources {
+    let finished = all.into_values().map(|(sum, frames)| ProcessResources {
         cores: (pace.seconds > 0.0).then(|| sum.playing_cpu_s / pace.seconds),
         cpu_ms_per_frame: (frames > 0).then(|| sum.playing_cpu_s * 1e3 / frames as f64),
         ..sum
-    };
-    all.into_values().map(finished).collect()
+    });
+    finished.collect()
 }
 
 /// Published bytes by stream, the largest first.
@@ -131,12 +131,12 @@ pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
         *messages += traffic.messages;
         *bytes = bytes.saturating_add(traffic.bytes);
     }
-    let of = |(stream, (messages, bytes))| StreamBytes {
+    let streams = { sums.into_iter() }.map(|(stream, (messages, bytes))| StreamBytes {
         stream,
         messages,
         bytes,
-    };
-    let mut streams: Vec<StreamBytes> = sums.into_iter().map(of).collect();
+    });
+    let mut streams: Vec<StreamBytes> = streams.collect();
     streams.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.stream.cmp(&b.stream)));
     streams
 }

@@ -52,11 +52,10 @@ impl fmt::Display for Pace {
             f,
             "pace      answered {answered}/{ticks} ({share}){rate}; between detections {interval}"
         )?;
-        let of = |(cav, pace): (&String, &super::AgentPace)| {
+        let agents = self.agents.iter().map(|(cav, pace)| {
             format!("{cav} {}/{ticks} ({})", pace.computed, percent(pace.share))
-        };
-        let agents: Vec<String> = self.agents.iter().map(of).collect();
-        match agents.as_slice() {
+        });
+        match agents.collect::<Vec<_>>().as_slice() {
             [] => Ok(()),
             agents => writeln!(f, "computed  {}", agents.join(", ")),
         }

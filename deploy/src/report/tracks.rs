@@ -203,13 +203,10 @@ fn frame(truth: &GroundTruth, tracks: Vec<Track>) -> TrackedFrame {
         center_m: center_m(&object.box3d),
     });
     let counting = tracks.into_iter().filter(|Track { box3d, .. }| {
-        let distance = |others: &[TrueBox]| {
-            let distances = others.iter().map(|other| distance_m(&other.box3d, box3d));
-            distances.fold(f64::INFINITY, f64::min)
-        };
         // On an object that does not count only if none that counts is nearer.
-        let to_ignored = distance(&truth.ignored);
-        let is_on_ignored = to_ignored < MATCH_DISTANCE_M && to_ignored < distance(&truth.objects);
+        let to_ignored = nearest_m(&truth.ignored, box3d);
+        let is_on_ignored =
+            to_ignored < MATCH_DISTANCE_M && to_ignored < nearest_m(&truth.objects, box3d);
         corners_within(&box3d.corners(), truth.area_m) && !is_on_ignored
     });
     let tracks = counting.map(|track| TrackPoint {
@@ -221,6 +218,12 @@ fn frame(truth: &GroundTruth, tracks: Vec<Track>) -> TrackedFrame {
         objects: objects.collect(),
         tracks: tracks.collect(),
     }
+}
+
+/// Distance to the nearest of some true boxes.
+fn nearest_m(others: &[TrueBox], box3d: &Box3d) -> f64 {
+    let distances = others.iter().map(|other| distance_m(&other.box3d, box3d));
+    distances.fold(f64::INFINITY, f64::min)
 }
 
 fn center_m(box3d: &Box3d) -> [f64; 2] {
@@ -268,11 +271,10 @@ impl fmt::Display for TrackTable<'_> {
         let mut table = TextTable::of(&["run", "method"], &numbers);
         for report in self.0 {
             let quality = &report.quality;
-            let count = |count: Option<usize>| count.map_or("-".into(), |count| count.to_string());
-            let of_true = |count: Option<usize>| match (count, quality.true_tracks) {
-                (Some(count), Some(all)) => format!("{count}/{all}"),
-                _ => "-".into(),
-            };
+            let [ids, frag] = [quality.ids, quality.frag].map(|count| Some(count?.to_string()));
+            let [mt, ml] = [quality.mt, quality.ml]
+                .map(|count| Some(format!("{}/{}", count?, quality.true_tracks?)));
+            let [ids, frag, mt, ml] = [ids, frag, mt, ml].map(|text| text.unwrap_or("-".into()));
             table.row([
                 report.run.clone(),
                 report.method.clone().unwrap_or_else(|| "-".into()),
@@ -282,10 +284,10 @@ impl fmt::Display for TrackTable<'_> {
                 number(quality.mota, 3),
                 number(quality.motp_m, 2),
                 number(quality.recall, 3),
-                count(quality.ids),
-                count(quality.frag),
-                of_true(quality.mt),
-                of_true(quality.ml),
+                ids,
+                frag,
+                mt,
+                ml,
                 number(quality.hota, 3),
                 number(quality.det_a, 3),
                 number(quality.ass_a, 3),

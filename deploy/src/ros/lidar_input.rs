@@ -13,7 +13,6 @@ use protocol::{CavId, Lidar, Limits, Stream, Topic};
 use ros2::{Qos, RosName, RosType, Sweep, SweepLimits, read_point_cloud};
 use serde::Serialize;
 use zenoh::bytes::ZBytes;
-use zenoh::sample::Sample;
 
 use super::agent_topic::AgentTopic;
 use super::motion_input::{MotionInput, MotionReport};
@@ -111,15 +110,17 @@ impl LidarInputs {
             let (queue, superseded) = (Arc::clone(&queue), Arc::clone(&superseded));
             let lane = cav.clone();
             // Runs on zenoh's receive thread, so it only queues. Sweeps are decoded by the queue's reader.
-            let receive =
-                move |sample: Sample| match queue.push(lane.clone(), sample.payload().clone()) {
-                    PushOutcome::Queued | PushOutcome::Closed(_) => {}
-                    PushOutcome::Replaced(_) | PushOutcome::NoLane(_) => {
-                        superseded.fetch_add(1, Ordering::Relaxed);
-                    }
-                };
             let ros_type = RosType::PointCloud2;
-            let subscription = session.subscribe(topic, ros_type, Qos::SENSOR_DATA, receive)?;
+            let subscription =
+                session.subscribe(topic, ros_type, Qos::SENSOR_DATA, move |sample| {
+                    let outcome = queue.push(lane.clone(), sample.payload().clone());
+                    match outcome {
+                        PushOutcome::Queued | PushOutcome::Closed(_) => {}
+                        PushOutcome::Replaced(_) | PushOutcome::NoLane(_) => {
+                            superseded.fetch_add(1, Ordering::Relaxed);
+                        }
+                    }
+                })?;
             let input = Input {
                 cav: cav.clone(),
                 topic: topic.clone(),
@@ -213,8 +214,9 @@ impl Input {
         self.frames.note_lidar(&self.cav, &sweep.frame_id);
         // Before the sweep: the agent waits for nothing then.
         if let Some(starting_pose) = &self.starting_pose {
-            let base_from_lidar = || self.frames.base_from_lidar(&self.cav, sweep.capture_nanos);
-            starting_pose.publish(sweep.capture_nanos, base_from_lidar);
+            starting_pose.publish(sweep.capture_nanos, || {
+                self.frames.base_from_lidar(&self.cav, sweep.capture_nanos)
+            });
         }
         if let Some(motion) = &mut self.motion
             && !motion.publish(previous_nanos, sweep.capture_nanos)

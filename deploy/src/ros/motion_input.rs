@@ -67,7 +67,7 @@ impl MotionInput {
             .clone()
             .any(|source| source.motion_type == MotionType::Imu);
         let measurements = Arc::<Mutex<Measurements>>::default();
-        let subscribe = |source: &MotionSource| {
+        let subscriptions = own.map(|source| {
             let (motion_type, topic) = (source.motion_type, source.source.topic.clone());
             let (measurements, ros_type) = (Arc::clone(&measurements), motion_type.ros_type());
             let report = MotionReport::default();
@@ -86,8 +86,8 @@ impl MotionInput {
                 }
                 lock(&measurements).add(&topic, read.ok(), takes_yaw_rate);
             })
-        };
-        let subscriptions = own.map(subscribe).collect::<Result<_, _>>()?;
+        });
+        let subscriptions = subscriptions.collect::<Result<_, _>>()?;
         let imu = Topic::stream(cav, Stream::Imu);
         let publisher = bus.publisher(imu, PublisherOptions::POSE.live())?;
         Ok(Some(Self {

@@ -267,12 +267,12 @@ impl<'scope, 'env> Node<'scope, 'env> {
     fn publish_static_transforms(&mut self) -> Result<()> {
         let mount = self.options.mount.unwrap_or_default();
         let mut in_robots = self.frames.lidars_in_robots(&self.names);
-        let is_robot = |cav: &CavId| self.options.robots().any(|robot| robot == *cav);
-        let place = |cav: &CavId| match is_robot(cav) {
+        let robots: BTreeSet<CavId> = self.options.robots().collect();
+        let frames = { self.agents.iter() }.filter_map(|cav| match robots.contains(cav) {
             true => in_robots.remove(cav),
             false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
-        };
-        let frames: Vec<_> = self.agents.iter().filter_map(place).collect();
+        });
+        let frames: Vec<_> = frames.collect();
         // The stamp of a fixed transform has no meaning.
         let cdr = ros2::transforms(0, &frames);
         // Only after a change: late subscribers get the last message anyway.
@@ -349,8 +349,10 @@ impl<'scope, 'env> Node<'scope, 'env> {
             return Ok(());
         };
         let publisher = self.publishers.get(&InitialPose::TOPIC);
-        let is_wanted = || publisher.is_some_and(RosPublisher::is_wanted);
-        match initial.of_message(cav, capture_nanos, message, is_wanted) {
+        let cdr = initial.of_message(cav, capture_nanos, message, || {
+            publisher.is_some_and(RosPublisher::is_wanted)
+        });
+        match cdr {
             Some(cdr) => self.publish(InitialPose::TOPIC, cdr),
             None => Ok(()),
         }

@@ -82,13 +82,13 @@ impl RobotFrames {
         ];
         let is_needed = !lock(&self.state).robots.is_empty();
         let topics = topics.into_iter().filter(|_| is_needed);
-        let subscribe = |(topic, qos, origin): (RosTopic, Qos, Origin)| {
+        let subscriptions = topics.map(|(topic, qos, origin)| {
             let frames = self.clone();
             session.subscribe(&topic.name(None), RosType::TfMessage, qos, move |sample| {
                 frames.note_transforms(&sample.payload().to_bytes(), origin);
             })
-        };
-        topics.map(subscribe).collect()
+        });
+        subscriptions.collect()
     }
 
     fn note_transforms(&self, bytes: &[u8], origin: Origin) {

@@ -7,7 +7,6 @@ use nalgebra::Isometry3;
 use protocol::{Gnss, GnssSource, Stream, Topic};
 use ros2::{Qos, RosType, StatedPose};
 use support::sync::lock;
-use zenoh::sample::Sample;
 
 use super::agent_topic::AgentTopic;
 use super::refusal_log::RefusalLog;
@@ -31,11 +30,13 @@ impl StartingPose {
         let ros_type = RosType::PoseWithCovarianceStamped;
         let log = Mutex::new(RefusalLog::of(topic.clone(), ros_type));
         let newest = Arc::clone(&stated);
-        let receive = move |sample: Sample| match StatedPose::read(&sample.payload().to_bytes()) {
-            Ok(pose) => *lock(&newest) = Some(pose),
-            Err(error) => lock(&log).warn(&error),
-        };
-        let subscription = session.subscribe(topic, ros_type, Qos::DEFAULT, receive)?;
+        let subscription = session.subscribe(topic, ros_type, Qos::DEFAULT, move |sample| {
+            let read = StatedPose::read(&sample.payload().to_bytes());
+            match read {
+                Ok(pose) => *lock(&newest) = Some(pose),
+                Err(error) => lock(&log).warn(&error),
+            }
+        })?;
         // The agent takes a stated pose from its GNSS stream, where the source tells the two apart.
         let gnss = Topic::stream(cav, Stream::Gnss);
         Ok(Self {

@@ -27,15 +27,14 @@ pub(super) fn forward(
     let topic = Topic::stream(cav, Stream::Lidar);
     let key = KeyExpr::one(&bus.key(topic.clone()));
     let mut translator = Translator::new(&bus.identity().run).with_frames(names, BTreeSet::new());
-    let is_ending = || ending.load(Ordering::Relaxed);
-    while !is_ending() {
+    while !ending.load(Ordering::Relaxed) {
         if !publisher.is_wanted() {
             thread::sleep(POLL_PERIOD);
             continue;
         }
         // One place: a slow network gets the newest sweep.
         let subscriber = bus.tap(std::slice::from_ref(&key), 1)?;
-        while publisher.is_wanted() && !is_ending() {
+        while publisher.is_wanted() && !ending.load(Ordering::Relaxed) {
             let Pop::Item(_, raw) = subscriber.take(Some(Instant::now() + POLL_PERIOD)) else {
                 continue;
             };

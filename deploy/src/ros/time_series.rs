@@ -38,8 +38,7 @@ impl<T: Copy> TimeSeries<T> {
         }
         self.0.push_back((nanos, value));
         // No underflow: measurements are in the order of time, and this one is the last.
-        let is_old = |first: &(u64, T)| nanos - first.0 > KEPT_NANOS;
-        while self.0.len() > MOST || self.0.front().is_some_and(is_old) {
+        while self.0.len() > MOST || self.0.front().is_some_and(|it| nanos - it.0 > KEPT_NANOS) {
             self.0.pop_front();
         }
         discarded
@@ -101,8 +100,7 @@ impl TimeSeries<f64> {
             return Some(last);
         };
         // Both ends have values of their own, so only what lies strictly between them is taken.
-        let is_between = |(time, _): &(u64, f64)| (from + 1..to).contains(time);
-        let between = self.0.iter().copied().filter(is_between);
+        let between = { self.0.iter().copied() }.filter(|(time, _)| (from + 1..to).contains(time));
         let (mut sum, mut previous) = (0.0, (from, first));
         for next in between.chain([(to, last)]) {
             sum += 0.5 * (previous.1 + next.1) * seconds(next.0 - previous.0);

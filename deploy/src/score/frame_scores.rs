@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
-use protocol::message::SkippedNeighbour;
 use protocol::{CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
 use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
@@ -268,7 +267,7 @@ impl FrameScores {
         let found = result.pose.world_from_cav();
         let ego_error = { found.zip(true_pose(&world_from_lidar, &self.ego)) }
             .map(|(found, truth)| PoseError::between(found, truth));
-        let stale = |left_out: &&SkippedNeighbour| left_out.reason == Some(DropReason::Stale);
+        let stale = { result.skipped.iter() }.filter(|one| one.reason == Some(DropReason::Stale));
         self.records.push(FrameRecord {
             tick,
             agent_frame: Some(result.agent_frame),
@@ -281,7 +280,7 @@ impl FrameScores {
             fused: result.fused.len(),
             skipped: result.skipped.len(),
             oldest_ms: ages_ms.clone().max_by(f64::total_cmp),
-            stale: result.skipped.iter().filter(stale).count(),
+            stale: stale.count(),
             payload_bytes: bytes.clone().map(|(payload, _)| payload).sum(),
             wire_bytes: bytes.clone().map(|(_, wire)| wire).sum(),
             ego_error_m: ego_error.map(|error| error.distance_m),

@@ -32,33 +32,42 @@ pub struct NeighbourRecord {
 
 /// Adds the neighbours of a result.
 pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &Detections) {
-    let mut change = |cav: &CavId, change: &dyn Fn(&mut NeighbourRecord)| {
-        if neighbours.len() < MAX_NEIGHBOURS || neighbours.contains_key(cav) {
-            change(neighbours.entry(cav.clone()).or_default());
-        }
-    };
     for fused in &result.fused {
-        change(&fused.cav, &|record| record.fused += 1);
+        if let Some(record) = record_of(&fused.cav, neighbours) {
+            record.fused += 1;
+        }
     }
     for skipped in &result.skipped {
-        if let Some(reason) = skipped.reason {
-            change(&skipped.cav, &|record| {
-                *record.left_out.entry(reason).or_default() += 1
-            });
+        if let Some(reason) = skipped.reason
+            && let Some(record) = record_of(&skipped.cav, neighbours)
+        {
+            *record.left_out.entry(reason).or_default() += 1;
         }
     }
     for neighbour in &result.neighbours {
-        change(&neighbour.cav, &|record| {
-            if let Some(misbehaviour) = neighbour.misbehaviour {
-                *record.misbehaviour_counts.entry(misbehaviour).or_default() += 1;
-            }
-            record.misbehaviour = neighbour.misbehaviour;
-            // One that cannot be fused gets no new trust score.
-            record.trust = neighbour.trust.or(record.trust);
-            let trusts = [record.least_trust, neighbour.trust].into_iter().flatten();
-            record.least_trust = trusts.reduce(f64::min);
-            record.clock_offset_s = neighbour.clock_offset_s.or(record.clock_offset_s);
-            record.capture_offset_s = neighbour.capture_offset_s.or(record.capture_offset_s);
-        });
+        let Some(record) = record_of(&neighbour.cav, neighbours) else {
+            continue;
+        };
+        if let Some(misbehaviour) = neighbour.misbehaviour {
+            *record.misbehaviour_counts.entry(misbehaviour).or_default() += 1;
+        }
+        record.misbehaviour = neighbour.misbehaviour;
+        // One that cannot be fused gets no new trust score.
+        record.trust = neighbour.trust.or(record.trust);
+        let trusts = [record.least_trust, neighbour.trust].into_iter().flatten();
+        record.least_trust = trusts.reduce(f64::min);
+        record.clock_offset_s = neighbour.clock_offset_s.or(record.clock_offset_s);
+        record.capture_offset_s = neighbour.capture_offset_s.or(record.capture_offset_s);
+    }
+}
+
+/// The record of a vehicle; `None` if there is no room for another one.
+fn record_of<'a>(
+    cav: &CavId,
+    neighbours: &'a mut BTreeMap<CavId, NeighbourRecord>,
+) -> Option<&'a mut NeighbourRecord> {
+    match neighbours.len() < MAX_NEIGHBOURS || neighbours.contains_key(cav) {
+        true => Some(neighbours.entry(cav.clone()).or_default()),
+        false => None,
     }
 }

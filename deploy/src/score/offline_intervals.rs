@@ -34,7 +34,7 @@ impl OfflineIntervals {
     /// [`BusError::Zenoh`] when the session is closed.
     pub(crate) fn watch(bus: &Bus) -> Result<Self, BusError> {
         let state = Arc::<Mutex<State>>::default();
-        let watch = |role| {
+        let watches = ROLES.into_iter().map(|role| {
             let state = Arc::clone(&state);
             bus.watch(role, move |event| {
                 let mut state = lock(&state);
@@ -50,9 +50,9 @@ impl OfflineIntervals {
                     }
                 }
             })
-        };
+        });
         Ok(Self {
-            _watches: ROLES.into_iter().map(watch).collect::<Result<_, _>>()?,
+            _watches: watches.collect::<Result<_, _>>()?,
             state,
         })
     }
@@ -70,7 +70,6 @@ impl OfflineIntervals {
 /// True if a process that the account concerns was offline: sender, receiver or the link between them.
 pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
-    let agent = |cav| process_id(Role::Agent, cav).to_string();
     let mut concerned: Vec<String> = match &account.topic {
         Topic::Stream {
             stream: Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_),
@@ -86,10 +85,11 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
                 | Stream::TracksJson
                 | Stream::Pace,
         } => vec![process_id(Role::Ego, cav).to_string()],
-        Topic::Stream { cav, .. } => vec![agent(cav)],
-        Topic::Received { ego, cav, .. } => {
-            vec![agent(cav), process_id(Role::Link, ego).to_string()]
-        }
+        Topic::Stream { cav, .. } => vec![process_id(Role::Agent, cav).to_string()],
+        Topic::Received { ego, cav, .. } => vec![
+            process_id(Role::Agent, cav).to_string(),
+            process_id(Role::Link, ego).to_string(),
+        ],
         Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => Vec::new(),
     };
     if let Some(to) = &account.to {

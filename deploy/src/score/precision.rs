@@ -16,14 +16,14 @@ pub(super) fn by_iou(scorer: &Scorer, ordering: Ordering) -> ByIou {
 }
 
 fn of_tallies(tallies: &[Tally], ordering: Ordering) -> ByIou {
-    let at = |index: usize| {
+    let [at_30, at_50, at_70] = [0, 1, 2].map(|index: usize| {
         let tally = tallies.get(index).filter(|tally| tally.objects > 0);
         tally.map(|tally| tally.curve(ordering).average_precision)
-    };
+    });
     ByIou {
-        at_30: at(0),
-        at_50: at(1),
-        at_70: at(2),
+        at_30,
+        at_50,
+        at_70,
     }
 }
 

@@ -31,22 +31,18 @@ impl StageStamps {
         detected_nanos: u64,
         stages: &[StageTiming],
     ) -> Self {
-        let since = |nanos: u64| ms_between(began_nanos, nanos);
-        let ms = |timing: &StageTiming| timing.nanos as f64 / 1e6;
-        let took = |name: &str| stages.iter().find(|timing| timing.stage == name).map(ms);
-        let is_fusing =
-            |timing: &&StageTiming| !["transport", "wait", "send"].contains(&timing.stage.as_str());
-        let fusing: f64 = stages.iter().filter(is_fusing).map(ms).sum();
-        let before = |end: Option<f64>, stage| Some(end? - took(stage)?);
-        let detected = since(detected_nanos);
+        let fusing = { stages.iter() }
+            .filter(|timing| !matches!(timing.stage.as_str(), "transport" | "wait" | "send"));
+        let fusing_ms: f64 = fusing.map(|timing| timing.nanos as f64 / 1e6).sum();
+        let detected = ms_between(began_nanos, detected_nanos);
         // The ego's stages follow each other without a gap: counted back from the end.
-        let fused = before(Some(detected), "send");
-        let decided = fused.map(|fused| fused - fusing);
-        let arrived = before(decided, "wait");
-        let published = before(arrived, "transport");
+        let fused = before_stage(stages, "send", Some(detected));
+        let decided = fused.map(|fused| fused - fusing_ms);
+        let arrived = before_stage(stages, "wait", decided);
+        let published = before_stage(stages, "transport", arrived);
         Self {
             began_nanos: Some(began_nanos),
-            posed_ms: posed_nanos.map(since),
+            posed_ms: posed_nanos.map(|posed_nanos| ms_between(began_nanos, posed_nanos)),
             published_ms: published,
             arrived_ms: arrived,
             decided_ms: decided,
@@ -59,6 +55,12 @@ impl StageStamps {
     pub(crate) fn since_began_ms(&self, nanos: u64) -> Option<f64> {
         self.began_nanos.map(|began| ms_between(began, nanos))
     }
+}
+
+/// Time at which a stage began that ended at `end_ms`; `None` without one.
+fn before_stage(stages: &[StageTiming], name: &str, end_ms: Option<f64>) -> Option<f64> {
+    let stage = stages.iter().find(|timing| timing.stage == name);
+    Some(end_ms? - stage?.nanos as f64 / 1e6)
 }
 
 fn ms_between(began_nanos: u64, nanos: u64) -> f64 {

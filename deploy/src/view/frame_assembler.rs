@@ -168,9 +168,9 @@ impl FrameAssembler {
 
     /// True if nothing is missing at `at`: results come before their tracks.
     fn is_complete(&mut self, at: u64) -> bool {
-        let has_none = |frame: &OpenFrame| frame.result.is_some() && frame.tracks.is_none();
         // An earlier result is still without: the ego tracks no more.
-        self.awaits_tracks &= !self.open.range(..at).any(|(_, frame)| has_none(frame));
+        self.awaits_tracks &=
+            !{ self.open.range(..at) }.any(|(_, it)| it.result.is_some() && it.tracks.is_none());
         let frame = self.open.get(&at);
         frame.is_some_and(|it| it.result.is_some() && !(self.awaits_tracks && it.tracks.is_none()))
     }
@@ -348,20 +348,21 @@ impl OpenFrame {
         let result = self.result();
         let (vehicles, points) = self.vehicles();
         let began = self.truth.as_ref().map(|(began, _)| *began);
-        let since_began_ms = |nanos: u64| began.map(|began| (nanos as f64 - began as f64) / 1e6);
         let done = self.result.as_ref().map(|(done, _)| *done);
-        let posed = result.and_then(|result| self.poses.get(&result.ego));
-        let process = |(process, (_, stages)): (&String, &(Ledger, Vec<StageSummary>))| Process {
+        let posed = result.and_then(|result| Some(self.poses.get(&result.ego)?.0));
+        let [latency_ms, posed_ms] =
+            [done, posed].map(|nanos| Some((nanos? as f64 - began? as f64) / 1e6));
+        let processes = ledgers.iter().map(|(process, (_, stages))| Process {
             process: process.clone(),
             stages: stages.clone(),
-        };
+        });
         SceneFrame {
             capture_s: capture_nanos as f64 / 1e9,
             tick: self.truth.as_ref().map(|(_, truth)| truth.tick),
             ego: result.map(|result| result.ego.clone()),
             method: result.map(|result| result.method.clone()),
-            latency_ms: done.and_then(since_began_ms),
-            posed_ms: posed.and_then(|(posed, _)| since_began_ms(*posed)),
+            latency_ms,
+            posed_ms,
             vehicles,
             truth: self.true_boxes(judgement),
             detections: self.detections(judgement),
@@ -369,7 +370,7 @@ impl OpenFrame {
             tracks: self.tracks.clone().unwrap_or_default(),
             links: self.links(),
             stages: result.map_or(Vec::new(), |result| result.stages.clone()),
-            processes: ledgers.iter().map(process).collect(),
+            processes: processes.collect(),
             messages: messages(ledgers.values().map(|(ledger, _)| ledger)),
             points,
             ..SceneFrame::default()
@@ -416,9 +417,6 @@ impl OpenFrame {
         let pose = estimate.and_then(PoseEstimate::world_from_cav);
         let sweep = self.sweep(cav);
         points.extend(&sweep);
-        let position = |pose: &Pose| Vector3::from(pose.translation_m);
-        let distance_m =
-            |(found, truth): (&Pose, &Pose)| (position(found) - position(truth)).norm();
         Vehicle {
             cav: cav.clone(),
             pose: pose.map(Planar::of),
@@ -431,7 +429,9 @@ impl OpenFrame {
                 _ => None,
             },
             truth: truth.map(Planar::of),
-            error_m: pose.zip(truth).map(distance_m),
+            error_m: pose.zip(truth).map(|(found, truth)| {
+                (Vector3::from(found.translation_m) - Vector3::from(truth.translation_m)).norm()
+            }),
             // Points of a vehicle without an estimate are shown where it truly is.
             world_from_lidar: pose.or(truth).copied(),
             points: sweep.len() / POINT_BYTES,
@@ -448,7 +448,7 @@ impl OpenFrame {
         for object in self.true_agents().flat_map(|agent| &agent.objects) {
             objects.entry(object.id).or_insert(object);
         }
-        let shown = |object: &TrueObject| ShownBox {
+        let shown = objects.into_values().map(|object| ShownBox {
             id: Some(object.id),
             is_counted: judgement.found.contains_key(&object.id),
             found_score: judgement.found.get(&object.id).copied().flatten(),
@@ -459,8 +459,8 @@ impl OpenFrame {
                 size_m: object.size_m,
                 heading_rad: object.world_from_object.yaw_rad(),
             })
-        };
-        objects.into_values().map(shown).collect()
+        });
+        shown.collect()
     }
 
     /// The ego's detections, placed by its estimated pose.
@@ -477,10 +477,9 @@ impl OpenFrame {
 
     /// Detections that single vehicles sent.
     fn single(&self) -> Vec<ShownBox> {
-        let each = |(cav, boxes): (&CavId, &Boxes)| {
-            self.placed(cav, &boxes.pose, boxes.detections(), Some(cav))
-        };
-        self.own_boxes.iter().flat_map(each).collect()
+        let shown = { self.own_boxes.iter() }
+            .flat_map(|(cav, boxes)| self.placed(cav, &boxes.pose, boxes.detections(), Some(cav)));
+        shown.collect()
     }
 
     /// Detections in the frame of a vehicle, placed by its estimated pose, or else by its true one.
@@ -495,52 +494,49 @@ impl OpenFrame {
         let Some(world_from_cav) = pose.map(Pose::isometry) else {
             return Vec::new();
         };
-        let shown = |detection: &Detection| ShownBox {
+        let shown = found.map(|detection| ShownBox {
             score: Some(detection.score),
             source: source.or(detection.source.as_ref()).cloned(),
             ..ShownBox::of(detection.box3d.transformed(&world_from_cav))
-        };
-        found.map(shown).collect()
+        });
+        shown.collect()
     }
 
     fn links(&self) -> Vec<Link> {
         let Some(result) = self.result() else {
             return Vec::new();
         };
-        let new = |from: &CavId| Link {
-            from: from.to_string(),
-            to: result.ego.to_string(),
-            ..Link::default()
-        };
         let mut links: BTreeMap<&CavId, Link> = BTreeMap::new();
         for (cav, arrival) in self.arrivals.iter().filter(|(cav, _)| **cav != result.ego) {
             let link = Link {
+                from: cav.to_string(),
                 latency_ms: Some(arrival.latency_ms),
                 stream: Some(arrival.stream.to_string()),
-                ..new(cav)
+                ..Link::default()
             };
             links.insert(cav, link);
         }
         let mut all = Vec::new();
         for fused in &result.fused {
             all.push(Link {
+                from: fused.cav.to_string(),
                 wire_bytes: Some(fused.wire_bytes),
                 age_ms: Some(fused.age_nanos as f64 / 1e6),
                 is_fused: true,
-                ..links.remove(&fused.cav).unwrap_or_else(|| new(&fused.cav))
+                ..links.remove(&fused.cav).unwrap_or_default()
             });
         }
         for skipped in &result.skipped {
             all.push(Link {
+                from: skipped.cav.to_string(),
                 skipped: skipped.reason,
-                ..links
-                    .remove(&skipped.cav)
-                    .unwrap_or_else(|| new(&skipped.cav))
+                ..links.remove(&skipped.cav).unwrap_or_default()
             });
         }
         // From these something has arrived, but the result does not name them.
         all.extend(links.into_values());
         for link in &mut all {
+            link.to = result.ego.to_string();
             let mut neighbours = result.neighbours.iter();
             let Some(known) = neighbours.find(|known| known.cav.as_str() == link.from) else {
                 continue;
@@ -557,12 +553,12 @@ impl OpenFrame {
 fn messages<'a>(ledgers: impl Iterator<Item = &'a Ledger>) -> Vec<Messages> {
     let mut sum = Ledger::default();
     ledgers.for_each(|ledger| sum.merge(ledger));
-    let line = |(account, counts): (&protocol::Account, &protocol::Counts)| Messages {
+    let lines = sum.iter().map(|(account, counts)| Messages {
         topic: account.topic.to_string(),
         to: account.to.as_ref().map(ToString::to_string),
         sent: counts.sent,
         received: counts.received,
         dropped: counts.dropped.clone(),
-    };
-    sum.iter().map(line).collect()
+    });
+    lines.collect()
 }

@@ -24,11 +24,9 @@ pub struct DetectionArea {
 
 impl From<&BevGrid> for DetectionArea {
     fn from(grid: &BevGrid) -> Self {
-        let edges = |low_m: f64, cells: u32| [low_m, low_m + f64::from(cells) * grid.cell_m];
-        Self {
-            x_m: edges(grid.x_min_m, grid.width),
-            y_m: edges(grid.y_min_m, grid.height),
-        }
+        let [x_m, y_m] = [(grid.x_min_m, grid.width), (grid.y_min_m, grid.height)]
+            .map(|(low_m, cells)| [low_m, low_m + f64::from(cells) * grid.cell_m]);
+        Self { x_m, y_m }
     }
 }
 
@@ -44,14 +42,12 @@ pub(super) struct Judgement {
 impl Judgement {
     /// True and false positives from a score on, and missed objects.
     pub(super) fn counts(&self, result: &Detections, least_score: f32) -> [usize; 3] {
-        let shown = || {
-            let all = result.detections.iter().zip(&self.verdicts);
-            all.filter(|(detection, _)| detection.score >= least_score)
-        };
-        let matches = shown().filter(|(_, verdict)| matches!(verdict, Verdict::Match(_)));
-        let wrong = shown().filter(|(_, verdict)| **verdict == Verdict::FalsePositive);
-        let is_missed = |score: &&Option<f32>| score.is_none_or(|score| score < least_score);
-        let missed = self.found.values().filter(is_missed);
+        let all = result.detections.iter().zip(&self.verdicts);
+        let shown = all.filter(|(detection, _)| detection.score >= least_score);
+        let matches = { shown.clone() }.filter(|(_, verdict)| matches!(verdict, Verdict::Match(_)));
+        let wrong = shown.filter(|(_, verdict)| **verdict == Verdict::FalsePositive);
+        let missed =
+            { self.found.values() }.filter(|score| score.is_none_or(|score| score < least_score));
         [matches.count(), wrong.count(), missed.count()]
     }
 }

@@ -41,8 +41,9 @@ struct LinkMessages {
 impl LinkSeries {
     /// Collects the messages to `ego`. Where there is no link emulation, they arrive when the recorder has them.
     pub(super) fn new(entries: &[Entry], ego: &CavId) -> Self {
-        let arrives = |entry: &&Entry| matches!(&entry.key.topic, Topic::Received { ego: to, .. } if to == ego);
-        let is_emulated = entries.iter().any(|entry| arrives(&entry));
+        let mut topics = entries.iter().map(|entry| &entry.key.topic);
+        let is_emulated =
+            topics.any(|topic| matches!(topic, Topic::Received { ego: to, .. } if to == ego));
         let mut series = Self::default();
         for entry in entries {
             let (cav, stream, is_sent, is_arrived) = match &entry.key.topic {
@@ -80,7 +81,7 @@ impl LinkSeries {
 
     /// Traffic of every link for the frame of a capture time, whose tick was published at `began_nanos`.
     pub(super) fn at(&self, capture_nanos: u64, began_nanos: Option<u64>) -> Vec<LinkTraffic> {
-        let traffic = |(from, link): (&CavId, &LinkMessages)| LinkTraffic {
+        let traffic = self.links.iter().map(|(from, link)| LinkTraffic {
             from: from.clone(),
             sent_bytes: link.sent.get(&capture_nanos).copied().unwrap_or(0),
             transit_ms: link.transit_ms.get(&capture_nanos).copied(),
@@ -88,8 +89,8 @@ impl LinkSeries {
             // before it is published, and the difference stays at 0.
             waiting_bytes: began_nanos
                 .map(|now| until(&link.published, now).saturating_sub(until(&link.arrived, now))),
-        };
-        self.links.iter().map(traffic).collect()
+        });
+        traffic.collect()
     }
 }
 

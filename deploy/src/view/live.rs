@@ -319,8 +319,8 @@ impl Listener {
             return;
         }
         if maps.is_none() {
-            let one = |cav| KeyExpr::one(&Key::stream(&self.run, cav, Stream::Bev));
-            let selectors: Vec<KeyExpr> = wanted.iter().map(one).collect();
+            let keys = { wanted.iter() }.map(|cav| Key::stream(&self.run, cav, Stream::Bev));
+            let selectors: Vec<KeyExpr> = keys.map(|key| KeyExpr::one(&key)).collect();
             let opened = self.open(&selectors, "feature maps");
             *maps = opened.map(|opened| (wanted, opened));
         }

@@ -149,8 +149,8 @@ impl RecordedRun {
             areas,
             protocol: { file.parent() }.and_then(|folder| RunStatus::read(folder).ok()?.protocol),
         };
-        let moment = |(at, entries)| run.moment(at, entries);
-        run.moments = moments.into_iter().filter_map(moment).collect();
+        let shown = { moments.into_iter() }.filter_map(|(at, entries)| run.moment(at, entries));
+        run.moments = shown.collect();
         if run.moments.is_empty() {
             return Err(ViewError::Empty(file));
         }
@@ -196,9 +196,8 @@ impl RecordedRun {
         // Reports until the last message of the moment: what was known at that time.
         let until = arrivals.max().unwrap_or(0);
         // Results come last, and complete the scene frame.
-        let is_of_result = |entry: &&usize| is_result(&self.entry(**entry).key.topic);
         let (results, others): (Vec<usize>, Vec<usize>) =
-            moment.entries.iter().partition(is_of_result);
+            { moment.entries.iter() }.partition(|at| is_result(&self.entry(**at).key.topic));
         let reports = self.reports_until(until).into_iter();
         for number in reports.chain(others).chain(results) {
             let entry = self.entry(number);
@@ -287,10 +286,10 @@ impl RecordedRun {
 
     /// `None` if there is neither truth nor result.
     fn moment(&self, capture_nanos: u64, entries: Vec<usize>) -> Option<Moment> {
-        let all = || entries.iter().map(|index| self.entry(*index));
-        let truth = all().find(|entry| entry.key.topic == Topic::Truth);
+        let mut all = entries.iter().map(|index| self.entry(*index));
+        let truth = all.clone().find(|entry| entry.key.topic == Topic::Truth);
         let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
-        let is_shown = truth.is_some() || all().any(|entry| is_result(&entry.key.topic));
+        let is_shown = truth.is_some() || all.any(|entry| is_result(&entry.key.topic));
         is_shown.then_some(Moment {
             capture_nanos,
             began_nanos,
@@ -299,8 +298,8 @@ impl RecordedRun {
     }
 
     fn timeline_of(&self, ego: Option<CavId>) -> Result<Timeline> {
-        let links_to = |ego| LinkSeries::new(self.recording.entries(), ego);
-        let links = ego.as_ref().map(links_to).unwrap_or_default();
+        let links = { ego.as_ref() }.map(|ego| LinkSeries::new(self.recording.entries(), ego));
+        let links = links.unwrap_or_default();
         let (mut pace, mut judge) = (PaceCounter::default(), Judge::new(self.protocol.clone()));
         let mut summaries = Vec::with_capacity(self.moments.len());
         let mut tracks = Vec::with_capacity(self.moments.len());
@@ -308,8 +307,8 @@ impl RecordedRun {
             let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;
             summary.links = links.at(moment.capture_nanos, moment.began_nanos);
             if let Some(began) = moment.began_nanos {
-                let done = |latency_ms| began.saturating_add((latency_ms * 1e6) as u64);
-                pace.tick(summary.latency_ms.map(done));
+                let done = { summary.latency_ms }.map(|ms| began.saturating_add((ms * 1e6) as u64));
+                pace.tick(done);
             }
             summaries.push(summary);
             let topic = ego.as_ref().map(|ego| Topic::stream(ego, Stream::Tracks));

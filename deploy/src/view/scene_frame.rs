@@ -203,8 +203,7 @@ impl SceneFrame {
             let (points, behind) = rest.split_at((vehicle.points * POINT_BYTES).min(rest.len()));
             rest = behind;
             let points = points.chunks_exact(POINT_BYTES).map(|point| {
-                let at = |axis: usize| i16::from_le_bytes([point[2 * axis], point[2 * axis + 1]]);
-                [0, 1, 2].map(|axis| f32::from(at(axis)) / 100.0)
+                [0, 2, 4].map(|i| f32::from(i16::from_le_bytes([point[i], point[i + 1]])) / 100.0)
             });
             (vehicle, points.collect())
         })
@@ -244,20 +243,20 @@ impl Planar {
 }
 
 fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S::Ok, S::Error> {
-    let rows = |pose: &Pose| {
+    let rows = pose.as_ref().map(|pose| {
         let matrix = pose.isometry().to_homogeneous();
         [0, 1]
             .map(|row| [0, 1, 2, 3].map(|column| matrix[(row, column)]))
             .concat()
-    };
-    pose.as_ref().map(rows).serialize(serializer)
+    });
+    rows.serialize(serializer)
 }
 
 /// The points of a sweep as sent to the page, evenly decimated if there are many.
 pub(super) fn decimate(points: &PointCloud) -> Vec<u8> {
-    // The cast saturates: beyond 327.67 m a coordinate stays at that limit.
-    let centimetres = |metres: f32| ((metres * 100.0).round() as i16).to_le_bytes();
     let decimated = points.decimate(MAX_POINTS);
     let coordinates = { decimated.xyzi.iter() }.flat_map(|[x, y, z, _]| [*x, *y, *z]);
-    coordinates.flat_map(centimetres).collect()
+    // The cast saturates: beyond 327.67 m a coordinate stays at that limit.
+    let bytes = coordinates.flat_map(|metres| ((metres * 100.0).round() as i16).to_le_bytes());
+    bytes.collect()
 }

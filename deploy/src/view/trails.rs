@@ -38,7 +38,7 @@ impl Trails {
             return Vec::new();
         };
         let world_from_ego = pose.isometry();
-        let shown = |track: &Track| {
+        let shown = tracks.tracks.iter().map(|track: &Track| {
             let place = world_from_ego * Point3::from(track.box3d.center_m);
             let trail = self.places.entry(track.id).or_default();
             trail.push_back((capture_nanos, [place.x, place.y]));
@@ -49,8 +49,8 @@ impl Trails {
                 speed_mps: x.hypot(y),
                 is_seen: track.unseen_s == 0.0,
             }
-        };
-        tracks.tracks.iter().map(shown).collect()
+        });
+        shown.collect()
     }
 }
 

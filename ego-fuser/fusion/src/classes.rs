@@ -21,14 +21,15 @@ impl Classes {
     /// that is trained with the fusion has created them; otherwise they are created here.
     pub(crate) fn under(path: &nn::Path<'_>, [channels, anchors]: [i64; 2]) -> Self {
         let path = path / "cls_head";
-        let of = |name: &str, size: &[i64]| {
+        let [weight, bias] = [
+            ("weight", &[anchors, channels, 1, 1][..]),
+            ("bias", &[anchors][..]),
+        ]
+        .map(|(name, size)| {
             path.get(name)
                 .unwrap_or_else(|| path.var(name, size, RANDOM))
-        };
-        Self {
-            weight: of("weight", &[anchors, channels, 1, 1]),
-            bias: of("bias", &[anchors]),
-        }
+        });
+        Self { weight, bias }
     }
 
     /// The same head; nothing is copied.

@@ -93,12 +93,14 @@ impl Fusion for Cobevt {
 
 /// `[N]`: indices of the maps, the ego first and then by distance.
 pub(super) fn nearest_first(metadata: &[MapMetadata]) -> Tensor {
-    let distance = |index: &i64| {
-        let [x, y, _] = metadata[*index as usize].ego_from_cav.translation_m;
-        // Below every distance: the ego stays first beside a neighbour at the same place.
-        if *index == 0 { -1.0 } else { x.hypot(y) }
-    };
     let mut order: Vec<i64> = (0..metadata.len() as i64).collect();
-    order.sort_by(|one, other| distance(one).total_cmp(&distance(other)));
+    order.sort_by(|&one, &other| {
+        let [one, other] = [one as usize, other as usize].map(|index| {
+            let [x, y, _] = metadata[index].ego_from_cav.translation_m;
+            // Below every distance: the ego stays first beside a neighbour at the same place.
+            if index == 0 { -1.0 } else { x.hypot(y) }
+        });
+        one.total_cmp(&other)
+    });
     Tensor::from_slice(&order)
 }

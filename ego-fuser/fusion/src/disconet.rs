@@ -82,17 +82,17 @@ impl DiscoNet {
         config.validate()?;
         let path = path / "pixel_weight_layer";
         let [first, second, third] = config.hidden;
-        let layer = |index: usize, io: [i64; 2]| {
-            let norm = Norm::with_defaults(&(&path / format!("bn1_{index}")), io[1]);
-            (Conv::new(&(&path / format!("conv1_{index}")), io, 1), norm)
-        };
         Ok(Self {
             channels: config.channels,
             layers: [
-                layer(1, [2 * config.channels, first]),
-                layer(2, [first, second]),
-                layer(3, [second, third]),
-            ],
+                (1, [2 * config.channels, first]),
+                (2, [first, second]),
+                (3, [second, third]),
+            ]
+            .map(|(index, io)| {
+                let norm = Norm::with_defaults(&(&path / format!("bn1_{index}")), io[1]);
+                (Conv::new(&(&path / format!("conv1_{index}")), io, 1), norm)
+            }),
             weight: Conv::new(&(&path / "conv1_4"), [third, 1], 1),
         })
     }

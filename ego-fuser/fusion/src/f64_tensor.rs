@@ -24,10 +24,9 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
 /// Count of the numbers that are not below `least`, rounded up to a multiple of `step`.
 pub(crate) fn above(numbers: &[f32], least: f32, step: usize) -> usize {
     // NaN is not below anything, so it counts.
-    let is_above = |number: &&f32| number.partial_cmp(&&least) != Some(Ordering::Less);
     numbers
         .iter()
-        .filter(is_above)
+        .filter(|number| number.partial_cmp(&&least) != Some(Ordering::Less))
         .count()
         .next_multiple_of(step)
 }
@@ -102,6 +101,11 @@ pub(crate) fn picked(tensor: &Tensor, rows: &[i64]) -> Result<Tensor, TchError> 
         0,
         &Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?,
     )
+}
+
+/// The sum over the first dimension.
+pub(crate) fn sum_over_first(tensor: &Tensor) -> Result<Tensor, TchError> {
+    tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None)
 }
 
 /// `[C, H * W]` of a map `[C, H, W]`, without a copy in either memory order.

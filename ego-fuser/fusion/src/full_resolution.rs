@@ -119,13 +119,13 @@ impl FullResolutionMap {
                 let sampling_grid = Tensor::f_from_slice(places)?
                     .f_view([1, 1, -1, 2])?
                     .f_to_device(map.device())?;
-                let read = |map: &Tensor, how| {
+                let [features, mask] = [(map, BILINEAR), (sent, NEAREST)].map(|(map, how)| {
                     let read = map.f_grid_sampler(&sampling_grid, how, PADDING_ZEROS, false)?;
                     read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)
-                };
-                let mask = read(sent, NEAREST)?.f_ceil()?;
+                });
+                let mask = mask?.f_ceil()?;
                 Ok(CellSamples {
-                    features: read(map, BILINEAR)? * &mask,
+                    features: features? * &mask,
                     mask,
                 })
             }

@@ -200,8 +200,8 @@ fn attend_and_learn_bias(
 ) -> Result<Tensor, TchError> {
     let (groups, heads, asking, channels) = query.size4()?;
     let asked = key.size()[2];
-    let flat = |x: &Tensor, tokens: i64| x.f_reshape([groups * heads, tokens, channels]);
-    let (query, key) = (flat(query, asking)?, flat(key, asked)?.f_transpose(1, 2)?);
+    let query = query.f_flatten(0, 1)?;
+    let key = key.f_flatten(0, 1)?.f_transpose(1, 2)?;
     let scale = (channels as f64).powf(-0.5);
     let scores = if bias.dim() == 2 {
         bias.f_baddbmm(&query, &key, 1.0, scale)?
@@ -213,7 +213,7 @@ fn attend_and_learn_bias(
     };
     let weights = scores.f_softmax(-1, None::<Kind>)?;
     weights
-        .f_bmm(&flat(value, asked)?)?
+        .f_bmm(&value.f_flatten(0, 1)?)?
         .f_view([groups, heads, asking, channels])
 }
 

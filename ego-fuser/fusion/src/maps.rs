@@ -59,7 +59,10 @@ impl ReceivedMaps {
     /// # Errors
     /// [`TchError`] when there are fewer.
     pub fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
-        let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
+        let sent = match &self.sent {
+            Some(sent) => Some(sent.f_narrow(0, first, end - first)?),
+            None => None,
+        };
         let full_resolution = self
             .full_resolution
             .get(first as usize..end as usize)
@@ -69,7 +72,7 @@ impl ReceivedMaps {
                 .iter()
                 .map(FullResolutionMap::shallow_clone)
                 .collect(),
-            ..Self::new(of(&self.maps)?, self.sent.as_ref().map(of).transpose()?)
+            ..Self::new(self.maps.f_narrow(0, first, end - first)?, sent)
         })
     }
 
@@ -81,11 +84,11 @@ impl ReceivedMaps {
         let maps: Vec<&Tensor> = all.iter().map(|maps| &maps.maps).collect();
         // If one of them was sent completely, its mask has to be written out.
         let sent = all.iter().any(|maps| maps.sent.is_some()).then(|| {
-            let cells = |maps: &&Self| match &maps.sent {
+            let cells = all.iter().map(|maps| match &maps.sent {
                 Some(sent) => Ok(sent.shallow_clone()),
                 None => maps.maps.f_narrow(1, 0, 1)?.f_ones_like(),
-            };
-            Tensor::f_cat(&all.iter().map(cells).collect::<Result<Vec<_>, _>>()?, 0)
+            });
+            Tensor::f_cat(&cells.collect::<Result<Vec<_>, TchError>>()?, 0)
         });
         Ok(Self {
             maps: Tensor::f_cat(&maps, 0)?,
@@ -181,8 +184,11 @@ pub(crate) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError
 
 /// The sums of each `count` neighbours along `dim`.
 fn sum_of_every(maps: &Tensor, dim: i64, count: i64) -> Result<Tensor, TchError> {
-    let every = |first: i64| maps.f_slice(dim, first, None, count);
-    (1..count).try_fold(every(0)?, |sum, first| sum.f_add(&every(first)?))
+    let mut sum = maps.f_slice(dim, 0_i64, None, count)?;
+    for first in 1..count {
+        sum = sum.f_add(&maps.f_slice(dim, first, None, count)?)?;
+    }
+    Ok(sum)
 }
 
 /// The grid of pooled maps.

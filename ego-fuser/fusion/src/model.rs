@@ -177,10 +177,9 @@ impl CooperativeModel {
             model.add_refinement();
         }
         // A single-vehicle network becomes a cooperative one whose fusion is untrained.
-        let is_fusion =
-            |name: &str| name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
         weights.copy_some_into(&model.variables, |name| {
-            !is_fusion(name) || weights.contains(name)
+            let is_fusion = name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
+            !is_fusion || weights.contains(name)
         })?;
         Ok(model)
     }
@@ -362,13 +361,11 @@ impl CooperativeModel {
             Ok(self.fusion.with_boxes(&fused, head, boxes)?)
         });
         let heads = heads.collect::<Result<Vec<HeadOutput>, ModelError>>()?;
-        let all = |map: fn(&HeadOutput) -> &Tensor| {
-            let maps: Vec<&Tensor> = heads.iter().map(map).collect();
-            Tensor::f_cat(&maps, 0)
-        };
+        let scores: Vec<&Tensor> = heads.iter().map(|head| &head.scores).collect();
+        let offsets: Vec<&Tensor> = heads.iter().map(|head| &head.offsets).collect();
         Ok(HeadOutput {
-            scores: all(|head| &head.scores)?,
-            offsets: all(|head| &head.offsets)?,
+            scores: Tensor::f_cat(&scores, 0)?,
+            offsets: Tensor::f_cat(&offsets, 0)?,
         })
     }
 

@@ -141,36 +141,32 @@ impl Fusion for ScriptFusion {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let features = &maps.warped.features;
         let device = features.device();
-        let column = |of: fn(&MapMetadata) -> f64| {
-            let values: Vec<f32> = maps.metadata.iter().map(|map| of(map) as f32).collect();
-            Tensor::f_from_slice(&values)?.f_to_device(device)
-        };
         let poses: Vec<f32> = maps.metadata.iter().flat_map(planar).collect();
         let poses = Tensor::f_from_slice(&poses)?
             .f_view([-1, 3])?
             .f_to_device(device)?;
-        let [confidence, age_s] = [column(|map| map.confidence)?, column(|map| map.age_secs)?];
-        let of_file = |text: String| TchError::Torch(format!("{}: {text}", self.file.display()));
+        let about: (Vec<f32>, Vec<f32>) = { maps.metadata.iter() }
+            .map(|map| (map.confidence as f32, map.age_secs as f32))
+            .unzip();
+        let confidence = Tensor::f_from_slice(&about.0)?.f_to_device(device)?;
+        let age_s = Tensor::f_from_slice(&about.1)?.f_to_device(device)?;
         let arguments = [features, &maps.warped.mask, &poses, &confidence, &age_s];
-        let fused = self
-            .module
-            .forward_ts(&arguments)
-            .map_err(|error| of_file(first_line(&error)))?;
-        // A map of another shape or kind would fail in the head only, without the name of the file.
-        let (found, expected) = (fused.size(), &features.size()[1..]);
-        if found != expected {
-            return Err(of_file(format!(
-                "forward returns a map of {found:?}, not of {expected:?}"
-            )));
-        }
-        if fused.kind() != features.kind() {
-            return Err(of_file(format!(
+        let expected = &features.size()[1..];
+        let fused = match self.module.forward_ts(&arguments) {
+            Err(error) => Err(first_line(&error)),
+            // A map of another shape or kind would fail in the head only, without the name of the file.
+            Ok(fused) if fused.size() != expected => Err(format!(
+                "forward returns a map of {:?}, not of {expected:?}",
+                fused.size()
+            )),
+            Ok(fused) if fused.kind() != features.kind() => Err(format!(
                 "forward returns {:?}, not {:?}",
                 fused.kind(),
                 features.kind()
-            )));
-        }
-        Ok(fused.into())
+            )),
+            Ok(fused) => Ok(fused.into()),
+        };
+        fused.map_err(|text| TchError::Torch(format!("{}: {text}", self.file.display())))
     }
 }
 

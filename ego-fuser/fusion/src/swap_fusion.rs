@@ -114,24 +114,18 @@ impl OffsetTable {
 
     /// `[M, asking * cells, asked * cells]` added to the scores. Agents beyond the table's range use its last entry.
     pub(super) fn bias(&self, asking: i64, asked: i64) -> tch::Result<Tensor> {
-        let (span, last) = (2 * self.window - 1, self.slots - 1);
-        let tokens = |slots: i64| {
-            let window = self.window;
-            (0..slots).flat_map(move |slot| {
-                (0..window * window).map(move |cell| [slot, cell / window, cell % window])
-            })
-        };
-        let offset = |from: [i64; 3], to: [i64; 3]| {
-            // Agents beyond the slots of the weights share the offset of the last slot.
-            let agent = (from[0] - to[0]).clamp(-last, last) + last;
-            (agent * span + from[1] - to[1] + self.window - 1) * span + from[2] - to[2]
-                + self.window
-                - 1
-        };
-        let index: Vec<i64> = tokens(asking)
-            .flat_map(|from| tokens(asked).map(move |to| offset(from, to)))
-            .collect();
-        let cells = self.window * self.window;
+        let (window, cells) = (self.window, self.window * self.window);
+        let (span, last) = (2 * window - 1, self.slots - 1);
+        let mut index = Vec::with_capacity((asking * cells * asked * cells) as usize);
+        for from in 0..asking * cells {
+            for to in 0..asked * cells {
+                // Agents beyond the slots of the weights share the offset of the last slot.
+                let agent = (from / cells - to / cells).clamp(-last, last) + last;
+                let row = from % cells / window - to % cells / window + window - 1;
+                let column = from % window - to % window + window - 1;
+                index.push((agent * span + row) * span + column);
+            }
+        }
         let index = Tensor::f_from_slice(&index)?.f_to_device(self.table.device())?;
         let shape = [asking * cells, asked * cells, self.heads];
         let bias = self.table.f_index_select(0, &index)?.f_view(shape)?;
@@ -163,28 +157,28 @@ impl GroupAttention {
 
     /// `[G, S, P, C]` to the same, of which the first `asked` slots are attended to.
     fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> tch::Result<Tensor> {
-        let &[groups, slots, _, channels] = &x.size()[..] else {
+        let &[_, slots, _, channels] = &x.size()[..] else {
             return Err(shape_error(x));
         };
-        let heads = |part: &Tensor| part.f_unflatten(-1, [self.heads, channels / self.heads]);
-        let flat = |x: &Tensor| x.f_view([groups, -1, x.size()[3]]);
+        let by_head = [self.heads, channels / self.heads];
         let parts = if asked == slots {
-            flat(&self.to_qkv.forward(x)?)?.f_split(channels, 2)?
+            let parts = self.to_qkv.forward(x)?.f_flatten(1, 2)?;
+            parts.f_split(channels, 2)?
         } else {
             // Slots that are not attended to have no keys and values.
             let weight = &self.to_qkv.weight;
-            let query = flat(&x.f_linear(&weight.f_narrow(0, 0, channels)?, None::<Tensor>)?)?;
+            let query = x.f_linear(&weight.f_narrow(0, 0, channels)?, None::<Tensor>)?;
             let there = x.f_narrow(1, 0, asked)?.f_contiguous()?;
             let key_value =
                 there.f_linear(&weight.f_narrow(0, channels, 2 * channels)?, None::<Tensor>)?;
-            std::iter::once(query)
-                .chain(flat(&key_value)?.f_split(channels, 2)?)
+            std::iter::once(query.f_flatten(1, 2)?)
+                .chain(key_value.f_flatten(1, 2)?.f_split(channels, 2)?)
                 .collect()
         };
         let seen = attend(
-            &heads(&parts[0])?,
-            &heads(&parts[1])?,
-            &heads(&parts[2])?,
+            &parts[0].f_unflatten(-1, by_head)?,
+            &parts[1].f_unflatten(-1, by_head)?,
+            &parts[2].f_unflatten(-1, by_head)?,
             Some(bias),
         )?;
         dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(x)

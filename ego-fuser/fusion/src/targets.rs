@@ -111,16 +111,11 @@ impl TargetAssigner {
         let row_y: Vec<f64> = (0..height)
             .map(|row| anchors[row * width * per_cell].center_m[1])
             .collect();
-        let on_lattice = |(index, anchor): (usize, &Box3d)| {
-            let cell = index / per_cell;
-            anchor.center_m[0] == column_x[cell % width]
-                && anchor.center_m[1] == row_y[cell / width]
-        };
-        if let Some(index) = anchors
-            .iter()
-            .enumerate()
-            .position(|entry| !on_lattice(entry))
-        {
+        let off_lattice = anchors.iter().enumerate().position(|(index, anchor)| {
+            let (row, column) = (index / per_cell / width, index / per_cell % width);
+            anchor.center_m[0] != column_x[column] || anchor.center_m[1] != row_y[row]
+        });
+        if let Some(index) = off_lattice {
             return Err(AnchorGridError::NotSeparable { index });
         }
         if !column_x.is_sorted_by(|a, b| a < b) || !row_y.is_sorted_by(|a, b| a < b) {
@@ -192,12 +187,12 @@ impl TargetAssigner {
     fn for_each_near(&self, object: &Box3d, mut visit: impl FnMut(usize)) {
         // The added metre, and a margin for the rounding to f32.
         let reach = self.reach + object.size_m[0].hypot(object.size_m[1]) / 2.0 + 1.01;
-        let within = |centers: &[f64], middle: f64| {
+        let [columns, rows] = [(&self.column_x, 0), (&self.row_y, 1)].map(|(centers, axis)| {
+            let middle = object.center_m[axis];
             centers.partition_point(|&at| at < middle - reach)
                 ..centers.partition_point(|&at| at <= middle + reach)
-        };
-        let columns = within(&self.column_x, object.center_m[0]);
-        for row in within(&self.row_y, object.center_m[1]) {
+        });
+        for row in rows {
             let first = (row * self.column_x.len() + columns.start) * self.per_cell;
             (first..first + columns.len() * self.per_cell).for_each(&mut visit);
         }
@@ -210,11 +205,10 @@ pub fn encode(object: &Box3d, anchor: &Box3d) -> [f64; BOX_CODE] {
     let [l, w, h] = object.size_m;
     let [anchor_l, anchor_w, anchor_h] = anchor.size_m;
     let diagonal = (anchor_w.powi(2) + anchor_l.powi(2)).sqrt();
-    let offset = |axis: usize| object.center_m[axis] - anchor.center_m[axis];
     [
-        offset(0) / diagonal,
-        offset(1) / diagonal,
-        offset(2) / anchor_h,
+        (object.center_m[0] - anchor.center_m[0]) / diagonal,
+        (object.center_m[1] - anchor.center_m[1]) / diagonal,
+        (object.center_m[2] - anchor.center_m[2]) / anchor_h,
         (h / anchor_h).ln(),
         (w / anchor_w).ln(),
         (l / anchor_l).ln(),
@@ -261,10 +255,9 @@ impl Standing {
 
     /// Intersection over union with one metre added to every side, as if metres were pixels.
     fn overlap(&self, other: &Self) -> f32 {
-        let side = |axis: usize| {
+        let [x, y] = [0, 1].map(|axis: usize| {
             self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]) + 1.0
-        };
-        let (x, y) = (side(0), side(1));
+        });
         // The added metre lets boxes overlap that are less than a metre apart.
         if x <= 0.0 || y <= 0.0 {
             return 0.0;

@@ -213,12 +213,10 @@ impl Incoming {
         device: Device,
     ) -> Result<Self, TchError> {
         let receiver_from_ego = nodes[receiver].ego_from_cav.isometry().inverse();
-        let relative = |node: &MapMetadata| -> Pose {
-            (receiver_from_ego * node.ego_from_cav.isometry()).into()
-        };
-        let entries = nodes
-            .iter()
-            .flat_map(|node| cav_from_ego_normalized(&relative(node), grid));
+        let entries = nodes.iter().flat_map(|node| {
+            let receiver_from_cav = receiver_from_ego * node.ego_from_cav.isometry();
+            cav_from_ego_normalized(&Pose::from(receiver_from_cav), grid)
+        });
         let theta = Tensor::f_from_slice(&entries.collect::<Vec<f32>>())?.f_view([-1, 2, 3])?;
         let theta = theta.f_to_device(device)?;
         let mask = match reach {

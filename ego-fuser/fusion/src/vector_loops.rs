@@ -41,8 +41,9 @@ pub(crate) fn exp(x: f32) -> f32 {
 pub(crate) fn exponentials(scores: &mut [f32]) -> f32 {
     let mut most = [f32::NEG_INFINITY; LANES];
     for scores in scores.chunks_exact(LANES) {
-        let larger = |most: f32, score: f32| if most < score { score } else { most };
-        (most.iter_mut().zip(scores)).for_each(|(most, score)| *most = larger(*most, *score));
+        for (most, score) in most.iter_mut().zip(scores) {
+            *most = if *most < *score { *score } else { *most };
+        }
     }
     let most = most.into_iter().fold(f32::NEG_INFINITY, f32::max);
     let mut sums = [0.0; LANES];

@@ -213,15 +213,22 @@ fn error(truth: &Pose, found: &Pose) -> [f64; 2] {
 }
 
 fn summary(offset: &Offset, errors: &[[[f64; 2]; 2]]) -> AlignmentError {
-    let values = |moment: usize, which: usize| errors.iter().map(move |error| error[moment][which]);
-    let mean = |moment, which| values(moment, which).sum::<f64>() / errors.len().max(1) as f64;
-    let median = |moment| statistics::median(&values(moment, 0).collect::<Vec<_>>()).unwrap_or(0.0);
+    let [mean_m, mean_deg] = [0, 1].map(|which| {
+        [0, 1].map(|moment| {
+            let values = errors.iter().map(|error| error[moment][which]);
+            values.sum::<f64>() / errors.len().max(1) as f64
+        })
+    });
+    let p50_m = [0, 1].map(|moment| {
+        let metres: Vec<f64> = errors.iter().map(|error| error[moment][0]).collect();
+        statistics::median(&metres).unwrap_or(0.0)
+    });
     AlignmentError {
         offset: *offset,
         pairs: errors.len(),
-        mean_m: [mean(0, 0), mean(1, 0)],
-        p50_m: [median(0), median(1)],
-        mean_deg: [mean(0, 1), mean(1, 1)],
+        mean_m,
+        p50_m,
+        mean_deg,
     }
 }
 

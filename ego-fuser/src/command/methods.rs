@@ -17,9 +17,11 @@ impl Arguments {
     /// Prints the registry to standard output.
     pub(crate) fn run(self) -> Result<()> {
         if self.json {
-            let row = |method: &Method| json!({"method": method, "exchange": method.exchange(), "summary": method.summary()});
-            let rows: Vec<_> = Method::ALL.iter().map(row).collect();
-            output::line(serde_json::to_string_pretty(&rows)?)?;
+            let rows = Method::ALL.iter().map(|method| {
+                let (exchange, summary) = (method.exchange(), method.summary());
+                json!({"method": method, "exchange": exchange, "summary": summary})
+            });
+            output::line(serde_json::to_string_pretty(&rows.collect::<Vec<_>>())?)?;
         } else {
             for method in Method::ALL {
                 output::line(format_args!("{method:<10} {}", method.summary()))?;

@@ -58,21 +58,23 @@ pub(super) fn corrected(ego_from_cav: Pose, received: &[Detection], own: &[Detec
         boxes,
     });
     let corrected = correct(&pair, &config)[1].ego_from_agent;
-    let is_near = |[x, y, _]: [f64; 3]| {
-        let mut own = own.iter().map(|own| own.box3d.center_m);
-        own.any(|[own_x, own_y, _]| (own_x - x).hypot(own_y - y) < MATCHED_M)
-    };
-    let matches = |ego_from_cav: &Pose| {
-        let ego_from_cav = ego_from_cav.isometry();
-        let landmarks = received.iter().filter(|one| one.score >= config.min_score);
-        landmarks
-            .filter(|one| is_near(one.box3d.transformed(&ego_from_cav).center_m))
-            .count()
-    };
-    match matches(&corrected) >= matches(&ego_from_cav) + MORE_MATCHES {
+    let before = matched_boxes(&ego_from_cav, received, own);
+    match matched_boxes(&corrected, received, own) >= before + MORE_MATCHES {
         true => corrected,
         false => ego_from_cav,
     }
+}
+
+/// Number of sent landmarks that match a box of the ego where a pose places them.
+fn matched_boxes(ego_from_cav: &Pose, received: &[Detection], own: &[Detection]) -> usize {
+    let ego_from_cav = ego_from_cav.isometry();
+    let landmarks = { received.iter() }.filter(|one| one.score >= LANDMARK_SCORE);
+    let centres = landmarks.map(|one| one.box3d.transformed(&ego_from_cav).center_m);
+    let matched = centres.filter(|[x, y, _]| {
+        let mut own = own.iter().map(|own| own.box3d.center_m);
+        own.any(|[own_x, own_y, _]| (own_x - x).hypot(own_y - y) < MATCHED_M)
+    });
+    matched.count()
 }
 
 /// Ego-only detections of a vehicle, in its own frame.

@@ -68,9 +68,10 @@ impl LatencyCompensation {
 
     /// Removes the tracks of neighbours that have not sent for long.
     pub(super) fn forget_absent(&mut self, now_nanos: u64) {
-        let is_absent = |sent_nanos| now_nanos.abs_diff(sent_nanos) > FORGOTTEN_NANOS;
-        self.of_cav
-            .retain(|_, followed| !followed.capture_nanos.is_some_and(is_absent));
+        self.of_cav.retain(|_, followed| {
+            let sent_nanos = followed.capture_nanos;
+            sent_nanos.is_none_or(|sent| now_nanos.abs_diff(sent) <= FORGOTTEN_NANOS)
+        });
     }
 
     /// Removes all tracks: another scene begins.
@@ -165,10 +166,11 @@ impl Followed {
 
 /// True if the velocity that the ego measures contradicts the stated one.
 fn is_contradicted(stated: &ObjectTrack, own: &ObjectTrack) -> bool {
-    let velocity = |track: &ObjectTrack| Vector2::from(track.velocity_mps.map(f64::from));
+    let [stated_mps, own_mps] =
+        [stated, own].map(|track| Vector2::from(track.velocity_mps.map(f64::from)));
     let [xx, xy, yy] = own.velocity_covariance.map(f64::from);
     let covariance = Matrix2::new(xx, xy, xy, yy) + Matrix2::identity() * STATED_SIGMA_MPS.powi(2);
-    let error = velocity(stated) - velocity(own);
+    let error = stated_mps - own_mps;
     let solved = covariance.cholesky().map(|factors| factors.solve(&error));
     // The gate of the tracker itself: both have two degrees of freedom.
     let gate = TrackerConfig::default().gate;

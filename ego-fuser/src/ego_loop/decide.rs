@@ -73,23 +73,24 @@ impl EgoLoop {
     fn is_complete(&self, capture_nanos: u64) -> bool {
         let mut awaited = { self.members.iter() }.filter(|cav| self.silence.is_awaited(cav));
         awaited.all(|cav| {
-            let has = |stream| {
-                let source = (cav.clone(), stream);
-                self.pairing.has_reached(&source, capture_nanos)
-            };
             let is_other = self.models.is_other(cav);
             // Boxes end the wait for maps that are of another network, or not in time.
             let boxes_do = self.reads_boxes
                 && self.box_senders.contains(cav)
                 && (is_other || !self.sends_maps_in_time(cav));
             self.ended.contains(cav)
-                || has(self.stream)
+                || self.has_reached(cav, self.stream, capture_nanos)
                 || if boxes_do {
-                    has(Stream::Boxes)
+                    self.has_reached(cav, Stream::Boxes, capture_nanos)
                 } else {
                     is_other
                 }
         })
+    }
+
+    fn has_reached(&self, cav: &CavId, stream: Stream, capture_nanos: u64) -> bool {
+        let source = (cav.clone(), stream);
+        self.pairing.has_reached(&source, capture_nanos)
     }
 
     /// True for a neighbour whose feature maps came before the ego's next sweep lately.
@@ -272,8 +273,7 @@ impl EgoLoop {
             };
             self.count(view, &choice.messages[index], reason);
             // A neighbour that is in the result by another message is not left out.
-            let is_in = |&index: &usize| choice.views[index].cav == view.cav;
-            if reason.is_some() && !fused.iter().any(is_in) {
+            if reason.is_some() && !fused.iter().any(|&one| choice.views[one].cav == view.cav) {
                 let cav = view.cav.clone();
                 choice.skipped.push(SkippedNeighbour { cav, reason });
             }

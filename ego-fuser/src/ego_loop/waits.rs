@@ -77,10 +77,10 @@ impl Waits {
     /// Waits of three seconds and more, and streams that are missing.
     pub(super) fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         let Self { ego, stream, .. } = self;
-        let is_late = |since: u64| now_nanos.saturating_sub(since) > AFTER_NANOS;
+        let late_before = now_nanos.saturating_sub(AFTER_NANOS);
         let no_own = { self.own_nanos }
             // An agent that publishes other streams is named for that instead.
-            .filter(|since| is_late(*since) && !self.without.contains_key(ego))
+            .filter(|since| *since < late_before && !self.without.contains_key(ego))
             .map(|since| (format!("no {stream} of agent {ego}"), since));
         let without = self.without.iter().map(|(cav, (published, since))| {
             let method = &self.method;
@@ -88,7 +88,7 @@ impl Waits {
             (problem, *since)
         });
         let gone = { self.gone.iter() }
-            .filter(|(_, since)| is_late(**since))
+            .filter(|(_, since)| **since < late_before)
             .map(|(cav, since)| (format!("vehicle {cav} is gone"), *since));
         no_own.into_iter().chain(without).chain(gone).collect()
     }

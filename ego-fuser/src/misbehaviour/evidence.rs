@@ -91,26 +91,17 @@ impl Evidence {
             ..Self::default()
         };
         let sender = Point2::from(ego_from_cav.translation.vector);
-        let is_near = |at: &Point2<f64>| {
-            let mut distances = [at.coords.norm(), (at - sender).norm()].into_iter();
-            distances.all(|distance| (OWN_BODY_M..NEAR_M).contains(&distance))
-        };
-        let points = |seen: &Observation| -> Vec<Point2<f64>> {
+        let [mine, theirs] = [own, theirs].map(|seen| -> Vec<Point2<f64>> {
             { seen.vehicles.iter() }
                 .map(|at| Point2::from(*at))
                 .collect()
-        };
-        let mine = points(own);
-        let theirs_here = { points(theirs).into_iter() }.map(|at| ego_from_cav * at);
-        let theirs_here: Vec<Point2<f64>> = theirs_here.collect();
-        let is_among = |at: &Point2<f64>, others: &[Point2<f64>]| {
-            others.iter().any(|other| (at - other).norm() < radius_m)
-        };
+        });
+        let theirs_here: Vec<_> = theirs.into_iter().map(|at| ego_from_cav * at).collect();
         for at in { theirs_here.iter() }.filter(|at| at.coords.norm() >= OWN_BODY_M) {
-            let is_mine = is_among(at, &mine);
+            let is_mine = is_among(at, &mine, radius_m);
             let sure = own.sure_at([at.x, at.y], radius_m);
             let is_empty = sure.is_some_and(|sure| sure < EMPTY);
-            match (is_near(at), is_mine) {
+            match (is_near_both(at, &sender), is_mine) {
                 (true, true) => evidence.matched += 1,
                 (true, false) if is_empty => {
                     evidence.contradicted += 1;
@@ -120,8 +111,9 @@ impl Evidence {
                 (false, is_mine) => evidence.strange += u32::from(!is_mine && is_empty),
             }
         }
-        let is_missed = |at: &&Point2<f64>| is_near(at) && !is_among(at, &theirs_here);
-        evidence.missed = mine.iter().filter(is_missed).count() as u32;
+        let near = mine.iter().filter(|at| is_near_both(at, &sender));
+        let missed = near.filter(|at| !is_among(at, &theirs_here, radius_m));
+        evidence.missed = missed.count() as u32;
         evidence
     }
 
@@ -225,15 +217,25 @@ impl Evidence {
     }
 }
 
+/// True if a place is within the distance of the ego and of the sender in which both detect objects.
+fn is_near_both(at: &Point2<f64>, sender: &Point2<f64>) -> bool {
+    let mut distances = [at.coords.norm(), (at - sender).norm()].into_iter();
+    distances.all(|distance| (OWN_BODY_M..NEAR_M).contains(&distance))
+}
+
+fn is_among(at: &Point2<f64>, others: &[Point2<f64>], radius_m: f64) -> bool {
+    others.iter().any(|other| (at - other).norm() < radius_m)
+}
+
 /// True if the ego would detect a vehicle there: it is near, and no detected one hides it.
 fn is_in_full_view(at: &Point2<f64>, detected: &[Point2<f64>]) -> bool {
     let distance_m = at.coords.norm();
-    let hides = |other: &Point2<f64>| {
-        let along_m = other.coords.dot(&at.coords) / distance_m;
-        let beside_m = other.coords.perp(&at.coords).abs() / distance_m;
-        (OWN_BODY_M..distance_m).contains(&along_m) && beside_m < HIDDEN_M
-    };
-    distance_m < FULL_VIEW_M && !detected.iter().any(hides)
+    distance_m < FULL_VIEW_M
+        && !detected.iter().any(|other| {
+            let along_m = other.coords.dot(&at.coords) / distance_m;
+            let beside_m = other.coords.perp(&at.coords).abs() / distance_m;
+            (OWN_BODY_M..distance_m).contains(&along_m) && beside_m < HIDDEN_M
+        })
 }
 
 #[cfg(test)]

@@ -89,7 +89,7 @@ pub fn neighbour_states(
     assessments: &[(usize, Assessment)],
     views: &[View],
 ) -> Vec<NeighbourState> {
-    let of = |(index, view): (usize, &View)| {
+    let states = views.iter().enumerate().map(|(index, view)| {
         let assessment = assessments.iter().find(|(known, _)| *known == index);
         let assessment = assessment.map(|(_, assessment)| assessment);
         NeighbourState {
@@ -97,8 +97,8 @@ pub fn neighbour_states(
             misbehaviour: assessment.and_then(|assessment| assessment.misbehaviour),
             ..NeighbourState::new(view.cav.clone())
         }
-    };
-    views.iter().enumerate().map(of).collect()
+    });
+    states.collect()
 }
 
 impl MisbehaviourDetector {
@@ -142,15 +142,12 @@ impl MisbehaviourDetector {
             };
             all.push(seen);
         }
-        // A message that serves a second frame is no new evidence.
-        let is_new = |view: &View| {
-            let last = self.last_of(view);
-            last.is_none_or(|(nanos, ..)| *nanos != view.capture_nanos)
-        };
         let mut evidence = Vec::with_capacity(neighbours.len());
         for ((view, ego_from_cav), seen) in neighbours.iter().zip(&all) {
-            let evidence_of = || self.evidence(own, &mine, view, ego_from_cav, seen);
-            evidence.push(is_new(view).then(evidence_of));
+            // A message that serves a second frame is no new evidence.
+            let last = self.last_of(view);
+            let is_new = last.is_none_or(|(nanos, ..)| *nanos != view.capture_nanos);
+            evidence.push(is_new.then(|| self.evidence(own, &mine, view, ego_from_cav, seen)));
         }
         flag_duplicates(&mut evidence, &all);
         // Of a neighbour's map and boxes the worse counts, once: true boxes are no excuse for a false map.
@@ -283,11 +280,8 @@ fn kind(view: &View) -> usize {
 /// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
 /// neither has any in its favour.
 fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
-    let log_odds = |evidence: &Option<Evidence>| evidence.as_ref()?.log_odds();
-    let fits = evidence
-        .iter()
-        .map(|evidence| log_odds(evidence).unwrap_or(0.0));
-    let fits: Vec<f64> = fits.collect();
+    let log_odds = { evidence.iter() }.map(|evidence| evidence.as_ref()?.log_odds());
+    let fits: Vec<f64> = log_odds.map(|odds| odds.unwrap_or(0.0)).collect();
     for (index, evidence) in evidence.iter_mut().enumerate() {
         let Some(evidence) = evidence else { continue };
         for other in (0..all.len()).filter(|&other| other != index && fits[other] >= fits[index]) {

@@ -79,10 +79,10 @@ impl Observation {
 
     pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
         let sure = all.iter().filter(|(_, score)| *score >= SURE);
-        let values = |([x, y], score): &([f64; 2], f32)| [*x as f32, *y as f32, *score];
+        let values = { all.iter() }.flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]);
         Self {
             vehicles: sure.map(|(at_m, _)| *at_m).collect(),
-            fingerprint: all.iter().flat_map(values).collect(),
+            fingerprint: values.collect(),
             sure: Sure::Boxes(all),
             is_blind: false,
             map: Vec::new(),
@@ -106,8 +106,6 @@ impl Observation {
     ) -> Result<Self, DetectorError> {
         let grid = detector.grid();
         let heads = detector.heads(map)?;
-        // Cells that were not sent have no features that a head can interpret.
-        let was_sent = |cell: usize| sent.is_none_or(|sent| sent[cell]);
         let limits = PostprocessConfig {
             score_threshold: SURE,
             ..PostprocessConfig::for_late_fusion(detector.config())
@@ -116,7 +114,8 @@ impl Observation {
         let mut found = Vec::new();
         for detection in detections(&boxes, &limits) {
             let [x, y, _] = detection.box3d.center_m;
-            if cell_of(&grid, x, y).is_none_or(was_sent) {
+            // Cells that were not sent have no features that a head can interpret.
+            if cell_of(&grid, x, y).is_none_or(|cell| sent.is_none_or(|sent| sent[cell])) {
                 found.push(([x, y], detection.score));
             }
         }
@@ -134,7 +133,7 @@ impl Observation {
         }
         let mut cells = heads.confidence;
         for (cell, sure) in cells.iter_mut().enumerate() {
-            if !was_sent(cell) {
+            if sent.is_some_and(|sent| !sent[cell]) {
                 *sure = 0.0;
             }
         }
@@ -162,8 +161,8 @@ impl Observation {
             }
             Sure::Boxes(_) if at_m[0].hypot(at_m[1]) > REACH_M => None,
             Sure::Boxes(all) => {
-                let distance_m = |[x, y]: &[f64; 2]| (x - at_m[0]).hypot(y - at_m[1]);
-                let near = all.iter().filter(|(at, _)| distance_m(at) <= radius_m);
+                let near = { all.iter() }
+                    .filter(|([x, y], _)| (x - at_m[0]).hypot(y - at_m[1]) <= radius_m);
                 Some(near.map(|(_, score)| *score).fold(0.0, f32::max))
             }
         }
@@ -184,11 +183,12 @@ fn around(grid: &BevGrid, [x, y]: [f64; 2], radius_m: f64) -> impl Iterator<Item
     let grid = *grid;
     let reach = (radius_m / grid.cell_m).ceil() as i64;
     let inside = cell_of(&grid, x, y).is_some();
-    let steps = move || (-reach..=reach).map(move |step| step as f64 * grid.cell_m);
-    let offsets = steps().flat_map(move |down| steps().map(move |right| (down, right)));
+    let offsets = (-reach..=reach).flat_map(move |down| {
+        (-reach..=reach).map(move |right| [down, right].map(|step| step as f64 * grid.cell_m))
+    });
     offsets
-        .filter(move |(down, right)| inside && down.hypot(*right) <= radius_m)
-        .filter_map(move |(down, right)| cell_of(&grid, x + right, y + down))
+        .filter(move |[down, right]| inside && down.hypot(*right) <= radius_m)
+        .filter_map(move |[down, right]| cell_of(&grid, x + right, y + down))
 }
 
 /// Cosine similarity of two messages, -1..1; 1 for copies.
@@ -196,11 +196,12 @@ pub(super) fn cosine_similarity(one: &[f32], other: &[f32]) -> f64 {
     if one.len() != other.len() || one.is_empty() {
         return 0.0;
     }
-    let dot = |a: &[f32], b: &[f32]| {
-        let products = a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b));
-        products.sum::<f64>()
-    };
     dot(one, other) / (dot(one, one) * dot(other, other)).sqrt().max(1e-12)
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    let products = a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b));
+    products.sum()
 }
 
 #[cfg(test)]

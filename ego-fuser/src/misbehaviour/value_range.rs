@@ -37,8 +37,8 @@ impl ValueRange {
             if channel.iter().any(|value| value.abs() > limit) {
                 return true;
             }
-            let is_above = |value: &&f32| value.abs() > CHANNEL * largest;
-            above += channel.iter().filter(is_above).count();
+            let counted = { channel.iter() }.filter(|value| value.abs() > CHANNEL * largest);
+            above += counted.count();
         }
         above as f64 > SHARE * map.len() as f64
     }

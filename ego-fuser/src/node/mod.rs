@@ -354,12 +354,12 @@ impl<'a> Node<'a> {
         stats.answered(None, result.fused.len());
         // On the Unix clock, as is the time of publication in the stamp.
         let (fused, log) = (unix_nanos(), self.log.clone());
-        let complete = move |stamp: &Stamp, result: &mut Detections| {
-            let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
-            result.stages.push(StageTiming::new("send", sending));
-            note(log, Stream::Detections, stamp, result.stages.clone());
-        };
-        self.detections.submit(capture_nanos, result, complete);
+        self.detections
+            .submit(capture_nanos, result, move |stamp, result| {
+                let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
+                result.stages.push(StageTiming::new("send", sending));
+                note(log, Stream::Detections, stamp, result.stages.clone());
+            });
     }
 
     fn publish_tracks(&self, capture_nanos: u64, tracks: Tracks) {

@@ -19,7 +19,7 @@ use perception::train::Prefetch;
 use perception::weights::Weights;
 use protocol::message::Bev;
 use protocol::text::hex;
-use protocol::{Dtype, Header, Limits, WIRE_VERSION, WireError, wire};
+use protocol::{Dtype, Header, Limits, WIRE_VERSION, wire};
 use sha2::{Digest, Sha256};
 use support::file_digests::FileDigests;
 use support::file_error::AtFile;
@@ -199,11 +199,10 @@ impl FeatureStore {
         let mut bytes = vec![0; (end - start) as usize];
         // At an offset of its own: threads share the file without moving a common position.
         self.file.read_exact_at(&mut bytes, start).at(&self.path)?;
-        let decode = || -> Result<_, WireError> {
-            let (_, message): (Header, Bev) = wire::decode([bytes.as_slice()], &Limits::default())?;
-            message.features.decode(&Limits::default())
-        };
-        let features = decode().at(&self.path)?.features;
+        let decoded = wire::decode([bytes.as_slice()], &Limits::default());
+        let (_, message): (Header, Bev) = decoded.at(&self.path)?;
+        let decoded = message.features.decode(&Limits::default());
+        let features = decoded.at(&self.path)?.features;
         let (channels, grid) = (features.channels, features.grid);
         let size = [1, channels, grid.height, grid.width].map(i64::from);
         Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))

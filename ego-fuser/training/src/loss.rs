@@ -115,11 +115,12 @@ impl LabelTensors {
         }
         let shape = [samples.len() as i64, anchors as i64];
         let positives = index.len() as i64;
-        let numbers = |values: &[f32], shape| Tensor::from_slice(values).view(shape);
+        let [positive, score_weight] =
+            [positive, score_weight].map(|values| Tensor::from_slice(&values).view(shape));
         let code = Tensor::from_slice(&code).view([positives, BOX_CODE as i64]);
         Self {
-            positive: numbers(&positive, shape).to_device(device),
-            score_weight: numbers(&score_weight, shape).to_device(device),
+            positive: positive.to_device(device),
+            score_weight: score_weight.to_device(device),
             code: code.to_device(device),
             index: Tensor::from_slice(&index).to_device(device),
             box_weight: Tensor::from_slice(&box_weight).to_device(device),

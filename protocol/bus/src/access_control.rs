@@ -91,15 +91,6 @@ fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
     for right in rights {
         keys.entry(right.act).or_default().push(right.keys.as_str());
     }
-    let rule = |act: Operation, flow: &str, messages: &[&str], keys: &[&str]| {
-        json!({
-            "id": format!("{name} {act:?} {flow}").to_lowercase(),
-            "permission": "allow",
-            "flows": [flow],
-            "messages": messages,
-            "key_exprs": keys,
-        })
-    };
     let mut rules = Vec::new();
     for (act, keys) in keys {
         let (from, to): (&[&str], &[&str]) = match act {
@@ -115,7 +106,13 @@ fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
         // Seen from the router: ingress comes from the principal, egress goes to it.
         for (flow, messages) in [("ingress", from), ("egress", to)] {
             if !messages.is_empty() {
-                rules.push(rule(act, flow, messages, &keys));
+                rules.push(json!({
+                    "id": format!("{name} {act:?} {flow}").to_lowercase(),
+                    "permission": "allow",
+                    "flows": [flow],
+                    "messages": messages,
+                    "key_exprs": keys,
+                }));
             }
         }
     }

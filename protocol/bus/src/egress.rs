@@ -40,16 +40,16 @@ const LOOPBACK: [&str; 2] = ["lo", "lo0"];
 
 /// Settings of zenoh that a router has in addition.
 pub(super) fn settings() -> Vec<(&'static str, Value)> {
-    let micros =
-        |duration: Duration| json!(u64::try_from(duration.as_micros()).unwrap_or(u64::MAX));
+    let [first, fragment] = [FIRST_WAIT, FRAGMENT_WAIT]
+        .map(|wait| json!(u64::try_from(wait.as_micros()).unwrap_or(u64::MAX)));
     let mut settings = vec![
         (
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop",
-            micros(FIRST_WAIT),
+            first,
         ),
         (
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
-            micros(FRAGMENT_WAIT),
+            fragment,
         ),
         ("qos/network", rules()),
     ];

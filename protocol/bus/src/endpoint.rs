@@ -24,19 +24,8 @@ impl Endpoint {
     /// # Errors
     /// [`BusError::Endpoint`] states the text that is not an endpoint.
     pub fn new(text: &str) -> Result<Self, BusError> {
-        let bad = || BusError::Endpoint(text.chars().take(100).collect());
-        let address = text
-            .strip_prefix(TCP)
-            .or_else(|| text.strip_prefix(QUIC))
-            .ok_or_else(bad)?;
-        // From the right: an IPv6 host has colons of its own.
-        let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
-        let bracketed = host.starts_with('[') && host.ends_with(']');
-        let clean = |c: char| {
-            c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c))
-        };
-        if host.is_empty() || !host.chars().all(clean) || port.parse::<u16>().is_err() {
-            return Err(bad());
+        if !is_endpoint(text) {
+            return Err(BusError::Endpoint(text.chars().take(100).collect()));
         }
         Ok(Self(text.into()))
     }
@@ -85,6 +74,19 @@ impl Endpoint {
         // Checked by the constructor.
         self.0.split_once('/').map_or("", |(_, address)| address)
     }
+}
+
+fn is_endpoint(text: &str) -> bool {
+    let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(QUIC));
+    // From the right: an IPv6 host has colons of its own.
+    let Some((host, port)) = address.and_then(|address| address.rsplit_once(':')) else {
+        return false;
+    };
+    let bracketed = host.starts_with('[') && host.ends_with(']');
+    let is_clean = host.chars().all(|c| {
+        c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c))
+    });
+    is_clean && !host.is_empty() && port.parse::<u16>().is_ok()
 }
 
 impl fmt::Display for Endpoint {

@@ -80,12 +80,11 @@ impl RateLimiter {
         };
         // A rate far below one message per second still admits one from time to time.
         let burst = (messages_per_s * BURST_S).max(1.0);
-        let full = || Meter {
+        let meter = meters.entry(key).or_insert_with(|| Meter {
             messages: burst,
             bytes: bytes_per_s * BURST_S,
             at: now,
-        };
-        let meter = meters.entry(key).or_insert_with(full);
+        });
         let passed = now.saturating_duration_since(meter.at).as_secs_f64();
         meter.messages = (meter.messages + passed * messages_per_s).min(burst);
         meter.bytes = (meter.bytes + passed * bytes_per_s).min(bytes_per_s * BURST_S);

@@ -57,17 +57,19 @@ pub fn present(session: &Session, selector: &str) -> Result<BTreeSet<ProcessId>>
         .wait();
     let tokens =
         tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
-    let process =
-        |reply: zenoh::query::Reply| match reply.result().ok()?.key_expr().as_str().parse() {
-            Ok(Key {
-                topic: Topic::Alive { role, cav },
-                ..
-            }) => Some(process_id(role, &cav)),
-            _ => None,
-        };
     Ok(std::iter::from_fn(|| tokens.recv().ok())
-        .filter_map(process)
+        .filter_map(|reply| process_of(&reply))
         .collect())
+}
+
+fn process_of(token: &zenoh::query::Reply) -> Option<ProcessId> {
+    match token.result().ok()?.key_expr().as_str().parse() {
+        Ok(Key {
+            topic: Topic::Alive { role, cav },
+            ..
+        }) => Some(process_id(role, &cav)),
+        _ => None,
+    }
 }
 
 /// A process joined or left.

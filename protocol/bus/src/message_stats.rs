@@ -307,12 +307,13 @@ impl MessageStats {
 
     /// State of the vehicles that have sent messages.
     pub fn peers(&self) -> Vec<PeerSummary> {
-        let summary = |(cav, peer): (&CavId, &Peer)| PeerSummary {
+        let state = self.lock();
+        let peers = state.peers.iter().map(|(cav, peer)| PeerSummary {
             cav: cav.clone(),
             clock_offset_s: peer.clock.as_ref().map(ClockOffset::seconds),
             trust: peer.trust,
-        };
-        self.lock().peers.iter().map(summary).collect()
+        });
+        peers.collect()
     }
 
     /// Sets the problems of a kind, in place of those before: text, and time of the beginning. Each
@@ -334,17 +335,12 @@ impl MessageStats {
 
     /// Problems of the process, each with its duration.
     pub fn problems(&self) -> Vec<String> {
-        let text = |(problem, since): &(String, Instant)| {
-            format!("{problem} (for {:.0} s)", since.elapsed().as_secs_f64())
-        };
         let state = self.lock();
-        state
-            .problems
-            .values()
-            .flatten()
-            .map(text)
-            .take(MAX_PROBLEMS)
-            .collect()
+        let problems = state.problems.values().flatten().take(MAX_PROBLEMS);
+        let texts = problems.map(|(problem, since)| {
+            format!("{problem} (for {:.0} s)", since.elapsed().as_secs_f64())
+        });
+        texts.collect()
     }
 
     /// Records the duration of a stage for one frame.
@@ -382,12 +378,14 @@ impl MessageStats {
 
     /// Published messages and bytes so far, by topic.
     pub fn traffic(&self) -> Vec<TopicTraffic> {
-        let of = |(topic, &(messages, bytes)): (&Topic, &(u64, u64))| TopicTraffic {
+        let state = self.lock();
+        let traffic = state.traffic.iter();
+        let traffic = traffic.map(|(topic, &(messages, bytes))| TopicTraffic {
             topic: topic.clone(),
             messages,
             bytes,
-        };
-        self.lock().traffic.iter().map(of).collect()
+        });
+        traffic.collect()
     }
 
     /// Counts a tick of the scene.
@@ -435,14 +433,14 @@ impl MessageStats {
     /// Histogram of every stage over all its frames.
     pub(crate) fn histograms(&self) -> Vec<StageHistogram> {
         let state = self.lock();
-        let ends = || BUCKETS_S.into_iter().chain([f64::MAX]);
-        let histogram = |(stage, timings): (&String, &Timings)| StageHistogram {
+        let ends = BUCKETS_S.into_iter().chain([f64::MAX]);
+        let histograms = state.stages.iter().map(|(stage, timings)| StageHistogram {
             stage: stage.clone(),
             count: timings.count,
             sum_s: timings.sum.as_secs_f64(),
-            buckets: ends().zip(timings.buckets).collect(),
-        };
-        state.stages.iter().map(histogram).collect()
+            buckets: ends.clone().zip(timings.buckets).collect(),
+        });
+        histograms.collect()
     }
 
     fn note(&self, topic: &Topic, change: impl FnOnce(&mut State)) {
@@ -500,13 +498,13 @@ impl Timings {
             .map(|time| time.as_secs_f64() * 1e3)
             .collect();
         let ms = sorted(&ms);
-        let quantile_ms = |q: f64| quantile(&ms, q).unwrap_or(0.0);
+        let [p50_ms, p95_ms, p99_ms] = [0.50, 0.95, 0.99].map(|q| quantile(&ms, q).unwrap_or(0.0));
         StageSummary {
             stage: stage.to_owned(),
             count: self.count,
-            p50_ms: quantile_ms(0.50),
-            p95_ms: quantile_ms(0.95),
-            p99_ms: quantile_ms(0.99),
+            p50_ms,
+            p95_ms,
+            p99_ms,
             max_ms: self.max.as_secs_f64() * 1e3,
         }
     }

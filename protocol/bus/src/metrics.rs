@@ -162,6 +162,19 @@ fn encode_series<L: EncodeLabelSet, M: EncodeMetric>(
     Ok(())
 }
 
+fn topic_label(account: &Account) -> (&'static str, String) {
+    ("topic", account.topic.to_string())
+}
+
+fn topic_and_side(account: &Account) -> [(&'static str, String); 2] {
+    let side = account.to.as_ref().map_or("sender", |_| "receiver");
+    [topic_label(account), ("side", side.to_owned())]
+}
+
+fn vehicle_label(peer: &PeerSummary) -> [(&'static str, String); 1] {
+    [("vehicle", peer.cav.to_string())]
+}
+
 struct StatsCollector(MessageStats);
 
 impl fmt::Debug for StatsCollector {
@@ -175,18 +188,13 @@ impl Collector for StatsCollector {
         let ledger = self.0.ledger();
         let sent = ledger.iter().filter(|(account, _)| account.to.is_none());
         let received = ledger.iter().filter(|(account, _)| account.to.is_some());
-        let topic = |account: &Account| ("topic", account.topic.to_string());
-        let topic_and_side = |account: &Account| {
-            let side = account.to.as_ref().map_or("sender", |_| "receiver");
-            [topic(account), ("side", side.to_owned())]
-        };
         let help = ("messages_sent", "Messages published");
         let series =
-            sent.map(|(account, counts)| ([topic(account)], ConstCounter::new(counts.sent)));
+            sent.map(|(account, counts)| ([topic_label(account)], ConstCounter::new(counts.sent)));
         encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
         let help = ("messages_received", "Messages accepted and used");
         let series = received
-            .map(|(account, counts)| ([topic(account)], ConstCounter::new(counts.received)));
+            .map(|(account, counts)| ([topic_label(account)], ConstCounter::new(counts.received)));
         encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
         let help = ("messages_dropped", "Messages lost, by reason");
         let series = ledger.iter().flat_map(|(account, counts)| {
@@ -230,9 +238,6 @@ impl Collector for StatsCollector {
         )?;
         encode_frames(&self.0.frames(), &mut encoder)?;
         let peers = self.0.peers();
-        let of_vehicle = |peer: &PeerSummary, value: Option<f64>| {
-            Some(([("vehicle", peer.cav.to_string())], ConstGauge::new(value?)))
-        };
         let help = (
             "clock_offset",
             "Clock of a vehicle minus ours, minus the shortest transit time",
@@ -240,10 +245,12 @@ impl Collector for StatsCollector {
         let seconds = Some(&Unit::Seconds);
         let series = peers
             .iter()
-            .filter_map(|peer| of_vehicle(peer, peer.clock_offset_s));
+            .filter_map(|peer| Some((vehicle_label(peer), ConstGauge::new(peer.clock_offset_s?))));
         encode_series(&mut encoder, help, seconds, MetricType::Gauge, series)?;
         let help = ("trust", "Trust score of a vehicle, 0 to 1");
-        let series = peers.iter().filter_map(|peer| of_vehicle(peer, peer.trust));
+        let series = peers
+            .iter()
+            .filter_map(|peer| Some((vehicle_label(peer), ConstGauge::new(peer.trust?))));
         encode_series(&mut encoder, help, None, MetricType::Gauge, series)?;
         let help = "Duration of a stage for one frame";
         let mut stages =

@@ -87,17 +87,17 @@ impl PassiveSubscriber {
             gaps: Mutex::default(),
             undelivered: AtomicU64::new(0),
         });
-        let subscribe = |selector: &KeyExpr| {
+        let mut subscribers = Vec::with_capacity(selectors.len());
+        for selector in selectors {
             let (shared, status) = (Arc::clone(&shared), status.clone());
             let subscriber = session.declare_subscriber(selector.as_str());
             let subscriber = subscriber
                 .callback(move |sample| shared.admit(&sample, &status))
                 .wait();
-            subscriber.map_err(|cause| {
+            subscribers.push(subscriber.map_err(|cause| {
                 BusError::zenoh(format!("subscribing to {}", selector.as_str()), &cause)
-            })
-        };
-        let subscribers = selectors.iter().map(subscribe).collect::<Result<_, _>>()?;
+            })?);
+        }
         Ok(Self {
             shared,
             _subscribers: subscribers,

@@ -74,17 +74,11 @@ impl<C: ProcessConfig> FromArgMatches for Configured<C> {
     }
 
     fn from_arg_matches_mut(matches: &mut ArgMatches) -> Result<Self, clap::Error> {
-        let refused = |error: &dyn std::fmt::Display| {
-            clap::Error::raw(
-                clap::error::ErrorKind::ValueValidation,
-                format!("{error}\n"),
-            )
-        };
         let file = matches.remove_one::<PathBuf>("config");
         // Step 1: the file, or required options over the defaults.
         let mut config: C = match &file {
-            Some(path) => config_file::read(path).map_err(|error| refused(&error))?,
-            None => minimal(|option| text_of(matches, option)).map_err(|error| refused(&error))?,
+            Some(path) => config_file::read(path).map_err(refused)?,
+            None => minimal(|option| text_of(matches, option)).map_err(refused)?,
         };
         // Step 2: the options that are given override it, the others keep its values.
         config.update_from_arg_matches_mut(matches)?;
@@ -94,6 +88,11 @@ impl<C: ProcessConfig> FromArgMatches for Configured<C> {
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
         self.config.update_from_arg_matches(matches)
     }
+}
+
+fn refused(error: impl std::fmt::Display) -> clap::Error {
+    let kind = clap::error::ErrorKind::ValueValidation;
+    clap::Error::raw(kind, format!("{error}\n"))
 }
 
 /// The option as it was given. A path that is not valid text is set again, exactly, with all other options.

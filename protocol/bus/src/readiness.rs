@@ -47,6 +47,14 @@ impl Route {
     pub fn new(topic: Topic, receiver: ProcessId) -> Self {
         Self { topic, receiver }
     }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        let (topic, receiver) = text.split_once('>').ok_or("there is no '>'")?;
+        let topic = topic.parse::<Topic>().map_err(|cause| cause.to_string())?;
+        let receiver = receiver.parse::<ProcessId>();
+        let receiver = receiver.map_err(|cause| cause.to_string())?;
+        Ok(Self { topic, receiver })
+    }
 }
 
 impl fmt::Display for Route {
@@ -73,20 +81,9 @@ impl FromStr for Route {
     type Err = RouteError;
 
     fn from_str(text: &str) -> Result<Self, RouteError> {
-        let error = |detail: String| RouteError {
+        Self::parse(text).map_err(|detail| RouteError {
             text: text.chars().take(100).collect(),
             detail,
-        };
-        let (topic, receiver) = text
-            .split_once('>')
-            .ok_or_else(|| error("there is no '>'".into()))?;
-        Ok(Self {
-            topic: topic
-                .parse()
-                .map_err(|cause: protocol::KeyError| error(cause.to_string()))?,
-            receiver: receiver
-                .parse()
-                .map_err(|cause: protocol::IdError| error(cause.to_string()))?,
         })
     }
 }

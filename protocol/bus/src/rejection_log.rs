@@ -119,29 +119,29 @@ fn rejected(line: &str) -> Option<((Rejection, String), u64)> {
         return None;
     }
     let (labels, count) = rest.rsplit_once('}')?;
-    let label = |wanted: &str| {
-        let mut known = labels
-            // Split at quote and comma: a value may contain a comma.
-            .split("\",")
-            .filter_map(|label| label.split_once("=\""));
-        known
-            .find(|(name, _)| *name == wanted)
-            .map(|(_, value)| value.trim_end_matches('"').to_owned())
-    };
-    let reason =
-        label("reason").filter(|reason| reason == "access-control" || reason == "low-pass")?;
-    let zid = label("remote_zid").unwrap_or_default();
-    let peer = label("remote_cn")
+    let reason = label(labels, "reason")
+        .filter(|reason| reason == "access-control" || reason == "low-pass")?;
+    let zid = label(labels, "remote_zid").unwrap_or_default();
+    let peer = label(labels, "remote_cn")
         .filter(|name| !name.is_empty())
         .unwrap_or_else(|| zid.clone());
     // Each priority has a count of its own.
-    let connection = format!("{zid} {}", label("priority")?);
+    let connection = format!("{zid} {}", label(labels, "priority")?);
     let rejection = Rejection {
         peer,
         reason,
-        message: label("message")?,
+        message: label(labels, "message")?,
     };
     Some(((rejection, connection), count.trim().parse().ok()?))
+}
+
+fn label(labels: &str, wanted: &str) -> Option<String> {
+    let mut known = labels
+        // Split at quote and comma: a value may contain a comma.
+        .split("\",")
+        .filter_map(|label| label.split_once("=\""));
+    let (_, value) = known.find(|(name, _)| *name == wanted)?;
+    Some(value.trim_end_matches('"').to_owned())
 }
 
 #[cfg(test)]

@@ -30,13 +30,13 @@ impl RouterContact {
     pub(super) fn watch(session: &Session) -> Result<Self, BusError> {
         let contact = Self::default();
         let noted = contact.clone();
-        let note = move |event: TransportEvent| {
+        let info = session.info();
+        let listener = info.transport_events_listener();
+        let listener = listener.callback(move |event: TransportEvent| {
             if event.transport().whatami() == WhatAmI::Router {
                 noted.note(event.kind() == SampleKind::Put, Instant::now());
             }
-        };
-        let info = session.info();
-        let listener = info.transport_events_listener().callback(note);
+        });
         let declared = listener.background().wait();
         declared.map_err(|cause| BusError::zenoh("watching the connection", &cause))?;
         Ok(contact)

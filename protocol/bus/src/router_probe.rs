@@ -50,17 +50,15 @@ impl RouterProbe {
         let probe = Self::begin(client, PROBE_KEY)?;
         // A weak reference: the thread ends with the probe instead of keeping it alive.
         let (router, alive) = (router.clone(), Arc::downgrade(&probe.arrived));
+        let thread = thread::Builder::new().name("router-probe".into());
         // On a thread: at a router that fails it waits for ever.
-        let publish = move || {
+        let thread = thread.spawn(move || {
             while alive.strong_count() > 0 && router.put(PROBE_KEY, [0_u8; 1]).wait().is_ok() {
                 thread::sleep(PERIOD);
             }
-        };
-        let thread = thread::Builder::new().name("router-probe".into());
-        let thread = thread
-            .spawn(publish)
-            .map_err(BusError::thread("router-probe"));
-        thread.map(|_| probe)
+        });
+        thread.map_err(BusError::thread("router-probe"))?;
+        Ok(probe)
     }
 
     fn begin(client: &BusOptions, key: &str) -> Result<Self, BusError> {

@@ -158,7 +158,6 @@ impl BusOptions {
             Role::Router => ("router", own, vec![]),
             Role::Client => ("client", vec![], own),
         };
-        let millis = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
         let mut settings = vec![
             ("mode", json!(mode)),
             ("listen/endpoints", json!(listen)),
@@ -244,25 +243,21 @@ impl BusOptions {
     }
 }
 
+fn millis(duration: Duration) -> u64 {
+    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
+}
+
 /// QUIC uses the handshake of TLS 1.3, and its settings.
 fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
-    let path = |file| json!(credentials.path(file));
+    let [authority, certificate, key] =
+        [AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE].map(|file| credentials.path(file));
     vec![
-        (
-            "transport/link/tls/root_ca_certificate",
-            path(AUTHORITY_FILE),
-        ),
+        ("transport/link/tls/root_ca_certificate", json!(authority)),
         ("transport/link/tls/enable_mtls", json!(true)),
-        (
-            "transport/link/tls/listen_certificate",
-            path(CERTIFICATE_FILE),
-        ),
-        ("transport/link/tls/listen_private_key", path(KEY_FILE)),
-        (
-            "transport/link/tls/connect_certificate",
-            path(CERTIFICATE_FILE),
-        ),
-        ("transport/link/tls/connect_private_key", path(KEY_FILE)),
+        ("transport/link/tls/listen_certificate", json!(certificate)),
+        ("transport/link/tls/listen_private_key", json!(key)),
+        ("transport/link/tls/connect_certificate", json!(certificate)),
+        ("transport/link/tls/connect_private_key", json!(key)),
         ("transport/link/tls/verify_name_on_connect", json!(true)),
         // An expired certificate ends the connections that it opened.
         ("transport/link/tls/close_link_on_expiration", json!(true)),

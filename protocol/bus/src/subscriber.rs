@@ -241,16 +241,12 @@ impl Subscription {
         inbox: &Arc<Inbox>,
         status: &StatusPublisher,
     ) -> Result<Self, BusError> {
-        // Keys outside this grammar carry none of our messages.
-        let topic = |sample: &Sample| {
-            let key: Result<Key, _> = sample.key_expr().as_str().parse();
-            key.ok().map(|key| key.topic)
-        };
         Self::declare(
             session,
             selector.as_str(),
             IngressFilter::new(inbox, None, status),
-            topic,
+            // Keys outside this grammar carry none of our messages.
+            |sample| Some(sample.key_expr().as_str().parse::<Key>().ok()?.topic),
         )
     }
 

@@ -24,18 +24,19 @@ pub(crate) fn explained(reason: String, fields: &[String]) -> String {
         return reason;
     };
     // A field that only another kind of file has says more than one that is spelled like a known one.
-    let is_of_another_kind =
-        |field: &str| !expected.contains(&field) && fields.iter().any(|own| own == field);
-    if let Some((_, kind)) = KINDS.iter().find(|(field, _)| is_of_another_kind(field)) {
+    let of_another_kind = KINDS
+        .iter()
+        .find(|(field, _)| !expected.contains(field) && fields.iter().any(|own| own == field));
+    if let Some((_, kind)) = of_another_kind {
         return format!("unknown field `{unknown}`: this is {kind}");
     }
-    let likeness = |name: &&str| strsim::jaro_winkler(unknown, name);
     let nearest = expected
         .iter()
-        .max_by(|a, b| likeness(a).total_cmp(&likeness(b)))
-        .filter(|name| expected.len() > 1 && likeness(name) > SIMILAR);
+        .map(|name| (strsim::jaro_winkler(unknown, name), name))
+        .max_by(|(a, _), (b, _)| a.total_cmp(b))
+        .filter(|(likeness, _)| expected.len() > 1 && *likeness > SIMILAR);
     match nearest {
-        Some(name) => format!(
+        Some((_, name)) => format!(
             "unknown field `{unknown}`, did you mean `{name}`? The fields are {}",
             expected.join(", ")
         ),

@@ -41,11 +41,11 @@ pub(crate) fn boxes<'a>(
     py: Python<'_>,
     boxes: impl Iterator<Item = &'a Box3d>,
 ) -> PyResult<Matrix> {
-    let row = |box3d: &Box3d| {
+    let values = boxes.map(|box3d| {
         let ([x, y, z], [dx, dy, dz]) = (box3d.center_m, box3d.size_m);
         [x, y, z, dx, dy, dz, box3d.heading_rad]
-    };
-    rows(py, boxes.map(row).collect())
+    });
+    rows(py, values.collect())
 }
 
 /// Covariance of x, y (square metres) and yaw (square radians) as `[3, 3]`.

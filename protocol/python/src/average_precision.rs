@@ -77,15 +77,11 @@ fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<V
             "detections of {found} frames, truth of {expected}"
         )));
     }
-    let frame = |(index, (found, objects)): (usize, (&Bound<'_, PyAny>, &Bound<'_, PyAny>))| {
+    let frames = detections.iter().zip(&truth).enumerate();
+    let scored = frames.map(|(index, (found, objects))| {
         Ok((scored_boxes(index, found)?, ground_truth(index, objects)?))
-    };
-    detections
-        .iter()
-        .zip(&truth)
-        .enumerate()
-        .map(frame)
-        .collect()
+    });
+    scored.collect()
 }
 
 fn entries<'py>(name: &str, frames: &Bound<'py, PyAny>) -> PyResult<Vec<Bound<'py, PyAny>>> {
@@ -124,12 +120,13 @@ fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detectio
     if let Some(bad) = scores.iter().find(|score| !score.is_finite()) {
         return Err(error(format!("detections of frame {frame}: score {bad}")));
     }
-    let detection = |(box3d, score)| Detection {
+    let scored = boxes.into_iter().zip(scores);
+    let detections = scored.map(|(box3d, score)| Detection {
         box3d,
         score,
         source: None,
-    };
-    Ok(boxes.into_iter().zip(scores).map(detection).collect())
+    });
+    Ok(detections.collect())
 }
 
 /// Ground truth of a frame; of arrays and annotations all boxes count, and all detections.
@@ -140,12 +137,11 @@ fn ground_truth(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<GroundTrut
     if let Some(truth) = &objects.get().truth {
         return Ok(truth.clone());
     }
-    let no_pose = || {
+    let boxes = objects.get().boxes.as_ref().ok_or_else(|| {
         error(format!(
             "truth of frame {frame}: objects without boxes, as the pose of the LiDAR is unknown"
         ))
-    };
-    let boxes = objects.get().boxes.as_ref().ok_or_else(no_pose)?;
+    })?;
     let boxes = boxes_of("truth", frame, boxes.bind(objects.py()).as_any())?;
     Ok(GroundTruth::of_boxes(boxes))
 }
@@ -164,12 +160,13 @@ fn boxes_of(what: &str, frame: usize, boxes: &Bound<'_, PyAny>) -> PyResult<Vec<
     if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
         return Err(error(format!("{what} of frame {frame}: a box with {bad}")));
     }
-    let box3d = |&[x, y, z, dx, dy, dz, heading_rad]: &[f64; 7]| Box3d {
+    let rows = values.as_chunks::<7>().0.iter();
+    let boxes = rows.map(|&[x, y, z, dx, dy, dz, heading_rad]| Box3d {
         center_m: [x, y, z],
         size_m: [dx, dy, dz],
         heading_rad,
-    };
-    Ok(values.as_chunks().0.iter().map(box3d).collect())
+    });
+    Ok(boxes.collect())
 }
 
 /// The array that NumPy makes of a list, or of an array of another type.

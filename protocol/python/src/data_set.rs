@@ -199,9 +199,9 @@ pub(crate) fn read(
         cameras,
         ..LoadOptions::default()
     };
-    let protocol = |layout: Layout| ProtocolConfig::default().resolve(layout).map_err(error);
     let opened: Result<_, PyErr> = py.detach(|| {
-        let of_recording = protocol(Layout::RECORDING)?;
+        let protocols = ProtocolConfig::default();
+        let of_recording = protocols.resolve(Layout::RECORDING).map_err(error)?;
         let recording = dataset::recording_of(&path)
             .map(|file| RecordingFrames::open(&file, &options, of_recording.clone()));
         if let Some(Ok(recording)) = recording {
@@ -209,7 +209,7 @@ pub(crate) fn read(
         }
         // A recording that cannot be read gives the same error here.
         let dataset = dataset::open(&path).map_err(error)?;
-        let protocol = protocol(dataset.layout)?;
+        let protocol = protocols.resolve(dataset.layout).map_err(error)?;
         Ok((Source::Folder(dataset), protocol))
     });
     let (source, protocol) = opened?;

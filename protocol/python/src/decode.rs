@@ -2,7 +2,7 @@
 
 use protocol::{CavId, Header, Key, Kind, Limits, Message as WireMessage, Topic, wire};
 use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods};
-use pyo3::{Py, PyAny, PyResult, Python, pyclass, pyfunction, pymethods};
+use pyo3::{Py, PyAny, PyErr, PyResult, Python, pyclass, pyfunction, pymethods};
 
 use crate::error::error;
 use crate::frame::Agent;
@@ -152,30 +152,32 @@ impl Message {
 /// Decodes one message of the wire format.
 #[pyfunction]
 pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<Message> {
-    let named = |cause: &dyn std::fmt::Display| error(format!("{kind_or_key}: {cause}"));
     // Every key has slashes, and no kind has one.
     if !kind_or_key.contains('/') {
         let kind = Kind::ALL
             .into_iter()
             .find(|kind| kind.to_string() == kind_or_key);
-        let known = || Kind::ALL.map(|kind| kind.to_string()).join(", ");
         let kind = kind.ok_or_else(|| {
+            let known = Kind::ALL.map(|kind| kind.to_string()).join(", ");
             error(format!(
-                "{kind_or_key:?} is no kind of message; there are {}",
-                known()
+                "{kind_or_key:?} is no kind of message; there are {known}"
             ))
         })?;
         let decoded = py.detach(|| Decoded::of_kind(kind, data));
-        return Message::new(py, None, decoded.map_err(|cause| named(&cause))?);
+        let decoded = decoded.map_err(|cause| error_of(kind_or_key, cause))?;
+        return Message::new(py, None, decoded);
     }
-    let key: Key = kind_or_key
-        .parse()
-        .map_err(|cause: protocol::KeyError| named(&cause))?;
+    let key = kind_or_key.parse::<Key>();
+    let key = key.map_err(|cause| error_of(kind_or_key, cause))?;
     if key.topic.is_json() {
-        return Err(named(&"messages of this key are JSON: use json.loads"));
+        let problem = "messages of this key are JSON: use json.loads";
+        return Err(error_of(kind_or_key, problem));
     }
-    let decoded = py
-        .detach(|| Decoded::of_key(&key, data))
-        .map_err(|cause| named(&cause))?;
+    let decoded = py.detach(|| Decoded::of_key(&key, data));
+    let decoded = decoded.map_err(|cause| error_of(kind_or_key, cause))?;
     Message::new(py, Some(kind_or_key.to_owned()), decoded)
+}
+
+fn error_of(kind_or_key: &str, cause: impl std::fmt::Display) -> PyErr {
+    error(format!("{kind_or_key}: {cause}"))
 }

@@ -4,7 +4,7 @@ use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame;
 use dataset::ground_truth::{self, GroundTruth};
 use numpy::{PyArray2, PyUntypedArrayMethods};
-use protocol::{Box3d, Pose};
+use protocol::Box3d;
 use pyo3::types::{PyDict, PyDictMethods};
 use pyo3::{Py, PyResult, Python, pyclass, pymethods};
 
@@ -34,7 +34,6 @@ impl Agent {
     /// Converts all parts but the ground truth, which stays in the frame as well.
     pub(crate) fn new(py: Python<'_>, parts: AgentParts) -> PyResult<(Py<Self>, frame::Frame)> {
         let mut recorded = parts.recorded;
-        let matrix = |pose: Option<&Pose>| pose.map(|pose| arrays::pose(py, pose)).transpose();
         let cameras = PyDict::new(py);
         for (number, camera) in std::mem::take(&mut recorded.cameras) {
             cameras.set_item(number, Camera::new(py, &camera)?)?;
@@ -50,8 +49,12 @@ impl Agent {
                 .map(|sweep| arrays::rows(py, sweep.xyzi))
                 .transpose()?,
             cameras: cameras.unbind(),
-            world_from_lidar: matrix(recorded.world_from_lidar.as_ref())?,
-            gnss_world_from_lidar: matrix(parts.gnss_world_from_lidar.as_ref())?,
+            world_from_lidar: (recorded.world_from_lidar)
+                .map(|pose| arrays::pose(py, &pose))
+                .transpose()?,
+            gnss_world_from_lidar: (parts.gnss_world_from_lidar)
+                .map(|pose| arrays::pose(py, &pose))
+                .transpose()?,
             speed_mps: recorded.speed_mps,
             yaw_rate_rad_s: recorded.yaw_rate_rad_s,
             objects: Objects::annotated(py, &recorded)?,
@@ -72,18 +75,12 @@ impl Agent {
 impl Agent {
     fn __repr__(&self, py: Python<'_>) -> String {
         let mut parts = vec![format!("{:?}", self.cav)];
-        let count =
-            |points: &Py<PyArray2<f32>>| points.bind(py).shape().first().copied().unwrap_or(0);
-        parts.extend(
-            self.points
-                .as_ref()
-                .map(|points| format!("{} points", count(points))),
-        );
-        parts.extend(
-            self.radar
-                .as_ref()
-                .map(|points| format!("{} radar points", count(points))),
-        );
+        for (points, name) in [(&self.points, "points"), (&self.radar, "radar points")] {
+            if let Some(points) = points {
+                let count = points.bind(py).shape().first().copied().unwrap_or(0);
+                parts.push(format!("{count} {name}"));
+            }
+        }
         let here: [(&str, bool); 5] = [
             ("true pose", self.world_from_lidar.is_some()),
             ("pose", self.pose.is_some()),
@@ -161,13 +158,11 @@ impl Frame {
         let Some(name) = protocol else {
             return Ok(self.protocol.clone());
         };
-        let known = || {
-            dataset::evaluation_protocol::PRESETS
-                .map(|(name, _)| name)
-                .join(", ")
-        };
-        EvaluationProtocol::preset(name)
-            .ok_or_else(|| error(format!("unknown protocol {name:?}; there are {}", known())))
+        EvaluationProtocol::preset(name).ok_or_else(|| {
+            let known = dataset::evaluation_protocol::PRESETS.map(|(name, _)| name);
+            let known = known.join(", ");
+            error(format!("unknown protocol {name:?}; there are {known}"))
+        })
     }
 }
 
@@ -189,15 +184,11 @@ impl Frame {
             .truth
             .iter()
             .position(|agent| agent.cav.as_str() == ego);
-        let no_pose = || {
-            error(format!(
-                "no true pose of agent {ego:?} in {}",
-                self.__repr__(py)
-            ))
-        };
-        let index = index
-            .filter(|&index| self.truth[index].world_from_lidar.is_some())
-            .ok_or_else(no_pose)?;
+        let index = index.filter(|&index| self.truth[index].world_from_lidar.is_some());
+        let index = index.ok_or_else(|| {
+            let frame = self.__repr__(py);
+            error(format!("no true pose of agent {ego:?} in {frame}"))
+        })?;
         let frames: Vec<&frame::Frame> = self.truth.iter().collect();
         let (objects, boxes): (Vec<&frame::Object>, Vec<Box3d>) =
             ground_truth::merged_objects(&frames, index, &rule)

@@ -297,14 +297,12 @@ pub(crate) fn listen(
     }
     let selectors = subscriptions::selectors(&run, streams, &access)?;
     let identity = Identity::new(run.clone(), principal.name(), principal.cav);
-    let connect = || {
+    let connection: Result<_, bus::BusError> = py.detach(|| {
         let bus = Bus::join(&options, identity)?;
         let subscriber = bus.tap(&selectors, PLACES)?;
         Ok(Connection { bus, subscriber })
-    };
-    let connection = py
-        .detach(connect)
-        .map_err(|cause: bus::BusError| error(cause))?;
+    });
+    let connection = connection.map_err(error)?;
     let protocol = EvaluationProtocol::preset("opv2v").ok_or_else(|| error("no protocol opv2v"))?;
     Ok(Listener {
         connection: Some(connection),

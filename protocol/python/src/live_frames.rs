@@ -57,12 +57,10 @@ impl LiveFrames {
             self.late += 1;
             return Ok(());
         }
-        let (run, protocol) = (&self.run, &self.protocol);
-        let empty = || Pending {
-            parts: FrameParts::empty(run, at, protocol),
+        let pending = self.pending.entry(at).or_insert_with(|| Pending {
+            parts: FrameParts::empty(&self.run, at, &self.protocol),
             last_message: Instant::now(),
-        };
-        let pending = self.pending.entry(at).or_insert_with(empty);
+        });
         pending.last_message = Instant::now();
         let added = pending.parts.add(&message.key.topic, message.pieces());
         if self.pending.len() > MOST_PENDING {

@@ -60,9 +60,9 @@ impl PoseEstimate {
             );
         };
         let matrix = matrix.bind(py).readonly();
-        let at = |row: usize, column: usize| matrix.get([row, column]).copied().unwrap_or(f64::NAN);
-        let yaw_deg = at(1, 0).atan2(at(0, 0)).to_degrees();
-        let [x, y, z] = [0, 1, 2].map(|row| at(row, 3));
+        let [cos, sin, x, y, z] = [[0_usize, 0], [1, 0], [0, 3], [1, 3], [2, 3]]
+            .map(|place| matrix.get(place).copied().unwrap_or(f64::NAN));
+        let yaw_deg = sin.atan2(cos).to_degrees();
         format!(
             "PoseEstimate(x={x:.2}, y={y:.2}, z={z:.2} m, yaw={yaw_deg:.1} deg, confidence={confidence:.3}{})",
             if self.covariance.is_some() {
@@ -214,19 +214,20 @@ impl Detections {
         let sources = found
             .iter()
             .map(|one| one.source.as_ref().map(ToString::to_string));
-        let empty = || PyList::empty(py).into_any().unbind();
+        let [tracks, fused, skipped, neighbours] =
+            std::array::from_fn(|_| PyList::empty(py).into_any().unbind());
         Ok(Self {
             cav: cav.to_owned(),
             boxes: arrays::boxes(py, found.iter().map(|one| &one.box3d))?,
             scores: PyArray1::from_vec(py, found.iter().map(|one| one.score).collect()).unbind(),
             sources: PyList::new(py, sources.collect::<Vec<_>>())?.unbind(),
-            tracks: empty(),
+            tracks,
             pose: PoseEstimate::new(py, pose)?,
             method: None,
             agent_frame: None,
-            fused: empty(),
-            skipped: empty(),
-            neighbours: empty(),
+            fused,
+            skipped,
+            neighbours,
             stages_ms: PyDict::new(py).unbind(),
         })
     }
@@ -272,26 +273,34 @@ pub(crate) struct Tracks {
 
 impl Tracks {
     pub(crate) fn new(py: Python<'_>, found: &protocol::Tracks) -> PyResult<Py<Self>> {
-        let all = || found.tracks.iter();
-        let numbers = |of: fn(&Track) -> f64| PyArray1::from_vec(py, all().map(of).collect());
-        let covariances: Vec<[f32; 4]> = all().flat_map(|track| track.covariance).collect();
+        let tracks = &found.tracks;
+        let covariances: Vec<[f32; 4]> = tracks.iter().flat_map(|track| track.covariance).collect();
         let covariances = PyArray1::from_vec(py, covariances.into_flattened());
+        let velocities_mps = tracks.iter().map(|track| track.velocity_mps).collect();
         let made = Self {
             cav: found.ego.to_string(),
             agent_frame: found.agent_frame,
-            ids: PyArray1::from_vec(py, all().map(|track| track.id).collect()).unbind(),
-            boxes: arrays::boxes(py, all().map(|track| &track.box3d))?,
-            velocities_mps: arrays::rows(py, all().map(|track| track.velocity_mps).collect())?,
-            covariances: covariances.reshape([found.tracks.len(), 4, 4])?.unbind(),
-            scores: numbers(|track| track.score).unbind(),
-            hits: PyArray1::from_vec(py, all().map(|track| track.hits).collect()).unbind(),
-            ages_s: numbers(|track| track.age_s).unbind(),
-            unseen_s: numbers(|track| track.unseen_s).unbind(),
+            ids: by_track(py, tracks, |track| track.id),
+            boxes: arrays::boxes(py, tracks.iter().map(|track| &track.box3d))?,
+            velocities_mps: arrays::rows(py, velocities_mps)?,
+            covariances: covariances.reshape([tracks.len(), 4, 4])?.unbind(),
+            scores: by_track(py, tracks, |track| track.score),
+            hits: by_track(py, tracks, |track| track.hits),
+            ages_s: by_track(py, tracks, |track| track.age_s),
+            unseen_s: by_track(py, tracks, |track| track.unseen_s),
             pose: PoseEstimate::new(py, &found.pose)?,
             left_out: found.left_out,
         };
         Py::new(py, made)
     }
+}
+
+fn by_track<T: numpy::Element>(
+    py: Python<'_>,
+    tracks: &[Track],
+    value: fn(&Track) -> T,
+) -> Py<PyArray1<T>> {
+    PyArray1::from_vec(py, tracks.iter().map(value).collect()).unbind()
 }
 
 #[pymethods]

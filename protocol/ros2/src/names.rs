@@ -32,16 +32,6 @@ impl RosName {
     /// # Errors
     /// [`NameError`] states the text that is no name.
     pub fn new(text: &str) -> Result<Self, NameError> {
-        let is_token = |token: &str| {
-            token
-                .bytes()
-                .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
-                // An empty part has no first byte and is refused.
-                && token
-                    .bytes()
-                    .next()
-                    .is_some_and(|first| !first.is_ascii_digit())
-        };
         match text.strip_prefix('/') {
             Some(tokens) if text.len() <= MAX_BYTES && tokens.split('/').all(is_token) => {
                 Ok(Self(text.into()))
@@ -61,6 +51,13 @@ impl RosName {
     pub fn as_str(&self) -> &str {
         &self.0
     }
+}
+
+fn is_token(token: &str) -> bool {
+    let (first, mut bytes) = (token.bytes().next(), token.bytes());
+    // An empty part has no first byte and is refused.
+    first.is_some_and(|first| !first.is_ascii_digit())
+        && bytes.all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
 }
 
 impl fmt::Display for RosName {

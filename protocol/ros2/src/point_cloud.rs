@@ -180,24 +180,9 @@ struct Columns<'a> {
 
 impl<'a> Columns<'a> {
     fn find(fields: &[Field<'a>]) -> Result<Self, PointCloudError> {
-        let floats = |datatype| matches!(datatype, Datatype::Float32 | Datatype::Float64);
-        let coordinate = |name| {
-            let found = || {
-                fields
-                    .iter()
-                    .map(|field| field.name.chars().take(40).collect())
-                    .collect()
-            };
-            let allowed = "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1";
-            column(fields, name, allowed, floats)?
-                .map(|(_, column)| column)
-                .ok_or_else(|| PointCloudError::NoField {
-                    missing: name,
-                    found: found(),
-                })
-        };
+        let [x, y, z] = ["x", "y", "z"].map(|name| coordinate(fields, name));
         Ok(Self {
-            xyz: [coordinate("x")?, coordinate("y")?, coordinate("z")?],
+            xyz: [x?, y?, z?],
             intensity: intensity(fields)?,
         })
     }
@@ -207,6 +192,21 @@ impl<'a> Columns<'a> {
         let columns = self.xyz.iter().chain(intensity);
         columns.map(|column| column.end()).max().unwrap_or(0)
     }
+}
+
+fn coordinate(fields: &[Field<'_>], name: &'static str) -> Result<Column, PointCloudError> {
+    let allowed = "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1";
+    let found = column(fields, name, allowed, |datatype| {
+        matches!(datatype, Datatype::Float32 | Datatype::Float64)
+    })?;
+    found
+        .map(|(_, column)| column)
+        .ok_or_else(|| PointCloudError::NoField {
+            missing: name,
+            found: (fields.iter())
+                .map(|field| field.name.chars().take(40).collect())
+                .collect(),
+        })
 }
 
 /// The field of the most preferred name of an intensity, else of a packed colour.
@@ -290,18 +290,6 @@ impl Layout {
         data_len: usize,
         limits: SweepLimits,
     ) -> Result<(), PointCloudError> {
-        let at_least = |what, found, needed, why| {
-            if found >= needed {
-                Ok(())
-            } else {
-                Err(PointCloudError::Layout {
-                    what,
-                    found,
-                    needed,
-                    why,
-                })
-            }
-        };
         let points = u64::from(self.height) * u64::from(self.width);
         if points > limits.max_points {
             return Err(PointCloudError::TooMany {
@@ -327,6 +315,23 @@ impl Layout {
         };
         at_least("length of data", data_len as u64, needed, "rows x row_step")
     }
+}
+
+fn at_least(
+    what: &'static str,
+    found: u64,
+    needed: u64,
+    why: &'static str,
+) -> Result<(), PointCloudError> {
+    if found >= needed {
+        return Ok(());
+    }
+    Err(PointCloudError::Layout {
+        what,
+        found,
+        needed,
+        why,
+    })
 }
 
 fn read_sweep<BO: ByteOrder>(
@@ -375,15 +380,15 @@ fn read_fields<'a, BO: ByteOrder>(
             max: MAX_FIELDS.into(),
         });
     }
-    let field = |_| {
+    let fields = (0..count).map(|_| {
         Ok(Field {
             name: message.read("fields.name", CdrReader::read_str)?,
             offset: message.u32("fields.offset")?,
             datatype: message.read("fields.datatype", CdrReader::read_u8)?,
             count: message.u32("fields.count")?,
         })
-    };
-    (0..count).map(field).collect()
+    });
+    fields.collect()
 }
 
 impl Sweep {
@@ -425,8 +430,8 @@ impl Sweep {
             let intensity = match &columns.intensity {
                 Some((_, column, IntensityKind::RedByte)) => {
                     // Bits 16 to 23 of `0x00RRGGBB`: a u32 is exact in f64.
-                    let red = |colour: f64| (colour / 65_536.0).floor() % 256.0;
-                    column.value::<BO>(point).map(red)
+                    let colour = column.value::<BO>(point);
+                    colour.map(|colour| (colour / 65_536.0).floor() % 256.0)
                 }
                 Some((_, column, _)) => column.value::<BO>(point),
                 None => None,

@@ -62,20 +62,17 @@ impl Qos {
 /// rmw_zenoh's defaults left out.
 impl fmt::Display for Qos {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let shown = |value: u32, default| {
-            if value == default {
-                String::new()
-            } else {
-                value.to_string()
-            }
-        };
         let (reliability, durability) = self.policies();
-        let (reliability, durability) = (shown(reliability.into(), 1), shown(durability.into(), 2));
-        write!(
-            f,
-            "{reliability}:{durability}:,{}:,:,:,,",
-            shown(self.depth, DEFAULT_DEPTH)
-        )
+        let [reliability, durability, depth] = [
+            (u32::from(reliability), 1),
+            (u32::from(durability), 2),
+            (self.depth, DEFAULT_DEPTH),
+        ]
+        .map(|(value, default)| match value == default {
+            true => String::new(),
+            false => value.to_string(),
+        });
+        write!(f, "{reliability}:{durability}:,{depth}:,:,:,,")
     }
 }
 

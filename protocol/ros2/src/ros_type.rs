@@ -70,11 +70,10 @@ impl RosType {
     pub fn schema(self) -> String {
         let (_, own) = self.definition();
         let separator = "=".repeat(80);
-        let with = |text: String, (name, fields): Definition| {
-            text + &format!("{separator}\nMSG: {name}\n{fields}")
-        };
         let contained = contained(self.definition()).into_iter();
-        contained.fold(own.to_owned(), with)
+        contained.fold(own.to_owned(), |text, (name, fields)| {
+            text + &format!("{separator}\nMSG: {name}\n{fields}")
+        })
     }
 
     /// Package and name.

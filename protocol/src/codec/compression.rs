@@ -23,31 +23,28 @@ pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireErro
 /// # Errors
 /// [`WireError::Compression`] when the frame is corrupt, or decompresses to more or fewer bytes.
 pub(super) fn unpack(packed: Vec<u8>, expected: usize) -> Result<Vec<u8>, WireError> {
-    let refuse = |detail: String| WireError::Compression {
+    decompress(&packed, expected).map_err(|detail| WireError::Compression {
         bytes: packed.len() as u64,
         expected: expected as u64,
         detail,
-    };
+    })
+}
+
+fn decompress(packed: &[u8], expected: usize) -> Result<Vec<u8>, String> {
     // A frame states its content size before anything is allocated for it.
-    match zstd::zstd_safe::get_frame_content_size(&packed)
-        .map_err(|_| refuse("no zstd frame".into()))?
-    {
+    match zstd::zstd_safe::get_frame_content_size(packed).map_err(|_| "no zstd frame")? {
         Some(claimed) if claimed == expected as u64 => {}
-        Some(claimed) => {
-            return Err(refuse(format!(
-                "the frame states {claimed} bytes of content"
-            )));
-        }
-        None => return Err(refuse("the frame does not state its content size".into())),
+        Some(claimed) => return Err(format!("the frame states {claimed} bytes of content")),
+        None => return Err("the frame does not state its content size".into()),
     }
     let mut bytes = Vec::with_capacity(expected);
     let found = zstd::bulk::Decompressor::new()
-        .and_then(|mut decompressor| decompressor.decompress_to_buffer(&packed, &mut bytes))
-        .map_err(|error| refuse(error.to_string()))?;
+        .and_then(|mut decompressor| decompressor.decompress_to_buffer(packed, &mut bytes))
+        .map_err(|error| error.to_string())?;
     if found == expected {
         Ok(bytes)
     } else {
-        Err(refuse(format!("the frame contains {found} bytes")))
+        Err(format!("the frame contains {found} bytes"))
     }
 }
 

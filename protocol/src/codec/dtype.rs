@@ -46,7 +46,8 @@ pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
     if values.is_empty() {
         return vec![0.0; channels];
     }
-    let scale = |channel: &[f32]| {
+    let channels = values.chunks_exact(values.len() / channels);
+    let scales = channels.map(|channel| {
         // Without the sign, bit patterns have the order of the numbers, and integers have a vectorised maximum.
         let largest = channel.iter().fold(0i32, |largest, value| {
             largest.max(value.abs().to_bits() as i32)
@@ -55,11 +56,8 @@ pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
         let scale = largest / I8_STEPS;
         // The inverse of a subnormal scale would be infinite.
         if scale.is_normal() { scale } else { 0.0 }
-    };
-    values
-        .chunks_exact(values.len() / channels)
-        .map(scale)
-        .collect()
+    });
+    scales.collect()
 }
 
 /// Appends `[C, K]` finite values; `scales` are those of their channels if the dtype has any.

@@ -5,6 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::checks::check_within;
 #[cfg(feature = "config")]
 use crate::config::FieldError;
 use crate::{BevGrid, WireError};
@@ -127,18 +128,15 @@ impl ConfidenceGate {
     /// # Errors
     /// [`WireError::Value`] when the window has an even width, is too wide, or its sigma is not positive.
     pub(super) fn cells(&self, confidence: &[f32], grid: &BevGrid) -> Result<Vec<u32>, WireError> {
-        let threshold = self.threshold;
-        let pass = |values: &[f32]| -> Vec<u32> {
-            (0u32..)
-                .zip(values)
-                .filter(|(_, value)| **value > threshold)
-                .map(|(cell, _)| cell)
-                .collect()
+        let smoothed = match self.smoothing {
+            Some(smoothing) => Some(smoothing.smooth(confidence, grid)?),
+            None => None,
         };
-        Ok(match self.smoothing {
-            Some(smoothing) => pass(&smoothing.smooth(confidence, grid)?),
-            None => pass(confidence),
-        })
+        let values = smoothed.as_deref().unwrap_or(confidence);
+        let passing = (0u32..)
+            .zip(values)
+            .filter(|(_, value)| **value > self.threshold);
+        Ok(passing.map(|(cell, _)| cell).collect())
     }
 }
 
@@ -183,31 +181,22 @@ impl Smoothing {
     )]
     fn weights(&self) -> Result<Vec<f32>, WireError> {
         let Self { kernel, sigma } = *self;
-        let refuse = |what, value, max| {
-            Err(WireError::Value {
-                what,
-                index: 0,
-                value,
-                min: 1e-3,
-                max,
-            })
-        };
         if kernel % 2 == 0 || kernel > MAX_KERNEL {
-            return refuse(
-                "odd kernel of the confidence gate",
-                f64::from(kernel),
-                f64::from(MAX_KERNEL),
-            );
-        }
-        if !(1e-3..=1e3).contains(&sigma) {
-            return refuse("sigma of the confidence gate", f64::from(sigma), 1e3);
+            return Err(WireError::Value {
+                what: "odd kernel of the confidence gate",
+                index: 0,
+                value: f64::from(kernel),
+                min: 1e-3,
+                max: f64::from(MAX_KERNEL),
+            });
         }
         let (half, sigma) = (f64::from(kernel / 2), f64::from(sigma));
+        check_within("sigma of the confidence gate", sigma, 1e-3, 1e3)?;
         // Its square is the published factor 1 / (2 pi sigma).
         let scale = 1.0 / (std::f64::consts::TAU * sigma).sqrt();
-        let weight =
-            |cell: u32| scale * (-(f64::from(cell) - half).powi(2) / (2.0 * sigma * sigma)).exp();
-        Ok((0..kernel).map(|cell| weight(cell) as f32).collect())
+        let weights = (0..kernel)
+            .map(|cell| scale * (-(f64::from(cell) - half).powi(2) / (2.0 * sigma * sigma)).exp());
+        Ok(weights.map(|weight| weight as f32).collect())
     }
 }
 

@@ -21,8 +21,6 @@ mod layout;
 mod rate;
 mod selection;
 
-use std::ops::Range;
-
 use serde::{Deserialize, Serialize};
 
 use crate::body::check_values;
@@ -316,13 +314,10 @@ impl EncodedFeatures {
                 found: self.grid.to_string(),
             });
         }
-        let decoded = |channels: u32, code_of: Option<u32>| u64::from(code_of.unwrap_or(channels));
         check_size("channels", self.channels.into(), channels.into())?;
         if self.code_of != code_of {
-            let (expected, found) = (
-                decoded(channels, code_of),
-                decoded(self.channels, self.code_of),
-            );
+            let expected = code_of.unwrap_or(channels).into();
+            let found = self.code_of.unwrap_or(self.channels).into();
             let what = "channels of the map behind the compressor";
             return Err(WireError::shape(what, expected, found));
         }
@@ -345,13 +340,7 @@ impl EncodedFeatures {
             body,
         } = self;
         let layout = Layout::new(&grid, channels, &codec, limits)?;
-        let features = |values| BevFeatures {
-            grid,
-            channels,
-            code_of,
-            values,
-        };
-        let body = match (body, codec) {
+        let (values, sent) = match (body, codec) {
             (
                 Body::Floats(values),
                 Codec {
@@ -362,42 +351,38 @@ impl EncodedFeatures {
             ) => {
                 let expected = layout.values.len() as u64 / 4;
                 check_size("features", values.len() as u64, expected)?;
-                return Ok(DecodedFeatures {
-                    features: features(values),
-                    sent: None,
-                });
+                (values, None)
             }
-            (body, _) => body,
-        };
-        let raw = unpack(body, codec.compression, layout.len())?;
-        let part = |range: &Range<usize>| {
-            let (expected, found) = (range.end as u64, raw.len() as u64);
-            let missing = WireError::shape("bytes of a feature map", expected, found);
-            raw.get(range.clone()).ok_or(missing)
-        };
-        let values = dtype::read(
-            codec.dtype,
-            part(&layout.scales)?,
-            part(&layout.values)?,
-            layout.selected,
-        )?;
-        check_values("feature", &values, limits.max_abs_value)?;
-        let (values, sent) = match codec.selection {
-            Selection::Dense => (values, None),
-            Selection::TopK { .. } => {
-                let selected =
-                    selection::read_mask(part(&layout.mask)?, layout.cells, layout.selected)?;
-                // Freed before the map is allocated: a receiver holds two bodies at most (`Limits`).
-                drop(raw);
-                let (map, sent) =
-                    selection::scatter(&values, channels as usize, layout.cells, &selected);
-                (map, Some(sent))
+            (body, _) => {
+                let raw = unpack(body, codec.compression, layout.len())?;
+                let [scales, mask, values] =
+                    [layout.scales, layout.mask, layout.values].map(|range| {
+                        let (expected, found) = (range.end as u64, raw.len() as u64);
+                        let missing = WireError::shape("bytes of a feature map", expected, found);
+                        raw.get(range).ok_or(missing)
+                    });
+                let values = dtype::read(codec.dtype, scales?, values?, layout.selected)?;
+                check_values("feature", &values, limits.max_abs_value)?;
+                match codec.selection {
+                    Selection::Dense => (values, None),
+                    Selection::TopK { .. } => {
+                        let (cells, channels) = (layout.cells, channels as usize);
+                        let selected = selection::read_mask(mask?, cells, layout.selected)?;
+                        // Freed before the map is allocated: a receiver holds two bodies at most (`Limits`).
+                        drop(raw);
+                        let (map, sent) = selection::scatter(&values, channels, cells, &selected);
+                        (map, Some(sent))
+                    }
+                }
             }
         };
-        Ok(DecodedFeatures {
-            features: features(values),
-            sent,
-        })
+        let features = BevFeatures {
+            grid,
+            channels,
+            code_of,
+            values,
+        };
+        Ok(DecodedFeatures { features, sent })
     }
 }
 

@@ -42,8 +42,8 @@ pub(super) fn within_budget(
     let fitting =
         usize::try_from(for_cells / (u64::from(channels) * dtype.size())).unwrap_or(usize::MAX);
     // A grid has at most 2^32 - 1 cells.
-    let all = || (0..u32::try_from(confidence.len()).unwrap_or(u32::MAX)).collect();
-    let candidates = candidates.map_or_else(all, <[u32]>::to_vec);
+    let all = 0..u32::try_from(confidence.len()).unwrap_or(u32::MAX);
+    let candidates = candidates.map_or_else(|| all.collect(), <[u32]>::to_vec);
     Ok(most_confident(confidence, candidates, fitting))
 }
 
@@ -54,13 +54,12 @@ pub(super) fn within_budget(
 )]
 fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<u32> {
     if count < cells.len() {
-        let descending = |a: &u32, b: &u32| {
+        // In linear time: the order among the selected cells does not matter.
+        cells.select_nth_unstable_by(count, |a, b| {
             confidence[*b as usize]
                 .total_cmp(&confidence[*a as usize])
                 .then(a.cmp(b))
-        };
-        // In linear time: the order among the selected cells does not matter.
-        cells.select_nth_unstable_by(count, descending);
+        });
         cells.truncate(count);
         // Back to row-major order, in which the mask and the values are written.
         cells.sort_unstable();

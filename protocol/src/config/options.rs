@@ -69,14 +69,11 @@ fn with_default(option: Arg, default: Option<String>) -> Arg {
     let Some(default) = default else {
         return option;
     };
-    let add = |help: &dyn std::fmt::Display| format!("{help} [default: {default}]");
-    let (short, long) = (
-        option.get_help().map(|help| add(help)),
-        option.get_long_help().map(|help| add(help)),
-    );
-    let styled =
-        |help: Option<String>| -> Resettable<StyledStr> { help.map(StyledStr::from).into() };
-    option.help(styled(short)).long_help(styled(long))
+    let [short, long] = [option.get_help(), option.get_long_help()].map(|help| {
+        let help = help.map(|help| StyledStr::from(format!("{help} [default: {default}]")));
+        Resettable::<StyledStr>::from(help)
+    });
+    option.help(short).long_help(long)
 }
 
 fn switchable(option: Arg) -> Arg {

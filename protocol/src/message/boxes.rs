@@ -55,15 +55,15 @@ impl Boxes {
     /// A message of objects. Their numbers are rounded to those that are transmitted: single precision, covariances half
     /// precision. The source that a detection names is left out, and a track that no receiver would take.
     pub fn new(pose: PoseEstimate, objects: &[PerceivedObject]) -> Self {
-        let round = |object: &PerceivedObject| {
+        let objects = objects.iter().map(|object| {
             let PerceivedObject { detection, track } = CompactBox::of(object).object();
             // Checked as rounded: a variance beyond half precision is infinite there.
             let track = track.filter(|track| track.check_values().is_ok());
             PerceivedObject { detection, track }
-        };
+        });
         Self {
             pose,
-            objects: objects.iter().map(round).collect(),
+            objects: objects.collect(),
         }
     }
 
@@ -141,7 +141,6 @@ impl CompactBox {
     )]
     fn of(object: &PerceivedObject) -> Self {
         let Detection { box3d, score, .. } = &object.detection;
-        let half = |value: f32| f16::from_f32(value).to_le_bytes();
         Self {
             center_m: box3d.center_m.map(|value| value as f32),
             size_m: box3d.size_m.map(|value| value as f32),
@@ -150,8 +149,8 @@ impl CompactBox {
             track: object.track.map(|track| CompactTrack {
                 id: track.id,
                 velocity_mps: track.velocity_mps,
-                position_covariance: track.position_covariance.map(half),
-                velocity_covariance: track.velocity_covariance.map(half),
+                position_covariance: track.position_covariance.map(half_precision),
+                velocity_covariance: track.velocity_covariance.map(half_precision),
             }),
         }
     }
@@ -166,15 +165,22 @@ impl CompactBox {
             score: self.score,
             source: None,
         };
-        let single = |bytes: HalfBytes| f16::from_le_bytes(bytes).to_f32();
         let track = self.track.as_ref().map(|track| ObjectTrack {
             id: track.id,
             velocity_mps: track.velocity_mps,
-            position_covariance: track.position_covariance.map(single),
-            velocity_covariance: track.velocity_covariance.map(single),
+            position_covariance: track.position_covariance.map(single_precision),
+            velocity_covariance: track.velocity_covariance.map(single_precision),
         });
         PerceivedObject { detection, track }
     }
+}
+
+fn half_precision(value: f32) -> HalfBytes {
+    f16::from_f32(value).to_le_bytes()
+}
+
+fn single_precision(bytes: HalfBytes) -> f32 {
+    f16::from_le_bytes(bytes).to_f32()
 }
 
 /// Serialisation of objects as [`CompactBox`].

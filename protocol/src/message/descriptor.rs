@@ -68,20 +68,24 @@ impl FromStr for ModelHash {
     type Err = ModelHashError;
 
     fn from_str(text: &str) -> Result<Self, ModelHashError> {
-        let refuse = || ModelHashError(text.chars().take(80).collect());
-        let digit = |byte: u8| match byte {
-            b'0'..=b'9' => Ok(byte - b'0'),
-            b'a'..=b'f' => Ok(byte - b'a' + 10),
-            _ => Err(refuse()),
-        };
-        if text.len() != 64 {
-            return Err(refuse());
-        }
-        let mut hash = [0; 32];
-        for (byte, [high, low]) in hash.iter_mut().zip(text.as_bytes().as_chunks().0) {
-            *byte = digit(*high)? << 4 | digit(*low)?;
-        }
+        let hash = hash_of(text).ok_or_else(|| ModelHashError(text.chars().take(80).collect()))?;
         Ok(Self(hash))
+    }
+}
+
+fn hash_of(text: &str) -> Option<[u8; 32]> {
+    let mut hash = [0; 32];
+    for (byte, [high, low]) in hash.iter_mut().zip(text.as_bytes().as_chunks().0) {
+        *byte = digit(*high)? << 4 | digit(*low)?;
+    }
+    (text.len() == 64).then_some(hash)
+}
+
+fn digit(byte: u8) -> Option<u8> {
+    match byte {
+        b'0'..=b'9' => Some(byte - b'0'),
+        b'a'..=b'f' => Some(byte - b'a' + 10),
+        _ => None,
     }
 }
 

@@ -98,15 +98,16 @@ pub fn exit_code(
 
 /// True for a place that cannot be written, and for a full disk or quota, which no input causes.
 fn is_of_writing(error: &anyhow::Error) -> bool {
-    let is_within = |cause: &(dyn Error + 'static)| match cause.downcast_ref() {
-        // `BadInput` is transparent: the chain of causes skips its inner error, which is looked at here.
-        Some(BadInput(inner)) => is_of_writing(inner),
-        None => {
-            let of_system = cause.downcast_ref::<io::Error>();
-            cause.is::<NoSpace>() || of_system.is_some_and(|error| NoSpace::of(error).is_some())
-        }
-    };
-    error.is::<NotWritten>() || error.chain().any(is_within)
+    let mut causes = error.chain();
+    error.is::<NotWritten>()
+        || causes.any(|cause| match cause.downcast_ref() {
+            // `BadInput` is transparent: the chain of causes skips its inner error, which is looked at here.
+            Some(BadInput(inner)) => is_of_writing(inner),
+            None => {
+                let of_system = cause.downcast_ref::<io::Error>();
+                cause.is::<NoSpace>() || of_system.is_some_and(|error| NoSpace::of(error).is_some())
+            }
+        })
 }
 
 /// The chain of causes on one line, without causes that the message above them quotes already.

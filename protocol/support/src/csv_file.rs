@@ -128,13 +128,13 @@ pub fn records(text: &str) -> impl Iterator<Item = (u64, StringRecord)> {
         .trim(Trim::All)
         .terminator(Terminator::Any(b'\n'))
         .from_reader(text.as_bytes());
-    let next = move || {
+    let records = std::iter::from_fn(move || {
         let mut record = StringRecord::new();
         // Text in memory has no errors but the end.
         let is_there = reader.read_record(&mut record).unwrap_or(false);
         is_there.then_some(record)
-    };
-    std::iter::from_fn(next).filter_map(|record| {
+    });
+    records.filter_map(|record| {
         let position = record.position()?;
         // The reader skips empty lines after it has stored the position.
         let rest = text

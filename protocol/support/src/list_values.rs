@@ -18,8 +18,8 @@ pub(crate) fn with_lists_joined(
         };
         if let Some(option) = text.strip_prefix("--") {
             let (name, value) = option.split_once('=').unwrap_or((option, ""));
-            let has_name = |arg: &&Arg| arg.get_long() == Some(name);
-            let mut named = of.get_arguments().filter(has_name);
+            let options = of.get_arguments();
+            let mut named = options.filter(|arg: &&Arg| arg.get_long() == Some(name));
             is_list = named.any(|arg| arg.get_value_delimiter() == Some(','));
             let is_value = is_list && !value.is_empty();
             // The list continues in the next word after `--name` alone, and after a comma at the end.

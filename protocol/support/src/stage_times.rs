@@ -19,10 +19,10 @@ impl StageTimes {
 
     /// Starts the first stage now; `stages` are reported in this order, also those that take no time.
     pub fn of(stages: &[&str]) -> Self {
-        let nothing = |stage: &&str| StageTiming::new(stage, Duration::ZERO);
+        let stages = stages.iter();
         Self {
             last: Instant::now(),
-            timings: stages.iter().map(nothing).collect(),
+            timings: (stages.map(|stage| StageTiming::new(stage, Duration::ZERO))).collect(),
         }
     }
 

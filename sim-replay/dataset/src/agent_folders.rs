@@ -86,16 +86,17 @@ fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
             .iter()
             .any(|name| name.ends_with(".yaml") || name.ends_with(PCD));
     }
-    let is_whole = |listing: &Listing| holds_pairs(listing, PCD) || holds_pairs(listing, BIN);
-    let holds_agents = || {
-        let mut below = listing
+    // In this order: the second test lists every folder below.
+    holds_frame(listing)
+        && !listing
             .folders
             .iter()
-            .filter_map(|folder| files::list(&dir.join(folder)).ok());
-        below.any(|listing| is_whole(&listing))
-    };
-    // In this order: the second test lists every folder below.
-    is_whole(listing) && !holds_agents()
+            .any(|folder| files::list(&dir.join(folder)).is_ok_and(|below| holds_frame(&below)))
+}
+
+/// True if there is a complete frame.
+fn holds_frame(listing: &Listing) -> bool {
+    holds_pairs(listing, PCD) || holds_pairs(listing, BIN)
 }
 
 fn is_number(name: &str) -> bool {
@@ -106,20 +107,15 @@ fn is_number(name: &str) -> bool {
 /// not agents.
 fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Listing)>> {
     let mut below = files::list_below(dir, &files::list(dir)?, problems);
-    let name = |folder: &Path| {
-        folder
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned()
-    };
-    below.retain(|(folder, listing)| is_number(&name(folder)) || is_agent_folder(folder, listing));
+    below.retain(|(folder, listing)| {
+        is_number(&name_of(folder)) || is_agent_folder(folder, listing)
+    });
     let are_numbers = below
         .iter()
-        .any(|(folder, listing)| is_number(&name(folder)) && is_agent_folder(folder, listing));
+        .any(|(folder, listing)| is_number(&name_of(folder)) && is_agent_folder(folder, listing));
     let mut agents = Vec::new();
     for (folder, listing) in below {
-        let name = name(&folder);
+        let name = name_of(&folder);
         let reason = match CavId::new(&name) {
             Ok(_) if are_numbers && !is_number(&name) => {
                 "no number as the other agents' are".to_owned()
@@ -138,17 +134,22 @@ fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Li
     Ok(agents)
 }
 
+fn name_of(folder: &Path) -> String {
+    let name = folder.file_name().unwrap_or_default();
+    name.to_string_lossy().into_owned()
+}
+
 impl ScenarioFolder {
     /// Lists the folders of all agents. Parts that have to be left out are added to `problems`.
     pub(super) fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self> {
         let listed = agents_in(dir, problems)?;
-        let has = |suffix: &str| {
-            listed
-                .iter()
-                .any(|(_, listing)| holds_pairs(listing, suffix))
-        };
         // Bare floats are used only where no agent has a PCD: a scenario has one kind of sweeps.
-        let suffix = if !has(PCD) && has(BIN) { BIN } else { PCD };
+        let mut suffixes = [PCD, BIN].into_iter();
+        let suffix = suffixes.find(|suffix| {
+            let mut listings = listed.iter().map(|(_, listing)| listing);
+            listings.any(|listing| holds_pairs(listing, suffix))
+        });
+        let suffix = suffix.unwrap_or(PCD);
         let mut by_agent = BTreeMap::new();
         for (id, listing) in &listed {
             let agent_dir = dir.join(id.as_str());
@@ -237,20 +238,15 @@ impl ScenarioFolder {
             .iter()
             .map(|frame| (&frame.agent, frame.stem.as_str()))
             .collect();
-        let of_agent = |agent: &CavId| {
+        let sweeps = Sweeps::new(SweepStorage::ByName, options);
+        self.agents.iter().fold(sweeps, |sweeps, agent| {
             // Missing files are left out first: they would use up the tries.
             let stems = self
                 .stems
                 .iter()
                 .filter(|stem| !missing.contains(&(agent, stem.as_str())));
-            stems
-                .map(|stem| self.pcd(agent, stem, None))
-                .take(Sweeps::MOST_TRIED)
-                .collect::<Vec<_>>()
-        };
-        let sweeps = Sweeps::new(SweepStorage::ByName, options);
-        self.agents.iter().fold(sweeps, |sweeps, agent| {
-            sweeps.with_agent(agent.clone(), of_agent(agent))
+            let files = stems.map(|stem| self.pcd(agent, stem, None));
+            sweeps.with_agent(agent.clone(), files)
         })
     }
 
@@ -292,11 +288,10 @@ impl ScenarioFolder {
                 .map(|index| index.saturating_mul(period_nanos))
                 .collect(),
         };
-        let tick = |(stem, capture_nanos): (&String, u64)| Tick {
-            stem: stem.clone(),
-            capture_nanos,
-        };
-        self.stems.iter().zip(times).map(tick).collect()
+        let ticks = self.stems.iter().zip(times);
+        ticks
+            .map(|(stem, capture_nanos)| Tick::new(stem, capture_nanos))
+            .collect()
     }
 
     /// The file that may state the length of a tick.
@@ -332,33 +327,23 @@ fn without_common_frame(
     dir: &Path,
     agents: &[CavId],
     by_agent: &BTreeMap<CavId, AgentFolder>,
-) -> impl Iterator<Item = ReadError> {
-    let stems = |id: &CavId| by_agent.get(id).map(|agent| &agent.stems);
-    let first = |id: &CavId| {
-        stems(id)
-            .and_then(BTreeSet::first)
-            .cloned()
-            .unwrap_or_default()
+) -> Vec<ReadError> {
+    let mut stems = agents
+        .iter()
+        .filter_map(|id| Some((id, &by_agent.get(id)?.stems)));
+    let Some((ego, of_ego)) = stems.next() else {
+        return Vec::new();
     };
-    let ego = agents.first().cloned();
-    let strangers = agents.iter().skip(1).filter(|id| {
-        let ego = ego.as_ref().and_then(stems);
-        ego.zip(stems(id))
-            .is_some_and(|(ego, own)| ego.is_disjoint(own))
-    });
-    strangers.map(|id| {
-        let ego = ego
-            .as_ref()
-            .map(|ego| (ego.to_string(), first(ego)))
-            .unwrap_or_default();
+    let strangers = stems.filter(|(_, own)| of_ego.is_disjoint(own));
+    let problems = strangers.map(|(id, own)| {
+        let [own_first, ego_first] =
+            [own, of_ego].map(|stems| stems.first().map_or("", String::as_str));
         let reason = format!(
-            "no frame of agent {id} (first {}) at a tick of the ego {} (first {}): it takes no part",
-            first(id),
-            ego.0,
-            ego.1
+            "no frame of agent {id} (first {own_first}) at a tick of the ego {ego} (first {ego_first}): it takes no part"
         );
         ReadError::malformed(&dir.join(id.as_str()), reason)
-    }).collect::<Vec<_>>().into_iter()
+    });
+    problems.collect()
 }
 
 /// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the

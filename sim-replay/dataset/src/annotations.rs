@@ -69,24 +69,29 @@ impl<'a> Annotations<'a> {
     /// yaw rate of left-handed files is clockwise.
     pub(super) fn motion(&mut self, handedness: Handedness) -> EgoMotion {
         let imu = self.root.optional("imu").ok().flatten();
-        let mut measured = |key, read: &dyn Fn(&Field<'a>) -> Result<f64>| {
-            imu.as_ref()
-                .and_then(|imu| self.optional_of(imu, &[key], read))
-        };
         let counter_clockwise = if handedness == Handedness::Left {
             -1.0
         } else {
             1.0
         };
-        let yaw_rate_rad_s = measured("yaw_rate_degps", &|field| {
-            let most_degps = EgoMotion::MAX_YAW_RATE_RAD_S.to_degrees();
-            Ok(counter_clockwise
-                * within(field, field.number()?, most_degps, "degrees/s")?.to_radians())
+        let yaw_rate_rad_s = imu.as_ref().and_then(|imu| {
+            self.optional_of(imu, &["yaw_rate_degps"], |field| {
+                let most_degps = EgoMotion::MAX_YAW_RATE_RAD_S.to_degrees();
+                let yaw_rate_degps = within(field, field.number()?, most_degps, "degrees/s")?;
+                Ok(counter_clockwise * yaw_rate_degps.to_radians())
+            })
         });
-        let speed_mps = measured("speed_mps", &|field| own_speed_mps(field, field.number()?));
-        let recorded = |field: &Field<'a>| own_speed_mps(field, speed_mps_of_kmh(field)?);
+        let speed_mps = imu.as_ref().and_then(|imu| {
+            self.optional_of(imu, &["speed_mps"], |field| {
+                own_speed_mps(field, field.number()?)
+            })
+        });
         EgoMotion {
-            speed_mps: speed_mps.or_else(|| self.optional(&["ego_speed"], recorded)),
+            speed_mps: speed_mps.or_else(|| {
+                self.optional(&["ego_speed"], |field| {
+                    own_speed_mps(field, speed_mps_of_kmh(field)?)
+                })
+            }),
             yaw_rate_rad_s,
         }
     }
@@ -203,15 +208,10 @@ impl<'a> Annotations<'a> {
 /// Ids are integers; those that went through an array of floats have a point.
 #[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
 fn listed_id(key: &str, field: &Field<'_>) -> Result<i64> {
-    let whole = || {
-        key.parse()
-            .ok()
-            .filter(|number: &f64| number.fract() == 0.0 && number.abs() < 1e15)
-    };
-    let id = key
-        .parse()
-        .ok()
-        .or_else(|| whole().map(|number| number as i64));
+    let id = key.parse().ok().or_else(|| {
+        let number: f64 = key.parse().ok()?;
+        (number.fract() == 0.0 && number.abs() < 1e15).then_some(number as i64)
+    });
     id.ok_or_else(|| field.error(format!("{key:?} is no object id, expected an integer")))
 }
 

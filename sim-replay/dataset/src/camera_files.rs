@@ -45,15 +45,12 @@ pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf> {
             .iter()
             .map(move |ending| dir.join(format!("{stem}_{prefix}{number}.{ending}")))
     });
-    let missing = || {
+    let found = names.into_iter().find(|path| path.is_file());
+    found.ok_or_else(|| {
         let path = dir.join(format!("{stem}_{}{number}.{}", PREFIXES[0], ENDINGS[0]));
         let reason = "there is no image of this camera, which has some of other frames";
         ReadError::malformed(&path, reason)
-    };
-    names
-        .into_iter()
-        .find(|path| path.is_file())
-        .ok_or_else(missing)
+    })
 }
 
 /// Reads an image; its calibration is that of the entry for the camera in `root`, if there is one.
@@ -70,11 +67,11 @@ pub(super) fn read(
         .ok_or_else(|| ReadError::malformed(path, "neither a PNG nor a JPEG by its first bytes"))?;
     let ImageSize { width, height } = imagesize::blob_size(&image)
         .map_err(|error| ReadError::malformed(path, error.to_string()))?;
-    let edge = |edge: usize| u32::try_from(edge).unwrap_or(u32::MAX);
+    let [width_px, height_px] = [width, height].map(|edge| u32::try_from(edge).unwrap_or(u32::MAX));
     let mut metadata = CameraMetadata {
         format,
-        width_px: edge(width),
-        height_px: edge(height),
+        width_px,
+        height_px,
         pinhole: None,
         lidar_from_camera: None,
     };

@@ -134,19 +134,13 @@ impl Folders {
                 files.entry(folder_of(path)).or_default().push(path.clone());
             }
         }
-        let sweeps = |files: Vec<PathBuf>| {
-            Arc::new(Sweeps::of_single_vehicle(
-                SweepStorage::ByName,
-                files,
-                &OpenOptions::default(),
-            ))
-        };
-        let alone = files
-            .into_iter()
-            .map(|(folder, files)| (folder, sweeps(files)))
-            .collect();
+        let alone = files.into_iter().map(|(folder, files)| {
+            let options = OpenOptions::default();
+            let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, &options);
+            (folder, Arc::new(sweeps))
+        });
         Self {
-            alone,
+            alone: alone.collect(),
             scenes: BTreeMap::new(),
         }
     }

@@ -92,13 +92,17 @@ impl EvaluationProtocol {
             return self.ground_truth;
         }
         let [x_low, y_low, z_low, x_high, y_high, z_high] = area_m;
-        let within = |[low, high]: [f64; 2], from, to| [low.max(from), high.min(to)];
         let GroundTruthRule { x_m, y_m, z_m, .. } = self.ground_truth;
-        let (x_m, y_m) = (within(x_m, x_low, x_high), within(y_m, y_low, y_high));
+        let [x_m, y_m, z_m] = [
+            (x_m, x_low, x_high),
+            (y_m, y_low, y_high),
+            (z_m, z_low, z_high),
+        ]
+        .map(|([low, high], from, to)| [low.max(from), high.min(to)]);
         GroundTruthRule {
             x_m,
             y_m,
-            z_m: within(z_m, z_low, z_high),
+            z_m,
             ..self.ground_truth
         }
     }
@@ -113,14 +117,11 @@ impl EvaluationProtocol {
 
     /// The scenario with the agents that take part, the ego first; none if no agent is of the requested kind.
     pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {
-        let is_unit = |index: &usize| {
-            scenario
-                .agents
-                .get(*index)
-                .is_some_and(|agent| scenario.roadside_units.contains(agent))
-        };
         let (units, vehicles): (Vec<usize>, Vec<usize>) =
-            (0..scenario.agents.len()).partition(is_unit);
+            (0..scenario.agents.len()).partition(|&index| {
+                let agent = scenario.agents.get(index);
+                agent.is_some_and(|agent| scenario.roadside_units.contains(agent))
+            });
         let mut order = match (self.agents, self.ego) {
             (AgentKinds::Vehicles, _) => vehicles,
             (AgentKinds::Units, _) => units,

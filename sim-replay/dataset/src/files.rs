@@ -133,20 +133,14 @@ pub(super) fn above(dir: &Path) -> impl Iterator<Item = PathBuf> {
 
 /// The name of a path below `root`, or the folder's own name where they are the same.
 pub(super) fn name_below(root: &Path, dir: &Path) -> String {
-    let below = dir
-        .strip_prefix(root)
-        .ok()
-        .filter(|below| !below.as_os_str().is_empty());
-    let own_name = || {
-        dir.canonicalize()
-            .ok()
-            .and_then(|dir| dir.file_name().map(PathBuf::from))
-            .unwrap_or_default()
+    let name = match dir.strip_prefix(root) {
+        Ok(below) if !below.as_os_str().is_empty() => below.to_owned(),
+        _ => {
+            let canonical = dir.canonicalize().unwrap_or_default();
+            canonical.file_name().map(PathBuf::from).unwrap_or_default()
+        }
     };
-    below
-        .map_or_else(own_name, Path::to_owned)
-        .to_string_lossy()
-        .replace('\\', "/")
+    name.to_string_lossy().replace('\\', "/")
 }
 
 #[cfg(test)]

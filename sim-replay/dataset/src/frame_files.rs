@@ -49,13 +49,12 @@ fn is_number(stem: &str) -> bool {
 pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str>) {
     let (numbers, others): (BTreeSet<&str>, BTreeSet<&str>) =
         all.iter().partition(|stem| is_number(stem));
-    let is_copy = |stem: &&&str| {
+    let names = others.iter().filter(|stem| {
         let rest = stem.trim_start_matches(|letter: char| letter.is_ascii_digit());
         // The removed digits are ASCII, so the cut lies between two characters.
-        numbers.contains(&stem[..stem.len() - rest.len()])
-    };
-    let names = others.iter().filter(|stem| !is_copy(stem)).count();
-    if !numbers.is_empty() && numbers.len() >= names {
+        !numbers.contains(&stem[..stem.len() - rest.len()])
+    });
+    if numbers.len() >= names.count() && !numbers.is_empty() {
         (numbers, others)
     } else {
         (all, BTreeSet::new())

@@ -62,13 +62,13 @@ impl GroundTruth {
 
     /// Boxes of unknown class in an unlimited area: all detections count.
     pub fn of_boxes(boxes: impl IntoIterator<Item = Box3d>) -> Self {
-        let of_box = |(box3d, id)| TrueBox {
+        let objects = boxes.into_iter().zip(0..).map(|(box3d, id)| TrueBox {
             id,
             class: ObjectClass::Other,
             box3d,
-        };
+        });
         Self {
-            objects: boxes.into_iter().zip(0..).map(of_box).collect(),
+            objects: objects.collect(),
             ignored: Vec::new(),
             area_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX],
         }
@@ -81,12 +81,12 @@ impl GroundTruth {
 }
 
 fn true_boxes(objects: &[(&Object, Box3d)]) -> Vec<TrueBox> {
-    let of_object = |(object, box3d): &(&Object, Box3d)| TrueBox {
+    let boxes = objects.iter().map(|&(object, box3d)| TrueBox {
         id: object.id,
         class: object.class,
-        box3d: *box3d,
-    };
-    objects.iter().map(of_object).collect()
+        box3d,
+    });
+    boxes.collect()
 }
 
 /// Range, classes and agents whose annotations count.
@@ -128,17 +128,20 @@ impl GroundTruthRule {
 
     /// True if enough corners lie in range, and all of them in x and y.
     pub fn keeps(&self, box3d: &Box3d) -> bool {
-        let corners = box3d.corners();
-        let within = |value: f64, [low, high]: [f64; 2]| low <= value && value <= high;
-        let in_plane = |&[x, y, _]: &[f64; 3]| within(x, self.x_m) && within(y, self.y_m);
-        let inside = corners
-            .iter()
-            .filter(|corner| in_plane(corner) && within(corner[2], self.z_m))
-            .count();
+        let (mut inside, mut are_in_plane) = (0, true);
+        for [x, y, z] in box3d.corners() {
+            let is_in_plane = is_within(x, self.x_m) && is_within(y, self.y_m);
+            inside += usize::from(is_in_plane && is_within(z, self.z_m));
+            are_in_plane &= is_in_plane;
+        }
         // The second test is the reference's own, on x and y alone, after merging. It decides only if fewer than all
         // corners pass the first one.
-        inside >= self.min_corners && corners.iter().all(in_plane)
+        inside >= self.min_corners && are_in_plane
     }
+}
+
+fn is_within(value: f64, [low, high]: [f64; 2]) -> bool {
+    low <= value && value <= high
 }
 
 /// The objects of one tick in the frame of the ego's LiDAR, by id, in the order of first occurrence: the ego's own
@@ -230,23 +233,21 @@ pub fn annotations<'a>(frames_of_tick: &[&'a Frame]) -> Vec<&'a [Object]> {
 
 /// Indices of the agents whose annotations count: the ego first, then those within range of it.
 pub fn contributors(frames_of_tick: &[&Frame], ego_index: usize, comm_range_m: f64) -> Vec<usize> {
-    let position = |index: usize| {
-        frames_of_tick
-            .get(index)
-            .and_then(|frame| frame.world_from_lidar)
-    };
-    let Some(ego) = position(ego_index) else {
+    let ego = frames_of_tick.get(ego_index);
+    let Some(ego) = ego.and_then(|ego| ego.world_from_lidar) else {
         return Vec::new();
     };
-    std::iter::once(ego_index)
-        .chain((0..frames_of_tick.len()).filter(|&index| {
-            let Some(other) = position(index).filter(|_| index != ego_index) else {
-                return false;
-            };
-            let ([x, y, _], [ego_x, ego_y, _]) = (other.translation_m, ego.translation_m);
-            (x - ego_x).hypot(y - ego_y) <= comm_range_m
-        }))
-        .collect()
+    let mut agents = vec![ego_index];
+    for (index, frame) in frames_of_tick.iter().enumerate() {
+        let Some(other) = frame.world_from_lidar.filter(|_| index != ego_index) else {
+            continue;
+        };
+        let ([x, y, _], [ego_x, ego_y, _]) = (other.translation_m, ego.translation_m);
+        if (x - ego_x).hypot(y - ego_y) <= comm_range_m {
+            agents.push(index);
+        }
+    }
+    agents
 }
 
 /// The object as a box without roll and pitch in another frame.

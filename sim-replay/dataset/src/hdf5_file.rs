@@ -60,6 +60,15 @@ fn link(name: &str, address: usize) -> Vec<u8> {
     message(6, link)
 }
 
+/// The header of the root group, with links to the data sets at these addresses.
+fn root_header(stamps: usize, poses: usize) -> Vec<u8> {
+    object_header(&[
+        message(2, [&[0, 0][..], &UNDEFINED, &UNDEFINED].concat()),
+        link("valid_timestamps", stamps),
+        link("poses", poses),
+    ])
+}
+
 fn superblock(end: usize) -> Vec<u8> {
     let mut block = b"\x89HDF\r\n\x1a\n".to_vec();
     block.extend([0, 0, 0, 0, 0, 8, 8, 0, 4, 0, 16, 0, 0, 0, 0, 0]);
@@ -84,27 +93,18 @@ pub fn poses_file(stamps: &[i64], poses: &[[f64; 12]]) -> Vec<u8> {
         .flatten()
         .flat_map(|value| value.to_le_bytes())
         .collect();
-    let link_info = message(2, [&[0, 0][..], &UNDEFINED, &UNDEFINED].concat());
-    let root_of = |a, b| {
-        object_header(&[
-            link_info.clone(),
-            link("valid_timestamps", a),
-            link("poses", b),
-        ])
-    };
-    let stamp_header = |data| dataset_header(&[stamps.len() as u64], &I64, data, stamp_bytes.len());
-    let pose_header =
-        |data| dataset_header(&[poses.len() as u64, 12], &F64, data, pose_bytes.len());
+    let (stamps, poses) = ([stamps.len() as u64], [poses.len() as u64, 12]);
+    let (stamp_len, pose_len) = (stamp_bytes.len(), pose_bytes.len());
     // Headers have the same length for every address.
-    let first = ROOT + root_of(0, 0).len();
-    let second = first + stamp_header(0).len();
-    let data = second + pose_header(0).len();
-    let pose_data = data + stamp_bytes.len();
+    let first = ROOT + root_header(0, 0).len();
+    let second = first + dataset_header(&stamps, &I64, 0, stamp_len).len();
+    let data = second + dataset_header(&poses, &F64, 0, pose_len).len();
+    let pose_data = data + stamp_len;
 
-    let mut file = superblock(pose_data + pose_bytes.len());
-    file.extend(root_of(first, second));
-    file.extend(stamp_header(data));
-    file.extend(pose_header(pose_data));
+    let mut file = superblock(pose_data + pose_len);
+    file.extend(root_header(first, second));
+    file.extend(dataset_header(&stamps, &I64, data, stamp_len));
+    file.extend(dataset_header(&poses, &F64, pose_data, pose_len));
     file.extend(stamp_bytes);
     file.extend(pose_bytes);
     file

@@ -104,8 +104,8 @@ fn wrong(path: &Path, field: &str, reason: String) -> ReadError {
 
 /// Shape and values of a dataset of numbers. Microseconds since 1970 fit a double exactly.
 fn numbers(path: &Path, file: &Hdf5File, name: &str) -> Result<(Vec<u64>, Vec<f64>)> {
-    let unsound = |error: hdf5_reader::error::Error| wrong(path, name, error.to_string());
-    let dataset = file.dataset(name).map_err(unsound)?;
+    let dataset = file.dataset(name);
+    let dataset = dataset.map_err(|error| wrong(path, name, error.to_string()))?;
     let values = match dataset.dtype() {
         Datatype::FloatingPoint { size: 4, .. } => values::<f32>(&dataset, f64::from),
         Datatype::FloatingPoint { .. } => values::<f64>(&dataset, |value| value),
@@ -113,7 +113,8 @@ fn numbers(path: &Path, file: &Hdf5File, name: &str) -> Result<(Vec<u64>, Vec<f6
         Datatype::FixedPoint { .. } => values::<i64>(&dataset, |value| value as f64),
         other => return Err(wrong(path, name, format!("{other:?}, expected numbers"))),
     };
-    Ok((dataset.shape().to_vec(), values.map_err(unsound)?))
+    let values = values.map_err(|error| wrong(path, name, error.to_string()))?;
+    Ok((dataset.shape().to_vec(), values))
 }
 
 fn values<T: hdf5_reader::H5Type>(

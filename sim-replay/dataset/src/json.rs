@@ -30,28 +30,30 @@ pub(super) fn parse(bytes: &[u8]) -> serde_json::Result<Value> {
 
 /// The text with quotes around each bare word that is no JSON by itself.
 pub(super) fn with_quoted_words(bytes: &[u8]) -> Vec<u8> {
-    let is_word = |byte: &u8| byte.is_ascii_alphanumeric() || b"+-._".contains(byte);
     let mut mended = Vec::with_capacity(bytes.len() + 16);
     let (mut rest, mut is_string) = (bytes, false);
     while let Some(&first) = rest.first() {
-        let end = match is_string || !is_word(&first) {
+        let end = match is_string || !is_of_word(first) {
             // An escaped character cannot end a string.
             true if first == b'\\' => rest.len().min(2),
             true => 1,
-            false => rest.iter().take_while(|byte| is_word(byte)).count(),
+            false => rest.iter().take_while(|byte| is_of_word(**byte)).count(),
         };
         // Escaped quotes do not arrive here: they are the second byte of the token before.
         is_string ^= first == b'"';
         let (token, after) = rest.split_at_checked(end).unwrap_or((rest, &[]));
-        let is_bare = !is_string && is_word(&first);
-        let is_json = || serde_json::from_slice::<Value>(token).is_ok();
-        match is_bare && !is_json() {
+        let is_bare = !is_string && is_of_word(first);
+        match is_bare && serde_json::from_slice::<Value>(token).is_err() {
             true => mended.extend([b"\"", token, b"\""].concat()),
             false => mended.extend(token),
         }
         rest = after;
     }
     mended
+}
+
+fn is_of_word(byte: u8) -> bool {
+    byte.is_ascii_alphanumeric() || b"+-._".contains(&byte)
 }
 
 /// A value with its position in the document; readers take numbers and texts from it.

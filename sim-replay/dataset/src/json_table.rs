@@ -55,10 +55,13 @@ pub(super) fn read(
 ) -> Result<usize> {
     let (mut used, mut unusable, mut first_problems) = (0, 0, Vec::new());
     let whole = for_each_row(path, max_bytes, |index, raw| {
-        let is_needed = |raw: &[u8]| serde_json::from_slice(raw).map(|keys| is_needed(&keys));
         // A row without valid keys is kept for its error message.
-        let is_needed = is_needed(raw).or_else(|_| is_needed(&json::with_quoted_words(raw)));
-        if is_needed.is_ok_and(|is_needed| !is_needed) {
+        let is_unneeded = match serde_json::from_slice(raw) {
+            Ok(keys) => !is_needed(&keys),
+            Err(_) => serde_json::from_slice(&json::with_quoted_words(raw))
+                .is_ok_and(|keys| !is_needed(&keys)),
+        };
+        if is_unneeded {
             return;
         }
         match parse_row(path, index, raw).and_then(|value| row(&Field::entry(path, index, &value)))
@@ -98,9 +101,9 @@ fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value> {
 /// Passes on the entries of the list in the order of the file. An entry need not be valid: it ends when its brackets
 /// are closed.
 fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])) -> Result<()> {
-    let io = |error| ReadError::io(path, error);
-    let file = bounded_file::open(path).map_err(io)?;
-    let size = file.metadata().map_err(io)?.len();
+    let file = bounded_file::open(path).map_err(|error| ReadError::io(path, error))?;
+    let metadata = file.metadata();
+    let size = metadata.map_err(|error| ReadError::io(path, error))?.len();
     if size > max_bytes {
         let reason = format!("{size} bytes: larger than {max_bytes} bytes, the most that is read");
         return Err(ReadError::malformed(path, reason));
@@ -109,7 +112,8 @@ fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])
     let mut reader = BufReader::with_capacity(BUFFER_BYTES, file.take(max_bytes));
     let mut list = RowSplitter::default();
     loop {
-        let bytes = reader.fill_buf().map_err(io)?;
+        let bytes = reader.fill_buf();
+        let bytes = bytes.map_err(|error| ReadError::io(path, error))?;
         if bytes.is_empty() {
             return list.finish().map_err(|reason| list.error(path, reason));
         }

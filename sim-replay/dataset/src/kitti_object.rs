@@ -168,7 +168,6 @@ fn object(
 ) -> Result<Object> {
     // The first word of an arbitrary file may be long.
     let field: String = kind.chars().take(40).collect();
-    let malformed = |reason: String| kitti_text::malformed(path, line, Some(&field), reason);
     let count = numbers.split_ascii_whitespace().count();
     // A score may follow.
     let has_score = count == LABEL_NUMBERS + 1;
@@ -182,16 +181,14 @@ fn object(
     let [.., height, width, length, x, y, z, rotation_y] = values;
     let size_m = [length, width, height];
     if size_m.iter().any(|&size| size <= 0.0 || size > MAX_SIZE_M) {
-        return Err(malformed(format!(
-            "{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m"
-        )));
+        let reason = format!("{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m");
+        return Err(kitti_text::malformed(path, line, Some(&field), reason));
     }
     let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
     let camera_from_object = camera_from_object([x, y, z], height, rotation_y);
     let world_from_object: Pose = (lidar_from_camera * camera_from_object).into();
-    world_from_object
-        .validate()
-        .map_err(|error| malformed(error.to_string()))?;
+    let valid = world_from_object.validate();
+    valid.map_err(|error| kitti_text::malformed(path, line, Some(&field), error.to_string()))?;
     Ok(Object {
         id,
         class,

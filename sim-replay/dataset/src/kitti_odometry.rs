@@ -61,11 +61,6 @@ pub(super) fn open(
     let (of_times, of_poses) = (dir.join("times.txt"), poses_path(dir).unwrap_or_default());
     keep_those_with(&mut scans, &of_times, times.as_deref(), problems);
     keep_those_with(&mut scans, &of_poses, poses.as_deref(), problems);
-    let capture_nanos = |scan: usize| match &times {
-        Some(times) => times.get(scan).copied().flatten().unwrap_or_default(),
-        None => options.period_nanos.saturating_mul(scan as u64),
-    };
-    let tick = |(scan, stem): (usize, String)| Tick::new(stem, capture_nanos(scan));
     let mut joins = Vec::new();
     for (is_joined, what) in [(poses.is_some(), "poses"), (times.is_some(), "times")] {
         let line = format!(
@@ -74,7 +69,14 @@ pub(super) fn open(
         );
         joins.extend(is_joined.then_some(line));
     }
-    let mut ticks: Vec<Tick> = scans.into_iter().map(tick).collect();
+    let ticks = scans.into_iter().map(|(scan, stem)| {
+        let capture_nanos = match &times {
+            Some(times) => times.get(scan).copied().flatten().unwrap_or_default(),
+            None => options.period_nanos.saturating_mul(scan as u64),
+        };
+        Tick::new(stem, capture_nanos)
+    });
+    let mut ticks: Vec<Tick> = ticks.collect();
     // Names without leading zeros are listed in another order than their numbers.
     ticks.sort_by_key(|tick| tick.capture_nanos);
     let files = ticks

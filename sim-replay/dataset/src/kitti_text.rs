@@ -44,10 +44,11 @@ pub(super) fn rows<T>(
     read: impl Fn(u64, &str) -> Result<T>,
 ) -> Result<Vec<Option<T>>> {
     let lines = counted_lines(path)?;
-    let is_comment = |(_, text): &&(u64, String)| text.trim_start().starts_with('#');
-    if let Some((line, _)) = lines.iter().find(is_comment) {
-        let reason = "a comment, where the number of a line is that of a scan".to_owned();
-        return Err(malformed(path, *line, None, reason));
+    for (line, text) in &lines {
+        if text.trim_start().starts_with('#') {
+            let reason = "a comment, where the number of a line is that of a scan".to_owned();
+            return Err(malformed(path, *line, None, reason));
+        }
     }
     let values = lines.iter().map(|(line, text)| match text.trim() {
         "" => Err(malformed(path, *line, None, "the line is blank".to_owned())),

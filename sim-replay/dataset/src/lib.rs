@@ -353,8 +353,9 @@ impl Scenario {
         variant: Option<&str>,
     ) -> Result<PcdCloud> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
-        let is_unknown = |asked: &&str| !self.lidar_variants.iter().any(|known| known == asked);
-        if let Some(asked) = variant.filter(is_unknown) {
+        if let Some(asked) = variant
+            && !self.lidar_variants.iter().any(|known| known == asked)
+        {
             return Err(ReadError::NoSuch {
                 scenario: self.name.clone(),
                 what: "LiDAR variant",

@@ -144,8 +144,9 @@ pub(super) fn open(
             problems.push(ReadError::malformed(dir, reason));
         }
     }
-    let tick = |(micros, stem): (u64, String)| Tick::new(stem, micros.saturating_mul(1000));
-    let ticks: Vec<Tick> = stamps.into_iter().map(tick).collect();
+    let ticks = stamps.into_iter();
+    let ticks = ticks.map(|(micros, stem)| Tick::new(stem, micros.saturating_mul(1000)));
+    let ticks: Vec<Tick> = ticks.collect();
     let layout = if storage == Storage::Oxford {
         Layout::OXFORD
     } else {
@@ -230,8 +231,8 @@ fn poses_as_stored(
         return Ok(None);
     };
     let truth = GroundTruth::read(&path, problems)?;
-    let at = |&micros: &u64| Some((micros, Pose::from(truth.at(micros)?)));
-    Ok(Some(("NCLT", stamps.keys().filter_map(at).collect())))
+    let poses = (stamps.keys()).filter_map(|&micros| Some((micros, Pose::from(truth.at(micros)?))));
+    Ok(Some(("NCLT", poses.collect())))
 }
 
 /// File of the mean position of a scene's training sequences.
@@ -266,12 +267,10 @@ fn first_row(path: &Path) -> Result<[f64; 3]> {
     let mut lines = lines(path)?;
     lines.retain(|(_, text)| !text.trim_start().starts_with('#'));
     let first = lines.first().map(|(line, text)| (*line, text.clone()));
-    let count = |text: &str| text.split_ascii_whitespace().count();
-    match (first, lines.len()) {
-        (Some((line, text)), 1 | 2) if lines.iter().all(|(_, row)| count(row) == 3) => {
-            numbers(path, line, None, &text)
-        }
-        (first, _) => {
+    let mut counts = (lines.iter()).map(|(_, row)| row.split_ascii_whitespace().count());
+    match (first, lines.len(), counts.all(|count| count == 3)) {
+        (Some((line, text)), 1 | 2, true) => numbers(path, line, None, &text),
+        (first, ..) => {
             let all: Vec<String> = lines.into_iter().map(|(_, text)| text).collect();
             let line = first.map_or(1, |(line, _)| line);
             numbers(path, line, None, &all.join(" "))

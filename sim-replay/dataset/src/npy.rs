@@ -46,19 +46,19 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
             "shape {shape:?} stated, {found} bytes found: the file is cut off"
         ));
     }
-    let point = |index: usize| {
+    let points = (0..columns.points).map(|index| {
         columns.places.map(|place| {
             let value = place
                 .and_then(|(first, scalar)| scalar.read(body.get(first + index * columns.step..)?));
             value.map_or(0.0, |value| value as f32)
         })
-    };
-    let points = (0..columns.points).map(point).collect();
+    });
     let [.., intensity] = columns.places;
     let intensity = intensity.map(|(_, scalar)| {
         let name = columns.intensity.as_deref().unwrap_or("4th column");
         IntensityOrigin::stored(name, scalar.intensity_kind())
     });
+    let points = points.collect();
     Ok(PcdCloud::of_points(points, intensity, "NumPy array"))
 }
 
@@ -108,10 +108,11 @@ fn shape_of(header: &str) -> Result<Vec<usize>, String> {
         .split(',')
         .map(str::trim)
         .filter(|size| !size.is_empty());
-    let no_size = |size| format!("shape ({text}): {size:?} is no size");
-    sizes
-        .map(|size| size.parse().map_err(|_| no_size(size)))
-        .collect()
+    let sizes = sizes.map(|size| {
+        let number = size.parse();
+        number.map_err(|_| format!("shape ({text}): {size:?} is no size"))
+    });
+    sizes.collect()
 }
 
 /// The type of an array of plain numbers. Bytes without a meaning (`|V8`) are none, and may be of size 0.
@@ -130,16 +131,15 @@ fn no_number(code: &str) -> String {
 
 /// The number type of NumPy's code, for example `<f4`.
 fn scalar_of(code: &str) -> Result<Scalar, String> {
-    let fault = || no_number(code);
-    let (order, rest) = code.split_at_checked(1).ok_or_else(fault)?;
-    let (kind, size) = rest.split_at_checked(1).ok_or_else(fault)?;
-    let size = size.parse().map_err(|_| fault())?;
+    let (order, rest) = code.split_at_checked(1).ok_or_else(|| no_number(code))?;
+    let (kind, size) = rest.split_at_checked(1).ok_or_else(|| no_number(code))?;
+    let size = size.parse().map_err(|_| no_number(code))?;
     let kind = match (kind, size) {
         ("f", 4 | 8) => ScalarKind::Float,
         ("i", 1 | 2 | 4 | 8) => ScalarKind::Signed,
         ("u", 1 | 2 | 4 | 8) => ScalarKind::Unsigned,
         ("V", _) => ScalarKind::Padding,
-        _ => return Err(fault()),
+        _ => return Err(no_number(code)),
     };
     Ok(Scalar::new(kind, size, order == ">"))
 }
@@ -175,47 +175,44 @@ fn product(one: usize, sizes: &[usize]) -> Option<usize> {
 
 fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
     let fields = fields_of(fields)?;
-    let is_number = |(_, scalar): &(String, Scalar)| scalar.kind != ScalarKind::Padding;
-    let find = |names: &[&str]| {
-        let index = names.iter().find_map(|name| {
-            fields
-                .iter()
-                .position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name))
-        })?;
-        let (name, scalar) = fields.get(index)?;
-        Some((name.clone(), (size_of(fields.get(..index)?), *scalar)))
-    };
-    let coordinate = |name: &str| {
+    let [x, y, z] = ["x", "y", "z"].map(|name| {
         let names: Vec<&str> = fields.iter().map(|(name, _)| name.as_str()).collect();
-        find(&[name])
+        find(&fields, &[name])
             .map(|(_, place)| place)
             .ok_or_else(|| format!("no field {name}, there are {names:?}"))
-    };
-    let intensity = find(&INTENSITY_FIELDS);
+    });
+    let intensity = find(&fields, &INTENSITY_FIELDS);
+    let place = intensity.as_ref().map(|(_, place)| *place);
     Ok(Columns {
-        places: [
-            Some(coordinate("x")?),
-            Some(coordinate("y")?),
-            Some(coordinate("z")?),
-            intensity.as_ref().map(|f| f.1),
-        ],
+        places: [Some(x?), Some(y?), Some(z?), place],
         step: size_of(&fields),
         points: product(1, shape).unwrap_or(usize::MAX),
         intensity: intensity.map(|(name, _)| name),
     })
 }
 
+/// Name and place of the first field of numbers with one of the names, the first preferred.
+fn find(fields: &[(String, Scalar)], names: &[&str]) -> Option<(String, (usize, Scalar))> {
+    let index = names.iter().find_map(|wanted| {
+        fields.iter().position(|(name, scalar)| {
+            scalar.kind != ScalarKind::Padding && name.eq_ignore_ascii_case(wanted)
+        })
+    })?;
+    let (name, scalar) = fields.get(index)?;
+    Some((name.clone(), (size_of(fields.get(..index)?), *scalar)))
+}
+
 fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns, String> {
-    let fault = || format!("shape {shape:?}, expected N x 3 or N x 4 numbers");
-    let (&last, before) = shape.split_last().ok_or_else(fault)?;
+    let (&last, before) = shape.split_last().ok_or_else(|| wrong_shape(shape))?;
     // 3 x 4 could be either: rows are points then.
     let is_by_component = matches!(before, [3 | 4]) && !COLUMNS.contains(&last);
     let (count, columns, is_planar) = match before {
         [components] if is_by_component => (last, *components, !is_fortran),
         [_, ..] if COLUMNS.contains(&last) => {
-            (product(1, before).ok_or_else(fault)?, last, is_fortran)
+            let count = product(1, before).ok_or_else(|| wrong_shape(shape))?;
+            (count, last, is_fortran)
         }
-        _ => return Err(fault()),
+        _ => return Err(wrong_shape(shape)),
     };
     // C order by component and Fortran order by point are the same bytes: all x, then all y.
     let (column_step, point_step) = if is_planar { (count, 1) } else { (1, columns) };
@@ -228,6 +225,10 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
         points: count,
         intensity: None,
     })
+}
+
+fn wrong_shape(shape: &[usize]) -> String {
+    format!("shape {shape:?}, expected N x 3 or N x 4 numbers")
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Opening of data sets: detects the layout of a folder by the table of layouts.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::layout::{LayoutRow, Reader, opened};
 use super::layouts::LAYOUTS;
@@ -37,8 +37,9 @@ pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset> {
 
 /// Refuses the file systems of the kernel, whose folders and files have no end.
 fn check_file_system(dir: &Path) -> Result<()> {
-    let is_kernels = |dir: PathBuf| KERNEL_FOLDERS.iter().any(|kernel| dir.starts_with(kernel));
-    match dir.canonicalize().is_ok_and(is_kernels) {
+    let canonical = dir.canonicalize().unwrap_or_default();
+    let mut kernels = KERNEL_FOLDERS.iter();
+    match kernels.any(|kernel| canonical.starts_with(kernel)) {
         true => Err(ReadError::Layout {
             path: dir.to_owned(),
             reason: "no data set: a folder of the kernel".to_owned(),
@@ -120,17 +121,20 @@ fn unknown(dir: &Path) -> ReadError {
     }
 }
 
+fn has_below(dir: &Path, path: &str) -> bool {
+    !roots::find(dir, |dir| dir.join(path).exists()).is_empty()
+}
+
 /// Advice for the parts of KITTI that are not read.
 fn unsupported_kitti(dir: &Path) -> Option<&'static str> {
-    let has = |path: &'static str| !roots::find(dir, |dir| dir.join(path).exists()).is_empty();
-    if has("velodyne_points/data") {
+    if has_below(dir, "velodyne_points/data") {
         return Some(
             "this looks like KITTI raw, whose GPS poses (oxts) are not read: use KITTI's odometry sequences of the \
              same drives, or write the poses of the LiDAR into a file poses.txt beside a folder velodyne with the \
              clouds; agent locate reads velodyne_points/data as it is",
         );
     }
-    has("velodyne/0000/000000.bin").then_some(
+    has_below(dir, "velodyne/0000/000000.bin").then_some(
         "this looks like KITTI tracking, which is not read: its poses (oxts) and labels (label_02) are in one file per \
          sequence; agent locate reads a folder velodyne/<sequence> as it is, KITTI's object data set is read with labels",
     )
@@ -139,6 +143,7 @@ fn unsupported_kitti(dir: &Path) -> Option<&'static str> {
 #[cfg(test)]
 mod tests {
     use std::fs;
+    use std::path::PathBuf;
     use std::sync::Arc;
 
     use protocol::CavId;

@@ -72,11 +72,10 @@ impl FrameSource for Opv2v {
             .iter()
             .filter(|number| own.is_some_and(|own| own.contains(number)))
         {
-            let file = camera_files::find(&dir, &tick.stem, number);
-            let read = |file: PathBuf| {
+            let camera = camera_files::find(&dir, &tick.stem, number).and_then(|file| {
                 camera_files::read(&file, number, &root, &|field| self.six_numbers(field))
-            };
-            found.add(number, file.and_then(read));
+            });
+            found.add(number, camera);
         }
         found
     }
@@ -101,19 +100,22 @@ impl FrameSource for Opv2v {
 
 impl Opv2v {
     fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame> {
-        let pose = |field: &Field<'_>| self.six_numbers(field);
         // A faulty LiDAR pose is an error of the frame: all else in it is relative to it.
         let world_from_lidar = root
             .optional("lidar_pose")?
-            .map(|field| pose(&field))
+            .map(|field| self.six_numbers(&field))
             .transpose()?;
         let mut annotations = Annotations::new(root);
         let motion = annotations.motion(self.handedness);
         Ok(Frame {
             world_from_lidar,
-            world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
+            world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], |field| {
+                self.six_numbers(field)
+            }),
             gnss_world_from_vehicle: annotations
-                .optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
+                .optional(&["predicted_ego_pos", "predicted_ego_pose"], |field| {
+                    self.six_numbers(field)
+                }),
             speed_mps: motion.speed_mps,
             yaw_rate_rad_s: motion.yaw_rate_rad_s,
             objects: annotations.objects(|id, _| Ok(id), |place| self.world_from(place)),

@@ -14,7 +14,7 @@ use super::presence::AbsentFrames;
 use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
-use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Result, Scenario, Tick, files};
+use super::{Dataset, FrameSource, Layout, ReadError, Result, Scenario, Tick, files};
 
 /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
 pub(crate) static OPV2V: LayoutRow = LayoutRow {
@@ -90,13 +90,10 @@ fn agent_folder_scenario(
     };
     let moments = folder.ticks(options.period_nanos, problems);
     let (agents, missing) = (folder.agents.clone(), folder.missing.clone());
-    let ego_lacks = |tick: &Tick| {
-        let is_of_ego = |frame: &MissingFrame| Some(&frame.agent) == agents.first();
-        missing
-            .iter()
-            .any(|frame| is_of_ego(frame) && frame.stem == tick.stem)
-    };
-    let ticks = moments.iter().filter(|tick| !ego_lacks(tick));
+    let ticks = moments.iter().filter(|tick| {
+        let mut of_tick = missing.iter().filter(|frame| frame.stem == tick.stem);
+        !of_tick.any(|frame| Some(&frame.agent) == agents.first())
+    });
     let ticks: Vec<Tick> = ticks.cloned().collect();
     let absent_at = AbsentFrames::new(&agents, &ticks, &missing).among(moments);
     let name = files::name_below(root, &folder.dir);

@@ -65,21 +65,16 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
             "element vertex has the list {list:?}, expected numbers only"
         ));
     }
-    let coordinate = |name: &str| {
+    let [x, y, z] = ["x", "y", "z"].map(|name| {
         let found = vertex.find(&[name]);
         found.ok_or_else(|| format!("element vertex has no property {name}"))
-    };
-    let columns = [
-        Some(coordinate("x")?),
-        Some(coordinate("y")?),
-        Some(coordinate("z")?),
-        vertex.find(&INTENSITY_FIELDS),
-    ];
+    });
+    let intensity = vertex.find(&INTENSITY_FIELDS);
+    let columns = [Some(x?), Some(y?), Some(z?), intensity];
     let (points, form) = match storage {
         Storage::Ascii => (ascii(vertex, before, body, &columns)?, "PLY, ascii"),
         _ => (binary(vertex, before, body, &columns)?, "PLY, binary"),
     };
-    let [.., intensity] = columns;
     let intensity = intensity
         .and_then(|index| vertex.properties.get(index))
         .map(|(name, scalar)| IntensityOrigin::stored(name, scalar.intensity_kind()));
@@ -89,6 +84,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
 /// Storage, elements, and the bytes behind the header.
 fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     const END: &[u8] = b"end_header";
+    const TOO_EARLY: &str = "a property before the first element";
     // A binary body may have no line end for long: the search for `end_header` is bounded.
     let start = bytes.get(..bytes.len().min(MAX_HEADER)).unwrap_or_default();
     if !start.starts_with(b"ply") {
@@ -107,14 +103,12 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     let (mut storage, mut elements) = (None, Vec::<Element>::new());
     for (number, line) in (1..).zip(text.lines()) {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
-        let fault = |reason: String| format!("line {number}: {reason}");
-        let too_early = || fault("a property before the first element".to_owned());
         match *words {
             ["format", name, _] => storage = Some((name.to_owned(), number)),
             ["element", name, count] => {
                 let count = count
                     .parse()
-                    .map_err(|_| fault(format!("{count:?} is no number of elements")))?;
+                    .map_err(|_| format!("line {number}: {count:?} is no number of elements"))?;
                 elements.push(Element {
                     name: name.to_owned(),
                     count,
@@ -123,15 +117,19 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
                 });
             }
             ["property", "list", _, _, name] => {
-                let element = elements.last_mut().ok_or_else(too_early)?;
+                let element = elements.last_mut();
+                let element = element.ok_or_else(|| format!("line {number}: {TOO_EARLY}"))?;
                 element.list.get_or_insert_with(|| name.to_owned());
             }
             ["property", kind, name] => {
                 let scalar = scalar_of(kind)
-                    .ok_or_else(|| fault(format!("{kind:?} is no type of a number")))?;
-                let element = elements.last_mut().ok_or_else(too_early)?;
+                    .ok_or_else(|| format!("line {number}: {kind:?} is no type of a number"))?;
+                let element = elements.last_mut();
+                let element = element.ok_or_else(|| format!("line {number}: {TOO_EARLY}"))?;
                 if element.properties.len() >= MAX_PROPERTIES {
-                    return Err(fault(format!("more than {MAX_PROPERTIES} properties")));
+                    return Err(format!(
+                        "line {number}: more than {MAX_PROPERTIES} properties"
+                    ));
                 }
                 element.properties.push((name.to_owned(), scalar));
             }
@@ -239,23 +237,21 @@ fn binary(
             "{count} vertices of {stride} bytes stated, {found} bytes found: the file is cut off"
         ));
     };
-    let column = |index: usize| {
+    let places = columns.map(|index| {
+        let index = index?;
+        let (_, scalar) = vertex.properties.get(index)?;
         let before = vertex.properties.iter().take(index);
         let first: usize = before.map(|(_, scalar)| scalar.size).sum();
-        vertex
-            .properties
-            .get(index)
-            .map(|(_, scalar)| (first, *scalar))
-    };
-    let places = columns.map(|index| index.and_then(column));
-    let point = |bytes: &[u8]| {
+        Some((first, *scalar))
+    });
+    let points = body.chunks_exact(stride.max(1)).map(|bytes| {
         places.map(|place| {
             place
                 .and_then(|(first, scalar)| scalar.read(bytes.get(first..)?))
                 .map_or(0.0, |v| v as f32)
         })
-    };
-    Ok(body.chunks_exact(stride.max(1)).map(point).collect())
+    });
+    Ok(points.collect())
 }
 
 #[cfg(test)]

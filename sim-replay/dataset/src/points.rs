@@ -132,8 +132,8 @@ impl AgentSweeps {
     /// Number of floats per point.
     fn form(&self, path: &Path) -> Result<FloatForm> {
         let form = self.form.get_or_init(|| {
-            let is_floats = |path: &&PathBuf| matches!(FileKind::of(path), Ok(FileKind::Floats));
-            let files = self.files.iter().filter(is_floats);
+            let files = self.files.iter();
+            let files = files.filter(|path| matches!(FileKind::of(path), Ok(FileKind::Floats)));
             let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
             let samples = samples.filter(|bytes| !bytes.is_empty()).take(SAMPLES);
             FloatForm::of(&samples.collect::<Vec<_>>())
@@ -258,16 +258,15 @@ fn nclt_raw(bytes: &[u8]) -> Result<PcdCloud, String> {
     const OFFSET_M: f64 = -100.0;
     check_whole_points(bytes.len(), 8)?;
     let (points, _) = bytes.as_chunks::<8>();
-    let point = |&[x0, x1, y0, y1, z0, z1, intensity, _laser]: &[u8; 8]| {
+    let points = (points.iter()).map(|&[x0, x1, y0, y1, z0, z1, intensity, _laser]| {
         let [x, y, z] = [[x0, x1], [y0, y1], [z0, z1]]
             // In double precision, rounded once: steps of 5 mm are no binary fractions.
             .map(|bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32);
         [x, y, z, f32::from(intensity)]
-    };
+    });
     let origin = IntensityOrigin::stored("7th byte", IntensityKind::Byte);
     let form = "8 bytes per point, as NCLT records them";
-    let points = points.iter().map(point).collect();
-    Ok(PcdCloud::of_points(points, Some(origin), form))
+    Ok(PcdCloud::of_points(points.collect(), Some(origin), form))
 }
 
 /// Negates y: left-handed points become right-handed ones.

@@ -30,11 +30,11 @@ impl AbsentFrames {
             .enumerate()
             .map(|(index, tick)| (tick.stem.as_str(), index))
             .collect();
-        let place = |frame: &MissingFrame| {
+        let pairs = missing.iter().filter_map(|frame| {
             Some((*agents.get(&frame.agent)?, *ticks.get(frame.stem.as_str())?))
-        };
+        });
         Self {
-            pairs: Arc::new(missing.iter().filter_map(place).collect()),
+            pairs: Arc::new(pairs.collect()),
             moments: None,
         }
     }
@@ -76,16 +76,16 @@ impl Scenario {
             .iter()
             .filter_map(|&index| self.agents.get(index).cloned())
             .collect();
-        let is_kept = |frame: &&MissingFrame| agents.contains(&frame.agent);
-        let missing: Vec<MissingFrame> = self.missing.iter().filter(is_kept).cloned().collect();
+        let missing = (self.missing.iter()).filter(|frame| agents.contains(&frame.agent));
+        let missing: Vec<MissingFrame> = missing.cloned().collect();
         let lacking: HashSet<&str> = (missing.iter())
             .filter(|frame| Some(&frame.agent) == agents.first())
             .map(|frame| frame.stem.as_str())
             .collect();
         // Not only the present ticks: the new ego may have frames where the old one has none.
         let moments = self.absent_at.moments.as_deref().unwrap_or(&self.ticks);
-        let is_tick = |tick: &&Tick| !lacking.contains(tick.stem.as_str());
-        let ticks: Vec<Tick> = moments.iter().filter(is_tick).cloned().collect();
+        let ticks = (moments.iter()).filter(|tick| !lacking.contains(tick.stem.as_str()));
+        let ticks: Vec<Tick> = ticks.cloned().collect();
         let absent_at = AbsentFrames {
             moments: self.absent_at.moments.clone(),
             ..AbsentFrames::new(&agents, &ticks, &missing)

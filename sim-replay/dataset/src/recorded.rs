@@ -152,16 +152,15 @@ impl Recorded {
 
     /// All agents with sweeps, in the order of the scene, which is that of the ground truth: the ego comes first.
     fn in_order(&self) -> Vec<CavId> {
-        let has_sweeps = |cav: &CavId| {
-            let mut keys = self.sensors.keys();
-            keys.any(|(_, known, stream)| known == cav && *stream == Stream::Lidar)
-        };
         let truths = self.truth.values();
         let listed = truths.flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
         let unlisted = self.sensors.keys().map(|(_, cav, _)| cav);
         let mut agents: Vec<CavId> = Vec::new();
         for cav in listed.chain(unlisted) {
-            if !agents.contains(cav) && has_sweeps(cav) {
+            let mut streams = self.sensors.keys();
+            if !agents.contains(cav)
+                && streams.any(|(_, known, stream)| known == cav && *stream == Stream::Lidar)
+            {
                 agents.push(cav.clone());
             }
         }
@@ -178,8 +177,9 @@ impl Recorded {
         let (mut ticks, mut missing) = (Vec::new(), Vec::new());
         for capture_nanos in captures {
             let stem = capture_nanos.to_string();
-            let lacks = |cav: &&CavId| !self.has(cav, capture_nanos, Stream::Lidar);
-            let lacking: Vec<&CavId> = self.agents.iter().filter(lacks).collect();
+            let lacking =
+                (self.agents.iter()).filter(|cav| !self.has(cav, capture_nanos, Stream::Lidar));
+            let lacking: Vec<&CavId> = lacking.collect();
             missing.extend(lacking.iter().map(|cav| MissingFrame::new(cav, &stem)));
             // The ego is the first of both lists: without its sweep there is no tick.
             if lacking.first() != self.agents.first().as_ref() {
@@ -208,11 +208,11 @@ impl Recorded {
 
     fn sensor<M: Payload>(&self, agent: &CavId, tick: &Tick, stream: Stream) -> Result<M> {
         let key = (tick.capture_nanos, agent.clone(), stream);
-        let lacks = || {
+        let entry = self.sensors.get(&key).ok_or_else(|| {
             let reason = format!("no {agent}/{stream} at {}", tick.stem);
             ReadError::malformed(self.recording.path(), reason)
-        };
-        message(&self.recording, self.sensors.get(&key).ok_or_else(lacks)?)
+        });
+        message(&self.recording, entry?)
     }
 }
 

@@ -27,15 +27,15 @@ pub(super) fn find(dir: &Path, is_root: impl Fn(&Path) -> bool) -> Vec<PathBuf> 
 /// are.
 fn folders(dir: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(dir).into_iter().flatten().flatten();
-    let is_folder = |entry: &fs::DirEntry| match entry.file_type() {
-        Ok(kind) if kind.is_symlink() => entry.path().is_dir(),
-        kind => kind.is_ok_and(|kind| kind.is_dir()),
-    };
-    let is_hidden = |entry: &fs::DirEntry| entry.file_name().as_encoded_bytes().starts_with(b".");
-    entries
-        .filter(|entry| !is_hidden(entry) && is_folder(entry))
-        .map(|entry| entry.path())
-        .collect()
+    let folders = entries.filter(|entry| {
+        let is_hidden = entry.file_name().as_encoded_bytes().starts_with(b".");
+        !is_hidden
+            && match entry.file_type() {
+                Ok(kind) if kind.is_symlink() => entry.path().is_dir(),
+                kind => kind.is_ok_and(|kind| kind.is_dir()),
+            }
+    });
+    folders.map(|entry| entry.path()).collect()
 }
 
 #[cfg(test)]

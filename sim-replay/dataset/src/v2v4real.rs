@@ -90,14 +90,10 @@ impl V2v4Real {
             None => Ok(listed_id),
             Some(-1) => {
                 // Agents with names count by their index.
-                let place = || {
-                    self.folder
-                        .agents
-                        .iter()
-                        .position(|id| id == agent)
-                        .unwrap_or(0) as i64
-                };
-                let agent = agent.as_str().parse::<i64>().unwrap_or_else(|_| place());
+                let agent = agent.as_str().parse::<i64>().unwrap_or_else(|_| {
+                    let mut agents = self.folder.agents.iter();
+                    agents.position(|id| id == agent).unwrap_or(0) as i64
+                });
                 Ok(listed_id.saturating_add(UNMATCHED_STEP.saturating_mul(agent)))
             }
             Some(shared) => Ok(shared),

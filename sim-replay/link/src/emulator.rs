@@ -205,7 +205,7 @@ impl LinkEmulator {
                 latest_nanos: BTreeMap::new(),
             });
         let stream = label(&packet.stream.to_string());
-        let random = |purpose| direction.chance.of(purpose, stream, packet.sequence);
+        let chance = direction.chance;
         let message = SentMessage {
             bytes: packet.bytes,
             distance_m: packet.distance_m,
@@ -217,16 +217,14 @@ impl LinkEmulator {
             config.loss_unit,
             &message,
             trace.as_ref(),
-            &mut random(Purpose::Loss),
+            &mut chance.of(Purpose::Loss, stream, packet.sequence),
         );
         if is_lost || config.is_cut(start_nanos, end_nanos) {
             self.schedule(end_nanos, packet, Delivery::Dropped(DropReason::LinkLoss));
             return;
         }
-        let delay_nanos =
-            config
-                .latency
-                .draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
+        let mut delay = chance.of(Purpose::Delay, stream, packet.sequence);
+        let delay_nanos = config.latency.draw(&mut delay, trace.as_ref(), &message);
         // No packet arrives before its last bit was sent, also with rounding.
         let arrival_nanos = config.floored(
             packet.submitted_nanos,
@@ -241,11 +239,13 @@ impl LinkEmulator {
         }
         // After the order was kept, and not entered in `latest_nanos`: only this message is late.
         if let Some(reorder) = config.reorder
-            && random(Purpose::Reorder).chance(reorder.probability)
+            && chance
+                .of(Purpose::Reorder, stream, packet.sequence)
+                .chance(reorder.probability)
         {
             arrival_nanos = arrival_nanos.saturating_add(nanos::of_ms(reorder.extra_ms));
         }
-        let mut twice = random(Purpose::Duplicate);
+        let mut twice = chance.of(Purpose::Duplicate, stream, packet.sequence);
         // The delay of the copy has a stream of its own too, so that it differs from the first delay.
         let is_repeated = config.duplicate > 0.0 && twice.chance(config.duplicate);
         let again_nanos =
@@ -279,11 +279,11 @@ impl LinkEmulator {
 impl LinkConfig {
     /// True if an outage lies in an interval.
     fn is_cut(&self, start_nanos: u64, end_nanos: u64) -> bool {
-        let nanos = |seconds: f64| nanos::of_ms(1e3 * seconds);
-        self.outages
-            .iter()
+        self.outages.iter().any(|outage| {
+            let [from, to] = [outage.from_s, outage.to_s].map(|s| nanos::of_ms(1e3 * s));
             // Half-open: a message that starts at the end of the outage passes.
-            .any(|outage| start_nanos < nanos(outage.to_s) && end_nanos >= nanos(outage.from_s))
+            start_nanos < to && end_nanos >= from
+        })
     }
 
     /// Rounds the time since `submitted_nanos` down to whole steps, if the link has them.

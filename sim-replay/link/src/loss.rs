@@ -33,19 +33,13 @@ impl LossState {
             // An empty message is one fragment too: without any it could never be lost.
             LossUnit::Fragment => message.bytes.div_ceil(FRAGMENT_BYTES).max(1),
         };
-        // Independent losses of all units at once.
-        let mut any = |share: f64| {
-            let survives = (1.0 - share).powi(i32::try_from(units).unwrap_or(i32::MAX));
-            // `unit` is below 1: a share of 0 never loses, and a share of 1 always does.
-            random.unit() >= survives
-        };
-        match law {
-            LossModel::None => false,
-            LossModel::Bernoulli(share) => any(*share),
-            LossModel::Distance(points) => any(interpolate(points, message.distance_m)),
-            LossModel::Trace => any(trace
+        let share = match law {
+            LossModel::None => return false,
+            LossModel::Bernoulli(share) => *share,
+            LossModel::Distance(points) => interpolate(points, message.distance_m),
+            LossModel::Trace => trace
                 .and_then(|trace| trace.at(message.sent_nanos))
-                .map_or(0.0, |step| step.loss)),
+                .map_or(0.0, |step| step.loss),
             LossModel::GilbertElliott {
                 to_bad,
                 to_good,
@@ -59,9 +53,13 @@ impl LossState {
                     self.is_bad ^= random.chance(leaves);
                     is_lost |= random.chance(if self.is_bad { *loss_bad } else { *loss_good });
                 }
-                is_lost
+                return is_lost;
             }
-        }
+        };
+        // Independent losses of all units at once.
+        let survives = (1.0 - share).powi(i32::try_from(units).unwrap_or(i32::MAX));
+        // `unit` is below 1: a share of 0 never loses, and a share of 1 always does.
+        random.unit() >= survives
     }
 }
 

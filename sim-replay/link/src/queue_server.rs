@@ -79,22 +79,24 @@ impl QueueServer {
         if rules.queue.keep_last {
             self.supersede(&packet, left);
         }
-        let is_full =
-            |line: &Self| line.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes;
         // A packet larger than the whole queue empties it and is dropped itself below.
-        while rules.queue.drop == QueueDrop::Head && is_full(self) {
+        while rules.queue.drop == QueueDrop::Head && self.is_full_for(&packet, rules) {
             let Some(oldest) = self.waiting.pop_front() else {
                 break;
             };
             self.waiting_bytes -= oldest.bytes;
             left.push(dropped(oldest, DropReason::LinkQueue, nanos));
         }
-        if is_full(self) {
+        if self.is_full_for(&packet, rules) {
             left.push(dropped(packet, DropReason::LinkQueue, nanos));
             return;
         }
         self.waiting_bytes += packet.bytes;
         self.waiting.push_back(packet);
+    }
+
+    fn is_full_for(&self, packet: &Packet, rules: &Rules<'_>) -> bool {
+        self.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes
     }
 
     /// Advances to `nanos`; the packets sent by then are added to `left`, in that order.
@@ -131,17 +133,17 @@ impl QueueServer {
 
     /// The same, with true for an urgent packet.
     fn next(&self, rules: &Rules<'_>) -> Option<(u64, bool)> {
-        let end = |sending: &Sending| {
-            let nanos = rules.capacity.time_of(sending.end)?;
+        let [urgent, usual] = [self.urgent.front(), self.sending.as_ref()].map(|sending| {
+            let Sending {
+                start_nanos, end, ..
+            } = sending?;
             // With a burst the work may have been available before the packet was submitted.
-            Some(nanos.max(sending.start_nanos))
-        };
-        let urgent = self.urgent.front().and_then(end).map(|nanos| (nanos, true));
-        let usual = self.sending.as_ref().and_then(end);
-        let usual = usual.map(|nanos| (nanos, false));
+            Some(rules.capacity.time_of(*end)?.max(*start_nanos))
+        });
         match (urgent, usual) {
-            (Some(urgent), Some(usual)) => Some(if urgent.0 <= usual.0 { urgent } else { usual }),
-            (urgent, usual) => urgent.or(usual),
+            (Some(urgent), Some(usual)) if usual < urgent => Some((usual, false)),
+            (Some(urgent), _) => Some((urgent, true)),
+            (None, usual) => usual.map(|nanos| (nanos, false)),
         }
     }
 

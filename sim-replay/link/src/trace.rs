@@ -74,14 +74,15 @@ impl Trace {
         let begin = steps
             .partition_point(|step| step.from_nanos <= offset_nanos)
             .saturating_sub(1);
-        let shifted = |step: &Step| Step {
+        let left = steps.get(begin..).unwrap_or_default();
+        if left.is_empty() {
+            return Err(FileError::new(path, NO_NUMBERS));
+        }
+        let shifted = left.iter().map(|step| Step {
             from_nanos: step.from_nanos.saturating_sub(offset_nanos),
             ..*step
-        };
-        match steps.get(begin..) {
-            Some(left @ [_, ..]) => Ok(Self::Steps(left.iter().map(shifted).collect())),
-            _ => Err(FileError::new(path, NO_NUMBERS)),
-        }
+        });
+        Ok(Self::Steps(shifted.collect()))
     }
 
     /// Reads delivery opportunities in mahimahi's format: one line per packet, whole milliseconds that never decrease.

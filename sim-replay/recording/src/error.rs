@@ -58,8 +58,8 @@ pub enum RecordingError {
 }
 
 impl RecordingError {
-    pub(super) fn io(path: &Path, source: std::io::Error) -> Self {
-        Self::Io {
+    pub(super) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        move |source| Self::Io {
             path: path.into(),
             source,
         }

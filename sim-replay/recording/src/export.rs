@@ -46,17 +46,16 @@ pub fn export_ros2(
     zstd_level: Option<u32>,
 ) -> Result<ExportReport, RecordingError> {
     let recording = Recording::open(from)?;
-    let nanos = |entry: &Entry| match times {
-        ExportTimes::Capture if matches!(entry.key.topic, Topic::Stats(_)) => None,
-        ExportTimes::Capture => Some(entry.header.stamp.capture_nanos),
-        ExportTimes::Arrival => Some(entry.arrived_nanos),
-    };
     let wanted: Vec<&Entry> = recording
         .entries()
         .iter()
         .filter(|entry| Translator::wants(&entry.key.topic))
         .collect();
-    let timed = in_order(&wanted, nanos);
+    let timed = in_order(&wanted, |entry| match times {
+        ExportTimes::Capture if matches!(entry.key.topic, Topic::Stats(_)) => None,
+        ExportTimes::Capture => Some(entry.header.stamp.capture_nanos),
+        ExportTimes::Arrival => Some(entry.arrived_nanos),
+    });
     if timed.is_empty() {
         let reason = "it holds no message that can be read and that ROS 2 has a type for; recordings of other versions of this program cannot be read";
         return Err(RecordingError::not_ours(from, reason));

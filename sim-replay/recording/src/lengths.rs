@@ -25,11 +25,7 @@ pub(super) fn check(opcode: u8, record: &[u8]) -> McapResult<()> {
     let fits = match opcode {
         op::CHUNK => chunk_fits(record),
         // Its number; name and encoding.
-        op::SCHEMA => record
-            .get(2..)
-            .and_then(text)
-            .and_then(|(_, rest)| text(rest))
-            .map(|_| ()),
+        op::SCHEMA => behind(record, 2, 2).map(|_| ()),
         op::CHANNEL => channel_fits(record),
         _ => Some(()),
     };
@@ -38,24 +34,17 @@ pub(super) fn check(opcode: u8, record: &[u8]) -> McapResult<()> {
 
 /// True if the contents of a record in the data section fill it exactly.
 pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
-    let texts = |head: usize, count: usize| {
-        let mut rest = record.get(head..)?;
-        for _ in 0..count {
-            rest = text(rest)?.1;
-        }
-        Some(rest)
-    };
     let rest = match opcode {
-        op::HEADER | op::METADATA => texts(0, 2),
+        op::HEADER | op::METADATA => behind(record, 0, 2),
         // The text of the schema has the same kind of length as its name and encoding.
-        op::SCHEMA => texts(2, 3),
-        op::CHANNEL => texts(4, 3),
+        op::SCHEMA => behind(record, 2, 3),
+        op::CHANNEL => behind(record, 4, 3),
         // The payload has no length of its own: any rest is valid.
         op::MESSAGE => return record.len() >= MESSAGE_HEAD,
-        op::CHUNK => texts(CHUNK_HEAD, 1).and_then(long),
-        op::MESSAGE_INDEX => texts(2, 1),
+        op::CHUNK => behind(record, CHUNK_HEAD, 1).and_then(long),
+        op::MESSAGE_INDEX => behind(record, 2, 1),
         // The contents are followed by their checksum.
-        op::ATTACHMENT => texts(16, 2)
+        op::ATTACHMENT => behind(record, 16, 2)
             .and_then(long)
             .filter(|rest| rest.len() == 4)
             .map(|_| [].as_slice()),
@@ -63,6 +52,15 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
         _ => None,
     };
     rest.is_some_and(<[u8]>::is_empty)
+}
+
+/// The bytes behind `count` texts, which begin at `head`.
+fn behind(record: &[u8], head: usize, count: usize) -> Option<&[u8]> {
+    let mut rest = record.get(head..)?;
+    for _ in 0..count {
+        rest = text(rest)?.1;
+    }
+    Some(rest)
 }
 
 /// True if a chunk of `len` bytes begins here: its compression is known, and its records fill the rest.
@@ -107,9 +105,7 @@ fn chunk_fits(chunk: &[u8]) -> Option<()> {
 
 /// Its number and its schema's; topic, encoding, and texts within a text.
 fn channel_fits(channel: &[u8]) -> Option<()> {
-    let (_, rest) = text(channel.get(4..)?)?;
-    let (_, rest) = text(rest)?;
-    let (mut metadata, _) = text(rest)?;
+    let (mut metadata, _) = text(behind(channel, 4, 2)?)?;
     while !metadata.is_empty() {
         metadata = text(metadata)?.1;
     }

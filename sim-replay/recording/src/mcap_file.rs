@@ -62,10 +62,10 @@ pub struct McapFile {
 
 /// True for a file of another program, as far as its summary shows: no message is read.
 pub(super) fn is_foreign(path: &Path) -> Result<bool, RecordingError> {
-    let io = |source| RecordingError::io(path, source);
-    let file = bounded_file::open(path).map_err(io)?;
-    let size = file.metadata().map_err(io)?.len();
-    Ok(Channels::of_summary(&file, size).map_err(io)?.are_foreign())
+    let file = bounded_file::open(path).map_err(RecordingError::io(path))?;
+    let size = file.metadata().map_err(RecordingError::io(path))?.len();
+    let channels = Channels::of_summary(&file, size).map_err(RecordingError::io(path))?;
+    Ok(channels.are_foreign())
 }
 
 impl McapFile {
@@ -79,14 +79,13 @@ impl McapFile {
         path: &Path,
         visit: &mut dyn FnMut(&Message<'static>, Place) -> bool,
     ) -> Result<Self, RecordingError> {
-        let io = |source| RecordingError::io(path, source);
-        let file = bounded_file::open(path).map_err(io)?;
-        let size = file.metadata().map_err(io)?.len();
+        let file = bounded_file::open(path).map_err(RecordingError::io(path))?;
+        let size = file.metadata().map_err(RecordingError::io(path))?.len();
         let mut records = Records::open(&file, size)
-            .map_err(io)?
+            .map_err(RecordingError::io(path))?
             .ok_or_else(|| RecordingError::not_ours(path, "not an MCAP file"))?;
         let mut contents = Contents {
-            channels: Channels::of_summary(&file, size).map_err(io)?,
+            channels: Channels::of_summary(&file, size).map_err(RecordingError::io(path))?,
             holders: Vec::new(),
             arrivals: Vec::new(),
             lost: Vec::new(),
@@ -94,7 +93,9 @@ impl McapFile {
             most_unpacked: bounded_file::most_unpacked(size),
             visit,
         };
-        contents.look_through(&mut records, size).map_err(io)?;
+        contents
+            .look_through(&mut records, size)
+            .map_err(RecordingError::io(path))?;
         let damage = contents.damage();
         let Contents {
             channels, holders, ..
@@ -165,7 +166,7 @@ impl McapFile {
         let read = self
             .file
             .read_exact_at(&mut body, begin + RECORD_HEAD as u64);
-        read.map_err(|source| RecordingError::io(&self.path, source))?;
+        read.map_err(RecordingError::io(&self.path))?;
         let messages = match is_chunk {
             true => unpack(&body, &mut unpacked.channels).map(|chunk| chunk.messages),
             false => unpacked
@@ -231,12 +232,10 @@ impl Contents<'_> {
                 Err(reason) => {
                     // The search begins at the next byte: a damaged record's length is not to be trusted.
                     let has_chunks = self.has_chunks();
-                    let is_own = |id| {
-                        self.channels
-                            .get(id)
-                            .is_some_and(|channel| is_own(&channel.message_encoding))
-                    };
-                    records.seek(begin + 1, |id| !has_chunks && is_own(id))?;
+                    records.seek(begin + 1, |id| {
+                        let channel = (!has_chunks).then(|| self.channels.get(id)).flatten();
+                        channel.is_some_and(|channel| is_own(&channel.message_encoding))
+                    })?;
                     self.lose((begin, records.at), reason);
                 }
             }
@@ -356,19 +355,19 @@ impl Contents<'_> {
 
     fn damage(&self) -> Vec<Damage> {
         let first = self.arrivals.first().map_or(0, |nanos| *nanos);
-        // Floats, because arrivals may go back in time. Their error is below 0.3 us.
-        let seconds = |nanos: &u64| (*nanos as f64 - first as f64) * 1e-9;
-        let damage = |lost: &Lost| Damage {
-            begin_bytes: lost.begin,
-            lost_bytes: lost.end - lost.begin,
-            from_s: self
-                .arrivals
-                .get(..lost.before)
-                .and_then(<[u64]>::last)
-                .map(seconds),
-            to_s: self.arrivals.get(lost.before).map(seconds),
-            reason: lost.reason.clone(),
-        };
-        self.lost.iter().map(damage).collect()
+        let damage = self.lost.iter().map(|lost| {
+            let before = self.arrivals.get(..lost.before).and_then(<[u64]>::last);
+            // Floats, because arrivals may go back in time. Their error is below 0.3 us.
+            let [from_s, to_s] = [before, self.arrivals.get(lost.before)]
+                .map(|nanos| Some((*nanos? as f64 - first as f64) * 1e-9));
+            Damage {
+                begin_bytes: lost.begin,
+                lost_bytes: lost.end - lost.begin,
+                from_s,
+                to_s,
+                reason: lost.reason.clone(),
+            }
+        });
+        damage.collect()
     }
 }

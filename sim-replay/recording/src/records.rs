@@ -39,13 +39,8 @@ impl<'a> Records<'a> {
     /// The records of a file of `size` bytes, after its magic number; `None` if it neither begins nor ends with one.
     pub(super) fn open(file: &'a File, size: u64) -> io::Result<Option<Self>> {
         let magic_len = mcap::MAGIC.len() as u64;
-        let has_magic = |at: u64| -> io::Result<bool> {
-            let mut found = [0; mcap::MAGIC.len()];
-            file.read_exact_at(&mut found, at)?;
-            Ok(found == *mcap::MAGIC)
-        };
         // One of the two suffices: the first bytes may be damaged, and the last ones cut off.
-        if size < magic_len || !has_magic(0)? && !has_magic(size - magic_len)? {
+        if size < magic_len || !has_magic(file, 0)? && !has_magic(file, size - magic_len)? {
             return Ok(None);
         }
         let mut crc = crc32fast::Hasher::new();
@@ -127,19 +122,17 @@ impl<'a> Records<'a> {
                 .min(WINDOW + KNOWN_BY);
             window.resize(len, 0);
             self.file.read_exact_at(&mut window, begin)?;
-            let is_record = |place: &usize| {
-                window
-                    .get(*place..)
-                    .is_some_and(|bytes| is_record(bytes, left - *place as u64, &is_own))
-            };
             let known = window
                 .iter()
                 .take(WINDOW)
                 .enumerate()
                 .filter(|(_, opcode)| is_known(**opcode));
-            let found = known.map(|(place, _)| place).find(is_record);
-            if let Some(place) = found {
-                self.at = begin + place as u64;
+            let mut known = known.map(|(place, _)| (place as u64, window.get(place..)));
+            let found = known.find(|(place, bytes)| {
+                bytes.is_some_and(|bytes| is_record(bytes, left - place, &is_own))
+            });
+            if let Some((place, _)) = found {
+                self.at = begin + place;
                 return Ok(());
             }
             begin += len.min(WINDOW) as u64;
@@ -147,6 +140,12 @@ impl<'a> Records<'a> {
         self.at = self.size;
         Ok(())
     }
+}
+
+fn has_magic(file: &File, at: u64) -> io::Result<bool> {
+    let mut found = [0; mcap::MAGIC.len()];
+    file.read_exact_at(&mut found, at)?;
+    Ok(found == *mcap::MAGIC)
 }
 
 fn split_head(head: [u8; RECORD_HEAD]) -> (u8, u64) {

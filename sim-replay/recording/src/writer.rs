@@ -74,7 +74,7 @@ impl RecordingWriter<File> {
     /// # Errors
     /// [`RecordingError::Io`], also if the file exists already.
     pub fn create(path: &Path, options: RecordingOptions) -> Result<Self> {
-        let file = File::create_new(path).map_err(|source| RecordingError::io(path, source))?;
+        let file = File::create_new(path).map_err(RecordingError::io(path))?;
         Self::over(file, path, options)
     }
 }
@@ -227,7 +227,7 @@ impl<S: Store> RecordingWriter<S> {
         let finished = self.mcap.finish();
         self.checked(finished)?;
         self.ended = Some("it is complete".into());
-        S::sync(&self.path).map_err(|source| RecordingError::io(&self.path, source))
+        S::sync(&self.path).map_err(RecordingError::io(&self.path))
     }
 
     /// The channel of messages as transmitted, declared on first use.
@@ -330,5 +330,5 @@ fn failure(path: &Path, error: McapError) -> RecordingError {
         McapError::Io(source) => source,
         other => std::io::Error::other(other),
     };
-    RecordingError::io(path, source)
+    RecordingError::io(path)(source)
 }

@@ -75,9 +75,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 /// True if one of the two contains the other: the input would be overwritten.
 fn overlap(from: &Path, out: &Path) -> bool {
-    let real = |path: &Path| path.canonicalize().ok();
-    real(from)
-        .zip(real(out))
+    let [from, out] = [from, out].map(|path| path.canonicalize().ok());
+    from.zip(out)
         .is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))
 }
 

@@ -32,12 +32,12 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         .join(&stop, &config.run, Role::Recorder, &CavId::new("recorder")?)?;
     let options = config.options();
     // A failure is reported at once to a process that waits for the report; the last line is the final report.
-    let mut on_failure = |report: &RecordReport| {
+    let report = recorder::record(&bus, &options, &stop, &mut |report: &RecordReport| {
         if args.json && print_json(report).is_err() {
             tracing::error!("the failure cannot be printed");
         }
-    };
-    let report = match recorder::record(&bus, &options, &stop, &mut on_failure) {
+    });
+    let report = match report {
         Ok(report) => report,
         Err(RecorderError::Recording(error)) => return Ok(Outcome::bad_input(&error)),
         Err(error) => return Err(error.into()),

@@ -83,9 +83,9 @@ fn open(scene: &SceneConfig) -> anyhow::Result<Scenario> {
         tracing::warn!("{problem}");
     }
     let asked = scene.scenario.as_deref();
-    let is_asked = |scenario: &&Scenario| asked.is_none_or(|name| scenario.name == name);
-    let found = dataset.scenarios.iter().find(is_asked).cloned();
-    found.with_context(|| {
+    let mut scenarios = dataset.scenarios.iter();
+    let found = scenarios.find(|scenario| asked.is_none_or(|name| scenario.name == name));
+    found.cloned().with_context(|| {
         let names = dataset.scenarios.iter().map(|scenario| &*scenario.name);
         let (dir, asked) = (scene.dir.display(), asked.unwrap_or("any"));
         let names = names.collect::<Vec<_>>().join(", ");

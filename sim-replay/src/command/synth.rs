@@ -154,11 +154,12 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) ->
         omitted,
         findings,
     } = summary;
-    let per_frame = |count: &usize| *count as f64 / (*agent_frames).max(1) as f64;
+    let [points, vehicles] =
+        [points, annotations].map(|count| *count as f64 / (*agent_frames).max(1) as f64);
     if json {
         let report = serde_json::json!({
             "out": options.out, "layout": layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
-            "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "omitted": omitted,
+            "points_per_frame": points, "vehicles_per_frame": vehicles, "omitted": omitted,
             "seconds": seconds, "map_findings": findings,
         });
         return output::line(report);
@@ -169,9 +170,7 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) ->
         layout.name()
     ))?;
     output::line(format_args!(
-        "{:.0} points and {:.1} annotated vehicles a frame",
-        per_frame(points),
-        per_frame(annotations)
+        "{points:.0} points and {vehicles:.1} annotated vehicles a frame"
     ))?;
     output::line(format_args!(
         "{seconds:.1} s, {:.0} agent-frames a second",
@@ -197,15 +196,12 @@ fn parse_map(text: &str) -> Result<RoadMapSource, String> {
 }
 
 fn parse_vehicles(text: &str) -> Result<RangeInclusive<usize>, String> {
-    let number = |text: &str| {
-        text.trim()
-            .parse::<usize>()
-            .map_err(|_| format!("{text:?} is no number"))
-    };
-    match text.split_once('-') {
-        Some((low, high)) => Ok(number(low)?..=number(high)?),
-        None => number(text).map(|count| count..=count),
-    }
+    let (low, high) = text.split_once('-').unwrap_or((text, text));
+    let [low, high] = [low, high].map(|text| {
+        let number = text.trim().parse::<usize>();
+        number.map_err(|_| format!("{text:?} is no number"))
+    });
+    Ok(low?..=high?)
 }
 
 #[cfg(test)]

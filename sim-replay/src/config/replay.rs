@@ -180,7 +180,8 @@ impl ReplayConfig {
     /// The options of the replay.
     pub fn options(&self) -> StreamOptions {
         let Self { scene, wait, .. } = self;
-        let seconds = |seconds| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
+        let [ready_timeout, answer_timeout] = [wait.ready_timeout_s, wait.answer_timeout_s]
+            .map(|seconds| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX));
         StreamOptions {
             agents: scene.agents.clone(),
             rate: scene.rate,
@@ -195,9 +196,9 @@ impl ReplayConfig {
             },
             await_agents: wait.await_agents,
             expect: wait.expect.clone(),
-            ready_timeout: seconds(wait.ready_timeout_s),
+            ready_timeout,
             lockstep: wait.egos.clone(),
-            answer_timeout: seconds(wait.answer_timeout_s),
+            answer_timeout,
             link: self
                 .sensor_link
                 .stages()

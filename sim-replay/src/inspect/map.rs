@@ -44,16 +44,11 @@ pub struct MapReport {
 pub fn inspect_map(path: &Path) -> Result<MapReport, FileError> {
     let Map { network, lanes } = read_map(path)?;
     let roads = &network.roads;
-    let heights = || {
-        lanes
-            .lanes
-            .iter()
-            .flat_map(|lane| &lane.centerline)
-            .map(|point| point[2])
-    };
+    let points = lanes.lanes.iter().flat_map(|lane| &lane.centerline);
+    let heights = points.map(|point| point[2]);
     let range = [
-        heights().fold(f64::INFINITY, f64::min),
-        heights().fold(f64::NEG_INFINITY, f64::max),
+        heights.clone().fold(f64::INFINITY, f64::min),
+        heights.fold(f64::NEG_INFINITY, f64::max),
     ];
     Ok(MapReport {
         path: path.display().to_string(),

@@ -108,14 +108,14 @@ fn counted(problems: Vec<Problem>) -> Vec<Problem> {
     for problem in problems {
         *counts.entry(problem).or_default() += 1;
     }
-    let with_count = |(problem, count): (Problem, usize)| match count {
+    let problems = counts.into_iter().map(|(problem, count)| match count {
         1 => problem,
         count => Problem {
             message: format!("{} ({count} times)", problem.message),
             ..problem
         },
-    };
-    counts.into_iter().map(with_count).collect()
+    });
+    problems.collect()
 }
 
 /// Problems of a scenario as a whole. Without poses no ground truth is a consequence.
@@ -124,12 +124,11 @@ fn scenario_problems(
     ticks: &[TickFindings],
     scale: IntensityScale,
 ) -> Vec<Problem> {
-    let of_agent = |agent: usize| {
+    let agents = (0..scenario.agents.len()).map(|agent| {
         let frames = ticks.iter().map(|tick| &tick.agents[agent].findings);
         frames.enumerate().collect()
-    };
-    let agents: Vec<Vec<(usize, &FrameFindings)>> =
-        (0..scenario.agents.len()).map(of_agent).collect();
+    });
+    let agents: Vec<Vec<(usize, &FrameFindings)>> = agents.collect();
     let mut problems = findings::of_scenario(scenario, &agents, scale);
     let frames = agents.iter().flatten().map(|(_, frame)| frame);
     if !frames.into_iter().any(|frame| frame.is_without_pose()) {
@@ -212,16 +211,13 @@ fn survey_points(
     let cloud = cloud
         .map_err(|error| problems.push(Problem::from(&error)))
         .ok()?;
-    let path = || {
-        scenario
-            .points_path(agent, tick, variant)
-            .unwrap_or_default()
-    };
+    let path = scenario.points_path(agent, tick, variant);
+    let path = path.unwrap_or_default();
     // Organised clouds have a point for every ray, including rays without a hit.
     if cloud.dropped as f64 > MOST_DROPPED * (cloud.dropped + cloud.points.len()) as f64 {
-        problems.push(not_finite(&path(), &cloud));
+        problems.push(not_finite(&path, &cloud));
     } else if let Some(reason) = cloud.without_returns() {
-        problems.push(Problem::from(&ReadError::malformed(&path(), reason)));
+        problems.push(Problem::from(&ReadError::malformed(&path, reason)));
     }
     Some(cloud)
 }
@@ -251,30 +247,24 @@ fn merged_counts(
     frames: &[&Frame],
     rule: &GroundTruthRule,
 ) -> Vec<TickReport> {
-    let report = |ego: &CavId, agents: Vec<CavId>, merged_boxes: usize| TickReport {
-        scenario: scenario.name.clone(),
-        tick: scenario.ticks[tick].stem.clone(),
-        ego: ego.clone(),
-        agents,
-        merged_boxes,
-    };
     let mut merged = Vec::new();
     for (index, ego) in frames.iter().enumerate() {
         let alone = ground_truth::merge(&[ego], 0, rule).len();
-        merged.push(report(&ego.cav, vec![ego.cav.clone()], alone));
+        let mut counts = vec![(vec![ego.cav.clone()], alone)];
         let contributors = ground_truth::contributors(frames, index, rule.comm_range_m);
         // Contributors include the ego: alone it would only repeat the entry above.
         if contributors.len() > 1 {
-            let agents = contributors
-                .iter()
-                .map(|&other| frames[other].cav.clone())
-                .collect();
-            merged.push(report(
-                &ego.cav,
-                agents,
-                ground_truth::merge(frames, index, rule).len(),
-            ));
+            let agents = contributors.iter().map(|&other| frames[other].cav.clone());
+            let together = ground_truth::merge(frames, index, rule).len();
+            counts.push((agents.collect(), together));
         }
+        merged.extend(counts.into_iter().map(|(agents, merged_boxes)| TickReport {
+            scenario: scenario.name.clone(),
+            tick: scenario.ticks[tick].stem.clone(),
+            ego: ego.cav.clone(),
+            agents,
+            merged_boxes,
+        }));
     }
     merged
 }
@@ -320,44 +310,39 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
 }
 
 fn summarize_agent(id: &CavId, frames: &[&FrameSurvey]) -> AgentReport {
-    let counts = |count: fn(&FrameSurvey) -> Option<usize>| {
-        Summary::of(
-            &frames
-                .iter()
-                .filter_map(|frame| count(frame))
-                .collect::<Vec<_>>(),
-        )
-    };
-    let findings = || frames.iter().map(|frame| &frame.findings);
-    let positions: Vec<[f64; 3]> = findings()
+    let findings = frames.iter().map(|frame| &frame.findings);
+    let positions: Vec<[f64; 3]> = (findings.clone())
         .filter_map(|frame| Some(frame.world_from_lidar?.translation_m))
         .collect();
-    let step = |pair: &[[f64; 3]]| {
+    let steps = positions.windows(2).map(|pair| {
         (0..3)
             .map(|axis| (pair[1][axis] - pair[0][axis]).powi(2))
             .sum::<f64>()
             .sqrt()
-    };
-    let sweeps: Vec<_> = findings()
+    });
+    let sweeps: Vec<_> = (findings.clone())
         .filter_map(|frame| frame.sweep.as_ref())
         .collect();
     AgentReport {
         id: id.clone(),
-        points: counts(|frame| Some(frame.findings.sweep.as_ref()?.points)),
+        points: summary_of(frames, |frame| Some(frame.findings.sweep.as_ref()?.points)),
         dropped_points: frames.iter().map(|frame| frame.dropped).sum(),
-        radar_points: counts(|frame| frame.radar_points),
+        radar_points: summary_of(frames, |frame| frame.radar_points),
         sweeps: SweepReport::of(&sweeps),
-        boxes: counts(|frame| frame.findings.boxes),
-        boxes_without_points: findings().map(|frame| frame.boxes_without_points).sum(),
+        boxes: summary_of(frames, |frame| frame.findings.boxes),
+        boxes_without_points: findings.map(|frame| frame.boxes_without_points).sum(),
         frames: sweeps.len(),
         // An empty sum is -0.
-        distance_m: (!positions.is_empty()).then(|| {
-            positions
-                .windows(2)
-                .map(step)
-                .fold(0.0, |sum, step| sum + step)
-        }),
+        distance_m: (!positions.is_empty()).then(|| steps.fold(0.0, |sum, step| sum + step)),
     }
+}
+
+fn summary_of(
+    frames: &[&FrameSurvey],
+    count: fn(&FrameSurvey) -> Option<usize>,
+) -> Option<Summary> {
+    let counts: Vec<usize> = frames.iter().filter_map(|frame| count(frame)).collect();
+    Summary::of(&counts)
 }
 
 #[cfg(test)]

@@ -44,14 +44,20 @@ impl Place {
         scenario: &str,
         ticks: usize,
     ) -> Result<Option<Self>, CheckpointError> {
-        let at = || path.to_path_buf();
         let text = match bounded_file::read_text(path, MAX_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(source) => return Err(CheckpointError::Read { path: at(), source }),
+            Err(source) => {
+                return Err(CheckpointError::Read {
+                    path: path.into(),
+                    source,
+                });
+            }
         };
-        let place: Self = serde_json::from_str(&text)
-            .map_err(|source| CheckpointError::Text { path: at(), source })?;
+        let place: Self = serde_json::from_str(&text).map_err(|source| CheckpointError::Text {
+            path: path.into(),
+            source,
+        })?;
         // A next tick equal to `ticks` is valid: the scene was played to its end.
         if place.scenario != scenario || place.position.next_tick > ticks {
             let position = format!(
@@ -59,7 +65,7 @@ impl Place {
                 place.position.next_tick, place.scenario
             );
             return Err(CheckpointError::Elsewhere {
-                path: at(),
+                path: path.into(),
                 place: position,
                 scenario: scenario.into(),
                 ticks,

@@ -178,8 +178,10 @@ impl<'a> Replay<'a> {
             agents: cavs.collect(),
             ..options
         };
-        let read = |path: &PathBuf| Place::read(path, &scenario.name, scenario.ticks.len());
-        let place = options.checkpoint.as_ref().map(read).transpose()?.flatten();
+        let place = match &options.checkpoint {
+            Some(path) => Place::read(path, &scenario.name, scenario.ticks.len())?,
+            None => None,
+        };
         let (seek, frames) = (options.seek, options.frames);
         let mut schedule = Schedule::new(&scenario.ticks, seek, frames, options.repeats);
         if let Some(place) = &place {
@@ -256,10 +258,9 @@ impl<'a> Replay<'a> {
     /// [`StreamError::NotReady`] with the routes that have not.
     pub fn wait_until_ready(&self) -> Result<(), StreamError> {
         let barrier = Barrier::new(self.expected_routes()).await_routes(self.bus)?;
-        let stop = self.stop.clone();
-        let wait = |timeout| barrier.wait_unless(timeout, || stop.requested());
+        let timeout = self.options.ready_timeout;
         if !self.is_resumed {
-            return Ok(wait(self.options.ready_timeout)?);
+            return Ok(barrier.wait_unless(timeout, || self.stop.requested())?);
         }
         let (tick, ticks) = (self.schedule.position.next_tick, self.tick_count);
         tracing::warn!(
@@ -267,7 +268,8 @@ impl<'a> Replay<'a> {
             ticks,
             "resuming from the checkpoint of the previous process instance"
         );
-        if let Err(not_ready) = wait(RESUME_TIMEOUT.min(self.options.ready_timeout)) {
+        let timeout = RESUME_TIMEOUT.min(timeout);
+        if let Err(not_ready) = barrier.wait_unless(timeout, || self.stop.requested()) {
             tracing::warn!("the replay continues, although {not_ready}");
         }
         Ok(())
@@ -480,8 +482,8 @@ impl<'a> Replay<'a> {
             return;
         }
         let capture_nanos = planned.capture_nanos;
-        let is_asked = |ego: &&CavId| self.present.contains(ego);
-        let egos = self.options.lockstep.iter().filter(is_asked);
+        let egos = self.options.lockstep.iter();
+        let egos = egos.filter(|ego| self.present.contains(*ego));
         let mut missing: BTreeSet<CavId> = egos.cloned().collect();
         let deadline = end_of(self.options.answer_timeout);
         while !missing.is_empty() {
@@ -545,7 +547,7 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
         return Ok((0..scenario.agents.len()).collect());
     }
     let agents = &scenario.agents;
-    let find = |cav: &CavId| {
+    let indices = asked.iter().map(|cav| {
         let found = agents.iter().position(|agent| agent == cav);
         found.ok_or_else(|| {
             let available: Vec<&str> = agents.iter().map(CavId::as_str).collect();
@@ -555,8 +557,8 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
                 available: available.join(", "),
             }
         })
-    };
-    asked.iter().map(find).collect()
+    });
+    indices.collect()
 }
 
 #[cfg(test)]

@@ -128,8 +128,7 @@ impl Lateness {
             .map(|late| late.as_secs_f64() * 1e3)
             .collect();
         let ms = sorted(&ms);
-        let quantile_ms = |q: f64| quantile(&ms, q).unwrap_or(0.0);
-        (self.p50_ms, self.p95_ms) = (quantile_ms(0.5), quantile_ms(0.95));
+        [self.p50_ms, self.p95_ms] = [0.5, 0.95].map(|q| quantile(&ms, q).unwrap_or(0.0));
     }
 }
 

@@ -40,33 +40,32 @@ impl SensorPublisher {
         cameras: &[u8],
         is_paced: bool,
     ) -> Result<Self, BusError> {
-        let paced = |options: PublisherOptions| {
-            if is_paced {
-                options.lossless(LOSSLESS_PLACES)
-            } else {
-                options
-            }
-        };
+        let [sweep, pose, radar, camera] = [
+            PublisherOptions::SENSOR,
+            PublisherOptions::POSE,
+            PublisherOptions::RADAR,
+            PublisherOptions::CAMERA,
+        ]
+        .map(|options| match is_paced {
+            true => options.lossless(LOSSLESS_PLACES),
+            false => options,
+        });
         let sensors = agents.iter().map(|cav| {
-            let publisher =
-                |stream, options| bus.publisher(Topic::stream(cav, stream), paced(options));
             Ok(Sensors {
                 // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
-                lidar: publisher(Stream::Lidar, PublisherOptions::SENSOR)?,
-                gnss: publisher(Stream::Gnss, PublisherOptions::POSE)?,
-                imu: publisher(Stream::Imu, PublisherOptions::POSE)?,
+                lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), sweep)?,
+                gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), pose)?,
+                imu: bus.publisher(Topic::stream(cav, Stream::Imu), pose)?,
                 radar: load
                     .radar
-                    .then(|| publisher(Stream::Radar, PublisherOptions::RADAR))
+                    .then(|| bus.publisher(Topic::stream(cav, Stream::Radar), radar))
                     .transpose()?,
                 cameras: cameras
                     .iter()
                     .filter(|_| load.cameras)
                     .map(|&number| {
-                        Ok((
-                            number,
-                            publisher(Stream::Camera(number), PublisherOptions::CAMERA)?,
-                        ))
+                        let topic = Topic::stream(cav, Stream::Camera(number));
+                        Ok((number, bus.publisher(topic, camera)?))
                     })
                     .collect::<Result<_, BusError>>()?,
                 // Never paced: a slow viewer must not hold back the replay.

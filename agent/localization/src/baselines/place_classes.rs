@@ -113,8 +113,9 @@ impl PlaceHead {
 
     /// The features scaled and shifted as `classes` `[N]` have learnt.
     pub(super) fn of_class(&self, features: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
-        let of = |table: &Tensor| table.f_index_select(0, classes);
-        features.f_mul(&of(&self.scale)?)?.f_add(&of(&self.shift)?)
+        let scale = self.scale.f_index_select(0, classes)?;
+        let shift = self.shift.f_index_select(0, classes)?;
+        features.f_mul(&scale)?.f_add(&shift)
     }
 }
 

@@ -73,11 +73,11 @@ impl<N: RegressPose> DescribePolar for PoseRegressor<N> {
         cloud: &PointCloud,
         times: &mut StageTimes,
     ) -> Result<Option<Tensor>, TchError> {
-        let by_sector = |tokens: Tensor| {
-            let rings = tokens.f_view([RINGS, SECTORS, -1])?;
-            rings.f_transpose(0, 1)?.f_reshape([SECTORS, -1])
+        let Some(tokens) = self.tokens(cloud, times)? else {
+            return Ok(None);
         };
-        self.tokens(cloud, times)?.map(by_sector).transpose()
+        let sectors = tokens.f_view([RINGS, SECTORS, -1])?.f_transpose(0, 1)?;
+        Ok(Some(sectors.f_reshape([SECTORS, -1])?))
     }
 }
 

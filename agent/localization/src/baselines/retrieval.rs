@@ -36,19 +36,14 @@ impl SweepDatabase {
     pub fn new(sweeps: &[DescribedSweep]) -> Option<Self> {
         let first = &sweeps.first()?.descriptor;
         let channels = Some(first.len()).filter(|&channels| channels > 0)?;
-        let mean_of = |value: &dyn Fn(&[f32]) -> f32| {
-            let values = sweeps.iter().map(|sweep| value(&sweep.descriptor));
-            values.sum::<f32>() / sweeps.len() as f32
-        };
-        let mean = (0..channels).map(|channel| mean_of(&|of| of[channel]));
+        let mean = (0..channels).map(|channel| mean_of(sweeps, |of| of[channel]));
         let mean: Vec<f32> = mean.collect();
-        let variance = |channel: usize| mean_of(&|of| (of[channel] - mean[channel]).powi(2));
-        let scale = (0..channels)
-            .map(|channel| 1.0 / variance(channel).sqrt().max(LEAST_DEVIATION))
-            .collect();
+        let variances = (0..channels)
+            .map(|channel| mean_of(sweeps, |of| (of[channel] - mean[channel]).powi(2)));
+        let scale = variances.map(|variance| 1.0 / variance.sqrt().max(LEAST_DEVIATION));
         let mut database = Self {
+            scale: scale.collect(),
             mean,
-            scale,
             descriptors: Vec::new(),
             world_from_sensor: Vec::new(),
         };
@@ -63,13 +58,12 @@ impl SweepDatabase {
     /// Pose of the sweep whose descriptor is nearest.
     pub fn nearest(&self, descriptor: &[f32]) -> Isometry3<f64> {
         let wanted = self.normalise(descriptor);
-        let distance = |stored: &[f32]| {
+        let stored = self.descriptors.chunks_exact(self.mean.len());
+        let squared = stored.map(|stored| {
             let squares = stored.iter().zip(&wanted).map(|(a, b)| (a - b).powi(2));
             squares.sum::<f32>()
-        };
-        let stored = self.descriptors.chunks_exact(self.mean.len());
-        let distances = stored.map(distance).enumerate();
-        let nearest = distances.min_by(|(_, a), (_, b)| a.total_cmp(b));
+        });
+        let nearest = (squared.enumerate()).min_by(|(_, a), (_, b)| a.total_cmp(b));
         nearest.map_or_else(Isometry3::identity, |(row, _)| self.world_from_sensor[row])
     }
 
@@ -110,6 +104,11 @@ impl Localize for Retrieval {
         times.lap(SOLVE);
         Ok(localization(Some(pose), times))
     }
+}
+
+fn mean_of(sweeps: &[DescribedSweep], value: impl Fn(&[f32]) -> f32) -> f32 {
+    let values = sweeps.iter().map(|sweep| value(&sweep.descriptor));
+    values.sum::<f32>() / sweeps.len() as f32
 }
 
 #[cfg(test)]

@@ -38,7 +38,16 @@ impl Dense {
 
     /// The same in integers.
     pub(crate) fn int8(&self, format: LayerFormat) -> Result<Int8Linear, TchError> {
-        let weight = self.weight.f_tr()?.f_contiguous()?;
-        Int8Linear::new(&weight, Some(&self.bias), format)
+        int8_linear(&self.weight, Some(&self.bias), format)
     }
+}
+
+/// A layer in integers.
+pub(super) fn int8_linear(
+    weight: &Tensor,
+    bias: Option<&Tensor>,
+    format: LayerFormat,
+) -> Result<Int8Linear, TchError> {
+    // Stored `[C_in, C_out]`: integer layers take the transpose.
+    Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
 }

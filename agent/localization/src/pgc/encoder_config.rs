@@ -61,15 +61,14 @@ pub struct SceneEncoderConfig {
 impl SceneEncoderConfig {
     /// LightLoc's encoder, its channels times `width`: one cell per 8x8x8 voxels of 0.25 m.
     pub fn full(width: f64) -> Self {
-        let scaled = |channels: i64| ((channels as f64 * width).round() as i64).max(1);
         Self {
             name: "full".into(),
             voxel_m: 0.25,
             range_m: 100.0,
             height_m: [-6.0, 40.0],
             input: VoxelInput::Coordinates,
-            widths: [32, 64, 128, 256].map(scaled).into(),
-            residual_widths: [256, 512].map(scaled).into(),
+            widths: scaled([32, 64, 128, 256], width),
+            residual_widths: scaled([256, 512], width),
             fine_cells: false,
             context_m: Vec::new(),
         }
@@ -178,7 +177,6 @@ impl SceneEncoderConfig {
 
     /// Parameters of the 3x3x3 convolutions, nearly all there are.
     fn parameters(&self) -> i64 {
-        let group = |from: i64, to: i64| (from + to) * to;
         let before_last = self.widths[self.levels() - 2];
         let mut products = self.input.channels() * self.widths[0];
         products += self
@@ -186,18 +184,24 @@ impl SceneEncoderConfig {
             .windows(2)
             .map(|pair| pair[0] * pair[1])
             .sum::<i64>();
+        // A residual group has two: from its inputs to its outputs, and between its outputs.
         products += if self.fine_cells {
-            group(before_last, before_last)
+            2 * before_last * before_last
         } else {
             0
         };
         let mut channels = self.widths[self.levels() - 1];
         for &width in &self.residual_widths {
-            products += group(channels, width);
+            products += (channels + width) * width;
             channels = width;
         }
         products * KERNEL_VOLUME as i64
     }
+}
+
+fn scaled<const N: usize>(channels: [i64; N], factor: f64) -> Vec<i64> {
+    let scaled = channels.map(|channels| ((channels as f64 * factor).round() as i64).max(1));
+    scaled.into()
 }
 
 #[cfg(test)]

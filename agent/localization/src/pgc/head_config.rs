@@ -82,28 +82,29 @@ impl RefinerConfig {
     /// its rows are.
     pub fn cropped(&self, low_m: [f64; 2], high_m: [f64; 2]) -> (Self, Vec<i64>) {
         let whole = self.corners();
-        let step = |axis: usize, place_m: f64| (place_m - self.low_m[axis]) / self.spacing_m;
         let first: [i64; 2] = std::array::from_fn(|axis| {
-            (step(axis, low_m[axis]).floor() as i64).clamp(0, whole[axis] - 1)
+            let steps = (low_m[axis] - self.low_m[axis]) / self.spacing_m;
+            (steps.floor() as i64).clamp(0, whole[axis] - 1)
         });
         let last: [i64; 2] = std::array::from_fn(|axis| {
-            (step(axis, high_m[axis]).ceil() as i64).clamp(first[axis], whole[axis] - 1)
+            let steps = (high_m[axis] - self.low_m[axis]) / self.spacing_m;
+            (steps.ceil() as i64).clamp(first[axis], whole[axis] - 1)
         });
-        let at = |axis: usize, step: i64| self.low_m[axis] + step as f64 * self.spacing_m;
+        let [low_m, high_m] = [first, last]
+            .map(|steps| [0, 1].map(|axis| self.low_m[axis] + steps[axis] as f64 * self.spacing_m));
         let cropped = Self {
-            low_m: [at(0, first[0]), at(1, first[1])],
+            low_m,
             // A little less than the last corner, so that rounding does not ask for one more.
-            high_m: std::array::from_fn(|axis| at(axis, last[axis]) - 0.01 * self.spacing_m),
+            high_m: high_m.map(|high_m| high_m - 0.01 * self.spacing_m),
             ..self.clone()
         };
         let [columns, rows] = cropped.corners();
-        let row = |x: i64, y: i64| {
+        let mut kept = Vec::new();
+        for y in 0..rows {
             // A part smaller than a window has corners beyond the full grid: they repeat its last ones.
-            (first[1] + y).min(whole[1] - 1) * whole[0] + (first[0] + x).min(whole[0] - 1)
-        };
-        let kept = (0..rows)
-            .flat_map(|y| (0..columns).map(move |x| row(x, y)))
-            .collect();
+            let row = (first[1] + y).min(whole[1] - 1) * whole[0];
+            kept.extend((0..columns).map(|x| row + (first[0] + x).min(whole[0] - 1)));
+        }
         (cropped, kept)
     }
 

@@ -111,16 +111,15 @@ fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>> {
     let folders = beside.chain(weights_folders());
     let mut files: Vec<_> = folders.flat_map(|folder| files_in(&folder)).collect();
     files.retain(|file| file != head);
-    let is_other = |file: &PathBuf| {
+    // Files with an encoder's name first: each one is read and hashed until the digest fits.
+    files.sort_by_key(|file| {
         let stem = file.file_stem().and_then(|stem| stem.to_str());
         !stem.is_some_and(|stem| stem.contains("encoder"))
-    };
-    // Files with an encoder's name first: each one is read and hashed until the digest fits.
-    files.sort_by_key(is_other);
-    let is_named = |file: &PathBuf| {
+    });
+    let named = files.into_iter().find(|file| {
         Weights::load(file).is_ok_and(|weights| CellEncoder::sha256_of(&weights) == sha256)
-    };
-    Ok(files.into_iter().find(is_named).ok_or(sha256))
+    });
+    Ok(named.ok_or(sha256))
 }
 
 /// The released encoder, for a new head.

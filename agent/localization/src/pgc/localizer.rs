@@ -10,7 +10,7 @@ use protocol::PointCloud;
 use protocol::config::FieldError;
 use serde::de::DeserializeOwned;
 use support::stage_times::StageTimes;
-use tch::{Device, Kind, TchError, Tensor, nn, no_grad};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::cell_choice::choose_evenly;
 use super::cell_encoder::{CellEncoder, PreparedSweep};
@@ -83,12 +83,12 @@ impl Localizer {
         let Inference { device, precision } = inference;
         let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
-        let build = |path: &nn::Path<'_>, config: SceneHeadConfig| {
-            // Before the layers are built: a wrong encoder is named as such, not by a shape.
-            config.check_encoder(head, encoder, &encoder_sha256)?;
-            SceneHead::new(path, &config)
-        };
-        let mut scene_head = weights.network(SceneHead::KIND, device, build)?;
+        let mut scene_head =
+            weights.network(SceneHead::KIND, device, |path, config: SceneHeadConfig| {
+                // Before the layers are built: a wrong encoder is named as such, not by a shape.
+                config.check_encoder(head, encoder, &encoder_sha256)?;
+                SceneHead::new(path, &config)
+            })?;
         // The head's file has the scales of both networks.
         if let Some(scales) = weights.activation_scales()? {
             let quantised = network

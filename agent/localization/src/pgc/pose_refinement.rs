@@ -90,7 +90,7 @@ pub(super) fn refine(
             })
             .collect();
         let usable = pairs.iter().filter(|pair| pair.usable());
-        let fits = usable.map(|pair| {
+        let fits = usable.clone().map(|pair| {
             let [source, target] =
                 [pair.source_m, pair.target_m].map(|point| Vector3::from(point.map(f64::from)));
             (source, target, f64::from(pair.weight))
@@ -101,11 +101,11 @@ pub(super) fn refine(
         }
         // Step: evidence, with the weights that the pairs have at the fitted pose.
         let scale_m = scales_m.last().copied().unwrap_or(INLIER_M);
-        let weigh = |pair: &Correspondence| {
-            f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m)
-        };
-        let usable = pairs.iter().filter(|pair| pair.usable());
-        let weighted: Vec<_> = usable.map(|pair| (pair, weigh(pair))).collect();
+        let weighted = usable.map(|pair| {
+            let share = forgiveness(pair.residual_m(&pose), scale_m);
+            (pair, f64::from(pair.weight) * share)
+        });
+        let weighted: Vec<_> = weighted.collect();
         let information_per_m2 = weighted.iter().map(|(_, weight)| weight).sum();
         let std = PoseStd::of(&pose, weighted.into_iter());
         let registration = Registration::judge(&pairs, pose, INLIER_M);

@@ -192,17 +192,15 @@ pub(super) fn confirm(
 
 /// The estimate of a sweep that is published.
 pub fn estimate(solved: &Solved) -> PoseEstimate {
-    let none = |reason, inliers: usize| {
-        PoseEstimate::no_pose(reason, u32::try_from(inliers).unwrap_or(u32::MAX))
-    };
-    match solved {
-        Ok(found) if found.is_rejected => none(NoPoseReason::LowConfidence, found.evidence.inliers),
-        Ok(found) => PoseEstimate::new(found.world_from_sensor.into(), found.sigma as f32),
+    let (reason, inliers) = match solved {
+        Ok(found) if found.is_rejected => (NoPoseReason::LowConfidence, found.evidence.inliers),
+        Ok(found) => return PoseEstimate::new(found.world_from_sensor.into(), found.sigma as f32),
         Err(error @ NoRegistration::TooFewCorrespondences { .. }) => {
-            none(NoPoseReason::TooFewPoints, error.inlier_count())
+            (NoPoseReason::TooFewPoints, error.inlier_count())
         }
-        Err(error) => none(NoPoseReason::TooFewInliers, error.inlier_count()),
-    }
+        Err(error) => (NoPoseReason::TooFewInliers, error.inlier_count()),
+    };
+    PoseEstimate::no_pose(reason, u32::try_from(inliers).unwrap_or(u32::MAX))
 }
 
 #[cfg(test)]

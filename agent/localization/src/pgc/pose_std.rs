@@ -57,12 +57,8 @@ impl PoseStd {
             return Self::UNBOUNDED;
         };
         let covariance = inverse * gradients * inverse;
-        let bounded = |variance: f64, most: f64| {
-            let std = variance.sqrt();
-            // NaN, of a variance that rounding left below zero, counts as unbounded too.
-            if std.is_finite() { std.min(most) } else { most }
-        };
-        let variance = |from: usize| (from..from + 3).map(|axis| covariance[(axis, axis)]).sum();
+        let [position_m2, rotation_rad2] =
+            [0..3, 3..6].map(|axes| axes.map(|axis| covariance[(axis, axis)]).sum());
         let position = covariance.fixed_view::<3, 3>(0, 0);
         // A matrix that is not finite has no eigenvalues.
         let worst_axis = if position.iter().all(|entry| entry.is_finite()) {
@@ -71,9 +67,9 @@ impl PoseStd {
             f64::NAN
         };
         Self {
-            position_m: bounded(variance(0), Self::UNBOUNDED.position_m),
-            worst_axis_m: bounded(worst_axis, Self::UNBOUNDED.worst_axis_m),
-            rotation_rad: bounded(variance(3), Self::UNBOUNDED.rotation_rad),
+            position_m: bounded_std(position_m2, Self::UNBOUNDED.position_m),
+            worst_axis_m: bounded_std(worst_axis, Self::UNBOUNDED.worst_axis_m),
+            rotation_rad: bounded_std(rotation_rad2, Self::UNBOUNDED.rotation_rad),
             covariance: match covariance.iter().all(|entry| entry.is_finite()) {
                 true => std::array::from_fn(|row| {
                     std::array::from_fn(|column| covariance[(row, column)])
@@ -93,6 +89,12 @@ const fn diagonal(value: f64) -> [[f64; 6]; 6] {
         row += 1;
     }
     matrix
+}
+
+fn bounded_std(variance: f64, most: f64) -> f64 {
+    let std = variance.sqrt();
+    // NaN, of a variance that rounding left below zero, counts as unbounded too.
+    if std.is_finite() { std.min(most) } else { most }
 }
 
 #[cfg(test)]

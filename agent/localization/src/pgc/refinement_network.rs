@@ -93,12 +93,13 @@ impl Refiner {
         let keys = gather(&self.keys, &window.corners)?;
         let similarity = keys.f_bmm(&query.f_unsqueeze(2)?)?.f_squeeze_dim(2)? * &self.sharpness;
         let shares = similarity.f_softmax(1, Kind::Float)?.f_unsqueeze(1)?;
-        let mean = |values: &Tensor| shares.f_bmm(values)?.f_squeeze_dim(1);
-        let plane_m = mean(&window.places_m)?;
-        let floor_m = mean(&gather(&self.heights, &window.corners)?)?;
+        let plane_m = shares.f_bmm(&window.places_m)?.f_squeeze_dim(1)?;
+        let heights = gather(&self.heights, &window.corners)?;
+        let floor_m = shares.f_bmm(&heights)?.f_squeeze_dim(1)?;
         let above_m = self.height.forward(&hidden)?.f_to_kind(Kind::Float)?;
         // The spread of the attention weights and the largest of them indicate the error of the prediction.
-        let variance = mean(&window.places_m.f_square()?)? - plane_m.f_square()?;
+        let squares = shares.f_bmm(&window.places_m.f_square()?)?;
+        let variance = squares.f_squeeze_dim(1)? - plane_m.f_square()?;
         let variance = variance.f_sum_dim_intlist(1_i64, true, Kind::Float)?;
         let spread = variance.f_clamp_min(1e-6)?.f_sqrt()?;
         let largest = shares.f_amax([2_i64], false)?;
@@ -117,13 +118,13 @@ impl Refiner {
         let [columns, rows] = config.corners();
         let device = assumed_m.device();
         // The whole window stays on the grid: a cell beyond the edge gets the outermost one.
-        let axis = |axis: usize, size: i64| {
+        let [column, row] = [(0, columns), (1, rows)].map(|(axis, size): (usize, i64)| {
             let steps = (assumed_m.f_select(1, axis as i64)? - low_m[axis]) / spacing_m;
             steps
                 .f_round()?
                 .f_clamp(reach as f64, (size - 1 - reach) as f64)
-        };
-        let (column, row) = (axis(0, columns)?, axis(1, rows)?);
+        });
+        let (column, row) = (column?, row?);
         let middle = [&column * spacing_m + low_m[0], &row * spacing_m + low_m[1]];
         // Row by row. Single precision holds whole numbers up to 2^24 exactly.
         let first = (row * columns as f64 + column).f_to_kind(Kind::Int64)?;

@@ -3,6 +3,7 @@
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
+use super::dense::int8_linear;
 use perception::int8::{ActivationScales, Int8Linear, LayerFormat, Quantisation, QuantiseError};
 use perception::sparse::{GatherIndex, Int8SparseConv, SparseConv};
 
@@ -33,16 +34,12 @@ pub(super) struct Int8ResidualGroup {
 
 impl ResidualGroup {
     pub(super) fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
-        let pointwise = |name: &str, from: i64| {
-            let stdev = (2.0 / from as f64).sqrt();
-            (path / name).var("weight", &[from, outputs], Init::Randn { mean: 0.0, stdev })
-        };
         Self {
             inward: SparseConv::new(&(path / "inward"), inputs, outputs),
-            middle: pointwise("middle", outputs),
+            middle: pointwise(&(path / "middle"), outputs, outputs),
             middle_bias: (path / "middle").var("bias", &[outputs], Init::Const(0.0)),
             outward: SparseConv::new(&(path / "outward"), outputs, outputs),
-            skip: (inputs != outputs).then(|| pointwise("skip", inputs)),
+            skip: (inputs != outputs).then(|| pointwise(&(path / "skip"), inputs, outputs)),
         }
     }
 
@@ -76,17 +73,13 @@ impl ResidualGroup {
     ) -> Result<Int8ResidualGroup, QuantiseError> {
         let inward = scales.get(&inward_activation(name))?;
         let middle = scales.get(&middle_activation(name))?;
-        let linear = |weight: &Tensor, bias: Option<&Tensor>, format| {
-            // Stored `[C_in, C_out]`: integer layers take the transpose.
-            Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
-        };
         let (bias, hidden) = (&self.middle_bias, LayerFormat::hidden(inward, middle));
         let skip = self.skip.as_ref();
-        let skip = skip.map(|skip| linear(skip, None, LayerFormat::last(input)));
+        let skip = skip.map(|skip| int8_linear(skip, None, LayerFormat::last(input)));
         Ok(Int8ResidualGroup {
             input,
             inward: self.inward.int8(LayerFormat::hidden(input, inward))?,
-            middle: linear(&self.middle, Some(bias), hidden)?,
+            middle: int8_linear(&self.middle, Some(bias), hidden)?,
             outward: self.outward.int8(LayerFormat::last(middle))?,
             skip: skip.transpose()?,
         })
@@ -104,6 +97,15 @@ impl Int8ResidualGroup {
         let mut outer = self.outward.forward(&inner, index)?;
         outer.f_add_(&skipped)?.f_relu_()
     }
+}
+
+fn pointwise(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Tensor {
+    let stdev = (2.0 / inputs as f64).sqrt();
+    path.var(
+        "weight",
+        &[inputs, outputs],
+        Init::Randn { mean: 0.0, stdev },
+    )
 }
 
 fn inward_activation(name: &str) -> String {

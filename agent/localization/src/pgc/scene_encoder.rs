@@ -60,10 +60,10 @@ impl SceneEncoder {
     pub fn new(path: &nn::Path<'_>, config: &SceneEncoderConfig) -> Result<Self, LocalizerError> {
         config.validate()?;
         let widths = &config.widths;
-        let level = |level: usize| path / "levels" / level;
-        let first = SparseConv::new(&level(0), config.input.channels(), widths[0]);
+        let levels = path / "levels";
+        let first = SparseConv::new(&(&levels / 0), config.input.channels(), widths[0]);
         let down = (1..widths.len())
-            .map(|to| SparseConv::new(&level(to), widths[to - 1], widths[to]))
+            .map(|to| SparseConv::new(&(&levels / to), widths[to - 1], widths[to]))
             .collect();
         let (before_last, fine) = (widths[widths.len() - 2], path / "fine");
         let fine = (config.fine_cells).then(|| ResidualGroup::new(&fine, before_last, before_last));
@@ -206,7 +206,7 @@ impl SceneEncoder {
                 parts.push(rows(&context, &batch.coarse_of_cell)?);
             }
         }
-        let sweep = |rows: &std::ops::Range<i64>| {
+        let sweeps = batch.coarse_rows.iter().map(|rows| {
             let own = (local.coarse).f_narrow(0, rows.start, rows.end - rows.start)?;
             let own = own.f_to_kind(Kind::Float)?;
             // The mean of no rows is NaN, and their maximum an error.
@@ -215,8 +215,7 @@ impl SceneEncoder {
             }
             let mean = own.f_mean_dim(0_i64, false, Kind::Float)?;
             Tensor::f_cat(&[mean, own.f_amax([0_i64], false)?], 0)
-        };
-        let sweeps = batch.coarse_rows.iter().map(sweep);
+        });
         let sweeps: Vec<Tensor> = sweeps.collect::<Result<_, _>>()?;
         Ok(SceneFeatures {
             cells: Tensor::f_cat(&parts, 1)?,
@@ -284,42 +283,50 @@ struct Plane {
 
 impl Plane {
     fn new(coarse: &Tensor, batch: &VoxelBatch) -> Result<Self, TchError> {
-        let (sweeps, edge) = (batch.sweeps(), batch.plane_edge);
-        let spread = |values: &Tensor| {
-            let channels = values.size()[1];
-            let empty = values.f_new_zeros(
-                [sweeps * edge * edge, channels],
-                (Kind::Float, values.device()),
-            )?;
-            let index = batch
-                .columns
-                .f_unsqueeze(1)?
-                .f_expand([-1, channels], false)?;
-            empty
-                .f_scatter_add(0, &index, values)?
-                .f_view([sweeps, edge, edge, channels])?
-                .f_permute([0, 3, 1, 2])
-        };
         let coarse = coarse.f_to_kind(Kind::Float)?;
         let ones = coarse.f_new_ones([coarse.size()[0], 1], (Kind::Float, coarse.device()))?;
         Ok(Self {
-            sum: spread(&coarse)?,
-            count: spread(&ones)?,
+            sum: Self::sum_of(&coarse, batch)?,
+            count: Self::sum_of(&ones, batch)?,
         })
+    }
+
+    /// `[sweeps, channels, edge, edge]` of values of coarse cells `[N, channels]`.
+    fn sum_of(values: &Tensor, batch: &VoxelBatch) -> Result<Tensor, TchError> {
+        let (sweeps, edge, channels) = (batch.sweeps(), batch.plane_edge, values.size()[1]);
+        let float = (Kind::Float, values.device());
+        let empty = values.f_new_zeros([sweeps * edge * edge, channels], float)?;
+        let index = batch.columns.f_unsqueeze(1)?;
+        empty
+            .f_scatter_add(0, &index.f_expand([-1, channels], false)?, values)?
+            .f_view([sweeps, edge, edge, channels])?
+            .f_permute([0, 3, 1, 2])
     }
 
     /// `[sweeps * edge * edge, channels]`: mean over the coarse cells in a square window.
     fn mean_over(&self, window: i64) -> Result<Tensor, TchError> {
-        // A square window is one row after one column of it: a fifth of the additions.
-        let along = |values: &Tensor, size: [i64; 2]| {
-            values.f_avg_pool2d(size, [1; 2], size.map(|n| n / 2), false, true, None::<i64>)
-        };
-        let pooled = |values: &Tensor| along(&along(values, [window, 1])?, [1, window]);
         // Sums over counts: the area of the window, with the padding, cancels. Empty windows are 0 / 1e-6.
-        let mean = pooled(&self.sum)? / pooled(&self.count)?.f_clamp_min(1e-6)?;
+        let sum = mean_over(&self.sum, [window; 2], true)?;
+        let mean = sum / mean_over(&self.count, [window; 2], true)?.f_clamp_min(1e-6)?;
         let channels = mean.size()[1];
         mean.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])
     }
+}
+
+/// Mean of maps `[N, C, H, W]` over a window of an odd height and width around each cell, padded with zeros or, without
+/// `counts_padding`, as far as it is on the map.
+pub(super) fn mean_over(
+    maps: &Tensor,
+    [height, width]: [i64; 2],
+    counts_padding: bool,
+) -> Result<Tensor, TchError> {
+    let mut means = maps.shallow_clone();
+    // One row after one column of the window: a fraction of the additions.
+    for size in [[height, 1], [1, width]] {
+        let padding = size.map(|edge| edge / 2);
+        means = means.f_avg_pool2d(size, [1; 2], padding, false, counts_padding, None::<i64>)?;
+    }
+    Ok(means)
 }
 
 #[cfg(test)]

@@ -65,11 +65,6 @@ impl SceneHead {
         config.validate()?;
         let (cells, sweeps, width) = (config.cell_channels, config.sweep_channels, config.width);
         let (classes, centres) = (config.classes, config.centres);
-        let block = |number: usize| {
-            let path = path / "blocks" / number;
-            [0, 1, 2].map(|layer: usize| Dense::new(&(&path / layer), width, width, 1.0))
-        };
-        let refiner = |config| Refiner::new(&(path / "refiner"), config);
         Ok(Self {
             config: config.clone(),
             cell_norm: FeatureNorm::new(&(path / "cell_norm"), cells),
@@ -77,9 +72,16 @@ impl SceneHead {
             classifier: Classifier::new(&(path / "classifier"), sweeps, classes),
             centres: (path / "centres").zeros_no_train("position", &[centres, 3]),
             inward: Dense::new(&(path / "inward"), cells + classes, width, 1.0),
-            blocks: (0..config.blocks).map(block).collect(),
+            blocks: (0..config.blocks)
+                .map(|number| {
+                    let path = path / "blocks" / number;
+                    [0, 1, 2].map(|layer| Dense::new(&(&path / layer), width, width, 1.0))
+                })
+                .collect(),
             outward: Dense::new(&(path / "outward"), width, centres + 4, 0.1),
-            refiner: config.refiner.as_ref().map(refiner).transpose()?,
+            refiner: (config.refiner.as_ref())
+                .map(|config| Refiner::new(&(path / "refiner"), config))
+                .transpose()?,
             int8: None,
         })
     }
@@ -187,8 +189,9 @@ impl SceneHead {
     pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
         let (mut before, mut blocks) = (scales.get(INWARD)?, Vec::with_capacity(self.blocks.len()));
         for (number, [first, second, third]) in self.blocks.iter().enumerate() {
-            let of = |part| scales.get(&block_activation(number, part));
-            let (inner, innermost, output) = (of("0")?, of("1")?, of("output")?);
+            let inner = scales.get(&block_activation(number, "0"))?;
+            let innermost = scales.get(&block_activation(number, "1"))?;
+            let output = scales.get(&block_activation(number, "output"))?;
             let layers = [
                 first.int8(LayerFormat::hidden(before, inner))?,
                 second.int8(LayerFormat::hidden(inner, innermost))?,
@@ -244,13 +247,13 @@ struct Classifier {
 impl Classifier {
     fn new(path: &nn::Path<'_>, inputs: i64, classes: i64) -> Self {
         let [first, second] = CLASSIFIER_WIDTHS;
-        let linear =
-            |layer: usize, from, to| nn::linear(path / layer, from, to, LinearConfig::default());
-        let norm = |layer: usize, width| Norm::with_defaults(&(path / "norms" / layer), width);
+        let config = LinearConfig::default();
         Self {
-            layers: [linear(0, inputs, first), linear(1, first, second)],
-            norms: [norm(0, first), norm(1, second)],
-            last: linear(2, second, classes),
+            layers: [(inputs, first, 0), (first, second, 1)]
+                .map(|(from, to, layer)| nn::linear(path / layer, from, to, config)),
+            norms: [(first, 0), (second, 1)]
+                .map(|(width, layer)| Norm::with_defaults(&(path / "norms" / layer), width)),
+            last: nn::linear(path / 2, second, classes, config),
         }
     }
 

@@ -59,16 +59,16 @@ impl SyntheticScene {
             ..SceneCoordinates::default()
         };
         for _ in 0..self.cells {
-            let mut within = |reach: f64| random.random_range(-reach..reach);
-            let sensor = Point3::new(within(50.0), within(50.0), within(5.0));
+            let sensor = [50.0, 50.0, 5.0].map(|reach: f64| random.random_range(-reach..reach));
+            let sensor = Point3::from(sensor);
             let mut predicted = pose * sensor;
             if random.random_bool(self.twins) {
                 // The predicted error does not show the mistake.
                 predicted += Vector3::new(24.0, 7.0, 0.0);
             }
             let world = if random.random_bool(self.outliers) {
-                let mut within = |reach: f64| random.random_range(-reach..reach);
-                Point3::new(within(200.0), within(200.0), within(5.0))
+                let world = [200.0, 200.0, 5.0];
+                Point3::from(world.map(|reach: f64| random.random_range(-reach..reach)))
             } else {
                 predicted + Vector3::from_fn(|_, _| noise.sample(&mut random))
             };
@@ -97,9 +97,10 @@ impl Localize for SyntheticScene {
 
 fn local_pose(seed: u64) -> Isometry3<f64> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut within = |reach: f64| random.random_range(-reach..reach);
+    let reaches = [150.0, 150.0, 0.5, 0.03, 0.03, 3.1];
+    let [x, y, z, roll, pitch, yaw] = reaches.map(|reach: f64| random.random_range(-reach..reach));
     Isometry3::from_parts(
-        Translation3::new(within(150.0), within(150.0), 2.0 + within(0.5)),
-        UnitQuaternion::from_euler_angles(within(0.03), within(0.03), within(3.1)),
+        Translation3::new(x, y, 2.0 + z),
+        UnitQuaternion::from_euler_angles(roll, pitch, yaw),
     )
 }

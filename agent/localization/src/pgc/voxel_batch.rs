@@ -41,9 +41,6 @@ impl VoxelBatch {
     ) -> Result<Self, TchError> {
         let input: Vec<f32> = (sweeps.iter().flat_map(|sweep| &sweep.input).copied()).collect();
         let input = tensor(&input, &[-1, config.input.channels()], device)?;
-        let stacked = |book: fn(&SweepVoxels) -> &Rulebook| {
-            Rulebook::stacked(sweeps.iter().map(|s| book(s)), device)
-        };
         let down = (0..config.levels() - 1)
             .map(|level| Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.down[level]), device))
             .collect::<Result<_, _>>()?;
@@ -51,24 +48,18 @@ impl VoxelBatch {
         let fine = (config.fine_cells).then(|| Rulebook::stacked(fine, device));
         let edge = i64::from(plane_edge(config));
         let coarse_rows = ranges(sweeps, |sweep| sweep.columns.len());
-        let shifted = |values: fn(&SweepVoxels) -> &[u32], shifts: Vec<i64>| {
-            let mut rows = Vec::new();
-            for (sweep, shift) in sweeps.iter().zip(shifts) {
-                rows.extend(values(sweep).iter().map(|&row| shift + i64::from(row)));
-            }
-            tensor(&rows, &[-1], device)
-        };
         let planes = (0..sweeps.len() as i64).map(|sweep| sweep * edge * edge);
-        let planes = planes.collect();
-        let starts = coarse_rows.iter().map(|rows| rows.start).collect();
+        let columns = sweeps.iter().map(|sweep| sweep.columns.as_slice());
+        let starts = coarse_rows.iter().map(|rows| rows.start);
+        let rows = sweeps.iter().map(|sweep| sweep.coarse_of_cell.as_slice());
         Ok(Self {
             input,
-            first: stacked(|sweep| &sweep.first)?,
+            first: Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.first), device)?,
             down,
             fine: fine.transpose()?,
-            coarse: stacked(|sweep| &sweep.coarse)?,
-            coarse_of_cell: shifted(|sweep| &sweep.coarse_of_cell, starts)?,
-            columns: shifted(|sweep| &sweep.columns, planes)?,
+            coarse: Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.coarse), device)?,
+            coarse_of_cell: shifted(rows.zip(starts), device)?,
+            columns: shifted(columns.zip(planes), device)?,
             plane_edge: edge,
             coarse_rows,
             cell_rows: ranges(sweeps, |sweep| sweep.cells.len()),
@@ -88,10 +79,19 @@ impl VoxelBatch {
 
 fn ranges(sweeps: &[&SweepVoxels], count: impl Fn(&SweepVoxels) -> usize) -> Vec<Range<i64>> {
     let mut end = 0;
-    let range = |sweep: &&SweepVoxels| {
+    let ranges = sweeps.iter().map(|sweep| {
         let start = end;
         end += count(sweep) as i64;
         start..end
-    };
-    sweeps.iter().map(range).collect()
+    });
+    ranges.collect()
+}
+
+/// Rows of sweeps one after another, those of each plus its shift.
+fn shifted<'a>(
+    sweeps: impl Iterator<Item = (&'a [u32], i64)>,
+    device: Device,
+) -> Result<Tensor, TchError> {
+    let rows = sweeps.flat_map(|(rows, shift)| rows.iter().map(move |&row| shift + i64::from(row)));
+    tensor(&rows.collect::<Vec<_>>(), &[-1], device)
 }

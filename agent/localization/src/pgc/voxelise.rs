@@ -168,8 +168,9 @@ fn cells(points: &[[f32; 3]], rows: &[u32], count: usize) -> Vec<Cell> {
 
 fn columns(sites: &Sites, config: &SceneEncoderConfig) -> Vec<u32> {
     let edge = plane_edge(config);
-    let column = |&[x, y, _]: &[i32; 3]| ((y + edge / 2) * edge + x + edge / 2) as u32;
-    sites.coords().iter().map(column).collect()
+    let coords = sites.coords().iter();
+    let columns = coords.map(|&[x, y, _]| ((y + edge / 2) * edge + x + edge / 2) as u32);
+    columns.collect()
 }
 
 #[cfg(test)]

@@ -68,8 +68,10 @@ fn parse_row(row: CsvRow<'_>) -> Result<TableRow, FileError> {
         return Ok(TableRow::NoPose);
     }
     let row = row.complete()?;
-    let metres = |column| row.number(column, -MAX_ERROR_M..=MAX_ERROR_M, "metres within 100 km");
-    let position_m = [metres(0)?, metres(1)?, metres(2)?];
+    let mut position_m = [0.0; 3];
+    for (column, metres) in position_m.iter_mut().enumerate() {
+        *metres = row.number(column, -MAX_ERROR_M..=MAX_ERROR_M, "metres within 100 km")?;
+    }
     let yaw_rad = row
         .number(3, -360.0..=360.0, "degrees within a turn")?
         .to_radians();

@@ -71,14 +71,14 @@ pub(super) fn refuse_useless(
     all: &[Arg],
     matches: &ArgMatches,
 ) -> Result<(), clap::Error> {
-    let is_useless = |option: &&Arg| {
+    let useless = all.iter().find(|option| {
         let id = option.get_id();
         let is_own = own.iter().any(|own| own.get_id() == id);
         // Options with a default always have a value: only those that were typed count.
         matches.value_source(id.as_str()) == Some(ValueSource::CommandLine)
             && !(is_own && settings.has_use_for(id.as_str()))
-    };
-    let Some(option) = all.iter().find(is_useless) else {
+    });
+    let Some(option) = useless else {
         return Ok(());
     };
     let option = option.get_long().unwrap_or_default();

@@ -259,11 +259,13 @@ fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate> {
 }
 
 fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
-    let number = |column| row.number(column, f64::MIN..=f64::MAX, "a finite number");
-    let translation_m = [number(3)?, number(4)?, number(5)?];
-    let rotation_wxyz = [number(6)?, number(7)?, number(8)?, number(9)?];
+    let mut numbers = [0.0; 7];
+    for (column, number) in (3..).zip(&mut numbers) {
+        *number = row.number(column, f64::MIN..=f64::MAX, "a finite number")?;
+    }
+    let [x, y, z, rotation_wxyz @ ..] = numbers;
     let world_from_cav = Pose {
-        translation_m,
+        translation_m: [x, y, z],
         rotation_wxyz,
     };
     world_from_cav

@@ -282,10 +282,11 @@ impl TrackedPose {
     /// True if the sweep is measured without the prediction.
     fn is_global_due(&self, capture_nanos: u64) -> bool {
         // In floating point: the difference is negative after a restart of the scene, which is not recent.
-        let since_s = |nanos: u64| (capture_nanos as f64 - nanos as f64) * 1e-9;
-        let is_recent = |nanos: u64| (0.0..self.config.global_period_s).contains(&since_s(nanos));
+        let since_s = (self.global_nanos).map(|nanos| (capture_nanos as f64 - nanos as f64) * 1e-9);
+        let recent_s = 0.0..self.config.global_period_s;
         // A prediction that a measurement contradicts is no place to search near.
-        self.tracker.is_contradicted() || !self.global_nanos.is_some_and(is_recent)
+        self.tracker.is_contradicted()
+            || !since_s.is_some_and(|since_s| recent_s.contains(&since_s))
     }
 }
 

@@ -31,35 +31,27 @@ impl Bits {
         size: usize,
         condition: impl Fn(f32) -> bool,
     ) -> Self {
-        let word = |entries: &[f32]| {
-            entries
-                .iter()
-                .enumerate()
-                .fold(0_u64, |word, (bit, &entry)| {
-                    word | u64::from(condition(entry)) << bit
-                })
-        };
-        let words = entries
-            .chunks(size.max(1))
-            .flat_map(|row| row.chunks(64))
-            .map(word)
-            .collect();
+        let chunks = entries.chunks(size.max(1)).flat_map(|row| row.chunks(64));
+        let words = chunks.map(|entries| {
+            let bits = entries.iter().enumerate();
+            bits.fold(0_u64, |word, (bit, &entry)| {
+                word | u64::from(condition(entry)) << bit
+            })
+        });
         Self {
-            words,
+            words: words.collect(),
             words_per_row: size.div_ceil(64),
         }
     }
 
     /// Number of bits that two rows share; for a symmetric matrix an entry of its square.
     pub(super) fn common(&self, a: usize, b: usize) -> u32 {
-        let row = |index: usize| {
-            &self.words[index * self.words_per_row..(index + 1) * self.words_per_row]
-        };
-        row(a)
-            .iter()
-            .zip(row(b))
-            .map(|(a, b)| (a & b).count_ones())
-            .sum()
+        let words = self.row(a).iter().zip(self.row(b));
+        words.map(|(a, b)| (a & b).count_ones()).sum()
+    }
+
+    fn row(&self, index: usize) -> &[u64] {
+        &self.words[index * self.words_per_row..(index + 1) * self.words_per_row]
     }
 }
 

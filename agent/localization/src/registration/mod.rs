@@ -49,12 +49,10 @@ pub struct Correspondence {
 impl Correspondence {
     /// True if it can be used: finite coordinates and a positive finite weight.
     pub fn usable(&self) -> bool {
-        let bounded =
-            |point: &[f32; 3]| point.iter().all(|coordinate| coordinate.abs() <= MAX_ABS_M);
+        let mut coordinates = self.source_m.iter().chain(&self.target_m);
         self.weight > 0.0
             && self.weight.is_finite()
-            && bounded(&self.source_m)
-            && bounded(&self.target_m)
+            && coordinates.all(|coordinate| coordinate.abs() <= MAX_ABS_M)
     }
 
     /// Distance between the target and the transformed source, metres.

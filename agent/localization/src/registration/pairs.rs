@@ -31,6 +31,14 @@ impl Gain {
     }
 }
 
+fn column(pairs: &[&Correspondence], value: impl Fn(&Correspondence) -> f32) -> Column {
+    // Padding has weight 0 and adds nothing to a score.
+    let blocks = pairs
+        .chunks(LANES)
+        .map(|block| std::array::from_fn(|lane| block.get(lane).map_or(0.0, |pair| value(pair))));
+    blocks.collect()
+}
+
 /// Usable correspondences, highest weights first, column by column.
 #[derive(Debug)]
 pub(super) struct Pairs {
@@ -49,24 +57,18 @@ impl Pairs {
         usable.shuffle(random);
         // The sort is stable: the shuffled order stays among equal weights.
         usable.sort_by(|a, b| b.weight.total_cmp(&a.weight));
-        let mean = |axis: usize| {
+        let origin = Vector3::from_fn(|axis, _| {
             let values = usable.iter().map(|pair| f64::from(pair.target_m[axis]));
             values.sum::<f64>() / usable.len().max(1) as f64
-        };
-        let origin = Vector3::new(mean(0), mean(1), mean(2));
-        let column = |value: &dyn Fn(&Correspondence) -> f32| -> Column {
-            // Padding has weight 0 and adds nothing to a score.
-            let padded = |block: &[&Correspondence]| {
-                std::array::from_fn(|lane| block.get(lane).map_or(0.0, |p| value(p)))
-            };
-            usable.chunks(LANES).map(padded).collect()
-        };
+        });
         Self {
-            source: std::array::from_fn(|axis| column(&|pair| pair.source_m[axis])),
+            source: std::array::from_fn(|axis| column(&usable, |pair| pair.source_m[axis])),
             target: std::array::from_fn(|axis| {
-                column(&|pair| (f64::from(pair.target_m[axis]) - origin[axis]) as f32)
+                column(&usable, |pair| {
+                    (f64::from(pair.target_m[axis]) - origin[axis]) as f32
+                })
             }),
-            weight: column(&|pair| pair.weight),
+            weight: column(&usable, |pair| pair.weight),
             count: usable.len(),
             origin,
         }

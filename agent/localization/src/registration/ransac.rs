@@ -144,28 +144,27 @@ pub fn solve(
     check_enough(correspondences, required)?;
     let mut random = ChaCha8Rng::seed_from_u64(config.seed);
     let pairs = Pairs::new(correspondences, &mut random);
-    let too_few = |found| NoRegistration::TooFewInliers {
-        found,
-        required,
-        given: correspondences.len(),
-    };
     let search = Search {
         pairs: &pairs,
         config,
         best: None,
     };
-    let best = search.run(&mut random).ok_or_else(|| too_few(0))?;
+    let best = search.run(&mut random);
     let scale_m = config.refine_scale_m;
-    let near = pairs.near(&best, refine::CUTOFF_SCALES * scale_m);
-    if near.len() < required {
-        return Err(too_few(near.len()));
-    }
-    let degenerate = |reason| NoRegistration::Degenerate {
-        inliers: near.len(),
-        reason,
+    let near = best.map(|best| pairs.near(&best, refine::CUTOFF_SCALES * scale_m));
+    let near = near.unwrap_or_default();
+    let Some(best) = best.filter(|_| near.len() >= required) else {
+        return Err(NoRegistration::TooFewInliers {
+            found: near.len(),
+            required,
+            given: correspondences.len(),
+        });
     };
     let refined = refine::converge(&near, &best, scale_m, FINAL_STEPS);
-    let refined = refined.map_err(degenerate)?;
+    let refined = refined.map_err(|reason| NoRegistration::Degenerate {
+        inliers: near.len(),
+        reason,
+    })?;
     // The fit has six degrees of freedom and may tilt beyond the limit.
     let motion = match config.allows_tilt_of(&refined) {
         true => refined,
@@ -237,8 +236,8 @@ impl Search<'_> {
 
     fn inliers(&self) -> usize {
         let threshold_m = self.config.inlier_threshold_m;
-        let near = |(_, motion)| self.pairs.near(&motion, threshold_m).len();
-        self.best.map_or(0, near)
+        let near = (self.best).map(|(_, motion)| self.pairs.near(&motion, threshold_m));
+        near.unwrap_or_default().len()
     }
 }
 

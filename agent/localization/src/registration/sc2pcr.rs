@@ -159,11 +159,11 @@ pub fn consensus(
     let sets: Vec<Vec<usize>> = (seeds.iter())
         .map(|&seed| {
             let row = &changes[seed * count..(seed + 1) * count];
-            let score = |other: usize| match row[other] < threshold {
+            let scores = (0..count).map(|other| match row[other] < threshold {
                 true => tight.common(seed, other),
                 false => 0,
-            };
-            points.consensus_set(&(0..count).map(score).collect::<Vec<u32>>(), config)
+            });
+            points.consensus_set(&scores.collect::<Vec<u32>>(), config)
         })
         .collect();
     // Step: one fit per seed. Without a seed, in tiny sets, there is none.
@@ -229,13 +229,13 @@ fn soft(change: f32, threshold: f32) -> f32 {
 fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfig) -> Vec<usize> {
     let count = confidence.len();
     let radius = config.seed_radius_m as f32;
-    let strength = |index: usize| {
+    let strengths = (0..count).map(|index| {
         let row = &source_distances[index * count..(index + 1) * count];
         let is_maximum = (row.iter().zip(confidence))
             .all(|(&far, &other)| far >= radius || confidence[index] >= other);
         if is_maximum { confidence[index] } else { 0.0 }
-    };
-    let strengths: Vec<f32> = (0..count).map(strength).collect();
+    });
+    let strengths: Vec<f32> = strengths.collect();
     let mut order = descending(&strengths);
     // Rounded down: fewer than 1 / ratio correspondences have no seed.
     order.truncate((count as f64 * config.seed_ratio) as usize);
@@ -326,21 +326,19 @@ impl Points {
     }
 
     fn changes_within(&self, set: &[usize]) -> Vec<f32> {
-        let of = |points: &[[f32; 3]]| {
-            distances(&set.iter().map(|&index| points[index]).collect::<Vec<_>>())
-        };
-        changes(&of(&self.source), &of(&self.target))
+        let [source, target] = [&self.source, &self.target]
+            .map(|points| distances(&set.iter().map(|&index| points[index]).collect::<Vec<_>>()));
+        changes(&source, &target)
     }
 
     fn inliers(&self, motion: &Isometry3<f64>, threshold_m: f64) -> usize {
         let rotation = motion.rotation.to_rotation_matrix();
-        let residual = |source: &[f32; 3], target: &[f32; 3]| {
-            (rotation * vector(source) + motion.translation.vector - vector(target)).norm()
-        };
         let pairs = self.source.iter().zip(&self.target);
-        pairs
-            .filter(|(source, target)| residual(source, target) < threshold_m)
-            .count()
+        let near = pairs.filter(|(source, target)| {
+            let moved = rotation * vector(source) + motion.translation.vector;
+            (moved - vector(target)).norm() < threshold_m
+        });
+        near.count()
     }
 }
 

@@ -48,12 +48,12 @@ impl PoseMeasurement {
 
     /// Measurement from a pose that was registered to a map: its covariance holds.
     fn registered(capture_nanos: u64, found: &FoundPose) -> Self {
-        let variance = |axis: usize| found.cell_covariance[axis][axis];
+        let covariance = &found.cell_covariance;
         Self {
             capture_nanos,
             world_from_lidar: found.world_from_sensor,
-            position_std_m: f64::midpoint(variance(0), variance(1)).sqrt(),
-            yaw_std_rad: variance(5).sqrt().min(YAW_STD_RAD[1]),
+            position_std_m: f64::midpoint(covariance[0][0], covariance[1][1]).sqrt(),
+            yaw_std_rad: covariance[5][5].sqrt().min(YAW_STD_RAD[1]),
         }
     }
 }

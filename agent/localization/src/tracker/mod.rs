@@ -99,12 +99,12 @@ impl PoseTracker {
     }
 
     fn can_predict(&self, capture_nanos: u64) -> bool {
-        let is_recent = |accepted: &PoseMeasurement| {
+        let is_recent = self.accepted.as_ref().is_some_and(|accepted| {
             seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s
-        };
+        });
         let track = self.track.as_ref();
         let is_ahead = track.is_some_and(|track| track.filter.capture_nanos <= capture_nanos);
-        is_ahead && self.accepted.as_ref().is_some_and(is_recent)
+        is_ahead && is_recent
     }
 
     /// Current state, if the vehicle is not lost.

@@ -275,12 +275,11 @@ impl MotionFilter {
 
     /// Covariance of position and yaw.
     pub(super) fn planar_covariance(&self) -> PlanarCovariance {
-        let entry = |row, column| self.covariance[(row, column)] as f32;
         PlanarCovariance {
-            xx_m2: entry(X, X),
-            xy_m2: entry(X, Y),
-            yy_m2: entry(Y, Y),
-            yaw_rad2: entry(YAW, YAW),
+            xx_m2: self.covariance[(X, X)] as f32,
+            xy_m2: self.covariance[(X, Y)] as f32,
+            yy_m2: self.covariance[(Y, Y)] as f32,
+            yaw_rad2: self.covariance[(YAW, YAW)] as f32,
         }
     }
 

@@ -91,15 +91,15 @@ impl Track {
     /// Uses a pose of the same time; false if it contradicts the track. A pose that only the filter without the speed
     /// expects is right, and the speed wrong.
     pub(super) fn correct(&mut self, measurement: &PoseMeasurement) -> bool {
-        let is_expected = |filter: &MotionFilter| {
+        let is_expected = [&self.filter, &self.unaided].map(|filter| {
             filter.capture_nanos == measurement.capture_nanos
                 && filter.distance_squared(measurement) <= POSE_GATE
-        };
-        match (is_expected(&self.filter), is_expected(&self.unaided)) {
-            (false, false) => return false,
+        });
+        match is_expected {
+            [false, false] => return false,
             // The pose corrects this copy below as well.
-            (false, true) => self.filter = self.unaided.clone(),
-            (true, _) => {}
+            [false, true] => self.filter = self.unaided.clone(),
+            [true, _] => {}
         }
         self.filter.correct(measurement);
         self.unaided.correct(measurement);

@@ -36,9 +36,8 @@ use serde::Serialize;
 use serde_json::json;
 use support::output;
 use support::provenance::Provenance;
-use terminal::progress;
 
-use super::retrieval::{self, RetrievalBy};
+use super::retrieval::{self, Bar, RetrievalBy};
 use super::scene_heads::{SceneHeadFile, by_head, with_files};
 use support::cli::{BadInput, Outcome};
 
@@ -285,8 +284,9 @@ impl Args {
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
-        let no_cuda = |missing| BadInput::new(format!("--device cuda: {missing}"));
-        let device = self.device.open().map_err(no_cuda)?;
+        let device = self.device.open();
+        let device =
+            device.map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
         Ok(Inference::new(device, self.precision))
     }
 
@@ -363,24 +363,19 @@ impl Args {
     }
 
     fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Evaluated> {
-        let count = |number: u32| usize::try_from(number).unwrap_or(usize::MAX);
         let options = SweepSelection {
             scenes: scenes.to_vec(),
             variant: self.variant.clone(),
-            every: count(self.every),
-            sweeps: self.sweeps.map(count),
+            every: self.every as usize,
+            sweeps: self.sweeps.map(|count| count as usize),
         };
-        let bar = progress::bar(0, "sweeps");
-        let mut on_sweep = |done, all| {
-            bar.set_length(all as u64);
-            bar.set_position(done as u64);
-        };
+        let bar = Bar::start("sweeps");
+        let mut on_sweep = bar.advance();
         let evaluated = match subject {
             Subject::Localizer(mut localizer) => evaluate(&mut *localizer, &options, &mut on_sweep),
             Subject::Source(mut source) => evaluate_source(&mut *source, &options, &mut on_sweep),
             Subject::Nearest(poses) => evaluate_nearest(&poses, &options, &mut on_sweep),
         };
-        bar.finish_and_clear();
         match evaluated {
             Ok(evaluated) => Ok(evaluated),
             // A network that fails is no fault of the input: exit code 1, not 2.
@@ -463,7 +458,6 @@ impl Args {
     }
 
     fn write(&self, sweeps: &[EvaluatedSweep]) -> anyhow::Result<()> {
-        let writing = |path: &Path| format!("writing {}", path.display());
         if let Some(path) = &self.csv {
             write_csv(path, sweeps).with_context(|| writing(path))?;
         }
@@ -475,6 +469,10 @@ impl Args {
         }
         Ok(())
     }
+}
+
+fn writing(path: &Path) -> String {
+    format!("writing {}", path.display())
 }
 
 /// Writes fitted numbers into a file of weights or a map.
@@ -507,11 +505,6 @@ fn report_line(report: &FitReport) -> String {
 
 /// Report as text.
 fn table(summary: &LocalizationSummary) -> String {
-    let number = |value: Option<f64>, digits: usize| {
-        value.map_or("-".into(), |value| format!("{value:.digits$}"))
-    };
-    let percent = |share: f64| format!("{:.1} %", 100.0 * share);
-    let share = |value: Option<f64>| value.map_or("-".into(), percent);
     let (rejected, ms) = (&summary.rejected, &summary.ms);
     let total = ms.get("total").copied();
     let stages = ms.iter().filter(|(stage, _)| *stage != "total");
@@ -552,9 +545,9 @@ fn table(summary: &LocalizationSummary) -> String {
         format!(
             "rejected   {} poses: {} of {} errors above 3 m, {} of the others",
             rejected.poses,
-            share(rejected.bad_share),
+            rejected.bad_share.map_or("-".into(), percent),
             rejected.bad,
-            share(rejected.good_share)
+            rejected.good_share.map_or("-".into(), percent)
         ),
         format!(
             "time       {} ms median, {:.1} mean: {}",
@@ -581,10 +574,14 @@ fn table(summary: &LocalizationSummary) -> String {
         let (exceeded, poses, p50_m) = (bound.exceeded, bound.poses, bound.p50_bound_m);
         format!("bound      {exceeded} of {poses} errors exceed their bound of one in 1,000 (median {p50_m:.2} m)")
     });
-    let lines = lines
-        .into_iter()
-        .chain(beyond)
-        .chain(integrity)
-        .chain(bound);
-    lines.map(|line| line + "\n").collect()
+    let lines = lines.into_iter().chain(beyond).chain(integrity);
+    lines.chain(bound).map(|line| line + "\n").collect()
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("-".into(), |value| format!("{value:.digits$}"))
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.1} %", 100.0 * share)
 }

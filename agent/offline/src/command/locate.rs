@@ -189,9 +189,8 @@ impl Args {
         sweeps: &mut Vec<SweepFindings>,
     ) -> anyhow::Result<Located> {
         let map = map.to_owned();
-        let name = |file: &CloudFile| file.path().display().to_string();
         let (cloud, read) = match file {
-            Ok(file) => (name(&file), file.read()),
+            Ok(file) => (file.path().display().to_string(), file.read()),
             Err(error) => {
                 let path = error.path().map(|path| path.display().to_string());
                 (path.unwrap_or_default(), Err(error))

@@ -144,11 +144,11 @@ impl Args {
 
     /// Name of the place. That of a surfel map alone is not known unless it is given: its head may have another.
     fn place(&self) -> String {
-        let unnamed = || match self.surfels_only {
-            true => String::new(),
-            false => name_of(&self.out),
-        };
-        self.name.clone().unwrap_or_else(unnamed)
+        match &self.name {
+            Some(name) => name.clone(),
+            None if self.surfels_only => String::new(),
+            None => name_of(&self.out),
+        }
     }
 
     fn config(&self) -> anyhow::Result<MapConfig> {
@@ -159,9 +159,9 @@ impl Args {
         let time =
             time.ok_or_else(|| BadInput::new(format!("--minutes is {minutes}, must be above 0")))?;
         check_out(&self.out, self.resume, self.force).map_err(BadInput::of)?;
-        let missing = || BadInput::new("no released encoder is found: --encoder FILE");
         let encoder = self.encoder.clone().or_else(released_encoder);
-        let encoder = encoder.ok_or_else(missing)?;
+        let encoder =
+            encoder.ok_or_else(|| BadInput::new("no released encoder is found: --encoder FILE"))?;
         let rejection = self.max_wrong.map_or(GOOD_LOSS, Rejection::MaxWrong);
         let checked = rejection.check();
         checked.map_err(|error| BadInput::new(format!("--max-wrong: {error}")))?;

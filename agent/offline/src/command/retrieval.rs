@@ -24,13 +24,16 @@ pub(crate) enum RetrievalBy {
     Position,
 }
 
+/// Unit of the progress.
+const DESCRIBED: &str = "sweeps described";
+
 /// Retrieval by the encoder of a localizer.
 pub(crate) fn by_encoder(
     folders: &[PathBuf],
     localizer: Localizer,
     left_out: &mut LeftOut,
 ) -> Result<Box<dyn Localize>, BadInput> {
-    let bar = Bar::start();
+    let bar = Bar::start(DESCRIBED);
     let database = read_database(folders, &localizer, left_out, &mut bar.advance());
     let database = database.map_err(BadInput::of)?;
     Ok(Box::new(Retrieval::new(localizer, database)))
@@ -42,7 +45,7 @@ pub(crate) fn by_descriptor(
     descriptor: Box<dyn DescribePolar>,
     left_out: &mut LeftOut,
 ) -> Result<Box<dyn Localize>, BadInput> {
-    let bar = Bar::start();
+    let bar = Bar::start(DESCRIBED);
     let mut describe = |cloud: &PointCloud| descriptor.polar(cloud, &mut stopwatch());
     let sweeps = described_sweeps(folders, &mut describe, left_out, &mut bar.advance());
     let sweeps = sweeps.map_err(BadInput::of)?;
@@ -55,7 +58,7 @@ pub(crate) fn positions(
     folders: &[PathBuf],
     left_out: &mut LeftOut,
 ) -> Result<Vec<Isometry3<f64>>, BadInput> {
-    let bar = Bar::start();
+    let bar = Bar::start(DESCRIBED);
     let mut describe = |_: &PointCloud| Ok::<_, LocalizerError>(Some(()));
     let sweeps = described_sweeps(folders, &mut describe, left_out, &mut bar.advance());
     let sweeps = sweeps.map_err(BadInput::of)?.into_iter();
@@ -63,14 +66,14 @@ pub(crate) fn positions(
 }
 
 /// Progress bar that ends with its scope.
-struct Bar(ProgressBar);
+pub(super) struct Bar(ProgressBar);
 
 impl Bar {
-    fn start() -> Self {
-        Self(progress::bar(0, "sweeps described"))
+    pub(super) fn start(unit: &str) -> Self {
+        Self(progress::bar(0, unit))
     }
 
-    fn advance(&self) -> impl FnMut(usize, usize) + '_ {
+    pub(super) fn advance(&self) -> impl FnMut(usize, usize) + '_ {
         |done, all| {
             self.0.set_length(all as u64);
             self.0.set_position(done as u64);

@@ -137,8 +137,9 @@ pub fn evaluate(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    let mut localize = |frame: &Frame| localizer.localize(LocalizerInput::of(&frame.points));
-    evaluate_with(&mut localize, options, on_sweep)
+    evaluate_with(options, on_sweep, |frame| {
+        localizer.localize(LocalizerInput::of(&frame.points))
+    })
 }
 
 /// The same for a pose source, which gets the pose of the GNSS receiver.
@@ -150,14 +151,13 @@ pub fn evaluate_source(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    let mut ask = |frame: &Frame| {
+    evaluate_with(options, on_sweep, |frame| {
         let measured = frame.gnss_world_from_lidar();
         let mut times = stopwatch();
         let estimate = estimate_pose(source, frame, measured.as_ref());
         times.lap("pose solve");
         Ok(Localization::from_estimate(estimate, times))
-    };
-    evaluate_with(&mut ask, options, on_sweep)
+    })
 }
 
 /// The pose of a frame, starting at a measured one where there is one.
@@ -189,28 +189,28 @@ pub fn evaluate_nearest(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    let mut ask = |frame: &Frame| {
+    evaluate_with(options, on_sweep, |frame| {
         let truth = frame
             .world_from_lidar
             .map(|pose| pose.isometry().translation.vector);
-        let distance = |pose: &Isometry3<f64>| {
+        let nearest = world_from_sensor.iter().min_by(|a, b| {
             // A frame without a true pose is refused before this is asked: the 0 is never used.
-            truth.map_or(0.0, |truth| {
-                (pose.translation.vector - truth).norm_squared()
-            })
-        };
-        let nearest = world_from_sensor.iter();
-        let nearest = nearest.min_by(|a, b| distance(a).total_cmp(&distance(b)));
+            let [a, b] = [a, b].map(|pose| {
+                truth.map_or(0.0, |truth| {
+                    (pose.translation.vector - truth).norm_squared()
+                })
+            });
+            a.total_cmp(&b)
+        });
         let estimate = nearest.map_or(NO_SOURCE, |&pose| PoseEstimate::new(pose.into(), 1.0));
         Ok(Localization::from_estimate(estimate, stopwatch()))
-    };
-    evaluate_with(&mut ask, options, on_sweep)
+    })
 }
 
 fn evaluate_with(
-    localize: &mut dyn FnMut(&Frame) -> Result<Localization, LocalizerError>,
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
+    mut localize: impl FnMut(&Frame) -> Result<Localization, LocalizerError>,
 ) -> Result<Evaluated, Error> {
     let datasets = options.scenes.iter().map(|dir| dataset::open(dir));
     let datasets = datasets.collect::<Result<Vec<_>, _>>()?;

@@ -125,10 +125,10 @@ impl LocalizationSummary {
             .map(|error| (error.distance_m, error.angle_deg))
             .unzip();
         let (metres, degrees) = (sorted(&metres), sorted(&degrees));
-        let success = |limit_m: f64| {
+        let [success_3m, success_1m] = [3.0, 1.0].map(|limit_m: f64| {
             let good = metres.iter().filter(|&&error_m| error_m < limit_m);
             good.count() as f64 / sweeps.len().max(1) as f64
-        };
+        });
         let judged = judged(sweeps);
         let (sigmas, errors): (Vec<f64>, Vec<f64>) =
             (judged.iter().map(|pose| (pose.sigma, pose.error_m))).unzip();
@@ -150,8 +150,8 @@ impl LocalizationSummary {
         let gaps: Vec<f64> = gaps.collect();
         Self {
             sweeps: sweeps.len(),
-            success_3m: success(3.0),
-            success_1m: success(1.0),
+            success_3m,
+            success_1m,
             mean_m: mean(&metres),
             p50_m: quantile(&metres, 0.5),
             p95_m: quantile(&metres, 0.95),
@@ -178,49 +178,50 @@ impl LocalizationSummary {
 }
 
 fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
-    let judged = |sweep: &EvaluatedSweep| {
+    let judged = sweeps.iter().filter_map(|sweep| {
         let (found, error) = (sweep.localization.found?, sweep.error()?);
         Some(Judged {
             sigma: found.sigma,
             error_m: error.distance_m,
             is_rejected: found.is_rejected,
         })
-    };
-    sweeps.iter().filter_map(judged).collect()
+    });
+    judged.collect()
 }
 
 fn calibration(judged: &[Judged]) -> Vec<CalibrationBin> {
     let mut by_sigma = judged.to_vec();
     by_sigma.sort_by(|a, b| a.sigma.total_cmp(&b.sigma));
-    let bin = |poses: &[Judged]| {
-        let of = |value: fn(&Judged) -> f64| poses.iter().map(value).collect::<Vec<f64>>();
-        CalibrationBin {
-            poses: poses.len(),
-            sigma: mean(&of(|pose| pose.sigma)).unwrap_or(0.0),
-            observed: mean(&of(|pose| observed(pose.error_m))).unwrap_or(0.0),
-            p50_m: median(&of(|pose| pose.error_m)).unwrap_or(0.0),
-            success_3m: mean(&of(|pose| f64::from(u8::from(pose.error_m < BAD_M)))).unwrap_or(0.0),
-        }
-    };
-    let cut = |bin: usize| bin * by_sigma.len() / BINS;
+    let all = by_sigma.len();
     (0..BINS)
-        .map(|place| &by_sigma[cut(place)..cut(place + 1)])
+        .map(|bin| &by_sigma[bin * all / BINS..(bin + 1) * all / BINS])
         .filter(|poses| !poses.is_empty())
-        .map(bin)
+        .map(|poses| CalibrationBin {
+            poses: poses.len(),
+            sigma: mean(&each(poses, |pose| pose.sigma)).unwrap_or(0.0),
+            observed: mean(&each(poses, |pose| observed(pose.error_m))).unwrap_or(0.0),
+            p50_m: median(&each(poses, |pose| pose.error_m)).unwrap_or(0.0),
+            success_3m: mean(&each(poses, |pose| f64::from(pose.error_m < BAD_M))).unwrap_or(0.0),
+        })
         .collect()
+}
+
+fn each(poses: &[Judged], value: fn(&Judged) -> f64) -> Vec<f64> {
+    poses.iter().map(value).collect()
 }
 
 fn rejected(judged: &[Judged]) -> RejectionSummary {
     let (good, bad): (Vec<&Judged>, Vec<&Judged>) =
         judged.iter().partition(|pose| pose.error_m <= BAD_M);
-    let count = |poses: &[&Judged]| poses.iter().filter(|pose| pose.is_rejected).count();
-    let share =
-        |poses: &[&Judged]| (!poses.is_empty()).then(|| count(poses) as f64 / poses.len() as f64);
+    let [bad_share, good_share] = [&bad, &good].map(|poses| {
+        let rejected = poses.iter().filter(|pose| pose.is_rejected).count();
+        (!poses.is_empty()).then(|| rejected as f64 / poses.len() as f64)
+    });
     RejectionSummary {
-        poses: count(&good) + count(&bad),
+        poses: judged.iter().filter(|pose| pose.is_rejected).count(),
         bad: bad.len(),
-        bad_share: share(&bad),
-        good_share: share(&good),
+        bad_share,
+        good_share,
     }
 }
 
@@ -264,12 +265,13 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
     let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for sweep in sweeps {
         let stages = &sweep.localization.times;
-        let mut add = |stage: &str, ms: f64| times.entry(stage.to_owned()).or_default().push(ms);
-        for timing in stages.timings() {
+        let of_stages = stages.timings().iter().map(|timing| {
             let stage = timing.stage.trim_start_matches("pose ");
-            add(stage, timing.nanos as f64 * 1e-6);
+            (stage, timing.nanos as f64 * 1e-6)
+        });
+        for (stage, ms) in of_stages.chain([("total", stages.total().as_secs_f64() * 1e3)]) {
+            times.entry(stage.to_owned()).or_default().push(ms);
         }
-        add("total", stages.total().as_secs_f64() * 1e3);
     }
     let medians = times.into_iter();
     let medians = medians.map(|(stage, ms)| (stage, median(&ms).unwrap_or(0.0)));
@@ -280,25 +282,20 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
 pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let judged = judged(sweeps);
     let bins = calibration(&judged);
-    let is_published = |sweep: &&EvaluatedSweep| sweep.published_error().is_some();
-    let published = sweeps.iter().filter(is_published).count();
-    let series = |name: &str, points, mark| Series {
-        name: name.into(),
-        points,
-        mark,
-    };
-    let cloud = |name: &str, is_rejected: bool| {
+    let published = sweeps.iter().filter_map(EvaluatedSweep::published_error);
+    let [kept, rejected] = [("published", false), ("rejected", true)].map(|(name, is_rejected)| {
         let poses = judged.iter().filter(|pose| pose.is_rejected == is_rejected);
         // The axis is logarithmic: errors beyond its ends are drawn there.
         let points = poses.map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)));
         series(name, points.collect(), Mark::Dots)
-    };
+    });
     let groups = bins.iter().map(|bin| (bin.sigma, bin.observed)).collect();
     let diagonal = vec![(0.0, 0.0), (1.0, 1.0)];
     let reliability = Chart {
         title: format!(
-            "Reliability, {} sweeps, {published} poses published",
-            sweeps.len()
+            "Reliability, {} sweeps, {} poses published",
+            sweeps.len(),
+            published.count()
         ),
         x: Axis::linear("sigma", [0.0, 1.0]),
         y: Axis::linear("mean of 1 / (1 + e^2), e in m", [0.0, 1.0]),
@@ -312,12 +309,20 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         x: Axis::linear("sigma", [0.0, 1.0]),
         y: Axis::logarithmic("distance to the true position, m", [0.01, 1000.0]),
         series: vec![
-            cloud("published", false),
+            kept,
             series("3 m", vec![(0.0, BAD_M), (1.0, BAD_M)], Mark::Line),
-            cloud("rejected", true),
+            rejected,
         ],
     };
     vec![reliability, errors]
+}
+
+fn series(name: &str, points: Vec<(f64, f64)>, mark: Mark) -> Series {
+    Series {
+        name: name.into(),
+        points,
+        mark,
+    }
 }
 
 #[cfg(test)]

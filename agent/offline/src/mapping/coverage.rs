@@ -40,10 +40,10 @@ pub struct CoveredCell {
 impl Coverage {
     /// Coverage of drives, each the positions of its sweeps in the order of time, metres; `None` without sweeps.
     pub(super) fn of(drives: &[Vec<Vector3<f64>>]) -> Option<Self> {
-        let all = || drives.iter().flatten();
-        let first = all().next()?;
+        let all = drives.iter().flatten();
+        let first = all.clone().next()?;
         let (mut low_m, mut high_m) = ([first.x, first.y], [first.x, first.y]);
-        for position in all() {
+        for position in all.clone() {
             for axis in 0..2 {
                 low_m[axis] = low_m[axis].min(position[axis]);
                 high_m[axis] = high_m[axis].max(position[axis]);
@@ -52,7 +52,7 @@ impl Coverage {
         let edge_m = (high_m[0] - low_m[0]).max(high_m[1] - low_m[1]);
         let cell_m = CELL_M.max((edge_m / MOST_CELLS / CELL_M).ceil() * CELL_M);
         let mut counts: BTreeMap<[i64; 2], usize> = BTreeMap::new();
-        for position in all() {
+        for position in all.clone() {
             // Floor, as coordinates may be negative: a cast alone rounds towards zero.
             *counts
                 .entry([0, 1].map(|axis| (position[axis] / cell_m).floor() as i64))
@@ -68,7 +68,7 @@ impl Coverage {
             .map(|pair| (pair[1] - pair[0]).norm())
             .sum();
         Some(Self {
-            sweeps: all().count(),
+            sweeps: all.count(),
             length_m,
             low_m,
             high_m,
@@ -79,14 +79,15 @@ impl Coverage {
 
     /// The grid as text, north up: `#` where there are sweeps, `.` where there are none.
     pub fn picture(&self) -> String {
-        let place =
-            |corner_m: [f64; 2]| corner_m.map(|metres| (metres / self.cell_m).round() as i64);
-        let places: Vec<[i64; 2]> = self.cells.iter().map(|cell| place(cell.corner_m)).collect();
-        let bounds = |axis: usize| {
-            let values = || places.iter().map(move |place| place[axis]);
-            (values().min().unwrap_or(0), values().max().unwrap_or(-1))
-        };
-        let ((west, east), (south, north)) = (bounds(0), bounds(1));
+        let places: Vec<[i64; 2]> = (self.cells.iter())
+            .map(|cell| {
+                cell.corner_m
+                    .map(|metres| (metres / self.cell_m).round() as i64)
+            })
+            .collect();
+        let [xs, ys] = [0, 1].map(|axis: usize| places.iter().map(move |place| place[axis]));
+        let (west, east) = (xs.clone().min().unwrap_or(0), xs.max().unwrap_or(-1));
+        let (south, north) = (ys.clone().min().unwrap_or(0), ys.max().unwrap_or(-1));
         let mut text = String::new();
         for y in (south..=north).rev() {
             let line = (west..=east).map(|x| if places.contains(&[x, y]) { '#' } else { '.' });

@@ -242,12 +242,11 @@ impl Map<'_> {
         let mut first_s = 0.0;
         // The cache reports after every batch of 4 sweeps, so this number is met exactly.
         let first = 4.min(probes.len());
-        let mut progress = |done: usize, _: usize| {
+        let built = FeatureCache::build(&probes, &encoder, unchanged, run, &mut |done, _| {
             if done == first {
                 first_s = began.elapsed().as_secs_f64();
             }
-        };
-        let built = FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress);
+        });
         match built.map(drop) {
             Err(Error::NoSweeps(..)) => return Err(self.no_poses(&probes)),
             built => built?,
@@ -342,7 +341,7 @@ impl Map<'_> {
         let observe = &mut *self.observe;
         let training_end_s = self.config.time.as_secs_f64() - plan.after_training_s();
         let mut steps_began_s = None;
-        let mut on_progress = |progress: &Progress| {
+        let summary = train_scene_on(&config, &sweeps, &mut |progress| {
             let mut seconds = started.elapsed().as_secs_f64();
             let text = match progress {
                 Progress::Encoding(done, total) => format!("encoding, {done} of {total} sweeps"),
@@ -356,8 +355,8 @@ impl Map<'_> {
                 Progress::Read(_) | Progress::Validated(_) => return,
             };
             observe(MapProgress::At(seconds, text));
-        };
-        Ok((train_scene_on(&config, &sweeps, &mut on_progress)?, run))
+        })?;
+        Ok((summary, run))
     }
 
     /// Copies the encoder beside the head, so that the folder is all that is needed.
@@ -402,13 +401,11 @@ impl Map<'_> {
         let mut localizer = Localizer::load_without_confidence(encoder, weights, inference)?;
         let started = self.started;
         let observe = &mut *self.observe;
-        let mut progress = |done, all| {
+        let (seed, end) = (self.config.run.seed, started + self.config.time);
+        let checked = check::check(&mut localizer, held_out, seed, end, &mut |done, all| {
             let text = format!("checking, {done} of {all} sweeps and copies, each mirrored too");
             observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
-        };
-        let deadline = started + self.config.time;
-        let seed = self.config.run.seed;
-        let checked = check::check(&mut localizer, held_out, seed, deadline, &mut progress);
+        });
         Ok(checked?)
     }
 

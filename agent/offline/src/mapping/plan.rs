@@ -59,15 +59,14 @@ impl Plan {
     pub(super) fn new(training: usize, held_out: usize, sweep_s: f64, total_s: f64) -> Self {
         let sweep_s = sweep_s.max(1e-4);
         // Each held-out sweep is localized as it is and mirrored; the localization costs as much as the encoding.
-        let checked_s = |count: usize| 4.0 * sweep_s * count as f64;
-        let most_checked = (0.2 * total_s / checked_s(1)) as usize;
+        let checked_s = 4.0 * sweep_s;
+        let most_checked = (0.2 * total_s / checked_s) as usize;
         let checked = held_out.min(MOST_CHECKED).min(most_checked.max(10));
-        let check_s = checked_s(if held_out > 0 {
-            checked.max(LEAST_CHECKED)
-        } else {
-            0
-        })
-        .min(CHECK_SHARE * total_s);
+        let localized = match held_out {
+            0 => 0,
+            _ => checked.max(LEAST_CHECKED),
+        };
+        let check_s = (checked_s * localized as f64).min(CHECK_SHARE * total_s);
         // The localization costs as much as the encoding here too.
         let affordable_scales = (SCALES_SHARE * total_s / (2.0 * sweep_s)) as usize;
         let scale_sweeps = affordable_scales

@@ -77,16 +77,13 @@ impl HeldOutAccuracy {
 
     /// One line.
     pub fn text(&self) -> String {
-        let number = |value: Option<f64>, digits: usize| {
-            value.map_or("-".into(), |value| format!("{value:.digits$}"))
-        };
+        let [median_m, median_deg] = [self.median_m, self.median_deg]
+            .map(|value| value.map_or("-".into(), |value| format!("{value:.3}")));
         format!(
-            "{:.1} % of {} held-out sweeps under 3 m, {:.1} % under 1 m, median {} m and {} degrees, {} without a pose",
+            "{:.1} % of {} held-out sweeps under 3 m, {:.1} % under 1 m, median {median_m} m and {median_deg} degrees, {} without a pose",
             100.0 * self.under_3m,
             self.sweeps,
             100.0 * self.under_1m,
-            number(self.median_m, 3),
-            number(self.median_deg, 3),
             self.no_pose
         )
     }
@@ -126,8 +123,8 @@ impl MapReport {
     }
 
     fn training_limit(&self) -> Option<String> {
-        let is_short = |error_m: &f64| *error_m > SHORT_TRAINING_M;
-        let error_m = self.cell_error_m.filter(is_short)?;
+        let error_m = self.cell_error_m;
+        let error_m = error_m.filter(|error_m| *error_m > SHORT_TRAINING_M)?;
         Some(format!(
             "The training was too short, the cells of its own sweeps are {error_m:.0} m off: more --minutes."
         ))

@@ -7,7 +7,7 @@ use perception::tensor_values::tensor;
 use tch::nn::{self, Init, LinearConfig, Module};
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::pairs::{ChosenCells, Pair};
+use super::pairs::Pair;
 use localization::pgc::{SceneEncoder, VoxelBatch};
 
 /// Channels of the embedding in which similarity is measured.
@@ -104,14 +104,16 @@ impl Contrast {
     }
 
     fn similarities(&self, anchors: &Tensor, partners: &Tensor) -> Result<Tensor, TchError> {
-        let embed = |x: &Tensor| {
-            let y = self.embedding.forward(x);
-            let squares = y.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?;
-            // The small number is added under the root, whose gradient is infinite at 0.
-            let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
-            Ok::<_, TchError>(y / norm)
-        };
-        Ok(embed(anchors)?.f_matmul(&embed(partners)?.f_tr()?)? / TEMPERATURE)
+        let (anchors, partners) = (self.embed(anchors)?, self.embed(partners)?);
+        Ok(anchors.f_matmul(&partners.f_tr()?)? / TEMPERATURE)
+    }
+
+    fn embed(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        let y = self.embedding.forward(x);
+        let squares = y.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+        // The small number is added under the root, whose gradient is infinite at 0.
+        let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
+        Ok(y / norm)
     }
 
     fn offset_error(
@@ -156,22 +158,22 @@ fn matches(pairs: &[Pair], device: Device) -> Result<Tensor, TchError> {
 
 /// `[anchors, partners]`: mask of candidates that are neither positives nor negatives.
 fn neither(pairs: &[Pair], device: Device) -> Result<Tensor, TchError> {
-    let cells = |side: &ChosenCells| side.rows.len() as i64;
-    let anchors: i64 = pairs.iter().map(|pair| cells(&pair.anchor)).sum();
-    let partners: i64 = pairs.iter().map(|pair| cells(&pair.partner)).sum();
+    let anchors: usize = pairs.iter().map(|pair| pair.anchor.rows.len()).sum();
+    let partners: usize = pairs.iter().map(|pair| pair.partner.rows.len()).sum();
     // Cells of other pairs stay at 0: all of them are negatives.
-    let mask = Tensor::f_zeros([anchors, partners], (Kind::Float, device))?;
-    let places = |side: &ChosenCells| tensor(side.places_m.as_flattened(), &[-1, 3], device);
+    let mask = Tensor::f_zeros([anchors as i64, partners as i64], (Kind::Float, device))?;
     let (mut row, mut column) = (0, 0);
     for pair in pairs {
-        let (anchor, partner) = (places(&pair.anchor)?, places(&pair.partner)?);
+        let anchor = tensor(pair.anchor.places_m.as_flattened(), &[-1, 3], device)?;
+        let partner = tensor(pair.partner.places_m.as_flattened(), &[-1, 3], device)?;
         // Mode 2 takes differences: by a matrix product short distances would be rounded.
         let distance = Tensor::f_cdist(&anchor, &partner, 2.0, 2_i64)?;
         let near = distance.f_lt(NEITHER_M)?.f_to_kind(Kind::Float)? * NEVER;
         // The match itself is near too, and must stay a candidate.
         let own: Vec<i64> = pair.matches.iter().map(|&partner| partner as i64).collect();
         let near = near.f_scatter_value(1, &tensor(&own, &[-1, 1], device)?, 0.0)?;
-        let (rows, columns) = (cells(&pair.anchor), cells(&pair.partner));
+        let rows = pair.anchor.rows.len() as i64;
+        let columns = pair.partner.rows.len() as i64;
         let own_rows = mask.f_narrow(0, row, rows)?;
         own_rows.f_narrow(1, column, columns)?.f_copy_(&near)?;
         row += rows;

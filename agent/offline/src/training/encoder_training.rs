@@ -71,17 +71,11 @@ pub fn train_encoder(
     let encoder = SceneEncoder::new(&(variables.root() / "encoder"), &config.encoder)?;
     let local_channels = config.encoder.local_channels();
     let contrast = Contrast::new(&(variables.root() / "contrast"), local_channels);
-    let mut read = |folders: &[PathBuf], seed| {
-        let store = Arc::new(SweepStore::read(folders, config.encoder.range_m)?);
-        observe(&Progress::Read(store.data.clone()));
-        let maker = PairMaker::new(Arc::clone(&store), config.encoder.clone(), seed)?;
-        Ok::<_, Error>((maker, store))
-    };
-    let (maker, store) = read(&config.scenes, run.seed)?;
+    let (maker, store) = read(&config.scenes, run.seed, &config.encoder, observe)?;
     let validation = match config.validation.as_slice() {
         [] => None,
         // Other random numbers than those of the training pairs.
-        folders => Some(read(folders, u64::MAX - run.seed)?.0),
+        folders => Some(read(folders, u64::MAX - run.seed, &config.encoder, observe)?.0),
     };
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     let (batch, anchors) = (run.batch as u64, maker.anchors());
@@ -117,6 +111,19 @@ pub fn train_encoder(
         sweeps: store.sweeps.len(),
         accuracy: training.accuracy,
     })
+}
+
+/// The sweeps of some folders, and the generator of their pairs.
+fn read(
+    folders: &[PathBuf],
+    seed: u64,
+    config: &SceneEncoderConfig,
+    observe: &mut Observe<'_>,
+) -> Result<(PairMaker, Arc<SweepStore>), Error> {
+    let store = Arc::new(SweepStore::read(folders, config.range_m)?);
+    observe(&Progress::Read(store.data.clone()));
+    let maker = PairMaker::new(Arc::clone(&store), config.clone(), seed)?;
+    Ok((maker, store))
 }
 
 struct Training<'a> {

@@ -36,6 +36,17 @@ impl SweepAugmentation {
         turn_rad: 0.0,
         keep: 1.0,
     };
+
+    /// Rotation of a copy, and its share of points.
+    fn draw(&self, copy: usize, rng: &mut ChaCha8Rng) -> (Isometry3<f64>, f64) {
+        if copy == 0 {
+            return (Isometry3::identity(), 1.0);
+        }
+        // Never 0: nothing can be drawn from an empty range.
+        let angle = self.turn_rad.clamp(1e-6, PI);
+        let turn = yaw(rng.random_range(-angle..angle));
+        (turn, rng.random_range(self.keep..=1.0))
+    }
 }
 
 /// Features of the cells of all sweeps of a scene, and where the cells are.
@@ -76,31 +87,19 @@ impl FeatureCache {
         let total = list.len() * augmentation.copies.max(1);
         let format = encoder.format().clone();
         let source = Arc::clone(list);
-        let prepare_one = move |number: u64| {
-            let (copy, index) = (
-                number as usize / source.len(),
-                number as usize % source.len(),
-            );
-            let sweep = source.posed_sweep(index, format.range_m())?;
-            // A stream for each number: augmentation does not depend on the number of threads.
-            let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            rng.set_stream(number);
-            let (turn, keep) = match copy {
-                0 => (Isometry3::identity(), 1.0),
-                _ => {
-                    // Never 0: nothing can be drawn from an empty range.
-                    let angle = augmentation.turn_rad.clamp(1e-6, PI);
-                    let turn = yaw(rng.random_range(-angle..angle));
-                    (turn, rng.random_range(augmentation.keep..=1.0))
-                }
-            };
-            Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))
-        };
-        let prepare = move |batch: u64| -> Vec<TurnedSweep> {
+        let mut loader = Prefetch::start(run.loader_threads, 0, move |batch| {
             let numbers = batch * BATCH..((batch + 1) * BATCH).min(total as u64);
-            numbers.filter_map(&prepare_one).collect()
-        };
-        let mut loader = Prefetch::start(run.loader_threads, 0, prepare);
+            let sweeps = numbers.filter_map(|number| {
+                let index = number as usize % source.len();
+                let sweep = source.posed_sweep(index, format.range_m())?;
+                // A stream for each number: augmentation does not depend on the number of threads.
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                rng.set_stream(number);
+                let (turn, keep) = augmentation.draw(number as usize / source.len(), &mut rng);
+                Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))
+            });
+            sweeps.collect::<Vec<_>>()
+        });
         let size = [(total * CELLS) as i64, encoder.format().cell_channels()];
         let cells = Tensor::f_empty(size, (Kind::Half, device))?;
         let mut builder = Builder::default();

@@ -9,7 +9,7 @@ use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::sweep_store::{SweepStore, heading_rad, yaw};
+use super::sweep_store::{StoredSweep, SweepStore, heading_rad, yaw};
 use crate::Error;
 use localization::pgc::{Cell, SceneEncoderConfig, SweepVoxels};
 
@@ -79,8 +79,9 @@ impl PairMaker {
         seed: u64,
     ) -> Result<Self, Error> {
         let partners = partners(&store);
-        let has_partner = |&index: &u32| !partners[index as usize].iter().all(Vec::is_empty);
-        let anchors: Vec<u32> = (0..partners.len() as u32).filter(has_partner).collect();
+        let anchors: Vec<u32> = (0..partners.len() as u32)
+            .filter(|&index| !partners[index as usize].iter().all(Vec::is_empty))
+            .collect();
         if anchors.is_empty() {
             return Err(Error::Input(format!(
                 "no two sweeps of one world within {PAIR_RANGE_M} m of each other"
@@ -130,7 +131,7 @@ impl PairMaker {
     fn build(&self, anchor: usize, partner: usize, rng: &mut ChaCha8Rng) -> Pair {
         // Positions near the anchor are small enough for f32.
         let origin = self.store.sweeps[anchor].world_from_sensor.translation;
-        let mut turned = |index: usize| {
+        let turned = [anchor, partner].map(|index| {
             let stored = &self.store.sweeps[index];
             // A car rolls and pitches a little, whatever its recorded pose.
             let turned_from_sensor = lean(rng) * yaw(rng.random_range(-PI..PI));
@@ -138,9 +139,9 @@ impl PairMaker {
             let sweep = stored.turned_voxels(&turned_from_sensor, keep, rng, &self.config);
             let world_from_sensor = origin.inverse() * stored.world_from_sensor;
             (sweep, world_from_sensor * turned_from_sensor.inverse())
-        };
-        let (anchor_sweep, world_from_anchor) = turned(anchor);
-        let (sweep, world_from_partner) = turned(partner);
+        });
+        let [(anchor_sweep, world_from_anchor), turned_partner] = turned;
+        let (sweep, world_from_partner) = turned_partner;
         let anchor_places = places(anchor_sweep.cells(), &world_from_anchor);
         let partner_places = places(sweep.cells(), &world_from_partner);
         let grid = Grid::new(&partner_places);
@@ -211,12 +212,12 @@ pub(super) fn choose(cells: &[Cell], count: usize, rng: &mut impl Rng) -> Vec<us
 }
 
 fn places(cells: &[Cell], world_from_sensor: &Isometry3<f64>) -> Vec<[f32; 3]> {
-    let place = |cell: &Cell| {
+    let places = cells.iter().map(|cell| {
         let [x, y, z] = cell.centroid_m.map(f64::from);
         let point = world_from_sensor * Point3::new(x, y, z);
         [point.x as f32, point.y as f32, point.z as f32]
-    };
-    cells.iter().map(place).collect()
+    });
+    places.collect()
 }
 
 /// Index of positions by cubes of [`MATCH_M`].
@@ -258,22 +259,15 @@ fn cube(place: [f32; 3]) -> [i32; 3] {
 
 /// For each sweep those of the same world in range: of its own drive, and of others.
 fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
-    let bucket = |index: usize, dx: i32, dy: i32| {
-        let sweep = &store.sweeps[index];
-        let place = sweep.world_from_sensor.translation.vector / PAIR_RANGE_M;
-        let [x, y] = [place.x, place.y].map(|axis| axis.floor() as i32);
-        (sweep.world, x + dx, y + dy)
-    };
     let mut buckets: HashMap<(usize, i32, i32), Vec<u32>> = HashMap::new();
-    for index in 0..store.sweeps.len() {
-        let bucket = buckets.entry(bucket(index, 0, 0)).or_default();
-        bucket.push(index as u32);
+    for (index, sweep) in (0..).zip(&store.sweeps) {
+        buckets.entry(bucket(sweep)).or_default().push(index);
     }
-    let near = |index: usize| {
-        let own = &store.sweeps[index];
-        let around = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy)));
+    let partners = store.sweeps.iter().enumerate().map(|(index, own)| {
+        let (world, x, y) = bucket(own);
+        let around = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (world, x + dx, y + dy)));
         let candidates = around
-            .filter_map(|(dx, dy)| buckets.get(&bucket(index, dx, dy)))
+            .filter_map(|bucket| buckets.get(&bucket))
             .flatten()
             .copied();
         let in_range = candidates.filter(|&other| {
@@ -285,6 +279,13 @@ fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
         let (same, other) =
             in_range.partition(|&other| store.sweeps[other as usize].drive == own.drive);
         [same, other]
-    };
-    (0..store.sweeps.len()).map(near).collect()
+    });
+    partners.collect()
+}
+
+/// World of a sweep, and its position in steps of [`PAIR_RANGE_M`].
+fn bucket(sweep: &StoredSweep) -> (usize, i32, i32) {
+    let place = sweep.world_from_sensor.translation.vector / PAIR_RANGE_M;
+    let [x, y] = [place.x, place.y].map(|axis| axis.floor() as i32);
+    (sweep.world, x, y)
 }

@@ -111,8 +111,8 @@ impl Redundancy {
         let window = self.config.windows.get(self.windows_done);
         let is_over = window.is_some_and(|[_, to]| share_done >= *to);
         if is_over {
-            let is_short = |losses: &Vec<f32>| losses.len() < ENOUGH_PASSES;
-            if self.recorded.iter().all(is_short) {
+            let mut recorded = self.recorded.iter();
+            if recorded.all(|losses| losses.len() < ENOUGH_PASSES) {
                 tracing::warn!(
                     "a window of RSD held fewer than {ENOUGH_PASSES} passes over the data: no sweep is left out after it"
                 );

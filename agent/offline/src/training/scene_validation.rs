@@ -96,16 +96,16 @@ pub(super) fn validate(
         translations.push(metres);
         rotations.push(degrees);
     }
-    let share = |limit: f64| {
+    let [success_3m, success_1m] = [3.0, 1.0].map(|limit: f64| {
         let successes = translations.iter().filter(|&&error| error < limit);
         successes.count() as f64 / translations.len() as f64
-    };
+    });
     Ok(SceneAccuracy {
         cell_p50_m: median(&cell_errors),
         pose_p50_m: median(&translations),
         pose_p50_deg: median(&rotations),
-        success_3m: share(3.0),
-        success_1m: share(1.0),
+        success_3m,
+        success_1m,
     })
 }
 

@@ -47,8 +47,10 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
-    let mut encoded = |done, total| observe(&Progress::Encoding(done, total));
-    let cache = FeatureCache::build(&list, &encoder, SweepAugmentation::NONE, run, &mut encoded)?;
+    let unchanged = SweepAugmentation::NONE;
+    let cache = FeatureCache::build(&list, &encoder, unchanged, run, &mut |done, total| {
+        observe(&Progress::Encoding(done, total));
+    })?;
     observe(&Progress::Read(list.data()));
     let network_config = SgLocConfig {
         scene_name: config.scene_name.clone(),

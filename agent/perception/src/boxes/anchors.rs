@@ -46,17 +46,17 @@ impl Anchors {
         stride: usize,
         anchors: &AnchorConfig,
     ) -> Self {
-        let along = |axis: usize| {
+        let [x_m, y_m] = [0, 1].map(|axis: usize| {
             let low = lidar_range_m[axis] + voxel_size_m[axis];
             linspace(
                 low,
                 lidar_range_m[axis + 3] - voxel_size_m[axis],
                 grid[axis] / stride,
             )
-        };
+        });
         Self {
-            x_m: along(0),
-            y_m: along(1),
+            x_m,
+            y_m,
             z_m: anchors.center_z_m,
             size_lwh_m: anchors.size_lwh_m,
             yaws_rad: anchors

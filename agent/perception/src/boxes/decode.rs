@@ -46,20 +46,17 @@ pub fn decode(
     anchors: &Anchors,
     threshold: f32,
 ) -> Result<Vec<Decoded>, DecodeError> {
-    let check = |field, found, expected| {
-        if found == expected {
-            Ok(())
-        } else {
-            Err(DecodeError {
+    for (field, found, of_anchor) in [("scores", scores.len(), 1), ("offsets", offsets.len(), 7)] {
+        let (anchors, expected) = (anchors.len(), anchors.len() * of_anchor);
+        if found != expected {
+            return Err(DecodeError {
                 field,
                 found,
-                anchors: anchors.len(),
+                anchors,
                 expected,
-            })
+            });
         }
-    };
-    check("scores", scores.len(), anchors.len())?;
-    check("offsets", offsets.len(), anchors.len() * 7)?;
+    }
     let per_cell = anchors.yaws_rad.len();
     let cells = anchors.len() / per_cell.max(1);
     // The sigmoid is increasing: a logit clearly below the threshold's needs no exponential.
@@ -97,13 +94,12 @@ pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
     let [x, y, z, h, w, l, yaw] = anchor;
     let diagonal = (l * l + w * w).sqrt();
     let [dx, dy, dz, _, _, _, dyaw] = offsets.map(f64::from);
-    let size = |component: usize, prior: f64| {
-        f64::from(offsets[component].min(MAX_LOG_SIZE)).exp() * prior
-    };
     Some(Box3d {
         center_m: [dx * diagonal + x, dy * diagonal + y, dz * h + z],
         // The code is in the order h, w, l, the box in the order l, w, h.
-        size_m: [size(5, l), size(4, w), size(3, h)],
+        size_m: [(5, l), (4, w), (3, h)].map(|(component, prior): (usize, f64)| {
+            f64::from(offsets[component].min(MAX_LOG_SIZE)).exp() * prior
+        }),
         heading_rad: dyaw + yaw,
     })
 }

@@ -127,9 +127,8 @@ fn project<'a>(
 /// heights.
 pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> bool {
     let [x, y, z] = bounds(corners);
-    let extent = |[low, high]: [f64; 2]| high - low;
-    let sized =
-        extent(x) <= config.max_extent_m && extent(y) <= config.max_extent_m && extent(z) > 0.0;
+    let [x_m, y_m, z_m] = [x, y, z].map(|[low, high]| high - low);
+    let sized = x_m <= config.max_extent_m && y_m <= config.max_extent_m && z_m > 0.0;
     sized && z[0] >= config.z_range_m[0] && z[1] <= config.z_range_m[1]
 }
 
@@ -152,18 +151,18 @@ pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
         std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 8.0);
     let edge =
         |from: usize, to: usize| [0, 1].map(|axis: usize| corners[to][axis] - corners[from][axis]);
-    let mean_length =
-        |edges: [[f64; 2]; 4]| edges.iter().map(|[x, y]| x.hypot(*y)).sum::<f64>() / 4.0;
     // Edges from rear to front, then from right to left, in the order of `Box3d::corners`.
     let along = [edge(3, 0), edge(2, 1), edge(7, 4), edge(6, 5)];
     let across = [edge(0, 1), edge(3, 2), edge(4, 5), edge(7, 6)];
     let heights = (0..4).map(|corner| (corners[corner + 4][2] - corners[corner][2]).abs());
     let height = heights.sum::<f64>() / 4.0;
-    let sum = |axis: usize| along.iter().map(|edge| edge[axis]).sum::<f64>();
+    let [length, width] =
+        [along, across].map(|edges| edges.iter().map(|[x, y]| x.hypot(*y)).sum::<f64>() / 4.0);
+    let [x, y] = [0, 1].map(|axis: usize| along.iter().map(|edge| edge[axis]).sum::<f64>());
     Box3d {
         center_m,
-        size_m: [mean_length(along), mean_length(across), height],
-        heading_rad: sum(1).atan2(sum(0)),
+        size_m: [length, width, height],
+        heading_rad: y.atan2(x),
     }
 }
 
@@ -181,10 +180,10 @@ impl Candidate {
 /// Lowest and highest x, y, z.
 fn bounds(corners: &[[f64; 3]; 8]) -> [[f64; 2]; 3] {
     std::array::from_fn(|axis| {
-        let values = || corners.iter().map(|corner| corner[axis]);
+        let values = corners.iter().map(|corner| corner[axis]);
         [
-            values().fold(f64::INFINITY, f64::min),
-            values().fold(f64::NEG_INFINITY, f64::max),
+            values.clone().fold(f64::INFINITY, f64::min),
+            values.fold(f64::NEG_INFINITY, f64::max),
         ]
     })
 }

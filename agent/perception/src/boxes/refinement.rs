@@ -81,11 +81,11 @@ impl BoxRefinement {
     /// # Errors
     /// As [`Self::refined`].
     pub fn corrections(&self, map: &Tensor, detections: &[Detection]) -> Result<Tensor> {
-        let of_map = |detection: &Detection| match self.y_axis {
+        let boxes = detections.iter().map(|detection| match self.y_axis {
             YAxis::Left => detection.box3d,
             YAxis::Right => detection.box3d.mirrored_y(),
-        };
-        let boxes: Vec<Box3d> = detections.iter().map(of_map).collect();
+        });
+        let boxes: Vec<Box3d> = boxes.collect();
         let all: Vec<f32> = { boxes.iter().zip(detections) }
             .flat_map(|(box3d, detection)| self.values(box3d, detection.score))
             .collect();
@@ -128,7 +128,9 @@ fn logit(score: f32) -> f64 {
 /// Detections with their corrections, `NUMBERS` each.
 pub fn corrected(mut detections: Vec<Detection>, corrections: &[f32]) -> Vec<Detection> {
     for (detection, numbers) in detections.iter_mut().zip(corrections.chunks_exact(NUMBERS)) {
-        let at = |index: usize| f64::from(numbers[index]).clamp(-MAX_CORRECTION, MAX_CORRECTION);
+        let limited: [f64; 7] = std::array::from_fn(|index| {
+            f64::from(numbers[index]).clamp(-MAX_CORRECTION, MAX_CORRECTION)
+        });
         let Box3d {
             center_m,
             size_m,
@@ -136,14 +138,14 @@ pub fn corrected(mut detections: Vec<Detection>, corrections: &[f32]) -> Vec<Det
         } = &mut detection.box3d;
         let (sin, cos) = heading_rad.sin_cos();
         // In sizes of the uncorrected box, so positions come before sizes.
-        let [along_m, across_m, up_m] = [0, 1, 2].map(|axis| at(axis) * size_m[axis]);
+        let [along_m, across_m, up_m] = [0, 1, 2].map(|axis| limited[axis] * size_m[axis]);
         center_m[0] += cos * along_m - sin * across_m;
         center_m[1] += sin * along_m + cos * across_m;
         center_m[2] += up_m;
         for (axis, size_m) in size_m.iter_mut().enumerate() {
-            *size_m *= at(3 + axis).exp();
+            *size_m *= limited[3 + axis].exp();
         }
-        *heading_rad += at(6);
+        *heading_rad += limited[6];
         detection.score = sigmoid((logit(detection.score) + f64::from(numbers[7])) as f32);
     }
     detections
@@ -154,14 +156,14 @@ pub fn correction(from: &Box3d, to: &Box3d) -> [f64; NUMBERS] {
     let [dx, dy, dz] = [0, 1, 2].map(|axis| to.center_m[axis] - from.center_m[axis]);
     let (sin, cos) = from.heading_rad.sin_cos();
     let [length_m, width_m, height_m] = from.size_m;
-    let log = |axis: usize| (to.size_m[axis] / from.size_m[axis]).ln();
+    let logs = [0, 1, 2].map(|axis| (to.size_m[axis] / from.size_m[axis]).ln());
     [
         (cos * dx + sin * dy) / length_m,
         (cos * dy - sin * dx) / width_m,
         dz / height_m,
-        log(0),
-        log(1),
-        log(2),
+        logs[0],
+        logs[1],
+        logs[2],
         roi::within_quarter_turn(to.heading_rad - from.heading_rad),
         0.0,
     ]

@@ -36,15 +36,13 @@ pub struct RoiEncoder {
 impl RoiEncoder {
     /// For maps of a detector, and `values` numbers of each box; its variables are below `path`.
     pub fn new(path: &nn::Path<'_>, detector: &DetectorConfig, values: usize) -> Self {
-        let layer = |name: &str, from: i64, to: i64| {
-            nn::linear(path / name, from, to, nn::LinearConfig::default())
-        };
+        let (channels, usual) = (detector.feature_channels(), nn::LinearConfig::default());
         let read = POSITIONS as i64 * REDUCED + values as i64;
         Self {
-            reduce: layer("reduce", detector.feature_channels(), REDUCED),
+            reduce: nn::linear(path / "reduce", channels, REDUCED, usual),
             layers: [
-                layer("around", read, CHANNELS),
-                layer("box", CHANNELS, CHANNELS),
+                nn::linear(path / "around", read, CHANNELS, usual),
+                nn::linear(path / "box", CHANNELS, CHANNELS, usual),
             ],
             grid: detector.feature_grid(),
         }
@@ -69,16 +67,12 @@ impl RoiEncoder {
 
 /// `[N * POSITIONS, C]`: the map at the sampling positions of each box, bilinear between cells; zeros beyond its edges.
 fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
-    // From -1 to 1 over the area of the map, as `grid_sampler` takes positions.
-    let normalised = |at_m: f64, min_m: f64, cells: u32| {
-        (2.0 * (at_m - min_m) / (grid.cell_m * f64::from(cells)) - 1.0) as f32
-    };
     let positions: Vec<f32> = { boxes.iter().flat_map(sampling_positions) }
         .flat_map(|[x_m, y_m]| {
             // x comes first, although the map is `[1, C, H, W]`.
             [
-                normalised(x_m, grid.x_min_m, grid.width),
-                normalised(y_m, grid.y_min_m, grid.height),
+                normalised(x_m - grid.x_min_m, grid.cell_m * f64::from(grid.width)),
+                normalised(y_m - grid.y_min_m, grid.cell_m * f64::from(grid.height)),
             ]
         })
         .collect();
@@ -87,6 +81,11 @@ fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
     // Without aligned corners: -1 and 1 are the outer edges of the outer cells.
     let sampled = map.f_detach()?.f_grid_sampler(&positions, 0, 0, false)?;
     sampled.f_view([map.size4()?.1, -1])?.f_transpose(0, 1)
+}
+
+/// From -1 to 1 over the extent of the map, as `grid_sampler` takes positions.
+fn normalised(from_edge_m: f64, extent_m: f64) -> f32 {
+    (2.0 * from_edge_m / extent_m - 1.0) as f32
 }
 
 /// Sampling positions of a box: x and y in the frame of the map, metres.
@@ -110,12 +109,12 @@ fn sampling_positions(box3d: &Box3d) -> impl Iterator<Item = [f64; 2]> + use<> {
 /// most [`MAX_LOG_RATIO`] in magnitude, then sine and cosine of twice the heading. A heading and its opposite are the same
 /// box.
 pub fn shape(box3d: &Box3d, usual_m: [f64; 3]) -> [f64; 5] {
-    let log = |axis: usize| {
+    let [length, width, height] = [0, 1, 2].map(|axis: usize| {
         let ratio = box3d.size_m[axis] / usual_m[axis];
         ratio.ln().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
-    };
+    });
     let (sin, cos) = (2.0 * box3d.heading_rad).sin_cos();
-    [log(0), log(1), log(2), sin, cos]
+    [length, width, height, sin, cos]
 }
 
 /// An angle within a quarter turn of zero, radians, up to half turns.

@@ -5,7 +5,7 @@ use tch::{TchError, Tensor};
 use super::backbone_level::BackboneLevel;
 use crate::int8::{ActivationScales, Int8Convolution, Quantisation, QuantiseError, ScaleSearch};
 use crate::layers::backbone::BevBackbone;
-use crate::layers::convolution::{ConvLayer, contiguous_map};
+use crate::layers::convolution::contiguous_map;
 use crate::layers::shrink::Shrink;
 
 /// Name of the canvas among the activations.
@@ -120,20 +120,13 @@ pub(super) fn observe_backbone(
         return Ok(());
     };
     search.observe(CANVAS, canvas)?;
-    let mut observed = |layers: &[ConvLayer], x: &Tensor, name: &dyn Fn(usize) -> String| {
-        layers
-            .iter()
-            .enumerate()
-            .try_fold(x.shallow_clone(), |x, (position, layer)| {
-                let y = layer.forward(&x, false);
-                search.observe(&name(position), &y)?;
-                Ok::<_, TchError>(y)
-            })
-    };
     let mut x = canvas.shallow_clone();
     let mut upsampled = Vec::new();
     for (level, (layers, deblock)) in levels.into_iter().zip(up).enumerate() {
-        x = observed(layers, &x, &|position| block_activation(level, position))?;
+        for (position, layer) in layers.iter().enumerate() {
+            x = layer.forward(&x, false);
+            search.observe(&block_activation(level, position), &x)?;
+        }
         upsampled.push(deblock.forward(&x, false));
     }
     let wide = Tensor::f_cat(&upsampled, 1)?;
@@ -142,6 +135,10 @@ pub(super) fn observe_backbone(
         .layers
         .split_last()
         .map_or(&[][..], |(_, hidden)| hidden);
-    let _ = observed(hidden, &wide, &shrink_activation)?;
+    let mut x = wide.shallow_clone();
+    for (position, layer) in hidden.iter().enumerate() {
+        x = layer.forward(&x, false);
+        search.observe(&shrink_activation(position), &x)?;
+    }
     search.observe(UPSAMPLED, &wide)
 }

@@ -91,8 +91,8 @@ const MAX_CENTRE_M: f64 = 1e4;
 pub(super) fn check_boxes(boxes: &[Decoded]) -> Result<(), DetectorError> {
     for Decoded { box3d, .. } in boxes {
         box3d.check().map_err(DetectorError::Box)?;
-        let is_far = |centre_m: &f64| centre_m.abs() > MAX_CENTRE_M;
-        if let Some(value) = box3d.center_m.into_iter().find(is_far) {
+        let mut centre_m = box3d.center_m.into_iter();
+        if let Some(value) = centre_m.find(|along_m| along_m.abs() > MAX_CENTRE_M) {
             return Err(DetectorError::Values {
                 what: "a detected box (centre, metres)",
                 value,

@@ -74,7 +74,6 @@ impl Layer {
     /// Calls an operator with this layer's parameters, followed by others of the operator.
     pub(super) fn call(&self, operator: &str, x: &Tensor, others: Vec<IValue>) -> Result<Tensor> {
         let (input, output, relu) = (self.format.input, self.format.output, self.format.relu);
-        let tensor = |tensor: &Tensor| IValue::Tensor(tensor.shallow_clone());
         let mut arguments = vec![
             tensor(x),
             IValue::Double(input.scale.step()),
@@ -91,4 +90,8 @@ impl Layer {
         arguments.extend(others);
         Operators::get()?.call(operator, &arguments)
     }
+}
+
+fn tensor(tensor: &Tensor) -> IValue {
+    IValue::Tensor(tensor.shallow_clone())
 }

@@ -7,6 +7,7 @@ use std::io::{Cursor, Write};
 use std::sync::OnceLock;
 
 use tch::{CModule, IValue, TchError, Tensor};
+use zip::result::ZipError;
 use zip::write::FileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
@@ -57,7 +58,6 @@ fn archive() -> Result<Vec<u8>, TchError> {
         ("constants.pkl", CONSTANTS),
         ("version", VERSION),
     ];
-    let failed = |error: zip::result::ZipError| TchError::FileFormat(error.to_string());
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     for (name, content) in files {
         let options = FileOptions::default().compression_method(CompressionMethod::Stored);
@@ -66,4 +66,8 @@ fn archive() -> Result<Vec<u8>, TchError> {
         zip.write_all(content)?;
     }
     Ok(zip.finish().map_err(failed)?.into_inner())
+}
+
+fn failed(error: ZipError) -> TchError {
+    TchError::FileFormat(error.to_string())
 }

@@ -48,15 +48,16 @@ impl ScaleSearch {
             // Infinite where all values are 0: any scale has the error 0 then.
             let reach = scale.step() * f64::from(MAX_ACTIVATION) / largest;
             // Measured where the best scale can be. Finer steps clamp nearly all; coarser ones err evenly.
-            let error = |zero_point| match reach {
-                ..0.03 => Ok(power),
-                0.03..4.0 => squared_error(values, Quantisation { scale, zero_point }),
-                // Rounding to steps of width s errs evenly by up to s / 2: s^2 / 12 in the mean square.
-                _ => Ok(power.min(count * scale.step().powi(2) / 12.0)),
-            };
             // Both are summed up: the first negative value may come with a later sweep.
-            *observed.unsigned.entry(exponent).or_default() += error(0)?;
-            *observed.centred.entry(exponent).or_default() += error(MIDDLE)?;
+            let sums = [(0, &mut observed.unsigned), (MIDDLE, &mut observed.centred)];
+            for (zero_point, errors) in sums {
+                *errors.entry(exponent).or_default() += match reach {
+                    ..0.03 => power,
+                    0.03..4.0 => squared_error(values, Quantisation { scale, zero_point })?,
+                    // Rounding to steps of width s errs evenly by up to s / 2: s^2 / 12 in the mean square.
+                    _ => power.min(count * scale.step().powi(2) / 12.0),
+                };
+            }
         }
         Ok(())
     }
@@ -68,19 +69,14 @@ impl ScaleSearch {
 
     /// The scales with the smallest squared errors.
     pub fn scales(&self) -> ActivationScales {
-        let best = |errors: &BTreeMap<i8, f64>| {
-            let best = errors.iter().min_by(|(_, a), (_, b)| a.total_cmp(b));
-            Scale::of_exponent(best.map_or(0, |(&exponent, _)| exponent))
-        };
         let chosen = self.activations.iter().map(|(name, observed)| {
-            let quantisation = match observed.is_negative {
-                true => Quantisation {
-                    scale: best(&observed.centred),
-                    zero_point: MIDDLE,
-                },
-                false => Quantisation::unsigned(best(&observed.unsigned)),
+            let (errors, zero_point) = match observed.is_negative {
+                true => (&observed.centred, MIDDLE),
+                false => (&observed.unsigned, 0),
             };
-            (name.clone(), quantisation)
+            let best = errors.iter().min_by(|(_, a), (_, b)| a.total_cmp(b));
+            let scale = Scale::of_exponent(best.map_or(0, |(&exponent, _)| exponent));
+            (name.clone(), Quantisation { scale, zero_point })
         });
         ActivationScales::new(chosen.collect())
     }

@@ -123,14 +123,14 @@ impl BevBackbone {
 
     /// The same backbone for inference, norms folded into the convolutions.
     pub fn folded(&self) -> Self {
-        let fold = |block: &Block| match block {
+        let blocks = self.blocks.iter().map(|block| match block {
             Block::Plain(layers) => Block::Plain(layers.iter().map(ConvLayer::folded).collect()),
             Block::Residual(blocks) => {
                 Block::Residual(blocks.iter().map(ResidualBlock::folded).collect())
             }
-        };
+        });
         Self {
-            blocks: self.blocks.iter().map(fold).collect(),
+            blocks: blocks.collect(),
             deblocks: self.deblocks.iter().map(ConvLayer::folded).collect(),
         }
     }

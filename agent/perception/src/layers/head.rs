@@ -28,24 +28,22 @@ pub struct DetectionHead {
 impl DetectionHead {
     /// Parameters `cls_head.*` and `reg_head.*` under `path`.
     pub fn new(path: &nn::Path<'_>, channels: i64, anchors: i64) -> Self {
-        let init = |mean| nn::ConvConfig {
+        let usual = nn::ConvConfig {
             ws_init: Init::Randn {
                 mean: 0.0,
                 stdev: 0.01,
             },
-            bs_init: Init::Const(mean),
+            bs_init: Init::Const(0.0),
             ..Default::default()
         };
-        let prior = -((1.0 - PRIOR) / PRIOR).ln();
+        let prior = nn::ConvConfig {
+            bs_init: Init::Const(-((1.0 - PRIOR) / PRIOR).ln()),
+            ..usual
+        };
+        let numbers = anchors * BOX_CODE;
         Self {
-            scores: nn::conv2d(path / "cls_head", channels, anchors, 1, init(prior)),
-            offsets: nn::conv2d(
-                path / "reg_head",
-                channels,
-                anchors * BOX_CODE,
-                1,
-                init(0.0),
-            ),
+            scores: nn::conv2d(path / "cls_head", channels, anchors, 1, prior),
+            offsets: nn::conv2d(path / "reg_head", channels, numbers, 1, usual),
         }
     }
 
@@ -54,12 +52,9 @@ impl DetectionHead {
     /// # Errors
     /// Those of the tensor library, when the features have another number of channels than the head.
     pub fn forward(&self, features: &Tensor) -> Result<HeadOutput, TchError> {
-        let apply = |conv: &nn::Conv2D| {
-            features.f_conv2d(&conv.ws, conv.bs.as_ref(), [1, 1], [0, 0], [1, 1], 1)
-        };
         Ok(HeadOutput {
-            scores: apply(&self.scores)?,
-            offsets: apply(&self.offsets)?,
+            scores: convolved(features, &self.scores)?,
+            offsets: convolved(features, &self.offsets)?,
         })
     }
 
@@ -79,16 +74,16 @@ impl DetectionHead {
             _ => weight.f_mm(&cells)?,
         };
         let anchors = self.scores.ws.size4()?.0;
-        let of = |first: i64, count: i64| {
-            output
-                .f_narrow(0, first, count)?
-                .f_view([1, count, height, width])
-        };
-        Ok(HeadOutput {
-            scores: of(0, anchors)?,
-            offsets: of(anchors, BOX_CODE * anchors)?,
-        })
+        let scores = output.f_narrow(0, 0, anchors)?;
+        let scores = scores.f_view([1, anchors, height, width])?;
+        let offsets = output.f_narrow(0, anchors, BOX_CODE * anchors)?;
+        let offsets = offsets.f_view([1, BOX_CODE * anchors, height, width])?;
+        Ok(HeadOutput { scores, offsets })
     }
+}
+
+fn convolved(features: &Tensor, conv: &nn::Conv2D) -> Result<Tensor, TchError> {
+    features.f_conv2d(&conv.ws, conv.bs.as_ref(), [1, 1], [0, 0], [1, 1], 1)
 }
 
 impl HeadOutput {

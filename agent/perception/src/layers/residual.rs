@@ -33,16 +33,13 @@ impl ResidualBlock {
     }
 
     fn new(path: &nn::Path<'_>, [input, filters]: [i64; 2], stride: i64) -> Self {
-        let layer = |conv: nn::Path<'_>, norm: nn::Path<'_>, io: [i64; 2], kernel, stride| {
-            ConvLayer::unbiased(&conv, io, kernel, stride).with_norm_of(&norm, io[1], NORM)
-        };
         let shortcut = path / "downsample";
         let is_changed = stride != 1 || input != filters;
         Self {
-            first: layer(path / "conv1", path / "bn1", [input, filters], 3, stride).with_relu(),
-            second: layer(path / "conv2", path / "bn2", [filters, filters], 3, 1),
+            first: layer([path / "conv1", path / "bn1"], [input, filters], 3, stride).with_relu(),
+            second: layer([path / "conv2", path / "bn2"], [filters, filters], 3, 1),
             shortcut: is_changed
-                .then(|| layer(&shortcut / 0, &shortcut / 1, [input, filters], 1, stride)),
+                .then(|| layer([&shortcut / 0, &shortcut / 1], [input, filters], 1, stride)),
         }
     }
 
@@ -68,6 +65,10 @@ impl ResidualBlock {
             shortcut: self.shortcut.as_ref().map(ConvLayer::folded),
         }
     }
+}
+
+fn layer([conv, norm]: [nn::Path<'_>; 2], io: [i64; 2], kernel: i64, stride: i64) -> ConvLayer {
+    ConvLayer::unbiased(&conv, io, kernel, stride).with_norm_of(&norm, io[1], NORM)
 }
 
 #[cfg(test)]

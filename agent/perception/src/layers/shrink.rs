@@ -71,10 +71,6 @@ impl Compressor {
     /// `channels` to `channels / ratio` and back; parameters `encoder.*` and `decoder.*` under `path`.
     pub fn new(path: &nn::Path<'_>, channels: i64, ratio: i64) -> Self {
         let code = (channels / ratio).max(1);
-        let layer = |part: &nn::Path<'_>, position: i64, io: [i64; 2]| {
-            let conv = ConvLayer::biased(&(part / position), io, 3, 1);
-            conv.with_norm(&(part / (position + 1)), io[1]).with_relu()
-        };
         let decoder = path / "decoder";
         Self {
             encoder: layer(&(path / "encoder"), 0, [channels, code]),
@@ -102,4 +98,9 @@ impl Compressor {
             decoder: self.decoder.iter().map(ConvLayer::folded).collect(),
         }
     }
+}
+
+fn layer(part: &nn::Path<'_>, position: i64, io: [i64; 2]) -> ConvLayer {
+    let conv = ConvLayer::biased(&(part / position), io, 3, 1);
+    conv.with_norm(&(part / (position + 1)), io[1]).with_relu()
 }

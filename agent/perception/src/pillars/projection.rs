@@ -35,13 +35,13 @@ impl PillarProjection {
     pub fn new(encoder: &PillarEncoder) -> Self {
         let (weight, bias) = encoder.folded();
         let channels = weight.size()[0] as usize;
-        let flat = |tensor: Tensor| {
+        let [weight, mut bias] = [weight, bias].map(|tensor: Tensor| {
             let tensor = tensor.to_device(tch::Device::Cpu).to_kind(Kind::Float);
             let tensor = tensor.contiguous().view([-1]);
             Vec::<f32>::try_from(&tensor).expect("contiguous f32 values on the CPU")
-        };
-        let (weight, bias) = (flat(weight), flat(bias));
+        });
         let blocks = channels.div_ceil(LANES);
+        bias.resize(blocks * LANES, 0.0);
         // Inputs: 0-2 position, 3 intensity, 4-6 offset from the mean, 7-9 offset from the centre.
         let lanes = |block: usize, value: &dyn Fn(&[f32]) -> f32| -> [f32; LANES] {
             std::array::from_fn(|lane| {
@@ -54,7 +54,6 @@ impl PillarProjection {
                 .map(|block| std::array::from_fn(|axis| lanes(block, &|row| value(row, axis))))
                 .collect()
         };
-        let bias_of = |channel: usize| bias.get(channel).copied().unwrap_or(0.0);
         // x, y, z are in the position and in both offsets, so their three weights add up.
         let position = axes(|row, axis| row[axis] + row[4 + axis] + row[7 + axis]);
         Self {
@@ -65,9 +64,7 @@ impl PillarProjection {
             // Point - mean = (point - centre) - (mean - centre): hence the sign.
             mean: axes(|row, axis| -row[4 + axis]),
             center: axes(|row, axis| row[axis]),
-            bias: (0..blocks)
-                .map(|block| std::array::from_fn(|lane| bias_of(block * LANES + lane)))
-                .collect(),
+            bias: bias.as_chunks().0.to_vec(),
         }
     }
 

@@ -134,10 +134,9 @@ impl AdamW {
     /// steps.
     pub fn state(&self) -> (BTreeMap<String, Tensor>, i64) {
         let both = self.entries.iter().flat_map(|entry| {
-            let stored = |prefix: &str, moment: &Tensor| {
+            [("mean", &entry.mean), ("square", &entry.square)].map(|(prefix, moment)| {
                 (format!("{prefix}.{}", entry.name), moment.shallow_clone())
-            };
-            [stored("mean", &entry.mean), stored("square", &entry.square)]
+            })
         });
         (both.collect(), self.steps)
     }

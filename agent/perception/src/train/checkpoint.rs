@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use support::file_error::{AtFile, FileError};
@@ -65,7 +65,6 @@ pub(crate) fn restore<P: DeserializeOwned>(
     optimizer: &mut AdamW,
 ) -> Result<P, FileError> {
     let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-    let incomplete = |error| format!("not a complete checkpoint: {error}");
     let (_, header) = SafeTensors::read_metadata(&bytes)
         .map_err(incomplete)
         .at(path)?;
@@ -97,16 +96,20 @@ pub(crate) fn restore<P: DeserializeOwned>(
     Ok(progress)
 }
 
+fn incomplete(error: SafeTensorError) -> String {
+    format!("not a complete checkpoint: {error}")
+}
+
 fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorError> {
     let file = SafeTensors::deserialize(bytes)?;
-    let read = |(name, view): (&str, TensorView<'_>)| {
+    // Tensors of another type are none of a checkpoint: they are missed by name.
+    let all = { file.iter() }.filter(|(_, view)| view.dtype() == Dtype::F32);
+    let all = all.map(|(name, view)| {
         let values = numbers(view.data(), f32::from_le_bytes);
         let shape: Vec<i64> = view.shape().iter().map(|&size| size as i64).collect();
         (name.to_owned(), Tensor::from_slice(&values).reshape(shape))
-    };
-    // Tensors of another type are none of a checkpoint: they are missed by name.
-    let all = { file.iter() }.filter(|(_, view)| view.dtype() == Dtype::F32);
-    Ok(all.map(read).collect())
+    });
+    Ok(all.collect())
 }
 
 #[cfg(test)]

@@ -62,17 +62,13 @@ impl Curve {
 
 /// The header and all rows up to `step`; a truncated last row is left out.
 fn rows_until(csv: &str, step: u64) -> String {
-    let is_kept = |row: &str| {
-        let first = row
-            .split(',')
-            .next()
-            .and_then(|cell| cell.parse::<f64>().ok());
-        row.ends_with('\n') && first.is_some_and(|found| found <= step as f64)
-    };
     let rows = csv.split_inclusive('\n').enumerate();
-    rows.filter(|(place, row)| *place == 0 || is_kept(row))
-        .map(|(_, row)| row)
-        .collect()
+    let kept = rows.filter(|(place, row)| {
+        let first = row.split(',').next();
+        let first = first.and_then(|cell| cell.parse::<f64>().ok());
+        *place == 0 || (row.ends_with('\n') && first.is_some_and(|found| found <= step as f64))
+    });
+    kept.map(|(_, row)| row).collect()
 }
 
 #[cfg(test)]

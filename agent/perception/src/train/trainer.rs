@@ -40,11 +40,12 @@ struct Progress {
 impl Progress {
     /// Rejects the state of a training with another seed, batch or method.
     fn check(&self, requested: &Self) -> Result<(), TrainingError> {
-        let text = |method: &Option<String>| method.clone().unwrap_or_default();
+        let [found, wanted] =
+            [self, requested].map(|progress| progress.method.clone().unwrap_or_default());
         let fields = [
             ("seed", self.seed.to_string(), requested.seed.to_string()),
             ("batch", self.batch.to_string(), requested.batch.to_string()),
-            ("method", text(&self.method), text(&requested.method)),
+            ("method", found, wanted),
         ];
         match fields
             .into_iter()

@@ -72,9 +72,10 @@ impl Weights {
             return Err(FileError::new(path, "a folder, must be one weights file"));
         }
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-        let incomplete = |error| incomplete(path, bytes.len(), error);
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(incomplete)?;
-        let file = SafeTensors::deserialize(&bytes).map_err(incomplete)?;
+        let (_, header) = SafeTensors::read_metadata(&bytes)
+            .map_err(|error| incomplete(path, bytes.len(), error))?;
+        let file = SafeTensors::deserialize(&bytes)
+            .map_err(|error| incomplete(path, bytes.len(), error))?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.iter() {
             if let Some(values) = read_values(path, name, &view)? {
@@ -140,8 +141,8 @@ impl Weights {
     /// # Errors
     /// [`FileError`] when it is another one.
     pub fn check_kind(&self, expected: &'static str) -> Result<()> {
-        let detector = || self.metadata(METHOD_KEY).map(|_| DETECTOR_KIND);
-        match self.metadata(KIND_KEY).or_else(detector) {
+        let kind = self.metadata(KIND_KEY);
+        match kind.or_else(|| self.metadata(METHOD_KEY).map(|_| DETECTOR_KIND)) {
             Some(found) if found != expected => Err(self.error(format_args!(
                 "weights of kind {found:?}, needed are those of kind {expected:?}"
             ))),

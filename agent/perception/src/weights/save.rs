@@ -91,15 +91,16 @@ pub(crate) struct Stored {
 impl Stored {
     /// The `values` of a tensor as `dtype`: `f16` or `f32`.
     pub(crate) fn new(name: String, tensor: &Tensor, values: &[f32], dtype: Dtype) -> Self {
-        let half = |&value: &f32| f16::from_f32(value).to_le_bytes();
-        let single = |value: &f32| value.to_le_bytes();
+        let values = values.iter().copied();
         Self {
             name,
             dtype,
             shape: tensor.size().iter().map(|&size| size as usize).collect(),
             bytes: match dtype {
-                Dtype::F16 => values.iter().flat_map(half).collect(),
-                _ => values.iter().flat_map(single).collect(),
+                Dtype::F16 => values
+                    .flat_map(|value| f16::from_f32(value).to_le_bytes())
+                    .collect(),
+                _ => values.flat_map(f32::to_le_bytes).collect(),
             },
         }
     }

@@ -57,12 +57,9 @@ impl Amota {
             };
             amota += motar(&point.counts);
             amotp_m += point.counts.motp_m().unwrap_or(MATCH_DISTANCE_M);
-            let clipped = |point: &OperatingPoint| point.counts.mota().unwrap_or(0.0).max(0.0);
             // Recalls fall: of equal values the first, that of the highest recall, stays.
-            if best
-                .as_ref()
-                .is_none_or(|best| clipped(&point) > clipped(best))
-            {
+            let mota = best.as_ref().map(OperatingPoint::clipped_mota);
+            if mota.is_none_or(|mota| point.clipped_mota() > mota) {
                 best = Some(point.clone());
             }
             last = Some(point);
@@ -86,6 +83,10 @@ impl OperatingPoint {
             counts: ClearMot::of(&kept, MATCH_DISTANCE_M),
         }
     }
+
+    fn clipped_mota(&self) -> f64 {
+        self.counts.mota().unwrap_or(0.0).max(0.0)
+    }
 }
 
 /// MOTA without the misses that the recall implies, relative to the recall, at least 0.
@@ -104,7 +105,7 @@ fn motar(counts: &ClearMot) -> f64 {
 fn thresholds(at_all: &ClearMot) -> Vec<Option<f64>> {
     let mut scores = at_all.match_scores.clone();
     scores.sort_by(|a, b| b.total_cmp(a));
-    let recall_of = |index: usize| (index + 1) as f64 / at_all.objects as f64;
+    let objects = at_all.objects as f64;
     let step = (1.0 - MIN_RECALL) / (THRESHOLDS - 1) as f64;
     let recalls = (0..THRESHOLDS).rev().map(|index| {
         let recall = if index + 1 == THRESHOLDS {
@@ -115,17 +116,17 @@ fn thresholds(at_all: &ClearMot) -> Vec<Option<f64>> {
         // Twelve decimals, so that 0.2 reaches 0.2.
         (recall * 1e12).round_ties_even() / 1e12
     });
-    let score_at = |recall: f64| {
-        let above = (0..scores.len()).find(|&index| recall_of(index) >= recall)?;
+    let scores_at = recalls.map(|recall| {
+        let above = (0..scores.len()).find(|&index| (index + 1) as f64 / objects >= recall)?;
         let Some(below) = above.checked_sub(1) else {
             return scores.first().copied();
         };
-        let (low, high) = (recall_of(below), recall_of(above));
+        let [low, high] = [below, above].map(|index| (index + 1) as f64 / objects);
         if recall == high {
             return Some(scores[above]);
         }
         let slope = (scores[above] - scores[below]) / (high - low);
         Some(slope * (recall - low) + scores[below])
-    };
-    recalls.map(score_at).collect()
+    });
+    scores_at.collect()
 }

@@ -134,9 +134,6 @@ fn pairs(
     histories: &BTreeMap<i64, History>,
     max_distance_m: f64,
 ) -> Vec<(usize, usize)> {
-    let near = |object, track| {
-        Some(frame.distance_m(object, track)).filter(|distance| *distance < max_distance_m)
-    };
     let mut is_taken = (
         vec![false; frame.objects.len()],
         vec![false; frame.tracks.len()],
@@ -148,8 +145,9 @@ fn pairs(
             .and_then(|history| history.last_track);
         let track = last.and_then(|last| frame.tracks.iter().position(|track| track.id == last));
         // Two objects may have had the same track last: the first one in the frame keeps it.
-        if let Some(track) =
-            track.filter(|&track| !is_taken.1[track] && near(index, track).is_some())
+        if let Some(track) = track
+            && !is_taken.1[track]
+            && frame.distance_m(index, track) < max_distance_m
         {
             (is_taken.0[index], is_taken.1[track]) = (true, true);
             kept.push((index, track));
@@ -160,7 +158,8 @@ fn pairs(
         frame.tracks.len(),
         |object, track| {
             let is_free = !is_taken.0[object] && !is_taken.1[track];
-            near(object, track).filter(|_| is_free)
+            let distance_m = frame.distance_m(object, track);
+            (is_free && distance_m < max_distance_m).then_some(distance_m)
         },
     ));
     kept

@@ -47,19 +47,21 @@ impl Hota {
         if first.matches + first.unmatched == 0.0 {
             return None;
         }
-        let mean = |of: fn(f64, f64) -> f64| {
-            let values = sums.iter().map(|sums| {
-                let det_a = sums.matches / (sums.matches + sums.unmatched);
-                of(det_a, sums.association / sums.matches.max(1.0))
-            });
-            values.sum::<f64>() / THRESHOLDS as f64
-        };
         Some(Self {
-            hota: mean(|det_a, ass_a| (det_a * ass_a).sqrt()),
-            det_a: mean(|det_a, _| det_a),
-            ass_a: mean(|_, ass_a| ass_a),
+            hota: mean(&sums, |det_a, ass_a| (det_a * ass_a).sqrt()),
+            det_a: mean(&sums, |det_a, _| det_a),
+            ass_a: mean(&sums, |_, ass_a| ass_a),
         })
     }
+}
+
+/// Mean over the thresholds of a value that follows from DetA and AssA.
+fn mean(sums: &[Sums; THRESHOLDS], of: fn(f64, f64) -> f64) -> f64 {
+    let values = sums.iter().map(|sums| {
+        let det_a = sums.matches / (sums.matches + sums.unmatched);
+        of(det_a, sums.association / sums.matches.max(1.0))
+    });
+    values.sum::<f64>() / THRESHOLDS as f64
 }
 
 /// Similarities of the objects (rows) and tracks (columns) of a frame.
@@ -75,9 +77,9 @@ fn add(sequence: &Sequence, sums: &mut [Sums; THRESHOLDS]) {
     let mut matches: [Pairs; THRESHOLDS] = Default::default();
     for frame in sequence.frames() {
         let similarity = similarities(frame);
-        let ids = |object: usize, track: usize| (frame.objects[object].id, frame.tracks[track].id);
         let costs = DMatrix::from_fn(similarity.nrows(), similarity.ncols(), |object, track| {
-            let aligned = alignment.get(&ids(object, track)).copied().unwrap_or(0.0);
+            let ids = (frame.objects[object].id, frame.tracks[track].id);
+            let aligned = alignment.get(&ids).copied().unwrap_or(0.0);
             -aligned * similarity[(object, track)]
         });
         // One assignment for all thresholds, as its costs do not depend on them.
@@ -88,7 +90,8 @@ fn add(sequence: &Sequence, sums: &mut [Sums; THRESHOLDS]) {
             let near = pairs.iter().filter(|&&pair| similarity[pair] >= threshold);
             let before = sums.matches;
             for &(object, track) in near {
-                *matches.entry(ids(object, track)).or_default() += 1.0;
+                let ids = (frame.objects[object].id, frame.tracks[track].id);
+                *matches.entry(ids).or_default() += 1.0;
                 sums.matches += 1.0;
             }
             let points = (frame.objects.len() + frame.tracks.len()) as f64;
@@ -134,6 +137,7 @@ fn jaccard(
     (object, track): &(i64, u64),
     both: f64,
 ) -> f64 {
-    let length = |frames: Option<&u32>| f64::from(frames.copied().unwrap_or(0));
-    both / (length(objects.get(object)) + length(tracks.get(track)) - both)
+    let [object, track] = [objects.get(object), tracks.get(track)]
+        .map(|frames| f64::from(frames.copied().unwrap_or(0)));
+    both / (object + track - both)
 }

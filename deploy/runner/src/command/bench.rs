@@ -80,7 +80,17 @@ fn print(capacity: &Capacity, is_first: bool) -> anyhow::Result<()> {
         ))?;
     }
     let mut table = TextTable::of(&[capacity.method.as_str(), "stage"], &["ms", "units"]);
-    let mut row = |part: &str, stage: &str, ms: f64| {
+    let vehicles = format!("frame of {} vehicles", capacity.vehicles);
+    let mut rows = Vec::new();
+    // The sums are means over all processes, the stages are those of the first one alone.
+    let sums = [("agent", capacity.agent_ms), ("ego", capacity.fuse_ms)];
+    for ((part, sum), stages) in sums.into_iter().zip(&capacity.stages) {
+        rows.extend(stages.iter().map(|(stage, ms)| (part, stage.as_str(), *ms)));
+        rows.push((part, "all", sum));
+    }
+    rows.push(("messages", "all, expected", capacity.messages_ms));
+    rows.push((vehicles.as_str(), "all", capacity.needed_ms));
+    for (part, stage, ms) in rows {
         let units = ms / capacity.unit_ms;
         table.row([
             part.into(),
@@ -88,18 +98,7 @@ fn print(capacity: &Capacity, is_first: bool) -> anyhow::Result<()> {
             format!("{ms:.1}"),
             format!("{units:.2}"),
         ]);
-    };
-    // The sums are means over all processes, the stages are those of the first one alone.
-    let sums = [("agent", capacity.agent_ms), ("ego", capacity.fuse_ms)];
-    for ((part, sum), stages) in sums.into_iter().zip(&capacity.stages) {
-        for (stage, ms) in stages {
-            row(part, stage, *ms);
-        }
-        row(part, "all", sum);
     }
-    row("messages", "all, expected", capacity.messages_ms);
-    let vehicles = format!("frame of {} vehicles", capacity.vehicles);
-    row(&vehicles, "all", capacity.needed_ms);
     output::text(format_args!("{table}\n"))?;
     Ok(())
 }

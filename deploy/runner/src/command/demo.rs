@@ -116,13 +116,13 @@ impl Arguments {
     }
 
     fn scenario(&self) -> Result<PathBuf, BadInput> {
-        let shared = || shared_files::shared(SCENARIO).into_iter().next();
-        let none = || {
-            BadInput::new(format!(
-                "{SCENARIO} is not beside the programs: name a file by --scenario"
-            ))
-        };
-        self.scenario.clone().or_else(shared).ok_or_else(none)
+        { self.scenario.clone() }
+            .or_else(|| shared_files::shared(SCENARIO).into_iter().next())
+            .ok_or_else(|| {
+                BadInput::new(format!(
+                    "{SCENARIO} is not beside the programs: name a file by --scenario"
+                ))
+            })
     }
 
     /// Folder of the scene, which is generated if it does not exist.

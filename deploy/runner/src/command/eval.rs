@@ -215,11 +215,6 @@ impl Arguments {
             let reason = "--watch-queue: without --link there is no queue to watch";
             return Err(BadInput::new(reason));
         }
-        let attack = |falsification| AttackConfig {
-            falsification,
-            attackers: self.attackers,
-            seed: self.attack_seed,
-        };
         let intensity_scale = self.intensity.scale;
         Ok(Trial {
             // Required unless --table is given, which does not come here.
@@ -241,7 +236,11 @@ impl Arguments {
                     weights: self.neighbour_weights.clone(),
                     falsification: None,
                 },
-                attack: self.attack.map(attack),
+                attack: self.attack.map(|falsification| AttackConfig {
+                    falsification,
+                    attackers: self.attackers,
+                    seed: self.attack_seed,
+                }),
                 ego: self.ego()?,
                 link: self.emulates_link().then(|| self.link()).transpose()?,
                 delay_ms: self.delay_ms,
@@ -267,9 +266,9 @@ impl Arguments {
         let encodes =
             self.codec.0 != CodecConfig::default() || self.rate.0 != RateConfig::default();
         let listens = self.attack.is_some() || self.trust || self.delay_ms > 0;
-        let any_exchanges = |content| { self.method.iter() }.any(|one| one.exchange() == content);
-        let maps = any_exchanges(Exchange::Features);
-        let boxes = any_exchanges(Exchange::Boxes) || self.boxes.is_some();
+        let [maps, boxes] = [Exchange::Features, Exchange::Boxes]
+            .map(|content| { self.method.iter() }.any(|one| one.exchange() == content));
+        let boxes = boxes || self.boxes.is_some();
         let messages = !{ self.method.iter() }.all(|one| one.exchange() == Exchange::Nothing);
         // With --feature-maps the codec also sets the format of kept maps, whatever is sent.
         let rule = if encodes && self.feature_maps.is_none() && !maps {

@@ -84,12 +84,10 @@ impl Cell {
 
 /// Name of a method as a name of files: that of a TorchScript file has its path in it.
 pub(crate) fn file_name(method: Method) -> String {
-    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
-    method
-        .name()
-        .chars()
-        .map(|letter| if is_plain(letter) { letter } else { '-' })
-        .collect()
+    method.name().replace(
+        |letter: char| !letter.is_ascii_alphanumeric() && !"._-".contains(letter),
+        "-",
+    )
 }
 
 #[cfg(test)]

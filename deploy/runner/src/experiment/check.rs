@@ -102,8 +102,8 @@ fn of_link_alone(experiment: &Experiment) -> Result<(), String> {
 
 /// Refuses a name that cannot be one of files.
 fn check_name(field: &str, name: &str) -> Result<(), String> {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-    match !name.is_empty() && name.chars().all(is_plain) {
+    let is_plain = { name.chars() }.all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
+    match !name.is_empty() && is_plain {
         true => Ok(()),
         false => Err(format!(
             "{field} {name:?} is to name files: letters, digits, - and _"
@@ -154,10 +154,9 @@ fn axes(grid: &Grid) -> Result<(), String> {
     )?;
     numbers("grid.loss", &grid.loss, 0.0, 1.0)?;
     values("grid.pose_noise", grid.pose_noise.as_ref(), |noise| {
-        let (position_std_m, heading_std_deg) = (noise.position_std_m, noise.heading_std_deg);
-        let field = |name: &str| format!("grid.pose_noise: {name}");
-        number(&field("position_std_m"), position_std_m, 0.0, 1000.0)?;
-        number(&field("heading_std_deg"), heading_std_deg, 0.0, 360.0)
+        let (position_m, heading_deg) = (noise.position_std_m, noise.heading_std_deg);
+        number("grid.pose_noise: position_std_m", position_m, 0.0, 1000.0)?;
+        number("grid.pose_noise: heading_std_deg", heading_deg, 0.0, 360.0)
     })?;
     values("grid.vehicles", grid.vehicles.as_ref(), |count| {
         number("grid.vehicles", *count as f64, 1.0, 64.0)
@@ -187,7 +186,7 @@ fn numbers(field: &str, axis: &Option<Vec<f64>>, low: f64, high: f64) -> Result<
 /// Contradictory or impossible combinations of fields.
 fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
     let (grid, ego, poses) = (&experiment.grid, &experiment.ego, &experiment.poses);
-    let exchanges = || grid.method.iter().map(|method| method.exchange());
+    let exchanges = grid.method.iter().map(|method| method.exchange());
     if experiment.weights.is_none() {
         return Err(
             "weights is left out: name a file, or a folder with one for each method".into(),
@@ -239,14 +238,14 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
             poses.name()
         ));
     }
-    if grid.codec.is_some() && exchanges().all(|exchange| exchange != Exchange::Features) {
+    if grid.codec.is_some() && exchanges.clone().all(|it| it != Exchange::Features) {
         let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
         return Err(format!(
             "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
             names.join(", ")
         ));
     }
-    if grid.vehicles.is_some() && exchanges().all(|exchange| exchange == Exchange::Nothing) {
+    if grid.vehicles.is_some() && exchanges.clone().all(|it| it == Exchange::Nothing) {
         let reason = "grid.vehicles varies the transmitting vehicles, but grid.method is none: there are none";
         return Err(reason.into());
     }

@@ -31,8 +31,7 @@ impl Experiment {
             *place = folder.join(&place);
         }
         // A name that is no preset is the path of a file.
-        let is_file = |link: &&mut String| LinkConfig::preset(link).is_err();
-        if let Some(link) = self.link.as_mut().filter(is_file) {
+        if let Some(link) = { self.link.as_mut() }.filter(|it| LinkConfig::preset(it).is_err()) {
             *link = folder.join(&link).to_string_lossy().into_owned();
         }
     }

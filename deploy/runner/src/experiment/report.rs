@@ -118,44 +118,46 @@ pub fn run_notes(result: &RunResult) -> String {
     text
 }
 
+/// Name, alignment and cells of a column.
+type Column = (&'static str, Side, fn(&Metrics) -> String);
+
 /// One line per run or evaluation, and the facts that are needed to compare the lines.
 pub fn table(all: &[Metrics]) -> String {
     use Side::{Left, Right};
-    let column = |name: &'static str, side: Side, cell: &dyn Fn(&Metrics) -> String| {
-        (name, side, all.iter().map(cell).collect::<Vec<String>>())
-    };
-    let mut columns = vec![
-        column("method", Left, &|metrics| metrics.method.clone()),
-        column("poses", Left, &|metrics| metrics.pose_source.clone()),
-    ];
     // Streaming AP exists only where results have a time of publication.
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
     let name = if is_live { "answered" } else { "frames" };
-    columns.push(column(name, Right, &frames));
-    for (index, name) in ["AP@0.3", "AP@0.5", "AP@0.7"].into_iter().enumerate() {
-        let precision = |metrics: &Metrics| number(metrics.ap_global.values()[index], 3);
-        columns.push(column(name, Right, &precision));
-    }
+    let mut columns: Vec<Column> = vec![
+        ("method", Left, |of| of.method.clone()),
+        ("poses", Left, |of| of.pose_source.clone()),
+        (name, Right, frames),
+        ("AP@0.3", Right, |of| number(of.ap_global.at_30, 3)),
+        ("AP@0.5", Right, |of| number(of.ap_global.at_50, 3)),
+        ("AP@0.7", Right, |of| number(of.ap_global.at_70, 3)),
+    ];
     if is_live {
-        let all_ticks = |metrics: &Metrics| number(metrics.ap_unanswered_empty.at_50, 3);
-        let streaming = |of: &Metrics| number(of.ap_streaming.and_then(|ap| ap.at_50), 3);
-        columns.push(column("AP@0.5 all", Right, &all_ticks));
-        columns.push(column("sAP@0.5", Right, &streaming));
+        columns.push(("AP@0.5 all", Right, |of| {
+            number(of.ap_unanswered_empty.at_50, 3)
+        }));
+        columns.push(("sAP@0.5", Right, |of| {
+            number(of.ap_streaming.and_then(|ap| ap.at_50), 3)
+        }));
     } else {
-        let frame_order = |metrics: &Metrics| number(metrics.ap_frame_order.at_50, 3);
-        columns.push(column("frame order 0.5", Right, &frame_order));
+        columns.push(("frame order 0.5", Right, |of| {
+            number(of.ap_frame_order.at_50, 3)
+        }));
     }
     if all.iter().any(|metrics| metrics.contribution.sent > 0) {
-        let fused = |metrics: &Metrics| number(metrics.contribution.fused_per_frame, 2);
-        columns.push(column("fused", Right, &fused));
+        columns.push(("fused", Right, |of| {
+            number(of.contribution.fused_per_frame, 2)
+        }));
     }
-    let pose_error = |metrics: &Metrics| number(metrics.pose.mean_m, 2);
-    columns.push(column("pose m", Right, &pose_error));
-    columns.push(column("latency ms", Right, &latency));
-    columns.push(column("bytes", Right, &wire_bytes));
+    columns.push(("pose m", Right, |of| number(of.pose.mean_m, 2)));
+    columns.push(("latency ms", Right, latency));
+    columns.push(("bytes", Right, wire_bytes));
     let mut table = TextTable::new(columns.iter().map(|(name, side, _)| (*name, *side)));
-    for row in 0..all.len() {
-        table.row(columns.iter().map(|(_, _, cells)| cells[row].clone()));
+    for metrics in all {
+        table.row(columns.iter().map(|(_, _, cell)| cell(metrics)));
     }
     table.to_string() + &comparison(all)
 }

@@ -144,8 +144,8 @@ fn python(text: &str) -> String {
 
 /// A word as a shell reads it back.
 fn quoted(word: &str) -> String {
-    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-=,:+".contains(letter);
-    if !word.is_empty() && word.chars().all(is_plain) {
+    let is_plain = { word.chars() }.all(|c| c.is_ascii_alphanumeric() || "/._-=,:+".contains(c));
+    if !word.is_empty() && is_plain {
         word.to_owned()
     } else {
         format!("'{}'", word.replace('\'', r"'\''"))

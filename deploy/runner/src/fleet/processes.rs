@@ -48,31 +48,33 @@ impl Fleet {
         let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
         let (ego, link) = (format!("ego-{}", self.ego), format!("link-{}", self.ego));
-        let config = |bus| self.ego_config(context, bus);
-        planner.plan(ego, "ego-fuser run", RestartPolicy::Service, config)?;
+        planner.plan(ego, "ego-fuser run", RestartPolicy::Service, |bus| {
+            self.ego_config(context, bus)
+        })?;
         if self.is_over_link() {
-            let config = |bus| self.link_config(context, bus);
-            planner.plan(link, "sim-replay link", RestartPolicy::Service, config)?;
+            planner.plan(link, "sim-replay link", RestartPolicy::Service, |bus| {
+                self.link_config(context, bus)
+            })?;
         }
-        let config = |bus| self.replay_config(context, bus);
         planner.plan(
             REPLAY.into(),
             "sim-replay stream",
             RestartPolicy::Task,
-            config,
+            |bus| self.replay_config(context, bus),
         )?;
         if let Some(record) = &self.scenario.record {
             let (run, out) = (context.run.clone(), context.folder.file(RECORDING));
-            let config = |bus| RecorderConfig {
-                run,
-                out,
-                record: record.clone(),
-                keep_running: false,
-                bus,
-            };
             // A recording cannot be resumed after an interruption.
-            let command = "sim-replay record --json";
-            planner.plan(RECORDER.into(), command, RestartPolicy::Optional, config)?;
+            let life = RestartPolicy::Optional;
+            planner.plan(RECORDER.into(), "sim-replay record --json", life, |bus| {
+                RecorderConfig {
+                    run,
+                    out,
+                    record: record.clone(),
+                    keep_running: false,
+                    bus,
+                }
+            })?;
         }
         Ok(planner.specs)
     }
@@ -118,13 +120,10 @@ impl Fleet {
         let remote = &self.scenario.remote_agents;
         for cav in self.agents.iter().filter(|cav| !remote.contains(cav)) {
             let context = planner.context;
-            let config = |bus| self.agent_config(cav, context, bus);
-            planner.plan(
-                format!("agent-{cav}"),
-                "agent run",
-                RestartPolicy::Service,
-                config,
-            )?;
+            let name = format!("agent-{cav}");
+            planner.plan(name, "agent run", RestartPolicy::Service, |bus| {
+                self.agent_config(cav, context, bus)
+            })?;
         }
         Ok(())
     }

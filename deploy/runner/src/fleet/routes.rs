@@ -15,9 +15,6 @@ impl Fleet {
     pub(super) fn routes(&self) -> Vec<Route> {
         let ego = process_id(Role::Ego, &self.ego);
         let scorer = process_id(Role::Scorer, &scorer_cav());
-        let route = |cav: &CavId, stream, receiver: &ProcessId| {
-            Route::new(Topic::stream(cav, stream), receiver.clone())
-        };
         let mut routes = vec![
             Route::new(Topic::Truth, scorer.clone()),
             route(&self.ego, Stream::Detections, &scorer),
@@ -39,23 +36,22 @@ impl Fleet {
             // The link takes nothing else of the ego. A neighbour's position is subscribed to before its stream.
             routes.push(route(&self.ego, Stream::Gnss, &link));
         }
-        let sent = |cav: &CavId| self.streams_of(cav).into_iter();
-        let sources =
-            { self.neighbours() }.flat_map(|cav| sent(cav).map(move |stream| (cav, stream)));
-        for (cav, stream) in sources {
-            // Over an emulated link a message takes two hops, and both have to be there.
-            if self.is_over_link() {
-                routes.push(route(cav, stream, &link));
-                routes.push(Route {
-                    topic: Topic::Received {
-                        ego: self.ego.clone(),
-                        cav: cav.clone(),
-                        stream,
-                    },
-                    receiver: ego.clone(),
-                });
-            } else {
-                routes.push(route(cav, stream, &ego));
+        for cav in self.neighbours() {
+            for stream in self.streams_of(cav) {
+                // Over an emulated link a message takes two hops, and both have to be there.
+                if self.is_over_link() {
+                    routes.push(route(cav, stream, &link));
+                    routes.push(Route {
+                        topic: Topic::Received {
+                            ego: self.ego.clone(),
+                            cav: cav.clone(),
+                            stream,
+                        },
+                        receiver: ego.clone(),
+                    });
+                } else {
+                    routes.push(route(cav, stream, &ego));
+                }
             }
         }
         routes
@@ -78,6 +74,10 @@ impl Fleet {
         }
         routes
     }
+}
+
+fn route(cav: &CavId, stream: Stream, receiver: &ProcessId) -> Route {
+    Route::new(Topic::stream(cav, stream), receiver.clone())
 }
 
 /// Id of the recorder in place of a vehicle's.

@@ -157,10 +157,9 @@ fn period_ms(fleet: &Fleet) -> Option<f64> {
 
 /// Megabytes of a frame: of each vehicle its sweep, and its map if it sends maps.
 fn frame_mb(fleet: &Fleet) -> Result<f64, RunError> {
-    let is_recorded = |tick: &usize| fleet.recorded.is_present(0, *tick);
     // One sweep stands for those of all vehicles: the first that vehicle 0 has.
     let sweep = (0..fleet.recorded.ticks.len())
-        .find(is_recorded)
+        .find(|tick| fleet.recorded.is_present(0, *tick))
         .map(|tick| fleet.recorded.load(0, tick, &LoadOptions::default()))
         .transpose()
         .map_err(EvaluateError::from)?;
@@ -169,8 +168,9 @@ fn frame_mb(fleet: &Fleet) -> Result<f64, RunError> {
         Exchange::Features => fleet.map_values(),
         _ => 0,
     };
-    let of_vehicle = |cav| sweep_bytes + map_bytes(&fleet.settings_of(cav), values);
-    Ok(fleet.agents.iter().map(of_vehicle).sum::<u64>() as f64 * 1e-6)
+    let bytes =
+        { fleet.agents.iter() }.map(|cav| sweep_bytes + map_bytes(&fleet.settings_of(cav), values));
+    Ok(bytes.sum::<u64>() as f64 * 1e-6)
 }
 
 /// Bytes of a vehicle's map of so many `values`; none where it sends boxes only.
@@ -190,11 +190,10 @@ fn capacity_of(
     frame_mb: f64,
     (period_ms, unit_ms): (f64, f64),
 ) -> Capacity {
-    let mean = |value: fn(&Measured) -> f64| {
-        measured.iter().map(value).sum::<f64>() / measured.len().max(1) as f64
-    };
-    let (agent_ms, fuse_ms) = (mean(|one| one.agent_ms), mean(|one| one.fuse_ms));
-    let free_share = mean(|one| one.free_share);
+    let count = measured.len().max(1) as f64;
+    let agent_ms = measured.iter().map(|one| one.agent_ms).sum::<f64>() / count;
+    let fuse_ms = measured.iter().map(|one| one.fuse_ms).sum::<f64>() / count;
+    let free_share = measured.iter().map(|one| one.free_share).sum::<f64>() / count;
     let messages_ms = frame_mb * UNITS_PER_MB * unit_ms;
     let needed_ms = local_vehicles as f64 * agent_ms + fuse_ms + messages_ms;
     let available_ms = machine.cores as f64 * free_share * period_ms;

@@ -29,11 +29,7 @@ fn try_draw(
     frame: &JudgedFrame,
     path: &Path,
 ) -> Result<(), Box<dyn std::error::Error>> {
-    let pose_of = |cav: &CavId| {
-        let mut poses = frame.world_from_lidar.iter();
-        Some(poses.find(|(known, _)| known == cav)?.1)
-    };
-    let world_from_ego: Pose = pose_of(&fleet.ego).ok_or("the truth names no pose of the ego")?;
+    let world_from_ego = pose_of(frame, &fleet.ego).ok_or("the truth names no pose of the ego")?;
     let scenario = &fleet.recorded;
     let options = LoadOptions {
         lidar_variant: fleet.scenario.scene.variant.clone(),
@@ -44,7 +40,7 @@ fn try_draw(
     let mut loaded = Vec::new();
     for cav in shown {
         let index = scenario.agents.iter().position(|agent| agent == cav);
-        let (Some(index), Some(world_from_cav)) = (index, pose_of(cav)) else {
+        let (Some(index), Some(world_from_cav)) = (index, pose_of(frame, cav)) else {
             continue;
         };
         let recorded = scenario.load(index, usize::try_from(frame.tick)?, &options)?;
@@ -55,23 +51,20 @@ fn try_draw(
     let rule = fleet.ground_truth_rule();
     let found = frame.result.detections.iter();
     let detections: Vec<_> = found.map(|found| (found.box3d, found.score)).collect();
-    let places = |axis: usize| {
-        let boxes = frame
-            .truth
-            .iter()
-            .chain(detections.iter().map(|(found, _)| found));
-        let vehicles = loaded
-            .iter()
-            .map(move |(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
-        boxes.map(move |shape| shape.center_m[axis]).chain(vehicles)
-    };
+    let [x_m, y_m] = [(0, rule.x_m), (1, rule.y_m)].map(|(axis, limit): (usize, [f64; 2])| {
+        let found = detections.iter().map(|(found, _)| found);
+        let boxes = { frame.truth.iter().chain(found) }.map(|shape| shape.center_m[axis]);
+        let vehicles =
+            { loaded.iter() }.map(|(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
+        around(boxes.chain(vehicles), limit)
+    });
     Picture {
         title: format!(
             "{}  tick {} (most neighbours)  {}",
             fleet.scenario.method, frame.tick, scenario.name
         ),
-        x_m: around(places(0), rule.x_m),
-        y_m: around(places(1), rule.y_m),
+        x_m,
+        y_m,
         views: loaded
             .iter()
             .map(|(name, ego_from_cav, xyzi)| View {
@@ -85,6 +78,12 @@ fn try_draw(
     }
     .save(path)?;
     Ok(())
+}
+
+/// True pose of a vehicle.
+fn pose_of(frame: &JudgedFrame, cav: &CavId) -> Option<Pose> {
+    let mut poses = frame.world_from_lidar.iter();
+    Some(poses.find(|(known, _)| known == cav)?.1)
 }
 
 /// Range of the places and a margin around it, metres, within a limit: the rest of the limit is empty.

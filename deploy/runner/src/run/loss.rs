@@ -1,7 +1,5 @@
 //! Lost data of a run: the reasons for exit code 3 and what would help, in one sentence.
 
-use std::path::Path;
-
 use protocol::DropReason;
 
 use crate::run::run_fleet::RunResult;
@@ -58,8 +56,9 @@ fn reasons(result: &RunResult) -> Vec<String> {
 /// What would help, from the first cause that applies.
 fn help(result: &RunResult) -> Option<String> {
     let dropped = &result.metrics.messages.dropped;
-    let count = |reason: &DropReason| dropped.get(reason).copied().unwrap_or(0);
-    let log = |folder: &Path| format!("see {}", folder.join("log").display());
+    let without_pose = dropped.get(&DropReason::NoPose).copied().unwrap_or(0);
+    let mut late = OVERLOAD.iter().filter_map(|reason| dropped.get(reason));
+    let log = format!("see {}", result.folder.path().join("log").display());
     let mut causes = result.causes.clone();
     // A failure is listed among the reasons already.
     causes.retain(|cause| !result.failures.contains(cause));
@@ -71,18 +70,17 @@ fn help(result: &RunResult) -> Option<String> {
     } else if result.interrupted {
         (!causes.is_empty()).then(|| listed(&causes, "and"))
     } else if !result.failures.is_empty() || !causes.is_empty() {
-        causes.push(log(result.folder.path()));
+        causes.push(log);
         Some(causes.join(", "))
-    } else if count(&DropReason::NoPose) > 0 && result.metrics.pose.success_3m == Some(0.0) {
+    } else if without_pose > 0 && result.metrics.pose.success_3m == Some(0.0) {
         Some("no vehicle found itself: is the head of agents.pose that of this scene?".into())
-    } else if result.metrics.messages.are_stuck() || OVERLOAD.iter().any(|reason| count(reason) > 0)
-    {
+    } else if result.metrics.messages.are_stuck() || late.any(|count| *count > 0) {
         let remedies = result.remedies.as_ref();
         remedies.map(|remedies| format!("{remedies} would answer more"))
     } else if !result.metrics.left_out.is_nothing() {
         None
     } else {
-        Some(log(result.folder.path()))
+        Some(log)
     }
 }
 

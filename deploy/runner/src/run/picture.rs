@@ -86,11 +86,9 @@ impl Picture<'_> {
 
     /// Width and height of the plan view, pixels.
     fn map_size(&self) -> Result<(u32, u32)> {
-        let [width, height] =
-            [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
-        let can_be_drawn = |side: f64| (1.0..=MAX_SIDE).contains(&side);
-        if can_be_drawn(width) && can_be_drawn(height) {
-            Ok((width as u32, height as u32))
+        let sides = [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
+        if sides.iter().all(|side| (1.0..=MAX_SIDE).contains(side)) {
+            Ok((sides[0] as u32, sides[1] as u32))
         } else {
             Err(FigureError::Draw(format!(
                 "x {:?} m, y {:?} m: a side must be above 0 and below {} m",
@@ -137,16 +135,13 @@ impl Picture<'_> {
 
     /// True if a point is on the plan view or at most `margin_m` outside it.
     fn is_near(&self, x: f64, y: f64, margin_m: f64) -> bool {
-        let is_within =
-            |[low, high]: [f64; 2], value| (low - margin_m..=high + margin_m).contains(&value);
-        is_within(self.x_m, x) && is_within(self.y_m, y)
+        [(self.x_m, x), (self.y_m, y)]
+            .into_iter()
+            .all(|([low, high], value)| (low - margin_m..=high + margin_m).contains(&value))
     }
 
     /// A line every 10 m.
     fn draw_grid(&self, plane: &Plane<'_>) -> Result<()> {
-        let tens = |[low, high]: [f64; 2]| {
-            ((low / 10.0).ceil() as i64..=(high / 10.0).floor() as i64).map(|ten| 10.0 * ten as f64)
-        };
         for x in tens(self.x_m) {
             plane.draw(&PathElement::new(self.y_m.map(|y| (x, y)), GRID))?;
         }
@@ -201,11 +196,11 @@ impl Picture<'_> {
         let mut labelled: Vec<(&Box3d, f32)> = Vec::new();
         for (found, score) in by_score {
             let [x, y, _] = found.center_m;
-            let covers = |(other, _): &(&Box3d, f32)| {
+            let is_covered = labelled.iter().any(|(other, _)| {
                 let [across, up] = [other.center_m[0] - x, other.center_m[1] - y].map(f64::abs);
                 across * PIXELS_PER_M < SCORE_SIZE[0] && up * PIXELS_PER_M < SCORE_SIZE[1]
-            };
-            if !labelled.iter().any(covers) {
+            });
+            if !is_covered {
                 labelled.push((found, score));
             }
         }
@@ -291,6 +286,11 @@ fn stroke(colour: RGBColor) -> ShapeStyle {
 
 fn text(pixels: i32, colour: RGBColor) -> TextStyle<'static> {
     (FONT, pixels).into_font().color(&colour)
+}
+
+/// Multiples of 10 in a range.
+fn tens([low, high]: [f64; 2]) -> impl Iterator<Item = f64> {
+    ((low / 10.0).ceil() as i64..=(high / 10.0).floor() as i64).map(|ten| 10.0 * ten as f64)
 }
 
 #[cfg(test)]

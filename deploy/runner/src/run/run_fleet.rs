@@ -13,7 +13,7 @@ use dataset::findings;
 use deploy::operate::network::{Network, RouterEndpoint};
 use deploy::operate::progress::Display;
 use deploy::operate::router_panic;
-use deploy::operate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
+use deploy::operate::run_folder::{RunFolder, SWEEP_LOG, name_of_now};
 use deploy::operate::security::RefusalWatch;
 use deploy::operate::status::Phase;
 use deploy::operate::status_reporter::{Ending, StatusReporter};
@@ -188,13 +188,13 @@ fn go(
         tracks,
     )?;
     if let Some(address) = fleet.scenario.network.metrics {
-        let peer = |spec: &ProcessSpec| {
+        let peers = specs.iter().filter_map(|spec| {
             Some(MetricsPeer {
                 process: spec.name.clone(),
                 address: spec.metrics?,
             })
-        };
-        scorer.serve_metrics(address, specs.iter().filter_map(peer).collect())?;
+        });
+        scorer.serve_metrics(address, peers.collect())?;
     }
     // Not returned at once on an error: scorer and router have to be ended first.
     let watched = watch(fleet, &context, specs, &place, &scorer, &stop);
@@ -439,11 +439,6 @@ fn write(
             unwritten.push(format!("{}: {error}", file.display()));
         }
     }
-    let mut note = |written: Result<(), RunFolderError>| {
-        if let Err(error) = written {
-            unwritten.push(error.to_string());
-        }
-    };
     let mut sum = Ledger::default();
     for process in &stats {
         sum.merge(&process.ledger);
@@ -467,26 +462,28 @@ fn write(
         provenance: provenance.clone().map(Provenance::with_command),
         ..metrics
     };
-    note(folder.write_json(deploy::score::metrics::FILE, &metrics));
+    let mut written = vec![folder.write_json(deploy::score::metrics::FILE, &metrics)];
     let remedies = remedies(fleet, capacity.as_ref());
     let run_report = RunReport {
         causes: watched.causes.clone(),
         ..RunReport::new(run, &metrics, board.records(), &stats, capacity)
     };
-    note(folder.write_json(report::FILE, &run_report));
-    note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
+    written.push(folder.write_json(report::FILE, &run_report));
+    written.push(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
     let report = LedgerReport {
         refused: refused.iter().map(RefusedReport::of).collect(),
         causes: watched.causes.clone(),
         ..LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted))
     };
-    note(folder.write_json("ledger.json", &report));
+    written.push(folder.write_json("ledger.json", &report));
     let resolved = Scenario {
         run: Some(run.clone()),
         provenance,
         ..fleet.scenario.clone()
     };
-    note(folder.write("scenario.yaml", &resolved.to_yaml()));
+    written.push(folder.write("scenario.yaml", &resolved.to_yaml()));
+    let errors = written.into_iter().filter_map(Result::err);
+    unwritten.extend(errors.map(|error| error.to_string()));
     let picture = crate::run::demo::draw(fleet, &board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
     RunResult {

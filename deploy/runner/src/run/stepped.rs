@@ -14,7 +14,7 @@ use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::{
     AgentPool, EmulatedLink, EvaluateError, EvaluatedFrame, Evaluator, Setup,
 };
-use protocol::{CavId, RunId};
+use protocol::RunId;
 use support::provenance::Provenance;
 use terminal::progress;
 
@@ -25,7 +25,7 @@ use crate::run::RunError;
 use crate::run::agent_pool::CrewProcesses;
 use crate::run::ledger_report::LedgerReport;
 use crate::run::run_fleet::{RunOptions, RunResult, in_folder};
-use crate::scenario::{AgentOverrides, Scenario};
+use crate::scenario::Scenario;
 
 /// Runs a scenario in simulation time to its end.
 ///
@@ -90,13 +90,13 @@ pub(super) fn setup(fleet: &Fleet) -> Result<Setup, RunError> {
     // Without a link in the scenario messages take the ideal one.
     let link = link.clone().unwrap_or_default();
     let link = EmulatedLink::open(&link.model, link.seed);
-    let own = |(cav, own): (&CavId, &AgentOverrides)| (cav.clone(), own.over(agents));
+    let vehicles = { vehicles.iter() }.map(|(cav, own)| (cav.clone(), own.over(agents)));
     let others = fleet.agents.iter().filter(|cav| **cav != fleet.ego);
     Ok(Setup {
         models: models.clone(),
         method: Some(*method),
         agents: agents.clone(),
-        vehicles: vehicles.iter().map(own).collect(),
+        vehicles: vehicles.collect(),
         attack: None,
         ego: ego.clone(),
         link: Some(link.map_err(|error| RunError::Fleet(error.into()))?),

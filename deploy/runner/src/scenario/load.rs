@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use agent::config::AgentSettings;
 use bus::config_file;
-use localization::pose_source::PoseSourceConfig;
 use support::file_error::{AtFile, FileError};
 
 use super::{FieldOverride, Scenario};
@@ -48,7 +47,6 @@ impl Scenario {
         }
         let file = std::path::absolute(path).at(path)?;
         let folder = file.parent().unwrap_or(Path::new("/"));
-        let absolute = |place: &Path| without_dots(&folder.join(place));
         let Scenario {
             scene,
             models,
@@ -65,28 +63,34 @@ impl Scenario {
             .chain(keys)
             .filter(|place| !place.as_os_str().is_empty())
         {
-            *place = absolute(place);
+            *place = without_dots(&folder.join(&place));
         }
-        let with_files = |pose: PoseSourceConfig| {
-            let found = pose.map_files(absolute).with_networks();
-            found.map_err(|error| FileError::new(path, format_args!("agents.pose: {error}")))
-        };
-        let with_files = |settings: AgentSettings| {
-            Ok(AgentSettings {
-                pose: with_files(settings.pose)?,
-                weights: settings.weights.map(|weights| absolute(&weights)),
-                ..settings
-            })
-        };
-        *agents = with_files(std::mem::take(agents))?;
-        { vehicles.values_mut() }.try_for_each(|own| own.change(with_files))?;
+        *agents = with_files(std::mem::take(agents), path, folder)?;
+        for own in vehicles.values_mut() {
+            own.change(|settings| with_files(settings, path, folder))?;
+        }
         if let Some(link) = link.as_mut().filter(|link| !link.is_preset()) {
-            link.model = absolute(Path::new(&link.model))
-                .to_string_lossy()
-                .into_owned();
+            let model = without_dots(&folder.join(&link.model));
+            link.model = model.to_string_lossy().into_owned();
         }
         Ok(scenario)
     }
+}
+
+/// Settings with their files found in `folder`, and the networks; errors name `path`.
+fn with_files(
+    settings: AgentSettings,
+    path: &Path,
+    folder: &Path,
+) -> Result<AgentSettings, FileError> {
+    let pose = { settings.pose }.map_files(|file| without_dots(&folder.join(file)));
+    let pose = { pose.with_networks() }
+        .map_err(|error| FileError::new(path, format_args!("agents.pose: {error}")))?;
+    Ok(AgentSettings {
+        pose,
+        weights: { settings.weights }.map(|weights| without_dots(&folder.join(weights))),
+        ..settings
+    })
 }
 
 /// The scenario of a file with other values for some fields.
@@ -123,7 +127,7 @@ mod tests {
     use fusion::Method;
     use protocol::{CavId, Dtype};
 
-    use localization::pose_source::{NoiseMode, NoisyPoseConfig};
+    use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseSourceConfig};
 
     use super::*;
 

@@ -198,8 +198,8 @@ impl Supervisor {
     /// Ends the processes that `which` selects by name: SIGTERM, then SIGKILL at `deadline`. Returns when they have
     /// ended, with the names of those that were killed.
     pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> Vec<String> {
-        let is_chosen = |watched: &mut Watched| which(&watched.name);
-        let chosen: Vec<Watched> = self.watched.extract_if(.., is_chosen).collect();
+        let chosen = self.watched.extract_if(.., |watched| which(&watched.name));
+        let chosen: Vec<Watched> = chosen.collect();
         // All are asked before any is waited for, so that they end at the same time.
         for watched in &chosen {
             watched.stop.send_replace(Some(deadline));

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{Account, CavId, Counts, Ledger, ProcessId, Role, Stream, Topic};
+use protocol::{CavId, Ledger, Role, Stream, Topic};
 use serde::{Deserialize, Serialize};
 
 /// Use of the data that neighbours shared.
@@ -28,26 +28,22 @@ impl Contribution {
         ledger: &Ledger,
         sent_bytes: Option<u64>,
     ) -> Self {
-        let is_shared = |(account, _): &(&Account, &Counts)| shares(&account.topic, ego);
-        let shared = || ledger.iter().filter(is_shared);
-        // Counted at the sender: what comes out of a link is the same message on another topic.
-        let is_sent = |account: &Account| matches!(account.topic, Topic::Stream { .. });
-        let of_senders = shared().filter(|(account, _)| is_sent(account));
-        // Beside a map boxes are a second message of the same frame.
+        let ego_process = format!("{}-", Role::Ego);
         let mut sent_frames = BTreeMap::<&CavId, u64>::new();
-        let mut sent = 0;
-        for (account, counts) in of_senders {
-            sent += counts.sent;
+        let (mut sent, mut used) = (0, 0);
+        for (account, counts) in { ledger.iter() }.filter(|(of, _)| shares(&of.topic, ego)) {
+            // Counted at the sender: what comes out of a link is the same message on another topic.
             if let Topic::Stream { cav, .. } = &account.topic {
+                sent += counts.sent;
+                // Beside a map boxes are a second message of the same frame.
                 let frames = sent_frames.entry(cav).or_default();
                 *frames = counts.sent.max(*frames);
             }
+            if { account.to.as_ref() }.is_some_and(|to| to.as_str().starts_with(&ego_process)) {
+                used += counts.received;
+            }
         }
         let sent_frames: u64 = sent_frames.values().sum();
-        let ego_process = format!("{}-", Role::Ego);
-        let is_ego = |to: &ProcessId| to.as_str().starts_with(&ego_process);
-        let of_egos = shared().filter(|(account, _)| account.to.as_ref().is_some_and(is_ego));
-        let used = of_egos.map(|(_, counts)| counts.received).sum();
         Self {
             fused_per_frame: (frames > 0).then(|| fused as f64 / frames as f64),
             sent,
@@ -70,7 +66,7 @@ fn shares(topic: &Topic, ego: &CavId) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{DropReason, ProcessId};
+    use protocol::{Account, DropReason, ProcessId};
 
     use super::*;
 

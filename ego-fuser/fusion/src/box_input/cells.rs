@@ -73,15 +73,15 @@ fn values(placed: &PlacedBox, support: f64, anchors: &Anchors) -> [f32; VALUES] 
 
 /// The box relative to an anchor, within the limits of what boxes of vehicles need.
 fn code(box3d: &Box3d, anchor: &Box3d) -> [f32; BOX_CODE] {
-    let [x, y, z, height, width, length, yaw] = encode(box3d, anchor);
-    let log = |ratio: f64| ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO);
+    let [x, y, z, logs @ .., yaw] = encode(box3d, anchor);
+    let [height, width, length] = logs.map(|log| log.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO));
     [
         x,
         y,
         z.clamp(-2.0, 2.0),
-        log(height),
-        log(width),
-        log(length),
+        height,
+        width,
+        length,
         within_quarter_turn(yaw),
     ]
     .map(|value| value as f32)
@@ -96,17 +96,17 @@ fn covered(box3d: &Box3d, grid: &BevGrid) -> Vec<(usize, f64)> {
     let corners = seen.corners();
     let size = [i64::from(grid.width), i64::from(grid.height)];
     let low_m = [grid.x_min_m, grid.y_min_m];
-    let range = |axis: usize| {
+    let [columns, rows] = [0, 1].map(|axis: usize| {
         // The first four corners are the bottom face.
         let along = corners[..4].iter().map(|corner| corner[axis]);
         let (low, high) = along.fold((f64::MAX, f64::MIN), |(low, high), at| {
             (low.min(at), high.max(at))
         });
         // Casts saturate, and the range is half-open: a box beyond the grid, or one of NaN, covers no cells.
-        let cell = |at: f64| ((at - low_m[axis]) / grid.cell_m).floor() as i64;
-        cell(low).max(0)..cell(high).saturating_add(1).min(size[axis])
-    };
-    let (columns, rows) = (range(0), range(1));
+        let [first, last] =
+            [low, high].map(|at: f64| ((at - low_m[axis]) / grid.cell_m).floor() as i64);
+        first.max(0)..last.saturating_add(1).min(size[axis])
+    });
     let footprint = Polygon::footprint(&corners);
     let mut found = Vec::new();
     for row in rows {

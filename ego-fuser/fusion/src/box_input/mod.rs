@@ -69,9 +69,6 @@ impl BoxInput {
         let path = path / "box_input";
         let anchors = Anchors::for_detector(detector);
         let (channels, count) = (detector.feature_channels(), anchors.yaws_rad.len() as i64);
-        let layer = |name: &str, from: i64, to: i64| {
-            nn::linear(&path / name, from, to, nn::LinearConfig::default())
-        };
         // Map, own scores and boxes, the box, its difference, covered share, and features of the region of interest.
         let of_cell = channels + count * (1 + 3 * BOX_CODE as i64) + 1 + CHANNELS;
         let out = nn::LinearConfig {
@@ -80,10 +77,9 @@ impl BoxInput {
         };
         Self {
             roi: RoiEncoder::new(&path, detector, VALUES),
-            cell: [
-                layer("cell", of_cell, HIDDEN),
-                layer("second", HIDDEN, HIDDEN),
-            ],
+            cell: [("cell", of_cell), ("second", HIDDEN)].map(|(name, from)| {
+                nn::linear(&path / name, from, HIDDEN, nn::LinearConfig::default())
+            }),
             out: nn::linear(&path / "out", HIDDEN, count * CHANGES + 1, out),
             grid: detector.feature_grid(),
             anchors,
@@ -161,11 +157,11 @@ impl Pairs {
         let cell_of = cell_of?;
         let anchors = head.scores.size4()?.1;
         let code = tensor(&found.code, &[-1, anchors, BOX_CODE as i64], device)?;
-        let of_cells = |map: &Tensor| {
+        let [scores, offsets] = [&head.scores, &head.offsets].map(|map| {
             let flat = map.f_detach()?.f_squeeze_dim(0)?.f_flatten(1, 2)?;
             flat.f_index_select(1, &cell_of)?.f_transpose(0, 1)
-        };
-        let (scores, offsets) = (of_cells(&head.scores)?, of_cells(&head.offsets)?);
+        });
+        let (scores, offsets) = (scores?, offsets?);
         let difference = code.f_sub(&offsets.f_reshape(code.size())?)?;
         let turn = difference.f_narrow(2, YAW, 1)?;
         // A heading and its opposite are the same box.
@@ -187,38 +183,40 @@ impl Pairs {
         let (_, anchors, height, width) = head.scores.size4()?;
         // The last column is the logarithm of the weight of the whole box, those before it are by anchor.
         let last = anchors * CHANGES;
-        let limit = MAX_LOG_WEIGHT;
         let weight = changes
             .f_narrow(1, last, 1)?
-            .f_clamp(-limit, limit)?
+            .f_clamp(-MAX_LOG_WEIGHT, MAX_LOG_WEIGHT)?
             .f_exp()?;
         let changes = changes
             .f_narrow(1, 0, last)?
             .f_view([-1, anchors, CHANGES])?;
-        let within = |first: i64, count: i64, [least, most]: [f64; 2]| {
+        let [score, gate, own_box] = [
+            (0, 1, [-MAX_LOGIT_CHANGE, MAX_LOGIT_CHANGE]),
+            (1, 1, GATE_RANGE),
+            (2, BOX_CODE as i64, [-MAX_OFFSET_CHANGE, MAX_OFFSET_CHANGE]),
+        ]
+        .map(|(first, count, [least, most])| {
             changes.f_narrow(2, first, count)?.f_clamp(least, most)
-        };
-        let score = within(0, 1, [-MAX_LOGIT_CHANGE, MAX_LOGIT_CHANGE])?;
-        let own_box = within(2, BOX_CODE as i64, [-MAX_OFFSET_CHANGE, MAX_OFFSET_CHANGE])?;
-        let gated = within(1, 1, GATE_RANGE)?.f_mul(&self.difference)?;
-        let change = Tensor::f_cat(&[score, own_box.f_add(&gated)?], 2)?;
+        });
+        let gated = gate?.f_mul(&self.difference)?;
+        let change = Tensor::f_cat(&[score?, own_box?.f_add(&gated)?], 2)?;
         let numbers = anchors * (1 + BOX_CODE as i64);
         let change = change.f_view([-1, numbers])?.f_mul(&weight)?;
         let options = (change.kind(), change.device());
-        let sum = |count: i64, values: &Tensor| {
+        let [change, weight] = [(numbers, &change), (1, &weight)].map(|(count, values)| {
             Tensor::f_zeros([height * width, count], options)?.f_index_add(0, &self.cell_of, values)
-        };
+        });
         // The head itself has change 0 and weight 1, so the denominator is at least 1 at every cell.
-        let mean = sum(numbers, &change)? / (sum(1, &weight)? + 1.0);
+        let mean = change? / (weight? + 1.0);
         let mean = mean
             .f_view([height, width, anchors, 1 + BOX_CODE as i64])?
             .f_permute([2, 3, 0, 1])?;
-        let to = |map: &Tensor, first: i64, count: i64| {
-            map.f_add(&mean.f_narrow(1, first, count)?.f_reshape(map.size())?)
-        };
+        let HeadOutput { scores, offsets } = head;
+        let score_change = mean.f_narrow(1, 0, 1)?.f_reshape(scores.size())?;
+        let offset_change = mean.f_narrow(1, 1, BOX_CODE as i64)?;
         Ok(HeadOutput {
-            scores: to(&head.scores, 0, 1)?,
-            offsets: to(&head.offsets, 1, BOX_CODE as i64)?,
+            scores: scores.f_add(&score_change)?,
+            offsets: offsets.f_add(&offset_change.f_reshape(offsets.size())?)?,
         })
     }
 }

@@ -35,14 +35,14 @@ pub fn placed<'a>(
     pose_confidence: f64,
 ) -> Vec<PlacedBox> {
     let ego_from_cav = ego_from_cav.isometry();
-    let place = |detection: &Detection| PlacedBox {
+    let boxes = detections.map(|detection| PlacedBox {
         box3d: detection.box3d.transformed(&ego_from_cav),
         sender,
         age_secs,
         score: f64::from(detection.score),
         pose_confidence,
-    };
-    let mut boxes: Vec<PlacedBox> = detections.map(place).collect();
+    });
+    let mut boxes: Vec<PlacedBox> = boxes.collect();
     boxes.sort_by(|a, b| b.score.total_cmp(&a.score));
     boxes
 }
@@ -52,7 +52,7 @@ pub(super) fn support(boxes: &[PlacedBox]) -> Vec<f64> {
     let footprints: Vec<Polygon> = { boxes.iter() }
         .map(|placed| Polygon::footprint(&placed.box3d.corners()))
         .collect();
-    let of = |(own, footprint): (&PlacedBox, &Polygon)| {
+    let by_box = boxes.iter().zip(&footprints).map(|(own, footprint)| {
         let mut by_sender = BTreeMap::new();
         for (other, overlapping) in boxes.iter().zip(&footprints) {
             if other.sender != own.sender {
@@ -62,9 +62,9 @@ pub(super) fn support(boxes: &[PlacedBox]) -> Vec<f64> {
                 *best = best.max(iou * other.confidence());
             }
         }
-        by_sender.values().sum()
-    };
-    boxes.iter().zip(&footprints).map(of).collect()
+        by_sender.values().sum::<f64>()
+    });
+    by_box.collect()
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
+use crate::f64_tensor::sum_over_first;
 use crate::layers::Linear;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
@@ -75,25 +76,18 @@ impl Consensus {
         let rows = best.f_divide_scalar_mode(width, "floor")?;
         let columns = best.f_remainder(width)?;
         // Beyond the edge the nearest cell is used: a few cells of a window hardly matter.
-        let around = |at: &Tensor, axis: i64, length: i64| {
-            let offset = offsets.f_select(1, axis)?.f_unsqueeze(0)?;
-            at.f_unsqueeze(1)?.f_add(&offset)?.f_clamp(0, length - 1)
-        };
-        let places = around(&rows, 1, height)? * width + around(&columns, 0, width)?;
-        let keys = |cells: &Tensor| {
-            let key = self.key.forward(cells)?;
-            // Keys of unit length make the similarity a cosine. The constant keeps keys of zeros finite.
-            let norm = key
-                .f_square()?
-                .f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?
-                + 1e-6;
-            key.f_div(&norm.f_sqrt()?)
-        };
+        let [near_columns, near_rows] =
+            [(0, &columns, width), (1, &rows, height)].map(|(axis, at, length)| {
+                let offset = offsets.f_select(1, axis)?.f_unsqueeze(0)?;
+                at.f_unsqueeze(1)?.f_add(&offset)?.f_clamp(0, length - 1)
+            });
+        let places = near_rows? * width + near_columns?;
         let candidates = ego
             .f_reshape([-1, channels])?
             .f_index_select(0, &places.f_view([-1])?)?;
-        let candidates = keys(&candidates)?.f_view([count, -1, KEYS])?;
-        let asked = keys(&other.f_reshape([-1, channels])?.f_index_select(0, &best)?)?;
+        let candidates = self.keys(&candidates)?.f_view([count, -1, KEYS])?;
+        let asked = other.f_reshape([-1, channels])?.f_index_select(0, &best)?;
+        let asked = self.keys(&asked)?;
         let similarity = candidates.f_bmm(&asked.f_unsqueeze(2)?)?.f_squeeze_dim(2)?;
         let share = similarity
             .f_mul(&self.sharpness.f_exp()?)?
@@ -107,6 +101,17 @@ impl Consensus {
         // A cell with one clear match counts more than one that is similar everywhere.
         let certain = share.f_amax([1i64].as_slice(), false)?;
         Ok(Some(self.fit(&from, &moved, &(weight * certain))?))
+    }
+
+    /// Keys of cells, of unit length, which makes the similarity a cosine.
+    fn keys(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+        let key = self.key.forward(cells)?;
+        // The constant keeps keys of zeros finite.
+        let norm = key
+            .f_square()?
+            .f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?
+            + 1e-6;
+        key.f_div(&norm.f_sqrt()?)
     }
 
     /// `[(2 * reach + 1)^2, 2]` columns and rows around a cell.
@@ -126,9 +131,8 @@ impl Consensus {
         let weight = weight
             .f_div(&(weight.f_sum(Kind::Float)? + TOO_LITTLE))?
             .f_unsqueeze(1)?;
-        let mean =
-            |x: &Tensor| (x * &weight).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>);
-        let (centre, step) = (mean(from)?, mean(moved)?);
+        let [centre, step] = [from, moved].map(|x| sum_over_first(&(x * &weight)));
+        let (centre, step) = (centre?, step?);
         let (one, other) = (from - &centre, from + moved - &centre - &step);
         // Step: planar least squares in closed form, by the sums of cross products and of dot products.
         let [x, y] = [one.f_select(1, 0)?, one.f_select(1, 1)?];

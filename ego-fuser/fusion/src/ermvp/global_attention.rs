@@ -106,8 +106,9 @@ impl GlobalHalf {
         let query = self.queries(&x, slots)?;
         let groups = Partition::Window.cut(&x, self.window)?;
         let windows = groups.size()[0];
-        let heads = |x: &Tensor| x.f_unflatten(-1, [self.heads, channels / self.heads]);
-        let query = heads(&query)?.f_expand([windows, -1, -1, -1], false)?;
+        let by_head = [self.heads, channels / self.heads];
+        let query = query.f_unflatten(-1, by_head)?;
+        let query = query.f_expand([windows, -1, -1, -1], false)?;
         let key_value = self
             .key_value
             .forward(&groups)?
@@ -120,8 +121,8 @@ impl GlobalHalf {
         };
         let seen = attend(
             &query,
-            &heads(&key_value[0])?,
-            &heads(&key_value[1])?,
+            &key_value[0].f_unflatten(-1, by_head)?,
+            &key_value[1].f_unflatten(-1, by_head)?,
             Some(&bias),
         )?;
         let seen = dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(&groups)?;

@@ -422,45 +422,45 @@ fn full_resolution(
 ) -> tch::Result<Vec<FullResolutionMap>> {
     (0..maps.size4()?.0)
         .map(|map| {
-            let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
-            FullResolutionMap::of(&of(maps)?, sent.as_ref().map(of).transpose()?.as_ref())
+            let sent = sent.as_ref().map(|sent| sent.f_narrow(0, map, 1));
+            FullResolutionMap::of(&maps.f_narrow(0, map, 1)?, sent.transpose()?.as_ref())
         })
         .collect()
 }
 
 /// Number of leading entries that are the newest of their agents.
 fn newest(facts: &[MapMetadata]) -> usize {
-    let is_first = |(entry, of): &(usize, &MapMetadata)| {
-        facts[..*entry]
-            .iter()
-            .all(|before| before.agent != of.agent)
-    };
-    facts.iter().enumerate().take_while(is_first).count()
+    let newest = facts
+        .iter()
+        .enumerate()
+        .take_while(|(entry, of)| facts[..*entry].iter().all(|other| other.agent != of.agent));
+    newest.count()
 }
 
 /// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents. The
 /// ego's own entry of the same time step gives that frame; without one the ego counts as stationary.
 fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
-    // Index of the time step: how many newer maps of the same agent are listed before it.
-    let step = |entry: usize| {
-        facts[..entry]
-            .iter()
-            .filter(|before| before.agent == facts[entry].agent)
-            .count()
-    };
-    let ego_of = |wanted: usize| {
-        (0..facts.len()).find(|&entry| facts[entry].agent == 0 && step(entry) == wanted)
-    };
     (newest..facts.len())
         .map(|entry| {
             if facts[entry].agent == 0 {
                 return Pose::IDENTITY;
             }
-            let ego = ego_of(step(entry)).map_or(Pose::IDENTITY, |ego| facts[ego].ego_from_cav);
+            let step = step_of(entry, facts);
+            let ego = (0..facts.len())
+                .find(|&ego| facts[ego].agent == 0 && step_of(ego, facts) == step)
+                .map_or(Pose::IDENTITY, |ego| facts[ego].ego_from_cav);
             // then_from_cav = now_from_then^-1 now_from_cav: the current frame is the common world.
             ego.from_world(&facts[entry].ego_from_cav)
         })
         .collect()
+}
+
+/// Index of the time step of an entry: how many newer maps of the same agent are listed before it.
+fn step_of(entry: usize, facts: &[MapMetadata]) -> usize {
+    let before = facts[..entry].iter();
+    before
+        .filter(|before| before.agent == facts[entry].agent)
+        .count()
 }
 
 /// Names the method of the weights beside an error, if it is another one.

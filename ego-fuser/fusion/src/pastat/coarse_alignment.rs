@@ -168,15 +168,13 @@ impl Origins {
 
 /// Index of every entry among those of its agent, 0 for the newest; of two of one age the first is the newer.
 pub(super) fn steps_back(agent: &[usize], age_secs: &[f64]) -> Vec<usize> {
-    let is_newer =
-        |a: usize, b: usize| age_secs[a] < age_secs[b] || (age_secs[a] == age_secs[b] && a < b);
-    (0..agent.len())
-        .map(|entry| {
-            (0..agent.len())
-                .filter(|&other| agent[other] == agent[entry] && is_newer(other, entry))
-                .count()
-        })
-        .collect()
+    let steps = (0..agent.len()).map(|entry| {
+        (0..agent.len())
+            .filter(|&other| agent[other] == agent[entry])
+            .filter(|&other| (age_secs[other], other) < (age_secs[entry], entry))
+            .count()
+    });
+    steps.collect()
 }
 
 /// Some entries, as floats.
@@ -184,18 +182,17 @@ fn rows_of(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<WarpedMa
     let index = Tensor::f_from_slice(entries)?.f_to_device(features.device())?;
     // Selection copies. Entries are distinct, so as many as there are rows are all, in order.
     let is_all = entries.len() as i64 == features.size()[0];
-    let pick = |tensor: &Tensor| match is_all {
+    let [features, mask] = [features, mask].map(|tensor| match is_all {
         true => tensor.f_to_kind(Kind::Float),
         false => tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float),
-    };
-    Ok(WarpedMaps::new(pick(features)?, pick(mask)?))
+    });
+    Ok(WarpedMaps::new(features?, mask?))
 }
 
 /// With rows below and columns to the right that reach nothing, so that both counts are multiples of `cells`.
 fn padded(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
-    let padded = |maps: &Tensor| Padding::to_multiples_of(cells, maps);
     Ok(WarpedMaps {
-        features: padded(&maps.features)?,
-        mask: padded(&maps.mask)?,
+        features: Padding::to_multiples_of(cells, &maps.features)?,
+        mask: Padding::to_multiples_of(cells, &maps.mask)?,
     })
 }

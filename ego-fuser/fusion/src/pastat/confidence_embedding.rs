@@ -53,9 +53,9 @@ impl ConfidenceEmbedding {
     pub(super) fn embed(&self, origins: &Origins) -> Result<Confidences, TchError> {
         let confidence = &origins.confidence;
         let shares = shares(confidence, &origins.steps_back);
-        let of_entry = |(share, &own): (&f32, &f64)| [*share, own as f32, confidence[0] as f32];
-        let of_maps: Vec<f32> = shares.iter().zip(confidence).flat_map(of_entry).collect();
-        let of_maps = Tensor::f_from_slice(&of_maps)?
+        let of_maps = (shares.iter().zip(confidence))
+            .flat_map(|(share, &own)| [*share, own as f32, confidence[0] as f32]);
+        let of_maps = Tensor::f_from_slice(&of_maps.collect::<Vec<f32>>())?
             .f_view([-1, CONFIDENCES])?
             .f_to_device(self.device)?;
         Ok(match &self.weight {
@@ -85,19 +85,16 @@ pub(super) fn shares(confidence: &[f64], steps_back: &[usize]) -> Vec<f32> {
         *sum += sigma.max(0.0);
         *count += 1;
     }
-    let share = |(&sigma, step): (&f64, &usize)| {
+    let shares = confidence.iter().zip(steps_back).map(|(&sigma, step)| {
         let (sum, count) = sums[step];
-        if sum > 0.0 {
+        let share = if sum > 0.0 {
             sigma.max(0.0) / sum
         } else {
             1.0 / count as f64
-        }
-    };
-    confidence
-        .iter()
-        .zip(steps_back)
-        .map(|pair| share(pair) as f32)
-        .collect()
+        };
+        share as f32
+    });
+    shares.collect()
 }
 
 #[cfg(test)]

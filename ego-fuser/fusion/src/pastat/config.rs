@@ -177,12 +177,11 @@ impl PastatConfig {
     /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells fill every part of
     /// FSA.
     pub(crate) fn padding_cells(&self) -> i64 {
-        let larger = |fsa: &FsaConfig| {
-            fsa.alignment_search.map_or(self.earlier_cells, |search| {
-                lcm(search.cells, self.earlier_cells)
-            })
+        let parts = match self.fsa.as_ref().map(|fsa| fsa.alignment_search) {
+            Some(Some(search)) => PARTS * lcm(search.cells, self.earlier_cells),
+            Some(None) => PARTS * self.earlier_cells,
+            None => 1,
         };
-        let parts = self.fsa.as_ref().map_or(1, |fsa| PARTS * larger(fsa));
         lcm(
             self.patch * self.windows.iter().copied().fold(1, lcm),
             parts,

@@ -158,12 +158,12 @@ impl Search<'_> {
     }
 
     fn score(&self, motion: &Isometry3<f64>, matches: &[(usize, usize)]) -> f64 {
-        let fit = |&(object, index): &(usize, usize)| {
+        let fits = matches.iter().map(|&(object, index)| {
             1.0 - (self.apart(motion, object, index) / self.config.fit_tolerance_m).powi(2)
-        };
+        });
         // A weak prior: moving the boxes by the whole search range costs as much as one exact match.
         let off = self.off(motion, self.prior) / self.config.search_m;
-        matches.iter().map(fit).sum::<f64>() - off * off
+        fits.sum::<f64>() - off * off
     }
 
     /// Mean distance between the boxes under two motions.

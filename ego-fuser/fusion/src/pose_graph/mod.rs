@@ -87,15 +87,11 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
         .iter()
         .map(|agent| flattened(&agent.ego_from_agent))
         .collect();
-    let unmoved = || {
-        agents
-            .iter()
-            .map(|agent| Corrected {
-                ego_from_agent: agent.ego_from_agent,
-                shared: 0,
-            })
-            .collect()
-    };
+    let unmoved = agents.iter().map(|agent| Corrected {
+        ego_from_agent: agent.ego_from_agent,
+        shared: 0,
+    });
+    let mut corrected: Vec<Corrected> = unmoved.collect();
     let Some(own) = seen.first() else {
         return Vec::new();
     };
@@ -107,9 +103,8 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
         graph.join(agent, &found.motion, &seen[agent], &found.matches);
     }
     if graph.joined.len() < 2 {
-        return unmoved();
+        return corrected;
     }
-    let mut corrected: Vec<Corrected> = unmoved();
     for (agent, solved, shared) in graph.solve(&priors, config) {
         if moved_by(&seen[agent], &priors[agent], &solved) < config.dead_zone_m {
             continue;
@@ -124,12 +119,12 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
 
 /// Mean distance between the boxes before and after.
 fn moved_by(seen: &[ObservedBox], before: &Isometry3<f64>, after: &Isometry3<f64>) -> f64 {
-    let moved = |seen: &ObservedBox| {
+    let moved = seen.iter().map(|seen| {
         let [old, new] =
             [before, after].map(|pose| pose.rotation * seen.center + pose.translation.vector);
         (new - old).norm()
-    };
-    seen.iter().map(moved).sum::<f64>() / seen.len().max(1) as f64
+    });
+    moved.sum::<f64>() / seen.len().max(1) as f64
 }
 
 fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<ObservedBox> {
@@ -156,6 +151,15 @@ fn flattened(pose: &Pose) -> Isometry3<f64> {
 fn planar(node: &Node) -> Isometry3<f64> {
     let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), node.heading_rad);
     Isometry3::from_parts(Vector3::new(node.x_m, node.y_m, 0.0).into(), turn)
+}
+
+/// The inverse of [`planar`].
+fn node_of(motion: &Isometry3<f64>) -> Node {
+    Node {
+        x_m: motion.translation.x,
+        y_m: motion.translation.y,
+        heading_rad: motion.rotation.euler_angles().2,
+    }
 }
 
 /// The graph while agents join it.
@@ -251,18 +255,13 @@ impl Assembly {
             .into_iter()
             .filter(|observation| viewers[observation.object] > 1)
             .collect();
-        let node = |motion: &Isometry3<f64>| Node {
-            x_m: motion.translation.x,
-            y_m: motion.translation.y,
-            heading_rad: motion.rotation.euler_angles().2,
-        };
         let (std_m, std_rad) = (config.pose_std_m, config.pose_std_deg.to_radians());
         let mut graph = Graph {
-            agents: self.joined.iter().map(|(_, motion)| node(motion)).collect(),
-            priors: self
-                .joined
-                .iter()
-                .map(|(agent, _)| node(&priors[*agent]))
+            agents: { self.joined.iter() }
+                .map(|(_, motion)| node_of(motion))
+                .collect(),
+            priors: { self.joined.iter() }
+                .map(|(agent, _)| node_of(&priors[*agent]))
                 .collect(),
             prior_information: [std_m.powi(-2), std_m.powi(-2), std_rad.powi(-2)],
             objects: self.objects,

@@ -50,11 +50,11 @@ impl TrajectoryAttention {
         let per_head = dim / self.heads;
         // The points of all tokens are stacked along the rows: [K h, w].
         let count = points.size()[1] / height;
-        let split = |first: i64| {
+        let [keys, values] = [0, dim].map(|first| {
             let part = read.f_narrow(1, first, dim)?;
             part.f_reshape([agents, self.heads, per_head, count, height, width])
-        };
-        let (keys, values) = (split(0)?, split(dim)?);
+        });
+        let (keys, values) = (keys?, values?);
         let query = query.f_reshape([agents, self.heads, per_head, 1, height, width])?;
         let scores = (query * keys).f_sum_dim_intlist([2i64].as_slice(), true, None)?
             / (per_head as f64).sqrt();

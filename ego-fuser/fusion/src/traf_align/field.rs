@@ -28,24 +28,15 @@ impl Trajectories {
     pub(super) fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Self {
         let [full, half] = WIDTHS;
         let points = config.kernel * config.kernel;
-        let layer = |name: &str, io: [i64; 2], stride: i64| {
-            ConvLayer::normed(
-                &(path / name),
-                &(path / format!("{name}_norm")),
-                io,
-                3,
-                stride,
-            )
-        };
         let offsets = path / "offsets";
         Self {
-            inner: layer("inner", [config.dim, full], 1),
-            down: layer("down", [full, half], 2),
-            deep: layer("deep", [half, half], 1),
+            inner: layer(path, "inner", [config.dim, full], 1),
+            down: layer(path, "down", [full, half], 2),
+            deep: layer(path, "deep", [half, half], 1),
             up: ConvLayer::upsampling(&(path / "up"), &(path / "up_norm"), [half, full], 2),
-            joined: layer("joined", [2 * full, full], 1),
+            joined: layer(path, "joined", [2 * full, full], 1),
             field: ConvLayer::biased(&(path / "field"), [full, config.field], 1, 1),
-            before_offsets: layer("before_offsets", [config.field, 2 * points], 1),
+            before_offsets: layer(path, "before_offsets", [config.field, 2 * points], 1),
             offsets: (
                 offsets.var("weight", &[2 * points, 2 * points, 3, 3], Init::Const(0.0)),
                 offsets.var("bias", &[2 * points], Init::Const(0.0)),
@@ -82,31 +73,29 @@ impl Trajectories {
         let (points, options) = (channels / 2, (Kind::Float, offsets.device()));
         let middle = (self.kernel - 1) as f64 / 2.0;
         let square = Tensor::f_arange(self.kernel, options)? - middle;
-        let along = |size: i64, view: [i64; 4]| -> Result<Tensor, TchError> {
-            Tensor::f_arange(size, options)?.f_view(view)
-        };
         // Point k is in row k / kernel and column k % kernel of the square.
-        let of_points = |repeat_inner: bool| -> Result<Tensor, TchError> {
-            let [rows, columns] = if repeat_inner {
-                [self.kernel, 1]
-            } else {
-                [1, self.kernel]
-            };
-            let grid = square
-                .f_view([columns, rows])?
-                .f_expand([self.kernel, self.kernel], false)?;
-            grid.f_reshape([1, points, 1, 1])
-        };
-        let x =
-            offsets.f_narrow(1, 0, points)? + of_points(true)? + along(width, [1, 1, 1, width])?;
-        let y = offsets.f_narrow(1, points, points)?
-            + of_points(false)?
-            + along(height, [1, 1, height, 1])?;
-        // -1 and 1 are the edges of the outer tokens, so the centre of the first is half a token from -1.
-        let scaled = |place: Tensor, size: i64| (place + 0.5) * (2.0 / size as f64) - 1.0;
-        let sampling_grid = Tensor::f_stack(&[scaled(x, width), scaled(y, height)], -1)?;
+        let [x, y] = [
+            (0, [1, self.kernel], width, [1, 1, 1, width]),
+            (points, [self.kernel, 1], height, [1, 1, height, 1]),
+        ]
+        .map(|(first, across, size, along)| {
+            let of_points = square.f_view(across)?.f_expand([self.kernel; 2], false)?;
+            let tokens = Tensor::f_arange(size, options)?.f_view(along)?;
+            let place = offsets.f_narrow(1, first, points)?
+                + of_points.f_reshape([1, points, 1, 1])?
+                + tokens;
+            // -1 and 1 are the edges of the outer tokens, so the centre of the first is half a token from -1.
+            Ok::<_, TchError>((place + 0.5) * (2.0 / size as f64) - 1.0)
+        });
+        let sampling_grid = Tensor::f_stack(&[x?, y?], -1)?;
         sampling_grid.f_view([agents, points * height, width, 2])
     }
+}
+
+/// A normed layer with a kernel of 3 tokens.
+fn layer(path: &nn::Path<'_>, name: &str, io: [i64; 2], stride: i64) -> ConvLayer {
+    let norm = path / format!("{name}_norm");
+    ConvLayer::normed(&(path / name), &norm, io, 3, stride)
 }
 
 #[cfg(test)]

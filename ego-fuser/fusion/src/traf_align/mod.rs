@@ -150,8 +150,8 @@ impl TrafAlign {
     ) -> Result<Tensor, TchError> {
         let (_, _, height, width) = maps.size4()?;
         // The U-Net halves the resolution of the tokens once.
-        let padded = |maps: &Tensor| Padding::to_multiples_of(2 * self.config.patch, maps);
-        let (maps, mask) = (padded(maps)?, padded(mask)?);
+        let maps = Padding::to_multiples_of(2 * self.config.patch, maps)?;
+        let mask = Padding::to_multiples_of(2 * self.config.patch, mask)?;
         let mut tokens = self.over_time(&maps, &mask, agents, train)?;
         let points = self.trajectories.points(&tokens, train)?;
         for layer in &self.layers {
@@ -225,13 +225,9 @@ impl Fusion for TrafAlign {
         let entries = reaching(&warped.mask, true)?;
         let agents = Agents::new(&maps.metadata, &entries);
         let index = Tensor::f_from_slice(&entries)?.f_to_device(warped.features.device())?;
-        let pick = |tensor: &Tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float);
-        let fused = self.fuse_present(
-            &pick(&warped.features)?,
-            &pick(&warped.mask)?,
-            &agents,
-            maps.is_training,
-        )?;
+        let [features, mask] = [&warped.features, &warped.mask]
+            .map(|tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float));
+        let fused = self.fuse_present(&features?, &mask?, &agents, maps.is_training)?;
         Ok(fused.f_to_kind(warped.features.kind())?.into())
     }
 }

@@ -45,32 +45,19 @@ impl AgentAttention {
         dropout: f64,
     ) -> Self {
         let inner = heads * head_channels;
-        let into = |name: &str| {
+        let [query, key, value] = ["q_linears", "k_linears", "v_linears"].map(|name| {
             std::array::from_fn(|kind| Linear::new(&(path / name / kind), channels, inner, true))
-        };
-        let relation = |name: &str| {
-            let shape = [
-                (AGENT_TYPES * AGENT_TYPES) as i64,
-                heads,
-                head_channels,
-                head_channels,
-            ];
-            // Near the identity: typed attention starts as ordinary attention.
-            let relation = path.var(name, &shape, SMALL);
-            let identity = Tensor::eye(head_channels, (relation.kind(), relation.device()));
-            let _ = tch::no_grad(|| relation.shallow_clone().g_add_(&identity));
-            relation
-        };
+        });
         Self {
             heads,
-            query: into("q_linears"),
-            key: into("k_linears"),
-            value: into("v_linears"),
+            query,
+            key,
+            value,
             out: std::array::from_fn(|kind| {
                 Linear::residual(&(path / "a_linears" / kind), inner, channels, true)
             }),
-            relation_att: relation("relation_att"),
-            relation_msg: relation("relation_msg"),
+            relation_att: relation(path, "relation_att", heads, head_channels),
+            relation_msg: relation(path, "relation_msg", heads, head_channels),
             dropout,
         }
     }
@@ -198,26 +185,18 @@ impl AgentAttention {
             Tensor::f_stack(&each.collect::<Result<Vec<_>, TchError>>()?, 0)?
         };
         // Cells are the groups, agents the tokens.
-        let cut = |x: &Tensor| {
+        let parts = key_value.f_split(inner, 2)?;
+        let [query, key, value] = [&query, &parts[0], &parts[1]].map(|x| {
             x.f_unflatten(2, [self.heads, inner / self.heads])?
                 .f_transpose(0, 1)
-        };
-        let parts = key_value.f_split(inner, 2)?;
-        attend(&cut(&query)?, &cut(&parts[0])?, &cut(&parts[1])?, bias)
+        });
+        attend(&query?, &key?, &value?, bias)
     }
 
     fn asked(&self, kind: usize) -> Result<Asked, TchError> {
-        let bias = |linear: &Linear| {
-            linear
-                .bias
-                .as_ref()
-                .expect("all projections have a bias")
-                .shallow_clone()
-        };
-        let query = (
-            self.query[kind].weight.shallow_clone(),
-            bias(&self.query[kind]),
-        );
+        let Linear { weight, bias } = &self.query[kind];
+        let bias = bias.as_ref().expect("all projections have a bias");
+        let query = (weight.shallow_clone(), bias.shallow_clone());
         let mut key_value = Vec::with_capacity(AGENT_TYPES);
         for sender in 0..AGENT_TYPES {
             let relation = (kind * AGENT_TYPES + sender) as i64;
@@ -236,6 +215,15 @@ impl AgentAttention {
         let key_value = key_value.try_into().expect("one for each type");
         Ok(Asked { query, key_value })
     }
+}
+
+/// A matrix for each pair of types and each head. Near the identity: typed attention starts as ordinary attention.
+fn relation(path: &nn::Path<'_>, name: &str, heads: i64, channels: i64) -> Tensor {
+    let pairs = (AGENT_TYPES * AGENT_TYPES) as i64;
+    let relation = path.var(name, &[pairs, heads, channels, channels], SMALL);
+    let identity = Tensor::eye(channels, (relation.kind(), relation.device()));
+    let _ = tch::no_grad(|| relation.shallow_clone().g_add_(&identity));
+    relation
 }
 
 /// A projection with a matrix per head, `[M, D, D]`, multiplied into it from the left.

@@ -57,18 +57,13 @@ pub struct V2xVitConfig {
 impl V2xVitConfig {
     /// The published sizes, for feature maps of `channels` (256 there).
     pub fn full(channels: i64) -> Self {
-        let window = |edge, heads| WindowConfig {
-            edge,
-            heads,
-            head_channels: (channels / heads).max(1),
-        };
         Self {
             channels,
             depth: 3,
             blocks: 1,
             agent_heads: 8,
             agent_head_channels: (channels / 8).max(1),
-            windows: vec![window(4, 16), window(8, 8), window(16, 4)],
+            windows: windows(channels, [(4, 16), (8, 8), (16, 4)]),
             merge: Merge::SplitAttention,
             hidden: channels,
             temporal_encoding: true,
@@ -79,16 +74,11 @@ impl V2xVitConfig {
     /// For live traffic on two cores: two layers, heads as wide as the published ones, no dropout (drawing its mask
     /// costs as much as a layer norm and a projection).
     pub fn lean(channels: i64) -> Self {
-        let window = |edge, heads| WindowConfig {
-            edge,
-            heads,
-            head_channels: (channels / heads).max(1),
-        };
         Self {
             depth: 2,
             agent_heads: 2,
             agent_head_channels: (channels / 2).max(1),
-            windows: vec![window(4, 4), window(8, 2), window(16, 1)],
+            windows: windows(channels, [(4, 4), (8, 2), (16, 1)]),
             dropout: 0.0,
             ..Self::full(channels)
         }
@@ -131,6 +121,16 @@ impl V2xVitConfig {
         let rule = "must be a share below 1";
         Ok(require(is_share, "fusion.dropout", self.dropout, rule)?)
     }
+}
+
+/// Windows given by edge and heads; the heads of each share `channels`.
+fn windows(channels: i64, sizes: [(i64, i64); 3]) -> Vec<WindowConfig> {
+    let windows = sizes.map(|(edge, heads)| WindowConfig {
+        edge,
+        heads,
+        head_channels: (channels / heads).max(1),
+    });
+    windows.into()
 }
 
 #[cfg(test)]

@@ -54,13 +54,12 @@ impl TemporalEncoding {
         let lower: Vec<i64> = rows.iter().map(|row| row.floor() as i64).collect();
         let upper: Vec<i64> = rows.iter().map(|row| row.ceil() as i64).collect();
         let share: Vec<f32> = rows.iter().map(|row| row.fract() as f32).collect();
-        let row = |index: &[i64]| picked(&self.table, index);
+        let (lower, upper) = (picked(&self.table, &lower)?, picked(&self.table, &upper)?);
         let share = Tensor::f_from_slice(&share)?
             .f_view([-1, 1])?
             .f_to_device(self.table.device())?;
-        self.linear.forward(
-            &row(&lower)?.f_lerp_tensor(&row(&upper)?, &share.f_expand_as(&row(&lower)?)?)?,
-        )
+        let codes = lower.f_lerp_tensor(&upper, &share.f_expand_as(&lower)?)?;
+        self.linear.forward(&codes)
     }
 }
 

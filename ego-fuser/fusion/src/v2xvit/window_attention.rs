@@ -5,6 +5,7 @@ use tch::{Kind, TchError, Tensor};
 
 use super::config::{Merge, WindowConfig};
 use crate::block_order::BlockOrder;
+use crate::f64_tensor::sum_over_first;
 use crate::layers::{LayerNorm, Linear, SMALL, attend, dropout};
 
 /// Tokens that are computed at once outside training: intermediate results then stay in the cache.
@@ -29,13 +30,12 @@ impl WindowBranch {
         // The tokens of a window are in block order, not row by row.
         let places = order.places(edge);
         let span = 2 * edge - 1;
-        let offset = |[row, column]: [i64; 2], to: [i64; 2]| {
-            (to[0] - row + edge - 1) * span + to[1] - column + edge - 1
-        };
-        let offsets: Vec<i64> = places
-            .iter()
-            .flat_map(|&from| places.iter().map(move |&to| offset(from, to)))
-            .collect();
+        let mut offsets = Vec::with_capacity(places.len() * places.len());
+        for [row, column] in &places {
+            for to in &places {
+                offsets.push((to[0] - row + edge - 1) * span + to[1] - column + edge - 1);
+            }
+        }
         Self {
             tokens: edge * edge,
             heads: config.heads,
@@ -111,8 +111,9 @@ impl WindowAttention {
         order: &BlockOrder,
         dropout: f64,
     ) -> Self {
-        let branch =
-            |(index, config)| WindowBranch::new(&(path / "pwmsa" / index), channels, config, order);
+        let branches = windows.iter().enumerate().map(|(index, config)| {
+            WindowBranch::new(&(path / "pwmsa" / index), channels, config, order)
+        });
         let (gate, wide) = (path / "split_attn", windows.len() as i64 * channels);
         let gate = (merge == Merge::SplitAttention).then(|| Gate {
             fc1: Linear::new(&(&gate / "fc1"), channels, channels, false),
@@ -121,7 +122,7 @@ impl WindowAttention {
         });
         let largest = order.largest() * order.largest();
         Self {
-            branches: windows.iter().enumerate().map(branch).collect(),
+            branches: branches.collect(),
             gate,
             largest,
             dropout,
@@ -150,15 +151,13 @@ impl WindowAttention {
             .iter()
             .map(WindowBranch::bias)
             .collect::<Result<Vec<_>, _>>()?;
-        let attend = |x: &Tensor| -> Result<Vec<Tensor>, TchError> {
-            self.branches
-                .iter()
-                .zip(&biases)
-                .map(|(branch, bias)| branch.attend(x, bias))
-                .collect()
-        };
         let chunks = x.f_split(chunk.max(1), 0)?;
-        let seen: Vec<Vec<Tensor>> = chunks.iter().map(attend).collect::<Result<_, _>>()?;
+        let seen = chunks.iter().map(|x| {
+            let branches = self.branches.iter().zip(&biases);
+            let seen = branches.map(|(branch, bias)| branch.attend(x, bias));
+            seen.collect::<Result<Vec<Tensor>, TchError>>()
+        });
+        let seen: Vec<Vec<Tensor>> = seen.collect::<Result<_, _>>()?;
         let (weights, bias) = self.merged(&seen, tokens)?;
         let outputs: Vec<Tensor> = seen
             .iter()
@@ -178,26 +177,20 @@ impl WindowAttention {
     /// Both merges weight the branches' outputs channel by channel. Those outputs are linear in the attention outputs,
     /// so the weights go into the projection, and so does the mean over the map that the gate needs.
     fn merged(&self, seen: &[Vec<Tensor>], tokens: i64) -> Result<(Vec<Tensor>, Tensor), TchError> {
-        let bias = |branch: &WindowBranch| {
-            branch
-                .out
-                .bias
-                .as_ref()
-                .expect("the projection has a bias")
-                .shallow_clone()
-        };
-        let biases = Tensor::f_stack(&self.branches.iter().map(bias).collect::<Vec<_>>(), 0)?;
+        let biases = (self.branches.iter())
+            .map(|branch| branch.out.bias.as_ref().expect("the projection has a bias"));
+        let biases = Tensor::f_stack(&biases.collect::<Vec<_>>(), 0)?;
         let shares = match &self.gate {
             None => biases.f_ones_like()? / self.branches.len() as f64,
             Some(gate) => {
-                let mut parts = vec![total(&biases)?];
+                let mut parts = vec![sum_over_first(&biases)?];
                 for (index, branch) in self.branches.iter().enumerate() {
-                    let sums = seen.iter().map(|seen| total(&seen[index]));
+                    let sums = seen.iter().map(|seen| sum_over_first(&seen[index]));
                     let sums = Tensor::f_stack(&sums.collect::<Result<Vec<_>, _>>()?, 0)?;
-                    let sum = total(&sums)? / tokens as f64;
+                    let sum = sum_over_first(&sums)? / tokens as f64;
                     parts.push(branch.out.weight.f_mv(&sum)?);
                 }
-                let mean = total(&Tensor::f_stack(&parts, 0)?)?;
+                let mean = sum_over_first(&Tensor::f_stack(&parts, 0)?)?;
                 gate.shares(&mean)?
             }
         };
@@ -213,13 +206,8 @@ impl WindowAttention {
                     .f_mul(&shares.f_get(index as i64)?)
             })
             .collect::<Result<Vec<_>, _>>()?;
-        Ok((weights, total(&(&biases * &shares))?))
+        Ok((weights, sum_over_first(&(&biases * &shares))?))
     }
-}
-
-/// The sum over the first dimension.
-fn total(rows: &Tensor) -> Result<Tensor, TchError> {
-    rows.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)
 }
 
 /// The sum over the branches of `seen W`, and `bias`.

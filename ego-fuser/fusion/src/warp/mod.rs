@@ -69,10 +69,9 @@ impl WarpedMaps {
 
     /// The entries from `first` up to `end`.
     pub(crate) fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
-        let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
         Ok(Self {
-            features: of(&self.features)?,
-            mask: of(&self.mask)?,
+            features: self.features.f_narrow(0, first, end - first)?,
+            mask: self.mask.f_narrow(0, first, end - first)?,
         })
     }
 }
@@ -213,8 +212,8 @@ fn place_of(
     grid: &BevGrid,
 ) -> [f32; 2] {
     // Centre of a cell, -1 and 1 being the edges of the outer cells.
-    let middle = |cell: usize, count: u32| (2 * cell + 1) as f32 / count as f32 - 1.0;
-    let (x, y) = (middle(column, grid.width), middle(row, grid.height));
+    let [x, y] = [(column, grid.width), (row, grid.height)]
+        .map(|(cell, count)| (2 * cell + 1) as f32 / count as f32 - 1.0);
     [xx * x + xy * y + x0, yx * x + yy * y + y0]
 }
 
@@ -233,9 +232,9 @@ fn read(map: &Tensor, sent: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, 
     if !are_numbers(map) {
         return read_by_tensors(map, sent, sampling_grid);
     }
-    let first = |tensor: &Tensor| tensor.f_squeeze_dim(0);
-    let (map, mask) =
-        Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(sampling_grid)?)?;
+    let cells = Cells::of(&map.f_squeeze_dim(0)?)?;
+    let sent = sent.f_squeeze_dim(0)?.f_squeeze_dim(0)?;
+    let (map, mask) = cells.read(&sent, &sampling_grid.f_squeeze_dim(0)?)?;
     Ok((as_batch(&map)?, mask.f_unsqueeze(0)?))
 }
 

@@ -106,21 +106,20 @@ impl Cells {
 fn place([x, y]: [f32; 2], [height, width]: [usize; 2]) -> Place {
     let columns = Pair::around(along(x, width), width);
     let rows = Pair::around(along(y, height), height);
-    let cell = |row: usize, column: usize| row * width + column;
     let ([top, bottom], [left, right]) = (rows.places, columns.places);
     let ([up, down], [before, behind]) = (rows.weights, columns.weights);
     Place {
         cells: [
-            cell(top, left),
-            cell(top, right),
-            cell(bottom, left),
-            cell(bottom, right),
+            top * width + left,
+            top * width + right,
+            bottom * width + left,
+            bottom * width + right,
         ],
         weights: [up * before, up * behind, down * before, down * behind],
         nearest: rows
             .nearest
             .zip(columns.nearest)
-            .map(|(row, column)| cell(row, column)),
+            .map(|(row, column)| row * width + column),
     }
 }
 
@@ -221,8 +220,7 @@ impl Pair {
         let first = truncated.saturating_sub(i32::from(truncated as f32 > at));
         let (second, share) = (first.saturating_add(1), at - first as f32);
         let last = size as i32 - 1;
-        let on_map = |cell: i32| 0 <= cell && cell <= last;
-        let weight = |cell: i32, weight: f32| if on_map(cell) { weight } else { 0.0 };
+        let on_map = 0..=last;
         let nearest = if share > 0.5 || (share == 0.5 && first & 1 != 0) {
             second
         } else {
@@ -231,8 +229,9 @@ impl Pair {
         Self {
             // Beyond the edge the weight is zero, and the clamped index can still be read.
             places: [first, second].map(|cell| cell.clamp(0, last) as usize),
-            weights: [weight(first, 1.0 - share), weight(second, share)],
-            nearest: on_map(nearest).then_some(nearest as usize),
+            weights: [(first, 1.0 - share), (second, share)]
+                .map(|(cell, weight)| if on_map.contains(&cell) { weight } else { 0.0 }),
+            nearest: on_map.contains(&nearest).then_some(nearest as usize),
         }
     }
 }

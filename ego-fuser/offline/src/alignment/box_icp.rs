@@ -23,13 +23,12 @@ pub fn align(
     neighbour: &[Box3d],
     start: &Isometry3<f64>,
 ) -> Result<Isometry3<f64>, NoAlignment> {
-    let centres = |boxes: &[Box3d]| -> Vec<Vector3<f64>> {
+    let [ego, neighbour] = [ego, neighbour].map(|boxes| -> Vec<Vector3<f64>> {
         let centres = boxes.iter().map(|node| Vector3::from(node.center_m));
         centres
             .filter(|centre| centre.iter().all(|c| c.abs() < 1e6))
             .collect()
-    };
-    let (ego, neighbour) = (centres(ego), centres(neighbour));
+    });
     if ego.len() < MIN_BOXES || neighbour.len() < MIN_BOXES {
         return Err(NoAlignment::TooFewBoxes {
             ego: ego.len(),
@@ -42,11 +41,11 @@ pub fn align(
         // Lazy: the fit walks the pairs several times, always with the motion of this round.
         let pairs = neighbour.iter().filter_map(|centre| {
             let moved = motion.rotation * centre + motion.translation.vector;
-            let apart = |other: &&Vector3<f64>| (*other - moved).xy().norm_squared();
-            Some((
-                *centre,
-                *ego.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))?,
-            ))
+            let nearest = ego.iter().min_by(|a, b| {
+                let [a, b] = [a, b].map(|other| (*other - moved).xy().norm_squared());
+                a.total_cmp(&b)
+            });
+            Some((*centre, *nearest?))
         });
         let Some(next) = planar_fit::fit(&pairs) else {
             break;

@@ -79,15 +79,13 @@ impl AlignmentMethod for BoxIcp {
 }
 
 fn message(boxes: &[Box3d]) -> Message {
-    let detection = |box3d: &Box3d| Detection {
+    let detections = boxes.iter().map(|box3d| Detection {
         box3d: *box3d,
         // The order of the boxes is their confidence: scores are not read.
         score: 1.0,
         source: None,
-    };
-    let objects: Vec<_> = { boxes.iter() }
-        .map(|box3d| detection(box3d).into())
-        .collect();
+    });
+    let objects: Vec<_> = detections.map(Into::into).collect();
     Message::Boxes(Boxes::new(NO_POSE, &objects))
 }
 

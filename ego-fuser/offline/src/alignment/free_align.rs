@@ -156,9 +156,9 @@ pub fn align(
         });
     }
     // Some boxes may not be nodes: back to the indices of the given lists.
-    let given = |&(a, b): &(usize, usize)| (ego.given[a], neighbour.given[b]);
+    let given = { best.matches.iter() }.map(|&(a, b)| (ego.given[a], neighbour.given[b]));
     Ok(BoxAlignment {
-        matches: best.matches.iter().map(given).collect(),
+        matches: given.collect(),
         ..best.clone()
     })
 }

@@ -13,7 +13,7 @@ use dataset::{self, Dataset, LeftOut, Scenario};
 use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
 use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
 use ego_fuser_offline::evaluation::alignment::table::{Row, Tally, markdown};
-use ego_fuser_offline::evaluation::alignment::{self, BoxSource, PairOutcome};
+use ego_fuser_offline::evaluation::alignment::{self, BoxSource};
 use localization::pose_source::{PoseSource, PoseSourceConfig, RecordedPose};
 use localization::registration::icp::IcpConfig;
 use perception::detector::Detector;
@@ -230,8 +230,9 @@ impl Arguments {
             let ticks = (0..scenario.ticks.len())
                 .step_by(self.every as usize)
                 .take(self.frames.unwrap_or(usize::MAX));
-            let mut add = |outcome: PairOutcome| tallies[outcome.method].add(&outcome);
-            let lost = alignment::run(methods, boxes, scenario, ticks, &mut add)?;
+            let lost = alignment::run(methods, boxes, scenario, ticks, &mut |outcome| {
+                tallies[outcome.method].add(&outcome);
+            })?;
             left_out.merge(&lost);
             bar.inc(1);
         }

@@ -41,8 +41,8 @@ impl Arguments {
     /// Measures and prints a line per offset.
     pub(crate) fn run(self) -> Result<Outcome> {
         tch::set_num_threads(1);
-        let is_sensible = |value: &f64| (0.0..=100.0).contains(value);
-        if !self.shifts_m.iter().chain(&self.turns_deg).all(is_sensible) {
+        let mut values = self.shifts_m.iter().chain(&self.turns_deg);
+        if !values.all(|value| (0.0..=100.0).contains(value)) {
             return Err(BadInput::new("--shifts-m and --turns-deg are 0 to 100").into());
         }
         let shifts = self.shifts_m.iter().map(|&shift_m| Offset {

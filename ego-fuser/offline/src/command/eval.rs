@@ -228,10 +228,10 @@ fn evaluate(setup: &Setup, data: &[Data], json: bool) -> Result<(Value, LeftOut)
 }
 
 fn print_row(row: &Value) -> std::io::Result<()> {
-    let ap = |name: &str| {
-        THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)))
-    };
-    let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
+    let [global, frame] = ["ap_global", "ap_frame_order"].map(|name| {
+        let aps = THRESHOLDS.map(|iou| row[name][format!("{iou}")].as_f64().unwrap_or(0.0));
+        aps.map(|ap| format!("{ap:.4}")).join(" ")
+    });
     output::line(format_args!(
         "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
         row["method"].as_str().unwrap_or_default(),
@@ -262,21 +262,19 @@ impl Tally {
     }
 
     fn row(&self, method: &str) -> Value {
-        let by_iou = |ordering| {
+        let [global, frame_order] = [Ordering::Global, Ordering::Frame].map(|ordering| {
             let found = self.scorer.average_precisions(ordering);
-            THRESHOLDS
-                .iter()
-                .zip(found)
-                .map(|(iou, ap)| (iou.to_string(), json!(ap)))
-                .collect::<serde_json::Map<_, _>>()
-        };
+            let by_iou = THRESHOLDS.iter().zip(found);
+            let by_iou = by_iou.map(|(iou, ap)| (iou.to_string(), json!(ap)));
+            by_iou.collect::<serde_json::Map<_, _>>()
+        });
         let bytes =
             self.payload_bytes.iter().sum::<u64>() as f64 / self.payload_bytes.len().max(1) as f64;
         json!({
             "method": method,
             "frames": self.frames,
-            "ap_global": by_iou(Ordering::Global),
-            "ap_frame_order": by_iou(Ordering::Frame),
+            "ap_global": global,
+            "ap_frame_order": frame_order,
             "payload_bytes_mean": bytes,
         })
     }

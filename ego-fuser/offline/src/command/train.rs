@@ -284,7 +284,6 @@ impl Arguments {
 
     /// The poses by which maps are aligned.
     fn poses(&self) -> Result<SamplePoses> {
-        let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(BadInput::of);
         let is_noisy = self.noise_position_std_m != 0.0 || self.noise_heading_std_deg != 0.0;
         let noise = is_noisy.then(|| NoisyPoseConfig {
             mode: self.noise_mode,
@@ -292,7 +291,8 @@ impl Arguments {
             heading_std_deg: self.noise_heading_std_deg,
             ..NoisyPoseConfig::default()
         });
-        let tables = self.poses.iter().map(read).collect::<Result<_, _>>()?;
+        let tables = { self.poses.iter() }.map(|file| PoseTable::read(file).map(Arc::new));
+        let tables = { tables.collect::<Result<_, _>>() }.map_err(BadInput::of)?;
         let poses = SamplePoses {
             tables,
             noise,

@@ -115,10 +115,10 @@ fn moment(
     truth: &[Isometry3<f64>],
     on_outcome: &mut dyn FnMut(PairOutcome),
 ) -> Result<(), AlignError> {
-    let ego_from = |index: usize| truth[0].inv_mul(&truth[index]);
+    let ego_from: Vec<Isometry3<f64>> = truth.iter().map(|pose| truth[0].inv_mul(pose)).collect();
     // The ego is at distance 0, so it is always the first.
     let near: Vec<usize> = (0..frames.len())
-        .filter(|&index| ego_from(index).translation.vector.norm() <= Ego::COMM_RANGE_M)
+        .filter(|&index| ego_from[index].translation.vector.norm() <= Ego::COMM_RANGE_M)
         .collect();
     let boxes = near
         .iter()
@@ -150,7 +150,7 @@ fn moment(
                 method: number,
                 bytes: received.bytes,
                 time: own.time.max(received.time) + start.elapsed(),
-                result: found.map(|found| AlignmentError::between(&ego_from(index), &found)),
+                result: found.map(|found| AlignmentError::between(&ego_from[index], &found)),
             });
         }
     }
@@ -202,8 +202,10 @@ fn boxes(
                 .map(|object| ground_truth::upright_box(object, &lidar_from_world))
                 .collect();
             // Nearest first, as an estimate of the best detected ones.
-            let range = |found: &Box3d| found.center_m[0].hypot(found.center_m[1]);
-            found.sort_by(|a, b| range(a).total_cmp(&range(b)));
+            found.sort_by(|a, b| {
+                let [a, b] = [a, b].map(|found| found.center_m[0].hypot(found.center_m[1]));
+                a.total_cmp(&b)
+            });
             Ok(found)
         }
     }

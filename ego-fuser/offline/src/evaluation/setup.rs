@@ -142,8 +142,9 @@ impl AgentPool {
             Self::All => (all.collect(), Vec::new()),
             Self::First(count) => all.partition(|place| place < count),
             Self::Named(names) => {
-                let place = |name| scenario.agents.iter().position(|agent| agent == name);
-                (names.iter().filter_map(place).collect(), Vec::new())
+                let (names, agents) = (names.iter(), &scenario.agents);
+                let places = names.filter_map(|name| agents.iter().position(|it| it == name));
+                (places.collect(), Vec::new())
             }
         }
     }

@@ -256,9 +256,10 @@ impl<'a> Run<'a> {
             let index = self.places.iter().position(|it| it == place);
             if let Some(participant) = index.and_then(|index| self.participants.get_mut(index)) {
                 // A replaying attacker repeats the message of the vehicle before it.
-                let captured = || all.last().map(Sent::captured).unwrap_or_default();
-                let sent = participant.compute(frame, map.as_ref(), captured)?;
-                all.push(sent);
+                let sent = participant.compute(frame, map.as_ref(), || {
+                    all.last().map(Sent::captured).unwrap_or_default()
+                });
+                all.push(sent?);
             }
         }
         Ok(all)
@@ -487,9 +488,8 @@ fn exact_reception(cav: &CavId, arrived_nanos: u64) -> Reception {
 
 /// Distance between two vehicles, metres; 0 where the recording has no poses.
 fn distance_m(one: &Frame, other: &Frame) -> f64 {
-    let place = |frame: &Frame| frame.world_from_lidar.map(|pose| pose.translation_m);
-    match (place(one), place(other)) {
-        (Some(one), Some(other)) => (one[0] - other[0]).hypot(one[1] - other[1]),
+    match [one, other].map(|frame| frame.world_from_lidar.map(|pose| pose.translation_m)) {
+        [Some(one), Some(other)] => (one[0] - other[0]).hypot(one[1] - other[1]),
         _ => 0.0,
     }
 }

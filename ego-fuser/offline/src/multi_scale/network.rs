@@ -192,17 +192,11 @@ impl MultiScaleNetwork {
             false,
             Kind::Int64,
         )?)?;
-        let bytes = |selected: u64| {
-            if selected == cells {
-                cells * cell_bytes
-            } else {
-                cells.div_ceil(8) + selected * cell_bytes
-            }
-        };
-        Ok(selected
-            .into_iter()
-            .map(|selected| bytes(selected.unsigned_abs()))
-            .collect())
+        let bytes = { selected.into_iter() }.map(|selected| match selected.unsigned_abs() {
+            all if all == cells => cells * cell_bytes,
+            selected => cells.div_ceil(8) + selected * cell_bytes,
+        });
+        Ok(bytes.collect())
     }
 
     /// The masks with ones everywhere for agents that send all cells.

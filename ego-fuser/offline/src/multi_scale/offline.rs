@@ -65,15 +65,16 @@ impl OfflineDetector {
         let Some((ego, others)) = frames.split_first() else {
             return Ok((Vec::new(), Vec::new()));
         };
-        let placed = |frame: &Frame| {
-            let pose = ego.world_from_lidar?.from_world(&frame.world_from_lidar?);
-            let [x, y, _] = pose.translation_m;
-            (x.hypot(y) <= Ego::COMM_RANGE_M).then_some(pose)
-        };
         let mut poses = vec![Pose::IDENTITY];
         let mut sweeps = vec![self.pillars(&ego.points, &Pose::IDENTITY)];
         for frame in others {
-            if let Some(pose) = placed(frame) {
+            let world_from = ego.world_from_lidar.zip(frame.world_from_lidar);
+            let Some((world_from_ego, world_from_cav)) = world_from else {
+                continue;
+            };
+            let pose = world_from_ego.from_world(&world_from_cav);
+            let [x, y, _] = pose.translation_m;
+            if x.hypot(y) <= Ego::COMM_RANGE_M {
                 sweeps.push(self.pillars(&frame.points, &pose));
                 poses.push(pose);
             }

@@ -8,9 +8,7 @@ use perception::detector::Detector;
 use perception::weights::Weights;
 use protocol::codec::encode_features;
 use protocol::message::Bev;
-use protocol::{
-    BevFeatures, CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, WireError, wire,
-};
+use protocol::{BevFeatures, CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, wire};
 use tch::Device;
 
 use crate::Error;
@@ -104,10 +102,8 @@ impl SweepEncoder {
             publish_nanos: 0,
         };
         let pose = PoseEstimate::no_pose(NoPoseReason::NoSource, 0);
-        let encode = || -> Result<_, WireError> {
-            let features = encode_features(features, &codec, None)?;
-            Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())
-        };
-        Ok(encode().at(&self.path)?)
+        let features = encode_features(features, &codec, None).at(&self.path)?;
+        let message = wire::encode(&stamp, Bev { pose, features }).at(&self.path)?;
+        Ok(message.to_vec())
     }
 }

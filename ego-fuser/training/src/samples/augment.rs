@@ -32,12 +32,12 @@ impl Augmentation {
     pub fn views(&self, vehicles: usize, rng: &mut impl Rng) -> Vec<ViewAugment> {
         let mirrored = rng.random_bool(self.mirror);
         let scale = 1.0 + self.scale * (2.0 * rng.random::<f64>() - 1.0);
-        let view = |_| ViewAugment {
+        let views = (0..vehicles).map(|_| ViewAugment {
             mirrored,
             scale,
             turn_rad: self.turn_rad * (2.0 * rng.random::<f64>() - 1.0),
-        };
-        (0..vehicles).map(view).collect()
+        });
+        views.collect()
     }
 }
 

@@ -342,8 +342,8 @@ impl SampleBuilder {
     }
 
     fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose> {
-        let missing = || without_pose(&self.scenes.scenario(tick).name, frame);
-        frame.world_from_lidar.ok_or_else(missing)
+        let (pose, scenario) = (frame.world_from_lidar, self.scenes.scenario(tick));
+        pose.ok_or_else(|| without_pose(&scenario.name, frame))
     }
 
     /// Objects annotated by `annotators`, the ego first, in the changed ego frame; those that count are on the BEV grid.
@@ -380,12 +380,10 @@ impl SampleBuilder {
 
 /// Metadata of the views, and their pose errors; both after the changes of the scene.
 fn metadata(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Vec<Offset>) {
-    let relative = |ego: &Pose, cav: &Pose, change: &ViewAugment| {
-        changes[0].pose(&ego.from_world(cav), change)
-    };
-    let of_entry = |(entry, change): (&Entry, &ViewAugment)| {
-        let ego_from_cav = relative(&entries[0].world_from_cav, &entry.world_from_cav, change);
-        let real = relative(&entries[0].found, &entry.found, change);
+    let of_entries = entries.iter().zip(changes).map(|(entry, change)| {
+        let reported = entries[0].world_from_cav.from_world(&entry.world_from_cav);
+        let real = entries[0].found.from_world(&entry.found);
+        let [ego_from_cav, real] = [reported, real].map(|pose| changes[0].pose(&pose, change));
         let facts = MapMetadata {
             agent: entry.place,
             ego_from_cav,
@@ -393,6 +391,6 @@ fn metadata(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Ve
             age_secs: entry.age_secs,
         };
         (facts, Offset::between(&ego_from_cav, &real))
-    };
-    entries.iter().zip(changes).map(of_entry).unzip()
+    });
+    of_entries.unzip()
 }

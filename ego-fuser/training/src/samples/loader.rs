@@ -110,15 +110,14 @@ pub fn batches(
     let mut builder = builder.clone();
     let size = run.batch as u64;
     Prefetch::start(run.loader_threads, first, move |number| {
-        let sample = |index| {
+        let samples = (number * size..(number + 1) * size).map(|index| {
             let mut rng = ChaCha8Rng::seed_from_u64(order.seed);
             // Streams are independent sequences of one seed.
             // Stream 0 is that of the order of the first epoch.
             rng.set_stream(index + 1);
             builder.build(order.tick(index), &mut rng)
-        };
-        let samples: Result<Vec<Sample>, _> =
-            (number * size..(number + 1) * size).map(sample).collect();
+        });
+        let samples: Result<Vec<Sample>, _> = samples.collect();
         Batch::collate(samples?, &pillar_grid)
     })
 }

@@ -36,20 +36,15 @@ const UNTRACKED: f64 = 0.15;
 
 /// Augmentation of neighbours' boxes in training, for the model card.
 pub(crate) fn augmentation_summary() -> String {
-    let percent = |share: f64| (100.0 * share).round();
     let ([of_each, of_all], [plane_m, _, turn_deg]) = (SHIFTED, LARGEST_SHIFT);
+    let ((late, late_s), [tracked_mps, untracked_mps]) = (LATE, CARRIED_MPS);
+    let [boxes_only, lost, shifted, late, inventing] =
+        [BOXES_ONLY, LOST, of_each + of_all, late, INVENTING.0]
+            .map(|share| (100.0 * share).round());
     format!(
-        "{} % send boxes in place of their map: {} % of the boxes lost, poses up to {plane_m} m and {turn_deg} degrees off in \
-         {} % of the samples, boxes of {} % of the neighbours up to {} s late and displaced by up to {} to {} m/s, invented \
-         boxes of {} %",
-        percent(BOXES_ONLY),
-        percent(LOST),
-        percent(of_each + of_all),
-        percent(LATE.0),
-        LATE.1,
-        CARRIED_MPS[0],
-        CARRIED_MPS[1],
-        percent(INVENTING.0),
+        "{boxes_only} % send boxes in place of their map: {lost} % of the boxes lost, poses up to {plane_m} m and \
+         {turn_deg} degrees off in {shifted} % of the samples, boxes of {late} % of the neighbours up to {late_s} s late \
+         and displaced by up to {tracked_mps} to {untracked_mps} m/s, invented boxes of {inventing} %"
     )
 }
 
@@ -151,7 +146,6 @@ fn sample(
         boxes.append(&mut of_agent);
     }
     // The others, numbered without gaps.
-    let number = |agent: usize| sends_boxes[..agent].iter().filter(|boxes| !**boxes).count();
     let kept: Vec<usize> = (0..facts.len())
         .filter(|&index| !sends_boxes[facts[index].agent])
         .collect();
@@ -160,9 +154,12 @@ fn sample(
         0,
         &Tensor::f_from_slice(&indices)?.f_to_device(maps.device())?,
     )?;
-    let facts = kept.into_iter().map(|index| MapMetadata {
-        agent: number(facts[index].agent),
-        ..facts[index]
+    let facts = kept.into_iter().map(|index| {
+        let before = sends_boxes[..facts[index].agent].iter();
+        MapMetadata {
+            agent: before.filter(|boxes| !**boxes).count(),
+            ..facts[index]
+        }
     });
     Ok((maps, facts.collect(), boxes))
 }
@@ -191,7 +188,7 @@ fn invented(
 ) -> Vec<PlacedBox> {
     let [x0, y0, _, x1, y1, _] = model.config().lidar_range_m;
     let count = rng.random_range(1..=INVENTING.1);
-    let one = |_| PlacedBox {
+    let boxes = (0..count).map(|_| PlacedBox {
         box3d: Box3d {
             center_m: [
                 rng.random_range(x0..x1),
@@ -205,8 +202,8 @@ fn invented(
         age_secs,
         score: rng.random_range(0.2..1.0),
         pose_confidence: 1.0,
-    };
-    (0..count).map(one).collect()
+    });
+    boxes.collect()
 }
 
 /// Error of a sender's pose that is not in its metadata, and what is left of its confidence.

@@ -60,14 +60,12 @@ impl SamplePoses {
 
     /// Pose of a vehicle without the added error.
     pub(super) fn found(&self, scenario: &str, frame: &Frame) -> Result<PoseEstimate, Error> {
-        let missing = || without_pose(scenario, frame);
-        if self.tables.is_empty() {
-            let pose = frame.world_from_lidar.ok_or_else(missing)?;
-            return Ok(PoseEstimate::new(pose, 1.0));
-        }
-        let (cav, nanos) = (&frame.cav, frame.capture_nanos);
-        let found = (self.tables.iter()).find_map(|table| table.get(scenario, cav, nanos));
-        found.copied().ok_or_else(missing)
+        let (cav, nanos, real) = (&frame.cav, frame.capture_nanos, frame.world_from_lidar);
+        let found = match self.tables.as_slice() {
+            [] => real.map(|pose| PoseEstimate::new(pose, 1.0)),
+            tables => (tables.iter()).find_map(|table| table.get(scenario, cav, nanos).copied()),
+        };
+        found.ok_or_else(|| without_pose(scenario, frame))
     }
 }
 
@@ -79,10 +77,10 @@ pub struct Offset(pub [f64; 3]);
 impl Offset {
     /// The offset between a sender's reported and true pose, both in the ego frame.
     pub fn between(reported: &Pose, real: &Pose) -> Self {
-        let along = |axis: usize| real.translation_m[axis] - reported.translation_m[axis];
+        let [dx, dy] = [0, 1].map(|axis| real.translation_m[axis] - reported.translation_m[axis]);
         let turn_rad = real.yaw_rad() - reported.yaw_rad();
         // Sine and cosine wrap the difference into half a turn to either side.
-        Self([along(0), along(1), turn_rad.sin().atan2(turn_rad.cos())])
+        Self([dx, dy, turn_rad.sin().atan2(turn_rad.cos())])
     }
 }
 
@@ -135,10 +133,9 @@ impl DrawnError {
     ) -> PoseEstimate {
         let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
         // The ego is never lost; where there is a neighbour, the divisor is 1 or more.
-        let is_lost = |lost: &&Lost| agent > 0 && lost.draw % (agents - 1) == agent - 1;
-        let (Some(lost), Some((pose, confidence))) =
-            (self.lost.as_ref().filter(is_lost), known(&noisy))
-        else {
+        let lost = { self.lost.as_ref() }
+            .filter(|lost| agent > 0 && lost.draw % (agents - 1) == agent - 1);
+        let (Some(lost), Some((pose, confidence))) = (lost, known(&noisy)) else {
             return noisy;
         };
         let ([x, y, z], [shift_x, shift_y]) = (pose.translation_m, lost.shift_m);

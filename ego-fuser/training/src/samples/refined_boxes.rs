@@ -7,7 +7,7 @@ use perception::boxes::refinement::{NUMBERS, corrected, correction, is_within_li
 use perception::tensor_values::{tensor, values};
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Detection, Pose};
-use tch::{Kind, Reduction, Tensor};
+use tch::{Device, Kind, Reduction, Tensor};
 
 use crate::Error;
 
@@ -69,16 +69,12 @@ impl Targets {
         let objects: Vec<Box3d> = { truth.objects.iter() }
             .map(|object| object.box3d.transformed(&cav_from_ego))
             .collect();
-        let footprint = |box3d: &Box3d| Polygon::footprint(&box3d.corners());
-        let footprints: Vec<Polygon> = objects.iter().map(footprint).collect();
-        let best = |box3d: &Box3d| {
-            let own = footprint(box3d);
-            let overlaps = footprints.iter().map(|object| own.iou(object));
-            overlaps.enumerate().max_by(|(_, a), (_, b)| a.total_cmp(b))
-        };
+        let footprints = { objects.iter() }.map(|object| Polygon::footprint(&object.corners()));
+        let footprints: Vec<Polygon> = footprints.collect();
         let mut targets = Self::default();
         for (detection, refined) in found.iter().zip(refined) {
-            let object = best(&detection.box3d).filter(|(_, iou)| *iou >= LEAST_IOU);
+            let object = overlapped(&detection.box3d, &footprints);
+            let object = object.filter(|(_, iou)| *iou >= LEAST_IOU);
             let wanted = object.map(|(index, _)| correction(&detection.box3d, &objects[index]));
             // A correction beyond the limits cannot be applied: its detection counts as one of no object.
             let wanted = wanted.filter(is_within_limits);
@@ -91,7 +87,7 @@ impl Targets {
                 .push(f32::from(u8::from(wanted.is_some())));
             let [least, most] = SCORED_IOU;
             // The score is that of the box after its correction.
-            let iou = best(&refined.box3d).map_or(0.0, |(_, iou)| iou);
+            let iou = overlapped(&refined.box3d, &footprints).map_or(0.0, |(_, iou)| iou);
             targets
                 .score
                 .push(((iou - least) / (most - least)).clamp(0.0, 1.0) as f32);
@@ -110,23 +106,35 @@ impl Targets {
     /// Smooth L1 of the boxes of objects and cross entropy of the scores, both divided by the number of detections.
     fn loss(&self, corrections: &Tensor, found: &[Detection]) -> tch::Result<Tensor> {
         let device = corrections.device();
-        let column = |values: &[f32]| tensor(values, &[-1, 1], device);
         let wanted = tensor(&self.corrections, &[-1, OF_BOX], device)?;
         let off = corrections.f_narrow(1, 0, OF_BOX)?;
         let boxes = off.f_smooth_l1_loss(&wanted, Reduction::None, BETA)?;
-        let boxes = boxes.f_mul(&column(&self.is_object)?)?.f_sum(Kind::Float)?;
+        let is_object = column(&self.is_object, device)?;
+        let boxes = boxes.f_mul(&is_object)?.f_sum(Kind::Float)?;
         // Scores of exactly 0 or 1 have no finite logit.
         let before: Vec<f32> = { found.iter() }
             .map(|detection| detection.score.clamp(1e-4, 1.0 - 1e-4))
             .collect();
         // A score is corrected by a sum of logits, as in inference.
-        let logit = column(&before)?.f_logit(None)? + corrections.f_narrow(1, OF_BOX, 1)?;
+        let logit = column(&before, device)?.f_logit(None)? + corrections.f_narrow(1, OF_BOX, 1)?;
         let (none, each) = (None::<&Tensor>, Reduction::None);
-        let score = column(&self.score)?;
+        let score = column(&self.score, device)?;
         let scores = logit.f_binary_cross_entropy_with_logits(&score, none, none, each)?;
-        let scores = scores.f_mul(&column(&self.is_known)?)?.f_sum(Kind::Float)?;
+        let is_known = column(&self.is_known, device)?;
+        let scores = scores.f_mul(&is_known)?.f_sum(Kind::Float)?;
         Ok((boxes * BOX_WEIGHT + scores) / found.len().max(1) as f64)
     }
+}
+
+/// Index of the object with the largest IoU from above, and that IoU.
+fn overlapped(box3d: &Box3d, objects: &[Polygon]) -> Option<(usize, f64)> {
+    let own = Polygon::footprint(&box3d.corners());
+    let overlaps = objects.iter().map(|object| own.iou(object));
+    overlaps.enumerate().max_by(|(_, a), (_, b)| a.total_cmp(b))
+}
+
+fn column(values: &[f32], device: Device) -> tch::Result<Tensor> {
+    tensor(values, &[-1, 1], device)
 }
 
 #[cfg(test)]

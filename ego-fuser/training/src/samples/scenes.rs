@@ -143,11 +143,13 @@ impl SceneSet {
 
     /// Identification of the data, and their problems.
     pub fn data(&self) -> DataListing {
-        let sha256 = || dataset::content_sha256(&self.scenarios, None, &FileDigests::default());
+        let sha256 = self.sha256.get_or_init(|| {
+            dataset::content_sha256(&self.scenarios, None, &FileDigests::default())
+        });
         let mut problems = self.problems.clone();
         problems.extend(lock(&self.unreadable).iter().cloned());
         DataListing {
-            sha256: self.sha256.get_or_init(sha256).clone(),
+            sha256: sha256.clone(),
             problems,
             without_pose: 0,
         }

@@ -62,43 +62,38 @@ impl DetectorCurve {
 }
 
 fn charts(title: &str, csv: &str) -> Vec<Chart> {
-    let loss = |name: &str, column: &str| Series {
+    let losses = [
+        ("sum", "loss"),
+        ("classes", "score_loss"),
+        ("boxes", "box_loss"),
+    ];
+    let losses = losses.map(|(name, column)| Series {
         name: name.into(),
         points: smooth(&column_over_steps(csv, column)),
         mark: Mark::Line,
-    };
-    let accuracy = |name: &str, column: &str| Series {
+    });
+    let accuracies = [("0.3", "ap_30"), ("0.5", "ap_50"), ("0.7", "ap_70")];
+    let accuracies = accuracies.map(|(name, column)| Series {
         name: name.into(),
         points: column_over_steps(csv, column),
         mark: Mark::LineAndDots,
-    };
-    let losses = vec![
-        loss("sum", "loss"),
-        loss("classes", "score_loss"),
-        loss("boxes", "box_loss"),
-    ];
-    let accuracies = vec![
-        accuracy("0.3", "ap_30"),
-        accuracy("0.5", "ap_50"),
-        accuracy("0.7", "ap_70"),
-    ];
-    let highest = |least, points: &mut dyn Iterator<Item = &(f64, f64)>| {
-        points.map(|point| point.1).fold(least, f64::max)
-    };
-    let steps = highest(1.0, &mut column_over_steps(csv, "step").iter());
-    let most = highest(0.1, &mut losses.iter().flat_map(|series| &series.points));
-    let over_steps = |y: Axis, series| Chart {
+    });
+    let steps = column_over_steps(csv, "step");
+    let steps = steps.iter().map(|point| point.1).fold(1.0, f64::max);
+    let points = losses.iter().flat_map(|series| &series.points);
+    let most = points.map(|point| point.1).fold(0.1, f64::max);
+    let mut charts = vec![(Axis::linear("loss", [0.0, most]), losses)];
+    if accuracies.iter().any(|series| !series.points.is_empty()) {
+        let axis = Axis::linear("validation AP at IoU", [0.0, 1.0]);
+        charts.push((axis, accuracies));
+    }
+    let charts = charts.into_iter().map(|(y, series)| Chart {
         title: title.into(),
         x: Axis::linear("step", [0.0, steps]),
         y,
-        series,
-    };
-    let mut charts = vec![over_steps(Axis::linear("loss", [0.0, most]), losses)];
-    if accuracies.iter().any(|series| !series.points.is_empty()) {
-        let axis = Axis::linear("validation AP at IoU", [0.0, 1.0]);
-        charts.push(over_steps(axis, accuracies));
-    }
-    charts
+        series: series.into(),
+    });
+    charts.collect()
 }
 
 /// Step and value of all rows that have one in `column`.
@@ -107,10 +102,13 @@ fn column_over_steps(csv: &str, column: &str) -> Vec<(f64, f64)> {
         return Vec::new();
     };
     // A row that was truncated by the end of a process has no such column.
-    let number = |row: &StringRecord, place| row.get(place)?.parse::<f64>().ok();
     csv_file::records(csv)
         .filter_map(|(_, row)| Some((number(&row, 0)?, number(&row, place)?)))
         .collect()
+}
+
+fn number(row: &StringRecord, place: usize) -> Option<f64> {
+    row.get(place)?.parse().ok()
 }
 
 /// Means over so many neighbours that about [`SMOOTH_POINTS`] points are left.
@@ -118,13 +116,12 @@ fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let finite: Vec<_> = (points.iter().copied())
         .filter(|point| point.1.is_finite())
         .collect();
-    let mean = |few: &[(f64, f64)]| {
-        let sum = |[x, y]: [f64; 2], point: &(f64, f64)| [x + point.0, y + point.1];
-        let [x, y] = few.iter().fold([0.0; 2], sum);
-        (x / few.len() as f64, y / few.len() as f64)
-    };
     let size = finite.len().div_ceil(SMOOTH_POINTS).max(1);
-    finite.chunks(size).map(mean).collect()
+    let means = finite.chunks(size).map(|few| {
+        let [x, y] = { few.iter() }.fold([0.0; 2], |[x, y], point| [x + point.0, y + point.1]);
+        (x / few.len() as f64, y / few.len() as f64)
+    });
+    means.collect()
 }
 
 #[cfg(test)]

@@ -105,15 +105,16 @@ impl<'a> Training<'a> {
         };
         samples.poses.validate()?;
         model.set_precision(run.precision);
-        let open = |folders| SceneSet::open(folders, &config.open, &config.protocol);
-        let scenes = Arc::new(open(&config.data)?);
+        let (options, protocol) = (&config.open, &config.protocol);
+        let scenes = Arc::new(SceneSet::open(&config.data, options, protocol)?);
         let assigner = Arc::new(model.assigner()?);
         let detector = model.config().clone();
         let mut builder =
             SampleBuilder::new(Arc::clone(&scenes), samples.clone(), detector, assigner);
         let mut validator = None;
         if !config.validation.is_empty() {
-            let (scenes, frames) = (open(&config.validation)?, config.validation_frames);
+            let scenes = SceneSet::open(&config.validation, options, protocol)?;
+            let frames = config.validation_frames;
             validator = Some(Validator::open(scenes, &samples, &model, frames)?);
         }
         if let Some(frozen) = &frozen {

@@ -92,11 +92,12 @@ impl Validator {
                 scorer.add(&detections, &truth);
             }
         }
-        let three = |values: Vec<f64>| std::array::from_fn(|index| values[index]);
+        let [global, frame] =
+            [Ordering::Global, Ordering::Frame].map(|it| scorer.average_precisions(it));
         Ok(Accuracy {
             frames: self.ticks.len(),
-            ap_global: three(scorer.average_precisions(Ordering::Global)),
-            ap_frame_order: three(scorer.average_precisions(Ordering::Frame)),
+            ap_global: std::array::from_fn(|index| global[index]),
+            ap_frame_order: std::array::from_fn(|index| frame[index]),
         })
     }
 }

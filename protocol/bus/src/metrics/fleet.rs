@@ -24,16 +24,9 @@ pub struct MetricsPeer {
 pub(super) fn fleet_exposition(own: &str, others: &[MetricsPeer]) -> String {
     // All at once: slow processes delay the document by one limit, not by one limit each.
     let texts: Vec<Option<String>> = thread::scope(|scope| {
-        let fetch = |peer: &MetricsPeer| {
-            let (status, body) = web::fetch_within(peer.address, "/metrics", WAIT_LIMIT).ok()?;
-            status
-                .contains(" 200 ")
-                .then(|| String::from_utf8(body).ok())
-                .flatten()
-        };
         let threads: Vec<_> = others
             .iter()
-            .map(|peer| scope.spawn(move || fetch(peer)))
+            .map(|peer| scope.spawn(move || series_of(peer)))
             .collect();
         threads
             .into_iter()
@@ -57,6 +50,14 @@ pub(super) fn fleet_exposition(own: &str, others: &[MetricsPeer]) -> String {
             .into_iter()
             .chain(texts.iter().flatten().map(String::as_str)),
     )
+}
+
+fn series_of(peer: &MetricsPeer) -> Option<String> {
+    let (status, body) = web::fetch_within(peer.address, "/metrics", WAIT_LIMIT).ok()?;
+    if !status.contains(" 200 ") {
+        return None;
+    }
+    String::from_utf8(body).ok()
 }
 
 /// Several documents as one: OpenMetrics wants the samples of a family together, described once.

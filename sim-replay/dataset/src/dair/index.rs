@@ -125,11 +125,11 @@ fn group_name(kind: Kind, group: Option<&String>) -> String {
 fn in_order(mut pairs: Vec<(u64, Pair)>) -> Vec<(Tick, Pair)> {
     pairs.sort_by(|(a, first), (b, second)| (a, &first.vehicle).cmp(&(b, &second.vehicle)));
     let start = pairs.first().map_or(0, |(micros, _)| *micros);
-    let tick = |(micros, pair): (u64, Pair)| {
+    let ticks = pairs.into_iter().map(|(micros, pair)| {
         let capture_nanos = (micros - start).saturating_mul(1000);
         (Tick::new(pair.vehicle.clone(), capture_nanos), pair)
-    };
-    pairs.into_iter().map(tick).collect()
+    });
+    ticks.collect()
 }
 
 fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<Pair>)> {
@@ -155,20 +155,9 @@ fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair> {
         true => Kind::V2xSeq,
         false => Kind::Dair,
     });
-    let id = |name: &str| {
-        if kind == Kind::V2xSeq {
-            return frame_id(&entry.required(&format!("{name}_frame"))?);
-        }
-        let points = format!("{name}_pointcloud_path");
-        match entry.optional(&format!("{name}_image_path"))? {
-            // Points are read by the same id.
-            Some(image) if entry.optional(&points)?.is_none() => stem(&image),
-            _ => stem(&entry.required(&points)?),
-        }
-    };
     Ok(Pair {
-        vehicle: id("vehicle")?,
-        infrastructure: id("infrastructure")?,
+        vehicle: id_of_side(entry, kind, "vehicle")?,
+        infrastructure: id_of_side(entry, kind, "infrastructure")?,
         offset_m: entry
             .optional("system_error_offset")?
             .map(|offset| offset_m(&offset))
@@ -178,6 +167,18 @@ fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair> {
             .map(|sequence| frame_id(&sequence))
             .transpose()?,
     })
+}
+
+fn id_of_side(pair: &Field<'_>, kind: Kind, side: &str) -> Result<String> {
+    if kind == Kind::V2xSeq {
+        return frame_id(&pair.required(&format!("{side}_frame"))?);
+    }
+    let points = format!("{side}_pointcloud_path");
+    match pair.optional(&format!("{side}_image_path"))? {
+        // Points are read by the same id.
+        Some(image) if pair.optional(&points)?.is_none() => stem(&image),
+        _ => stem(&pair.required(&points)?),
+    }
 }
 
 /// The id of a frame: the name of its files without suffix.
@@ -193,8 +194,11 @@ fn frame_id(field: &Field<'_>) -> Result<String> {
 
 /// Ids become names of files.
 fn checked_id(field: &Field<'_>, id: &str) -> Result<String> {
-    let is_name = |letter: char| letter.is_ascii_alphanumeric() || letter == '_' || letter == '-';
-    if id.is_empty() || id.len() > 64 || !id.chars().all(is_name) {
+    let mut letters = id.chars();
+    if id.is_empty()
+        || id.len() > 64
+        || !letters.all(|letter| letter.is_ascii_alphanumeric() || matches!(letter, '_' | '-'))
+    {
         let shown: String = id.chars().take(40).collect();
         return Err(field.error(format!(
             "{shown:?} is no id of a frame: expected up to 64 letters, digits, _ and -"
@@ -228,12 +232,12 @@ fn read_captures(
         problems.push(ReadError::malformed(&path, reason));
     }
     let unit = time_stamps::micros_per_unit(stamps.values().copied());
-    let capture = |(id, group): (String, Option<String>)| {
+    let captures = groups.into_iter().map(|(id, group)| {
         let stamp = stamps.get(&id);
         let micros = stamp.map(|&stamp| time_stamps::micros(stamp, unit));
         (id, Capture { micros, group })
-    };
-    groups.into_iter().map(capture).collect()
+    });
+    captures.collect()
 }
 
 /// Id of a frame, and its batch or sequence where the entry states one.
@@ -249,10 +253,9 @@ fn frame_and_group(entry: &Field<'_>, kind: Kind) -> Result<(String, Option<Stri
 
 /// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.
 pub(super) fn offset_m(offset: &Field<'_>) -> Result<[f64; 2]> {
-    let delta = |key| {
-        offset
-            .optional(key)?
-            .map_or(Ok(0.0), |delta| delta.number())
-    };
-    Ok([delta("delta_x")?, delta("delta_y")?])
+    let [x, y] = ["delta_x", "delta_y"].map(|key| {
+        let delta = offset.optional(key)?;
+        delta.map_or(Ok(0.0), |delta| delta.number())
+    });
+    Ok([x?, y?])
 }

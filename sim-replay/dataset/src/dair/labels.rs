@@ -71,8 +71,8 @@ pub(super) fn in_frame(
             return Ok(None);
         };
         let location = label.required("3d_location")?;
-        let axis = |key| location.required(key)?.number();
-        let center = Translation3::new(axis("x")?, axis("y")?, axis("z")?);
+        let [x, y, z] = numbers_of(&location, ["x", "y", "z"])?;
+        let center = Translation3::new(x, y, z);
         let yaw_rad = label.required("rotation")?.number()?;
         let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad);
         let world_from_object: Pose =
@@ -136,12 +136,16 @@ fn unknown_class(path: &Path, label: &Field<'_>) -> Option<Problem> {
 
 /// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
 fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>> {
-    let edge = |key| dimensions.required(key)?.number();
-    let size_m = [edge("l")?, edge("w")?, edge("h")?];
+    let size_m = numbers_of(dimensions, ["l", "w", "h"])?;
     if size_m.contains(&0.0) {
         return Ok(None);
     }
     check_size(dimensions, size_m).map(Some)
+}
+
+fn numbers_of(field: &Field<'_>, keys: [&str; 3]) -> Result<[f64; 3]> {
+    let [first, second, third] = keys.map(|key| field.required(key)?.number());
+    Ok([first?, second?, third?])
 }
 
 fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3]> {
@@ -159,15 +163,17 @@ fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3]> {
 #[expect(clippy::indexing_slicing, reason = "24 numbers are 8 corners")]
 fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>> {
     let numbers = field.numbers::<24>()?;
-    let (corners, _) = numbers.as_chunks::<3>();
-    let corner = |index: usize| Vector3::from(corners[index]);
-    let mean = |pairs: [(usize, usize); 4]| {
-        let edges = pairs.iter().map(|&(to, from)| corner(to) - corner(from));
+    let corners = numbers.as_chunks::<3>().0.iter();
+    let corners: Vec<Vector3<f64>> = corners.map(|corner| Vector3::from(*corner)).collect();
+    let parallel_edges = [
+        [(0, 3), (1, 2), (4, 7), (5, 6)],
+        [(0, 1), (3, 2), (4, 5), (7, 6)],
+        [(4, 0), (5, 1), (6, 2), (7, 3)],
+    ];
+    let [ahead, aside, above] = parallel_edges.map(|pairs: [(usize, usize); 4]| {
+        let edges = pairs.iter().map(|&(to, from)| corners[to] - corners[from]);
         edges.sum::<Vector3<f64>>() / 4.0
-    };
-    let ahead = mean([(0, 3), (1, 2), (4, 7), (5, 6)]);
-    let aside = mean([(0, 1), (3, 2), (4, 5), (7, 6)]);
-    let above = mean([(4, 0), (5, 1), (6, 2), (7, 3)]);
+    });
     let size_m = [ahead.norm(), aside.norm(), above.norm()];
     if size_m.contains(&0.0) {
         return Ok(None);
@@ -184,7 +190,7 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>> {
     // Not from `aside`: right-handed on whichever side the first corner is.
     let y = above.cross(&x).normalize();
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
-    let center = (0..8).map(corner).sum::<Vector3<f64>>() / 8.0;
+    let center = corners.into_iter().sum::<Vector3<f64>>() / 8.0;
     let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
     let pose: Pose = Isometry3::from_parts(center.into(), rotation).into();
     let valid = pose.validate();

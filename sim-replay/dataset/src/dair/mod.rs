@@ -137,12 +137,14 @@ fn scenario(
         kept.insert(tick.stem.clone(), pair);
         moments.push(tick);
     }
-    let has_vehicle = |tick: &&Tick| !missing.contains(&MissingFrame::new(&agents[0], &tick.stem));
-    let ticks: Vec<Tick> = moments.iter().filter(has_vehicle).cloned().collect();
+    let ticks = (moments.iter())
+        .filter(|tick| !missing.contains(&MissingFrame::new(&agents[0], &tick.stem)));
+    let ticks: Vec<Tick> = ticks.cloned().collect();
     let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
     for agent in &agents {
-        let file = |tick: &Tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent)));
-        sweeps = sweeps.with_agent(agent.clone(), moments.iter().filter_map(file));
+        let files = (moments.iter())
+            .filter_map(|tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent))));
+        sweeps = sweeps.with_agent(agent.clone(), files);
     }
     let layout = sides.kind.layout();
     let source = Arc::new(Source {

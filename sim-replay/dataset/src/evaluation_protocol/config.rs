@@ -100,11 +100,11 @@ fn intervals(range: &[f64]) -> Result<[[f64; 2]; 3], String> {
         return Err(format!("ground_truth_range_m: {count} numbers, expected 6"));
     };
     let intervals = [[x_low, x_high], [y_low, y_high], [z_low, z_high]];
-    let is_wrong = |[low, high]: &[f64; 2]| !(low.is_finite() && high.is_finite() && low < high);
-    let Some([low, high]) = intervals.iter().find(|interval| is_wrong(interval)) else {
-        return Ok(intervals);
-    };
-    Err(format!(
-        "ground_truth_range_m: from {low} to {high} is no range"
-    ))
+    for [low, high] in intervals {
+        if !(low.is_finite() && high.is_finite() && low < high) {
+            let reason = format!("ground_truth_range_m: from {low} to {high} is no range");
+            return Err(reason);
+        }
+    }
+    Ok(intervals)
 }

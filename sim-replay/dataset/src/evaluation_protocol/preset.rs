@@ -54,33 +54,37 @@ pub(super) fn preset(name: &str) -> Option<EvaluationProtocol> {
 }
 
 fn rule(name: &str) -> GroundTruthRule {
-    let range = |x: f64, y: f64, z_m: [f64; 2], comm_range_m: f64| GroundTruthRule {
+    match name {
+        "v2v4real" => GroundTruthRule::V2V4REAL,
+        // V2X-R: opencood/hypes_yaml/V2X-R, ground truth as wide as the points.
+        "v2xr" => vehicles_in(140.8, 40.0, [-3.0, 1.0], 70.0),
+        // HEAL, dairv2x configurations: the range of the points, z widened by 1 m where labels are filtered. V2X-Seq's
+        // own code takes every pair, however far apart.
+        "dair" | "v2xseq" => vehicles_in(102.4, 51.2, [-4.5, 2.5], 100.0),
+        // V2X-Real: opencood/data_utils/datasets/__init__.py.
+        "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => vehicles_in(100.0, 40.0, [-15.0, 15.0], 50.0),
+        // HEAL, v2xsim2 configurations, vehicles only. CoAlign has z -3..2 m and 50 m.
+        "v2xsim" => vehicles_in(32.0, 32.0, [-3.0, 1.0], 70.0),
+        // V2X-Radar: communication range of its configurations.
+        "v2xradar" => vehicles_in(140.8, 40.0, [-3.0, 1.0], 300.0),
+        // RCooper: roadside units up to 200 m apart.
+        "rcooper" => vehicles_in(200.0, 40.0, [-20.0, 0.0], 200.0),
+        // Open MARS has no annotations and so no protocol: chosen for this project.
+        "mars" => vehicles_in(51.2, 51.2, [-5.0, 3.0], 70.0),
+        // OPV2V, V2XSet, V2VDet.
+        _ => GroundTruthRule::OPV2V,
+    }
+}
+
+/// The rule for vehicles with all corners within x and y to both sides.
+fn vehicles_in(x: f64, y: f64, z_m: [f64; 2], comm_range_m: f64) -> GroundTruthRule {
+    GroundTruthRule {
         x_m: [-x, x],
         y_m: [-y, y],
         z_m,
         comm_range_m,
         min_corners: 8,
         classes: ClassSet::VEHICLES,
-    };
-    match name {
-        "v2v4real" => GroundTruthRule::V2V4REAL,
-        // V2X-R: opencood/hypes_yaml/V2X-R, ground truth as wide as the points.
-        "v2xr" => range(140.8, 40.0, [-3.0, 1.0], 70.0),
-        // HEAL, dairv2x configurations: the range of the points, z widened by 1 m where labels are filtered. V2X-Seq's
-        // own code takes every pair, however far apart.
-        "dair" | "v2xseq" => range(102.4, 51.2, [-4.5, 2.5], 100.0),
-        // V2X-Real: opencood/data_utils/datasets/__init__.py.
-        "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => range(100.0, 40.0, [-15.0, 15.0], 50.0),
-        // HEAL, v2xsim2 configurations, vehicles only. CoAlign has z -3..2 m and 50 m.
-        "v2xsim" => range(32.0, 32.0, [-3.0, 1.0], 70.0),
-        // V2X-Radar: communication range of its configurations.
-        "v2xradar" => range(140.8, 40.0, [-3.0, 1.0], 300.0),
-        // RCooper: roadside units up to 200 m apart.
-        "rcooper" => range(200.0, 40.0, [-20.0, 0.0], 200.0),
-        // Open MARS has no annotations and so no protocol: chosen for this project.
-        "mars" => range(51.2, 51.2, [-5.0, 3.0], 70.0),
-        // OPV2V, V2XSet, V2VDet.
-        _ => GroundTruthRule::OPV2V,
     }
 }
 

@@ -4,7 +4,7 @@ use protocol::{CavId, PointCloud, Pose};
 
 use super::cells::Cells;
 use crate::Problem;
-use crate::frame::{Frame, Object};
+use crate::frame::Frame;
 
 /// Least number of boxes of an agent for which shares are evaluated.
 const ENOUGH_BOXES: usize = 20;
@@ -38,16 +38,15 @@ pub(super) fn mostly_empty(
 /// Number of boxes that hold none of the points.
 pub(super) fn without_points(frame: &Frame, world_from_lidar: &Pose, points: &PointCloud) -> usize {
     let (cells, world_from_lidar) = (Cells::new(points), world_from_lidar.isometry());
-    let holds_point = |object: &Object| {
+    let empty = frame.objects.iter().filter(|object| {
         let object_from_lidar = object
             .world_from_object
             .isometry()
             .inv_mul(&world_from_lidar);
         #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
         let half = object.size_m.map(|size| (size / 2.0) as f32);
-        cells.holds_point(&object_from_lidar.cast::<f32>(), half)
-    };
-    let empty = frame.objects.iter().filter(|object| !holds_point(object));
+        !cells.holds_point(&object_from_lidar.cast::<f32>(), half)
+    });
     empty.count()
 }
 

@@ -117,16 +117,16 @@ fn without_pose(
     (agent, id): (usize, &CavId),
     frames: &[(usize, &FrameFindings)],
 ) -> Option<Problem> {
-    let lacking = || frames.iter().filter(|(_, one)| one.is_without_pose());
-    let (tick, _) = lacking().next()?;
+    let mut lacking = frames.iter().filter(|(_, one)| one.is_without_pose());
+    let count = lacking.clone().count();
+    let (tick, _) = lacking.next()?;
     let stem = scenario.ticks.get(*tick)?;
     let path = (scenario.source.frame_files(id, stem).into_iter().next())
         .or_else(|| scenario.points_path(agent, *tick, None).ok())
         .unwrap_or_default();
     let path = path.display().to_string();
     let message = format!(
-        "{path}: lidar_pose: missing in {} of {} frames of agent {id}, this is the first: boxes cannot be placed",
-        lacking().count(),
+        "{path}: lidar_pose: missing in {count} of {} frames of agent {id}, this is the first: boxes cannot be placed",
         frames.len()
     );
     Some(Problem {

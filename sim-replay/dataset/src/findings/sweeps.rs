@@ -46,15 +46,15 @@ pub struct SweepFindings {
 impl SweepFindings {
     /// Findings of a sweep with intensities from 0 to 1.
     pub fn of(cloud: &PcdCloud) -> Self {
-        let values = || cloud.points.xyzi.iter().map(|point| point[3]);
+        let values = cloud.points.xyzi.iter().map(|point| point[3]);
         // Evenly picked: the first points may all be of one laser.
         let step = cloud.points.len().div_ceil(MEDIAN_OF).max(1);
-        let median = median(&values().step_by(step).collect::<Vec<_>>());
+        let median = median(&values.clone().step_by(step).collect::<Vec<_>>());
         let range = median.map(|median| {
             [
-                values().fold(f32::INFINITY, f32::min),
+                values.clone().fold(f32::INFINITY, f32::min),
                 median,
-                values().fold(f32::NEG_INFINITY, f32::max),
+                values.clone().fold(f32::NEG_INFINITY, f32::max),
             ]
         });
         Self {
@@ -62,8 +62,8 @@ impl SweepFindings {
             form: cloud.form,
             intensity: cloud.intensity.clone(),
             range,
-            above_one: values().filter(|&value| value > 1.0).count(),
-            below_zero: values().filter(|&value| value < 0.0).count(),
+            above_one: values.clone().filter(|&value| value > 1.0).count(),
+            below_zero: values.filter(|&value| value < 0.0).count(),
             plausibility: Plausibility::of(&cloud.points),
         }
     }
@@ -79,15 +79,14 @@ impl SweepReport {
     /// The sweeps of an agent together, in order; `None` if no sweep has a point.
     pub fn of(sweeps: &[&SweepFindings]) -> Option<Self> {
         let first = sweeps.iter().find(|sweep| sweep.range.is_some())?;
-        let ranges = || sweeps.iter().filter_map(|sweep| sweep.range);
+        let ranges = sweeps.iter().filter_map(|sweep| sweep.range);
+        let medians: Vec<f32> = ranges.clone().map(|[_, median, _]| median).collect();
         Some(Self {
             form: first.form,
             intensity: first.intensity.clone(),
-            min_intensity: ranges().map(|[min, ..]| min).fold(f32::INFINITY, f32::min),
-            median_intensity: median(&ranges().map(|[_, median, _]| median).collect::<Vec<_>>())?,
-            max_intensity: ranges()
-                .map(|[.., max]| max)
-                .fold(f32::NEG_INFINITY, f32::max),
+            min_intensity: (ranges.clone()).fold(f32::INFINITY, |least, [min, ..]| least.min(min)),
+            median_intensity: median(&medians)?,
+            max_intensity: ranges.fold(f32::NEG_INFINITY, |most, [.., max]| most.max(max)),
         })
     }
 }
@@ -109,13 +108,14 @@ pub(super) fn problems(
     let points = plausibility.fault().map(|fault| ("x y z", fault));
     let intensity = intensity_fault(&report, sweeps, scale).map(|fault| ("intensity", fault));
     let path = folder.display().to_string();
-    let problem = |(field, fault): (&str, String)| Problem {
+    let faults = points.into_iter().chain(intensity);
+    let problems = faults.map(|(field, fault)| Problem {
         message: format!("{path}: sweeps{named}: {fault}"),
         path: path.clone(),
         line: None,
         field: Some(field.to_owned()),
-    };
-    points.into_iter().chain(intensity).map(problem).collect()
+    });
+    problems.collect()
 }
 
 /// The first fault of the intensities.

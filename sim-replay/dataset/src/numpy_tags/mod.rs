@@ -234,7 +234,7 @@ fn ordered(shape: Vec<usize>, values: Vec<f64>, is_fortran: bool) -> NumpyArray 
 
 /// Converts the order in which the first index runs fastest to row-major.
 fn row_major(shape: &[usize], values: &[f64]) -> Vec<f64> {
-    let place = |index: usize| {
+    let values = (0..values.len()).map(|index| {
         let (mut rest, mut place, mut stride) = (index, 0, values.len());
         // Digits of the row-major index, weighed as Fortran weighs them.
         let mut weight = 1;
@@ -244,12 +244,10 @@ fn row_major(shape: &[usize], values: &[f64]) -> Vec<f64> {
             rest %= stride.max(1);
             weight *= size;
         }
-        place
-    };
-    // Every place is below the product of the sizes, the number of values.
-    (0..values.len())
-        .map(|index| values.get(place(index)).copied().unwrap_or(f64::NAN))
-        .collect()
+        // Every place is below the product of the sizes, the number of values.
+        values.get(place).copied().unwrap_or(f64::NAN)
+    });
+    values.collect()
 }
 
 #[cfg(test)]

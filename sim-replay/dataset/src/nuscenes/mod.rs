@@ -214,14 +214,16 @@ impl Builder<'_> {
     fn scenario(self, agents: Vec<CavId>, parts: Parts, options: &OpenOptions) -> Scenario {
         let (ticks, moments) = (parts.ticks, parts.moments);
         let (missing, contents) = (parts.missing, parts.contents);
-        let is_unit = |agent: &&CavId| rig::is_roadside_unit(self.layout, agent.as_str());
+        let units = agents.iter();
+        let units = units.filter(|agent| rig::is_roadside_unit(self.layout, agent.as_str()));
+        let roadside_units = units.cloned().collect();
         let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
         for agent in &agents {
-            let file = |tick: &Tick| {
+            let files = moments.iter().filter_map(|tick| {
                 let sweep = contents.get(&tick.stem)?.sweeps.get(agent)?;
                 Some(self.root.join(&sweep.file))
-            };
-            sweeps = sweeps.with_agent(agent.clone(), moments.iter().filter_map(file));
+            });
+            sweeps = sweeps.with_agent(agent.clone(), files);
         }
         let source = Arc::new(Source {
             root: self.root.to_owned(),
@@ -232,7 +234,7 @@ impl Builder<'_> {
         });
         Scenario {
             absent_at: AbsentFrames::new(&agents, &ticks, &missing).among(moments),
-            roadside_units: agents.iter().filter(is_unit).cloned().collect(),
+            roadside_units,
             missing,
             ..Scenario::new(self.name, self.layout, agents, ticks, source)
         }

@@ -44,8 +44,8 @@ pub(super) fn read_all(
 pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize> {
     let token = row.required(key)?;
     let text = token.id()?;
-    let unknown = || token.error(format!("no row has the token {:?}", excerpt(&text, 40)));
-    indices.get(&text).copied().ok_or_else(unknown)
+    let index = indices.get(&text).copied();
+    index.ok_or_else(|| token.error(format!("no row has the token {:?}", excerpt(&text, 40))))
 }
 
 /// `translation` in metres and `rotation` as quaternion w, x, y, z.

@@ -224,9 +224,9 @@ fn place(
         }
         Ok(())
     })?;
-    let without_pose = || rows.values().flatten().map(|row| row.file.as_str());
-    if let Some(first) = without_pose().min() {
-        let count = without_pose().count();
+    let without_pose = rows.values().flatten().map(|row| row.file.as_str());
+    if let Some(first) = without_pose.clone().min() {
+        let count = without_pose.count();
         let reason = format!("no pose for {count} sweeps, the first {first}: left out");
         problems.push(ReadError::malformed(&version.join("ego_pose.json"), reason));
     }

@@ -1,6 +1,6 @@
 //! Points as lines of decimal numbers.
 
-use super::header::{Field, Header, IntensitySource, Kind};
+use super::header::{Header, IntensitySource, Kind};
 use super::number::{is_separator, ordinary, unusual};
 use super::{PcdCloud, PcdError, Place, unpack_rgb};
 
@@ -117,8 +117,10 @@ impl<'a> Lines<'a> {
 
     /// Skips blanks; true if the line, or the text, ends after them.
     fn is_at_end_of_line(&mut self) -> bool {
-        let is_blank = |&byte: &u8| byte != b'\n' && is_separator(byte);
-        while let Some((_, rest)) = self.rest.split_first().filter(|(byte, _)| is_blank(byte)) {
+        while let Some((&byte, rest)) = self.rest.split_first()
+            && byte != b'\n'
+            && is_separator(byte)
+        {
             self.rest = rest;
         }
         matches!(self.rest.first(), None | Some(b'\n'))
@@ -228,7 +230,8 @@ impl<'a> Lines<'a> {
 }
 
 fn columns(header: &Header) -> Vec<Column> {
-    let column = |(index, field): (usize, &Field)| match header.intensity {
+    let fields = header.fields.iter().enumerate();
+    let columns = fields.map(|(index, field)| match header.intensity {
         IntensitySource::Value(intensity) if intensity == index => Column::Component(3),
         IntensitySource::Red(colour) if colour == index && field.kind == Kind::Float => {
             Column::FloatColour
@@ -239,8 +242,8 @@ fn columns(header: &Header) -> Vec<Column> {
             .iter()
             .position(|&xyz| xyz == index)
             .map_or(Column::Ignored, Column::Component),
-    };
-    header.fields.iter().enumerate().map(column).collect()
+    });
+    columns.collect()
 }
 
 /// Bytes of a token of up to 15 bytes at the start of a text as one number, and its length.

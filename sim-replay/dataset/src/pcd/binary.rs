@@ -29,7 +29,7 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
         );
         return Err(PcdError::of("POINTS", reason));
     }
-    Ok(gather(header, body, |field, first| {
+    Ok(gather(header, body, |(field, first)| {
         column_of(field, first, stride)
     }))
 }
@@ -74,7 +74,7 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
     }
     let unpacked = lzf::decompress(packed, unpacked_len)
         .map_err(|error| PcdError::of("DATA", error.to_string()))?;
-    Ok(gather(header, &unpacked, |field, first| {
+    Ok(gather(header, &unpacked, |(field, first)| {
         // A field begins behind the numbers of all points of those before it.
         column_of(field, first * points, field.size * field.count)
     }))
@@ -89,31 +89,31 @@ fn column_of(field: &Field, first: usize, step: usize) -> Column {
     }
 }
 
-/// `column` gives the place of a field from the bytes of a point before it. `data` holds every number that it points
-/// at: its length has been checked.
+/// A field, and the number of bytes of a point before it.
 #[expect(
     clippy::indexing_slicing,
     reason = "the header's indices are of its fields"
 )]
-fn gather(header: &Header, data: &[u8], column: impl Fn(&Field, usize) -> Column) -> PcdCloud {
-    let column = |index: usize| {
-        let before = header.fields[..index]
-            .iter()
-            .map(|field| field.size * field.count)
-            .sum();
-        column(&header.fields[index], before)
-    };
+fn field_at(header: &Header, index: usize) -> (&Field, usize) {
+    let before = header.fields[..index].iter();
+    let before = before.map(|field| field.size * field.count).sum();
+    (&header.fields[index], before)
+}
+
+/// `column` gives the place of a field from the bytes of a point before it. `data` holds every number that it points
+/// at: its length has been checked.
+fn gather(header: &Header, data: &[u8], column: impl Fn((&Field, usize)) -> Column) -> PcdCloud {
     let mut points = vec![[0.0; 4]; header.points];
     for (component, index) in header.xyz.into_iter().enumerate() {
-        column(index).fill(data, &mut points, component);
+        column(field_at(header, index)).fill(data, &mut points, component);
     }
     let mut labels = Vec::new();
     match header.intensity {
-        IntensitySource::Value(index) => column(index).fill(data, &mut points, 3),
+        IntensitySource::Value(index) => column(field_at(header, index)).fill(data, &mut points, 3),
         // The four bytes of a packed colour, whether declared a float or an integer.
         IntensitySource::Red(index) => {
             labels.reserve_exact(points.len());
-            column(index).each(data, &mut points, |point, bytes| {
+            column(field_at(header, index)).each(data, &mut points, |point, bytes| {
                 let (red, label) = unpack_rgb(u32::from_le_bytes(bytes));
                 point[3] = red;
                 labels.push(label);

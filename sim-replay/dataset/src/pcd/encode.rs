@@ -44,15 +44,13 @@ pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<
         .iter()
         .enumerate()
         .map(|(index, &[x, y, z, fourth])| {
-            let packed = |green: u8| f32::from_bits(red_byte(fourth) << 16 | u32::from(green) << 8);
-            let fourth = match intensity {
-                IntensityField::Intensity => fourth,
-                IntensityField::Red => packed(0),
-                IntensityField::RedAndLabel(labels) => {
-                    packed(labels.get(index).copied().unwrap_or(0))
-                }
+            let green = match intensity {
+                IntensityField::Intensity => return [x, y, z, fourth],
+                IntensityField::Red => 0,
+                IntensityField::RedAndLabel(labels) => labels.get(index).copied().unwrap_or(0),
             };
-            [x, y, z, fourth]
+            let packed = red_byte(fourth) << 16 | u32::from(green) << 8;
+            [x, y, z, f32::from_bits(packed)]
         });
     match encoding {
         Encoding::Ascii => {

@@ -365,12 +365,13 @@ impl<'a> Entries<'a> {
             let reason = format!("{} values, expected 7", entry.values.len());
             return Err(PcdError::at(entry.line, "VIEWPOINT", reason));
         }
-        let is_number = |value: &&str| value.parse::<f64>().is_ok_and(f64::is_finite);
-        let Some(value) = entry.values.iter().find(|value| !is_number(value)) else {
-            return Ok(());
-        };
-        let reason = format!("{value:?} is no finite number");
-        Err(PcdError::at(entry.line, "VIEWPOINT", reason))
+        for value in &entry.values {
+            if !value.parse::<f64>().is_ok_and(f64::is_finite) {
+                let reason = format!("{value:?} is no finite number");
+                return Err(PcdError::at(entry.line, "VIEWPOINT", reason));
+            }
+        }
+        Ok(())
     }
 
     fn data(&self) -> Result<Data, PcdError> {
@@ -383,10 +384,10 @@ impl<'a> Entries<'a> {
         let found = kinds
             .into_iter()
             .find(|(name, _)| name.eq_ignore_ascii_case(data));
-        let reason = || format!("{data:?}, expected ascii, binary or binary_compressed");
-        found
-            .map(|(_, data)| data)
-            .ok_or_else(|| PcdError::at(line, "DATA", reason()))
+        found.map(|(_, kind)| kind).ok_or_else(|| {
+            let reason = format!("{data:?}, expected ascii, binary or binary_compressed");
+            PcdError::at(line, "DATA", reason)
+        })
     }
 }
 
@@ -448,29 +449,24 @@ fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, Pcd
 }
 
 fn find_xyz(fields: &[Field], line: u64) -> Result<[usize; 3], PcdError> {
-    let find = |name| find_coordinate(fields, name, line);
-    Ok([find("x")?, find("y")?, find("z")?])
+    let [x, y, z] = ["x", "y", "z"].map(|name| find_coordinate(fields, name, line));
+    Ok([x?, y?, z?])
 }
 
 /// The first field of the most preferred name that holds one number.
 fn find_intensity(fields: &[Field]) -> IntensitySource {
-    let find = |name: &&str| {
+    if let Some(index) = find_number(fields, &INTENSITY_FIELDS) {
+        return IntensitySource::Value(index);
+    }
+    find_number(fields, &COLOUR_FIELDS).map_or(IntensitySource::None, IntensitySource::Red)
+}
+
+fn find_number(fields: &[Field], names: &[&str]) -> Option<usize> {
+    names.iter().find_map(|name| {
         fields
             .iter()
             .position(|field| field.count == 1 && field.name.eq_ignore_ascii_case(name))
-    };
-    let value = INTENSITY_FIELDS
-        .iter()
-        .find_map(find)
-        .map(IntensitySource::Value);
-    value
-        .or_else(|| {
-            COLOUR_FIELDS
-                .iter()
-                .find_map(find)
-                .map(IntensitySource::Red)
-        })
-        .unwrap_or(IntensitySource::None)
+    })
 }
 
 #[cfg(test)]

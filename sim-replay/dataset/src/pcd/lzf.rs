@@ -64,17 +64,12 @@ fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&
 )]
 fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&'a [u8], LzfError> {
     let mut next = input.iter();
-    let mut byte = || {
-        next.next()
-            .map(|&byte| usize::from(byte))
-            .ok_or(LzfError::CutOff)
-    };
     let mut count = (control >> 5) + 2;
     // 7 in the three bits: one more byte of the length, before that of the distance.
     if count == 9 {
-        count += byte()?;
+        count += byte(&mut next)?;
     }
-    let distance = ((control & 31) << 8) + byte()? + 1;
+    let distance = ((control & 31) << 8) + byte(&mut next)? + 1;
     let len = output.len();
     let start = len
         .checked_sub(distance)
@@ -88,6 +83,11 @@ fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&
         }
     }
     Ok(next.as_slice())
+}
+
+fn byte(input: &mut std::slice::Iter<'_, u8>) -> Result<usize, LzfError> {
+    let byte = input.next().ok_or(LzfError::CutOff)?;
+    Ok(usize::from(*byte))
 }
 
 #[cfg(test)]

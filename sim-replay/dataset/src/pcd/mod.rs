@@ -168,7 +168,6 @@ impl PcdCloud {
 
     /// Removes points that are not finite. `labels`: one for each point, or none.
     pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
-        let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
         let (all, first) = (
             points.len(),
             points.iter().position(|point| !is_finite(point)),
@@ -187,6 +186,10 @@ impl PcdCloud {
             ..Self::default()
         }
     }
+}
+
+fn is_finite(point: &[f32; 4]) -> bool {
+    point.iter().all(|value| value.is_finite())
 }
 
 /// Red and green of a packed `0x00RRGGBB`: intensity and label.

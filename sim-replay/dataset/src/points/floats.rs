@@ -56,17 +56,18 @@ impl FloatForm {
     pub(super) fn of(samples: &[Vec<u8>]) -> Result<Self, String> {
         let votes = samples.iter().filter_map(|bytes| Self::of_sample(bytes));
         let votes: Vec<Result<Self, String>> = votes.collect();
-        let count = |form| votes.iter().filter(|vote| **vote == Ok(form)).count();
-        match (count(Self::Four), count(Self::Five)) {
-            (0, 0) if votes.is_empty() => {
+        let counts = [Self::Four, Self::Five]
+            .map(|form| votes.iter().filter(|vote| **vote == Ok(form)).count());
+        match counts {
+            [0, 0] if votes.is_empty() => {
                 let fitting = [Self::Four, Self::Five].into_iter().find(|form| {
                     (samples.first())
                         .is_some_and(|bytes| bytes.len().is_multiple_of(4 * form.numbers()))
                 });
                 Ok(fitting.unwrap_or(Self::Four))
             }
-            (0, 0) => votes.into_iter().next().unwrap_or(Ok(Self::Four)),
-            (four, five) if five > four => Ok(Self::Five),
+            [0, 0] => votes.into_iter().next().unwrap_or(Ok(Self::Four)),
+            [four, five] if five > four => Ok(Self::Five),
             _ => Ok(Self::Four),
         }
     }
@@ -85,8 +86,8 @@ impl FloatForm {
                 "no sweep of x y z intensity or x y z intensity ring as f32: {fault}"
             )));
         }
-        let entropy_of = |form: Self| column_entropy(&numbers, form.numbers());
-        let (four, five) = (entropy_of(Self::Four), entropy_of(Self::Five));
+        let [four, five] =
+            [Self::Four, Self::Five].map(|form| column_entropy(&numbers, form.numbers()));
         let (form, entropy) = match five < four {
             true => (Self::Five, five),
             false => (Self::Four, four),
@@ -99,9 +100,9 @@ impl FloatForm {
             .collect();
         // Multiples of the right number are as good as it: the first within `EQUAL` of the best is right.
         let least = (others.iter()).fold(entropy - MUCH_LESS, |least, other| least.min(other.1));
-        let right =
-            |(_, other): &&(usize, f64)| *other < entropy - MUCH_LESS && *other <= least + EQUAL;
-        Some(match others.iter().find(right) {
+        let mut right = (others.iter())
+            .filter(|(_, other)| *other < entropy - MUCH_LESS && *other <= least + EQUAL);
+        Some(match right.next() {
             Some((step, _)) => Err(format!(
                 "it looks like {step} floats per point, expected 4 (x y z intensity) or 5 (and the laser's number)"
             )),
@@ -135,9 +136,10 @@ impl FloatForm {
 
 /// Description of implausible numbers, if there are more than a few.
 fn absurd(numbers: &[f32]) -> Option<String> {
-    let is_absurd = |number: f32| number.abs() > LARGEST || (number != 0.0 && number.abs() < TINY);
-    let share =
-        numbers.iter().filter(|&&number| is_absurd(number)).count() as f64 / numbers.len() as f64;
+    let absurd = numbers
+        .iter()
+        .filter(|&&number| number.abs() > LARGEST || (number != 0.0 && number.abs() < TINY));
+    let share = absurd.count() as f64 / numbers.len() as f64;
     let percent = 100.0 * share;
     (share > ABSURD_SHARE).then(|| {
         format!("{percent:.1} % of the numbers are beyond 1e7 or below 1e-30, usual is none")
@@ -148,7 +150,7 @@ fn absurd(numbers: &[f32]) -> Option<String> {
 /// size of the sample (Miller and Madow).
 fn column_entropy(numbers: &[f32], step: usize) -> f64 {
     let points = (numbers.len() / step) as f64;
-    let of_column = |column: usize| {
+    let entropies = (0..step).map(|column| {
         // Sign and exponent of a float are its upper 9 bits.
         let mut counts = [0_u32; 1 << 9];
         for number in numbers
@@ -165,6 +167,6 @@ fn column_entropy(numbers: &[f32], step: usize) -> f64 {
         let entropy: f64 = shares.iter().map(|share| -share * share.ln()).sum();
         // The correction is (occupied bins - 1) / 2n: a small sample underestimates the entropy.
         entropy + (shares.len() - 1) as f64 / (2.0 * points)
-    };
-    (0..step).map(of_column).sum::<f64>() / step as f64
+    });
+    entropies.sum::<f64>() / step as f64
 }

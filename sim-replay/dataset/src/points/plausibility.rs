@@ -66,32 +66,34 @@ impl Plausibility {
 
     /// The first exceeded limit, and the usual value.
     pub fn fault(&self) -> Option<String> {
-        let of = |count: usize, all: usize| count as f64 / all.max(1) as f64;
-        let percent = |share: f64| format!("{:.1} %", 100.0 * share);
         // First: integers read as floats also lie within the range, close to the origin.
-        let tiny = of(self.tiny, 3 * self.points);
+        let tiny = share(self.tiny, 3 * self.points);
         if tiny > TINY_SHARE {
             return Some(format!(
-                "{} of the coordinates are tiny (below {TINY:e} m, not zero), usual is none: are these floats?",
-                percent(tiny)
+                "{:.1} % of the coordinates are tiny (below {TINY:e} m, not zero), usual is none: are these floats?",
+                100.0 * tiny
             ));
         }
-        let within = 1.0 - of(self.beyond_range, self.points);
+        let within = 1.0 - share(self.beyond_range, self.points);
         if within < WITHIN_RANGE {
             return Some(format!(
-                "{} of the points lie within {RANGE_M} m, usual are {} or more",
-                percent(within),
-                percent(WITHIN_RANGE)
+                "{:.1} % of the points lie within {RANGE_M} m, usual are {:.1} % or more",
+                100.0 * within,
+                100.0 * WITHIN_RANGE
             ));
         }
-        let at_origin = of(self.at_origin, self.points);
+        let at_origin = share(self.at_origin, self.points);
         (at_origin > AT_ORIGIN).then(|| {
             format!(
-                "{} of the points lie exactly at the origin, usual is none",
-                percent(at_origin)
+                "{:.1} % of the points lie exactly at the origin, usual is none",
+                100.0 * at_origin
             )
         })
     }
+}
+
+fn share(count: usize, all: usize) -> f64 {
+    count as f64 / all.max(1) as f64
 }
 
 impl PcdCloud {

@@ -53,14 +53,11 @@ pub(super) fn longest_steady(stamps: &[u64]) -> SteadyPart {
     let Some(longest) = longest else {
         return SteadyPart::default();
     };
-    let neighbour = |part: Option<usize>| part.and_then(|part| parts.get(part));
+    let before = longest.checked_sub(1).and_then(|part| parts.get(part));
+    let after = longest.checked_add(1).and_then(|part| parts.get(part));
     let bounds = (
-        neighbour(longest.checked_sub(1))
-            .and_then(|part| part.last())
-            .copied(),
-        neighbour(longest.checked_add(1))
-            .and_then(|part| part.first())
-            .copied(),
+        before.and_then(|part| part.last()).copied(),
+        after.and_then(|part| part.first()).copied(),
     );
     let kept = parts.swap_remove(longest);
     SteadyPart {

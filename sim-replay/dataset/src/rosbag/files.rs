@@ -133,15 +133,16 @@ fn listed(dir: &Path) -> Result<Vec<PathBuf>> {
     let names = root
         .required(INFORMATION)?
         .required("relative_file_paths")?;
-    let file = |name: &Field<'_>| {
+    let items = names.items()?;
+    let files = items.iter().map(|name| {
         let name = Path::new(name.text()?);
         // Descriptions before version 4 begin with the folder's own name. What is outside of the folder is not read.
         let own = name
             .file_name()
             .ok_or_else(|| names.expected("names of files"))?;
         Ok(dir.join(own))
-    };
-    names.items()?.iter().map(file).collect()
+    });
+    files.collect()
 }
 
 /// The file, or an unpacked copy of it that exists as long as the value.

@@ -102,13 +102,12 @@ impl Attempt {
     /// Chooses the source: of those that give poses to at least half as many sweeps as any other, the first by rank.
     fn of(path: &Path, contents: &Contents, sweeps: SweepTopic) -> Self {
         let sources = PoseSources::of(path, contents, &sweeps);
-        let poses = |source: &PoseSource| -> SweepPoses {
-            let nanos = sweeps.sweeps.iter().map(|sweep| sweep.nanos);
-            nanos
-                .map(|nanos| source.at(&sources.transforms, nanos))
-                .collect()
-        };
-        let all: Vec<SweepPoses> = sources.sources.iter().map(poses).collect();
+        let all = sources.sources.iter().map(|source| {
+            let sweeps = sweeps.sweeps.iter();
+            let poses = sweeps.map(|sweep| source.at(&sources.transforms, sweep.nanos));
+            poses.collect::<SweepPoses>()
+        });
+        let all: Vec<SweepPoses> = all.collect();
         let counts: Vec<usize> = all.iter().map(found).collect();
         let most = counts.iter().copied().max().unwrap_or(0);
         let suited = sources.sources.iter().zip(&counts).enumerate();
@@ -125,7 +124,6 @@ impl Attempt {
 
     fn finish(self, path: &Path, contents: &Contents, problems: &mut Vec<ReadError>) -> Joined {
         let (sweeps, sources, chosen) = (self.sweeps, self.sources, self.chosen);
-        let fault = |reason: String| ReadError::malformed(path, reason);
         let source = chosen
             .as_ref()
             .and_then(|(index, _)| sources.sources.get(*index));
@@ -134,11 +132,13 @@ impl Attempt {
         problems.extend(sources.problems);
         let poses: Vec<Option<Pose>> = match (&chosen, source) {
             (Some((_, poses)), Some(source)) => {
-                problems.extend(without_pose(poses, source, &sweeps.topic).map(fault));
+                let reasons = without_pose(poses, source, &sweeps.topic);
+                problems.extend(reasons.map(|reason| ReadError::malformed(path, reason)));
                 poses.iter().map(|pose| pose.ok().map(Pose::from)).collect()
             }
             _ => {
-                problems.push(fault(format!("{text}: the sequence is read without poses")));
+                let reason = format!("{text}: the sequence is read without poses");
+                problems.push(ReadError::malformed(path, reason));
                 vec![None; sweeps.sweeps.len()]
             }
         };
@@ -168,22 +168,14 @@ fn text(
     sources: &PoseSources,
     chosen: Option<&PoseSource>,
 ) -> String {
-    let span = |span: Option<(u64, u64)>| match span {
-        Some((first, last)) => format!("from {:.3} s to {:.3} s", seconds(first), seconds(last)),
-        None => "none".to_owned(),
-    };
     let of_sweeps = format!("{} ({})", sweeps.topic, sweeps.frame);
     let others = sources
         .sources
         .iter()
         .filter(|source| chosen.is_none_or(|chosen| chosen.name != source.name))
         .map(|source| {
-            format!(
-                "{}, {} poses {}",
-                source.name,
-                source.poses,
-                span(source.span)
-            )
+            let span = span_text(source.span);
+            format!("{}, {} poses {span}", source.name, source.poses)
         });
     let unused = others.chain(sources.unusable.iter().cloned());
     let clouds = contents
@@ -222,9 +214,16 @@ fn text(
             format!(
                 "no pose for any of {} sweeps of {of_sweeps} {}: {unused}",
                 sweeps.sweeps.len(),
-                span(of_stamps)
+                span_text(of_stamps)
             )
         }
+    }
+}
+
+fn span_text(span: Option<(u64, u64)>) -> String {
+    match span {
+        Some((first, last)) => format!("from {:.3} s to {:.3} s", seconds(first), seconds(last)),
+        None => "none".to_owned(),
     }
 }
 

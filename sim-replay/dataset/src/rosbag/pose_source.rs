@@ -152,10 +152,10 @@ impl PoseSources {
     ) -> Result<PoseSource, String> {
         let world = most_frequent(poses.iter().map(|pose| pose.parent.as_str()));
         let child = most_frequent(poses.iter().map(|pose| pose.child.as_deref().unwrap_or("")));
-        let is_of = |pose: &&PoseStamp| {
-            pose.parent == world && pose.child.as_deref().unwrap_or("") == child
-        };
-        let of_frames: Vec<&PoseStamp> = poses.iter().filter(is_of).collect();
+        let of_frames = poses
+            .iter()
+            .filter(|pose| pose.parent == world && pose.child.as_deref().unwrap_or("") == child);
+        let of_frames: Vec<&PoseStamp> = of_frames.collect();
         let others = poses.len() - of_frames.len();
         if others > 0 {
             let reason = format!(

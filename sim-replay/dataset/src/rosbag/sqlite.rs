@@ -23,19 +23,19 @@ impl SqliteFile {
         scan: &mut dyn Scan,
         problems: &mut Vec<ReadError>,
     ) -> std::result::Result<Self, ReadError> {
-        let fault = |error| ReadError::malformed(name, format!("SQLite: {error}"));
         // SQLite's own mutex is not needed: the connection is behind one here.
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
         // Refuses pipes and devices before SQLite opens them.
         bounded_file::open(path).map_err(|error| ReadError::io(name, error))?;
-        let connection = Connection::open_with_flags(path, flags).map_err(fault)?;
-        for (id, topic) in topics(&connection).map_err(fault)? {
+        let connection =
+            Connection::open_with_flags(path, flags).map_err(|error| fault(name, &error))?;
+        for (id, topic) in topics(&connection).map_err(|error| fault(name, &error))? {
             if !scan.declare(&topic) {
                 continue;
             }
             if let Err(error) = messages(&connection, (id, &topic), file, scan) {
                 let rest = format!("the rows of {} after it are left out", topic.name);
-                problems.push(fault(error).with_consequence(&rest));
+                problems.push(fault(name, &error).with_consequence(&rest));
             }
         }
         Ok(Self(Mutex::new(connection)))
@@ -47,6 +47,10 @@ impl SqliteFile {
         let mut statement = connection.prepare("SELECT data FROM messages WHERE id = ?1")?;
         statement.query_row([row], |row| row.get(0))
     }
+}
+
+fn fault(name: &Path, error: &rusqlite::Error) -> ReadError {
+    ReadError::malformed(name, format!("SQLite: {error}"))
 }
 
 /// Number and description of each topic.

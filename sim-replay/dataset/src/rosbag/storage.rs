@@ -65,15 +65,17 @@ impl Storage {
 
     /// The bytes of a message in CDR.
     pub(super) fn read(&self, place: Place) -> Result<Vec<u8>> {
-        let fault = |reason: String| ReadError::malformed(self.path(place), reason);
+        let path = self.path(place);
         let data = match (self.0.get(place.file).map(|file| &file.form), place.at) {
             (Some(Form::Mcap(file)), At::Mcap(at)) => file.read(at).map_err(as_read_error)?,
-            (Some(Form::Sqlite(file)), At::Row(row)) => file
-                .read(row)
-                .map_err(|error| fault(format!("SQLite: row {row} of messages: {error}")))?,
-            _ => return Err(fault("the bag has no such message".into())),
+            (Some(Form::Sqlite(file)), At::Row(row)) => file.read(row).map_err(|error| {
+                let reason = format!("SQLite: row {row} of messages: {error}");
+                ReadError::malformed(path, reason)
+            })?,
+            _ => return Err(ReadError::malformed(path, "the bag has no such message")),
         };
-        let message = unpacked_message(&data).map_err(|error| fault(error.to_string()))?;
+        let message = unpacked_message(&data);
+        let message = message.map_err(|error| ReadError::malformed(path, error.to_string()))?;
         Ok(message.into_owned())
     }
 }

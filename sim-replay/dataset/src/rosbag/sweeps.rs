@@ -24,37 +24,31 @@ impl SweepTopic {
     /// The sweeps of `topic` in the order in which they were recorded. Sweeps without a stamp, in another frame than most,
     /// or out of order are left out and counted.
     pub(super) fn new(path: &Path, topic: &str, clouds: &[CloudStamp]) -> Self {
-        let mut problems = Vec::new();
-        let mut left_out = |count: usize, reason: String| {
-            if count > 0 {
-                let reason = format!(
-                    "{topic}: {count} of {} sweeps {reason}: left out",
-                    clouds.len()
-                );
-                problems.push(ReadError::malformed(path, reason));
-            }
-        };
         let frame = most_frequent(clouds.iter().map(|cloud| cloud.frame.as_str()));
         let (stamped, unstamped): (Vec<&CloudStamp>, Vec<&CloudStamp>) =
             clouds.iter().partition(|cloud| cloud.nanos > 0);
-        left_out(unstamped.len(), "have the stamp 0".into());
         let (of_frame, others): (Vec<&CloudStamp>, Vec<&CloudStamp>) =
             stamped.into_iter().partition(|cloud| cloud.frame == frame);
-        left_out(
-            others.len(),
-            format!("are not in frame {frame}, as most are"),
-        );
         let stamps: Vec<u64> = of_frame.iter().map(|cloud| cloud.nanos).collect();
         let steady = longest_steady(&stamps);
-        left_out(
-            steady.strays,
-            "have a stamp that is not between those around it".into(),
-        );
-        left_out(
-            steady.of_other_parts,
-            "are before or after the clock of their stamps was set back".into(),
-        );
-        let recorded = |index: Option<usize>| Some(of_frame.get(index?)?.recorded_nanos);
+        let other_frame = format!("are not in frame {frame}, as most are");
+        let stray = "have a stamp that is not between those around it";
+        let other_part = "are before or after the clock of their stamps was set back";
+        let mut problems = Vec::new();
+        for (count, reason) in [
+            (unstamped.len(), "have the stamp 0"),
+            (others.len(), other_frame.as_str()),
+            (steady.strays, stray),
+            (steady.of_other_parts, other_part),
+        ] {
+            if count > 0 {
+                let all = clouds.len();
+                let reason = format!("{topic}: {count} of {all} sweeps {reason}: left out");
+                problems.push(ReadError::malformed(path, reason));
+            }
+        }
+        let [after, before] = [steady.bounds.0, steady.bounds.1]
+            .map(|index| Some(of_frame.get(index?)?.recorded_nanos));
         Self {
             topic: topic.to_owned(),
             frame,
@@ -62,7 +56,7 @@ impl SweepTopic {
                 .iter()
                 .filter_map(|&index| of_frame.get(index).map(|cloud| (*cloud).clone()))
                 .collect(),
-            recorded_nanos: (recorded(steady.bounds.0), recorded(steady.bounds.1)),
+            recorded_nanos: (after, before),
             problems,
         }
     }

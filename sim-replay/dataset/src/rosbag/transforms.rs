@@ -70,8 +70,9 @@ impl Transforms {
     /// The shortest way from the body of a robot to a frame on it: joints may move, the body itself does not.
     pub(super) fn route_down(&self, body: &str, frame: &str) -> Option<Route> {
         let route = self.route(body, frame)?;
-        let is_up = |step: &Step| !step.is_down && self.is_moving(*step);
-        (!route.0.iter().any(is_up)).then_some(route)
+        let mut steps = route.0.iter();
+        let is_held = steps.all(|step| step.is_down || !self.is_moving(*step));
+        is_held.then_some(route)
     }
 
     fn is_moving(&self, step: Step) -> bool {
@@ -140,16 +141,13 @@ impl Transforms {
             .iter()
             .filter(|edge| matches!(edge.motion, Motion::Moving(_)));
         let parents: BTreeSet<&str> = moving.map(|edge| edge.parent.as_str()).collect();
-        let is_world = |parent: &str| {
-            let is_topmost = !self.edges.iter().any(|edge| edge.child == parent);
+        let worlds = parents.into_iter().filter(|parent| {
+            let is_topmost = !self.edges.iter().any(|edge| edge.child == *parent);
             let name = last_part(parent);
             is_map(parent) || name.contains("odom") || is_topmost && !name.starts_with("base")
-        };
-        let route = |parent: &'_ str| self.route(parent, frame);
-        parents
-            .into_iter()
-            .filter(|parent| is_world(parent))
-            .filter_map(|parent| Some((parent, route(parent)?)))
+        });
+        worlds
+            .filter_map(|parent| Some((parent, self.route(parent, frame)?)))
             .filter(|(_, route)| self.begins_moving(route))
             .collect()
     }

@@ -55,15 +55,6 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
         return Ok(false);
     }
     let scenarios = read(folder)?;
-    let differs = |setting, found: String, wanted: String| {
-        let folder = folder.to_owned();
-        Err(SynthError::Kept {
-            folder,
-            setting,
-            found,
-            wanted,
-        })
-    };
     let maps: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
     for made in &scenarios {
         let settings: [(&str, &dyn ToString, &dyn ToString); 7] = [
@@ -78,22 +69,31 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
         for (setting, found, wanted) in settings {
             let (found, wanted) = (found.to_string(), wanted.to_string());
             if found != wanted {
-                return differs(setting, found, wanted);
+                return differs(folder, setting, found, wanted);
             }
         }
         if !maps.contains(&made.map) {
-            return differs("map", made.map.clone(), maps.join(" or "));
+            return differs(folder, "map", made.map.clone(), maps.join(" or "));
         }
         if !options.agents.contains(&made.agents) {
             let wanted = format!("{} to {}", options.agents.start(), options.agents.end());
-            return differs("agents", made.agents.to_string(), wanted);
+            return differs(folder, "agents", made.agents.to_string(), wanted);
         }
     }
     let (found, wanted) = (scenarios.len(), options.scenes);
     if found != wanted {
-        return differs("scenarios", found.to_string(), wanted.to_string());
+        return differs(folder, "scenarios", found.to_string(), wanted.to_string());
     }
     Ok(true)
+}
+
+fn differs(folder: &Path, setting: &'static str, found: String, wanted: String) -> Result<bool> {
+    Err(SynthError::Kept {
+        folder: folder.to_owned(),
+        setting,
+        found,
+        wanted,
+    })
 }
 
 /// As [`generate`], but the folder is renamed to its final name when the data set is complete: an interrupted run

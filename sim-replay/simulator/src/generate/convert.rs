@@ -14,7 +14,6 @@ use super::layout::{
     Unfinished, locked,
 };
 use super::scenes::check_folder;
-use dataset::frame::Frame;
 use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
 
 /// Candidate lengths of a tick, nanoseconds: the step of a simulator, and resolutions of sensor clocks.
@@ -166,8 +165,8 @@ fn read(scenario: &Scenario, index: usize) -> LoadedTick {
         cameras: true,
     };
     let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
-    let lacks_pose = |(_, frame): &mut (usize, Frame)| frame.world_from_lidar.is_none();
-    for (agent, _) in loaded.frames.extract_if(.., lacks_pose) {
+    let frames = &mut loaded.frames;
+    for (agent, _) in frames.extract_if(.., |(_, frame)| frame.world_from_lidar.is_none()) {
         let path = scenario.points_path(agent, index, None).unwrap_or_default();
         let error = ReadError::malformed(&path, "there is no pose for this sweep");
         loaded.unreadable.push((agent, Problem::from(&error)));
@@ -182,7 +181,7 @@ fn variants(
     index: usize,
     left_out: &Mutex<LeftOut>,
 ) -> Vec<SweepVariant> {
-    let read = |name: &String| {
+    let variants = scenario.lidar_variants.iter().filter_map(|name| {
         let cloud = scenario.load_points(agent, index, Some(name));
         // Counted as a file, since a copy is part of its frame.
         let cloud = cloud
@@ -194,6 +193,6 @@ fn variants(
             points: cloud.points.xyzi,
             labels,
         })
-    };
-    scenario.lidar_variants.iter().filter_map(read).collect()
+    });
+    variants.collect()
 }

@@ -95,8 +95,9 @@ impl Positioning {
                     + (0.5 * true_radps * elapsed_s * moved).powi(2);
                 let predicted = [position[0] + moved * cos, position[1] + moved * sin];
                 let gain = (variance + drift) / (variance + drift + measured);
-                let mix = |axis: usize| predicted[axis] + gain * (gnss_m[axis] - predicted[axis]);
-                ([mix(0), mix(1)], (1.0 - gain) * (variance + drift))
+                let corrected =
+                    [0, 1].map(|axis| predicted[axis] + gain * (gnss_m[axis] - predicted[axis]));
+                (corrected, (1.0 - gain) * (variance + drift))
             }
         };
         self.state = Some((position, variance));

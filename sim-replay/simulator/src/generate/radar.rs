@@ -30,13 +30,12 @@ pub struct Radar {
 
 impl Default for Radar {
     fn default() -> Self {
-        let degrees = |angle: f32| angle.to_radians();
         let pattern = RayPattern {
-            first_azimuth_rad: degrees(60.0),
-            azimuth_step_rad: degrees(-1.0),
+            first_azimuth_rad: 60.0f32.to_radians(),
+            azimuth_step_rad: (-1.0f32).to_radians(),
             columns: 121,
-            first_elevation_rad: degrees(-15.0),
-            elevation_step_rad: degrees(1.5),
+            first_elevation_rad: (-15.0f32).to_radians(),
+            elevation_step_rad: 1.5f32.to_radians(),
             channels: 21,
             range_m: 150.0,
             rolling: false,
@@ -95,13 +94,12 @@ impl Radar {
                 let direction = exact / exact.norm();
                 // Doppler: the part of the relative velocity along the ray.
                 let radial = (rotation.transpose() * (velocity - own_velocity)).dot(&direction);
-                let mut noise = |deviation: f64| deviation * random.normal();
-                let aside = Vector3::new(noise(1.0), noise(1.0), noise(1.0))
+                let aside = Vector3::new(random.normal(), random.normal(), random.normal())
                     * DIRECTION_NOISE_RAD
                     * exact.norm();
                 // `shift` moves the point from the radar's mount to the reference. Both have the same axes.
-                let point = exact + direction * noise(RANGE_NOISE_M) + aside + shift;
-                let radial = radial + noise(VELOCITY_NOISE_MPS);
+                let point = exact + direction * (RANGE_NOISE_M * random.normal()) + aside + shift;
+                let radial = radial + VELOCITY_NOISE_MPS * random.normal();
                 let [x, y, z]: [f32; 3] = point.map(|metres| metres as f32).into();
                 self.points.push([x, y, z, radial as f32]);
             }

@@ -21,7 +21,6 @@ use super::sensing::{Agent, Bench, STEP_NANOS, Scene, capture_nanos};
 use super::world::World;
 use crate::generate::Result;
 use crate::map::{self, Finding, MapModel, RoadMapSource};
-use dataset::frame::Frame;
 use support::random::derive_seed;
 
 /// Summary of generation.
@@ -230,12 +229,11 @@ impl Scene<'_, '_> {
 }
 
 fn counts(moment: &Moment) -> Summary {
-    let sum =
-        |count: fn(&Frame) -> usize| moment.frames.iter().map(|agent| count(&agent.frame)).sum();
+    let frames = moment.frames.iter().map(|agent| &agent.frame);
     Summary {
         agent_frames: moment.frames.len(),
-        points: sum(|frame| frame.points.len()),
-        annotations: sum(|frame| frame.objects.len()),
+        points: frames.clone().map(|frame| frame.points.len()).sum(),
+        annotations: frames.map(|frame| frame.objects.len()).sum(),
         ..Summary::default()
     }
 }

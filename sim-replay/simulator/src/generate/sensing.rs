@@ -219,10 +219,10 @@ impl Scene<'_, '_> {
             bodies,
             noise,
         );
-        let red = |&[x, y, z, velocity]: &[f32; 4]| [x, y, z, velocity_to_red(velocity)];
-        PointCloud {
-            xyzi: returns.iter().map(red).collect(),
-        }
+        let returns = returns.iter();
+        let xyzi = returns.map(|&[x, y, z, velocity]| [x, y, z, velocity_to_red(velocity)]);
+        let xyzi = xyzi.collect();
+        PointCloud { xyzi }
     }
 }
 
@@ -272,10 +272,8 @@ fn vehicles_around<'a>(
 ) -> (Vec<Body<'a>>, Vec<Annotation<'a>>) {
     let here = frame.of(own).map(|moving| moving.motion.end.position_m);
     let here = here.unwrap_or_default();
-    // Positions are centres: the margin covers half of the longest vehicle.
-    let near = |motion: &Sweep| (motion.end.position_m - here).xy().norm() < SIGHT_M + 10.0;
     let moving = frame.moving.iter();
-    let moving = moving.filter(|moving| moving.vehicle != own && near(&moving.motion));
+    let moving = moving.filter(|moving| moving.vehicle != own);
     let moving = moving.map(|moving| {
         let vehicle: &Vehicle = &recording.vehicles[moving.vehicle];
         (vehicle, moving.motion, moving.id, moving.speed_mps)
@@ -284,18 +282,19 @@ fn vehicles_around<'a>(
         let motion = Sweep::still(parked.placement);
         (&parked.vehicle, motion, parked.id, 0.0)
     });
-    let parked = parked.filter(|(_, motion, ..)| near(motion));
-    let all = moving
+    // Positions are centres: the margin covers half of the longest vehicle.
+    let near = moving
         .chain(parked)
-        .map(|(vehicle, motion, id, speed_mps)| {
-            let annotation = Annotation {
-                id,
-                vehicle,
-                placement: motion.end,
-                speed_mps,
-            };
-            let shape = &vehicle.shape;
-            (Body { shape, motion }, annotation)
-        });
+        .filter(|(_, motion, ..)| (motion.end.position_m - here).xy().norm() < SIGHT_M + 10.0);
+    let all = near.map(|(vehicle, motion, id, speed_mps)| {
+        let annotation = Annotation {
+            id,
+            vehicle,
+            placement: motion.end,
+            speed_mps,
+        };
+        let shape = &vehicle.shape;
+        (Body { shape, motion }, annotation)
+    });
     all.unzip()
 }

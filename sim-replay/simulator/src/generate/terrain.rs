@@ -47,33 +47,32 @@ struct GridRay {
 impl Tops {
     /// The highest node of each square of `cells` cells, its borders included.
     fn of_squares(grid: &HeightGrid, cells: usize) -> Self {
-        let count = |nodes: usize| (nodes - 1).div_ceil(cells).max(1);
-        let (columns, rows) = (count(grid.columns), count(grid.rows));
-        let top = |square: usize| {
+        let [columns, rows] =
+            [grid.columns, grid.rows].map(|nodes| (nodes - 1).div_ceil(cells).max(1));
+        let values = (0..columns * rows).map(|square| {
             let (column, row) = (square % columns * cells, square / columns * cells);
             let nodes = (0..=cells).flat_map(|v| (0..=cells).map(move |u| (column + u, row + v)));
             let heights = nodes.map(|(i, j)| grid.node_m(i, j));
             heights.fold(f64::MIN, f64::max)
-        };
-        let values = (0..columns * rows).map(top).collect();
+        });
         Self {
             cells: cells as f64,
             columns: columns as i64,
             rows: rows as i64,
-            values,
+            values: values.collect(),
         }
     }
 
     /// The highest of each square and the eight around it.
     fn widened(&self) -> Self {
-        let around = |square: i64| {
+        let values = (0..self.columns * self.rows).map(|square| {
             let (column, row) = (square % self.columns, square / self.columns);
             let squares = (-1..=1).flat_map(|v| (-1..=1).map(move |u| (column + u, row + v)));
             let heights = squares.map(|(column, row)| self.at(column, row));
             heights.fold(f64::MIN, f64::max)
-        };
+        });
         Self {
-            values: (0..self.columns * self.rows).map(around).collect(),
+            values: values.collect(),
             ..*self
         }
     }
@@ -108,17 +107,8 @@ impl TerrainSurface {
         let mut cell = ray.place(from_m).map(|place| place.floor() as i64);
         let forward = ray.slope.map(|slope| slope > 0.0);
         let inverse = ray.slope.map(|slope| 1.0 / slope);
-        let leave = |axis: usize, cell: i64| {
-            let border = (cell + i64::from(forward[axis])) as f64;
-            // Along the other axis no border is ever reached.
-            if inverse[axis].is_finite() {
-                (border - ray.origin[axis]) * inverse[axis]
-            } else {
-                f64::MAX
-            }
-        };
         // The ray visits cell after cell; the nearer border gives the next one.
-        let mut leaves = [leave(0, cell[0]), leave(1, cell[1])];
+        let mut leaves = [0, 1].map(|axis| ray.leave(axis, cell[axis], inverse[axis]));
         let mut at = from_m;
         loop {
             let axis = usize::from(leaves[1] < leaves[0]);
@@ -134,32 +124,36 @@ impl TerrainSurface {
                 return None;
             }
             cell[axis] += if forward[axis] { 1 } else { -1 };
-            leaves[axis] = leave(axis, cell[axis]);
+            leaves[axis] = ray.leave(axis, cell[axis], inverse[axis]);
             at = exit;
         }
     }
 
     /// Between two distances inside one cell; on each of its two triangles the height above ground is linear.
     fn meet_in_cell(&self, ray: &GridRay, cell: [i64; 2], from: f64, to: f64) -> Option<f64> {
-        let corner = |u: i64, v: i64| self.node_m(cell[0] + u, cell[1] + v);
-        let (low, right, left, high) = (corner(0, 0), corner(1, 0), corner(0, 1), corner(1, 1));
-        let local = |at: f64| {
-            let [x, y] = ray.place(at);
-            (x - cell[0] as f64, y - cell[1] as f64)
+        let [low, right, left, high] =
+            [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(u, v)| self.node_m(cell[0] + u, cell[1] + v));
+        let [u, v] = ray.within(cell, from);
+        // The diagonal of a cell separates its two triangles.
+        let diagonal = from + (v - u) / off_zero(ray.slope[0] - ray.slope[1]);
+        let pieces: &[[f64; 2]] = if diagonal > from && diagonal < to {
+            &[[from, diagonal], [diagonal, to]]
+        } else {
+            &[[from, to]]
         };
-        let above = |at: f64, is_right: bool| {
-            let (u, v) = local(at);
-            let ground = if is_right {
-                low + u * (right - low) + v * (high - right)
-            } else {
-                low + v * (left - low) + u * (high - left)
-            };
-            ray.height(at) - ground
-        };
-        let meet = |from: f64, to: f64| {
+        pieces.iter().find_map(|&[from, to]| {
             // The middle decides on the triangle, since either end may lie on the diagonal.
-            let (u, v) = local(0.5 * (from + to));
-            let (start, end) = (above(from, u >= v), above(to, u >= v));
+            let [u, v] = ray.within(cell, 0.5 * (from + to));
+            let is_right = u >= v;
+            let [start, end] = [from, to].map(|at| {
+                let [u, v] = ray.within(cell, at);
+                let ground = if is_right {
+                    low + u * (right - low) + v * (high - right)
+                } else {
+                    low + v * (left - low) + u * (high - left)
+                };
+                ray.height(at) - ground
+            });
             // Rays that come out of the ground from below do not hit it.
             (end <= 0.0 && start >= end).then(|| {
                 // Already below at its start: the seam between two pieces leaves no gap.
@@ -169,14 +163,7 @@ impl TerrainSurface {
                     from + (to - from) * start / (start - end)
                 }
             })
-        };
-        let (u, v) = local(from);
-        // The diagonal of a cell separates its two triangles.
-        let diagonal = from + (v - u) / off_zero(ray.slope[0] - ray.slope[1]);
-        if diagonal > from && diagonal < to {
-            return meet(from, diagonal).or_else(|| meet(diagonal, to));
-        }
-        meet(from, to)
+        })
     }
 
     fn node_m(&self, column: i64, row: i64) -> f64 {
@@ -189,6 +176,20 @@ impl TerrainSurface {
 impl GridRay {
     fn place(&self, at: f64) -> [f64; 2] {
         std::array::from_fn(|axis| self.origin[axis] + self.slope[axis] * at)
+    }
+
+    /// The place in a cell.
+    fn within(&self, cell: [i64; 2], at: f64) -> [f64; 2] {
+        let [x, y] = self.place(at);
+        [x - cell[0] as f64, y - cell[1] as f64]
+    }
+
+    /// Where it leaves a cell along an axis of slope 1 / `inverse`.
+    fn leave(&self, axis: usize, cell: i64, inverse: f64) -> f64 {
+        let border = (cell + i64::from(self.slope[axis] > 0.0)) as f64;
+        let at = (border - self.origin[axis]) * inverse;
+        // Along the other axis no border is ever reached.
+        if inverse.is_finite() { at } else { f64::MAX }
     }
 
     fn height(&self, at: f64) -> f64 {
@@ -308,10 +309,6 @@ pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
         .try_normalize(1e-9)?;
     // The top of a deck faces up, whatever the order of its corners.
     let normal = if normal.z < 0.0 { -normal } else { normal };
-    let plane = |normal: &Vector3<f64>, point: &Vector3<f64>| {
-        let [x, y, z]: [f32; 3] = normal.map(|part| part as f32).into();
-        [x, y, z, normal.dot(point) as f32]
-    };
     let top = plane(&normal, &local[0]);
     // The second plane is the underside, DECK_M below the top.
     let mut planes = vec![top, [-top[0], -top[1], -top[2], DECK_M - top[3]]];
@@ -330,6 +327,11 @@ pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
     bounds.min_m[2] -= DECK_M / (normal.z as f32).max(0.2);
     let shape = BodyShape::new(vec![Part::Hull { planes, bounds }], 0.25);
     Some((shape, center))
+}
+
+fn plane(normal: &Vector3<f64>, point: &Vector3<f64>) -> [f32; 4] {
+    let [x, y, z]: [f32; 3] = normal.map(|part| part as f32).into();
+    [x, y, z, normal.dot(point) as f32]
 }
 
 #[cfg(test)]

@@ -260,9 +260,8 @@ impl Form {
     }
 
     fn wheels(&self, radius: f32, front: f32, rear: f32) -> Vec<Part> {
-        let at = |x, side: f32| wheel([x, side * (self.side - 0.14), radius], radius, 0.12);
         [(front, 1.0), (front, -1.0), (rear, 1.0), (rear, -1.0)]
-            .map(|(x, side)| at(x, side))
+            .map(|(x, side)| wheel([x, side * (self.side - 0.14), radius], radius, 0.12))
             .into()
     }
 }
@@ -274,14 +273,13 @@ fn frustum(
     [rear1, front1, side1]: [f32; 3],
 ) -> Part {
     let rise = top - bottom;
-    // A face through (at0, bottom) and (at1, top), with its normal towards growing `at`.
-    let slant = |at0: f32, at1: f32| {
+    // Faces through (at0, bottom) and (at1, top), with their normals towards growing `at`.
+    // The rear is a front seen backwards: its `at` grows towards negative x.
+    let edges = [[front0, front1], [-rear0, -rear1], [side0, side1]];
+    let [front, rear, left] = edges.map(|[at0, at1]| {
         let (norm, back) = (rise.hypot(at0 - at1), at0 - at1);
         [rise, back, rise * at0 + back * bottom].map(|value| value / norm)
-    };
-    // The rear is a front seen backwards: its `at` grows towards negative x.
-    let [front, rear] = [slant(front0, front1), slant(-rear0, -rear1)];
-    let left = slant(side0, side1);
+    });
     let planes = vec![
         [front[0], 0.0, front[1], front[2]],
         [-rear[0], 0.0, rear[1], rear[2]],

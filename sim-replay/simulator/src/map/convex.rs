@@ -112,8 +112,8 @@ impl CellIndex {
     pub(crate) fn new([low, high]: [[f64; 2]; 2], cell_m: f64) -> Self {
         // Huge maps get larger cells rather than more of them.
         let cell_m = cell_m.max((high[0] - low[0]).max(high[1] - low[1]) / 2000.0);
-        let count = |axis: usize| ((high[axis] - low[axis]).max(0.0) / cell_m) as usize + 1;
-        let (columns, rows) = (count(0), count(1));
+        let [columns, rows] =
+            [0, 1].map(|axis| ((high[axis] - low[axis]).max(0.0) / cell_m) as usize + 1);
         Self {
             origin_m: low,
             cell_m,
@@ -148,14 +148,12 @@ impl CellIndex {
         })
     }
 
-    fn cell(&self, [x, y]: [f64; 2]) -> [usize; 2] {
-        let place = |value: f64, origin: f64, count: usize| {
-            (((value - origin) / self.cell_m).max(0.0) as usize).min(count - 1)
-        };
-        [
-            place(x, self.origin_m[0], self.columns),
-            place(y, self.origin_m[1], self.rows),
-        ]
+    fn cell(&self, point: [f64; 2]) -> [usize; 2] {
+        let counts = [self.columns, self.rows];
+        [0, 1].map(|axis| {
+            let place = ((point[axis] - self.origin_m[axis]) / self.cell_m).max(0.0) as usize;
+            place.min(counts[axis] - 1)
+        })
     }
 }
 

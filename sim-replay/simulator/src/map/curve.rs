@@ -135,9 +135,8 @@ impl Curve {
 /// End of a curve of length `s` that starts at the origin along x with curvature `k`, which grows by `rate` per metre:
 /// u, v and heading. The Fresnel integrals by Gauss-Legendre quadrature on pieces that turn little; exact for arcs.
 fn clothoid(k: f64, rate: f64, s: f64) -> (f64, f64, f64) {
-    let heading = |t: f64| t * (k + 0.5 * rate * t);
+    let turn = s * (k + 0.5 * rate * s);
     if rate == 0.0 {
-        let turn = heading(s);
         // Half-angle form: no loss of digits when the arc is nearly straight.
         let chord = if turn.abs() < 1e-9 {
             s
@@ -154,12 +153,13 @@ fn clothoid(k: f64, rate: f64, s: f64) -> (f64, f64, f64) {
     for piece in 0..pieces {
         let middle = half * f64::from(2 * piece + 1);
         for (node, weight) in GAUSS {
-            let (sin, cos) = heading(middle + node * half).sin_cos();
+            let t = middle + node * half;
+            let (sin, cos) = (t * (k + 0.5 * rate * t)).sin_cos();
             u += weight * half * cos;
             v += weight * half * sin;
         }
     }
-    (u, v, heading(s))
+    (u, v, turn)
 }
 
 /// u, v and heading after `s` metres of arc along `v(u)`.

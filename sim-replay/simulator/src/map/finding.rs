@@ -107,8 +107,8 @@ impl FindingLog {
 }
 
 fn shortened(text: &str) -> String {
-    let shown = |letter: char| if letter.is_control() { ' ' } else { letter };
-    text.chars().take(MAX_TEXT).map(shown).collect()
+    let text: String = text.chars().take(MAX_TEXT).collect();
+    text.replace(char::is_control, " ")
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::fmt;
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
 use super::lane_table::{LaneTable, Origin};
-use super::road::{Connection, Contact, RoadLink, RoadNetwork};
+use super::road::{Contact, RoadLink, RoadNetwork};
 
 /// A link whose lanes are farther apart than this is refused, metres.
 const LINK_GAP_M: f64 = 0.5;
@@ -41,11 +41,10 @@ impl Linker<'_> {
             let (section, id) = (origin.section, origin.lane);
             let road = &self.network.roads[origin.road];
             let along = road.leads_along(section, id);
-            let beside = |other: i32| {
+            let [inner, outer] = [id - id.signum(), id + id.signum()].map(|other| {
                 let found = self.table.get(origin.road, section, other);
                 found.filter(|_| road.leads_along(section, other) == along)
-            };
-            let (inner, outer) = (beside(id - id.signum()), beside(id + id.signum()));
+            });
             // Seen along the road, the reference line is to the left of lanes with negative ids.
             (lane.left, lane.right) = match (id < 0) == along {
                 true => (inner, outer),
@@ -126,15 +125,10 @@ impl Linker<'_> {
             return Vec::new();
         };
         let forward = road.leads_along(origin.section, origin.lane);
-        let linked = |road: usize, section: usize| {
-            let lane = lane.linked(forward);
-            lane.and_then(|lane| self.table.get(road, section, lane))
-                .into_iter()
-                .collect()
-        };
+        let next_lane = lane.linked(forward);
         let next_section = origin.next_section(forward);
         if let Some(section) = next_section.filter(|&section| section < road.sections.len()) {
-            return linked(origin.road, section);
+            return self.lanes_of(origin.road, section, next_lane);
         }
         let end = if forward {
             Contact::End
@@ -144,23 +138,27 @@ impl Linker<'_> {
         match road.link(end) {
             None => Vec::new(),
             Some(RoadLink::Road { road, contact }) => {
-                linked(road, self.table.end_section(road, contact))
+                self.lanes_of(road, self.table.end_section(road, contact), next_lane)
             }
             Some(RoadLink::Junction(junction)) => self.through_junction(junction, origin, end),
         }
+    }
+
+    fn lanes_of(
+        &self,
+        road: usize,
+        section: usize,
+        ids: impl IntoIterator<Item = i32>,
+    ) -> Vec<LaneId> {
+        let ids = ids.into_iter();
+        ids.filter_map(|id| self.table.get(road, section, id))
+            .collect()
     }
 
     /// Lanes that the connections of a junction name for the lane of `origin`, which leads into it at `end` of its road.
     fn through_junction(&self, place: usize, origin: Origin, end: Contact) -> Vec<LaneId> {
         let junction = &self.network.junctions[place];
         let mut lanes = Vec::new();
-        let mut add = |road: usize, contact: Contact, ids: &mut dyn Iterator<Item = i32>| {
-            let section = self.table.end_section(road, contact);
-            lanes.extend(ids.filter_map(|id| self.table.get(road, section, id)));
-        };
-        // Without links, lanes of one id are linked.
-        let same =
-            |connection: &Connection| connection.lane_links.is_empty().then_some(origin.lane);
         let connections = junction.connections.iter();
         for connection in connections
             .clone()
@@ -169,12 +167,11 @@ impl Linker<'_> {
             let links = connection.lane_links.iter();
             let onto = links
                 .filter(|(from, _)| *from == origin.lane)
-                .map(|&(_, to)| to);
-            add(
-                connection.connecting,
-                connection.contact,
-                &mut onto.chain(same(connection)),
-            );
+                .map(|&(_, to)| to)
+                // Without links, lanes of one id are linked.
+                .chain(connection.lane_links.is_empty().then_some(origin.lane));
+            let (road, contact) = (connection.connecting, connection.contact);
+            lanes.extend(self.lanes_of(road, self.table.end_section(road, contact), onto));
         }
         // A direct junction is passed both ways: from the linked road onto the incoming one too.
         let back = connections.filter(|connection| {
@@ -187,12 +184,10 @@ impl Linker<'_> {
                     let links = connection.lane_links.iter();
                     let onto = links
                         .filter(|(_, to)| *to == origin.lane)
-                        .map(|&(from, _)| from);
-                    add(
-                        connection.incoming,
-                        contact,
-                        &mut onto.chain(same(connection)),
-                    );
+                        .map(|&(from, _)| from)
+                        .chain(connection.lane_links.is_empty().then_some(origin.lane));
+                    let section = self.table.end_section(connection.incoming, contact);
+                    lanes.extend(self.lanes_of(connection.incoming, section, onto));
                 }
             }
         }

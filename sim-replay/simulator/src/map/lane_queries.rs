@@ -31,18 +31,19 @@ pub(crate) struct LaneIndex {
 impl LaneIndex {
     /// Indexes every centre line of `graph`.
     pub(crate) fn new(graph: &LaneGraph) -> Self {
-        let points = || graph.lanes.iter().flat_map(|lane| lane.centerline.iter());
-        let low = points().fold([f64::INFINITY; 2], |low, p| {
+        let points = graph.lanes.iter().flat_map(|lane| lane.centerline.iter());
+        let low = points.clone().fold([f64::INFINITY; 2], |low, p| {
             [low[0].min(p[0]), low[1].min(p[1])]
         });
-        let high = points().fold([f64::NEG_INFINITY; 2], |high, p| {
+        let high = points.fold([f64::NEG_INFINITY; 2], |high, p| {
             [high[0].max(p[0]), high[1].max(p[1])]
         });
-        let cells = |axis: usize| ((high[axis] - low[axis]).max(0.0) / CELL_M) as usize + 1;
+        let [columns, rows] =
+            [0, 1].map(|axis| ((high[axis] - low[axis]).max(0.0) / CELL_M) as usize + 1);
         let mut index = Self {
             origin_m: low,
-            columns: cells(0),
-            rows: cells(1),
+            columns,
+            rows,
             starts: Vec::new(),
             entries: Vec::new(),
         };
@@ -108,7 +109,6 @@ impl LaneIndex {
     fn visit(&self, x: f64, y: f64, radius_m: f64, mut found: impl FnMut(LaneId, usize)) {
         let low = self.cell(x - radius_m, y - radius_m);
         let high = self.cell(x + radius_m, y + radius_m);
-        let clamp = |value: i64, count: usize| value.clamp(0, count as i64 - 1) as usize;
         // Wholly outside the grid, where clamping would visit the cells at its edge.
         if self.entries.is_empty() || high[0] < 0 || high[1] < 0 {
             return;
@@ -116,8 +116,8 @@ impl LaneIndex {
         if low[0] >= self.columns as i64 || low[1] >= self.rows as i64 {
             return;
         }
-        for row in clamp(low[1], self.rows)..=clamp(high[1], self.rows) {
-            for column in clamp(low[0], self.columns)..=clamp(high[0], self.columns) {
+        for row in low[1].max(0) as usize..=(high[1] as usize).min(self.rows - 1) {
+            for column in low[0].max(0) as usize..=(high[0] as usize).min(self.columns - 1) {
                 let cell = row * self.columns + column;
                 for &(lane, place) in
                     &self.entries[self.starts[cell] as usize..self.starts[cell + 1] as usize]

@@ -79,14 +79,13 @@ pub enum RoadMapSource {
 impl RoadMapSource {
     /// The name of the map made from it: its kind, or the stem of the map's file in small letters.
     pub fn name(&self) -> String {
-        let stem = |path: &Path| {
-            path.file_stem()
-                .map(|stem| stem.to_string_lossy().to_lowercase())
-        };
         match self {
             Self::Town1 => "town1".into(),
             Self::Town4 => "town4".into(),
-            Self::OpenDrive(path) => stem(path).unwrap_or_else(|| "map".into()),
+            Self::OpenDrive(path) => match path.file_stem() {
+                Some(stem) => stem.to_string_lossy().to_lowercase(),
+                None => "map".into(),
+            },
         }
     }
 }
@@ -118,31 +117,26 @@ pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, FileErro
         RoadMapSource::OpenDrive(path) => {
             let Map { network, lanes } = read_map(path)?;
             check_extent(path, &network, &lanes)?;
-            Ok(place_roadside(
-                name,
-                &Layout {
-                    network,
-                    islands: Vec::new(),
-                },
-                map_seed,
-            ))
+            let islands = Vec::new();
+            let layout = Layout { network, islands };
+            Ok(place_roadside(name, &layout, map_seed))
         }
     }
 }
 
 /// Refuses maps without driving lanes, and maps so large that the ground between their roads would not fit in memory.
 fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result<(), FileError> {
-    let points = || graph.lanes.iter().flat_map(|lane| &lane.centerline);
-    let extent = |axis: usize| {
-        let values = || points().map(|point| point[axis]);
-        values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
-    };
     if graph.lanes.is_empty() {
         let roads = network.roads.len();
         let problem = format_args!("none of its {roads} roads has a driving lane");
         return Err(FileError::new(path, problem));
     }
-    let extent_m = extent(0).max(extent(1));
+    let [x_m, y_m] = [0, 1].map(|axis: usize| {
+        let points = graph.lanes.iter().flat_map(|lane| &lane.centerline);
+        let values = points.map(|point| point[axis]);
+        values.clone().fold(f64::NEG_INFINITY, f64::max) - values.fold(f64::INFINITY, f64::min)
+    });
+    let extent_m = x_m.max(y_m);
     if extent_m > MAX_EXTENT_M {
         let problem = format_args!(
             "its lanes reach over {extent_m:.0} m, more than the limit of {MAX_EXTENT_M} m"

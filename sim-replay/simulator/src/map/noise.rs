@@ -11,11 +11,11 @@ pub(crate) fn hills_m(x: f64, y: f64, seed: u64) -> f64 {
 /// Random values 0..1 at whole places, with smooth passages between them.
 fn value_noise(x: f64, y: f64, seed: u64) -> f64 {
     let (column, row) = (x.floor(), y.floor());
-    let fade = |t: f64| t * t * (3.0 - 2.0 * t);
-    let (u, v) = (fade(x - column), fade(y - row));
-    let at = |dx: i64, dy: i64| hashed(column as i64 + dx, row as i64 + dy, seed);
-    let low = at(0, 0) + u * (at(1, 0) - at(0, 0));
-    let high = at(0, 1) + u * (at(1, 1) - at(0, 1));
+    let [u, v] = [x - column, y - row].map(|t| t * t * (3.0 - 2.0 * t));
+    let [a, b, c, d] = [(0, 0), (1, 0), (0, 1), (1, 1)]
+        .map(|(dx, dy)| hashed(column as i64 + dx, row as i64 + dy, seed));
+    let low = a + u * (b - a);
+    let high = c + u * (d - c);
     low + v * (high - low)
 }
 

@@ -30,6 +30,13 @@ impl Profile {
         (start, [from, slope, c, d])
     }
 
+    /// That cubic alone, from 0 on.
+    pub(crate) fn between(length: f64, from: [f64; 2], to: [f64; 2]) -> Self {
+        Self {
+            records: vec![Self::hermite(0.0, length, from, to)],
+        }
+    }
+
     /// Value at `s`; the first cubic also holds before its start, and an empty profile is 0.
     pub fn at(&self, s: f64) -> f64 {
         self.record_at(s)

@@ -349,13 +349,13 @@ impl Road {
     /// Lower and upper `t` of lane `id` of section `section` at `s_m`, metres.
     pub(crate) fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
         let section = &self.sections[section];
-        let side = section.side(id > 0);
+        let side = section.side(id > 0).iter();
         // Cubics of a map may fall below zero or diverge.
-        let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).clamp(0.0, MAX_WIDTH_M);
+        let mut widths = side.map(|lane| lane.width.at(s_m - section.s_m).clamp(0.0, MAX_WIDTH_M));
         // Never 0: the reference line is no lane.
         let place = id.unsigned_abs() as usize;
-        let inner: f64 = side.iter().take(place - 1).map(width).sum();
-        let outer = inner + side.get(place - 1).map_or(0.0, width);
+        let inner: f64 = widths.by_ref().take(place - 1).sum();
+        let outer = inner + widths.next().unwrap_or(0.0);
         let origin = self.lane_offset_m(s_m);
         if id > 0 {
             [origin + inner, origin + outer]

@@ -104,14 +104,7 @@ impl CrossSection {
 impl Patch {
     /// Height of the surface at (or beside) a place, metres.
     pub(crate) fn height_m(&self, [x, y]: [f64; 2]) -> f64 {
-        let mix = |a: [f64; 2], b: [f64; 2], share: f64| {
-            [0, 1].map(|axis| a[axis] + share * (b[axis] - a[axis]))
-        };
-        let middle = |a: [f64; 2], b: [f64; 2]| [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0];
-        let (start, end) = (
-            middle(self.quad[0], self.quad[3]),
-            middle(self.quad[1], self.quad[2]),
-        );
+        let [start, end] = [[0, 3], [1, 2]].map(|[a, b]| middle(self.quad[a], self.quad[b]));
         let (dx, dy) = (end[0] - start[0], end[1] - start[1]);
         let share = ((x - start[0]) * dx + (y - start[1]) * dy) / (dx * dx + dy * dy).max(1e-9);
         let share = share.clamp(0.0, 1.0);
@@ -121,10 +114,10 @@ impl Patch {
             return right_z;
         }
         // A slope across goes on beside the road, so that a grid of heights meets it up to its edge.
-        let (right, left) = (
-            mix(self.quad[0], self.quad[1], share),
-            mix(self.quad[3], self.quad[2], share),
-        );
+        let [right, left] = [[0, 1], [3, 2]].map(|[a, b]| {
+            let (a, b) = (self.quad[a], self.quad[b]);
+            [0, 1].map(|axis| a[axis] + share * (b[axis] - a[axis]))
+        });
         let (dx, dy) = (left[0] - right[0], left[1] - right[1]);
         let width_m = dx.hypot(dy).max(1e-3);
         let across_m = ((x - right[0]) * dx + (y - right[1]) * dy) / width_m;
@@ -142,6 +135,11 @@ impl Patch {
     }
 }
 
+/// The middle between two places.
+pub(super) fn middle(a: [f64; 2], b: [f64; 2]) -> [f64; 2] {
+    [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0]
+}
+
 impl Surface {
     pub(crate) fn new(network: &RoadNetwork) -> Self {
         let roads: Vec<Vec<CrossSection>> = network.roads.iter().map(cross_sections).collect();
@@ -152,7 +150,12 @@ impl Surface {
             for pair in sections.windows(2) {
                 let [from, to] = [pair[0], pair[1]];
                 let before = patches.len();
-                let mut strip = |a: [f64; 2], b: [f64; 2], carriageway| {
+                // The carriageway, then what lies to the right and to the left of it.
+                let [a, b] = [from, to].map(|cut| {
+                    let ([low, high], [right, left]) = (cut.paved_m, cut.carriageway_m);
+                    [[right, left], [low, right], [left, high]]
+                });
+                for ((a, b), carriageway) in a.into_iter().zip(b).zip([true, false, false]) {
                     // Strips of less than a centimetre are rounding.
                     if a[1] - a[0] > 0.01 || b[1] - b[0] > 0.01 {
                         strips(road, [(from, a), (to, b)], most_pieces, |quad, z_m| {
@@ -166,12 +169,7 @@ impl Surface {
                             });
                         });
                     }
-                };
-                strip(from.carriageway_m, to.carriageway_m, true);
-                let right = |c: CrossSection| [c.paved_m[0], c.carriageway_m[0]];
-                let left = |c: CrossSection| [c.carriageway_m[1], c.paved_m[1]];
-                strip(right(from), right(to), false);
-                strip(left(from), left(to), false);
+                }
                 let own = &mut patches[before..];
                 let top_m = own
                     .iter()
@@ -255,17 +253,17 @@ fn strips(
     } else {
         (width_m / PIECE_M).ceil().clamp(1.0, most_pieces) as usize
     };
-    let corner = |cut: &CrossSection, range: [f64; 2], place: usize| {
-        let t_m = range[0] + (range[1] - range[0]) * place as f64 / count as f64;
-        road.point_at(cut.section, cut.s_m, t_m)
-    };
     for place in 0..count {
-        let corners = [
-            corner(&from, a, place),
-            corner(&to, b, place),
-            corner(&to, b, place + 1),
-            corner(&from, a, place + 1),
+        let ends = [
+            (&from, a, place),
+            (&to, b, place),
+            (&to, b, place + 1),
+            (&from, a, place + 1),
         ];
+        let corners = ends.map(|(cut, range, place)| {
+            let t_m = range[0] + (range[1] - range[0]) * place as f64 / count as f64;
+            road.point_at(cut.section, cut.s_m, t_m)
+        });
         piece(corners.map(|[x, y, _]| [x, y]), corners.map(|[_, _, z]| z));
     }
 }
@@ -273,19 +271,19 @@ fn strips(
 /// Edge of the cells of a grid over all patches, metres: `least_m`, or more where surfaces are so wide and skewed that
 /// the cells they touch would exhaust the memory or take minutes to visit.
 pub(super) fn cell_m(patches: &[Patch], least_m: f64) -> f64 {
-    let touched = |cell_m: f64| -> f64 {
-        let boxes = patches.iter().map(|patch| bounds(&patch.quad));
-        boxes
-            .map(|[low, high]| [0, 1].map(|axis| (high[axis] - low[axis]) / cell_m + 1.0))
-            .map(|[x, y]| x * y)
-            .sum()
-    };
     let mut cell_m = least_m;
     // Every patch touches one cell at least, and there are far fewer patches than that.
-    while touched(cell_m) > MAX_TOUCHED && cell_m < 1e9 {
+    while touched(patches, cell_m) > MAX_TOUCHED && cell_m < 1e9 {
         cell_m *= 2.0;
     }
     cell_m
+}
+
+/// Number of cells of a grid that the bounds of patches touch.
+fn touched(patches: &[Patch], cell_m: f64) -> f64 {
+    let boxes = patches.iter().map(|patch| bounds(&patch.quad));
+    let sides = boxes.map(|[low, high]| [0, 1].map(|axis| (high[axis] - low[axis]) / cell_m + 1.0));
+    sides.map(|[x, y]| x * y).sum()
 }
 
 fn cross_sections(road: &Road) -> Vec<CrossSection> {
@@ -304,7 +302,12 @@ fn cross_sections(road: &Road) -> Vec<CrossSection> {
 /// The cut at `s_m`, with widths taken at `inside_m`, which always lies in the section.
 fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
     let origin = road.lane_offset_m(inside_m);
-    let range = |wanted: fn(LaneKind) -> bool| {
+    let kinds: [fn(LaneKind) -> bool; 3] = [
+        |kind| kind == LaneKind::Driving,
+        |kind| [LaneKind::Driving, LaneKind::Shoulder, LaneKind::Parking].contains(&kind),
+        |kind| kind != LaneKind::Other && kind != LaneKind::Median,
+    ];
+    let [driving, carriageway, paved] = kinds.map(|wanted| {
         let mut range: Option<[f64; 2]> = None;
         for id in road.sections[section].lane_ids() {
             let Some(lane) = road.sections[section].lane(id) else {
@@ -316,15 +319,7 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
             }
         }
         range
-    };
-    let driving = range(|kind| kind == LaneKind::Driving);
-    let carriageway = range(|kind| {
-        matches!(
-            kind,
-            LaneKind::Driving | LaneKind::Shoulder | LaneKind::Parking
-        )
     });
-    let paved = range(|kind| kind != LaneKind::Other && kind != LaneKind::Median);
     let carriageway_m = carriageway.or(driving).unwrap_or([origin; 2]);
     let paved_m = paved.unwrap_or(carriageway_m);
     let bank = (!road.lateral.is_level() && paved_m[1] > paved_m[0]).then(|| {

@@ -4,7 +4,7 @@
 use super::convex::{Quad, Rectangle, bounds, overlap};
 use super::ground::{Ground, HeightGrid, Terrain, Triangle};
 use super::noise::hills_m;
-use super::surface::{Patch, Surface, cell_m};
+use super::surface::{Patch, Surface, cell_m, middle};
 
 /// Distance between terrain nodes, metres; larger on maps that would need more than [`MAX_NODES`], or have very wide
 /// surfaces.
@@ -39,7 +39,7 @@ pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
     }
     let mut grid = empty_grid(surface);
     let fixed = fix_under_roads(&mut grid, surface);
-    fill(&mut grid, &fixed);
+    fill_level(&mut grid.heights_m, &fixed, grid.columns, grid.rows);
     raise_hills(&mut grid, &fixed, seed);
     let decks = decks(&grid, surface);
     Ground {
@@ -111,14 +111,14 @@ fn open_under_bridges(grid: &mut HeightGrid, surface: &Surface) {
 /// Nodes whose square of half side `reach_m` overlaps an outline, with their places in the plane.
 fn nodes_within(grid: &HeightGrid, quad: &Quad, reach_m: f64) -> Vec<(usize, [f64; 2])> {
     let [low, high] = bounds(quad);
-    let place = |value: f64, axis: usize| ((value - grid.origin_m[axis]) / grid.cell_m).max(0.0);
-    let range = |axis: usize| {
-        place(low[axis] - reach_m, axis).ceil() as usize
-            ..=place(high[axis] + reach_m, axis) as usize
-    };
+    let [columns, rows] = [0, 1].map(|axis: usize| {
+        let [first, last] = [low[axis] - reach_m, high[axis] + reach_m]
+            .map(|value| ((value - grid.origin_m[axis]) / grid.cell_m).max(0.0));
+        first.ceil() as usize..=last as usize
+    });
     let mut nodes = Vec::new();
-    for row in range(1) {
-        for column in range(0) {
+    for row in rows {
+        for column in columns.clone() {
             let node = [
                 grid.origin_m[0] + column as f64 * grid.cell_m,
                 grid.origin_m[1] + row as f64 * grid.cell_m,
@@ -148,10 +148,6 @@ fn distance_m(place: [f64; 2], quad: &Quad) -> f64 {
 
 /// Gives the nodes between the roads heights that pass smoothly from road to road: averages of ever coarser grids fill
 /// what the finer ones leave open, and each level is smoothed on the way back.
-fn fill(grid: &mut HeightGrid, fixed: &[bool]) {
-    fill_level(&mut grid.heights_m, fixed, grid.columns, grid.rows);
-}
-
 fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) {
     if fixed.iter().all(|&fixed| fixed) {
         return;
@@ -253,41 +249,38 @@ fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
         .iter()
         .map(|&fixed| if fixed { 0.0 } else { f32::MAX / 4.0 })
         .collect();
-    let mut relax = |place: usize, column: usize, row: usize, steps: [(i64, i64, f32); 4]| {
-        for (dx, dy, cost) in steps {
-            let (x, y) = (column as i64 + dx, row as i64 + dy);
-            if x >= 0 && y >= 0 && x < columns as i64 && y < rows as i64 {
-                let near = distances[y as usize * columns + x as usize] + cost;
-                distances[place] = distances[place].min(near);
-            }
-        }
-    };
-    const DIAGONAL: f32 = std::f32::consts::SQRT_2;
     // Step: forward sweep, from the neighbours at lower columns and rows.
     for row in 0..rows {
         for column in 0..columns {
-            let back = [
-                (-1, 0, 1.0),
-                (0, -1, 1.0),
-                (-1, -1, DIAGONAL),
-                (1, -1, DIAGONAL),
-            ];
-            relax(row * columns + column, column, row, back);
+            relax(&mut distances, [columns, rows], [column, row], -1);
         }
     }
     // Step: backward sweep, from the neighbours at higher columns and rows.
     for row in (0..rows).rev() {
         for column in (0..columns).rev() {
-            let ahead = [
-                (1, 0, 1.0),
-                (0, 1, 1.0),
-                (1, 1, DIAGONAL),
-                (-1, 1, DIAGONAL),
-            ];
-            relax(row * columns + column, column, row, ahead);
+            relax(&mut distances, [columns, rows], [column, row], 1);
         }
     }
     distances
+}
+
+/// Shortens a node's distance to those over its neighbours at lower (`sign` -1) or higher (1) columns and rows.
+fn relax(distances: &mut [f32], [columns, rows]: [usize; 2], [column, row]: [usize; 2], sign: i64) {
+    const DIAGONAL: f32 = std::f32::consts::SQRT_2;
+    let steps = [
+        (1, 0, 1.0),
+        (0, 1, 1.0),
+        (1, 1, DIAGONAL),
+        (-1, 1, DIAGONAL),
+    ];
+    for (dx, dy, cost) in steps {
+        let (x, y) = (column as i64 + sign * dx, row as i64 + sign * dy);
+        if x >= 0 && y >= 0 && x < columns as i64 && y < rows as i64 {
+            let near = distances[y as usize * columns + x as usize] + cost;
+            let place = row * columns + column;
+            distances[place] = distances[place].min(near);
+        }
+    }
 }
 
 /// Triangles of the road surfaces that lie above the terrain.
@@ -321,7 +314,6 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
 /// True if a patch lies above the terrain anywhere.
 fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
     let [a, b, c, d] = patch.quad;
-    let middle = |p: [f64; 2], q: [f64; 2]| [(p[0] + q[0]) / 2.0, (p[1] + q[1]) / 2.0];
     // A wide patch spans several cells of the terrain, so its corners alone do not tell.
     let probes = [
         a,

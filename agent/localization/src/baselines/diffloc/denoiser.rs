@@ -56,24 +56,24 @@ impl PoseDenoiser {
     /// Those of the tensor library.
     pub fn new(path: &nn::Path<'_>) -> Result<Self, TchError> {
         let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + FEATURES + 1;
-        let layer = |number: usize| {
-            let path = path / "layers" / number;
-            TransformerLayer::new(&path, WIDTH, HEADS, EXPANSION, 0.0)
-        };
         let half = STEP_CHANNELS / 2;
         let harmonics = (0..HARMONICS).map(|power| (1_u32 << power) as f32);
         let of_step = (0..half).map(|k| LONGEST.powf(-(k as f64) / half as f64) as f32);
-        let table = |values: &[f32]| tensor(values, &[-1], path.device());
         Ok(Self {
             inward: Dense::new(&(path / "inward"), inputs, WIDTH, 0.7),
-            layers: (0..LAYERS).map(layer).collect(),
+            layers: (0..LAYERS)
+                .map(|number| {
+                    let path = path / "layers" / number;
+                    TransformerLayer::new(&path, WIDTH, HEADS, EXPANSION, 0.0)
+                })
+                .collect(),
             norm: LayerNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
             outward: [
                 Dense::new(&(path / "outward" / 0), WIDTH, LAST, 1.0),
                 Dense::new(&(path / "outward" / 1), LAST, POSE, 0.1),
             ],
-            frequencies: table(&harmonics.collect::<Vec<_>>())?,
-            step_frequencies: table(&of_step.collect::<Vec<_>>())?,
+            frequencies: tensor(&harmonics.collect::<Vec<_>>(), &[-1], path.device())?,
+            step_frequencies: tensor(&of_step.collect::<Vec<_>>(), &[-1], path.device())?,
         })
     }
 

@@ -115,11 +115,12 @@ impl DiffLoc {
         let noise = (0..POSE).map(|_| StandardNormal.sample(&mut random));
         let start = tensor::<f32>(&noise.collect::<Vec<_>>(), &[POSE], device)?;
         let start = start.f_expand([count, frames, POSE], false)?;
-        let velocity = |noisy: &Tensor, step| {
-            let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
-            self.denoiser.forward(noisy, &steps, features, windows)
-        };
-        no_grad(|| self.schedule.denoise(&start, DENOISING_STEPS, velocity))
+        no_grad(|| {
+            (self.schedule).denoise(&start, DENOISING_STEPS, |noisy, step| {
+                let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
+                self.denoiser.forward(noisy, &steps, features, windows)
+            })
+        })
     }
 }
 
@@ -127,18 +128,19 @@ impl RegressPose for DiffLoc {
     const KIND: &'static str = "DiffLoc";
 
     fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> Result<Self, TchError> {
-        let layer = |number: usize| {
-            let drop_path = DROP_PATH * number as f64 / (LAYERS - 1) as f64;
-            let path = path / "layers" / number;
-            TransformerLayer::new(&path, TOKEN_WIDTH, HEADS, EXPANSION, drop_path)
-        };
         let (mean, stdev) = (0.0, 0.02);
         let (size, random) = ([TOKENS, TOKEN_WIDTH], Init::Randn { mean, stdev });
         let all = TOKENS * TOKEN_WIDTH;
         Ok(Self {
             inward: Dense::new(&(path / "inward"), channels, TOKEN_WIDTH, 0.7),
             positions: path.var("positions", &size, random),
-            layers: (0..LAYERS).map(layer).collect(),
+            layers: (0..LAYERS)
+                .map(|number| {
+                    let drop_path = DROP_PATH * number as f64 / (LAYERS - 1) as f64;
+                    let path = path / "layers" / number;
+                    TransformerLayer::new(&path, TOKEN_WIDTH, HEADS, EXPANSION, drop_path)
+                })
+                .collect(),
             norm: LayerNorm::new(&(path / "norm"), TOKEN_WIDTH, NORM_EPS),
             mask: Dense::new(&(path / "mask"), TOKEN_WIDTH, 1, 0.1),
             outward: Dense::new(&(path / "outward"), all, WIDTH, 0.7),

@@ -25,18 +25,17 @@ impl NoiseSchedule {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(device: Device) -> Result<Self, TchError> {
-        let beta =
-            |step: usize| BETAS[0] + (BETAS[1] - BETAS[0]) * step as f64 / (STEPS - 1) as f64;
         let kept = (0..STEPS).scan(1.0, |product, step| {
-            *product *= 1.0 - beta(step);
+            let beta = BETAS[0] + (BETAS[1] - BETAS[0]) * step as f64 / (STEPS - 1) as f64;
+            *product *= 1.0 - beta;
             Some(*product)
         });
         let kept: Vec<f64> = kept.collect();
-        let table = |factor: fn(f64) -> f64| {
-            let values: Vec<f32> = kept.iter().map(|&kept| factor(kept) as f32).collect();
-            tensor(&values, &[-1], device)
-        };
-        let factors = [table(f64::sqrt)?, table(|kept| (1.0 - kept).sqrt())?];
+        let signal: Vec<f32> = kept.iter().map(|kept| kept.sqrt() as f32).collect();
+        let noise = kept.iter().map(|&kept| (1.0 - kept).sqrt() as f32);
+        let signal = tensor(&signal, &[-1], device)?;
+        let noise = tensor(&noise.collect::<Vec<_>>(), &[-1], device)?;
+        let factors = [signal, noise];
         Ok(Self { kept, factors })
     }
 
@@ -55,10 +54,10 @@ impl NoiseSchedule {
         noise: &Tensor,
         steps: &Tensor,
     ) -> Result<Tensor, TchError> {
-        let factor = |table: &Tensor| table.f_index_select(0, steps)?.f_view([-1, 1, 1]);
-        let [signal, deviation] = &self.factors;
-        let noise = noise.f_mul(&factor(deviation)?)?;
-        poses.f_mul(&factor(signal)?)?.f_add(&noise)
+        let [signal, deviation] = (self.factors.each_ref())
+            .map(|table| table.f_index_select(0, steps)?.f_view([-1, 1, 1]));
+        let noise = noise.f_mul(&deviation?)?;
+        poses.f_mul(&signal?)?.f_add(&noise)
     }
 
     /// Poses `[W, F, D]` that `noisy` poses come from if their velocity at steps `[W]` is this (Salimans and Ho 2022).
@@ -88,8 +87,8 @@ impl NoiseSchedule {
         mut predict: impl FnMut(&Tensor, i64) -> Result<Tensor, TchError>,
     ) -> Result<Tensor, TchError> {
         let last = (self.kept.len() - 1) as f64;
-        let share = |number: usize| number as f64 / (count.max(2) - 1) as f64;
-        let steps = (0..count.max(1)).map(|number| (last * (1.0 - share(number))).round() as usize);
+        let shares = (0..count.max(1)).map(|number| number as f64 / (count.max(2) - 1) as f64);
+        let steps = shares.map(|share| (last * (1.0 - share)).round() as usize);
         let mut steps: Vec<usize> = steps.collect();
         steps.dedup();
         let mut noisy = noise.shallow_clone();

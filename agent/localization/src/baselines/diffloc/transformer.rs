@@ -73,8 +73,9 @@ impl TransformerLayer {
             .forward(x)?
             .f_view(size)?
             .f_permute([2, 0, 3, 1, 4])?;
-        let part = |number| parts.f_select(0, number);
-        let [query, key, value] = [part(0)?, part(1)?, part(2)?];
+        let query = parts.f_select(0, 0)?;
+        let key = parts.f_select(0, 1)?;
+        let value = parts.f_select(0, 2)?;
         let found = match mask {
             None => {
                 let none = None::<Tensor>;

@@ -23,20 +23,12 @@ pub struct Branch {
 impl Branch {
     /// Builds the layers for so many tokens and classes below `path`.
     pub(super) fn new(path: &nn::Path<'_>, tokens: i64, classes: i64) -> Self {
-        let chain = |name: &str, outputs| {
-            let path = path / name;
-            [
-                Dense::new(&(&path / 0), SWEEP, 128, 1.0),
-                Dense::new(&(&path / 1), 128, 64, 1.0),
-                Dense::new(&(&path / 2), 64, outputs, 0.1),
-            ]
-        };
         Self {
             outward: Dense::new(&(path / "outward"), tokens * WIDTH, SWEEP, 0.7),
             norm: Norm::with_defaults(&(path / "norm"), SWEEP),
             head: PlaceHead::new(&(path / "head"), SWEEP, classes),
-            position: chain("position", 3),
-            heading: chain("heading", 2),
+            position: perceptron(&(path / "position"), 3),
+            heading: perceptron(&(path / "heading"), 2),
         }
     }
 
@@ -62,10 +54,18 @@ impl Branch {
     /// Those of the tensor library.
     pub fn poses(&self, features: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
         let features = self.head.of_class(features, classes)?;
-        let through = |[first, second, third]: &[Dense; 3]| {
+        let [position, heading] = [&self.position, &self.heading].map(|[first, second, third]| {
             let hidden = first.forward(&features)?.f_relu()?;
             third.forward(&second.forward(&hidden)?.f_relu()?)
-        };
-        Tensor::f_cat(&[through(&self.position)?, through(&self.heading)?], 1)
+        });
+        Tensor::f_cat(&[position?, heading?], 1)
     }
+}
+
+fn perceptron(path: &nn::Path<'_>, outputs: i64) -> [Dense; 3] {
+    [
+        Dense::new(&(path / 0), SWEEP, 128, 1.0),
+        Dense::new(&(path / 1), 128, 64, 1.0),
+        Dense::new(&(path / 2), 64, outputs, 0.1),
+    ]
 }

@@ -27,11 +27,12 @@ impl Fusion {
     /// `[S, P + C + 2, WIDTH]` of tokens `[S, P, WIDTH]` of points and `[S, C, WIDTH]` of columns: in this order, then
     /// one pooled token of each.
     pub(super) fn forward(&self, points: &Tensor, columns: &Tensor) -> Result<Tensor, TchError> {
-        let pooled = |tokens: &Tensor| tokens.f_mean_dim(1_i64, true, Kind::Float);
-        let tokens = Tensor::f_cat(&[points, columns, &pooled(points)?, &pooled(columns)?], 1)?;
-        let weight = |number| self.weights.f_select(0, number);
-        let euclidean = self.euclidean.forward(&tokens)?.f_mul(&weight(0)?)?;
-        euclidean.f_add(&self.poincare.forward(&tokens)?.f_mul(&weight(1)?)?)
+        let [of_points, of_columns] =
+            [points, columns].map(|tokens| tokens.f_mean_dim(1_i64, true, Kind::Float));
+        let tokens = Tensor::f_cat(&[points, columns, &of_points?, &of_columns?], 1)?;
+        let [flat, curved] = [0, 1].map(|number| self.weights.f_select(0, number));
+        let euclidean = self.euclidean.forward(&tokens)?.f_mul(&flat?)?;
+        euclidean.f_add(&self.poincare.forward(&tokens)?.f_mul(&curved?)?)
     }
 }
 

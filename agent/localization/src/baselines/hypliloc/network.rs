@@ -52,12 +52,11 @@ impl HypLiLoc {
         train: bool,
     ) -> Result<[Tensor; 3], TchError> {
         let tokens = tokens.f_to_kind(kind)?;
-        let single = |of: Tensor| of.f_to_kind(Kind::Float);
-        let points = single(self.inward.forward(&tokens)?)?.f_add(&self.positions)?;
-        let points = self.attention.forward(&points)?;
+        let points = self.inward.forward(&tokens)?.f_to_kind(Kind::Float)?;
+        let points = self.attention.forward(&points.f_add(&self.positions)?)?;
         let mut layers = self.panorama.iter();
         let columns = layers.try_fold(panorama(&tokens)?, |x, layer| layer.forward(&x))?;
-        let columns = single(columns)?;
+        let columns = columns.f_to_kind(Kind::Float)?;
 
         let fused = (self.first).forward(&normalise(&points)?, &normalise(&columns)?)?;
         let (inward, attention, outward) = &self.point_block;
@@ -81,10 +80,7 @@ impl RegressPose for HypLiLoc {
     const KIND: &'static str = "HypLiLoc";
 
     fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> Result<Self, TchError> {
-        let block = path / "point_block";
-        let layer = |number: usize| TokenLayer::new(&(&block / number), [WIDTH; 2]);
-        let circular = |name: &str, inputs| CircularLayer::new(&(path / name), [inputs, WIDTH]);
-        let branch = |name: &str, tokens| Branch::new(&(path / "branches" / name), tokens, classes);
+        let (block, branches) = (path / "point_block", path / "branches");
         let mut log_variances = path.var("log_variances", &[3, 2], Init::Const(0.0));
         let start = Tensor::from_slice(&Self::START);
         no_grad(|| log_variances.f_copy_(&start))?;
@@ -94,21 +90,21 @@ impl RegressPose for HypLiLoc {
             positions: path.var("positions", &[TOKENS, WIDTH], Init::Randn { mean, stdev }),
             attention: GraphAttention::plain(&(path / "attention"), WIDTH),
             panorama: [
-                circular("panorama0", RINGS * channels),
-                circular("panorama1", WIDTH),
+                CircularLayer::new(&(path / "panorama0"), [RINGS * channels, WIDTH]),
+                CircularLayer::new(&(path / "panorama1"), [WIDTH; 2]),
             ],
             first: Fusion::new(&(path / "first_fusion")),
             point_block: (
-                layer(0),
+                TokenLayer::new(&(&block / 0), [WIDTH; 2]),
                 GraphAttention::with_metric(&(&block / 1), WIDTH, Space::Euclidean),
-                layer(2),
+                TokenLayer::new(&(&block / 2), [WIDTH; 2]),
             ),
-            panorama_block: circular("panorama_block", WIDTH),
+            panorama_block: CircularLayer::new(&(path / "panorama_block"), [WIDTH; 2]),
             second: Fusion::new(&(path / "second_fusion")),
             branches: [
-                branch("points", TOKENS),
-                branch("panorama", SECTORS),
-                branch("fusion", TOKENS + SECTORS + 2),
+                Branch::new(&(&branches / "points"), TOKENS, classes),
+                Branch::new(&(&branches / "panorama"), SECTORS, classes),
+                Branch::new(&(&branches / "fusion"), TOKENS + SECTORS + 2, classes),
             ],
             log_variances,
         })

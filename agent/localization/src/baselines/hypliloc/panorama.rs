@@ -28,8 +28,7 @@ impl CircularLayer {
     /// `[S, SECTORS, C]` to `[S, SECTORS, C']`, in the precision of the columns.
     pub(super) fn forward(&self, columns: &Tensor) -> Result<Tensor, TchError> {
         // The first column and the last are neighbours: a roll has no edge to pad.
-        let beside = |shift: i64| columns.f_roll(shift, 1);
-        let three = [beside(1)?, columns.shallow_clone(), beside(-1)?];
-        self.0.forward(&Tensor::f_cat(&three, 2)?)
+        let (before, after) = (columns.f_roll(1, 1)?, columns.f_roll(-1, 1)?);
+        (self.0).forward(&Tensor::f_cat(&[&before, columns, &after], 2)?)
     }
 }

@@ -36,18 +36,15 @@ impl SgLocHead {
         let surroundings = encoder.context_m.iter().map(|_| coarse);
         let scales = [fine, coarse].into_iter().chain(surroundings);
         let scales: Vec<i64> = scales.filter(|&channels| channels > 0).collect();
-        let squeeze = |(number, &channels): (usize, &i64)| {
-            Dense::new(&(path / "squeeze" / number), channels, 1, 0.1)
-        };
-        let layer = |path: &nn::Path<'_>, inputs| {
-            DenseNorm::new(path, [inputs, WIDTH], BatchNormConfig::default())
-        };
-        let block = |number: usize| [0, 1].map(|of| layer(&(path / "blocks" / number / of), WIDTH));
         Self {
-            squeeze: scales.iter().enumerate().map(squeeze).collect(),
+            squeeze: (scales.iter().enumerate())
+                .map(|(scale, &channels)| Dense::new(&(path / "squeeze" / scale), channels, 1, 0.1))
+                .collect(),
             inward: layer(&(path / "inward"), encoder.cell_channels() + 3),
             scales,
-            blocks: (0..BLOCKS).map(block).collect(),
+            blocks: (0..BLOCKS)
+                .map(|number| [0, 1].map(|of| layer(&(path / "blocks" / number / of), WIDTH)))
+                .collect(),
             outward: Dense::new(&(path / "outward"), WIDTH, 3, 0.1),
         }
     }
@@ -89,4 +86,8 @@ impl SgLocHead {
         }
         Ok(parts)
     }
+}
+
+fn layer(path: &nn::Path<'_>, inputs: i64) -> DenseNorm {
+    DenseNorm::new(path, [inputs, WIDTH], BatchNormConfig::default())
 }

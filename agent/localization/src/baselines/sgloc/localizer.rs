@@ -5,7 +5,7 @@ use std::path::Path;
 use perception::tensor_values::{tensor, values};
 use perception::weights::Weights;
 use protocol::NoPoseReason;
-use tch::{Device, Kind, nn, no_grad};
+use tch::{Device, Kind, no_grad};
 
 use super::SgLoc;
 use crate::baselines::regressed_pose::no_pose;
@@ -42,9 +42,10 @@ impl SgLocLocalizer {
     /// [`LocalizerError`] when the file is missing, truncated or of another kind, or its tensors are not those of its
     /// configuration.
     pub fn load(path: &Path, device: Device, solver: PoseSolver) -> Result<Self, LocalizerError> {
-        let build = |path: &nn::Path<'_>, config| SgLoc::new(path, &config);
+        let weights = Weights::load(path)?;
         Ok(Self {
-            network: Weights::load(path)?.network(Self::KIND, device, build)?,
+            network: weights
+                .network(Self::KIND, device, |path, config| SgLoc::new(path, &config))?,
             solver,
             device,
         })

@@ -3,13 +3,14 @@
 use std::sync::{Mutex, PoisonError};
 
 use perception::detector::{BackboneLevel, Detector};
+use perception::tensor_values::tensor;
 use perception::weights::{KIND_KEY, Weights};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::EncodedCells;
 use super::bev_cells::{BevCells, BevFormat};
 use crate::pgc::error::LocalizerError;
-use crate::pgc::scene_encoder::SceneFeatures;
+use crate::pgc::scene_encoder::{SceneFeatures, mean_over};
 
 /// Encoder of a detector, in its fastest form.
 #[derive(Debug)]
@@ -85,16 +86,14 @@ impl BackboneEncoder {
         };
         Ok(no_grad(|| {
             let map = coarsest.map()?;
-            let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(map.device());
-            let own = levels
-                .iter()
-                .zip(&sweep.places)
-                .map(|(level, places)| level.of_cells(&index(places)?));
+            let own = (levels.iter().zip(&sweep.places))
+                .map(|(level, places)| level.of_cells(&tensor(places, &[-1], map.device())?));
             let mut parts: Vec<Tensor> = own.collect::<Result<_, _>>()?;
-            let places = index(places)?;
+            let places = tensor(places, &[-1], map.device())?;
             let channels = map.size()[1];
             for window in self.format.windows() {
-                let means = mean_over(&map, window)?
+                // Padding is not counted: the counts of both passes multiply, so the mean of means is exact.
+                let means = mean_over(&map, window, false)?
                     .f_permute([0, 2, 3, 1])?
                     .f_reshape([-1, channels])?;
                 parts.push(means.f_index_select(0, &places)?);
@@ -105,23 +104,6 @@ impl BackboneEncoder {
             Ok::<_, TchError>(SceneFeatures::new(cells, sweeps.f_to_device(self.device)?))
         })?)
     }
-}
-
-/// Mean of a map `[1, C, H, W]` over a window of an odd height and width around each cell, as far as it is on the map.
-fn mean_over(map: &Tensor, [height, width]: [i64; 2]) -> Result<Tensor, TchError> {
-    // One row after one column of the window: a fraction of the additions.
-    // Padding is not counted: the counts of both passes multiply, so the mean of means is exact.
-    let along = |map: &Tensor, size: [i64; 2]| {
-        map.f_avg_pool2d(
-            size,
-            [1; 2],
-            size.map(|edge| edge / 2),
-            false,
-            false,
-            None::<i64>,
-        )
-    };
-    along(&along(map, [height, 1])?, [1, width])
 }
 
 #[cfg(test)]

@@ -47,7 +47,8 @@ impl BevFormat {
     pub fn of_detector(config: &DetectorConfig) -> Self {
         let pillars = config.pillar_grid();
         let mut stride = 1;
-        let level = |(&channels, &step): (&i64, &i64)| {
+        let levels = config.num_filters.iter().zip(&config.layer_strides);
+        let levels = levels.map(|(&channels, &step)| {
             stride *= step;
             LevelGrid {
                 channels,
@@ -55,20 +56,18 @@ impl BevFormat {
                 width: pillars[0].div_ceil(stride as usize),
                 height: pillars[1].div_ceil(stride as usize),
             }
-        };
-        let levels = config.num_filters.iter().zip(&config.layer_strides);
-        let levels = levels.map(level).collect();
+        });
         let range_m = config.lidar_range_m.map(f64::abs);
-        let reach_m = |axis: usize| range_m[axis].max(range_m[axis + 3]);
+        let [x_m, y_m] = [0, 1].map(|axis| range_m[axis].max(range_m[axis + 3]));
         Self {
             crop: Crop::for_detector(config),
             low_m: [0, 1].map(|axis| config.lidar_range_m[axis] as f32),
-            range_m: reach_m(0).hypot(reach_m(1)),
+            range_m: x_m.hypot(y_m),
             y_sign: match config.y_axis == YAxis::Right {
                 true => -1.0,
                 false => 1.0,
             },
-            levels,
+            levels: levels.collect(),
         }
     }
 
@@ -86,19 +85,18 @@ impl BevFormat {
 
     /// Channels, height and width of each level.
     pub(super) fn shapes(&self) -> impl Iterator<Item = [i64; 3]> + '_ {
-        let shape = |level: &LevelGrid| [level.channels, level.height as i64, level.width as i64];
-        self.levels.iter().map(shape)
+        let levels = self.levels.iter();
+        levels.map(|level| [level.channels, level.height as i64, level.width as i64])
     }
 
     /// Height and width of the surroundings of a cell, cells of the coarsest level; odd, so that the cell is in the
     /// centre.
     pub(super) fn windows(&self) -> impl Iterator<Item = [i64; 2]> + '_ {
         let cell_m = self.levels.last().map_or([1.0; 2], |level| level.cell_m);
-        let window = move |edge_m: f64| {
+        CONTEXT_M.into_iter().map(move |edge_m| {
             // Height first: maps are `[.., H, W]`, and y is along H.
             [1, 0].map(|axis| 2 * (edge_m / f64::from(cell_m[axis]) / 2.0).round() as i64 + 1)
-        };
-        CONTEXT_M.into_iter().map(window)
+        })
     }
 
     fn coarse_channels(&self) -> i64 {
@@ -142,20 +140,20 @@ impl BevCells {
         let occupied = (columns.iter().enumerate()).filter(|(_, column)| column.points > 0);
         let cells = occupied.map(|(number, column)| (number, column.cell()));
         let (numbers, cells): (Vec<usize>, Vec<Cell>) = cells.unzip();
-        let place = |grid: &LevelGrid| {
+        let places = format.levels.iter().map(|grid| {
             // Strides are whole numbers: the cells of a level are whole blocks of those of the finest.
             let steps =
                 [0, 1].map(|axis| (grid.cell_m[axis] / finest.cell_m[axis]).round() as usize);
-            let number = |&number: &usize| {
+            let places = numbers.iter().map(|&number| {
                 let column = number % finest.width / steps[0];
                 let row = number / finest.width / steps[1];
                 (row * grid.width + column) as i64
-            };
-            numbers.iter().map(number).collect()
-        };
+            });
+            places.collect()
+        });
         Self {
             cells,
-            places: format.levels.iter().map(place).collect(),
+            places: places.collect(),
             cloud,
         }
     }

@@ -99,10 +99,10 @@ impl ConfidenceModel {
             return Err(FitError::TooFew(sweeps.len()));
         }
         // Bounded from below: the logarithm of an error of 0 would make the sums infinite.
-        let log_error = |error_m: f64| error_m.max(SMALLEST_ERROR_M).ln();
-        let (rows, targets): (Vec<[f64; FEATURES]>, Vec<f64>) = (sweeps.iter())
-            .map(|sweep| (features(&sweep.evidence), log_error(sweep.error_m)))
-            .unzip();
+        let targets = (sweeps.iter()).map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln());
+        let targets: Vec<f64> = targets.collect();
+        let rows = sweeps.iter().map(|sweep| features(&sweep.evidence));
+        let rows: Vec<[f64; FEATURES]> = rows.collect();
         let (bias, weights) = non_negative_regression(&rows, &targets);
         let mut model = Self {
             bias,
@@ -141,18 +141,16 @@ impl ConfidenceModel {
             Rejection::MaxWrong(share) => threshold_of_risk(&sigmas, share),
         };
         let below = self.reject_below;
-        let count = |is_counted: &dyn Fn(&(f64, bool)) -> bool| {
-            sigmas.iter().filter(|sigma| is_counted(sigma)).count()
-        };
-        let accepted = count(&|(sigma, _)| *sigma >= below);
-        let wrong = count(&|(sigma, is_good)| !is_good && *sigma >= below);
-        let bad = count(&|(_, is_good)| !is_good);
+        let accepted = sigmas.iter().filter(|(sigma, _)| *sigma >= below);
+        let wrong = accepted.clone().filter(|(_, is_good)| !is_good).count();
+        let bad = sigmas.iter().filter(|(_, is_good)| !is_good).count();
+        let good_rejected = (sigmas.iter()).filter(|(sigma, is_good)| *is_good && *sigma < below);
         Ok(FitReport {
             sweeps: sigmas.len(),
             bad,
             bad_rejected: bad - wrong,
-            good_rejected: count(&|(sigma, is_good)| *is_good && *sigma < below),
-            wrong_limit: share_limit(wrong, accepted),
+            good_rejected: good_rejected.count(),
+            wrong_limit: share_limit(wrong, accepted.count()),
         })
     }
 }
@@ -197,12 +195,12 @@ fn threshold_of_risk(sigmas: &[(f64, bool)], max_wrong: f64) -> f64 {
 /// Ridge regression with weights that are not negative, on standardised features, by coordinate descent.
 fn non_negative_regression(rows: &[[f64; FEATURES]], targets: &[f64]) -> (f64, [f64; FEATURES]) {
     let count = rows.len() as f64;
-    let row = |row: &[f64; FEATURES]| SVector::<f64, FEATURES>::from(*row);
-    let mean = rows.iter().map(row).sum::<SVector<f64, FEATURES>>() / count;
+    let rows = (rows.iter()).map(|row| SVector::<f64, FEATURES>::from(*row));
+    let mean = rows.clone().sum::<SVector<f64, FEATURES>>() / count;
     let target_mean = targets.iter().sum::<f64>() / count;
     let mut square = SMatrix::<f64, FEATURES, FEATURES>::zeros();
     let mut cross = SVector::<f64, FEATURES>::zeros();
-    for (features, target) in rows.iter().map(row).zip(targets) {
+    for (features, target) in rows.zip(targets) {
         let centred = features - mean;
         square += centred * centred.transpose() / count;
         cross += centred * (target - target_mean) / count;

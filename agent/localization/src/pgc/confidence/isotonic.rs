@@ -103,10 +103,9 @@ struct Pool {
 
 impl Pool {
     fn of(samples: &[(f64, f64)]) -> Self {
-        let sum = |part: fn(&(f64, f64)) -> f64| samples.iter().map(part).sum();
         Self {
-            x: sum(|sample| sample.0),
-            value: sum(|sample| sample.1),
+            x: samples.iter().map(|sample| sample.0).sum(),
+            value: samples.iter().map(|sample| sample.1).sum(),
             count: samples.len() as f64,
         }
     }

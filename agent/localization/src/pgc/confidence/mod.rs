@@ -109,16 +109,18 @@ impl ConfidenceModel {
     }
 }
 
+fn log(value: f64) -> f64 {
+    value.clamp(1e-3, 1e6).ln()
+}
+
+/// Feature of a refined pose. A head has a refiner or has none: features that are always 0 get no weight.
+fn refinement(second: Option<&RefinementEvidence>, of: fn(&RefinementEvidence) -> f64) -> f64 {
+    second.map_or(0.0, |second| log(of(second)))
+}
+
 /// Evidence against a pose, each feature the larger the worse: logarithms, because errors span orders of magnitude.
 fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
-    let log = |value: f64| value.clamp(1e-3, 1e6).ln();
-    // A head has a refiner or has none: features that are always 0 get no weight.
-    let refinement = |value: fn(&RefinementEvidence) -> f64| {
-        evidence
-            .second
-            .as_ref()
-            .map_or(0.0, |second| log(value(second)))
-    };
+    let second = evidence.second.as_ref();
     [
         -log(evidence.inlier_ratio),
         -log(evidence.inliers as f64 / 100.0),
@@ -127,13 +129,13 @@ fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
         log(evidence.median_epsilon_m),
         log(evidence.position_std_m),
         log(evidence.rotation_std_rad),
-        -refinement(|second| second.inlier_ratio),
-        refinement(|second| second.rms_m),
-        refinement(|second| second.median_epsilon_m),
-        refinement(|second| second.moved_m),
-        refinement(|second| second.residual_quartile_m),
-        -refinement(|second| second.information_per_m2),
-        refinement(|second| second.worst_axis_std_m),
+        -refinement(second, |second| second.inlier_ratio),
+        refinement(second, |second| second.rms_m),
+        refinement(second, |second| second.median_epsilon_m),
+        refinement(second, |second| second.moved_m),
+        refinement(second, |second| second.residual_quartile_m),
+        -refinement(second, |second| second.information_per_m2),
+        refinement(second, |second| second.worst_axis_std_m),
     ]
 }
 

@@ -35,6 +35,16 @@ pub struct IcpLevel {
     pub max_steps: u32,
 }
 
+impl IcpLevel {
+    fn new(voxel_m: f64, scale_m: f64, max_steps: u32) -> Self {
+        Self {
+            voxel_m,
+            scale_m,
+            max_steps,
+        }
+    }
+}
+
 /// Settings of a registration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -57,16 +67,11 @@ pub struct IcpConfig {
 impl Default for IcpConfig {
     /// For 64-channel sweeps of streets.
     fn default() -> Self {
-        let level = |voxel_m, scale_m, max_steps| IcpLevel {
-            voxel_m,
-            scale_m,
-            max_steps,
-        };
         Self {
             levels: vec![
-                level(2.0, 1.0, 40),
-                level(1.0, 0.4, 20),
-                level(0.5, 0.15, 20),
+                IcpLevel::new(2.0, 1.0, 40),
+                IcpLevel::new(1.0, 0.4, 20),
+                IcpLevel::new(0.5, 0.15, 20),
             ],
             range_m: [2.5, 80.0],
             source_voxel_m: 0.5,

@@ -55,13 +55,11 @@ pub struct SurfelMap {
 impl SurfelMap {
     /// Settings of registrations to a map: one grid, first with a wide kernel, then with a narrow one.
     pub fn registration() -> IcpConfig {
-        let level = |scale_m, max_steps| IcpLevel {
-            voxel_m: VOXEL_M,
-            scale_m,
-            max_steps,
-        };
         IcpConfig {
-            levels: vec![level(0.4, 8), level(0.1, 12)],
+            levels: vec![
+                IcpLevel::new(VOXEL_M, 0.4, 8),
+                IcpLevel::new(VOXEL_M, 0.1, 12),
+            ],
             max_points: 2000,
             ..IcpConfig::default()
         }
@@ -163,14 +161,12 @@ fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>,
 }
 
 fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
-    let incomplete = |error| {
-        format!(
-            "not a complete safetensors file ({} bytes): {error}",
-            bytes.len()
-        )
-    };
-    let (_, header) = SafeTensors::read_metadata(bytes).map_err(incomplete)?;
-    let file = SafeTensors::deserialize(bytes).map_err(incomplete)?;
+    let read = SafeTensors::read_metadata(bytes)
+        .and_then(|(_, header)| Ok((header, SafeTensors::deserialize(bytes)?)));
+    let (header, file) = read.map_err(|error| {
+        let count = bytes.len();
+        format!("not a complete safetensors file ({count} bytes): {error}")
+    })?;
     let metadata = header.metadata().clone().unwrap_or_default();
     let kind = metadata.get(KIND_KEY).map(String::as_str);
     if kind != Some(KIND) {
@@ -195,15 +191,15 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
         ));
     }
     let planes = (0..counts[0]).map(|row| {
-        let of = |axis: usize| 3 * row + axis;
+        let first = 3 * row;
         let voxel: [i32; 3] = std::array::from_fn(|axis| {
-            let at = 2 * of(axis);
+            let at = 2 * (first + axis);
             i32::from(i16::from_le_bytes([voxels[at], voxels[at + 1]]))
         });
         // Half a step is added because the writer rounds down.
-        let inside = Vector3::from_fn(|axis, _| (f64::from(centres[of(axis)]) + 0.5) / 256.0);
+        let inside = Vector3::from_fn(|axis, _| (f64::from(centres[first + axis]) + 0.5) / 256.0);
         let centre_m = (Vector3::from(voxel.map(f64::from)) + inside) * config.voxel_m;
-        let normal = Vector3::from_fn(|axis, _| f64::from(normals[of(axis)] as i8));
+        let normal = Vector3::from_fn(|axis, _| f64::from(normals[first + axis] as i8));
         // Bytes have rounded the length. A file may hold a zero normal, which has no direction.
         let normal = normal.try_normalize(0.5).unwrap_or_else(Vector3::z);
         (voxel, Surfel { centre_m, normal })

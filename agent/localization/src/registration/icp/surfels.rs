@@ -108,8 +108,9 @@ impl Surfels {
     /// Fits the planes: each to the points of its voxel and of the 26 around it, since one sweep leaves a line or two
     /// in a voxel.
     pub(super) fn fit(&mut self) {
-        let around = |coord: &[i32; 3]| {
-            let mut moments = Moments::default();
+        let voxels = self.sites.coords().iter().zip(&self.moments);
+        let planes = voxels.map(|(coord, own)| {
+            let mut around = Moments::default();
             for offset in 0..27 {
                 let shifted = [
                     coord[0] + offset % 3 - 1,
@@ -117,26 +118,17 @@ impl Surfels {
                     coord[2] + offset / 9 - 1,
                 ];
                 if let Some(row) = self.sites.row(shifted) {
-                    moments.merge(&self.moments[row as usize]);
+                    around.merge(&self.moments[row as usize]);
                 }
             }
-            moments
-        };
-        let plane = |(coord, own): (&[i32; 3], &Moments)| {
             let plane = Surfel {
                 // Of its own points: the mean over all 27 voxels may lie outside this one.
                 centre_m: own.mean(),
-                normal: around(coord).normal()?,
+                normal: around.normal()?,
             };
             Some(self.kept(*coord, &plane))
-        };
-        self.planes = self
-            .sites
-            .coords()
-            .iter()
-            .zip(&self.moments)
-            .map(plane)
-            .collect();
+        });
+        self.planes = planes.collect();
         self.count = self.planes.iter().flatten().count();
     }
 

@@ -97,8 +97,8 @@ impl PoseLoss for DiffLoc {
 
 /// L1 of the poses, and of their differences between sweeps that see each other.
 fn denoising_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Result<[Tensor; 2]> {
-    let drawn = |of: &Tensor| of.f_repeat([DRAWS, 1, 1]);
-    let (features, poses) = (drawn(features)?, drawn(poses)?);
+    let features = features.f_repeat([DRAWS, 1, 1])?;
+    let poses = poses.f_repeat([DRAWS, 1, 1])?;
     let count = poses.size()[0];
     let on = (Kind::Float, poses.device());
     let schedule = &network.schedule;

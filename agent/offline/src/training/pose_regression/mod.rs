@@ -98,8 +98,9 @@ fn train<N: PoseLoss>(
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
     let mut read = |folders: &[PathBuf]| {
         let list = Arc::new(SweepList::open(folders)?);
-        let mut encoded = |done, total| observe(&Progress::Encoding(done, total));
-        let sweeps = PooledSweeps::encode(&list, &encoder, run, &mut encoded)?;
+        let sweeps = PooledSweeps::encode(&list, &encoder, run, &mut |done, total| {
+            observe(&Progress::Encoding(done, total));
+        })?;
         Ok::<_, Error>((sweeps, list.data()))
     };
     let (sweeps, data) = read(&config.scenes)?;
@@ -109,14 +110,14 @@ fn train<N: PoseLoss>(
     };
     observe(&Progress::Read(data.clone()));
     let count = sweeps.world_from_sensor.len();
-    let mean = |axis: usize| {
+    let origin_m = [0, 1, 2].map(|axis: usize| {
         let positions = sweeps.world_from_sensor.iter();
         let positions = positions.map(|pose| pose.translation.vector[axis]);
         positions.sum::<f64>() / count as f64
-    };
+    });
     let network_config = PoseRegressorConfig {
         scene_name: config.scene_name.clone(),
-        origin_m: [0, 1, 2].map(mean),
+        origin_m,
         classes: CLASSES.min(count) as i64,
         encoder: encoder.config().clone(),
     };

@@ -74,13 +74,12 @@ impl PooledSweeps {
     ) -> Result<Self, Error> {
         let total = list.len();
         let (source, config) = (Arc::clone(list), encoder.config().clone());
-        let prepare = move |batch: u64| -> Vec<Prepared> {
+        let mut loader = Prefetch::start(run.loader_threads, 0, move |batch| {
             // The threads also ask for batches beyond the end: their range is empty.
             let numbers = batch * BATCH..((batch + 1) * BATCH).min(total as u64);
-            let one = |number| Prepared::read(&source, number as usize, &config);
-            numbers.filter_map(one).collect()
-        };
-        let mut loader = Prefetch::start(run.loader_threads, 0, prepare);
+            let read = numbers.filter_map(|index| Prepared::read(&source, index as usize, &config));
+            read.collect::<Vec<_>>()
+        });
         let mut parts = Vec::new();
         let (mut statics, mut drives, mut poses) = (Vec::new(), Vec::new(), Vec::new());
         for done in (0..total).step_by(BATCH as usize) {
@@ -128,21 +127,20 @@ impl PooledSweeps {
         origin_m: [f64; 3],
     ) -> Result<TokenCache, TchError> {
         let device = self.pooled.device();
-        let pose = |pose: &Isometry3<f64>| {
+        let poses = self.world_from_sensor.iter().map(|pose| {
             // The difference is taken in f64: world coordinates are too large for f32.
             let position = pose.translation.vector - Vector3::from(origin_m);
             let (sin, cos) = heading_rad(pose).sin_cos();
             [position.x, position.y, position.z, cos, sin].map(|value| value as f32)
-        };
-        let poses: Vec<[f32; 5]> = self.world_from_sensor.iter().map(pose).collect();
-        let mut first = 0;
-        let of = |row: usize| {
-            if row > 0 && self.drives[row] != self.drives[row - 1] {
+        });
+        let poses: Vec<[f32; 5]> = poses.collect();
+        let (mut first, mut first_of_drive) = (0, Vec::new());
+        for (row, drive) in self.drives.iter().enumerate() {
+            if row > 0 && *drive != self.drives[row - 1] {
                 first = row as i64;
             }
-            first
-        };
-        let first_of_drive: Vec<i64> = (0..self.drives.len()).map(of).collect();
+            first_of_drive.push(first);
+        }
         let mut parts = Vec::new();
         for part in self.pooled.f_split(FITTED, 0)? {
             parts.push(no_grad(|| projection.forward(&part))?);
@@ -215,11 +213,10 @@ impl TokenCache {
         let of_drive = self.first_of_drive.f_index_select(0, &last.f_view([-1])?)?;
         let rows = last.f_sub(&skip.f_mul(&back)?)?;
         let rows = rows.f_maximum(&of_drive.f_view([-1, 1])?)?.f_view([-1])?;
-        let of = |values: &Tensor| values.f_index_select(0, &rows);
         Ok(TokenSweeps {
-            tokens: of(&self.sweeps.tokens)?,
-            statics: of(&self.sweeps.statics)?,
-            poses: of(&self.sweeps.poses)?,
+            tokens: self.sweeps.tokens.f_index_select(0, &rows)?,
+            statics: self.sweeps.statics.f_index_select(0, &rows)?,
+            poses: self.sweeps.poses.f_index_select(0, &rows)?,
         })
     }
 }
@@ -236,10 +233,11 @@ impl TokenSweeps {
         let turns = turns.f_repeat_interleave_self_int(frames, 0, count)?;
         let turned = self.turned(&turns)?;
         let on = (Kind::Float, device);
-        let of_sweeps = |most: f64| Ok::<_, TchError>(Tensor::f_rand([count, 1, 1], on)? * most);
-        let [dropped, noise] = SPOILT;
-        let is_kept = Tensor::f_rand([count, TOKENS, 1], on)?.f_ge_tensor(&of_sweeps(dropped)?)?;
-        let noise = Tensor::f_randn([count, TOKENS, channels], on)?.f_mul(&of_sweeps(noise)?)?;
+        let [most_dropped, most_noise] = SPOILT;
+        let is_kept = Tensor::f_rand([count, TOKENS, 1], on)?;
+        let is_kept = is_kept.f_ge_tensor(&(Tensor::f_rand([count, 1, 1], on)? * most_dropped))?;
+        let noise = Tensor::f_randn([count, TOKENS, channels], on)?;
+        let noise = noise.f_mul(&(Tensor::f_rand([count, 1, 1], on)? * most_noise))?;
         let tokens = turned
             .tokens
             .f_add(&noise)?
@@ -252,13 +250,6 @@ impl TokenSweeps {
         let source = Tensor::f_arange(SECTORS, (Kind::Int64, turns.device()))?;
         let source = source.f_sub(&turns.f_unsqueeze(1)?)?.f_remainder(SECTORS)?;
         let source = source.f_view([-1, 1, SECTORS, 1])?;
-        let rolled = |values: &Tensor| {
-            let of_rings = values.f_view([turns.size()[0], RINGS, SECTORS, -1])?;
-            let source = source.f_expand(of_rings.size(), false)?;
-            of_rings
-                .f_gather(2, &source, false)?
-                .f_view(values.size().as_slice())
-        };
         // The sensor itself has turned the other way.
         let angle = turns.f_to_kind(Kind::Float)?.f_unsqueeze(1)? * (TAU / SECTORS as f64);
         let (cos, sin) = (angle.f_cos()?, angle.f_sin()?);
@@ -267,11 +258,20 @@ impl TokenSweeps {
         let position = self.poses.f_narrow(1, 0, 3)?;
         let [x, y] = heading;
         Ok(Self {
-            tokens: rolled(&self.tokens)?,
-            statics: rolled(&self.statics)?,
+            tokens: rolled(&self.tokens, &source)?,
+            statics: rolled(&self.statics, &source)?,
             poses: Tensor::f_cat(&[position, x, y], 1)?,
         })
     }
+}
+
+/// Values of all tokens, each from the sector `source` `[S, 1, SECTORS, 1]` of the same ring.
+fn rolled(values: &Tensor, source: &Tensor) -> Result<Tensor, TchError> {
+    let of_rings = values.f_view([source.size()[0], RINGS, SECTORS, -1])?;
+    let source = source.f_expand(of_rings.size(), false)?;
+    of_rings
+        .f_gather(2, &source, false)?
+        .f_view(values.size().as_slice())
 }
 
 #[cfg(test)]

@@ -74,16 +74,16 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
     let logits = head.classify(&cache.sweeps, false)?;
     let classes = Vec::try_from(&logits.f_argmax(1, false)?)?;
     let sweep_of_cell: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
-    // Cells are stored sweep after sweep, so these numbers ascend.
-    let first_cell = |sweep: usize| sweep_of_cell.partition_point(|&of| of < sweep as i64) as i64;
     let errors = (0..cache.sweep_count()).map(|sweep| {
-        let rows = first_cell(sweep)..first_cell(sweep + 1);
-        let count = (rows.end - rows.start).min(CELLS);
+        // Cells are stored sweep after sweep, so these numbers ascend.
+        let [start, end] = [sweep, sweep + 1]
+            .map(|sweep| sweep_of_cell.partition_point(|&of| of < sweep as i64) as i64);
+        let count = (end - start).min(CELLS);
         if count == 0 {
             return Ok(f64::INFINITY);
         }
         let on = (Kind::Double, cache.cells.device());
-        let (first, last) = (rows.start as f64, (rows.end - 1) as f64);
+        let (first, last) = (start as f64, (end - 1) as f64);
         // Evenly over the cells of the sweep, first and last included.
         let rows = Tensor::f_linspace(first, last, count, on)?.f_to_kind(Kind::Int64)?;
         let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
@@ -99,12 +99,12 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
 }
 
 fn nearest(middles: &[(usize, [f64; 3])], position: &[f64; 3]) -> usize {
-    let square_m2 = |(_, middle): &(usize, [f64; 3])| {
-        let squares = (0..3).map(|axis| (middle[axis] - position[axis]).powi(2));
-        squares.sum::<f64>()
-    };
-    let nearest = middles
-        .iter()
-        .min_by(|one, other| square_m2(one).total_cmp(&square_m2(other)));
+    let nearest = middles.iter().min_by(|one, other| {
+        let [one_m2, other_m2] = [one, other].map(|(_, middle)| {
+            let squares = (0..3).map(|axis| (middle[axis] - position[axis]).powi(2));
+            squares.sum::<f64>()
+        });
+        one_m2.total_cmp(&other_m2)
+    });
     nearest.map_or(0, |(class, _)| *class)
 }

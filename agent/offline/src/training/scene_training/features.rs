@@ -35,9 +35,11 @@ impl Features {
     ) -> Result<Self, Error> {
         let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
-            let mut progress = |done, total| observe(&Progress::Encoding(done, total));
+            let run = &config.run;
             let cache =
-                FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
+                FeatureCache::build(list, &encoder, augmentation, run, &mut |done, total| {
+                    observe(&Progress::Encoding(done, total));
+                })?;
             observe(&Progress::Read(list.data()));
             Ok::<_, Error>(cache)
         };

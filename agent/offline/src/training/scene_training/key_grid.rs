@@ -19,15 +19,10 @@ const MARGIN_M: f64 = 8.0;
 
 /// A key grid that covers all cells, whose world coordinates are `targets_m` `[N, 3]`.
 pub(super) fn covering(targets_m: &Tensor, local_channels: i64) -> Result<RefinerConfig, TchError> {
-    let bound = |extreme: Tensor, margin_m: f64| -> Result<[f64; 2], TchError> {
-        let values: Vec<f32> = Vec::try_from(&extreme)?;
-        Ok([
-            f64::from(values[0]) + margin_m,
-            f64::from(values[1]) + margin_m,
-        ])
-    };
-    let low_m = bound(targets_m.f_amin([0_i64], false)?, -MARGIN_M)?;
-    let high_m = bound(targets_m.f_amax([0_i64], false)?, MARGIN_M)?;
+    let low_m: Vec<f32> = Vec::try_from(&targets_m.f_amin([0_i64], false)?)?;
+    let low_m = [0, 1].map(|axis: usize| f64::from(low_m[axis]) - MARGIN_M);
+    let high_m: Vec<f32> = Vec::try_from(&targets_m.f_amax([0_i64], false)?)?;
+    let high_m = [0, 1].map(|axis: usize| f64::from(high_m[axis]) + MARGIN_M);
     let area_m2 = (high_m[0] - low_m[0]) * (high_m[1] - low_m[1]);
     let spacing_m = (area_m2 / CORNERS).sqrt().max(SPACING_M);
     let reach = (REACH_M / spacing_m).ceil() as i64;
@@ -52,14 +47,8 @@ pub(super) fn crop(
     let Some(full) = &head.refiner else {
         return Ok(variables);
     };
-    let bound = |share: f64, axis: i64| -> Result<f64, TchError> {
-        let values = targets_m.f_select(1, axis)?;
-        // `kthvalue` counts from 1.
-        let rank = ((values.size()[0] - 1) as f64 * share).round() as i64 + 1;
-        values.f_kthvalue(rank, 0, false)?.0.f_double_value(&[])
-    };
-    let low_m = [bound(EDGE_SHARE, 0)?, bound(EDGE_SHARE, 1)?];
-    let high_m = [bound(1.0 - EDGE_SHARE, 0)?, bound(1.0 - EDGE_SHARE, 1)?];
+    let low_m = quantiles(targets_m, EDGE_SHARE)?;
+    let high_m = quantiles(targets_m, 1.0 - EDGE_SHARE)?;
     let (cropped, rows) = full.cropped(low_m, high_m);
     let rows = Tensor::f_from_slice(&rows)?.f_to_device(variables.device())?;
     head.refiner = Some(cropped);
@@ -78,4 +67,16 @@ pub(super) fn crop(
         no_grad(|| variable.f_copy_(&source))?;
     }
     Ok(kept)
+}
+
+/// x and y below which a share of the cells lies.
+fn quantiles(targets_m: &Tensor, share: f64) -> Result<[f64; 2], TchError> {
+    let mut quantiles = [0.0; 2];
+    for (axis, quantile) in (0..).zip(&mut quantiles) {
+        let values = targets_m.f_select(1, axis)?;
+        // `kthvalue` counts from 1.
+        let rank = ((values.size()[0] - 1) as f64 * share).round() as i64 + 1;
+        *quantile = values.f_kthvalue(rank, 0, false)?.0.f_double_value(&[])?;
+    }
+    Ok(quantiles)
 }

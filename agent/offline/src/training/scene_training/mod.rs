@@ -309,7 +309,8 @@ fn classifier_time(length: Length) -> Option<Duration> {
 /// The configuration of the head for these features.
 fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig> {
     let (training, format) = (&features.training, &features.format);
-    let refiner = || key_grid::covering(&training.targets_m, format.local_channels());
+    let refiner = { config.refiner }
+        .then(|| key_grid::covering(&training.targets_m, format.local_channels()));
     Ok(SceneHeadConfig {
         scene_name: config.scene_name.clone(),
         encoder_sha256: features.encoder_sha256.clone(),
@@ -321,7 +322,7 @@ fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHe
         blocks: config.blocks,
         origin_m: training.origin_m,
         max_cells: MAX_CELLS,
-        refiner: config.refiner.then(refiner).transpose()?,
+        refiner: refiner.transpose()?,
         sweep_points: median_points(&training.points),
     })
 }

@@ -2,7 +2,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use deploy::score::metrics::Metrics;
 use figures::{Axis, Chart, Mark, Series};
 use fusion::Exchange;
 
@@ -110,14 +109,10 @@ pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
         .collect();
     let mut figures = Vec::new();
     for &dimension in &varying {
-        let chart = |title: &str, precision: fn(&Metrics) -> Option<f64>| {
-            chart(experiment, runs, dimension, &varying, title, precision)
-        };
-        let charts = [
-            chart("AP@0.5", |metrics| metrics.ap_global.at_50),
-            chart("AP@0.7", |metrics| metrics.ap_global.at_70),
-        ];
-        let charts: Vec<Chart> = charts.into_iter().flatten().collect();
+        let mut charts = Vec::new();
+        for (title, iou) in [("AP@0.5", 1), ("AP@0.7", 2)] {
+            charts.extend(chart(experiment, runs, dimension, &varying, title, iou));
+        }
         let name = dimension.name;
         if !charts.is_empty() {
             figures.push(Figure { name, charts });
@@ -126,18 +121,20 @@ pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
     figures
 }
 
+/// A chart of the precisions at one IoU, by its place among them.
 fn chart(
     experiment: &Experiment,
     runs: &[Run],
     dimension: &Dimension,
     varying: &[&Dimension],
     title: &str,
-    precision: fn(&Metrics) -> Option<f64>,
+    iou: usize,
 ) -> Option<Chart> {
     // Along bytes, the cells of all values of a codec form one line.
     let mut series: Vec<(String, Points)> = Vec::new();
     for run in runs {
-        let (Some(x), Some(y)) = ((dimension.value)(run), precision(&run.cell.metrics)) else {
+        let precision = run.cell.metrics.ap_global.values()[iou];
+        let (Some(x), Some(y)) = ((dimension.value)(run), precision) else {
             continue;
         };
         let point = &run.point;
@@ -187,12 +184,13 @@ enum Key {
 }
 
 fn line(name: String, points: Points) -> Series {
-    let mean = |values: &[(f64, f64)], of: fn(&(f64, f64)) -> f64| {
-        values.iter().map(of).sum::<f64>() / values.len() as f64
-    };
     let mut points: Vec<(f64, f64)> = points
         .values()
-        .map(|values| (mean(values, |value| value.0), mean(values, |value| value.1)))
+        .map(|values| {
+            let (xs, ys) = (values.iter().map(|it| it.0), values.iter().map(|it| it.1));
+            let count = values.len() as f64;
+            (xs.sum::<f64>() / count, ys.sum::<f64>() / count)
+        })
         .collect();
     // The keys are in the order of bits or letters, not of values.
     points.sort_by(|a, b| a.0.total_cmp(&b.0));

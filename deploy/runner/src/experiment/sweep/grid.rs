@@ -77,24 +77,23 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
         dtype: experiment.dtype,
         ..CodecSpec::default()
     };
-    let point = |&method: &Method| Point {
-        method,
-        codec,
-        latency_ms: None,
-        jitter_ms: None,
-        bandwidth_mbps: None,
-        loss: None,
-        pose_noise: None,
-        vehicles: None,
-        seed: 0,
-    };
-    let of = |methods: &[Method], codecs: &Option<Vec<CodecSpec>>| {
-        let points = methods.iter().map(point).collect();
-        spread(points, codecs, |point, codec| point.codec = codec)
-    };
     let first = { grid.codec.as_ref() }.map(|codecs| codecs.iter().take(1).copied().collect());
-    let mut points = of(&grid.method, &grid.codec);
-    points.extend(of(&grid.reference, &first));
+    let mut points = Vec::new();
+    for (methods, codecs) in [(&grid.method, &grid.codec), (&grid.reference, &first)] {
+        let plain = methods.iter().map(|&method| Point {
+            method,
+            codec,
+            latency_ms: None,
+            jitter_ms: None,
+            bandwidth_mbps: None,
+            loss: None,
+            pose_noise: None,
+            vehicles: None,
+            seed: 0,
+        });
+        let plain = plain.collect();
+        points.extend(spread(plain, codecs, |point, codec| point.codec = codec));
+    }
     let points = spread(points, &grid.latency_ms, |point, ms| {
         point.latency_ms = Some(ms)
     });
@@ -205,14 +204,13 @@ impl Point {
             boxes: _,
         } = self.codec;
         let cells = grid.cells() as u64;
-        let budget = |keep: f64| {
+        // All cells need no budget, and a mask would only cost bytes.
+        let budget_bytes = keep.filter(|keep| *keep < 1.0).map(|keep| {
             let kept = (keep * cells as f64).ceil() as u64;
             // Layout of a sparse map: scales (4 bytes per channel of I8), mask (1 bit per cell), values.
             let scales = if dtype == Dtype::I8 { 4 * channels } else { 0 };
             scales + cells.div_ceil(8) + kept * channels * dtype.size()
-        };
-        // All cells need no budget, and a mask would only cost bytes.
-        let budget_bytes = keep.filter(|keep| *keep < 1.0).map(budget);
+        });
         CodecConfig {
             dtype,
             gate: None,

@@ -329,8 +329,8 @@ impl Sweep {
             }
         };
         let computed = if jobs > 1 && missing.len() > 1 {
-            let on_frame = || bar.inc(1);
-            workers::run(&self.file, &self.out, missing, jobs, &on_frame, &on_done)
+            let (file, out) = (&self.file, &self.out);
+            workers::run(file, out, missing, jobs, &|| bar.inc(1), &on_done)
         } else {
             missing.iter().try_for_each(|&(index, key)| {
                 self.compute_one(index, key.clone(), &mut || bar.inc(1))?;
@@ -354,10 +354,6 @@ impl Sweep {
     /// An error when the parent process has ended.
     pub fn work(&self) -> Result<()> {
         const PARENT: &str = "the parent sweep";
-        let reply = |line: &str| {
-            let mut output = io::stdout().lock();
-            writeln!(output, "{line}").and_then(|()| output.flush())
-        };
         for line in io::stdin().lock().lines() {
             let request: Option<(usize, CellKey)> =
                 serde_json::from_str(&line.context(PARENT)?).ok();
@@ -415,6 +411,12 @@ pub fn read(file: &Path) -> Result<Experiment, FileError> {
             Err(FileError::new(file, problem))
         }
     }
+}
+
+/// Answers the parent process.
+fn reply(line: &str) -> io::Result<()> {
+    let mut output = io::stdout().lock();
+    writeln!(output, "{line}").and_then(|()| output.flush())
 }
 
 /// Places in `part` whose runs are not cached.

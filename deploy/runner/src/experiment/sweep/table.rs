@@ -75,30 +75,30 @@ fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
         fixed(comm.wire_bytes_mean, 1),
         fixed(comm.log2_payload, 4),
     ]);
-    let log2 = |bytes: Option<f64>| fixed(bytes.filter(|bytes| *bytes > 0.0).map(f64::log2), 4);
     let per_frame = used as f64 / metrics.frames.max(1) as f64;
     let payload = comm.payload_bytes_mean.filter(|_| is_plain);
-    fields.extend([
-        log2(comm.wire_bytes_mean),
-        log2(comm.wire_bytes_mean.map(|bytes| bytes * per_frame)),
-        log2(payload.map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64)),
-        fixed(Some(comm.nominal_fp32_log2), 4),
-    ]);
+    let sizes = [
+        comm.wire_bytes_mean,
+        comm.wire_bytes_mean.map(|bytes| bytes * per_frame),
+        payload.map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64),
+    ];
+    fields.extend(sizes.map(|bytes| fixed(bytes.filter(|bytes| *bytes > 0.0).map(f64::log2), 4)));
+    fields.push(fixed(Some(comm.nominal_fp32_log2), 4));
     let (latency, age) = (&metrics.latency_ms.capture_to_detection, &metrics.age_ms);
     let times = [latency.p50, latency.p95, latency.p99, age.p50, age.p95];
     fields.extend(times.map(|ms| fixed(ms, 3)));
-    let count = |reason: &DropReason| messages.dropped.get(reason).copied().unwrap_or(0);
-    let stale = count(&DropReason::Stale);
+    let dropped = REASONS.map(|reason| messages.dropped.get(&reason).copied().unwrap_or(0));
+    let stale = messages.dropped.get(&DropReason::Stale).copied();
     let mut counts = vec![
         used,
-        stale,
+        stale.unwrap_or(0),
         messages.sent,
         messages.received,
         messages.in_flight,
     ];
-    counts.extend(REASONS.iter().map(count));
+    counts.extend(dropped);
     let all: u64 = messages.dropped.values().sum();
-    counts.push(all - REASONS.iter().map(count).sum::<u64>());
+    counts.push(all - dropped.iter().sum::<u64>());
     fields.extend(counts.iter().map(ToString::to_string));
     fields
 }

@@ -27,33 +27,28 @@ pub(super) struct VaryingTable {
 impl VaryingTable {
     /// The varying settings, then precisions, then the other varying results.
     pub(super) fn new(columns: &[&str], lines: &[Vec<String>]) -> Self {
-        let values = |place: usize| {
-            lines
-                .iter()
-                .map(move |line| line.get(place).map_or("", String::as_str))
-        };
-        let varies = |place: usize| values(place).any(|value| Some(value) != values(place).next());
-        let settings = columns
-            .iter()
-            .position(|column| *column == LAST_SETTING)
-            .map_or(0, |last| last + 1);
-        let is_shown = |place: &usize| varies(*place) || PRECISIONS.contains(&columns[*place]);
+        let varies: Vec<bool> = (0..columns.len())
+            .map(|place| column(lines, place).any(|it| Some(it) != column(lines, place).next()))
+            .collect();
+        let settings = columns.iter().position(|column| *column == LAST_SETTING);
+        let settings = settings.map_or(0, |last| last + 1);
         let (precisions, others): (Vec<usize>, Vec<usize>) = (settings..columns.len())
-            .filter(is_shown)
+            .filter(|&place| varies[place] || PRECISIONS.contains(&columns[place]))
             .partition(|&place| PRECISIONS.contains(&columns[place]));
-        let varied: Vec<usize> = (0..settings).filter(|&place| varies(place)).collect();
+        let varied: Vec<usize> = (0..settings).filter(|&place| varies[place]).collect();
         let kept: Vec<usize> = [&varied[..], &precisions, &others].concat();
-        let constant = |place: usize| {
-            let value = values(place).next().filter(|value| !value.is_empty())?;
-            Some((columns[place].to_owned(), value.to_owned()))
-        };
         let names = kept.iter().map(|&place| columns[place].to_owned());
-        let cells = |line: &Vec<String>| kept.iter().map(|&place| line[place].clone()).collect();
+        let cells =
+            { lines.iter() }.map(|line| kept.iter().map(|&place| line[place].clone()).collect());
         let others = (0..columns.len()).filter(|place| !kept.contains(place));
+        let constants = others.filter_map(|place| {
+            let value = { column(lines, place).next() }.filter(|value| !value.is_empty())?;
+            Some((columns[place].to_owned(), value.to_owned()))
+        });
         Self {
             columns: names.collect(),
-            lines: lines.iter().map(cells).collect(),
-            constants: others.filter_map(constant).collect(),
+            lines: cells.collect(),
+            constants: constants.collect(),
             settings: varied.len(),
         }
     }
@@ -70,11 +65,11 @@ impl VaryingTable {
     pub(super) fn sentence(&self) -> Option<String> {
         let column = self.columns.iter().position(|column| column == MAIN)?;
         let (low, high) = self.range(column).filter(|(low, high)| low < high)?;
-        let run_with = |value: f64| {
-            // Both numbers were read from the same text, so they are equal bit by bit.
+        // Both numbers were read from the same text, so they are equal bit by bit.
+        let [worst, best] = [low, high].map(|value| {
             (0..self.lines.len()).find(|&line| self.number(line, column) == Some(value))
-        };
-        let [worst, best] = [run_with(low)?, run_with(high)?].map(|run| self.settings_of(run));
+        });
+        let [worst, best] = [worst?, best?].map(|run| self.settings_of(run));
         Some(format!(
             "AP@0.5 is between {low:.3} ({worst}) and {high:.3} ({best})."
         ))
@@ -82,31 +77,25 @@ impl VaryingTable {
 
     /// The table for a terminal: settings, precisions, and of the other results those that fit; then the sentence.
     pub(super) fn text(&self) -> String {
-        let name = |place: usize| self.columns[place].as_str();
-        let width = |place: usize| {
-            let cells = self.lines.iter().map(|line| line[place].len());
-            usize::from(GAP) + cells.chain([name(place).len()]).max().unwrap_or(0)
-        };
         let mut shown: Vec<usize> = (0..self.columns.len())
-            .filter(|&place| place < self.settings || PRECISIONS.contains(&name(place)))
+            .filter(|&at| at < self.settings || PRECISIONS.contains(&self.columns[at].as_str()))
             .collect();
-        let mut used: usize = shown.iter().map(|&place| width(place)).sum();
-        for place in
-            (self.settings..self.columns.len()).filter(|&place| KEY_RESULTS.contains(&name(place)))
-        {
+        let mut used: usize = shown.iter().map(|&place| self.width(place)).sum();
+        let results = self.settings..self.columns.len();
+        for place in results.filter(|&place| KEY_RESULTS.contains(&self.columns[place].as_str())) {
             // Once a column has no room, those behind it are left out too.
-            used += width(place);
+            used += self.width(place);
             if used <= TERMINAL {
                 shown.push(place);
             }
         }
-        let side = |place: usize| {
+        let heads = shown.iter().map(|&place| {
             let is_number = (0..self.lines.len()).all(|line| {
                 self.lines[line][place].is_empty() || self.number(line, place).is_some()
             });
-            if is_number { Side::Right } else { Side::Left }
-        };
-        let heads = shown.iter().map(|&place| (name(place), side(place)));
+            let side = if is_number { Side::Right } else { Side::Left };
+            (self.columns[place].as_str(), side)
+        });
         let mut table = TextTable::new(heads);
         for line in &self.lines {
             table.row(shown.iter().map(|&place| match line[place].as_str() {
@@ -114,10 +103,14 @@ impl VaryingTable {
                 value => value.to_owned(),
             }));
         }
-        let sentence = self
-            .sentence()
-            .map_or(String::new(), |sentence| format!("{sentence}\n"));
+        let sentence = { self.sentence() }.map_or(String::new(), |it| format!("{it}\n"));
         format!("{table}{sentence}")
+    }
+
+    /// Characters of a column and of the gap beside it.
+    fn width(&self, column: usize) -> usize {
+        let cells = self.lines.iter().map(|line| line[column].len());
+        usize::from(GAP) + cells.chain([self.columns[column].len()]).max().unwrap_or(0)
     }
 
     fn settings_of(&self, line: usize) -> String {
@@ -141,6 +134,11 @@ impl VaryingTable {
             .map(|number| (number, number))
             .reduce(|(low, high), (number, _)| (low.min(number), high.max(number)))
     }
+}
+
+/// Fields of a column, empty where a line is shorter.
+fn column(lines: &[Vec<String>], place: usize) -> impl Iterator<Item = &str> {
+    { lines.iter() }.map(move |line| line.get(place).map_or("", String::as_str))
 }
 
 #[cfg(test)]

@@ -59,7 +59,6 @@ fn serve<'r>(
 ) -> Result<()> {
     // Wrapped at once, so that no early return leaves the process behind.
     let mut worker = Worker(start(file, out)?);
-    let silent = || WorkerError("it ended without an answer".into());
     let mut input = worker.0.stdin.take().ok_or_else(silent)?;
     let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
     loop {
@@ -82,6 +81,10 @@ fn serve<'r>(
             }
         }
     }
+}
+
+fn silent() -> WorkerError {
+    WorkerError("it ended without an answer".into())
 }
 
 fn start(file: &Path, out: &Path) -> Result<Child> {

@@ -35,17 +35,17 @@ pub fn markdown(table: &FilledTable) -> String {
         let values: Vec<String> = if single {
             let cells = &cells[0];
             let frame_order = precision(cells, |cell| cell.metrics.ap_frame_order);
-            let bytes =
-                |digits, value: &dyn Fn(&Cell) -> Option<f64>| number(&mean(cells, value), digits);
+            let payload = mean(cells, &|cell| cell.metrics.comm.payload_bytes_mean);
+            let log2 = mean(cells, &|cell| cell.metrics.comm.log2_payload);
             vec![
                 precision(cells, |cell| cell.metrics.ap_global),
                 frame_order,
-                bytes(0, &|cell| cell.metrics.comm.payload_bytes_mean),
-                bytes(2, &|cell| cell.metrics.comm.log2_payload),
+                number(&payload, 0),
+                number(&log2, 2),
             ]
         } else {
-            let global = |cells: &Vec<Cell>| precision(cells, |cell| cell.metrics.ap_global);
-            cells.iter().map(global).collect()
+            let global = { cells.iter() }.map(|of| precision(of, |cell| cell.metrics.ap_global));
+            global.collect()
         };
         let _ = writeln!(text, "| {} | {} |", row.label(), values.join(" | "));
     }
@@ -157,11 +157,11 @@ fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {
 
 /// Three precisions in per cent.
 fn precision(cells: &[Cell], of: impl Fn(&Cell) -> ByIou) -> String {
-    let at = |index: usize| {
-        let percent = |cell: &Cell| of(cell).values()[index].map(|value| 100.0 * value);
-        number(&mean(cells, &percent), 2)
-    };
-    [0, 1, 2].map(at).join(" / ")
+    let precisions = [0, 1, 2].map(|index: usize| {
+        let percent = mean(cells, &|cell| Some(100.0 * of(cell).values()[index]?));
+        number(&percent, 2)
+    });
+    precisions.join(" / ")
 }
 
 #[cfg(test)]

@@ -32,9 +32,9 @@ impl ConfidenceGate {
     pub(super) fn forward(&self, others: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
         // A layer of both, side by side; the ego's part is the same for all others.
         let dim = ego.size4()?.3;
-        let part = |first: i64| self.hidden.ws.f_narrow(1, first, dim);
-        let hidden = others.f_linear(&part(0)?, None::<&Tensor>)?
-            + ego.f_linear(&part(dim)?, self.hidden.bs.as_ref())?;
+        let (ws, bs) = (&self.hidden.ws, self.hidden.bs.as_ref());
+        let hidden = others.f_linear(&ws.f_narrow(1, 0, dim)?, None::<&Tensor>)?
+            + ego.f_linear(&ws.f_narrow(1, dim, dim)?, bs)?;
         // The last layer is zero at first, of which the sigmoid is a half: the factor makes it 1.
         let weight = self.out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
         let (maps, rows, columns, _) = weight.size4()?;

@@ -68,23 +68,14 @@ impl Decoder {
     pub(super) fn changed(&self, fused: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
         let (_, rows, columns, dim) = ego.size4()?;
         let (channels, patch) = (self.channels, self.patch);
-        // Weights are stored by channel and then by cell; transposing these few is cheaper than transposing the result.
-        let by_cell = |weights: &Tensor, each: i64| {
-            weights
-                .f_view([channels, patch * patch, each])?
-                .f_transpose(0, 1)?
-                .f_reshape([-1, each])
+        let bias = match &self.cells.bs {
+            Some(bias) => Some(self.by_cell(bias, 1)?.f_squeeze_dim(1)?),
+            None => None,
         };
-        let bias = self
-            .cells
-            .bs
-            .as_ref()
-            .map(|bias| by_cell(bias, 1)?.f_squeeze_dim(1))
-            .transpose()?;
         let cells = self
             .norm
             .forward(ego)
-            .f_linear(&by_cell(&self.cells.ws, dim)?, bias.as_ref())?;
+            .f_linear(&self.by_cell(&self.cells.ws, dim)?, bias.as_ref())?;
         let cells = cells
             .f_to_kind(Kind::Float)?
             .f_view([1, rows, columns, patch, patch, channels].as_slice())?;
@@ -99,5 +90,14 @@ impl Decoder {
         changed
             .f_view([1, rows * patch, columns * patch, channels])?
             .f_permute([0, 3, 1, 2])
+    }
+
+    /// Weights of the last layer, `each` for a channel of a cell, in the order of cells and then channels. They are stored
+    /// by channel and then by cell; transposing these few is cheaper than transposing the result.
+    fn by_cell(&self, weights: &Tensor, each: i64) -> Result<Tensor, TchError> {
+        weights
+            .f_view([self.channels, self.patch * self.patch, each])?
+            .f_transpose(0, 1)?
+            .f_reshape([-1, each])
     }
 }

@@ -135,11 +135,11 @@ fn offsets(pairs: &Pairs, area: &Area, config: SearchConfig, train: bool) -> Res
     // The settings count cells of the ego's grid, those of `area` may be pooled already.
     let (cells, radius) = (config.cells / area.cells, config.radius);
     let (edges, none): ([i64; 2], [i64; 2]) = ([cells; 2], [0; 2]);
-    let large = |maps: &Tensor| {
+    let [ego, shown] = [&pairs.ego, &pairs.shown].map(|maps| {
         let maps = maps.f_detach()?;
         maps.f_avg_pool2d(edges, edges, none, false, true, None::<i64>)
-    };
-    let maps = [&large(&pairs.ego)?, &large(&pairs.shown)?];
+    });
+    let maps = [&ego?, &shown?];
     let cell_m = area.cell_m * cells as f64;
     let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
     if train {
@@ -180,11 +180,10 @@ fn turned_tries(
         .whole
         .f_sub_scalar(TURN_MARGIN)?;
     let shifts_m = shifts(radius)? * cell_m;
-    let offsets = |turn_rad: f64| shifts_m.f_pad([0, 1], "constant", turn_rad);
     fit.f_split(others.size4()?.0, 0)?
         .into_iter()
         .zip(TURNS_RAD)
-        .map(|(fit, turn_rad)| Ok((fit, offsets(turn_rad)?)))
+        .map(|(fit, turn_rad)| Ok((fit, shifts_m.f_pad([0, 1], "constant", turn_rad)?)))
         .collect()
 }
 

@@ -133,16 +133,17 @@ impl Strip<'_> {
         score
     }
 
+    fn is_valid(&self, entry: usize, cell: usize) -> bool {
+        self.of.valid[entry * self.of.cells + self.first + cell] != 0.0
+    }
+
     /// Scores of the entries to their weights.
     fn softmax(&self, scores: &mut [Row]) {
-        let valid = |entry: usize, cell: usize| {
-            self.of.valid[entry * self.of.cells + self.first + cell] != 0.0
-        };
         for cell in 0..self.count {
-            let is_any = (0..scores.len()).any(|entry| valid(entry, cell));
+            let is_any = (0..scores.len()).any(|entry| self.is_valid(entry, cell));
             for (entry, scores) in scores.iter_mut().enumerate() {
                 // Without any valid token all scores are equal: minus infinity for all would give NaN.
-                scores[cell] = match (is_any, valid(entry, cell)) {
+                scores[cell] = match (is_any, self.is_valid(entry, cell)) {
                     (false, _) => 0.0,
                     (true, true) => scores[cell],
                     (true, false) => f32::NEG_INFINITY,

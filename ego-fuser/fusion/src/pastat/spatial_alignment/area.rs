@@ -58,24 +58,22 @@ impl Area {
 
     /// Positions of vehicles, metres from the centre of the area, `[N, 2]`.
     pub(crate) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
-        let place = |pose: &Pose| {
+        let places = ego_from_cav.iter().flat_map(|pose| {
             [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32)
-        };
-        let places: Vec<f32> = ego_from_cav.iter().flat_map(place).collect();
-        Tensor::f_from_slice(&places)?.f_view([-1, 2])
+        });
+        Tensor::f_from_slice(&places.collect::<Vec<f32>>())?.f_view([-1, 2])
     }
 
     /// `[PARTS^2, 2]`: centres of the compared parts, metres from the centre of the area.
     pub(crate) fn middles_of_parts(&self) -> Result<Tensor, TchError> {
-        let along =
-            |part: i64, half_m: f64| (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32;
         let [half_x, half_y] = self.half_m;
-        let middles: Vec<f32> = (0..PARTS)
-            .flat_map(|row| {
-                (0..PARTS).flat_map(move |column| [along(column, half_x), along(row, half_y)])
+        let middles = (0..PARTS * PARTS).flat_map(|part| {
+            let (row, column) = (part / PARTS, part % PARTS);
+            [(column, half_x), (row, half_y)].map(|(part, half_m)| {
+                (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32
             })
-            .collect();
-        Tensor::f_from_slice(&middles)?.f_view([-1, 2])
+        });
+        Tensor::f_from_slice(&middles.collect::<Vec<f32>>())?.f_view([-1, 2])
     }
 }
 
@@ -116,15 +114,11 @@ pub(crate) fn own_sampling_grid(
 
 /// `[N, 3]`: x and y, metres, and yaw, radians.
 fn planar_poses(ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
-    let of_pose = |pose: &Pose| {
-        [
-            pose.translation_m[0] as f32,
-            pose.translation_m[1] as f32,
-            pose.yaw_rad() as f32,
-        ]
-    };
-    let values: Vec<f32> = ego_from_cav.iter().flat_map(of_pose).collect();
-    Tensor::f_from_slice(&values)?.f_view([-1, 3])
+    let values = ego_from_cav.iter().flat_map(|pose| {
+        let [x, y, _] = pose.translation_m;
+        [x, y, pose.yaw_rad()].map(|value| value as f32)
+    });
+    Tensor::f_from_slice(&values.collect::<Vec<f32>>())?.f_view([-1, 3])
 }
 
 /// Positions of the cells of a grid over `area` on grids over `on`, given the position and rotation on `area`,
@@ -137,14 +131,14 @@ fn places(
 ) -> Result<Tensor, TchError> {
     let yaw = pose.f_select(1, 2)?;
     let (cos, sin) = (yaw.f_cos()?, yaw.f_sin()?);
-    let from =
-        |axis: usize| Ok::<_, TchError>(area.middle_m[axis] - pose.f_select(1, axis as i64)?);
-    let at = |axis: usize| Ok::<_, TchError>(origin.f_select(1, axis as i64)? - on.middle_m[axis]);
     let ([half_x, half_y], [on_x, on_y]) = (area.half_m, on.half_m);
-    let (from_x, from_y) = (from(0)?, from(1)?);
+    let from_x = area.middle_m[0] - pose.f_select(1, 0)?;
+    let from_y = area.middle_m[1] - pose.f_select(1, 1)?;
+    let at_x = origin.f_select(1, 0)? - on.middle_m[0];
+    let at_y = origin.f_select(1, 1)? - on.middle_m[1];
     // R^T (p - pose) + origin, with p and the result scaled to -1..1 over their areas.
-    let x0 = (&cos * &from_x + &sin * &from_y + at(0)?) / on_x;
-    let y0 = (&cos * &from_y - &sin * &from_x + at(1)?) / on_y;
+    let x0 = (&cos * &from_x + &sin * &from_y + at_x) / on_x;
+    let y0 = (&cos * &from_y - &sin * &from_x + at_y) / on_y;
     let (xx, xy) = (&cos * (half_x / on_x), &sin * (half_y / on_x));
     let (yx, yy) = (&sin * (-half_x / on_y), &cos * (half_y / on_y));
     let affine = Tensor::f_stack(&[xx, xy, x0, yx, yy, y0], 1)?.f_view([-1, 2, 3])?;

@@ -5,7 +5,7 @@ use std::cell::OnceCell;
 use multiversion::multiversion;
 use tch::{Kind, Result, Tensor};
 
-use crate::f64_tensor::{are_numbers, numbers};
+use crate::f64_tensor::{are_numbers, numbers, sum_over_first};
 use crate::vector_loops::{LANES, add_products};
 
 /// Parts of the grid along each edge: enough to distinguish a rotation from a shift.
@@ -29,9 +29,13 @@ pub(crate) struct Correlation {
 /// The shifts in the order of [`Correlation`], `[K, 2]`: cells along x and y from a cell of a neighbour's map to the
 /// cell of the ego's that it is compared with.
 pub(crate) fn shifts(radius: i64) -> Result<Tensor> {
-    let steps = || -radius..=radius;
-    let all: Vec<f32> = steps()
-        .flat_map(|row| steps().flat_map(move |column| [column as f32, row as f32]))
+    let steps = -radius..=radius;
+    let all: Vec<f32> = (steps.clone())
+        .flat_map(|row| {
+            steps
+                .clone()
+                .flat_map(move |column| [column as f32, row as f32])
+        })
         .collect();
     Tensor::f_from_slice(&all)?.f_view([-1, 2])
 }
@@ -82,15 +86,14 @@ impl Shifted {
             _ => by_part(others, self.parts)?.f_matmul(&self.maps()?.f_transpose(1, 2)?)?,
         };
         let theirs = sum_by_part(&others.f_square()?, self.parts)?;
-        let over_parts =
-            |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
-        let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
         // Normalised by the ego's unshifted map: what a shift moves across the edges of a part is neglected.
-        let energy = length(self.squares.f_unsqueeze(1)? * &theirs)?;
-        let whole_energy = length(self.squares.f_sum(None::<Kind>)? * over_parts(&theirs)?)?;
+        let energy = self.squares.f_unsqueeze(1)? * &theirs;
+        let energy = energy.f_add_scalar(EPSILON)?.f_sqrt()?;
+        let whole_energy = self.squares.f_sum(None::<Kind>)? * sum_over_first(&theirs)?;
+        let whole_energy = whole_energy.f_add_scalar(EPSILON)?.f_sqrt()?;
         Ok(Correlation {
             parts: &products / energy.f_unsqueeze(2)?,
-            whole: over_parts(&products)? / whole_energy.f_unsqueeze(1)?,
+            whole: sum_over_first(&products)? / whole_energy.f_unsqueeze(1)?,
             energy,
         })
     }

@@ -57,10 +57,10 @@ pub(super) struct AlignedTokens {
 impl SpatialAlignment {
     /// Its variables are `fsa.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let network =
-            |fsa| AlignmentNetwork::new(&(path / "fsa"), [config.channels, config.dim], fsa);
+        let (path, size) = (path / "fsa", [config.channels, config.dim]);
+        let fsa = config.fsa.as_ref();
         Self {
-            network: config.fsa.as_ref().map(network),
+            network: fsa.map(|fsa| AlignmentNetwork::new(&path, size, fsa)),
             earlier_cells: config.earlier_cells,
         }
     }
@@ -164,8 +164,10 @@ impl SpatialAlignment {
 fn of_newest(deltas: &Tensor, agent: &[usize], newest: usize) -> Result<Tensor, TchError> {
     let with_ego = deltas.f_constant_pad_nd([0, 0, 1, 0])?;
     let (newest, earlier) = agent.split_at(newest);
-    let entry_of = |agent: &usize| newest.iter().position(|of| of == agent).unwrap_or(0) as i64;
-    picked(&with_ego, &earlier.iter().map(entry_of).collect::<Vec<_>>())
+    let entries = earlier
+        .iter()
+        .map(|agent| newest.iter().position(|of| of == agent).unwrap_or(0) as i64);
+    picked(&with_ego, &entries.collect::<Vec<_>>())
 }
 
 /// Tokens `[N, D, h, w]` and their validity `[N, h, w]`, all but the first entry's moved by `deltas` `[N - 1, 3]`.
@@ -177,18 +179,16 @@ fn moved_tokens(
     area: &Area,
 ) -> Result<(Tensor, Tensor), TchError> {
     let (entries, _, rows, columns) = values.size4()?;
-    let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, entries - 1);
-    let with_first =
-        |first: &Tensor, after: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, after], 0);
     let places = sampling_grid(deltas, &origins.ego_from_cav[1..], area, [rows, columns])?;
     let (after, after_valid) = resample(
-        &after_first(values)?,
-        &after_first(valid)?.f_unsqueeze(1)?,
+        &values.f_narrow(0, 1, entries - 1)?,
+        &valid.f_narrow(0, 1, entries - 1)?.f_unsqueeze(1)?,
         &places,
     )?;
+    let after_valid = after_valid.f_squeeze_dim(1)?;
     Ok((
-        with_first(values, after)?,
-        with_first(valid, after_valid.f_squeeze_dim(1)?)?,
+        Tensor::f_cat(&[values.f_narrow(0, 0, 1)?, after], 0)?,
+        Tensor::f_cat(&[valid.f_narrow(0, 0, 1)?, after_valid], 0)?,
     ))
 }
 

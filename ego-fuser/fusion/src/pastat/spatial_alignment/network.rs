@@ -9,7 +9,7 @@ use tch::{Result, Tensor};
 use super::area::{Area, resample, sampling_grid};
 use super::correlation::{PARTS, Shifted, peaks, shifts};
 use super::pairs::{Displacements, Pairs};
-use crate::f64_tensor::pointwise;
+use crate::f64_tensor::{pointwise, sum_over_first};
 use crate::layers::{ZERO, around};
 use crate::pastat::confidence_embedding::CONFIDENCES;
 use crate::pastat::config::{FsaConfig, SearchConfig};
@@ -127,14 +127,12 @@ impl AlignmentNetwork {
         let senders =
             area.places_of(ego_from_cav)?.f_to_device(device)? + deltas.f_narrow(1, 0, 2)?;
         let motion = rigid_motion(&parts, &weight, &senders, area)?;
-        let by_entry = |parts: Tensor| {
-            parts
-                .f_transpose(0, 1)?
-                .f_reshape([ego_from_cav.len() as i64, -1])
-        };
+        let count = ego_from_cav.len() as i64;
+        let [parts, fit] =
+            [parts, fit].map(|by_part| by_part.f_transpose(0, 1)?.f_reshape([count, -1]));
         let inputs = [
-            by_entry(parts)?,
-            by_entry(fit)?,
+            parts?,
+            fit?,
             whole,
             similarity.f_unsqueeze(1)?,
             motion.shallow_clone(),
@@ -163,9 +161,9 @@ impl AlignmentNetwork {
     /// Compared form of maps, `[N, M, H, W]`: zero mean over the valid cells, so that empty road matches nothing.
     fn shown(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor> {
         let shown = self.matching[1].forward(&features.f_relu()?);
-        let over_map =
-            |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
-        let mean = over_map(&(&shown * mask))? / over_map(mask)?.f_clamp_min(1.0)?;
+        let [sum, count] = [&(&shown * mask), mask]
+            .map(|maps| maps.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None));
+        let mean = sum? / count?.f_clamp_min(1.0)?;
         Ok((shown - mean) * mask)
     }
 }
@@ -191,8 +189,7 @@ fn moved(pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor> {
 /// - `weight`: `[PARTS^2, N]`, confidence of each of them
 /// - `senders`: `[N, 2]`, positions of the maps' senders, metres from the centre of `area`
 fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) -> Result<Tensor> {
-    let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
-    let share = weight / over_parts(weight)?.f_add_scalar(EPSILON)?;
+    let share = weight / sum_over_first(weight)?.f_add_scalar(EPSILON)?;
     let share = share.f_unsqueeze(2)?;
     // Centres of the parts, from the centre of the grid.
     let middles = area
@@ -200,24 +197,24 @@ fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) 
         .f_to_device(parts.device())?
         .f_unsqueeze(1)?;
     let (mean, middle) = (
-        over_parts(&(parts * &share))?,
-        over_parts(&(&middles * &share))?,
+        sum_over_first(&(parts * &share))?,
+        sum_over_first(&(&middles * &share))?,
     );
     let (shift, arm) = (
         parts - mean.f_unsqueeze(0)?,
         &middles - middle.f_unsqueeze(0)?,
     );
-    let column = |tensor: &Tensor, axis: i64| tensor.f_narrow(2, axis, 1);
     // Least squares for a small angle: the sum of arm x shift over the sum of |arm|^2.
-    let turning = column(&arm, 0)? * column(&shift, 1)? - column(&arm, 1)? * column(&shift, 0)?;
-    let inertia = over_parts(
+    let turning = arm.f_narrow(2, 0, 1)? * shift.f_narrow(2, 1, 1)?
+        - arm.f_narrow(2, 1, 1)? * shift.f_narrow(2, 0, 1)?;
+    let inertia = sum_over_first(
         &(arm
             .f_square()?
             .f_sum_dim_intlist([2_i64].as_slice(), true, None)?
             * &share),
     )?;
     // A single part does not determine a rotation: a few metres of lever arm prevent division by zero.
-    let turn = over_parts(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
+    let turn = sum_over_first(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
     let to_sender = senders - middle;
     // The weighted centre of the observed parts moves by `mean`; a rotation moves the sender relative to it.
     let across = Tensor::f_cat(

@@ -56,14 +56,15 @@ pub(crate) struct Displacements {
 impl Displacements {
     /// Concatenation of several comparisons.
     pub(crate) fn all(several: &[Self]) -> Result<Self, TchError> {
-        let cat = |of: fn(&Self) -> &Tensor| {
-            Tensor::f_cat(&several.iter().map(of).collect::<Vec<_>>(), 0)
-        };
         Ok(Self {
-            deltas: cat(|each| &each.deltas)?,
-            fit: cat(|each| &each.fit)?,
-            similarity: cat(|each| &each.similarity)?,
+            deltas: Self::concatenated(several, |each| &each.deltas)?,
+            fit: Self::concatenated(several, |each| &each.fit)?,
+            similarity: Self::concatenated(several, |each| &each.similarity)?,
         })
+    }
+
+    fn concatenated(several: &[Self], of: fn(&Self) -> &Tensor) -> Result<Tensor, TchError> {
+        Tensor::f_cat(&several.iter().map(of).collect::<Vec<_>>(), 0)
     }
 
     /// Rows of some maps.
@@ -78,11 +79,10 @@ impl Displacements {
     /// The same with rows of another comparison for the maps in `rows`.
     pub(crate) fn with(&self, rows: &[i64], other: &Self) -> Result<Self, TchError> {
         let index = Tensor::f_from_slice(rows)?.f_to_device(self.deltas.device())?;
-        let with = |of: fn(&Self) -> &Tensor| of(self).f_index_copy(0, &index, of(other));
         Ok(Self {
-            deltas: with(|each| &each.deltas)?,
-            fit: with(|each| &each.fit)?,
-            similarity: with(|each| &each.similarity)?,
+            deltas: self.deltas.f_index_copy(0, &index, &other.deltas)?,
+            fit: self.fit.f_index_copy(0, &index, &other.fit)?,
+            similarity: self.similarity.f_index_copy(0, &index, &other.similarity)?,
         })
     }
 }

@@ -77,22 +77,22 @@ impl AgentAttention {
     ) -> Result<Tensor> {
         let (_, height, width, dim) = ego.size4()?;
         let (cells, each) = (height * width, dim / self.heads);
-        let by_channel = |tokens: &Tensor| tokens.f_view([cells, dim])?.f_transpose(0, 1);
-        let by_head = |linear: &nn::Linear| linear.ws.f_view([self.heads, each, dim]);
         let query = self.query.forward(&norm.forward(ego)) / (each as f64).sqrt();
-        let query = by_channel(&query)?.f_reshape([self.heads, each, cells])?;
+        let [query, ego] =
+            [&query, ego].map(|tokens| tokens.f_view([cells, dim])?.f_transpose(0, 1));
+        let query = query?.f_reshape([self.heads, each, cells])?;
+        let [key, value] =
+            [&self.key, &self.value].map(|linear| linear.ws.f_view([self.heads, each, dim]));
         let (one, none) = (Tensor::from(1f32), Tensor::from(0f32));
         let (gain, shift) = (
             norm.ws.as_ref().unwrap_or(&one),
             norm.bs.as_ref().unwrap_or(&none),
         );
         // Query of each head led back through the weights of the key and the gain of the norm.
-        let asked = (by_head(&self.key)? * gain)
-            .f_transpose(1, 2)?
-            .f_matmul(&query)?;
-        let gathered = others.gather(&numbers(&asked)?, &numbers(&by_channel(ego)?)?);
+        let asked = (key? * gain).f_transpose(1, 2)?.f_matmul(&query)?;
+        let gathered = others.gather(&numbers(&asked)?, &numbers(&ego?)?);
         let gathered = Tensor::f_from_slice(&gathered)?.f_view([self.heads, dim, cells])?;
-        let values = by_head(&self.value)?;
+        let values = value?;
         // The weights of a head add up to 1, so the shift of the norm passes through the values once.
         let mixed = (&values * gain).f_matmul(&gathered)?
             + values.f_matmul(&shift.f_expand([dim], false)?.f_unsqueeze(1)?)?;
@@ -127,7 +127,7 @@ struct WindowSize {
 impl WindowAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64, edges: &[i64]) -> Self {
         let heads = heads / edges.len() as i64;
-        let size = |(index, &edge): (usize, &i64)| WindowSize {
+        let sizes = edges.iter().enumerate().map(|(index, &edge)| WindowSize {
             edge,
             bias: path.var(
                 &format!("bias{index}"),
@@ -135,11 +135,11 @@ impl WindowAttention {
                 Init::Const(0.0),
             ),
             places: relative_places(edge),
-        };
+        });
         Self {
             query_key_value: nn::linear(path / "query_key_value", dim, 3 * dim, BARE),
             out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
-            sizes: edges.iter().enumerate().map(size).collect(),
+            sizes: sizes.collect(),
             heads,
         }
     }
@@ -158,8 +158,7 @@ impl WindowAttention {
         let hides = valid.f_eq(0.0)?.f_any()?.f_int64_value(&[])? != 0;
         if entries == 1 && are_numbers(&projected) && !hides {
             let (projected, mut seen) = (numbers(&projected)?, vec![0.0; tokens.numel()]);
-            let sizes = |sizes: &[i64]| sizes.iter().map(|size| *size as usize).collect::<Vec<_>>();
-            let all = sizes(&[height, width, dim, share, share / self.heads]);
+            let all = [height, width, dim, share, share / self.heads].map(|size| size as usize);
             for (index, size) in self.sizes.iter().enumerate() {
                 let windows = Windows {
                     size: [all[0], all[1]],
@@ -175,9 +174,9 @@ impl WindowAttention {
         let mut parts = Vec::with_capacity(self.sizes.len());
         for (index, size) in self.sizes.iter().enumerate() {
             // Channels are queries, keys, values: in each, every size of window has its share.
-            let of_size =
-                |which: i64| projected.f_narrow(3, which * dim + index as i64 * share, share);
-            parts.push(self.within(size, [of_size(0)?, of_size(1)?, of_size(2)?], valid)?);
+            let [query, key, value] = [0, 1, 2]
+                .map(|which| projected.f_narrow(3, which * dim + index as i64 * share, share));
+            parts.push(self.within(size, [query?, key?, value?], valid)?);
         }
         Ok(self.out.forward(&Tensor::f_cat(&parts, 3)?))
     }
@@ -186,18 +185,14 @@ impl WindowAttention {
         let (entries, height, width, share) = parts[0].size4()?;
         let (edge, each) = (size.edge, share / self.heads);
         let (down, across) = (height / edge, width / edge);
-        let windows = |tensor: &Tensor| {
+        // One row for each window and head: one batched product computes them all.
+        let [query, key, value] = parts.map(|tensor| {
             tensor
                 .f_reshape([entries, down, edge, across, edge, self.heads, each])?
                 .f_permute([0, 1, 3, 5, 2, 4, 6])?
                 .f_reshape([entries * down * across, self.heads, edge * edge, each])
-        };
-        // One row for each window and head: one batched product computes them all.
-        let [query, key, value] = [
-            windows(&parts[0])?,
-            windows(&parts[1])?,
-            windows(&parts[2])?,
-        ];
+        });
+        let (query, key, value) = (query?, key?, value?);
         let mut scores = (query / (each as f64).sqrt()).f_matmul(&key.f_transpose(2, 3)?)?;
         scores = scores.f_add_(&self.preference(size)?)?;
         let hidden = valid.f_eq(0.0)?;
@@ -231,13 +226,13 @@ impl WindowAttention {
 
 /// Row of the bias table for each pair of tokens of a window.
 fn relative_places(edge: i64) -> Vec<i64> {
-    let tokens = || (0..edge).flat_map(move |row| (0..edge).map(move |column| (row, column)));
-    let place = |(a_row, a_column): (i64, i64), (b_row, b_column): (i64, i64)| {
-        (a_row - b_row + edge - 1) * (2 * edge - 1) + a_column - b_column + edge - 1
-    };
-    tokens()
-        .flat_map(|a| tokens().map(move |b| place(a, b)))
-        .collect()
+    let tokens = edge * edge;
+    let places = (0..tokens * tokens).map(|pair| {
+        let (a, b) = (pair / tokens, pair % tokens);
+        let (rows, columns) = (a / edge - b / edge, a % edge - b % edge);
+        (rows + edge - 1) * (2 * edge - 1) + columns + edge - 1
+    });
+    places.collect()
 }
 
 #[cfg(test)]

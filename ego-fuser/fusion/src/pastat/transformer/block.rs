@@ -20,15 +20,14 @@ impl Block {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         let (dim, heads) = (config.dim, config.heads);
         let wide = config.mlp_ratio * dim;
-        let norm =
-            |name: &str| nn::layer_norm(path / name, vec![dim], nn::LayerNormConfig::default());
-        let linear =
-            |name: &str, from, to| nn::linear(path / name, from, to, nn::LinearConfig::default());
         Self {
-            norms: [norm("norm_agents"), norm("norm_windows"), norm("norm_mlp")],
+            norms: ["norm_agents", "norm_windows", "norm_mlp"]
+                .map(|name| nn::layer_norm(path / name, vec![dim], nn::LayerNormConfig::default())),
             agents: AgentAttention::new(&(path / "agents"), dim, heads),
             windows: WindowAttention::new(&(path / "windows"), dim, heads, &config.windows),
-            mlp: [linear("mlp0", dim, wide), linear("mlp1", wide, dim)],
+            mlp: [("mlp0", dim, wide), ("mlp1", wide, dim)].map(|(name, from, to)| {
+                nn::linear(path / name, from, to, nn::LinearConfig::default())
+            }),
         }
     }
 

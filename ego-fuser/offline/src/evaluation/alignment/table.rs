@@ -63,35 +63,28 @@ impl Tally {
     pub fn row(&self, method: &str) -> Row {
         let failed: usize = self.reasons.values().sum();
         let pairs = failed + self.errors.len();
-        let share = |count: usize| count as f64 / pairs.max(1) as f64;
-        let within = |metres: f64| {
-            share(
-                self.errors
-                    .iter()
-                    .filter(|error| error.metres < metres)
-                    .count(),
-            )
-        };
-        let bytes_mean = self.bytes / pairs.max(1) as f64;
-        let of = |value: fn(&AlignmentError) -> f64| {
-            let values: Vec<f64> = self.errors.iter().map(value).collect();
-            mean(&values).zip(median(&values))
-        };
-        let (metres, degrees) = (of(|error| error.metres), of(|error| error.degrees));
+        let divisor = pairs.max(1) as f64;
+        let [success_3m, success_1m] = [3.0, 1.0].map(|limit_m| {
+            let right = self.errors.iter().filter(|error| error.metres < limit_m);
+            right.count() as f64 / divisor
+        });
+        let bytes_mean = self.bytes / divisor;
+        let metres: Vec<f64> = self.errors.iter().map(|error| error.metres).collect();
+        let degrees: Vec<f64> = self.errors.iter().map(|error| error.degrees).collect();
         Row {
             method: method.to_owned(),
             pairs,
-            time_s: self.seconds / pairs.max(1) as f64,
+            time_s: self.seconds / divisor,
             bytes_mean,
             // Nothing sent gives 0 instead of minus infinity.
             log2_bytes: bytes_mean.max(1.0).log2(),
-            success_3m: within(3.0),
-            success_1m: within(1.0),
-            mean_m: metres.map(|(mean, _)| mean),
-            p50_m: metres.map(|(_, median)| median),
-            mean_deg: degrees.map(|(mean, _)| mean),
-            p50_deg: degrees.map(|(_, median)| median),
-            not_aligned: share(failed),
+            success_3m,
+            success_1m,
+            mean_m: mean(&metres),
+            p50_m: median(&metres),
+            mean_deg: mean(&degrees),
+            p50_deg: median(&degrees),
+            not_aligned: failed as f64 / divisor,
             reasons: self.reasons.clone(),
         }
     }
@@ -103,22 +96,21 @@ pub fn markdown(rows: &[Row]) -> String {
         "| method | time, s | bytes, log2 | under 3 m, % | under 1 m, % | mean / median, m | mean / median, deg | no alignment, % | pairs |\n\
          | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n",
     );
-    let both = |mean: Option<f64>, median: Option<f64>| match (mean, median) {
-        (Some(mean), Some(median)) => format!("{mean:.2} / {median:.2}"),
-        _ => "-".to_owned(),
-    };
     for row in rows {
+        let errors = [(row.mean_m, row.p50_m), (row.mean_deg, row.p50_deg)];
+        let [metres, degrees] = errors.map(|mean_and_median| match mean_and_median {
+            (Some(mean), Some(median)) => format!("{mean:.2} / {median:.2}"),
+            _ => "-".to_owned(),
+        });
         // Writing to a string does not fail.
         let _ = writeln!(
             text,
-            "| {} | {:.4} | {:.2} | {:.2} | {:.2} | {} | {} | {:.2} | {} |",
+            "| {} | {:.4} | {:.2} | {:.2} | {:.2} | {metres} | {degrees} | {:.2} | {} |",
             row.method,
             row.time_s,
             row.log2_bytes,
             100.0 * row.success_3m,
             100.0 * row.success_1m,
-            both(row.mean_m, row.p50_m),
-            both(row.mean_deg, row.p50_deg),
             100.0 * row.not_aligned,
             row.pairs
         );

@@ -139,11 +139,10 @@ impl Evaluator {
     /// [`EvaluateError`] when a frame cannot be computed.
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
         let samples = self.samples(scenario, MEASURED_VEHICLES, &|ticks| ticks < MEASURED_TICKS)?;
-        let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
         Ok(ComputeTimes {
-            pose_ms: median(&samples.pose),
-            map_ms: median(&samples.map),
-            fuse_ms: median(&samples.fuse),
+            pose_ms: median(&samples.pose).unwrap_or(0.0).ceil(),
+            map_ms: median(&samples.map).unwrap_or(0.0).ceil(),
+            fuse_ms: median(&samples.fuse).unwrap_or(0.0).ceil(),
         })
     }
 
@@ -169,19 +168,19 @@ impl Evaluator {
         // Restored before an error is returned.
         self.setup.agents.pose = source;
         let samples = samples?;
-        let warm = |sample: &[f64]| median(&sample[sample.len() / 2..]).unwrap_or(0.0);
         // A live vehicle measures one sweep in `interval`: an observation counts as that share.
         let interval = f64::from(self.setup.agents.pose.measuring_interval(&samples.motion));
         let steps = ComputeTimes {
-            pose_ms: warm(&samples.pose) + warm(&samples.observe) / interval,
-            map_ms: warm(&samples.map),
-            fuse_ms: warm(&samples.fuse),
+            pose_ms: late_median(&samples.pose) + late_median(&samples.observe) / interval,
+            map_ms: late_median(&samples.map),
+            fuse_ms: late_median(&samples.fuse),
         };
-        let medians = |stages: Vec<(String, Vec<f64>)>| {
-            let median = |(stage, sample): (String, Vec<f64>)| (stage, warm(&sample));
-            stages.into_iter().map(median).collect()
-        };
-        let stages = samples.stages.map(medians);
+        let stages = samples.stages.map(|stages| {
+            let stages = stages.into_iter();
+            stages
+                .map(|(stage, sample)| (stage, late_median(&sample)))
+                .collect()
+        });
         Ok(EstimatedTimes { steps, stages })
     }
 
@@ -251,6 +250,11 @@ impl Evaluator {
         self.ego.forget();
         Ok(samples)
     }
+}
+
+/// Median of the later half of a sample, 0 where it is empty.
+fn late_median(sample: &[f64]) -> f64 {
+    median(&sample[sample.len() / 2..]).unwrap_or(0.0)
 }
 
 fn ms(time: Duration) -> f64 {

@@ -16,7 +16,7 @@ use bus::{
     Subscription, process_id,
 };
 use dataset::frame::Frame;
-use protocol::{CavId, Lidar, Limits, ProcessId, Role, Stream, Topic, WireError, wire};
+use protocol::{CavId, Lidar, Limits, Role, Stream, Topic, WireError, wire};
 
 use super::super::sent::{Answer, Sent};
 
@@ -95,31 +95,26 @@ impl RemotePool {
             (BTreeMap::new(), Vec::new(), Vec::new());
         let here = bus.identity().process.clone();
         for (cav, streams) in vehicles {
-            let topic = |stream| Topic::Stream {
-                cav: cav.clone(),
-                stream,
-            };
-            let publisher =
-                |stream| bus.publisher(topic(stream), PublisherOptions::SENSOR.lossless(1));
+            let options = PublisherOptions::SENSOR.lossless(1);
             sensors.insert(
                 cav.clone(),
                 Sensors {
-                    gnss: publisher(Stream::Gnss)?,
-                    imu: publisher(Stream::Imu)?,
-                    lidar: publisher(Stream::Lidar)?,
+                    gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), options)?,
+                    imu: bus.publisher(Topic::stream(cav, Stream::Imu), options)?,
+                    lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), options)?,
                 },
             );
             let there = process_id(Role::Agent, cav);
-            let route = |stream, receiver: &ProcessId| Route {
-                topic: topic(stream),
-                receiver: receiver.clone(),
-            };
             routes.extend(
-                [Stream::Gnss, Stream::Imu, Stream::Lidar].map(|stream| route(stream, &there)),
+                [Stream::Gnss, Stream::Imu, Stream::Lidar].map(|stream| Route {
+                    topic: Topic::stream(cav, stream),
+                    receiver: there.clone(),
+                }),
             );
             for stream in [Stream::Pose].into_iter().chain(streams.iter().copied()) {
-                subscriptions.push(bus.subscribe(topic(stream), &inbox)?);
-                routes.push(route(stream, &here));
+                let (topic, receiver) = (Topic::stream(cav, stream), here.clone());
+                subscriptions.push(bus.subscribe(topic.clone(), &inbox)?);
+                routes.push(Route { topic, receiver });
             }
         }
         // No sweep is sent before both directions are connected: nothing would receive it.
@@ -138,6 +133,12 @@ impl RemotePool {
             .into_values()
             .flat_map(|Sensors { gnss, imu, lidar }| [gnss, imu, lidar])
             .for_each(Publisher::finish);
+    }
+
+    /// True while messages of a vehicle are missing in its answer.
+    fn awaits(&self, cav: &CavId, answer: &Answer) -> bool {
+        let streams = self.streams.get(cav);
+        !answer.is_complete(streams.map_or(&[], Vec::as_slice))
     }
 
     /// Sends the sweeps of a tick and waits for all answers, in the same order.
@@ -163,11 +164,7 @@ impl RemotePool {
             .iter()
             .map(|frame| (&frame.cav, Answer::default()))
             .collect();
-        let is_open = |(cav, answer): &(&&CavId, &Answer)| {
-            let streams = self.streams.get(**cav);
-            !answer.is_complete(streams.map_or(&[], Vec::as_slice))
-        };
-        while answers.iter().any(|entry| is_open(&entry)) {
+        while answers.iter().any(|(cav, answer)| self.awaits(cav, answer)) {
             match self.inbox.take(Some(deadline)) {
                 Pop::Item(topic, Event::Message(arrival)) => {
                     let Topic::Stream { cav, .. } = &topic else {
@@ -192,7 +189,7 @@ impl RemotePool {
                 Pop::TimedOut | Pop::Closed => {
                     let silent = answers
                         .iter()
-                        .filter(is_open)
+                        .filter(|(cav, answer)| self.awaits(cav, answer))
                         .map(|(cav, _)| cav.to_string());
                     let cavs = silent.collect::<Vec<_>>().join(", ");
                     return Err(RemoteError::Silent {

@@ -136,20 +136,18 @@ impl MountedCamera {
         let step_rad = 1.0 / (RAYS_PER_PIXEL * focal_px);
         // Two rays beyond the edge, as the shading takes normals from neighbouring rays.
         let half_rad = [width, height].map(|edge| (edge / 2.0 / focal_px).atan() + 2.0 * step_rad);
-        let count = |half_rad: f64| (2.0 * half_rad / step_rad).ceil() as usize + 1;
+        let [columns, channels] =
+            half_rad.map(|half_rad| (2.0 * half_rad / step_rad).ceil() as usize + 1);
         let pattern = RayPattern {
             // Columns run to the right in the image, so azimuths, positive to the left, fall.
             first_azimuth_rad: (yaw_rad + half_rad[0]) as f32,
             azimuth_step_rad: -step_rad as f32,
-            columns: count(half_rad[0]),
+            columns,
             first_elevation_rad: -half_rad[1] as f32,
             elevation_step_rad: step_rad as f32,
-            channels: count(half_rad[1]),
+            channels,
             range_m: RANGE_M,
             rolling: false,
-        };
-        let nearest = |angle_rad: f64, first_rad: f64| {
-            ((angle_rad - first_rad) / step_rad).round().max(0.0) as u32
         };
         let pixels =
             (0..size.height_px).flat_map(|row| (0..size.width_px).map(move |column| (row, column)));
@@ -158,8 +156,9 @@ impl MountedCamera {
             let left = -(f64::from(column) + 0.5 - pinhole.cx_px) / focal_px;
             let up = -(f64::from(row) + 0.5 - pinhole.cy_px) / focal_px;
             let (azimuth, elevation) = (left.atan(), (up / left.hypot(1.0)).atan());
-            let column = nearest(-azimuth, -half_rad[0]);
-            (column, nearest(elevation, -half_rad[1]))
+            let [column, channel] = [half_rad[0] - azimuth, half_rad[1] + elevation]
+                .map(|angle_rad| (angle_rad / step_rad).round().max(0.0) as u32);
+            (column, channel)
         });
         let position_m = Vector3::from(position_m);
         Self {

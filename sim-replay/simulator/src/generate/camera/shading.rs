@@ -140,21 +140,26 @@ impl<'a> Shader<'a> {
         Vector3::from(column.point_m(self.elevations[channel.min(self.channels - 1)], range_m))
     }
 
+    /// From the point `here` of a ray to that of a neighbour, where both hit the same body.
+    fn towards(&self, ray: usize, here: Vector3<f32>, to: (usize, usize)) -> Option<Vector3<f32>> {
+        let other = self.ray(to.0, to.1);
+        // At the edge of the pattern the neighbour is the ray itself.
+        let is_same = other != ray && self.image.hits[other] == self.image.hits[ray];
+        is_same.then(|| self.point(to.0, to.1, self.image.depths_m[other]) - here)
+    }
+
     /// Normal of the surface, from the neighbouring rays that hit the same body, in the world.
     fn normal(&self, column: usize, channel: usize) -> Vector3<f32> {
         let ray = self.ray(column, channel);
         let here = self.point(column, channel, self.image.depths_m[ray]);
-        let towards = |(column, channel): (usize, usize)| {
-            let other = self.ray(column, channel);
-            // At the edge of the pattern the neighbour is the ray itself.
-            let is_same = other != ray && self.image.hits[other] == self.image.hits[ray];
-            is_same.then(|| self.point(column, channel, self.image.depths_m[other]) - here)
-        };
-        let along = |next: (usize, usize), before: (usize, usize)| {
-            towards(next).or_else(|| towards(before).map(|difference| -difference))
-        };
-        let across = along((column + 1, channel), (column.saturating_sub(1), channel));
-        let up = along((column, channel + 1), (column, channel.saturating_sub(1)));
+        let [across, up] = [
+            [(column + 1, channel), (column.saturating_sub(1), channel)],
+            [(column, channel + 1), (column, channel.saturating_sub(1))],
+        ]
+        .map(|[next, before]| {
+            let forward = self.towards(ray, here, next);
+            forward.or_else(|| self.towards(ray, here, before).map(|back| -back))
+        });
         // Too few rays on the body for a plane: it counts as level.
         let (Some(across), Some(up)) = (across, up) else {
             return Vector3::z();

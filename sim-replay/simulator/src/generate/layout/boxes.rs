@@ -82,15 +82,15 @@ pub(super) fn points_in(frame: &AgentFrame, object: &Object) -> usize {
     let half = object.size_m.map(|size| (size / 2.0) as f32);
     let center = object_from_lidar.inverse().translation.vector;
     let reach = half.iter().map(|half| half * half).sum::<f32>().sqrt();
+    let points = frame.frame.points.xyzi.iter();
     // Most points are far away in x or y; this test needs no transform.
     let near =
-        |&&[x, y, ..]: &&[f32; 4]| (x - center.x).abs() <= reach && (y - center.y).abs() <= reach;
-    let inside = |&&[x, y, z, _]: &&[f32; 4]| {
+        points.filter(|[x, y, ..]| (x - center.x).abs() <= reach && (y - center.y).abs() <= reach);
+    let inside = near.filter(|&&[x, y, z, _]| {
         let local = object_from_lidar * Point3::new(x, y, z);
         (0..3).all(|axis| local[axis].abs() <= half[axis])
-    };
-    let points = frame.frame.points.xyzi.iter();
-    points.filter(near).filter(inside).count()
+    });
+    inside.count()
 }
 
 /// The name of a class in the types of V2V4Real and V2X-Real.

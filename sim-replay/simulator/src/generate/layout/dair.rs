@@ -195,18 +195,18 @@ impl Dair {
 impl SceneWriter for Dair {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
         let layout = self.layout();
-        let refused = |reason: String| Err(SynthError::Layout { layout, reason });
         if scene.agents.len() < 2 {
-            return refused(format!(
+            let reason = format!(
                 "scene {} has one agent; a vehicle and a roadside unit are needed",
                 scene.name
-            ));
+            );
+            return Err(SynthError::Layout { layout, reason });
         }
         let frames = scene.capture_nanos.len();
         if self.next_frame + frames > FIRST_UNIT_FRAME {
-            return refused(format!(
-                "more than {FIRST_UNIT_FRAME} frames have no numbers of six digits"
-            ));
+            let reason =
+                format!("more than {FIRST_UNIT_FRAME} frames have no numbers of six digits");
+            return Err(SynthError::Layout { layout, reason });
         }
         if self.scenes == 0 {
             self.make_folders()?;
@@ -269,14 +269,17 @@ impl SceneWriter for Dair {
         let mut rows = std::mem::take(&mut *locked(&self.rows));
         // Moments are written by several threads, in any order.
         rows.sort_by_key(|(number, _)| *number);
-        let list = |of: fn(&Rows) -> &Value| {
-            Value::Array(rows.iter().map(|(_, rows)| of(rows).clone()).collect())
-        };
-        self.write_json("vehicle-side/data_info.json", &list(|rows| &rows.vehicle))?;
-        let units = list(|rows| &rows.unit);
+        let vehicles = list_of(&rows, |rows| &rows.vehicle);
+        self.write_json("vehicle-side/data_info.json", &vehicles)?;
+        let units = list_of(&rows, |rows| &rows.unit);
         self.write_json("infrastructure-side/data_info.json", &units)?;
-        self.write_json("cooperative/data_info.json", &list(|rows| &rows.pair))
+        let pairs = list_of(&rows, |rows| &rows.pair);
+        self.write_json("cooperative/data_info.json", &pairs)
     }
+}
+
+fn list_of(rows: &[(usize, Rows)], row: fn(&Rows) -> &Value) -> Value {
+    Value::Array(rows.iter().map(|(_, rows)| row(rows).clone()).collect())
 }
 
 impl Dair {
@@ -284,11 +287,8 @@ impl Dair {
     fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> Rows {
         let begin_micros = EPOCH_MICROS + batch.number as u64 * DAY_MICROS;
         let micros = begin_micros + batch.capture_nanos[moment.index] / 1000;
-        let first = batch.first_frame;
-        let last = first + batch.capture_nanos.len() - 1;
-        let span = |offset: usize| [first, last].map(|number| format!("{:06}", offset + number));
-        let vehicle = self.side_row(&VEHICLE, id, micros, batch, span(0));
-        let unit = self.side_row(&UNIT, unit_id, micros, batch, span(FIRST_UNIT_FRAME));
+        let vehicle = self.side_row(&VEHICLE, id, micros, batch, 0);
+        let unit = self.side_row(&UNIT, unit_id, micros, batch, FIRST_UNIT_FRAME);
         let offset = json!({ "delta_x": 0.0, "delta_y": 0.0 });
         let pair = match self.edition {
             Edition::Dair => json!({
@@ -314,14 +314,17 @@ impl Dair {
         }
     }
 
+    /// The row of one side, whose frames have numbers from `first_number` on over all scenes.
     fn side_row(
         &self,
         side: &Side,
         id: &str,
         micros: u64,
         batch: &Batch,
-        [first, last]: [String; 2],
+        first_number: usize,
     ) -> Value {
+        let [first, last] = [0, batch.capture_nanos.len() - 1]
+            .map(|frame| format!("{:06}", first_number + batch.first_frame + frame));
         let mut row = json!({
             "image_path": format!("image/{id}.jpg"),
             "image_timestamp": micros.to_string(),

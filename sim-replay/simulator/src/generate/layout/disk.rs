@@ -50,11 +50,10 @@ pub(super) fn write_origin(folder: &Path, scene: &SceneHeader) -> Result<(), Syn
 
 /// The name of a scene as one part of a path.
 fn flat_name(name: &str) -> String {
-    let allowed = |letter: char| letter.is_alphanumeric() || matches!(letter, '.' | '-' | '_');
-    let text: String = name
-        .chars()
-        .map(|letter| if allowed(letter) { letter } else { '_' })
-        .collect();
+    let text = name.replace(
+        |letter: char| !letter.is_alphanumeric() && !matches!(letter, '.' | '-' | '_'),
+        "_",
+    );
     // A leading dot would hide the file.
     text.trim_start_matches('.').to_owned()
 }

@@ -2,9 +2,9 @@
 
 use serde_json::{Map, Value, json};
 
+use super::SceneHeader;
 use super::boxes::of_255;
 use super::nuscenes::Style;
-use super::{SceneAgent, SceneHeader};
 
 /// The style.
 pub(super) static STYLE: Style = Style {
@@ -17,8 +17,9 @@ pub(super) static STYLE: Style = Style {
 };
 
 fn channels(scene: &SceneHeader) -> Vec<String> {
-    let channel = |agent: &SceneAgent| format!("LIDAR_FRONT_CENTER_{}", agent.id);
-    scene.agents.iter().map(channel).collect()
+    let agents = scene.agents.iter();
+    let channels = agents.map(|agent| format!("LIDAR_FRONT_CENTER_{}", agent.id));
+    channels.collect()
 }
 
 fn scene_fields(scene: &SceneHeader) -> Map<String, Value> {

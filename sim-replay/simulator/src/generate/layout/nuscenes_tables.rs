@@ -114,13 +114,12 @@ impl Tables {
         self.push("log", row);
         let row = json!({ "token": map, "log_tokens": [log], "category": "semantic_prior", "filename": "" });
         self.push("map", row);
-        let end = |token: Option<&String>| token.cloned().unwrap_or_default();
         let mut row = json!({
             "token": token,
             "log_token": log,
             "nbr_samples": scene.samples.len(),
-            "first_sample_token": end(sample_tokens.first()),
-            "last_sample_token": end(sample_tokens.last()),
+            "first_sample_token": sample_tokens.first().map_or("", String::as_str),
+            "last_sample_token": sample_tokens.last().map_or("", String::as_str),
             "name": scene.name,
         });
         if let Some(row) = row.as_object_mut() {
@@ -245,17 +244,13 @@ impl Tables {
 
 /// The tokens before and after each, empty at the ends.
 fn linked(tokens: &[String]) -> impl Iterator<Item = (&str, &str, &str)> {
-    let at = |place: Option<usize>| {
-        place
-            .and_then(|place| tokens.get(place))
-            .map_or("", String::as_str)
-    };
     (0..tokens.len()).map(move |place| {
-        (
-            at(Some(place)),
-            at(place.checked_sub(1)),
-            at(place.checked_add(1)),
-        )
+        let places = [Some(place), place.checked_sub(1), place.checked_add(1)];
+        let [token, before, after] = places.map(|place| {
+            let token = place.and_then(|place| tokens.get(place));
+            token.map_or("", String::as_str)
+        });
+        (token, before, after)
     })
 }
 

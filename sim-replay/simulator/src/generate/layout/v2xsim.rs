@@ -18,13 +18,14 @@ pub(super) static STYLE: Style = Style {
 fn channels(scene: &SceneHeader) -> Vec<String> {
     let unit = scene.agents.iter().position(|agent| agent.is_roadside);
     let mut numbers = 1..;
-    let mut number = |agent: usize| match Some(agent) == unit {
-        true => 0,
-        false => numbers.next().unwrap_or_default(),
-    };
-    (0..scene.agents.len())
-        .map(|agent| format!("LIDAR_TOP_id_{}", number(agent)))
-        .collect()
+    let channels = (0..scene.agents.len()).map(|agent| {
+        let number = match Some(agent) == unit {
+            true => 0,
+            false => numbers.next().unwrap_or_default(),
+        };
+        format!("LIDAR_TOP_id_{number}")
+    });
+    channels.collect()
 }
 
 fn scene_fields(scene: &SceneHeader) -> Map<String, Value> {

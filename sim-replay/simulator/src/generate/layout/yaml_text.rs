@@ -4,7 +4,7 @@ use std::fmt::{self, Write as _};
 
 use nalgebra::Vector3;
 
-use super::{AgentFrame, BoxAnchor, SceneAgent, SceneHeader};
+use super::{AgentFrame, BoxAnchor, SceneHeader};
 use dataset::frame::{Frame, Object};
 
 /// Kilometres per hour in a metre per second.
@@ -41,29 +41,30 @@ pub(super) struct ObjectEntry<'a> {
 impl ObjectEntry<'_> {
     /// Writes the entry, with keys in alphabetical order.
     pub(super) fn write(&self, yaml: &mut String) -> fmt::Result {
-        let more = |yaml: &mut String, after: &str, until: &str| {
-            let more = self.more.iter();
-            let mut between = more.filter(|(key, _)| after < *key && *key < until);
-            between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))
-        };
         writeln!(yaml, "  {}:", self.object.id)?;
         write_list(yaml, "    ", "angle", &self.angle_deg)?;
-        more(yaml, "angle", "center")?;
+        self.write_more(yaml, "angle", "center")?;
         write_list(yaml, "    ", "center", &self.center_m)?;
-        more(yaml, "center", "extent")?;
+        self.write_more(yaml, "center", "extent")?;
         write_list(
             yaml,
             "    ",
             "extent",
             &self.object.size_m.map(|size| size / 2.0),
         )?;
-        more(yaml, "extent", "location")?;
+        self.write_more(yaml, "extent", "location")?;
         write_list(yaml, "    ", "location", &self.location_m)?;
-        more(yaml, "location", "speed")?;
+        self.write_more(yaml, "location", "speed")?;
         match self.object.speed_mps {
             Some(speed_mps) => writeln!(yaml, "    speed: {}", KMH_PER_MPS * speed_mps),
             None => Ok(()),
         }
+    }
+
+    fn write_more(&self, yaml: &mut String, after: &str, until: &str) -> fmt::Result {
+        let more = self.more.iter();
+        let mut between = more.filter(|(key, _)| after < *key && *key < until);
+        between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))
     }
 }
 
@@ -121,11 +122,11 @@ pub(super) fn agent_folders(scene: &SceneHeader) -> Vec<String> {
         return own;
     }
     let (mut vehicles, mut units) = (FIRST_VEHICLE.., 1..);
-    let mut number = |agent: &SceneAgent| match agent.is_roadside {
+    let folders = agents.iter().map(|agent| match agent.is_roadside {
         true => format!("-{}", units.next().unwrap_or_default()),
         false => vehicles.next().unwrap_or_default().to_string(),
-    };
-    scene.agents.iter().map(&mut number).collect()
+    });
+    folders.collect()
 }
 
 #[cfg(test)]
@@ -133,6 +134,7 @@ mod tests {
     use dataset::frame::ObjectClass;
     use protocol::{CavId, Pose};
 
+    use super::super::SceneAgent;
     use super::*;
 
     fn folders(agents: &[(&str, bool)]) -> Vec<String> {

@@ -126,18 +126,16 @@ fn channels(
 ) -> Option<Range<usize>> {
     let distances = corners.iter().map(|corner| corner.xy().norm());
     let farthest_m = distances.fold(0.0, f32::max) + BEND_M;
-    let heights = || corners.iter().map(|corner| corner.z);
-    let low = heights().fold(f32::MAX, f32::min) - BEND_M;
-    let high = heights().fold(f32::MIN, f32::max) + BEND_M;
+    let heights = corners.iter().map(|corner| corner.z);
+    let low = heights.clone().fold(f32::MAX, f32::min) - BEND_M;
+    let high = heights.fold(f32::MIN, f32::max) + BEND_M;
     // For each sign of the height, the distance that gives the outermost elevation.
-    let steepest = |height: f32, falling: bool| {
-        let is_near = (height < 0.0) == falling;
-        (height / if is_near { nearest_m } else { farthest_m }).atan()
-    };
-    let channel =
-        |elevation: f32| (elevation - pattern.first_elevation_rad) / pattern.elevation_step_rad;
-    let first = channel(steepest(low, true)).floor().max(0.0);
-    let last = channel(steepest(high, false)).ceil();
+    let low_at_m = if low < 0.0 { nearest_m } else { farthest_m };
+    let high_at_m = if high < 0.0 { farthest_m } else { nearest_m };
+    let [first, last] = [low / low_at_m, high / high_at_m].map(|tangent: f32| {
+        (tangent.atan() - pattern.first_elevation_rad) / pattern.elevation_step_rad
+    });
+    let (first, last) = (first.floor().max(0.0), last.ceil());
     let last = last.min((pattern.channels - 1) as f32);
     (first <= last).then(|| first as usize..last as usize + 1)
 }
@@ -158,23 +156,25 @@ fn columns(
         (low, high) = (low.min(delta), high.max(delta));
     }
     let margin = BEND_M / nearest_m;
-    let index = |azimuth: f32| (azimuth - pattern.first_azimuth_rad) / pattern.azimuth_step_rad;
-    let interval = |turn: f32| {
-        let a = index(middle + low - margin + turn);
-        let b = index(middle + high + margin + turn);
-        // One column more at either end against rounding.
-        (a.min(b).floor() as i64 - 1, a.max(b).ceil() as i64 + 1)
-    };
+    let outermost = [middle + low - margin, middle + high + margin];
     let count = pattern.columns as i64;
     if pattern.is_full_turn() {
-        let (first, last) = interval(0.0);
+        let (first, last) = interval(pattern, outermost, 0.0);
         return Some((first, (last - first + 1).min(count) as usize));
     }
     debug_assert!(middle.abs() <= PI + 1e-3);
     // An azimuth beyond half a turn may meet the pattern a full turn away.
-    let intervals = [-TAU, 0.0, TAU].map(interval).into_iter();
+    let turns = [-TAU, 0.0, TAU].into_iter();
+    let intervals = turns.map(|turn| interval(pattern, outermost, turn));
     let clipped = intervals.filter(|(first, last)| *last >= 0 && *first < count);
     let (first, last) = clipped.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
     let (first, last) = (first.max(0), last.min(count - 1));
     Some((first, (last - first + 1) as usize))
+}
+
+/// The first and the last column between two azimuths turned by `turn`, with one more at either end against rounding.
+fn interval(pattern: &RayPattern, azimuths: [f32; 2], turn: f32) -> (i64, i64) {
+    let [a, b] = azimuths
+        .map(|azimuth| (azimuth + turn - pattern.first_azimuth_rad) / pattern.azimuth_step_rad);
+    (a.min(b).floor() as i64 - 1, a.max(b).ceil() as i64 + 1)
 }

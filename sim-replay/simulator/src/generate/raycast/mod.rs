@@ -21,6 +21,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use column::{ColumnPose, ColumnRays};
 use footprint::{Footprint, SensorFrames};
+use part::greater;
 
 /// [`RangeImage::hits`] of a ray without a hit.
 pub(crate) const MISS: u32 = u32::MAX;
@@ -61,6 +62,15 @@ pub struct Body<'a> {
     pub shape: &'a BodyShape,
     /// `world_from_body` over the sweep.
     pub motion: Sweep,
+}
+
+impl Body<'_> {
+    /// `body_from_world`, the turning part, at a time of the sweep, and the position relative to `anchor`.
+    fn frame(&self, time: f32, anchor: &Vector3<f64>) -> (Matrix3<f32>, Vector3<f32>) {
+        let placement = self.motion.at(f64::from(time));
+        let body_from_world = placement.rotation().transpose().cast();
+        (body_from_world, (placement.position_m - anchor).cast())
+    }
 }
 
 /// The ground surface.
@@ -234,27 +244,22 @@ impl Caster {
         let count = self.pattern.columns as i64;
         let channels = footprint.channels.clone();
         let (cos, sin) = (&self.cos[channels.clone()], &self.sin[channels.clone()]);
-        let frame = |time: f32| -> (Matrix3<f32>, Vector3<f32>) {
-            let placement = body.motion.at(f64::from(time));
-            let body_from_world = placement.rotation().transpose().cast();
-            (body_from_world, (placement.position_m - anchor).cast())
-        };
         // Most bodies stand still: one frame serves all columns.
-        let still = body.motion.is_still().then(|| frame(1.0));
+        let still = body.motion.is_still().then(|| body.frame(1.0, anchor));
         for column in footprint.first_column..footprint.first_column + footprint.columns as i64 {
             // A footprint may reach over the seam of a full turn.
             let column = column.rem_euclid(count) as usize;
             let offset = column * self.pattern.channels;
             let range = offset + channels.start..offset + channels.end;
             let depths = &mut self.image.depths_m[range.clone()];
-            let farther = |far: f32, &depth: &f32| if depth > far { depth } else { far };
             // All rays of the column already end nearer, so the body is hidden here.
-            if depths.iter().fold(0.0, farther) < footprint.nearest_m {
+            if depths.iter().fold(0.0, |far, &depth| greater(depth, far)) < footprint.nearest_m {
                 continue;
             }
             let hits = &mut self.image.hits[range];
             let pose = &self.columns[column];
-            let (body_from_world, position) = still.unwrap_or_else(|| frame(pose.time));
+            let (body_from_world, position) =
+                still.unwrap_or_else(|| body.frame(pose.time, anchor));
             let rays: ColumnRays<'_> = pose.in_body(&body_from_world, &position, cos, sin);
             for part in &body.shape.parts {
                 part.cast(&rays, depths, hits, id);

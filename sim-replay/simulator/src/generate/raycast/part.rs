@@ -66,17 +66,16 @@ impl Bounds {
 
     /// Radius of the upright cylinder around the origin that holds the box.
     pub fn radius_m(&self) -> f64 {
-        let reach = |axis: usize| f64::from(self.min_m[axis].abs().max(self.max_m[axis].abs()));
-        reach(0).hypot(reach(1))
+        let [x, y] =
+            [0, 1].map(|axis: usize| f64::from(self.min_m[axis].abs().max(self.max_m[axis].abs())));
+        x.hypot(y)
     }
 
     /// The eight corners.
     pub fn corners(&self) -> [[f32; 3]; 8] {
-        let edge = |corner: usize, axis: usize| match corner >> axis & 1 {
-            0 => self.min_m[axis],
-            _ => self.max_m[axis],
-        };
-        std::array::from_fn(|corner| std::array::from_fn(|axis| edge(corner, axis)))
+        std::array::from_fn(|corner| {
+            std::array::from_fn(|axis| [self.min_m, self.max_m][corner >> axis & 1][axis])
+        })
     }
 
     /// True if the plane through `origin` with unit normal `normal` touches the box.
@@ -145,7 +144,7 @@ fn lesser(a: f32, b: f32) -> f32 {
 }
 
 #[inline(always)]
-fn greater(a: f32, b: f32) -> f32 {
+pub(super) fn greater(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }
 
@@ -161,12 +160,11 @@ fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, (depth, hit, id): Pixels<'_>
     let (h, u) = (rays.forward, rays.up);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
         // Slab test: the ray is inside between its last entry and its first exit.
-        let slab = |axis: usize| {
+        let [(x_in, x_out), (y_in, y_out), (z_in, z_out)] = [0, 1, 2].map(|axis| {
             let inverse = 1.0 / off_zero(h[axis] * cos + u[axis] * sin);
             let (a, b) = (low[axis] * inverse, high[axis] * inverse);
             (lesser(a, b), greater(a, b))
-        };
-        let ((x_in, x_out), (y_in, y_out), (z_in, z_out)) = (slab(0), slab(1), slab(2));
+        });
         let enter = greater(greater(x_in, y_in), z_in);
         let exit = lesser(lesser(x_out, y_out), z_out);
         shorten(enter, enter <= exit, depth, hit, id);
@@ -180,10 +178,10 @@ fn cast_hull(planes: &[[f32; 4]], rays: &ColumnRays<'_>, (depth, hit, id): Pixel
         let range = start..start + count;
         let (mut enter, mut exit) = ([f32::MIN; LANES], [f32::MAX; LANES]);
         for plane in planes {
-            let dot = |v: &[f32; 3]| plane[0] * v[0] + plane[1] * v[1] + plane[2] * v[2];
             // Distance to the plane from inside, and its decrease along the two directions that span the column.
-            let inside = plane[3] - dot(&rays.origin);
-            let (along, rise) = (dot(&rays.forward), dot(&rays.up));
+            let [origin, along, rise] = [rays.origin, rays.forward, rays.up]
+                .map(|v| plane[0] * v[0] + plane[1] * v[1] + plane[2] * v[2]);
+            let inside = plane[3] - origin;
             let lanes = enter[..count].iter_mut().zip(&mut exit[..count]);
             for ((enter, exit), (cos, sin)) in
                 lanes.zip(rays.cos[range.clone()].iter().zip(&rays.sin[range.clone()]))

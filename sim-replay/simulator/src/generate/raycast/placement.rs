@@ -83,7 +83,6 @@ impl Sweep {
 
     /// The placement at a time between 0 (start) and 1 (end).
     pub fn at(&self, time: f64) -> Placement {
-        let mix = |a: f64, b: f64| a + (b - a) * time;
         // The short way round, also across the step from pi to -pi.
         let turn = wrapped(self.end.yaw_rad - self.start.yaw_rad);
         Placement {
@@ -91,8 +90,8 @@ impl Sweep {
                 + (self.end.position_m - self.start.position_m) * time,
             // Backwards from the end, so that the pose at time 1 is the end to the last bit.
             yaw_rad: self.end.yaw_rad - turn * (1.0 - time),
-            pitch_rad: mix(self.start.pitch_rad, self.end.pitch_rad),
-            roll_rad: mix(self.start.roll_rad, self.end.roll_rad),
+            pitch_rad: self.start.pitch_rad + (self.end.pitch_rad - self.start.pitch_rad) * time,
+            roll_rad: self.start.roll_rad + (self.end.roll_rad - self.start.roll_rad) * time,
         }
     }
 

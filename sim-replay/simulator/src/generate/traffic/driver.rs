@@ -86,13 +86,14 @@ pub(crate) fn bend_speeds_mps(lane: &Lane) -> Vec<f32> {
     let points = &lane.centerline;
     (0..points.len())
         .map(|index| {
-            let at = |index: usize| [points[index][0], points[index][1]];
             let (before, after) = (index.saturating_sub(REACH), index + REACH);
-            let (a, b, c) = (at(before), at(index), at(after.min(points.len() - 1)));
-            let side = |p: [f64; 2], q: [f64; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
+            let [a, b, c] = [before, index, after.min(points.len() - 1)]
+                .map(|index| [points[index][0], points[index][1]]);
+            let [ab, bc, ac] =
+                [[a, b], [b, c], [a, c]].map(|[p, q]| (q[0] - p[0]).hypot(q[1] - p[1]));
             let doubled_area =
                 ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
-            let product = side(a, b) * side(b, c) * side(a, c);
+            let product = ab * bc * ac;
             // Curvature of the circle through the three points.
             let is_triangle = product > 1e-6;
             let curvature = if is_triangle {

@@ -99,10 +99,10 @@ impl Explorer {
 
     /// Dijkstra's algorithm, backwards from all least visited lanes.
     fn look_around(&self) -> Vec<Option<u64>> {
-        let roads = || (0..self.visits.len()).filter(|&lane| self.is_road[lane]);
-        let fewest = roads().map(|lane| self.visits[lane]).min();
+        let roads = (0..self.visits.len()).filter(|&lane| self.is_road[lane]);
+        let fewest = roads.clone().map(|lane| self.visits[lane]).min();
         let mut unknown_m = vec![None; self.visits.len()];
-        let mut open: BinaryHeap<_> = roads()
+        let mut open: BinaryHeap<_> = roads
             .filter(|&lane| Some(self.visits[lane]) == fewest)
             .map(|lane| Reverse((0, lane)))
             .collect();

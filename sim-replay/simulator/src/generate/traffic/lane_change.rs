@@ -104,8 +104,8 @@ impl Traffic<'_> {
         let sides = sides.filter_map(|side| Some((side, side.of(lane)?)));
         let mut sides: Vec<(Side, LaneId)> = sides.collect();
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
-            let wanted = |&(_, lane): &(Side, LaneId)| explorer.prefers(lane, own);
-            let better: Vec<_> = sides.iter().copied().filter(wanted).collect();
+            let mut better = sides.clone();
+            better.retain(|&(_, lane)| explorer.prefers(lane, own));
             if better.is_empty() && !self.random.chance(RANDOM_CHANGE_SHARE) {
                 return None;
             }
@@ -147,12 +147,12 @@ impl Traffic<'_> {
     fn gain_mps2(&self, index: usize, path: &Path) -> f64 {
         let car = &self.cars[index];
         let wanted_mps = free_speed_mps(car, self.roads);
-        let with = |leader: Option<Obstacle>| {
+        // The leader of the last step: those of this step are found after the changes.
+        let [changed, kept] = [self.leader_on(index, path), car.leader].map(|leader| {
             car.driver
                 .acceleration_mps2(car.speed_mps, wanted_mps, leader.as_slice())
-        };
-        // The leader of the last step: those of this step are found after the changes.
-        with(self.leader_on(index, path)) - with(car.leader)
+        });
+        changed - kept
     }
 
     /// True if a change is safe: the driver's own path past the vehicle ahead, and the gaps on the new lane.
@@ -165,12 +165,6 @@ impl Traffic<'_> {
         }) {
             return false;
         }
-        let brakes_softly = |car: &Car, ahead: Obstacle| {
-            let speed_mps = car.speed_mps;
-            // With its own speed as the desired one, the free term of the model is 0 and the braking remains.
-            let braking = -car.driver.acceleration_mps2(speed_mps, speed_mps, &[ahead]);
-            ahead.gap_m > SAFE_GAP_M && braking < SAFE_MPS2
-        };
         let leader = self.leader_on(index, path);
         if !leader.is_none_or(|leader| brakes_softly(car, leader)) {
             return false;
@@ -256,6 +250,14 @@ fn is_held_up(car: &Car, roads: &Roads<'_>) -> bool {
     car.leader.as_ref().is_some_and(|leader| {
         leader.speed_mps < slow_mps && leader.gap_m < 8.0 + 2.5 * car.speed_mps
     }) && car.speed_mps < slow_mps
+}
+
+/// True if a driver keeps the least gap to a vehicle ahead without strong braking.
+fn brakes_softly(car: &Car, ahead: Obstacle) -> bool {
+    let speed_mps = car.speed_mps;
+    // With its own speed as the desired one, the free term of the model is 0 and the braking remains.
+    let braking = -car.driver.acceleration_mps2(speed_mps, speed_mps, &[ahead]);
+    ahead.gap_m > SAFE_GAP_M && braking < SAFE_MPS2
 }
 
 /// Length of a change, metres.

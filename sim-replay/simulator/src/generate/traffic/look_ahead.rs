@@ -66,10 +66,11 @@ impl Traffic<'_> {
                 return None;
             }
             // Vehicles at the same position are ordered by index, as in the list.
-            let is_ahead = |&&(s_m, other): &&(f64, u32)| {
+            let mut occupants = self.occupants[lane.0 as usize].iter();
+            let ahead = occupants.find(|&&(s_m, other)| {
                 other as usize != index && (start_m + s_m, other as usize) > (0.0, index)
-            };
-            if let Some(&(s_m, other)) = self.occupants[lane.0 as usize].iter().find(is_ahead) {
+            });
+            if let Some(&(s_m, other)) = ahead {
                 let leader = &self.cars[other as usize];
                 let gap_m = start_m + s_m - car.half_length_m() - leader.half_length_m();
                 let speed_mps = leader.speed_mps;

@@ -149,15 +149,16 @@ impl Path {
             self.s_m -= graph.lane(self.lane()).length_m;
             self.current += 1;
         }
-        let behind = |path: &Self| -> f64 {
-            // Distance from the end of the first lane to the centre of the vehicle.
-            let lanes = path.lanes.iter().take(path.current).skip(1);
-            lanes.map(|&lane| graph.lane(lane).length_m).sum::<f64>() + path.s_m
-        };
-        while self.current > 0 && behind(self) > keep_behind_m {
+        while self.current > 0 && self.behind_m(graph) > keep_behind_m {
             self.lanes.pop_front();
             self.current -= 1;
         }
+    }
+
+    /// Distance from the end of the first lane to the centre of the vehicle, metres.
+    fn behind_m(&self, graph: &LaneGraph) -> f64 {
+        let lanes = self.lanes.iter().take(self.current).skip(1);
+        lanes.map(|&lane| graph.lane(lane).length_m).sum::<f64>() + self.s_m
     }
 
     /// Lanes touched by the stretch from `behind_m` behind to the vehicle's centre, the current one first.

@@ -53,10 +53,9 @@ impl Rectangle {
         {
             return false;
         }
-        let side = |axis: [f64; 2]| [-axis[1], axis[0]];
-        let axes = [self.axis, side(self.axis), other.axis, side(other.axis)];
-        axes.iter()
-            .all(|axis| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis))
+        let axes = [self.axis, other.axis].map(|[x, y]| [[x, y], [-y, x]]);
+        let mut axes = axes.iter().flatten();
+        axes.all(|axis| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis))
     }
 
     /// Distance of a point from the rectangle, 0 inside, metres.

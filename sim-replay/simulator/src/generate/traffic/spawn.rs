@@ -84,12 +84,10 @@ impl<'t> Traffic<'t> {
     }
 
     fn spawns_between(&self, center_m: [f64; 2], low_m: f64, high_m: f64) -> Vec<Spawn> {
-        let is_inside = |spawn: &&Spawn| {
-            let distance = (spawn.point_m[0] - center_m[0]).hypot(spawn.point_m[1] - center_m[1]);
-            (low_m..high_m).contains(&distance)
-        };
         let spawns = self.roads.spawns.iter();
-        spawns.filter(is_inside).copied().collect()
+        let inside =
+            spawns.filter(|spawn| (low_m..high_m).contains(&distance_m(spawn.point_m, center_m)));
+        inside.copied().collect()
     }
 
     fn has_room(&self, vehicle: &Vehicle, spawn: Spawn, index: usize, near: &mut Vec<u32>) -> bool {
@@ -141,7 +139,7 @@ impl<'t> Traffic<'t> {
             let car = &self.cars[index];
             if car.is_present {
                 let point_m = car.point_m();
-                let distance_m = (point_m[0] - center_m[0]).hypot(point_m[1] - center_m[1]);
+                let distance_m = distance_m(point_m, center_m);
                 // Just before the end, where it would otherwise stop for good.
                 let is_at_an_end =
                     car.path.remaining_m(self.roads.graph) < car.half_length_m() + 3.0;
@@ -175,19 +173,19 @@ impl<'t> Traffic<'t> {
         // True in one step of each interval, so that one vehicle leaves at a time.
         if over_s > 0.0 && over_s % NEXT_LEAVES_S < STEP_S {
             let center_m = self.cars[0].point_m();
-            let distance_m =
-                |car: &Car| (car.point_m()[0] - center_m[0]).hypot(car.point_m()[1] - center_m[1]);
             let standing = (1..self.cars.len()).filter(|&index| {
                 let car = &self.cars[index];
                 car.is_present && car.standing_s > NEXT_LEAVES_S
             });
-            let distance_m = |index: usize| distance_m(&self.cars[index]);
-            return standing.min_by(|&a, &b| distance_m(a).total_cmp(&distance_m(b)));
+            let distances =
+                standing.map(|index| (index, distance_m(self.cars[index].point_m(), center_m)));
+            let nearest = distances.min_by(|a, b| a.1.total_cmp(&b.1));
+            return nearest.map(|(index, _)| index);
         }
-        let is_first = |car: &Car| car.leader.is_none_or(|leader| leader.gap_m > QUEUE_GAP_M);
         let stuck = (1..self.cars.len()).filter(|&index| {
             let car = &self.cars[index];
-            car.is_present && car.standing_s > STUCK_S && is_first(car)
+            let is_first = car.leader.is_none_or(|leader| leader.gap_m > QUEUE_GAP_M);
+            car.is_present && car.standing_s > STUCK_S && is_first
         });
         stuck.max_by(|&a, &b| self.cars[a].standing_s.total_cmp(&self.cars[b].standing_s))
     }
@@ -205,4 +203,8 @@ impl<'t> Traffic<'t> {
         self.index.insert(index as u32, car.point_m());
         self.next_id += 1;
     }
+}
+
+fn distance_m(a: [f64; 2], b: [f64; 2]) -> f64 {
+    (a[0] - b[0]).hypot(a[1] - b[1])
 }

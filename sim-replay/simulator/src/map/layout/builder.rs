@@ -77,8 +77,9 @@ impl CrossProfile {
 
     /// Width of the wider side, metres.
     pub(super) fn half_width_m(&self) -> f64 {
-        let width = |side: &[(LaneKind, f64)]| side.iter().map(|&(_, width)| width).sum::<f64>();
-        width(&self.left).max(width(&self.right))
+        let [left, right] =
+            [&self.left, &self.right].map(|side| side.iter().map(|&(_, width)| width).sum::<f64>());
+        left.max(right)
     }
 }
 
@@ -107,15 +108,15 @@ impl Builder {
         profile: &CrossProfile,
         limit_mps: f64,
     ) -> usize {
-        let lanes = |side: &[(LaneKind, f64)]| {
+        let [left, right] = [&profile.left, &profile.right].map(|side| {
             side.iter()
                 .map(|&(kind, width)| RoadLane::new(kind, Profile::constant(width)))
                 .collect()
-        };
+        });
         let section = LaneSection {
             s_m: 0.0,
-            left: lanes(&profile.left),
-            right: lanes(&profile.right),
+            left,
+            right,
         };
         self.push(plan_view, elevation, section, limit_mps)
     }
@@ -149,12 +150,10 @@ impl Builder {
         let (exit, entry) = (self.lane_edge(from, true), self.lane_edge(to, false));
         let curve = clothoid::between(exit.pose, entry.pose, 0.0);
         let length_m = curve.length_m;
-        let cubic = |from, to| Profile {
-            records: vec![Profile::hermite(0.0, length_m, from, to)],
-        };
-        let elevation = cubic([exit.height_m, exit.slope], [entry.height_m, entry.slope]);
+        let heights = [&exit, &entry].map(|edge| [edge.height_m, edge.slope]);
+        let elevation = Profile::between(length_m, heights[0], heights[1]);
         // No slope at either end: the edges of the lanes join without a kink.
-        let width = cubic([exit.width_m, 0.0], [entry.width_m, 0.0]);
+        let width = Profile::between(length_m, [exit.width_m, 0.0], [entry.width_m, 0.0]);
         let mut only = RoadLane::new(LaneKind::Driving, width);
         (only.predecessor, only.successor) = (Some(from.lane), Some(to.lane));
         let section = LaneSection {

@@ -45,9 +45,9 @@ pub(super) fn spread(
 /// two streets, and the grid is connected. With a `port`, the node nearest to it has a street to it.
 pub(super) fn grid(
     plan: &GridPlan,
-    y_range: impl Fn(f64) -> [f64; 2],
     port: Option<Pose2>,
     rng: &mut ChaCha8Rng,
+    y_range: impl Fn(f64) -> [f64; 2],
 ) -> StreetGraph {
     let mut calm = 1.0;
     loop {
@@ -93,14 +93,14 @@ fn full_grid(
             });
         }
     }
-    let at = |column: usize, row: usize| column * plan.rows + row;
     for column in 0..plan.columns_m.len() {
         for row in 0..plan.rows {
+            let node = column * plan.rows + row;
             if row + 1 < plan.rows {
-                graph.edges.push([at(column, row), at(column, row + 1)]);
+                graph.edges.push([node, node + 1]);
             }
             if column + 1 < plan.columns_m.len() {
-                graph.edges.push([at(column, row), at(column + 1, row)]);
+                graph.edges.push([node, node + plan.rows]);
             }
         }
     }
@@ -109,10 +109,10 @@ fn full_grid(
 
 /// Ties the node nearest to `port` to it.
 fn attach(graph: &mut StreetGraph, port: Pose2) {
-    let distance = |node: usize| (graph.nodes[node].x - port.x).hypot(graph.nodes[node].y - port.y);
-    let nearest = (0..graph.nodes.len())
-        .min_by(|&a, &b| distance(a).total_cmp(&distance(b)))
-        .unwrap_or(0);
+    let nodes = graph.nodes.iter();
+    let distances = nodes.map(|node| (node.x - port.x).hypot(node.y - port.y));
+    let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+    let nearest = nearest.map_or(0, |(node, _)| node);
     graph.nodes.push(Node {
         x: port.x,
         y: port.y,

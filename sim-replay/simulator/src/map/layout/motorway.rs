@@ -44,11 +44,12 @@ impl Motorway {
         direction: Direction,
     ) -> usize {
         let steps = ((to_m - from_m).abs() / KNOT_M).ceil().max(1.0) as usize;
-        let at = |step: usize| from_m + (to_m - from_m) * step as f64 / steps as f64;
-        let poses = (0..=steps).map(|step| self.left_edge(at(step), direction));
+        let stops = (0..=steps).map(|step| from_m + (to_m - from_m) * step as f64 / steps as f64);
+        let stops: Vec<f64> = stops.collect();
+        let poses = stops.iter().map(|&s| self.left_edge(s, direction));
         let curves = path(&poses.collect::<Vec<_>>());
         let records = (0..steps).map(|step| {
-            let (a, b) = (at(step), at(step + 1));
+            let (a, b) = (stops[step], stops[step + 1]);
             let length = curves[step].length_m;
             // Slopes per metre of the ring, in driving direction, onto the longer or shorter carriageway.
             let scale = (b - a) / length;
@@ -141,9 +142,7 @@ impl Motorway {
     fn ramp(&self, builder: &mut Builder, poses: [Pose2; 2], heights: [[f64; 2]; 2]) -> usize {
         let curves = path(&poses);
         let [from, to] = heights;
-        let elevation = Profile {
-            records: vec![Profile::hermite(0.0, curves[0].length_m, from, to)],
-        };
+        let elevation = Profile::between(curves[0].length_m, from, to);
         let profile = CrossProfile {
             left: vec![(LaneKind::Shoulder, 0.4)],
             right: vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)],

@@ -47,8 +47,8 @@ impl Ring {
         };
         let mut length = 0.0;
         for sample in 0..SAMPLES {
-            let at = |sample: usize| ring.point(2.0 * PI * sample as f64 / SAMPLES as f64);
-            let (from, to) = (at(sample), at(sample + 1));
+            let [from, to] = [sample, sample + 1]
+                .map(|sample| ring.point(2.0 * PI * sample as f64 / SAMPLES as f64));
             length += (to[0] - from[0]).hypot(to[1] - from[1]);
             ring.lengths_m.push(length);
         }
@@ -99,14 +99,14 @@ impl Ring {
     /// Height at a length, metres.
     pub(super) fn height_m(&self, s_m: f64) -> f64 {
         let total = self.length_m();
-        let height = |bump: &Bump| {
+        let heights = self.bumps.iter().map(|bump| {
             // The shorter way round the closed line, with a sign.
             let away = (s_m - bump.middle_m + total / 2.0).rem_euclid(total) - total / 2.0;
             let share =
                 ((bump.reach_m - away.abs()) / (bump.reach_m - bump.plateau_m)).clamp(0.0, 1.0);
             bump.height_m * share * share * (3.0 - 2.0 * share)
-        };
-        self.bumps.iter().map(height).fold(0.0, f64::max)
+        });
+        heights.fold(0.0, f64::max)
     }
 
     /// Slope at a length.
@@ -145,13 +145,12 @@ impl Ring {
     /// A leaning figure of eight with some waves. At a quarter of the parameter it heads down the right-hand end.
     fn point(&self, t: f64) -> [f64; 2] {
         let [a, b] = [0, 1].map(|axis| self.half_m[axis] * (1.0 + self.lean[axis] * t.sin()));
-        let wave =
-            |[height, phase]: [f64; 2], frequency: f64| height * (frequency * t + phase).sin();
-        let [x2, y2, x3, y3] = self.waves;
-        [
-            a * t.sin() + wave(x2, 2.0) + wave(x3, 3.0),
-            b * (2.0 * t).sin() + wave(y2, 2.0) + wave(y3, 3.0),
-        ]
+        let frequencies = [2.0, 2.0, 3.0, 3.0];
+        let [x2, y2, x3, y3]: [f64; 4] = std::array::from_fn(|wave| {
+            let [height, phase] = self.waves[wave];
+            height * (frequencies[wave] * t + phase).sin()
+        });
+        [a * t.sin() + x2 + x3, b * (2.0 * t).sin() + y2 + y3]
     }
 }
 

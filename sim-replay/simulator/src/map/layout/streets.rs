@@ -63,20 +63,22 @@ impl StreetGraph {
 
     /// True if every street is long enough for the junctions and corners at its ends, even a broad one.
     pub(super) fn has_room(&self) -> bool {
-        let radius = |node: usize| {
-            if self.nodes[node].port.is_some() {
-                return 0.0;
-            }
-            let around = self.edges.iter().filter(|edge| edge.contains(&node));
-            let others = around.map(|&[a, b]| if a == node { b } else { a });
-            let arms: Vec<(f64, f64)> = others
-                .map(|other| (self.angle(node, other), BROAD_M))
-                .collect();
-            junction_radius_m(&arms)
-        };
-        self.edges
-            .iter()
-            .all(|&[a, b]| self.distance_m(a, b) > radius(a) + radius(b) + LEAST_STREET_M)
+        let mut edges = self.edges.iter();
+        edges.all(|&[a, b]| {
+            let radii_m = self.broad_radius_m(a) + self.broad_radius_m(b);
+            self.distance_m(a, b) > radii_m + LEAST_STREET_M
+        })
+    }
+
+    /// Distance from a node's middle at which broad streets begin, metres.
+    fn broad_radius_m(&self, node: usize) -> f64 {
+        if self.nodes[node].port.is_some() {
+            return 0.0;
+        }
+        let around = self.edges.iter().filter(|edge| edge.contains(&node));
+        let others = around.map(|&[a, b]| if a == node { b } else { a });
+        let arms = others.map(|other| (self.angle(node, other), BROAD_M));
+        junction_radius_m(&arms.collect::<Vec<_>>())
     }
 
     /// A node at which streets end: three or more meet there, or it is a port.
@@ -180,7 +182,7 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
         0.0
     };
     let sidewalk_m = rng.random_range(1.6..3.4);
-    let mut side = || {
+    let [left, right] = [(); 2].map(|()| {
         let mut lanes = vec![(LaneKind::Driving, 3.5)];
         lanes.push(match rng.random_bool(0.6) {
             true => (LaneKind::Parking, 2.3),
@@ -191,11 +193,8 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
         }
         lanes.push((LaneKind::Sidewalk, sidewalk_m));
         lanes
-    };
-    CrossProfile {
-        left: side(),
-        right: side(),
-    }
+    });
+    CrossProfile { left, right }
 }
 
 /// Distance from each junction's middle at which its roads begin, metres: far enough that their edges do not overlap.
@@ -237,9 +236,9 @@ fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
             .distance_m(before, corner)
             .min(graph.distance_m(corner, after));
         let reach = (0.4 * shorter_m).min(22.0);
-        let middle = |heading| Pose2::new(graph.nodes[corner].x, graph.nodes[corner].y, heading);
-        poses.push(middle(graph.angle(before, corner)).moved(-reach, 0.0, 0.0));
-        poses.push(middle(graph.angle(corner, after)).moved(reach, 0.0, 0.0));
+        let Node { x, y, .. } = graph.nodes[corner];
+        poses.push(Pose2::new(x, y, graph.angle(before, corner)).moved(-reach, 0.0, 0.0));
+        poses.push(Pose2::new(x, y, graph.angle(corner, after)).moved(reach, 0.0, 0.0));
     }
     poses.push(end_pose(graph, chain, radii, 1).reversed());
     poses

@@ -27,14 +27,13 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
         left_out,
         jitter_m: 5.0,
     };
-    let y_range = |x: f64| {
+    let graph = grid(&plan, None, &mut rng, |x| {
         let share = x / width - 0.5;
         [
             shear * x + share * taper * height,
             height + shear * x - share * taper * height,
         ]
-    };
-    let graph = grid(&plan, y_range, None, &mut rng);
+    });
     let mut builder = Builder::default();
     streets::lay_out(&mut builder, &graph, LIMIT_MPS, &mut rng);
     Layout {

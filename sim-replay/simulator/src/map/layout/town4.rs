@@ -66,14 +66,13 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
 /// One roundabout inside the ring's right-hand lobe and one outside, on a line across the motorway at its far end.
 fn roundabouts(motorway: &Motorway, rng: &mut ChaCha8Rng) -> [Roundabout; 2] {
     let apex = motorway.ring.pose(motorway.ring.apex_m());
-    let mut at = |side: f64| {
+    [-1.0, 1.0].map(|side: f64| {
         let distance = rng.random_range(88.0..104.0);
         Roundabout {
             center_m: [apex.x + side * distance, apex.y],
             radius_m: rng.random_range(20.0..25.0),
         }
-    };
-    [at(-1.0), at(1.0)]
+    })
 }
 
 /// The road below the motorway.
@@ -141,14 +140,11 @@ fn map_model(
     let port = inside.port(PI);
     let east = port.x - rng.random_range(30.0..45.0);
     let west = motorway.ring.pose(0.0).x + rng.random_range(150.0..175.0);
-    let y_range = |x: f64| {
-        let [low, high] = motorway.ring.lobe_m(x);
-        [low + CLEARANCE_M, high - CLEARANCE_M]
-    };
     let columns = (((east - west) / STREETS_M) as usize + 1).clamp(2, 4);
     let columns_m = spread(west, east, columns, 0.12, rng);
     // As many rows as the shortest column has room for.
-    let heights = columns_m.iter().map(|&x| y_range(x)[1] - y_range(x)[0]);
+    let ranges = columns_m.iter().map(|&x| inside_lobe_m(motorway, x));
+    let heights = ranges.map(|[low, high]| high - low);
     let rows = (heights.fold(f64::INFINITY, f64::min) / STREETS_M) as usize + 1;
     let plan = GridPlan {
         columns_m,
@@ -156,8 +152,14 @@ fn map_model(
         left_out: 0.12,
         jitter_m: 4.0,
     };
-    let graph = grid(&plan, y_range, Some(port), rng);
+    let graph = grid(&plan, Some(port), rng, |x| inside_lobe_m(motorway, x));
     streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0].1
+}
+
+/// Lowest and highest y at `x` inside the right-hand lobe, clear of the motorway.
+fn inside_lobe_m(motorway: &Motorway, x: f64) -> [f64; 2] {
+    let [low, high] = motorway.ring.lobe_m(x);
+    [low + CLEARANCE_M, high - CLEARANCE_M]
 }
 
 /// The works quarter outside the ring; returns the street's end at the roundabout.
@@ -173,7 +175,8 @@ fn works(builder: &mut Builder, outside: &Roundabout, rng: &mut ChaCha8Rng) -> R
         jitter_m: 5.0,
     };
     let (y, shear) = (port.y, rng.random_range(-0.15..0.15));
-    let y_range = |x: f64| [y - height / 2.0, y + height / 2.0].map(|y| y + shear * (x - west));
-    let graph = grid(&plan, y_range, Some(port), rng);
+    let graph = grid(&plan, Some(port), rng, |x| {
+        [y - height / 2.0, y + height / 2.0].map(|y| y + shear * (x - west))
+    });
     streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0].1
 }

@@ -24,41 +24,46 @@ fn read_all<T>(
 }
 
 pub(super) fn read_objects(road: Element, log: &mut FindingLog) -> Vec<RoadObject> {
-    let read_object = |element: Element| {
-        let label = [element.optional_text("type"), element.optional_text("name")]
-            .map(Option::unwrap_or_default)
-            .join(" ");
-        let size = |name| element.number_or(name, 0.0, 0.0, 1e4);
-        Ok(RoadObject {
-            label,
-            s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
-            t_m: element.number("t", -1e4, 1e4)?,
-            z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
-            heading_rad: element.number_or("hdg", 0.0, -1e4, 1e4)?,
-            size_m: [size("length")?, size("width")?, size("height")?],
-        })
-    };
     read_all(road, "objects", "object", read_object, log)
 }
 
+fn read_object(element: Element) -> Result<RoadObject> {
+    let label = [element.optional_text("type"), element.optional_text("name")]
+        .map(Option::unwrap_or_default)
+        .join(" ");
+    Ok(RoadObject {
+        label,
+        s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
+        t_m: element.number("t", -1e4, 1e4)?,
+        z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
+        heading_rad: element.number_or("hdg", 0.0, -1e4, 1e4)?,
+        size_m: [
+            element.number_or("length", 0.0, 0.0, 1e4)?,
+            element.number_or("width", 0.0, 0.0, 1e4)?,
+            element.number_or("height", 0.0, 0.0, 1e4)?,
+        ],
+    })
+}
+
 pub(super) fn read_signals(road: Element, log: &mut FindingLog) -> Vec<RoadSignal> {
-    let read_signal = |element: Element| {
-        // The signal faces against the direction it is for; `+` is for traffic along the road.
-        let flip = match element.optional_text("orientation") {
-            Some("-") => std::f64::consts::PI,
-            _ => 0.0,
-        };
-        Ok(RoadSignal {
-            name: element.optional_text("name").unwrap_or_default().to_owned(),
-            dynamic: element.optional_text("dynamic") == Some("yes"),
-            s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
-            t_m: element.number("t", -1e4, 1e4)?,
-            z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
-            heading_rad: flip + element.number_or("hOffset", 0.0, -1e4, 1e4)?,
-            height_m: element.number_or("height", 0.0, 0.0, 100.0)?,
-        })
-    };
     read_all(road, "signals", "signal", read_signal, log)
+}
+
+fn read_signal(element: Element) -> Result<RoadSignal> {
+    // The signal faces against the direction it is for; `+` is for traffic along the road.
+    let flip = match element.optional_text("orientation") {
+        Some("-") => std::f64::consts::PI,
+        _ => 0.0,
+    };
+    Ok(RoadSignal {
+        name: element.optional_text("name").unwrap_or_default().to_owned(),
+        dynamic: element.optional_text("dynamic") == Some("yes"),
+        s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
+        t_m: element.number("t", -1e4, 1e4)?,
+        z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
+        heading_rad: flip + element.number_or("hOffset", 0.0, -1e4, 1e4)?,
+        height_m: element.number_or("height", 0.0, 0.0, 100.0)?,
+    })
 }
 
 pub(super) fn read_structures(
@@ -67,19 +72,19 @@ pub(super) fn read_structures(
     log: &mut FindingLog,
 ) -> Vec<RoadStructure> {
     let mut structures = Vec::new();
-    for (name, tunnel) in [("bridge", false), ("tunnel", true)] {
-        let read = |element: Element| {
-            let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
-            Ok(RoadStructure {
-                tunnel,
-                s_m,
-                length_m: element.number("length", 0.0, MAX_LENGTH_M)?,
-            })
-        };
-        structures.extend(read_all(road, "objects", name, read, log));
+    for name in ["bridge", "tunnel"] {
+        structures.extend(read_all(road, "objects", name, read_structure, log));
     }
     part_tunnels(&mut structures, road_length_m);
     structures
+}
+
+fn read_structure(element: Element) -> Result<RoadStructure> {
+    Ok(RoadStructure {
+        tunnel: element.name() == "tunnel",
+        s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
+        length_m: element.number("length", 0.0, MAX_LENGTH_M)?,
+    })
 }
 
 /// Cuts tunnels so that none reaches into the next or beyond its road, and leaves out empty ones: together they are at

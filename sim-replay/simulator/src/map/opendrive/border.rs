@@ -32,8 +32,7 @@ pub(super) fn widths_from_borders(
     stretch: &Stretch,
     log: &mut FindingLog,
 ) -> Result<()> {
-    let has_border = |element: &Element| element.child("border").is_some();
-    if !elements.iter().any(has_border) {
+    if !elements.iter().any(|one| one.child("border").is_some()) {
         return Ok(());
     }
     let side = f64::from(sign);
@@ -49,7 +48,7 @@ pub(super) fn widths_from_borders(
             }
             continue;
         }
-        if has_border(element) {
+        if element.child("border").is_some() {
             element.note(log, "has both <width> and <border>", "the width is used");
         }
         inner = sum(&inner, &lane.width);
@@ -115,14 +114,13 @@ fn sum(a: &Profile, b: &Profile) -> Profile {
     let mut starts: Vec<f64> = records.map(|&(start, _)| start).collect();
     starts.sort_unstable_by(f64::total_cmp);
     starts.dedup();
-    let at = |profile: &Profile, place: f64| {
-        let record = profile.record_at(place);
-        record.map_or([0.0; 4], |(start, coefficients)| {
-            moved(coefficients, place - start)
-        })
-    };
     let records = starts.into_iter().map(|place| {
-        let ([a0, a1, a2, a3], [b0, b1, b2, b3]) = (at(a, place), at(b, place));
+        let [[a0, a1, a2, a3], [b0, b1, b2, b3]] = [a, b].map(|profile| {
+            let record = profile.record_at(place);
+            record.map_or([0.0; 4], |(start, coefficients)| {
+                moved(coefficients, place - start)
+            })
+        });
         (place, [a0 + b0, a1 + b1, a2 + b2, a3 + b3])
     });
     Profile {

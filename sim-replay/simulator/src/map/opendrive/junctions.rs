@@ -45,11 +45,6 @@ fn read_connection(
     direct: bool,
     log: &mut FindingLog,
 ) -> Result<Option<Connection>> {
-    let road = |attribute| {
-        let id = element.text(attribute)?;
-        let found = ids.roads.get(id).copied();
-        found.ok_or_else(|| element.error_value(attribute, id, "the id of a road of this map"))
-    };
     let onto = match direct {
         true => "linkedRoad",
         false => "connectingRoad",
@@ -70,11 +65,16 @@ fn read_connection(
     if lane_links.is_empty() && !is_empty {
         return Err(element.error_element("has no lane link that can be read"));
     }
-    let (incoming, connecting) = (road("incomingRoad")?, road(onto)?);
     Ok(Some(Connection {
-        incoming,
-        connecting,
+        incoming: read_road(element, "incomingRoad", ids)?,
+        connecting: read_road(element, onto, ids)?,
         contact: read_contact(element)?,
         lane_links,
     }))
+}
+
+fn read_road(element: Element, attribute: &'static str, ids: &Ids) -> Result<usize> {
+    let id = element.text(attribute)?;
+    let found = ids.roads.get(id).copied();
+    found.ok_or_else(|| element.error_value(attribute, id, "the id of a road of this map"))
 }

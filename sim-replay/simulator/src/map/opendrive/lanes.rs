@@ -42,11 +42,10 @@ pub(super) fn read_sections(
             length_m: end_m - s_m,
             lane_offset,
         };
-        let mut side = |name, sign| read_side(element, name, sign, &stretch, log);
         let section = LaneSection {
             s_m,
-            left: side("left", 1)?,
-            right: side("right", -1)?,
+            left: read_side(element, "left", 1, &stretch, log)?,
+            right: read_side(element, "right", -1, &stretch, log)?,
         };
         check_widths(element, &section, end_m - s_m)?;
         sections.push(section);
@@ -112,13 +111,12 @@ fn read_side(
 fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane> {
     let width = read_profile(element, "width", "sOffset", MAX_WIDTH_M)?;
     let link = element.child("link");
-    let mut linked = |name| {
+    let [predecessor, successor] = ["predecessor", "successor"].map(|name| {
         let end = link.and_then(|link| link.child(name))?;
         end.lane_id("id")
             .map_err(|error| error.note(log, "lane link treated as absent"))
             .ok()
-    };
-    let (predecessor, successor) = (linked("predecessor"), linked("successor"));
+    });
     let mut speeds = children(element, "speed");
     let speed_limit_mps = speeds.next().and_then(|speed| read_speed(speed, log));
     for further in speeds {
@@ -166,11 +164,10 @@ fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
 
 /// Reports the heights of lanes over the road (kerbs), which are not built.
 fn note_heights(element: Element, log: &mut FindingLog) {
-    let height =
-        |element: &Element, name| element.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0).abs();
-    let heights = children(element, "height");
-    let heights = heights.map(|record| height(&record, "inner").max(height(&record, "outer")));
-    let highest_m = heights.fold(0.0, f64::max);
+    let heights = children(element, "height").flat_map(|record| {
+        ["inner", "outer"].map(|name| record.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0))
+    });
+    let highest_m = heights.map(f64::abs).fold(0.0, f64::max);
     if highest_m > 0.0 {
         let kind = element.optional_text("type").unwrap_or_default();
         let found = format!("type=\"{kind}\" has <height> up to {highest_m} m");

@@ -8,13 +8,12 @@ use super::element::{Element, Result};
 /// Fills the links of a road; links to elements that are not in this map are treated as absent.
 pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut FindingLog) {
     let link = element.child("link");
-    let mut end = |name| {
+    [road.predecessor, road.successor] = ["predecessor", "successor"].map(|name| {
         let end = link.and_then(|link| link.child(name))?;
         read_link(end, ids)
             .map_err(|error| error.note(log, "link treated as absent"))
             .ok()
-    };
-    (road.predecessor, road.successor) = (end("predecessor"), end("successor"));
+    });
     road.junction = match element.optional_text("junction").map(str::trim) {
         // -1 stands for a road outside junctions.
         None | Some("-1" | "") => None,

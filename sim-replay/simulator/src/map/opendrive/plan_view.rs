@@ -61,17 +61,17 @@ fn road_length_m(road: Element, total_m: f64, log: &mut FindingLog) -> f64 {
 }
 
 fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
-    let coordinate = |name| element.number(name, -MAX_COORDINATE_M, MAX_COORDINATE_M);
-    let (x, y) = (coordinate("x")?, coordinate("y")?);
+    let x = element.number("x", -MAX_COORDINATE_M, MAX_COORDINATE_M)?;
+    let y = element.number("y", -MAX_COORDINATE_M, MAX_COORDINATE_M)?;
     let start = Pose2::new(x, y, element.number("hdg", -1e4, 1e4)?);
     let length_m = element.number("length", 0.0, MAX_LENGTH_M)?;
     let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
     let Some(kind) = element.elements().find(|child| child.name() != "userData") else {
         return Err(element.error_element("has no shape"));
     };
-    let curve = |shape| Curve::new(s_m, start, length_m, shape);
+    let line = Curve::new(s_m, start, length_m, CurveShape::Line);
     let shape = match kind.name() {
-        "line" => return Ok(curve(CurveShape::Line)),
+        "line" => return Ok(line),
         "arc" => match curvatures(kind, ["curvature"], length_m, log)? {
             Some([curvature]) => CurveShape::Arc { curvature },
             None => CurveShape::Line,
@@ -82,14 +82,14 @@ fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
             None => CurveShape::Line,
         },
         "poly3" => CurveShape::Poly3(kind.cubic(["a", "b", "c", "d"])?),
-        "paramPoly3" => return read_param_poly3(element, kind, &curve, log),
+        "paramPoly3" => return read_param_poly3(element, kind, line, log),
         other => {
             return Err(element.error_element(&format!(
                 "holds <{other}>; expected line, arc, spiral, poly3 or paramPoly3"
             )));
         }
     };
-    checked(element, curve(shape), log)
+    checked(element, Curve { shape, ..line }, log)
 }
 
 /// Curvatures of an element; `None` where one is tighter than any road bends: the element becomes a straight
@@ -117,29 +117,33 @@ fn curvatures<const N: usize>(
     Ok(None)
 }
 
-/// The parameter runs from 0 to 1 unless the element has it run over the length.
+/// `line` gives start and length. The parameter runs from 0 to 1 unless the element has it run over the length.
 fn read_param_poly3(
     element: Element,
     kind: Element,
-    curve: &dyn Fn(CurveShape) -> Curve,
+    line: Curve,
     log: &mut FindingLog,
 ) -> Result<Curve> {
     let u = kind.cubic(["aU", "bU", "cU", "dU"])?;
     let v = kind.cubic(["aV", "bV", "cV", "dV"])?;
-    let with = |normalized| curve(CurveShape::ParamPoly3 { u, v, normalized });
-    let has_length = with(true).length_m > 0.0;
+    let [by_length, by_share] = [false, true].map(|normalized| Curve {
+        shape: CurveShape::ParamPoly3 { u, v, normalized },
+        ..line
+    });
+    let has_length = line.length_m > 0.0;
+    let default = if has_length { by_share } else { by_length };
     match kind.optional_text("pRange").map(str::trim) {
-        Some("arcLength") => return checked(element, with(false), log),
-        Some("normalized") => return checked(element, with(has_length), log),
+        Some("arcLength") => return checked(element, by_length, log),
+        Some("normalized") => return checked(element, default, log),
         Some(_) => kind.note_value(log, "pRange", "treated as absent: normalized"),
         None => {}
     }
-    if has_length && !fits(&with(true)) && fits(&with(false)) {
+    if has_length && !fits(&by_share) && fits(&by_length) {
         let found = "has no pRange and fits its length only by arcLength";
         kind.note(log, found, "arcLength is used");
-        return Ok(with(false));
+        return Ok(by_length);
     }
-    checked(element, with(has_length), log)
+    checked(element, default, log)
 }
 
 /// The curve, if it is about as long as its element; a short one that is not becomes a straight line.
@@ -161,15 +165,20 @@ fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve
 
 /// True if a curve is as long as its element up to a factor of two.
 fn fits(curve: &Curve) -> bool {
-    let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
-    let measured_m: f64 = (0..10)
-        .map(|tenth| at(tenth).distance_m(&at(tenth + 1)))
-        .sum();
+    let measured_m: f64 = tenths_m(curve).sum();
     measured_m > 0.5 * curve.length_m && measured_m < 2.0 * curve.length_m
 }
 
 /// True if no tenth of a curve is longer than twice its nominal length, which arbitrary polynomials may exceed.
 fn keeps_its_length(curve: &Curve) -> bool {
-    let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
-    (0..10).all(|tenth| at(tenth).distance_m(&at(tenth + 1)) <= 0.2 * curve.length_m + 0.1)
+    tenths_m(curve).all(|chord_m| chord_m <= 0.2 * curve.length_m + 0.1)
+}
+
+/// Distances between the ends of each tenth of a curve, metres.
+fn tenths_m(curve: &Curve) -> impl Iterator<Item = f64> {
+    (0..10).map(move |tenth: u32| {
+        let [from, to] =
+            [tenth, tenth + 1].map(|tenth| curve.at(curve.length_m * f64::from(tenth) / 10.0));
+        from.distance_m(&to)
+    })
 }

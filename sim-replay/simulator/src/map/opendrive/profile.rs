@@ -34,14 +34,9 @@ pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -
     let Some(element) = road.child("lateralProfile") else {
         return lateral;
     };
-    lateral.superelevation_rad = slope(element, "superelevation", |_| true, length_m, log);
-    lateral.crossfall_rad = ["left", "right"].map(|side| {
-        let is_of_side = |record: &Element| {
-            matches!(record.optional_text("side"), None | Some("both"))
-                || record.optional_text("side") == Some(side)
-        };
-        slope(element, "crossfall", is_of_side, length_m, log)
-    });
+    lateral.superelevation_rad = slope(element, "superelevation", None, length_m, log);
+    lateral.crossfall_rad =
+        ["left", "right"].map(|side| slope(element, "crossfall", Some(side), length_m, log));
     match read_shapes(element) {
         Ok(shapes) if shapes.iter().any(|shape| !is_zero(&shape.height_m)) => {
             lateral.shapes = shapes
@@ -58,10 +53,11 @@ pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -
     lateral
 }
 
+/// The records `name`; with a `side`, those of this side or of both.
 fn slope(
     parent: Element,
     name: &'static str,
-    is_wanted: impl Fn(&Element) -> bool,
+    side: Option<&str>,
     length_m: f64,
     log: &mut FindingLog,
 ) -> Profile {
@@ -72,7 +68,9 @@ fn slope(
             return Profile::default();
         }
     };
-    let mut wanted = children(parent, name).map(|record| is_wanted(&record));
+    let sides = children(parent, name).map(|record| record.optional_text("side"));
+    let mut wanted =
+        sides.map(|of| side.is_none() || of == side || matches!(of, None | Some("both")));
     profile.records.retain(|_| wanted.next().unwrap_or(false));
     // Records of zeros only would make a level road count as banked.
     if is_zero(&profile) {

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
 use super::super::lane::wrap_angle;
-use super::super::road::{LaneKind, RoadLane};
+use super::super::road::{LaneKind, Road};
 use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind};
 use super::frontage::{Side, Zone, sides};
@@ -67,42 +67,21 @@ fn along_side(site: &mut Site, side: &Side, share: f64, barrier: Barrier, rng: &
 /// The strip between left and right driving lanes of a road with both directions.
 fn between_directions(site: &mut Site, road: usize) {
     let network = site.network;
-    let middle = |cut: &CrossSection| {
-        let section = &network.roads[road].sections[cut.section];
-        let innermost = |side: &[RoadLane]| {
-            let place = side
-                .iter()
-                .position(|lane| lane.kind == LaneKind::Driving)?;
-            Some(place as i32 + 1)
-        };
-        let (left, right) = (innermost(&section.left)?, innermost(&section.right)?);
-        let road = &network.roads[road];
-        let s = cut
-            .s_m
-            .min(road.section_end_m(cut.section) - 1e-6)
-            .max(section.s_m);
-        let low = road.lane_span_m(cut.section, -right, s)[1];
-        let high = road.lane_span_m(cut.section, left, s)[0];
-        (high - low > 1.0).then(|| {
-            let middle_m = (low + high) / 2.0;
-            let [x, y] = cut.at(middle_m);
-            [x, y, cut.height_m(middle_m)]
-        })
-    };
     let cuts = &site.surface.roads[road];
-    let mut parts = Vec::new();
+    let mut parts: Vec<Solid> = Vec::new();
     for pair in cuts.chunks(4) {
         // One piece from each fourth cut to the next.
         let Some(last) = pair.last() else { continue };
         let next = cuts.iter().find(|cut| cut.s_m > last.s_m).unwrap_or(last);
-        if let (Some(from), Some(to)) = (middle(&pair[0]), middle(next))
+        let ends = [&pair[0], next].map(|cut| strip_middle(&network.roads[road], cut));
+        if let [Some(from), Some(to)] = ends
             && (to[0] - from[0]).hypot(to[1] - from[1]) > 0.5
         {
             parts.extend(piece(from, to, Barrier::Concrete));
         }
     }
     // Inside a junction only where no lane leads across.
-    let clear = |part: &Solid| {
+    parts.retain(|part| {
         let [a, b] = [part.bottom_m(), part.top_m()];
         let outline = outline(part);
         network.roads[road].junction.is_none()
@@ -112,9 +91,29 @@ fn between_directions(site: &mut Site, road: usize) {
                     && a < patch.high_m() + 4.5
                     && b > patch.low_m() - 0.05
             })
-    };
-    let parts: Vec<Solid> = parts.into_iter().filter(clear).collect();
+    });
     site.place(&parts);
+}
+
+/// The middle between left and right driving lanes at a cut, if they are more than a metre apart.
+fn strip_middle(road: &Road, cut: &CrossSection) -> Option<[f64; 3]> {
+    let section = &road.sections[cut.section];
+    let [left, right] = [&section.left, &section.right].map(|side| {
+        let mut lanes = (1i32..).zip(side);
+        lanes.find(|(_, lane)| lane.kind == LaneKind::Driving)
+    });
+    let ((left, _), (right, _)) = (left?, right?);
+    let s = cut
+        .s_m
+        .min(road.section_end_m(cut.section) - 1e-6)
+        .max(section.s_m);
+    let low = road.lane_span_m(cut.section, -right, s)[1];
+    let high = road.lane_span_m(cut.section, left, s)[0];
+    (high - low > 1.0).then(|| {
+        let middle_m = (low + high) / 2.0;
+        let [x, y] = cut.at(middle_m);
+        [x, y, cut.height_m(middle_m)]
+    })
 }
 
 /// Splits a stretch into nearly straight pieces.
@@ -147,9 +146,9 @@ fn piece(from: [f64; 3], to: [f64; 3], barrier: Barrier) -> Vec<Solid> {
     let length = (b[0] - a[0]).hypot(b[1] - a[1]);
     for post in 0..=(length / POST_M).floor() as u32 {
         let share = f64::from(post) * POST_M / length.max(0.1);
-        let at = |i: usize| from[i] + share * (to[i] - from[i]);
-        let pose = Pose2::new(at(0), at(1), (b[1] - a[1]).atan2(b[0] - a[0]));
-        let foot = PartFootprint::new(pose, at(2));
+        let [x, y, z] = [0, 1, 2].map(|axis| from[axis] + share * (to[axis] - from[axis]));
+        let pose = Pose2::new(x, y, (b[1] - a[1]).atan2(b[0] - a[0]));
+        let foot = PartFootprint::new(pose, z);
         parts.push(foot.standing(kind, -0.3, [0.1, 0.14, 1.02], 0.5));
     }
     parts

@@ -74,8 +74,7 @@ fn bridge(site: &mut Site, road: usize) {
 }
 
 fn slab(from: &CrossSection, to: &CrossSection, thickness_m: f64) -> Solid {
-    let middle = |cut: &CrossSection| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0);
-    let (a, b) = (middle(from), middle(to));
+    let [a, b] = [from, to].map(|cut| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0));
     let width = (from.paved_m[1] - from.paved_m[0]).max(to.paved_m[1] - to.paved_m[0]);
     // Below the lowest edge, so that the slab does not stick out of the road.
     let top = from.range_m()[0].min(to.range_m()[0]) - 0.06;

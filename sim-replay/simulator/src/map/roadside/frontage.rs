@@ -1,7 +1,7 @@
 //! Frontage: the two sides of every road, along which objects are placed.
 
 use super::super::curve::Pose2;
-use super::super::road::{LaneKind, Road, RoadLane, RoadNetwork};
+use super::super::road::{LaneKind, Road, RoadNetwork};
 use super::super::surface::CrossSection;
 use super::site::Site;
 
@@ -145,16 +145,15 @@ fn drives(road: &Road, left: bool) -> bool {
 fn zone(road: &Road) -> Zone {
     let middle = road.length_m / 2.0;
     let section = &road.sections[road.section_at(middle)];
-    let lanes = || section.left.iter().chain(&section.right);
-    let driving = |side: &[RoadLane]| -> f64 {
-        side.iter()
-            .filter(|lane| lane.kind == LaneKind::Driving)
-            .map(|lane| lane.width.at(middle - section.s_m))
-            .sum()
-    };
-    if lanes().any(|lane| lane.kind == LaneKind::Sidewalk) {
+    let mut lanes = section.left.iter().chain(&section.right);
+    let [left_m, right_m] = [&section.left, &section.right].map(|side| {
+        let driving = side.iter().filter(|lane| lane.kind == LaneKind::Driving);
+        let widths = driving.map(|lane| lane.width.at(middle - section.s_m));
+        widths.sum::<f64>()
+    });
+    if lanes.any(|lane| lane.kind == LaneKind::Sidewalk) {
         Zone::Street
-    } else if driving(&section.left).max(driving(&section.right)) > MOTORWAY_WIDTH_M {
+    } else if left_m.max(right_m) > MOTORWAY_WIDTH_M {
         Zone::Motorway
     } else if road
         .speed_limit_mps(middle)

@@ -33,21 +33,22 @@ pub(super) fn place_roadside(
     seed: u64,
 ) -> (Vec<Solid>, Vec<ParkingSpot>) {
     let mut site = Site::new(&layout.network, surface, ground);
-    let stream = |number| {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(number);
-        rng
-    };
     bridges::place(&mut site);
-    infill::place_islands(&mut site, &layout.islands, &mut stream(7));
-    barriers::place(&mut site, &mut stream(1));
-    parking::place_along_kerbs(&mut site, &mut stream(2));
-    poles::place(&mut site, &mut stream(3));
-    motorway::place(&mut site, &mut stream(4));
-    trees::place_along_streets(&mut site, &mut stream(5));
-    plots::place(&mut site, &mut stream(6));
-    infill::place(&mut site, &mut stream(8));
+    infill::place_islands(&mut site, &layout.islands, &mut stream(seed, 7));
+    barriers::place(&mut site, &mut stream(seed, 1));
+    parking::place_along_kerbs(&mut site, &mut stream(seed, 2));
+    poles::place(&mut site, &mut stream(seed, 3));
+    motorway::place(&mut site, &mut stream(seed, 4));
+    trees::place_along_streets(&mut site, &mut stream(seed, 5));
+    plots::place(&mut site, &mut stream(seed, 6));
+    infill::place(&mut site, &mut stream(seed, 8));
     (site.solids, site.parking)
+}
+
+fn stream(seed: u64, number: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(number);
+    rng
 }
 
 #[cfg(test)]

@@ -127,12 +127,12 @@ fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
         let parts: Vec<Solid> = match rng.random_range(0..6) {
             0 => {
                 let size = [0.1, rng.random_range(1.5..3.2), rng.random_range(1.0..2.4)];
-                let post = |v: f64| {
+                let [right, left] = [-0.4, 0.4].map(|v: f64| {
                     let (at, post) = ([0.1, v * size[1], -0.2], [0.07, 2.0 + size[2]]);
                     foot.cylinder(SolidKind::Pole, at, post, 0.5)
-                };
+                });
                 let panel = foot.standing(SolidKind::Sign, 1.8, size, 0.95);
-                vec![post(-0.4), post(0.4), panel]
+                vec![right, left, panel]
             }
             1 => {
                 let size = [0.5, 1.2, rng.random_range(1.2..2.0)];

@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
+use super::super::curve::Pose2;
 use super::super::{Solid, SolidKind};
 use super::buildings::{Lot, Style};
 use super::frontage::{Side, Zone, sides};
@@ -190,17 +191,12 @@ fn parking_lot(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Op
 fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f64> {
     let (width, depth) = (rng.random_range(14.0..32.0), rng.random_range(12.0..22.0));
     let lot = free_lot(site, side, s, [width, depth], 1.0)?;
-    let spot = |rng: &mut ChaCha8Rng| {
-        let u = rng.random_range(-0.45..0.45) * width;
-        let v = rng.random_range(-0.42..0.42) * depth;
-        lot.foot.pose.moved(u, v, rng.random_range(0.0..TAU))
-    };
     for _ in 0..rng.random_range(3..=9) {
-        let (pose, species) = (spot(rng), Species::random(rng));
+        let (pose, species) = (spot_on(&lot, rng), Species::random(rng));
         plant(site, pose, species, rng.random_range(0.7..1.4), rng);
     }
     for _ in 0..rng.random_range(1..=3) {
-        let foot = site.foot(spot(rng));
+        let foot = site.foot(spot_on(&lot, rng));
         let bench = foot.standing(SolidKind::StreetFurniture, -0.1, [1.8, 0.6, 0.9], 0.4);
         site.try_place(&[bench], 0.1, true);
     }
@@ -211,6 +207,12 @@ fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f
     let low = lot.foot.z_m;
     site.take(&lots::outline(&lot), [low - 1.0, low + LOT_HEIGHT_M]);
     Some(s + width)
+}
+
+fn spot_on(lot: &Lot, rng: &mut ChaCha8Rng) -> Pose2 {
+    let u = rng.random_range(-0.45..0.45) * lot.width_m;
+    let v = rng.random_range(-0.42..0.42) * lot.depth_m;
+    lot.foot.pose.moved(u, v, rng.random_range(0.0..TAU))
 }
 
 /// A monument, as a landmark.

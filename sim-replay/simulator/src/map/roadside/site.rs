@@ -118,10 +118,12 @@ impl<'a> Site<'a> {
 
     /// Reserves the hull of a junction's lanes, so that nothing is placed between them.
     fn keep_junction_free(&mut self, junction: usize) {
-        let inside = |road: u32| self.network.roads[road as usize].junction == Some(junction);
         let (mut points, mut z_m) = (Vec::new(), [f64::INFINITY, f64::NEG_INFINITY]);
-        let patches = self.surface.patches.iter();
-        for patch in patches.filter(|patch| patch.carriageway && inside(patch.road)) {
+        let patches = self.surface.patches.iter().filter(|patch| {
+            let road = &self.network.roads[patch.road as usize];
+            patch.carriageway && road.junction == Some(junction)
+        });
+        for patch in patches {
             points.extend(patch.quad);
             z_m = [
                 z_m[0].min(patch.z_m[0]).min(patch.z_m[3]),
@@ -138,25 +140,24 @@ impl<'a> Site<'a> {
 /// Convex hull, anticlockwise (Andrew's monotone chain).
 fn hull(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
     points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
-    let turn = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| {
-        (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-    };
-    let half = |points: &mut dyn Iterator<Item = [f64; 2]>| {
-        let mut chain: Vec<[f64; 2]> = Vec::new();
-        for point in points {
-            while chain.len() > 1
-                && turn(chain[chain.len() - 2], chain[chain.len() - 1], point) <= 0.0
-            {
-                chain.pop();
-            }
-            chain.push(point);
-        }
-        chain.pop();
-        chain
-    };
-    let mut lower = half(&mut points.iter().copied());
-    lower.extend(half(&mut points.iter().rev().copied()));
+    let mut lower = half_hull(points.iter().copied());
+    lower.extend(half_hull(points.iter().rev().copied()));
     lower
+}
+
+/// The corners on one side of a hull, without the last one.
+fn half_hull(points: impl Iterator<Item = [f64; 2]>) -> Vec<[f64; 2]> {
+    let mut chain: Vec<[f64; 2]> = Vec::new();
+    for c in points {
+        while let [.., a, b] = chain[..]
+            && (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) <= 0.0
+        {
+            chain.pop();
+        }
+        chain.push(c);
+    }
+    chain.pop();
+    chain
 }
 
 #[cfg(test)]

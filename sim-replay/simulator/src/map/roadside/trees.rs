@@ -37,19 +37,14 @@ pub(super) fn tree(
     rng: &mut ChaCha8Rng,
 ) -> Vec<Solid> {
     let leaves = rng.random_range(0.2..0.45);
-    let trunk = |radius_m: f64, height_m: f64| {
-        foot.post(SolidKind::TreeTrunk, -0.3, [radius_m, height_m + 0.3], 0.25)
-    };
-    let crown =
-        |at: [f64; 3], radii: [f64; 3]| foot.ellipsoid(SolidKind::TreeCrown, at, radii, leaves);
     match species {
         Species::Broadleaf => {
             let clear = rng.random_range(1.8..3.0) * size;
             let [rx, ry, rz] =
                 [1.4..2.6, 1.4..2.6, 1.3..2.4].map(|range| rng.random_range(range) * size);
             let mut parts = vec![
-                trunk(rng.random_range(0.12..0.28) * size, clear + rz),
-                crown([0.0, 0.0, clear + rz], [rx, ry, rz]),
+                trunk(foot, rng.random_range(0.12..0.28) * size, clear + rz),
+                crown(foot, [0.0, 0.0, clear + rz], [rx, ry, rz], leaves),
             ];
             // Large crowns are lobed.
             if size > 0.9 {
@@ -59,26 +54,27 @@ pub(super) fn tree(
                     0.6 * ry * turn.sin(),
                     clear + rz * rng.random_range(1.1..1.6),
                 ];
-                parts.push(crown(at, [0.7 * rx, 0.7 * ry, 0.7 * rz]));
+                parts.push(crown(foot, at, [0.7 * rx, 0.7 * ry, 0.7 * rz], leaves));
             }
             parts
         }
         Species::Conifer => {
             let height = rng.random_range(6.0..13.0) * size;
             let radius = height * rng.random_range(0.13..0.2);
-            let mut parts = vec![trunk(0.16 * size, height * 0.5)];
+            let mut parts = vec![trunk(foot, 0.16 * size, height * 0.5)];
             for (level, share) in [(0.28, 1.0), (0.52, 0.72), (0.76, 0.42)] {
                 let radii = [radius * share, radius * share, 0.22 * height];
-                parts.push(crown([0.0, 0.0, level * height], radii));
+                parts.push(crown(foot, [0.0, 0.0, level * height], radii, leaves));
             }
             parts
         }
         Species::Columnar => {
             let height = rng.random_range(7.0..14.0) * size;
             let radius = rng.random_range(0.7..1.2) * size;
+            let radii = [radius, radius, 0.45 * height];
             vec![
-                trunk(0.14 * size, height * 0.4),
-                crown([0.0, 0.0, 0.55 * height], [radius, radius, 0.45 * height]),
+                trunk(foot, 0.14 * size, height * 0.4),
+                crown(foot, [0.0, 0.0, 0.55 * height], radii, leaves),
             ]
         }
         Species::Bush => {
@@ -88,6 +84,14 @@ pub(super) fn tree(
             vec![foot.ellipsoid(SolidKind::Hedge, at, radii, leaves)]
         }
     }
+}
+
+fn trunk(foot: PartFootprint, radius_m: f64, height_m: f64) -> Solid {
+    foot.post(SolidKind::TreeTrunk, -0.3, [radius_m, height_m + 0.3], 0.25)
+}
+
+fn crown(foot: PartFootprint, at: [f64; 3], radii: [f64; 3], leaves: f32) -> Solid {
+    foot.ellipsoid(SolidKind::TreeCrown, at, radii, leaves)
 }
 
 /// Plants a tree at a pose on the ground, if all of it finds room.

@@ -81,23 +81,23 @@ impl MapRefinement {
     /// Computes in integers from here on, except in training.
     pub(crate) fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
         let (input, hidden) = (scales.get(INPUT)?, scales.get(HIDDEN)?);
-        let [first, second] = &self.convolutions;
-        let quantised = |convolution: &nn::Conv2D, format| {
-            // Tiles come with the cells around them, so nothing is padded.
-            let geometry = ConvGeometry {
-                stride: 1,
-                padding: 0,
-                upsampling: 1,
-            };
-            Int8Convolution::new(&convolution.ws, convolution.bs.as_ref(), geometry, format)
+        // Tiles come with the cells around them, so nothing is padded.
+        let geometry = ConvGeometry {
+            stride: 1,
+            padding: 0,
+            upsampling: 1,
         };
-        let convolutions = [
-            quantised(first, LayerFormat::hidden(input, hidden))?,
-            quantised(second, LayerFormat::last(hidden))?,
+        let formats = [
+            LayerFormat::hidden(input, hidden),
+            LayerFormat::last(hidden),
         ];
+        let [first, second] = [0, 1].map(|layer| {
+            let nn::Conv2D { ws, bs, .. } = &self.convolutions[layer];
+            Int8Convolution::new(ws, bs.as_ref(), geometry, formats[layer])
+        });
         self.int8 = Some(Int8Refinement {
             input,
-            convolutions,
+            convolutions: [first?, second?],
         });
         Ok(())
     }

@@ -45,9 +45,9 @@ impl Tiles {
 
     /// All tiles of a map.
     pub(super) fn all(size: [i64; 2]) -> Self {
-        let starts = |cells: i64| (0..cells).step_by(EDGE as usize);
-        let first_cells = starts(size[0])
-            .flat_map(|row| starts(size[1]).map(move |column| [row, column]))
+        let [rows, columns] = size.map(|cells| (0..cells).step_by(EDGE as usize));
+        let first_cells = rows
+            .flat_map(|row| columns.clone().map(move |column| [row, column]))
             .collect();
         Self { first_cells, size }
     }
@@ -72,11 +72,10 @@ impl Tiles {
     /// Indices of the cells of all tiles and of so many cells around them; `None` beyond the edges of the map.
     fn cells(&self, margin: i64) -> impl Iterator<Item = Option<i64>> {
         let [height, width] = self.size;
-        let along = move |first: i64| first - margin..first + EDGE + margin;
         self.first_cells.iter().flat_map(move |&[row, column]| {
-            along(row).flat_map(move |row| {
+            (row - margin..row + EDGE + margin).flat_map(move |row| {
                 let is_row = (0..height).contains(&row);
-                along(column).map(move |column| {
+                (column - margin..column + EDGE + margin).map(move |column| {
                     (is_row && (0..width).contains(&column)).then_some(row * width + column)
                 })
             })

@@ -9,6 +9,7 @@
 
 mod selection;
 
+use perception::tensor_values::tensor;
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, Init, Module};
 use tch::{Device, Kind, Result, Tensor};
@@ -247,10 +248,10 @@ fn settled(origins: &Origins, corrections: &Tensor, first: usize) -> Result<Vec<
         .collect();
     Ok((first..all.len())
         .map(|entry| {
-            let is_same_agent = |newest: &usize| origins.agent[*newest] == origins.agent[entry];
             // For earlier maps of the ego this is the first entry, whose correction is zero.
-            let newest = (0..first).find(is_same_agent).map(|newest| all[newest]);
-            newest
+            (0..first)
+                .find(|newest| origins.agent[*newest] == origins.agent[entry])
+                .map(|newest| all[newest])
                 .filter(|newest| {
                     (newest[0] - all[entry][0]).hypot(newest[1] - all[entry][1]) < SAME_PLACE_M
                 })
@@ -275,17 +276,16 @@ struct Places {
 
 impl Places {
     fn of(selection: &Selection, width: i64, device: Device) -> Result<Self> {
-        let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(device);
         let near: Vec<i64> = selection
             .near
             .iter()
             .map(|&[row, column]| row as i64 * width + column as i64)
             .collect();
-        let around = index(&selection.around)?.f_view([-1, AROUND])?;
+        let around = tensor(&selection.around, &[-1, AROUND], device)?;
         Ok(Self {
-            patches: index(&selection.patches)?,
-            cells: index(&selection.cells)?,
-            near: index(&near)?,
+            patches: tensor(&selection.patches, &[-1], device)?,
+            cells: tensor(&selection.cells, &[-1], device)?,
+            near: tensor(&near, &[-1], device)?,
             middle: around.f_select(1, AROUND / 2)?,
             around: Around::of(&around)?,
         })

@@ -53,28 +53,20 @@ impl Selection {
         ))
     }
 
-    fn of(patches: &[usize], patch: usize, [height, width]: [usize; 2]) -> Self {
-        let cells_of = |index: &usize| {
+    fn of(patches: &[usize], patch: usize, size: [usize; 2]) -> Self {
+        let [height, width] = size;
+        let cells = patches.iter().flat_map(|index| {
             let (row, column) = (
                 index / (width / patch) * patch,
                 index % (width / patch) * patch,
             );
             (row..row + patch)
                 .flat_map(move |row| (column..column + patch).map(move |column| [row, column]))
-        };
-        let cells: Vec<[usize; 2]> = patches.iter().flat_map(cells_of).collect();
-        // Offsets count from the cell above and to the left, hence one less.
-        let on_map = |[row, column]: [usize; 2], [down, right]: [usize; 2]| {
-            let [row, column] = [
-                (row + down).checked_sub(1)?,
-                (column + right).checked_sub(1)?,
-            ];
-            (row < height && column < width).then_some(row * width + column)
-        };
-        let beside = |&cell: &[usize; 2]| BESIDE.map(|step| on_map(cell, step));
+        });
+        let cells: Vec<[usize; 2]> = cells.collect();
         // First marked, then numbered in the order of the grid, so that shared neighbours are read once.
         let mut place = vec![None; height * width];
-        for cell in cells.iter().flat_map(beside).flatten() {
+        for cell in cells.iter().flat_map(|&cell| beside(cell, size)).flatten() {
             place[cell] = Some(0);
         }
         let mut near = Vec::new();
@@ -86,13 +78,13 @@ impl Selection {
             *place = Some(near.len() as i64);
             near.push([cell / width, cell % width]);
         }
-        let place_of = |cell: Option<usize>| {
-            cell.and_then(|cell| place[cell])
-                .unwrap_or(near.len() as i64)
-        };
+        let around = cells.iter().flat_map(|&cell| beside(cell, size));
+        let around = around.map(|cell| cell.and_then(|cell| place[cell]));
         Self {
             patches: patches.iter().map(|&patch| patch as i64).collect(),
-            around: cells.iter().flat_map(beside).map(place_of).collect(),
+            around: around
+                .map(|place| place.unwrap_or(near.len() as i64))
+                .collect(),
             cells: cells
                 .iter()
                 .map(|[row, column]| (row * width + column) as i64)
@@ -100,6 +92,16 @@ impl Selection {
             near,
         }
     }
+}
+
+/// The nine cells in and around one of a map of a size, counted row by row; `None` beyond the edge.
+fn beside([row, column]: [usize; 2], [height, width]: [usize; 2]) -> [Option<usize>; 9] {
+    BESIDE.map(|[down, right]| {
+        // Offsets count from the cell above and to the left, hence one less.
+        let row = (row + down).checked_sub(1)?;
+        let column = (column + right).checked_sub(1)?;
+        (row < height && column < width).then_some(row * width + column)
+    })
 }
 
 #[cfg(test)]
