@@ -202,6 +202,24 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/alive/*/*"))
     }
 
+    /// True if it covers every key of the other. As in zenoh, wildcards cover no chunk that begins with `@`.
+    pub fn includes(&self, other: &Self) -> bool {
+        let mut chunks = other.0.split('/');
+        for own in self.0.split('/') {
+            // Always the last chunk.
+            if own == "**" {
+                return chunks.all(|chunk| !chunk.starts_with('@'));
+            }
+            let is_covered = |chunk: &str| {
+                own == chunk || own == "*" && chunk != "**" && !chunk.starts_with('@')
+            };
+            if !chunks.next().is_some_and(is_covered) {
+                return false;
+            }
+        }
+        chunks.next().is_none()
+    }
+
     /// The key expression.
     pub fn as_str(&self) -> &str {
         &self.0
@@ -370,6 +388,25 @@ mod tests {
         assert_eq!(KeyExpr::stats(&run).as_str(), "v2v/r1/stats/*");
         assert_eq!(KeyExpr::run(&run).as_str(), "v2v/r1/**");
         assert!(KeyExpr::run(&run).as_str().parse::<Key>().is_err());
+    }
+
+    #[test]
+    fn a_wildcard_includes_the_chunks_that_it_stands_for() {
+        let run = RunId::new("r1").unwrap();
+        let [camera, preview, own] = [
+            KeyExpr::stream(&run, Stream::Camera(3)),
+            KeyExpr::stream(&run, Stream::Preview),
+            KeyExpr::one(&Key::stream(&run, &cav("1"), Stream::Camera(3))),
+        ];
+        let (cameras, all) = (KeyExpr::cameras(&run), KeyExpr::run(&run));
+        for (wide, narrow) in [(&cameras, &camera), (&camera, &own), (&all, &cameras)] {
+            assert!(wide.includes(narrow) && !narrow.includes(wide), "{wide}");
+            assert!(wide.includes(wide));
+        }
+        let other = KeyExpr::stream(&run, Stream::Camera(30));
+        assert!(!camera.includes(&other) && !other.includes(&camera));
+        assert!(preview.includes(&preview) && !all.includes(&preview));
+        assert!(!KeyExpr::stats(&run).includes(&all));
     }
 
     proptest! {

@@ -399,7 +399,11 @@ impl AgentLoop {
                 self.report.failed += 1;
                 let first = &mut self.report.failure;
                 first.get_or_insert_with(|| error.to_string());
-                self.drop_messages(Stream::Lidar, 1, DropReason::NotFinite);
+                let reason = match error.is_of_frame() {
+                    true => DropReason::NotFinite,
+                    false => DropReason::Shape,
+                };
+                self.drop_messages(Stream::Lidar, 1, reason);
                 self.outputs.push(Output::Failed(error));
             }
         }

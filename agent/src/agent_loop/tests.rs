@@ -134,6 +134,18 @@ fn after_the_end_a_sweep_waits_for_nothing() {
 }
 
 #[test]
+fn a_sweep_that_does_not_fail_by_its_values_is_counted_apart() {
+    let agent = Agent::without_detector(cav(), Box::new(RecordedPose));
+    let mut agent_loop = AgentLoop::new(agent, LoopOptions::default());
+    let outputs = outputs(&mut agent_loop, vec![sweep(10), Input::Ended]);
+    let dropped = outputs.into_iter().filter_map(|output| match output {
+        Output::Dropped(_, reason) => Some(reason),
+        _ => None,
+    });
+    assert_eq!(dropped.collect::<Vec<_>>(), [DropReason::Shape]);
+}
+
+#[test]
 fn the_same_inputs_give_the_same_bytes() {
     let options = LoopOptions {
         publish: vec![Stream::Bev, Stream::Boxes, Stream::Points],

@@ -145,8 +145,9 @@ impl KeyStore<'_> {
         } else {
             let key = KeyPair::generate().map_err(&unusable)?;
             let pem = params.self_signed(&key).map_err(&unusable)?.pem();
-            self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
             self.write(pem_path, &pem, 0o644)?;
+            // Written last: if it exists, the certificate does.
+            self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
             (pem, key)
         };
         let issuer = Issuer::new(params, key);
@@ -172,10 +173,13 @@ impl KeyStore<'_> {
             .signed_by(&key, &authority.issuer)
             .map_err(&unusable)?;
         make_folder(folder)?;
+        let path = folder.join(CERTIFICATE_FILE);
+        // One that is replaced does not fit the new key.
+        let _ = fs::remove_file(&path);
         self.write(folder.join(AUTHORITY_FILE), &authority.pem, 0o644)?;
         self.write(folder.join(KEY_FILE), &key.serialize_pem(), 0o600)?;
         // Written last: if it exists, the other files do.
-        self.write(folder.join(CERTIFICATE_FILE), &certificate.pem(), 0o644)
+        self.write(path, &certificate.pem(), 0o644)
     }
 
     /// Writes the router's list of every process in the folder, including earlier ones.
@@ -330,6 +334,25 @@ mod tests {
         })
         .unwrap();
         assert_ne!(read("agent-1"), agent);
+    }
+
+    #[test]
+    fn a_call_that_was_interrupted_is_made_good_by_the_next() {
+        let folder = tempfile::tempdir().unwrap();
+        let plan = KeyPlan::new(folder.path(), principals(&["agent-1"]), 1);
+        // Folders in the way of the authority's certificate, and of one that is replaced.
+        for (obstacle, replace) in [("ca.new", false), ("agent-1/cert.new", true)] {
+            let obstacle = folder.path().join(obstacle);
+            fs::create_dir(&obstacle).unwrap();
+            let plan_of_call = KeyPlan {
+                replace,
+                ..plan.clone()
+            };
+            make(&plan_of_call).unwrap_err();
+            fs::remove_dir(&obstacle).unwrap();
+            make(&plan).unwrap();
+            Credentials::read(&folder.path().join("agent-1")).unwrap();
+        }
     }
 
     #[test]

@@ -419,16 +419,12 @@ impl Sender {
 pub fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
     let has_subscribers = Arc::<AtomicBool>::default();
     let noted = Arc::clone(&has_subscribers);
-    // Listened before the query: a change between the two is not missed.
+    // It is told of subscribers from before, too: the answer of a query could overwrite a newer change.
     let listener = publisher.matching_listener();
     listener
         .callback(move |status| noted.store(status.matching(), Ordering::Relaxed))
         .background()
         .wait()?;
-    // False is never stored here: it could overwrite a newer change.
-    if publisher.matching_status().wait()?.matching() {
-        has_subscribers.store(true, Ordering::Relaxed);
-    }
     Ok(has_subscribers)
 }
 
@@ -451,6 +447,16 @@ mod tests {
 
     use super::*;
     use crate::{BusOptions, Endpoint, open};
+
+    #[test]
+    fn subscribers_from_before_are_known_at_once() {
+        let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
+        let publisher = session.declare_publisher("v2v/test/truth").wait().unwrap();
+        let is_known = || has_subscribers(&publisher).unwrap().load(Ordering::Relaxed);
+        assert!(!is_known());
+        let _subscriber = session.declare_subscriber("v2v/test/truth").wait().unwrap();
+        assert!(is_known());
+    }
 
     #[test]
     fn messages_rejected_by_zenoh_are_not_in_flight() {

@@ -36,12 +36,10 @@ impl Access {
         Self::Of(principal.clone(), subscribed.collect())
     }
 
-    fn permits(&self, run: &RunId, wanted: &KeyExpr) -> bool {
+    fn permits(&self, wanted: &KeyExpr) -> bool {
         match self {
             Self::All => true,
-            Self::Of(_, permitted) => permitted
-                .iter()
-                .any(|keys| keys == wanted || *keys == KeyExpr::run(run)),
+            Self::Of(_, permitted) => permitted.iter().any(|keys| keys.includes(wanted)),
         }
     }
 }
@@ -57,7 +55,7 @@ pub(crate) fn selectors(
     for name in names.unwrap_or_else(|| STREAMS.map(str::to_owned).into()) {
         let wanted = selector(run, &name)?;
         match access {
-            _ if access.permits(run, &wanted) => selectors.push(wanted),
+            _ if access.permits(&wanted) => selectors.push(wanted),
             Access::Of(principal, _) if is_choice => {
                 return Err(error(format!(
                     "streams: a certificate of {principal} does not permit {name:?}"
@@ -67,7 +65,7 @@ pub(crate) fn selectors(
         }
     }
     // Control messages, with the end of the run, are not permitted to every principal.
-    selectors.retain(|wanted| access.permits(run, wanted));
+    selectors.retain(|wanted| access.permits(wanted));
     Ok(selectors)
 }
 

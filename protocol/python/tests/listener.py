@@ -71,6 +71,7 @@ def test_a_certificate_permits_its_streams(run):
     refuses(lambda: v2vloc.listen(endpoint, run="secure", credentials=keys / "viewer", streams=["lidar"]),
             "a certificate of viewer does not permit \"lidar\"")
     with background("v2vloc", "router", "--listen", endpoint, "--keys", keys / "router"):
+        v2vloc.listen(endpoint, run="secure", credentials=keys / "viewer", streams=["camera/3"], timeout_s=30).close()
         listener = v2vloc.listen(endpoint, run="secure", credentials=keys / "recorder", timeout_s=30)
         call("sim-replay", "stream", run.scene, "--run", "secure", "--connect", endpoint, "--keys", keys / "replay",
              "--frames", 2, "--await-agents=false")

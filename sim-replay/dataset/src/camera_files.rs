@@ -13,6 +13,8 @@ use super::{ReadError, Result};
 
 /// Prefixes of the number of a camera in file names and in the YAML: OPV2V's and V2X-Real's.
 const PREFIXES: [&str; 2] = ["camera", "cam"];
+/// Most digits of the number of a camera, zeros in front included.
+const MAX_DIGITS: usize = 3;
 /// Endings of image files.
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 /// Largest image file that is read, bytes.
@@ -33,24 +35,41 @@ fn number(name: &str) -> Option<u8> {
     let is_image = ENDINGS
         .iter()
         .any(|known| ending.eq_ignore_ascii_case(known));
-    (is_image && digits.bytes().all(|byte| byte.is_ascii_digit()))
+    let is_number = digits.len() <= MAX_DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit());
+    (is_image && is_number)
         .then(|| digits.parse().ok())
         .flatten()
 }
 
+/// The names of a camera: its number may have zeros in front.
+fn names_of(number: u8) -> impl Iterator<Item = String> {
+    let digits = number.to_string().len()..=MAX_DIGITS;
+    PREFIXES.into_iter().flat_map(move |prefix| {
+        let digits = digits.clone();
+        digits.map(move |digits| format!("{prefix}{number:0digits$}"))
+    })
+}
+
 /// The image of a camera beside `dir/stem.yaml`.
 pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf> {
-    let names = PREFIXES.iter().flat_map(|prefix| {
-        ENDINGS
-            .iter()
-            .map(move |ending| dir.join(format!("{stem}_{prefix}{number}.{ending}")))
+    let mut found = names_of(number).filter_map(|name| {
+        let mut paths = ENDINGS
+            .map(|ending| dir.join(format!("{stem}_{name}.{ending}")))
+            .into_iter();
+        paths.find(|path| path.is_file())
     });
-    let found = names.into_iter().find(|path| path.is_file());
-    found.ok_or_else(|| {
+    let Some(image) = found.next() else {
         let path = dir.join(format!("{stem}_{}{number}.{}", PREFIXES[0], ENDINGS[0]));
         let reason = "there is no image of this camera, which has some of other frames";
-        ReadError::malformed(&path, reason)
-    })
+        return Err(ReadError::malformed(&path, reason));
+    };
+    match found.next() {
+        Some(other) => {
+            let reason = format!("camera {number} has another image, {}", other.display());
+            Err(ReadError::malformed(&image, reason))
+        }
+        None => Ok(image),
+    }
 }
 
 /// Reads an image; its calibration is that of the entry for the camera in `root`, if there is one.
@@ -75,8 +94,8 @@ pub(super) fn read(
         pinhole: None,
         lidar_from_camera: None,
     };
-    for prefix in PREFIXES {
-        let Some(entry) = root.optional(&format!("{prefix}{number}"))? else {
+    for name in names_of(number) {
+        let Some(entry) = root.optional(&name)? else {
             continue;
         };
         metadata.pinhole = entry
@@ -140,6 +159,20 @@ mod tests {
         ];
         let found = numbers(&names.map(str::to_owned));
         assert_eq!(found.into_iter().collect::<Vec<_>>(), [0, 2, 3]);
+    }
+
+    #[test]
+    fn an_image_is_found_by_a_number_with_zeros_and_two_of_a_camera_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let [first, second] = ["1_camera07.png", "1_cam7.jpg"].map(|name| folder.path().join(name));
+        std::fs::write(&first, "").unwrap();
+        assert_eq!(find(folder.path(), "1", 7).unwrap(), first);
+        std::fs::write(&second, "").unwrap();
+        let problem = find(folder.path(), "1", 7).unwrap_err().to_string();
+        assert!(
+            problem.contains("camera07.png") && problem.contains("cam7.jpg"),
+            "{problem}"
+        );
     }
 
     #[test]

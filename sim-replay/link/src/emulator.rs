@@ -225,11 +225,9 @@ impl LinkEmulator {
         }
         let mut delay = chance.of(Purpose::Delay, stream, packet.sequence);
         let delay_nanos = config.latency.draw(&mut delay, trace.as_ref(), &message);
+        let exact_nanos = end_nanos.saturating_add(delay_nanos);
         // No packet arrives before its last bit was sent, also with rounding.
-        let arrival_nanos = config.floored(
-            packet.submitted_nanos,
-            end_nanos.saturating_add(delay_nanos),
-        );
+        let arrival_nanos = config.floored(packet.submitted_nanos, exact_nanos);
         let mut arrival_nanos = arrival_nanos.max(end_nanos);
         // A late message holds back those behind it in its stream, as in a transport that delivers in order.
         if config.keep_order {
@@ -237,30 +235,36 @@ impl LinkEmulator {
             arrival_nanos = arrival_nanos.max(*latest);
             *latest = arrival_nanos;
         }
+        // Further delays are added to the time before rounding.
+        let mut exact_nanos = exact_nanos.max(arrival_nanos);
         // After the order was kept, and not entered in `latest_nanos`: only this message is late.
         if let Some(reorder) = config.reorder
             && chance
                 .of(Purpose::Reorder, stream, packet.sequence)
                 .chance(reorder.probability)
         {
-            arrival_nanos = arrival_nanos.saturating_add(nanos::of_ms(reorder.extra_ms));
+            exact_nanos = exact_nanos.saturating_add(nanos::of_ms(reorder.extra_ms));
+            arrival_nanos = arrival_nanos.max(config.floored(packet.submitted_nanos, exact_nanos));
         }
         let mut twice = chance.of(Purpose::Duplicate, stream, packet.sequence);
         // The delay of the copy has a stream of its own too, so that it differs from the first delay.
         let is_repeated = config.duplicate > 0.0 && twice.chance(config.duplicate);
-        let again_nanos =
-            is_repeated.then(|| config.latency.draw(&mut twice, trace.as_ref(), &message));
+        let copy_nanos = is_repeated.then(|| {
+            let again_nanos = config.latency.draw(&mut twice, trace.as_ref(), &message);
+            let exact_nanos = exact_nanos.saturating_add(again_nanos);
+            arrival_nanos.max(config.floored(packet.submitted_nanos, exact_nanos))
+        });
         let first = Delivery::Arrived {
             is_copy: false,
             is_repeated,
         };
         self.schedule(arrival_nanos, packet.clone(), first);
-        if let Some(again_nanos) = again_nanos {
+        if let Some(copy_nanos) = copy_nanos {
             let copy = Delivery::Arrived {
                 is_copy: true,
                 is_repeated: false,
             };
-            self.schedule(arrival_nanos.saturating_add(again_nanos), packet, copy);
+            self.schedule(copy_nanos, packet, copy);
         }
     }
 

@@ -1,6 +1,6 @@
 //! `sim-replay convert`: write a data set in another layout.
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use dataset::{self, IntensityOption, OpenOptions};
 use simulator::generate::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
@@ -75,9 +75,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 /// True if one of the two contains the other: the input would be overwritten.
 fn overlap(from: &Path, out: &Path) -> bool {
-    let [from, out] = [from, out].map(|path| path.canonicalize().ok());
+    let [from, out] = [from, out].map(real);
     from.zip(out)
         .is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))
+}
+
+/// The path without links and `..`, also where its last folders do not exist yet.
+fn real(path: &Path) -> Option<PathBuf> {
+    let mut real = PathBuf::new();
+    for component in std::path::absolute(path).ok()?.components() {
+        if component == Component::ParentDir {
+            real.pop();
+        } else {
+            real.push(component);
+            real = real.canonicalize().unwrap_or(real);
+        }
+    }
+    Some(real)
 }
 
 fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
@@ -125,5 +139,9 @@ mod tests {
         assert!(!overlap(&from, &out));
         assert!(overlap(&from, &from) && overlap(&from, &inside) && overlap(&inside, &from));
         assert!(overlap(&from, &inside.join("..")));
+        let link = out.join("link");
+        std::os::unix::fs::symlink(&inside, &link).unwrap();
+        assert!(overlap(&from, &inside.join("new/d")) && overlap(&from, &link.join("../new")));
+        assert!(!overlap(&from, &inside.join("new/../../../new")));
     }
 }

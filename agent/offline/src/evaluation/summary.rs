@@ -215,7 +215,7 @@ fn rejected(judged: &[Judged]) -> RejectionSummary {
         judged.iter().partition(|pose| pose.error_m <= BAD_M);
     let [bad_share, good_share] = [&bad, &good].map(|poses| {
         let rejected = poses.iter().filter(|pose| pose.is_rejected).count();
-        (!poses.is_empty()).then(|| rejected as f64 / poses.len() as f64)
+        (!poses.is_empty()).then_some(rejected as f64 / poses.len() as f64)
     });
     RejectionSummary {
         poses: judged.iter().filter(|pose| pose.is_rejected).count(),

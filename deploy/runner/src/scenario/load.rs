@@ -112,8 +112,12 @@ fn without_dots(path: &Path) -> PathBuf {
     for component in path.components() {
         match component {
             Component::CurDir => {}
-            // By the text alone: symbolic links are not resolved. Above the root there is nothing to drop.
+            // Above the root there is nothing to drop.
             Component::ParentDir => {
+                // The folder above a link is the one above its target.
+                if clean.is_symlink() {
+                    clean = clean.canonicalize().unwrap_or(clean);
+                }
                 clean.pop();
             }
             other => clean.push(other),
@@ -389,6 +393,16 @@ mod tests {
         let scenario = Scenario::load(&file).unwrap();
         assert!(scenario.scene.dir.is_absolute() && scenario.scene.dir.ends_with("scene"));
         assert!(scenario.models.weights.exists());
+    }
+
+    #[test]
+    fn the_folder_above_a_link_is_the_one_above_its_target() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().canonicalize().unwrap();
+        std::fs::create_dir_all(root.join("a/b")).unwrap();
+        std::os::unix::fs::symlink(root.join("a/b"), root.join("link")).unwrap();
+        assert_eq!(without_dots(&root.join("link/../c")), root.join("a/c"));
+        assert_eq!(without_dots(&root.join("link/./c")), root.join("link/c"));
     }
 
     #[test]

@@ -403,4 +403,34 @@ mod tests {
         );
         assert!(!blamed(Error::Training(TrainingError::Diverged(9))).is::<BadInput>());
     }
+
+    #[test]
+    fn a_network_is_a_preset_or_a_file_with_its_fields() {
+        let half = concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../../deploy/networks/half.json"
+        );
+        let network = parse_network(half).unwrap();
+        assert_eq!(
+            (network.name.as_str(), network.sent_channels()),
+            ("half", 32)
+        );
+        assert_eq!(parse_network("lean"), Ok(DetectorConfig::lean()));
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("wide.json");
+        let text = std::fs::read_to_string(half).unwrap();
+        for (from, to, problem) in [
+            ("\"max_pillars\"", "\"pillars\"", "unknown field `pillars`"),
+            ("[16, 32, 64]", "[16, 32]", "num_filters"),
+        ] {
+            std::fs::write(&file, text.replace(from, to)).unwrap();
+            let message = parse_network(file.to_str().unwrap()).unwrap_err();
+            assert!(message.contains(problem), "{message}");
+        }
+        let message = parse_network("wide").unwrap_err();
+        assert!(
+            message.starts_with("neither lean, full nor a file"),
+            "{message}"
+        );
+    }
 }

@@ -202,6 +202,13 @@ impl Scan for Contents {
             None => {}
         }
     }
+
+    fn forget(&mut self, file: usize) {
+        self.clouds.retain(|_, clouds| {
+            clouds.retain(|cloud| cloud.place.file != file);
+            !clouds.is_empty()
+        });
+    }
 }
 
 /// A rigid transform of a message, whose quaternion may be rounded.

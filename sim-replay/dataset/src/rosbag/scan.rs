@@ -54,4 +54,6 @@ pub(super) trait Scan {
     fn declare(&mut self, topic: &Topic) -> bool;
     /// Takes a message of a wanted topic.
     fn take(&mut self, message: Message<'_>);
+    /// Drops the positions in a file that could not be read to its end: the next file gets its index.
+    fn forget(&mut self, file: usize);
 }

@@ -40,7 +40,10 @@ impl Storage {
         for path in paths {
             match BagFile::open(path, files.len(), scan, problems) {
                 Ok(file) => files.push(file),
-                Err(fault) => faults.push(fault),
+                Err(fault) => {
+                    scan.forget(files.len());
+                    faults.push(fault);
+                }
             }
         }
         if files.is_empty() && !faults.is_empty() {

@@ -258,6 +258,25 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
 }
 
 #[test]
+fn late_messages_and_copies_are_cut_down_to_whole_frames_too() {
+    let reorder = ReorderConfig {
+        probability: 1.0,
+        extra_ms: 50.0,
+    };
+    let config = LinkConfig {
+        latency: LatencyModel::ConstantMs(80.0),
+        floor_ms: 100.0,
+        reorder: Some(reorder),
+        duplicate: 1.0,
+        ..LinkConfig::default()
+    };
+    let outcomes = all(&config, [packet("a", 0, 10, 7 * MS)]);
+    let times: Vec<u64> = outcomes.iter().map(|outcome| outcome.nanos / MS).collect();
+    // After 130 ms, and the copy after 210 ms.
+    assert_eq!(times, [107, 207]);
+}
+
+#[test]
 fn jitter_reorders_unless_order_is_kept() {
     let jitter = LinkConfig {
         latency: LatencyModel::UniformMs([0.0, 50.0]),

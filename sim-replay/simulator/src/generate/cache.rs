@@ -22,6 +22,9 @@ const MAX_FILE_BYTES: u64 = 1 << 20;
 #[derive(Debug, Deserialize)]
 struct MadeWith {
     generator: Generator,
+    /// The sensors.
+    #[serde(default)]
+    vehicle_base: serde_json::Value,
 }
 
 #[derive(Debug, Deserialize)]
@@ -38,17 +41,20 @@ struct Generator {
     weather: String,
     #[serde(default = "default_layout")]
     layout: String,
+    /// Size of the images, which stands among the sensors.
+    #[serde(skip)]
+    cameras: String,
 }
 
 fn default_layout() -> String {
     SceneLayout::Opv2v.name().to_owned()
 }
 
-/// True if scenes of these options are in their folder already.
+/// True if scenes of these options are in their folder already. They may have further weather copies.
 ///
 /// # Errors
 /// [`SynthError::Kept`] if the folder holds other scenes, with the first setting in which they differ;
-/// [`SynthError::File`] if their settings cannot be read.
+/// [`SynthError::File`] if their settings cannot be read, or they cannot be searched for weather copies.
 pub fn are_kept(options: &SynthOptions) -> Result<bool> {
     let folder = options.out.as_path();
     if !folder.exists() {
@@ -56,8 +62,11 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
     }
     let scenarios = read(folder)?;
     let maps: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
+    let cameras = options
+        .cameras
+        .map_or("none".to_owned(), |size| size.to_string());
     for made in &scenarios {
-        let settings: [(&str, &dyn ToString, &dyn ToString); 7] = [
+        let settings: [(&str, &dyn ToString, &dyn ToString); 8] = [
             ("subset", &made.subset, &options.subset.name()),
             ("seed", &made.seed, &options.seed),
             ("frames", &made.frames, &options.frames),
@@ -65,6 +74,7 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
             ("weather", &made.weather, &options.weather.name()),
             ("map_seed", &made.map_seed, &options.map_seed),
             ("layout", &made.layout, &options.layout.name()),
+            ("cameras", &made.cameras, &cameras),
         ];
         for (setting, found, wanted) in settings {
             let (found, wanted) = (found.to_string(), wanted.to_string());
@@ -83,6 +93,19 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
     let (found, wanted) = (scenarios.len(), options.scenes);
     if found != wanted {
         return differs(folder, "scenarios", found.to_string(), wanted.to_string());
+    }
+    if options.copies.is_empty() {
+        return Ok(true);
+    }
+    // The recorded settings do not name the copies.
+    let dataset = dataset::open(folder).map_err(|error| FileError::new(folder, error))?;
+    for scenario in &dataset.scenarios {
+        let found = &scenario.lidar_variants;
+        let mut wanted = options.copies.iter().filter_map(|copy| copy.variant());
+        if let Some(lacking) = wanted.find(|copy| !found.iter().any(|name| name == copy)) {
+            let found = format!("{found:?}");
+            return differs(folder, "weather_copies", found, lacking.into());
+        }
     }
     Ok(true)
 }
@@ -136,14 +159,17 @@ fn read(folder: &Path) -> Result<Vec<Generator>> {
             let text = error.without_snippet().to_string();
             FileError::new(&file, text.lines().next().unwrap_or_default())
         })?;
-        generators.push(made.generator);
+        let (mut generator, sensors) = (made.generator, made.vehicle_base);
+        let size = sensors.pointer("/sensing/perception/camera/image_size");
+        generator.cameras = size.and_then(|size| size.as_str()).unwrap_or("none").into();
+        generators.push(generator);
     }
     Ok(generators)
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Subset, Weather};
+    use super::super::{ImageSize, Subset, Weather};
     use super::*;
 
     #[test]
@@ -154,6 +180,11 @@ mod tests {
             scenes: 2,
             frames: 2,
             agents: 2..=2,
+            copies: vec![Weather::Fog],
+            cameras: Some(ImageSize {
+                width_px: 16,
+                height_px: 16,
+            }),
             ..SynthOptions::new(Subset::V2vdet, 7, out.clone())
         };
         assert!(!are_kept(&options).unwrap());
@@ -211,6 +242,20 @@ mod tests {
                     ..options.clone()
                 },
                 "map town4, not town1",
+            ),
+            (
+                SynthOptions {
+                    cameras: None,
+                    ..options.clone()
+                },
+                "cameras 16x16, not none",
+            ),
+            (
+                SynthOptions {
+                    copies: vec![Weather::Snow],
+                    ..options.clone()
+                },
+                r#"weather_copies ["fog_0.060"], not snow"#,
             ),
         ] {
             let problem = are_kept(&asked).unwrap_err().to_string();

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use bus::process_id;
 use link::{Delivery, LinkEmulator, Outcome, Packet};
 use protocol::{
-    Account, CavId, DropReason, HEADER_LEN, Ledger, ProcessId, RateChoice, Role, Stream, Topic,
+    Account, CavId, DropReason, HEADER_LEN, Ledger, ProcessId, RateReason, Role, Stream, Topic,
 };
 
 use ego_fuser::capture_clock::SweepTime;
@@ -34,6 +34,8 @@ impl Envelope {
 /// A message that was handed over; of a pose only the size is needed.
 struct Kept {
     topic: Topic,
+    /// Reason for its format, if it is a feature map that had to keep within a limit.
+    adapted: Option<RateReason>,
     envelope: Option<Envelope>,
 }
 
@@ -87,7 +89,7 @@ impl DelayedDelivery {
             submitted_nanos: sent.capture_nanos.saturating_add(compute.pose_nanos()),
             distance_m,
         };
-        self.hand_over(pose.clone(), None);
+        self.hand_over(pose.clone(), None, None);
         for message in std::mem::take(&mut sent.messages) {
             let packet = Packet {
                 stream: message.content.exchange().stream(),
@@ -95,10 +97,7 @@ impl DelayedDelivery {
                 submitted_nanos: sent.capture_nanos.saturating_add(compute.agent_nanos()),
                 ..pose.clone()
             };
-            if let Some(RateChoice { reason, .. }) = message.rate {
-                let topic = topic(&sent.cav, packet.stream);
-                self.ledger.adapted(&Account::published(topic), reason);
-            }
+            let adapted = message.rate.map(|rate| rate.reason);
             let mut view = sent.view(message.content);
             // The sender stamps by its own clock, which may be wrong.
             let clock = self.link.clock();
@@ -115,16 +114,28 @@ impl DelayedDelivery {
                 payload_bytes: message.bytes - HEADER_LEN as u64,
                 wire_bytes: message.bytes + sent.pose_bytes,
             };
-            self.hand_over(packet, Some(Envelope { message, sweep }));
+            self.hand_over(packet, adapted, Some(Envelope { message, sweep }));
         }
     }
 
-    fn hand_over(&mut self, mut packet: Packet, envelope: Option<Envelope>) {
+    fn hand_over(
+        &mut self,
+        mut packet: Packet,
+        adapted: Option<RateReason>,
+        envelope: Option<Envelope>,
+    ) {
         packet.id = self.next_id;
         packet.submitted_nanos = packet.submitted_nanos.saturating_sub(self.began_nanos);
         self.next_id += 1;
         let topic = topic(&packet.from, packet.stream);
-        self.kept.insert(packet.id, Kept { topic, envelope });
+        self.kept.insert(
+            packet.id,
+            Kept {
+                topic,
+                adapted,
+                envelope,
+            },
+        );
         // By time, then by number: messages of one time keep their order.
         self.pending
             .insert((packet.submitted_nanos, packet.id), packet);
@@ -139,8 +150,11 @@ impl DelayedDelivery {
             .filter(|entry| entry.key().0 <= nanos)
         {
             let packet = entry.remove();
-            self.ledger
-                .sent(&Account::published(topic(&packet.from, packet.stream)));
+            let account = Account::published(topic(&packet.from, packet.stream));
+            self.ledger.sent(&account);
+            if let Some(reason) = self.kept.get(&packet.id).and_then(|kept| kept.adapted) {
+                self.ledger.adapted(&account, reason);
+            }
             self.sent_bytes += packet.bytes;
             self.link.submit(packet);
         }
@@ -226,5 +240,47 @@ fn topic(cav: &CavId, stream: Stream) -> Topic {
     Topic::Stream {
         cav: cav.clone(),
         stream,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use ego_fuser::ego::Content;
+    use link::LinkConfig;
+    use localization::pose_source::NO_SOURCE;
+    use protocol::RateChoice;
+
+    use super::super::super::sent::SentMessage;
+    use super::*;
+
+    #[test]
+    fn a_message_that_is_not_submitted_is_not_counted_as_adapted() {
+        let [ego, cav] = ["1", "2"].map(|name| CavId::new(name).unwrap());
+        let link = LinkEmulator::new(LinkConfig::default(), Path::new("."), 0).unwrap();
+        let mut delivery = DelayedDelivery::new(link, &ego, 0);
+        let message = SentMessage {
+            content: Content::Boxes(Vec::new()),
+            bytes: 100,
+            rate: Some(RateChoice {
+                reason: RateReason::Fits,
+                limit_bytes: 100,
+            }),
+        };
+        let sent = Sent {
+            cav: cav.clone(),
+            capture_nanos: 1,
+            pose: NO_SOURCE,
+            pose_bytes: 100,
+            messages: vec![message],
+            failure: None,
+        };
+        delivery.enqueue(0, sent, &ComputeTimes::default(), 1.0);
+        let account = Account::published(topic(&cav, Stream::Boxes));
+        assert_eq!(delivery.ledger().get(&account), None);
+        delivery.until(1);
+        let counts = delivery.ledger().get(&account).unwrap();
+        assert_eq!((counts.sent, counts.adapted[&RateReason::Fits]), (1, 1));
     }
 }
