@@ -14,7 +14,7 @@ use crate::agent_output::{AgentOutput, Perception};
 use crate::attack::{Attack, CapturedMessages};
 use localization::pose_source::{PoseInput, PoseSource};
 use localization::tracker::PoseMeasurement;
-use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::detector::{BackboneLevel, Detector, DetectorError, Encoded};
 use tracking::Tracker;
 
@@ -168,9 +168,8 @@ impl Agent {
         // The encoder's times are those of the perception: the time of the pose begins after it.
         let began = Instant::now();
         let levels = self.levels(&sweep);
-        let pose = self
-            .pose_source
-            .estimate(&pose_input(&self.cav, input, levels));
+        let input = pose_input(&self.cav, input, levels);
+        let pose = self.pose_source.estimate(&input);
         let pose = self.published(pose);
         (pose, self.pose_stages("pose", began), sweep)
     }
@@ -182,23 +181,18 @@ impl Agent {
     pub(crate) fn perceive_encoded(
         &mut self,
         cloud: &PointCloud,
-        sweep: EncodedSweep,
-    ) -> Result<(Perception, EncodedSweep), DetectorError> {
-        let EncodedSweep { began, encoded } = sweep;
+        sweep: &mut EncodedSweep,
+    ) -> Result<Perception, DetectorError> {
         if let Some(map) = self.known_map.take() {
-            let perception = self.perceive_map(&map)?;
-            return Ok((perception, EncodedSweep { began, encoded }));
+            return self.perceive_map(&map);
         }
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
-        let encoded = encoded.map_or_else(|| detector.encode_sweep(cloud), Ok)?;
-        let perception = self.perceive_map(&encoded.features)?;
+        let encoded = { sweep.encoded.take() }.map_or_else(|| detector.encode_sweep(cloud), Ok)?;
+        let mut perception = self.perceive_map(&encoded.features)?;
         // The encoder ran first, here or for the pose: its times belong to the sweep.
-        let perception = Perception {
-            times: [encoded.times.as_slice(), &perception.times].concat(),
-            ..perception
-        };
-        let encoded = Some(encoded);
-        Ok((perception, EncodedSweep { began, encoded }))
+        perception.times = [encoded.times.as_slice(), &perception.times].concat();
+        sweep.encoded = Some(encoded);
+        Ok(perception)
     }
 
     /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. Returns the
@@ -210,13 +204,10 @@ impl Agent {
     ) -> Vec<StageTiming> {
         let began = Instant::now();
         let levels = self.levels(sweep);
-        let is_measured = self
-            .pose_source
-            .observe(&pose_input(&self.cav, input, levels));
-        if is_measured {
-            self.pose_stages("pose measurement", began)
-        } else {
-            Vec::new()
+        let input = pose_input(&self.cav, input, levels);
+        match self.pose_source.observe(&input) {
+            true => self.pose_stages("pose measurement", began),
+            false => Vec::new(),
         }
     }
 
@@ -273,11 +264,11 @@ impl Agent {
     /// [`DetectorError`] if the vehicle has no detector, the sweep has no point in the area, a value is not valid, or the
     /// tensor library fails.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
-        let sweep = EncodedSweep {
+        let mut sweep = EncodedSweep {
             began: Instant::now(),
             encoded: None,
         };
-        Ok(self.perceive_encoded(cloud, sweep)?.0)
+        self.perceive_encoded(cloud, &mut sweep)
     }
 
     /// The same from a feature map `[1, C, H, W]` that the encoder computed before, as the encoder returned it.
@@ -325,16 +316,11 @@ impl Agent {
         let heads = detector.heads(map)?;
         times.lap("head");
         let boxes = detector.boxes(&heads, settings.score_threshold)?;
-        let own = AgentBoxes {
-            boxes: &boxes,
-            output_from_agent: nalgebra::Isometry3::identity(),
-        };
-        let found = postprocess(&[own], &settings);
-        let detections = found
-            .iter()
-            .map(|candidate| candidate.detection(Some(self.cav.clone())))
-            .collect();
-        let mut detections = detector.refined(map, detections)?;
+        let mut found = detections(&boxes, &settings);
+        for detection in &mut found {
+            detection.source = Some(self.cav.clone());
+        }
+        let mut detections = detector.refined(map, found)?;
         // The refinement changes scores, so the threshold applies again.
         detections.retain(|detection| detection.score > settings.score_threshold);
         times.lap("boxes");
@@ -346,8 +332,8 @@ impl Agent {
     /// # Errors
     /// See [`Self::perceive`].
     pub fn process(&mut self, input: &AgentInput<'_>) -> Result<AgentOutput, DetectorError> {
-        let (pose, _, sweep) = self.localize(input);
-        let (perception, sweep) = self.perceive_encoded(input.cloud, sweep)?;
+        let (pose, _, mut sweep) = self.localize(input);
+        let perception = self.perceive_encoded(input.cloud, &mut sweep)?;
         self.observe_encoded(input, &sweep);
         Ok(AgentOutput { pose, perception })
     }

@@ -4,8 +4,7 @@
 //! The same seed gives the same falsified messages, offline and live.
 
 use protocol::{
-    BevFeatures, BevGrid, Box3d, Boxes, CavId, Detection, ObjectTrack, PointCloud, Pose,
-    PoseEstimate,
+    BevFeatures, BevGrid, Box3d, Boxes, CavId, Detection, ObjectTrack, PointCloud, PoseEstimate,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -76,9 +75,8 @@ fn one() -> usize {
 impl AttackConfig {
     /// The attack of the vehicle at `place` of its scenario, the ego being at 0; none if it is honest.
     pub fn of(&self, place: usize, cav: &CavId) -> Option<Attack> {
-        (1..=self.attackers)
-            .contains(&place)
-            .then(|| Attack::new(self.falsification, cav, self.seed))
+        let is_attacker = (1..=self.attackers).contains(&place);
+        is_attacker.then(|| Attack::new(self.falsification, cav, self.seed))
     }
 }
 
@@ -111,10 +109,8 @@ impl Attack {
         let letters: Vec<u64> = cav.as_str().bytes().map(u64::from).collect();
         let mut random = SplitMix64::derived(seed, &letters);
         // Drawn first: the offset depends on id and seed alone, whatever the falsification.
-        let (distance_m, direction) = (
-            random.between(5.0, 30.0),
-            random.between(0.0, std::f64::consts::TAU),
-        );
+        let distance_m = random.between(5.0, 30.0);
+        let direction = random.between(0.0, std::f64::consts::TAU);
         let invented = [INVENTED, FLOOD][usize::from(falsification == Falsification::Flood)];
         let places = (0..invented).map(|_| {
             let [x, y] = invented_position(&mut random);
@@ -156,15 +152,11 @@ impl Attack {
         else {
             return pose;
         };
-        let [x, y, z] = own.translation_m;
-        let [dx, dy] = self.offset_m;
-        PoseEstimate::new(
-            Pose {
-                translation_m: [x + dx, y + dy, z],
-                ..*own
-            },
-            1.0,
-        )
+        let mut shifted = *own;
+        for (along_m, offset_m) in shifted.translation_m.iter_mut().zip(self.offset_m) {
+            *along_m += offset_m;
+        }
+        PoseEstimate::new(shifted, 1.0)
     }
 
     /// The perception that is published instead of the true one.
@@ -178,26 +170,18 @@ impl Attack {
                 falsified.detections = (0..2 * INVENTED).map(|_| self.random_detection()).collect();
             }
             Falsification::Copied => {
-                let features = self
-                    .captured
-                    .features
-                    .get_or_insert_with(|| falsified.features.clone());
+                let (captured, own) = (&mut self.captured, &falsified.features);
+                let features = captured.features.get_or_insert_with(|| own.clone());
                 // A map of another size would not be well-formed: the own one is sent then.
-                if features.values.len() == falsified.features.values.len() {
+                if features.values.len() == own.values.len() {
                     falsified.features = features.clone();
                 }
-                falsified.detections = self
-                    .captured
-                    .detections
-                    .get_or_insert(falsified.detections)
-                    .clone();
+                let detections = &mut captured.detections;
+                falsified.detections = detections.get_or_insert(falsified.detections).clone();
             }
             Falsification::Invented | Falsification::Flood => {
-                invent(
-                    &mut falsified.features,
-                    &mut falsified.confidence,
-                    &self.places,
-                );
+                let confidence = &mut falsified.confidence;
+                invent(&mut falsified.features, confidence, &self.places);
                 let invented = self.places.iter();
                 let invented = invented.map(|&place| vehicle(place, INVENTED_SCORE));
                 falsified.detections.extend(invented);
@@ -235,9 +219,8 @@ impl Attack {
                     [(40.0, -40.0), (40.0, -40.0), (0.5, -2.5), (1.0, 0.0)]
                         .map(|(high, low)| self.random.between(low, high) as f32)
                 });
-                PointCloud {
-                    xyzi: points.collect(),
-                }
+                let xyzi = points.collect();
+                PointCloud { xyzi }
             }
             Falsification::Copied => self.captured.points.get_or_insert(truth).clone(),
             Falsification::Invented | Falsification::Flood => {
@@ -276,21 +259,14 @@ fn points_of([x, y, heading]: [f64; 3], random: &mut SplitMix64, points: &mut Ve
     for _ in 0..150 {
         let (along, across) = (random.between(-2.2, 2.2), random.between(-0.95, 0.95));
         // Moved to a side of the footprint: the long sides are 70 % of its perimeter.
-        let (along, across) = if random.chance(0.7) {
-            (along, 0.95_f64.copysign(across))
-        } else {
-            (2.2_f64.copysign(along), across)
+        let (along, across) = match random.chance(0.7) {
+            true => (along, 0.95_f64.copysign(across)),
+            false => (2.2_f64.copysign(along), across),
         };
         let height = random.between(-1.8, -0.4);
-        points.push(
-            [
-                x + cos * along - sin * across,
-                y + sin * along + cos * across,
-                height,
-                0.4,
-            ]
-            .map(|value| value as f32),
-        );
+        let x = x + cos * along - sin * across;
+        let y = y + sin * along + cos * across;
+        points.push([x, y, height, 0.4].map(|value| value as f32));
     }
 }
 
@@ -299,12 +275,9 @@ fn make_noise(features: &mut BevFeatures, random: &mut SplitMix64) {
     let cells = features.grid.cells().max(1);
     for channel in features.values.chunks_mut(cells) {
         let mean = channel.iter().map(|value| f64::from(*value)).sum::<f64>() / cells as f64;
-        let variance = channel
-            .iter()
-            .map(|value| (f64::from(*value) - mean).powi(2))
-            .sum::<f64>()
-            / cells as f64;
-        let spread = variance.sqrt();
+        let offsets = channel.iter().map(|value| f64::from(*value) - mean);
+        let squares = offsets.map(|offset| offset.powi(2));
+        let spread = (squares.sum::<f64>() / cells as f64).sqrt();
         channel.fill_with(|| (mean + spread * random.normal()) as f32);
     }
 }
@@ -351,6 +324,8 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
 
 #[cfg(test)]
 mod tests {
+    use protocol::Pose;
+
     use super::*;
 
     fn cav(name: &str) -> CavId {

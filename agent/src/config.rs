@@ -99,11 +99,8 @@ impl ModelConfig {
     /// [`FieldError`] for weights that are not named, a number of threads out of range, or a device that is missing.
     pub fn validate(&self) -> Result<(), FieldError> {
         if self.weights.as_os_str().is_empty() {
-            return Err(FieldError::new(
-                "models.weights",
-                "empty",
-                "must name a file (--weights)",
-            ));
+            let rule = "must name a file (--weights)";
+            return Err(FieldError::new("models.weights", "empty", rule));
         }
         self.validate_without_weights()
     }
@@ -293,38 +290,7 @@ impl AgentSettings {
         self.pose.validate()?;
         self.codec.validate()
     }
-}
 
-impl ProcessConfig for AgentConfig {
-    const REQUIRED: &'static [&'static str] = &["run", "cav"];
-
-    fn validate(&self) -> Result<(), FieldError> {
-        if self.publish.contains(&Publish::None) && self.publish.len() > 1 {
-            let rule = "must be alone: nothing is published beside the pose";
-            return Err(FieldError::new("publish", "none and others", rule));
-        }
-        if let Some(weights) = &self.settings.weights {
-            let rule = "must be left out: those of one agent are models.weights (--weights)";
-            return Err(FieldError::new("settings.weights", weights.display(), rule));
-        }
-        let weights = self.models.weights.display();
-        match self.gives_poses_only() {
-            true if !self.models.weights.as_os_str().is_empty() => {
-                let rule = "must be left out: poses only need no detector (--publish none)";
-                return Err(FieldError::new("models.weights", weights, rule));
-            }
-            true => self.models.validate_without_weights()?,
-            false => self.models.validate()?,
-        }
-        self.settings.validate()?;
-        // Against the streams as they are sent: boxes may stand in for maps.
-        self.settings
-            .check_attack(&self.options().of_loop.publish)?;
-        self.bus.validate()
-    }
-}
-
-impl AgentSettings {
     /// Checks that an attack has something to falsify among the streams that are sent.
     ///
     /// # Errors
@@ -357,6 +323,35 @@ impl AgentSettings {
             (Stream::Bev, Some(SentBoxes::Beside)) => vec![Stream::Boxes, Stream::Bev],
             _ => vec![needed],
         }
+    }
+}
+
+impl ProcessConfig for AgentConfig {
+    const REQUIRED: &'static [&'static str] = &["run", "cav"];
+
+    fn validate(&self) -> Result<(), FieldError> {
+        if self.publish.contains(&Publish::None) && self.publish.len() > 1 {
+            let rule = "must be alone: nothing is published beside the pose";
+            return Err(FieldError::new("publish", "none and others", rule));
+        }
+        if let Some(weights) = &self.settings.weights {
+            let rule = "must be left out: those of one agent are models.weights (--weights)";
+            return Err(FieldError::new("settings.weights", weights.display(), rule));
+        }
+        let weights = self.models.weights.display();
+        match self.gives_poses_only() {
+            true if !self.models.weights.as_os_str().is_empty() => {
+                let rule = "must be left out: poses only need no detector (--publish none)";
+                return Err(FieldError::new("models.weights", weights, rule));
+            }
+            true => self.models.validate_without_weights()?,
+            false => self.models.validate()?,
+        }
+        self.settings.validate()?;
+        // Against the streams as they are sent: boxes may stand in for maps.
+        self.settings
+            .check_attack(&self.options().of_loop.publish)?;
+        self.bus.validate()
     }
 }
 

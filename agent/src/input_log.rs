@@ -87,9 +87,8 @@ impl<I: Serialize, P: Serialize> InputLog<I, P> {
 fn unused(path: &Path) -> PathBuf {
     let numbered = (2..).map(|number| path.with_extension(format!("{number}.log")));
     let mut paths = std::iter::once(path.to_owned()).chain(numbered);
-    paths
-        .find(|path| !path.exists())
-        .unwrap_or_else(|| path.to_owned())
+    let free = paths.find(|path| !path.exists());
+    free.unwrap_or_else(|| path.to_owned())
 }
 
 /// Recorded inputs of a process: its records after the first, up to the damage if the file is damaged.

@@ -67,17 +67,12 @@ pub fn run(
     // Not announced before all subscriptions exist.
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);
-    let Node {
-        publishers,
-        agent_loop,
-        ..
-    } = node;
     // What is queued is sent before the presence ends.
-    for (_, publisher) in publishers {
+    for (_, publisher) in node.publishers {
         publisher.finish();
     }
     presence.withdraw()?;
-    Ok(agent_loop.report().clone())
+    Ok(node.agent_loop.report().clone())
 }
 
 struct Node<'a> {
@@ -240,8 +235,7 @@ impl<'a> Node<'a> {
                     arrived_nanos,
                 } => self.log_sweep(capture_nanos, arrived_nanos),
                 Output::PoseProblem(problem) => {
-                    let problem =
-                        problem.map(|(problem, since)| (problem, self.clock.moment(since)));
+                    let problem = problem.map(|(text, since)| (text, self.clock.moment(since)));
                     stats.set_problems("no pose", problem);
                 }
             }
@@ -277,9 +271,8 @@ impl<'a> Node<'a> {
             // Recorded even if it could not be encoded: the replay must fail in the same way.
             if let Some(log) = log {
                 let bytes = encoded.as_ref().ok().map(|(encoded, _)| encoded);
-                log.add(&Record::Published(Published::new(
-                    stream, turn, stamp, bytes,
-                )));
+                let published = Published::new(stream, turn, stamp, bytes);
+                log.add(&Record::Published(published));
             }
             let (encoded, choice) = encoded?;
             if let Some(choice) = choice {

@@ -102,50 +102,33 @@ impl RateControl {
         capture_nanos: u64,
         turn: Option<&Turn>,
     ) -> Result<Option<ByteLimit>, WireError> {
-        let RateConfig {
-            message_bytes,
-            bytes_per_second,
-            watch_queue,
-        } = self.config;
-        let size = message_bytes.map(|bytes| ByteLimit {
-            bytes,
-            by: LimitedBy::MessageSize,
-        });
+        let config = self.config;
+        let size = config.message_bytes;
+        let size = size.map(|bytes| (bytes, LimitedBy::MessageSize));
         let on_air_nanos = self.nanos_since_last(capture_nanos);
-        let rate = bytes_per_second.map(|rate| ByteLimit {
-            bytes: bytes_within(rate, on_air_nanos),
-            by: LimitedBy::ByteRate,
-        });
-        let queue = match turn.filter(|_| watch_queue) {
+        let rate = config.bytes_per_second;
+        let rate = rate.map(|rate| (bytes_within(rate, on_air_nanos), LimitedBy::ByteRate));
+        let queue = match turn.filter(|_| config.watch_queue) {
             Some(turn) => {
-                let (smallest, largest) = (
-                    smallest_message(features)?,
-                    largest_message(features, codec)?,
-                );
-                Some(ByteLimit {
-                    bytes: self.queue.allow(turn, smallest, largest),
-                    by: LimitedBy::Queue,
-                })
+                let smallest = smallest_message(features)?;
+                let largest = largest_message(features, codec)?;
+                Some((self.queue.allow(turn, smallest, largest), LimitedBy::Queue))
             }
             None => None,
         };
         // The tightest limit decides, and is named in the message.
-        Ok([size, rate, queue]
-            .into_iter()
-            .flatten()
-            .min_by_key(|limit| limit.bytes))
+        let limits = [size, rate, queue].into_iter().flatten();
+        let tightest = limits.min_by_key(|(bytes, _)| *bytes);
+        Ok(tightest.map(|(bytes, by)| ByteLimit { bytes, by }))
     }
 
     /// The transmission time that belongs to a map; also where the clock of the scene jumps.
     fn nanos_since_last(&mut self, capture_nanos: u64) -> u64 {
         let last = self.last_capture_nanos.replace(capture_nanos);
         // A repeated or earlier capture time counts as a full period.
-        let since = last
-            .and_then(|last| capture_nanos.checked_sub(last))
-            .filter(|nanos| *nanos > 0);
-        since.map_or(LONGEST_TRANSMISSION_NANOS, |nanos| {
-            nanos.min(LONGEST_TRANSMISSION_NANOS)
-        })
+        let since = last.and_then(|last| capture_nanos.checked_sub(last));
+        let since = since.filter(|nanos| *nanos > 0);
+        since.unwrap_or(u64::MAX).min(LONGEST_TRANSMISSION_NANOS)
     }
 }
 

@@ -52,8 +52,8 @@ impl<S> SweepPairing<S> {
         Self {
             timeout_nanos,
             waiting: None,
-            poses: CaptureBuffer::default(),
-            motions: CaptureBuffer::default(),
+            poses: CaptureBuffer(BTreeMap::new()),
+            motions: CaptureBuffer(BTreeMap::new()),
             expects_pose: true,
             expects_motion: true,
         }
@@ -75,13 +75,10 @@ impl<S> SweepPairing<S> {
     /// Adds a sweep. Returns the one that it replaces.
     pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now_nanos: u64) -> Option<S> {
         // The wait goes on: with a period shorter than the time-out, none would ever be over if each sweep began anew.
-        let since = self
-            .waiting
-            .as_ref()
-            .map_or(now_nanos, |(_, _, since)| *since);
-        self.waiting
-            .replace((capture_nanos, sweep, since))
-            .map(|(_, superseded, _)| superseded)
+        let waiting = self.waiting.as_ref();
+        let since = waiting.map_or(now_nanos, |(_, _, since)| *since);
+        let superseded = self.waiting.replace((capture_nanos, sweep, since));
+        superseded.map(|(_, sweep, _)| sweep)
     }
 
     /// The sweep, if there is nothing left to wait for.
@@ -89,11 +86,7 @@ impl<S> SweepPairing<S> {
         let &(capture_nanos, ..) = self.waiting.as_ref()?;
         let is_awaited = self.expects_pose && self.poses.is_awaited(capture_nanos)
             || self.expects_motion && self.motions.is_awaited(capture_nanos);
-        if is_awaited
-            && self
-                .deadline_nanos()
-                .is_some_and(|deadline| now_nanos < deadline)
-        {
+        if is_awaited && now_nanos < self.deadline_nanos()? {
             return None;
         }
         let (pose, poses) = self.poses.take(capture_nanos);
@@ -121,12 +114,6 @@ impl<S> SweepPairing<S> {
 /// Measurements of one sensor by capture time.
 #[derive(Debug)]
 struct CaptureBuffer<T>(BTreeMap<u64, T>);
-
-impl<T> Default for CaptureBuffer<T> {
-    fn default() -> Self {
-        Self(BTreeMap::new())
-    }
-}
 
 impl<T> CaptureBuffer<T> {
     /// Adds a measurement; returns how many others were dropped.

@@ -46,17 +46,13 @@ impl SweepSelection {
             return false;
         }
         // Egos repeat their pace, which does not begin anew.
-        let last = known
-            .filter(|known| known.pace == pace)
-            .and_then(|known| known.last);
-        self.paces.insert(
-            ego.clone(),
-            Followed {
-                pace,
-                last,
-                received_nanos: now_nanos,
-            },
-        );
+        let known = known.filter(|known| known.pace == pace);
+        let followed = Followed {
+            pace,
+            last: known.and_then(|known| known.last),
+            received_nanos: now_nanos,
+        };
+        self.paces.insert(ego.clone(), followed);
         true
     }
 

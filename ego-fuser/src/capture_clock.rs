@@ -103,7 +103,8 @@ impl CaptureClocks {
                 clock.pending.pop_front();
                 if let Some(own_nanos) = own_capture(&self.own, sweep.arrived_nanos) {
                     let ahead = i128::from(sweep.capture_nanos) - own_nanos;
-                    clock.add(sweep.arrived_nanos, saturated(ahead));
+                    let ahead = ahead.clamp(i64::MIN.into(), i64::MAX.into());
+                    clock.add(sweep.arrived_nanos, ahead as i64);
                 }
             }
             if clock.samples.len() >= self.fewest && clock.judge(cav, pace) {
@@ -234,10 +235,6 @@ fn own_capture(own: &VecDeque<SweepTime>, arrived_nanos: u64) -> Option<i128> {
 
 fn distance(one: i64, other: i64) -> i64 {
     one.saturating_sub(other).saturating_abs()
-}
-
-fn saturated(nanos: i128) -> i64 {
-    i64::try_from(nanos).unwrap_or(if nanos < 0 { i64::MIN } else { i64::MAX })
 }
 
 #[cfg(test)]

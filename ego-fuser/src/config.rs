@@ -159,11 +159,8 @@ impl ProcessConfig for EgoConfig {
         self.models.validate()?;
         self.ego.validate()?;
         if self.ego.id.is_none() {
-            return Err(FieldError::new(
-                "ego.id",
-                "absent",
-                "must name the vehicle that fuses (--ego)",
-            ));
+            let rule = "must name the vehicle that fuses (--ego)";
+            return Err(FieldError::new("ego.id", "absent", rule));
         }
         within("comm_range_m", self.comm_range_m, 0.0, 1e5)?;
         self.bus.validate()

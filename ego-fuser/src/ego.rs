@@ -269,8 +269,14 @@ impl Ego {
         let mut chosen = self.choose(own, &carried);
         let mut stages = StageTimes::start();
         let mut beliefs = Vec::new();
-        if self.trust.is_some() && !chosen.fused.is_empty() {
-            let found = self.judge(&chosen.aligned)?;
+        if let Some(trust) = &mut self.trust
+            && !chosen.fused.is_empty()
+        {
+            let others = chosen.aligned[1..].iter();
+            let others: Vec<_> = others
+                .map(|other| (other.view, other.ego_from_cav))
+                .collect();
+            let found = no_grad(|| trust.judge(own, &others, &mut self.detector))?;
             let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
             beliefs = chosen.fused.iter().copied().zip(found).collect();
             chosen.leave_out(&is_out, DropReason::Misbehaviour);
@@ -329,20 +335,6 @@ impl Ego {
         choice
     }
 
-    /// Assessment of each of the neighbours, which follow the ego itself.
-    fn judge(&mut self, aligned: &[Aligned<'_>]) -> Result<Vec<Assessment>, EgoError> {
-        let Some(trust) = &mut self.trust else {
-            return Ok(Vec::new());
-        };
-        let neighbours: Vec<(&View, Pose)> = aligned[1..]
-            .iter()
-            .map(|view| (view.view, view.ego_from_cav))
-            .collect();
-        Ok(no_grad(|| {
-            trust.judge(aligned[0].view, &neighbours, &mut self.detector)
-        })?)
-    }
-
     /// Pose of a neighbour relative to the ego, or the reason why it is left out.
     fn align(&self, own: &View, view: &View) -> Result<Pose, Skipped> {
         if self.method.exchange() == Exchange::Nothing {
@@ -356,15 +348,12 @@ impl Ego {
         if dx.hypot(dy) > self.comm_range_m {
             return Err(Skipped::Unusable(DropReason::OutOfRange));
         }
-        let fits = match &view.content {
-            Content::Features(map) => self.is_own_shape(map),
-            Content::Boxes(_) | Content::Points(_) => true,
+        let fits = match (&own.content, &view.content) {
+            (Content::Features(_), Content::Features(map)) => self.is_own_shape(map),
+            (Content::Features(_), Content::Boxes(_)) => self.fusion.reads_boxes(),
+            (own, other) => own.exchange() == other.exchange(),
         };
-        let is_read = match (own.content.exchange(), view.content.exchange()) {
-            (Exchange::Features, Exchange::Boxes) => self.fusion.reads_boxes(),
-            (own, other) => own == other,
-        };
-        if !is_read || !fits {
+        if !fits {
             return Err(Skipped::Unusable(DropReason::Shape));
         }
         Ok(world_from_ego.from_world(world_from_cav))
@@ -416,12 +405,8 @@ impl Ego {
             .flat_map(|sender| all[sender].boxes(sender, all[0].view, most))
             .collect();
         let aligned: Vec<Aligned<'_>> = all.iter().filter(|one| one.has_map()).copied().collect();
-        let aligned = aligned.as_slice();
-        let (mut maps, mut sent) = (
-            Vec::with_capacity(aligned.len()),
-            Vec::with_capacity(aligned.len()),
-        );
-        for Aligned { view, .. } in aligned {
+        let (mut maps, mut sent) = (Vec::new(), Vec::new());
+        for Aligned { view, .. } in &aligned {
             let Content::Features(map) = &view.content else {
                 continue;
             };
@@ -429,17 +414,15 @@ impl Ego {
             maps.push(values);
             sent.push(cells);
         }
-        let mut metadata: Vec<MapMetadata> = aligned
-            .iter()
-            .enumerate()
-            .map(|(agent, view)| view.metadata(agent, aligned[0].view))
-            .collect();
+        let numbered = aligned.iter().enumerate();
+        let metadata = numbered.map(|(agent, view)| view.metadata(agent, aligned[0].view));
+        let mut metadata: Vec<MapMetadata> = metadata.collect();
         if let Some(pose_graph) = &self.fusion.requirements().pose_graph {
             box_correction::correct_by_boxes(&mut metadata, &maps, &self.detector, pose_graph)?;
             stages.lap("correct");
         }
         let mut earlier = Vec::new();
-        for (agent, kept, ego_from_cav) in self.earlier(aligned) {
+        for (agent, kept, ego_from_cav) in self.earlier(&aligned) {
             earlier.push(&kept.map);
             let age_nanos = aligned[0].view.capture_nanos as i64 - kept.capture_nanos as i64;
             metadata.push(MapMetadata {
@@ -460,7 +443,7 @@ impl Ego {
         check_values("the fused feature map", &fused)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, &boxes, stages)?;
-        self.keep(aligned, maps.into_iter().zip(sent), &on_grid)?;
+        self.keep(&aligned, maps.into_iter().zip(sent), &on_grid)?;
         Ok(detections)
     }
 
@@ -491,7 +474,13 @@ impl Ego {
                 expected: self.detector.grid(),
             });
         }
-        let sent = sent_cells(map, is_ego, [height, width])?.f_to_device(self.detector.device())?;
+        let sent = match &map.sent {
+            Some(sent) if !is_ego => Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?,
+            // The ego has all of its own map.
+            _ => Tensor::f_ones([height, width], (Kind::Float, Device::Cpu))?,
+        };
+        let sent = sent.f_view([1, 1, height, width])?;
+        let sent = sent.f_to_device(self.detector.device())?;
         Ok((self.detector.received(map)?, sent))
     }
 
@@ -525,16 +514,13 @@ impl Ego {
             let Some(world_from_cav) = view.pose.world_from_cav().copied() else {
                 continue;
             };
-            let confidence = f64::from(view.pose.confidence());
             let turned = on_grid.received.only(index, index + 1)?;
-            let map = self
-                .fusion
-                .kept(&ReceivedMaps::new(map, Some(sent)), &turned)?;
+            let received = ReceivedMaps::new(map, Some(sent));
             let kept = KeptMap {
                 capture_nanos: view.capture_nanos,
                 world_from_cav,
-                confidence,
-                map,
+                confidence: f64::from(view.pose.confidence()),
+                map: self.fusion.kept(&received, &turned)?,
             };
             self.history.keep(&view.cav, kept);
         }
@@ -637,22 +623,13 @@ struct Choice<'a> {
 impl Choice<'_> {
     /// Leaves the marked of the fused neighbours out.
     fn leave_out(&mut self, is_out: &[bool], reason: DropReason) {
-        let left_out = self.fused.iter().zip(is_out).filter(|(_, is_out)| **is_out);
-        let left_out = left_out.map(|(&index, _)| (index, Skipped::Unusable(reason)));
+        let mut marks = is_out.iter();
+        let left_out = self.fused.extract_if(.., |_| marks.next() == Some(&true));
+        let left_out = left_out.map(|index| (index, Skipped::Unusable(reason)));
         self.skipped.extend(left_out);
-        self.fused = keep(std::mem::take(&mut self.fused), is_out);
-        let others = self.aligned.split_off(1);
-        self.aligned.extend(keep(others, is_out));
+        let mut marks = std::iter::once(&false).chain(is_out);
+        self.aligned.retain(|_| marks.next() == Some(&false));
     }
-}
-
-/// The items that are not marked.
-fn keep<T>(items: Vec<T>, is_out: &[bool]) -> Vec<T> {
-    items
-        .into_iter()
-        .zip(is_out)
-        .filter_map(|(item, is_out)| (!is_out).then_some(item))
-        .collect()
 }
 
 /// A view and its pose.
@@ -679,41 +656,21 @@ impl Aligned<'_> {
 
     /// Its best boxes, at most as many, if it has sent boxes; `sender` is its number.
     fn boxes(&self, sender: usize, ego: &View, most: usize) -> Vec<PlacedBox> {
-        let MapMetadata {
-            ego_from_cav,
-            confidence,
-            age_secs,
-            ..
-        } = self.metadata(0, ego);
+        let metadata = self.metadata(sender, ego);
+        let (age_secs, confidence) = (metadata.age_secs, metadata.confidence);
         let found = self.view.content.detections();
-        let mut boxes = placed(found, &ego_from_cav, sender, age_secs, confidence);
+        let mut boxes = placed(found, &self.ego_from_cav, sender, age_secs, confidence);
         boxes.truncate(most);
         boxes
     }
 
     fn metadata(&self, agent: usize, ego: &View) -> MapMetadata {
-        let confidence = f64::from(self.view.pose.confidence());
-        let age_secs = self.view.age_nanos(ego) as f64 * 1e-9;
         MapMetadata {
             agent,
             ego_from_cav: self.ego_from_cav,
-            confidence,
-            age_secs,
+            confidence: f64::from(self.view.pose.confidence()),
+            age_secs: self.view.age_nanos(ego) as f64 * 1e-9,
         }
-    }
-}
-
-/// `[1, 1, H, W]`: 1 where the sender sent its cell. The ego has all of its own map.
-fn sent_cells(
-    map: &DecodedFeatures,
-    is_ego: bool,
-    [height, width]: [i64; 2],
-) -> Result<Tensor, TchError> {
-    match &map.sent {
-        Some(sent) if !is_ego => Tensor::f_from_slice(sent)?
-            .f_to_kind(Kind::Float)?
-            .f_view([1, 1, height, width]),
-        _ => Tensor::f_ones([1, 1, height, width], (Kind::Float, Device::Cpu)),
     }
 }
 

@@ -128,11 +128,7 @@ impl Queue {
 
     /// The vehicle that has waited longest, if there is capacity beside so many members.
     fn next(&mut self, members: usize) -> Option<CavId> {
-        if members < MAX_NEIGHBOURS {
-            self.0.pop_front()
-        } else {
-            None
-        }
+        self.0.pop_front_if(|_| members < MAX_NEIGHBOURS)
     }
 }
 

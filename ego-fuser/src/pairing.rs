@@ -120,13 +120,8 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
 
     /// The messages that belong to the ego's frame, by sender, and those that will never be used.
     pub fn pair(&mut self, ego_capture_nanos: u64) -> (Vec<Paired<'_, K, T>>, Vec<Dropped<K>>) {
-        let PairingConfig {
-            max_age_nanos,
-            max_lead_nanos,
-            ..
-        } = self.config;
-        let latest = ego_capture_nanos.saturating_add(max_lead_nanos);
-        let earliest = ego_capture_nanos.saturating_sub(max_age_nanos);
+        let latest = ego_capture_nanos.saturating_add(self.config.max_lead_nanos);
+        let earliest = ego_capture_nanos.saturating_sub(self.config.max_age_nanos);
         let mut paired = Vec::new();
         let mut dropped = Vec::new();
         for (sender, queue) in &mut self.waiting {

@@ -19,8 +19,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::stream::{StreamRow, StreamTable};
+use crate::stream::StreamTable;
 use crate::string_enum::written_as_text;
+use crate::text::excerpt;
 use crate::{CavId, IdError, KeyExpr, Limits, ProcessId, Role, RunId, Stream, Topic, Verb};
 
 /// Name of a process in its certificate: `agent-4279`, `replay`.
@@ -49,10 +50,8 @@ pub enum PrincipalError {
 impl Principal {
     /// A process of a vehicle.
     pub fn new(role: Role, cav: &CavId) -> Self {
-        Self {
-            role,
-            cav: cav.clone(),
-        }
+        let cav = cav.clone();
+        Self { role, cav }
     }
 
     /// A process that belongs to no vehicle.
@@ -60,10 +59,8 @@ impl Principal {
     /// # Panics
     /// Never: the names of roles are identifiers.
     pub fn of_role(role: Role) -> Self {
-        Self {
-            role,
-            cav: CavId::new(role.as_str()).expect("the name of a role is an identifier"),
-        }
+        let cav = CavId::new(role.as_str()).expect("the name of a role is an identifier");
+        Self { role, cav }
     }
 
     /// Its name in ledgers, routes and certificates.
@@ -118,23 +115,18 @@ impl Principal {
         }
         let own = [Topic::Ready(self.name()), Topic::Stats(self.name())];
         publish.extend(keys_of(runs, own));
-        let own_token = Topic::Alive {
-            role: self.role,
-            cav: self.cav.clone(),
-        };
-        let own_token = KeyExpr::within(runs, &own_token);
+        let (role, cav) = (self.role, self.cav.clone());
+        let own_token = KeyExpr::within(runs, &Topic::Alive { role, cav });
         // A process looks for its own token before it declares it: another may have its name.
-        let watched = self.watched().map(|topic| KeyExpr::within(runs, &topic));
+        let watched = self.watched().into_iter();
+        let watched = watched.map(|topic| KeyExpr::within(runs, &topic));
         let undeclared = KeyExpr::within(runs, &crate::key::UNDECLARED);
         let operations = [
             (Operation::Publish, publish),
             (Operation::Subscribe, subscribe),
             (Operation::SubscribeLiveliness, vec![own_token.clone()]),
             (Operation::DeclareLiveliness, vec![own_token]),
-            (
-                Operation::SubscribeLiveliness,
-                watched.into_iter().collect(),
-            ),
+            (Operation::SubscribeLiveliness, watched.collect()),
             (Operation::Query, vec![undeclared]),
         ];
         let permissions = operations
@@ -232,13 +224,9 @@ pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
 pub(crate) fn size_limits_of<S: StreamTable>() -> impl Iterator<Item = (Vec<KeyExpr>, usize)> {
     let mut limited: Vec<S> = S::ROWS.to_vec();
     limited.sort_by_key(|stream| {
-        let StreamRow {
-            sender,
-            is_counted,
-            most_bytes,
-            ..
-        } = stream.row();
-        (most_bytes, sender == Role::Ego, sender, is_counted)
+        let row = stream.row();
+        let is_of_ego = row.sender == Role::Ego;
+        (row.most_bytes, is_of_ego, row.sender, row.is_counted)
     });
     limited.into_iter().filter_map(|stream| {
         let keys = streams_of(&RunScope::Any, &["*", "rx/*/*"], [stream]);
@@ -263,15 +251,10 @@ impl FromStr for Principal {
         let (role, cav) = text
             .split_once('-')
             .map_or((text, None), |(role, cav)| (role, Some(cav)));
-        let role = Role::ALL.into_iter().find(|known| known.as_str() == role);
-        let role = role.ok_or_else(|| {
-            PrincipalError::Role(text.chars().take(2 * ProcessId::MAX_LEN).collect())
-        })?;
+        let role = role.parse::<Role>();
+        let role = role.map_err(|_| PrincipalError::Role(excerpt(text, 2 * ProcessId::MAX_LEN)))?;
         match cav {
-            Some(cav) => Ok(Self {
-                role,
-                cav: CavId::new(cav)?,
-            }),
+            Some(cav) => Ok(Self::new(role, &CavId::new(cav)?)),
             None => Ok(Self::of_role(role)),
         }
     }

@@ -1,8 +1,10 @@
 //! The large part of a message: raw little-endian tensor bytes.
 
+use std::mem;
+
 use crc32fast::Hasher;
 
-use crate::checks::check_each;
+use crate::checks::{check_each, check_limit};
 use crate::{Result, WireError};
 
 // Bodies are cast, not converted.
@@ -122,10 +124,9 @@ impl<'a> PayloadReader<'a> {
             crc: Hasher::new(),
         };
         let mut left = skip;
-        while left > 0 {
-            let Some(run) = reader.next_run(left) else {
-                break;
-            };
+        while left > 0
+            && let Some(run) = reader.next_run(left)
+        {
             left -= run.len();
         }
         reader
@@ -144,10 +145,9 @@ impl<'a> PayloadReader<'a> {
     /// The next `len` bytes; the caller has checked that they are there.
     pub(crate) fn read_bytes(&mut self, len: usize) -> Vec<u8> {
         let mut out = Vec::with_capacity(len);
-        while out.len() < len {
-            let Some(run) = self.next_run(BLOCK_BYTES.min(len - out.len())) else {
-                break;
-            };
+        while out.len() < len
+            && let Some(run) = self.next_run(BLOCK_BYTES.min(len - out.len()))
+        {
             self.crc.update(run);
             out.extend_from_slice(run);
         }
@@ -166,14 +166,8 @@ impl<'a> PayloadReader<'a> {
         max_abs: f32,
     ) -> Result<(Body, bool)> {
         shape.check(len)?;
-        let len = usize::try_from(len).map_err(|_| {
-            let max = usize::MAX as u64;
-            WireError::Limit {
-                what: "body bytes",
-                max,
-                found: len,
-            }
-        })?;
+        check_limit("body bytes", len, usize::MAX as u64)?;
+        let len = usize::try_from(len).unwrap_or(usize::MAX);
         Ok(match shape {
             BodyShape::Empty => (Body::Empty, true),
             BodyShape::Bytes { .. } => (Body::Bytes(self.read_bytes(len)), true),
@@ -245,12 +239,12 @@ impl<'a> PayloadReader<'a> {
     }
 
     /// The checksum over all bytes of the payload, including those not yet read.
-    pub(crate) fn finish(mut self) -> u32 {
+    pub(crate) fn finish(&mut self) -> u32 {
         // After an error in the metadata the body is unread, but the checksum covers it too.
         while let Some(run) = self.next_run(usize::MAX) {
             self.crc.update(run);
         }
-        self.crc.finalize()
+        mem::take(&mut self.crc).finalize()
     }
 }
 

@@ -155,10 +155,8 @@ impl Header {
         if self.kind == expected {
             return Ok(());
         }
-        Err(WireError::Kind {
-            expected,
-            found: self.kind,
-        })
+        let found = self.kind;
+        Err(WireError::Kind { expected, found })
     }
 
     /// Checks that the sender in the header is the vehicle that owns the key.
@@ -169,10 +167,8 @@ impl Header {
         if self.stamp.cav == *expected {
             return Ok(());
         }
-        Err(WireError::Identity {
-            expected: expected.clone(),
-            found: self.stamp.cav.clone(),
-        })
+        let (expected, found) = (expected.clone(), self.stamp.cav.clone());
+        Err(WireError::Identity { expected, found })
     }
 }
 

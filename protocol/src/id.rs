@@ -56,10 +56,8 @@ fn check(
         });
     }
     if reserved.contains(&text) {
-        return Err(IdError::Reserved {
-            kind,
-            text: text.into(),
-        });
+        let text = text.into();
+        return Err(IdError::Reserved { kind, text });
     }
     Ok(text.into())
 }

@@ -54,6 +54,11 @@ pub enum KeyError {
 }
 
 impl KeyError {
+    pub(crate) fn id(text: &str, source: IdError) -> Self {
+        let text = shown(text);
+        Self::Id { text, source }
+    }
+
     pub(crate) fn unknown(text: &str) -> Self {
         Self::Unknown { text: shown(text) }
     }
@@ -86,11 +91,8 @@ impl Key {
 
     /// `v2v/<run>/alive/<role>/<cav>`.
     pub fn alive(run: &RunId, role: Role, cav: &CavId) -> Self {
-        Topic::Alive {
-            role,
-            cav: cav.clone(),
-        }
-        .in_run(run)
+        let cav = cav.clone();
+        Topic::Alive { role, cav }.in_run(run)
     }
 }
 
@@ -110,10 +112,7 @@ impl FromStr for Key {
             return Err(KeyError::unknown(text));
         };
         let topic = topic.parse()?;
-        let run = RunId::new(run).map_err(|source| KeyError::Id {
-            text: shown(text),
-            source,
-        })?;
+        let run = RunId::new(run).map_err(|source| KeyError::id(text, source))?;
         Ok(Self { run, topic })
     }
 }

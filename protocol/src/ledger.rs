@@ -40,10 +40,8 @@ impl Account {
 
     /// Account of a receiver, or of the link on the way to it.
     pub fn towards(topic: Topic, to: &ProcessId) -> Self {
-        Self {
-            topic,
-            to: Some(to.clone()),
-        }
+        let to = Some(to.clone());
+        Self { topic, to }
     }
 }
 

@@ -7,6 +7,7 @@ use bincode::config::{Configuration, Limit, LittleEndian, Varint};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use crate::checks::check_limit;
 use crate::text::excerpt;
 use crate::{Kind, Limits, Result, WireError};
 
@@ -22,19 +23,11 @@ const CONFIG: Configuration<LittleEndian, Varint, Limit<HARD_LIMIT>> =
 /// receiver.
 pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>) -> Result<u32> {
     let len = bincode::serde::encode_into_std_write(metadata, head, CONFIG).map_err(|error| {
-        WireError::Metadata {
-            kind,
-            detail: error.to_string(),
-        }
+        let detail = error.to_string();
+        WireError::Metadata { kind, detail }
     })?;
-    match u32::try_from(len) {
-        Ok(bytes) if len <= HARD_LIMIT => Ok(bytes),
-        _ => Err(WireError::Limit {
-            what: "metadata bytes",
-            max: HARD_LIMIT as u64,
-            found: len as u64,
-        }),
-    }
+    check_limit("metadata bytes", len as u64, HARD_LIMIT as u64)?;
+    Ok(u32::try_from(len).unwrap_or(u32::MAX))
 }
 
 /// Reads metadata that fill `bytes` completely.

@@ -35,8 +35,7 @@ impl PointCloud {
     /// Every n-th point, with n such that at most `most` points remain.
     pub fn decimate(&self, most: usize) -> Self {
         let step = self.len().div_ceil(most.max(1)).max(1);
-        Self {
-            xyzi: self.xyzi.iter().step_by(step).copied().collect(),
-        }
+        let xyzi = self.xyzi.iter().step_by(step).copied().collect();
+        Self { xyzi }
     }
 }

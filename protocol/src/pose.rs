@@ -98,10 +98,9 @@ impl Pose {
         }
         let norm = self.rotation_wxyz.iter().map(|q| q * q).sum::<f64>().sqrt();
         if (norm - 1.0).abs() > UNIT_TOLERANCE {
-            Err(InvalidPose::NotUnit(norm))
-        } else {
-            Ok(())
+            return Err(InvalidPose::NotUnit(norm));
         }
+        Ok(())
     }
 
     /// Heading: the angle from the target's x axis to the source's, seen from above, in radians.
@@ -151,10 +150,9 @@ impl From<Isometry3<f64>> for Pose {
 
 fn check_bounded(value: f64) -> Result<(), InvalidPose> {
     if value.abs() <= MAX_ABS_M {
-        Ok(())
-    } else {
-        Err(InvalidPose::NotFinite(value))
+        return Ok(());
     }
+    Err(InvalidPose::NotFinite(value))
 }
 
 #[cfg(test)]

@@ -67,7 +67,8 @@ impl Polygon {
         if self.bounds_overlap(other) <= 0.0 {
             return 0.0;
         }
-        let mut clipped = Clipped::from(&self.corners);
+        let mut clipped = Clipped::default();
+        self.corners.iter().for_each(|corner| clipped.push(*corner));
         for edge in 0..4 {
             clipped = clipped.keep_left_of(other.corners[edge], other.corners[(edge + 1) % 4]);
             if clipped.len < 3 {
@@ -103,21 +104,10 @@ impl Polygon {
 }
 
 /// A polygon during clipping.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Clipped {
     corners: [[f64; 2]; MAX_CORNERS],
     len: usize,
-}
-
-impl From<&Footprint> for Clipped {
-    fn from(corners: &Footprint) -> Self {
-        let mut clipped = Self {
-            corners: [[0.0; 2]; MAX_CORNERS],
-            len: 4,
-        };
-        clipped.corners[..4].copy_from_slice(corners);
-        clipped
-    }
 }
 
 impl Clipped {
@@ -126,10 +116,7 @@ impl Clipped {
     /// A cut is on the segment between its two corners whatever the rounding, so touching and coinciding edges cannot
     /// move a corner far away.
     fn keep_left_of(&self, a: [f64; 2], b: [f64; 2]) -> Self {
-        let mut kept = Self {
-            corners: [[0.0; 2]; MAX_CORNERS],
-            len: 0,
-        };
+        let mut kept = Self::default();
         let mut previous = self.corners[self.len - 1];
         let mut previous_side = side(previous, a, b);
         for &corner in &self.corners[..self.len] {

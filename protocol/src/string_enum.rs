@@ -7,7 +7,7 @@ macro_rules! named {
         $(#[$doc])*
         #[derive(
             Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize,
-            strum::Display, strum::IntoStaticStr,
+            strum::Display, strum::EnumString, strum::IntoStaticStr,
         )]
         pub enum $name {
             $($(#[$value_doc])* #[serde(rename = $text)] #[strum(serialize = $text)] $value,)+

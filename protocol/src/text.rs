@@ -1,16 +1,8 @@
 //! Text forms that several crates need: bytes as hexadecimal, and excerpts of foreign texts.
 
-use std::fmt::Write as _;
-
 /// Two lower-case hexadecimal digits per byte.
 pub fn hex(bytes: &[u8]) -> String {
-    bytes
-        .iter()
-        .fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
-            // Writing to a string cannot fail.
-            let _ = write!(text, "{byte:02x}");
-            text
-        })
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// At most `max_chars` characters from the beginning: a hostile text inside an error must not fill the log.

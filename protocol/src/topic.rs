@@ -98,10 +98,8 @@ impl Topic {
 
     /// The key of this topic in `run`.
     pub fn in_run(self, run: &RunId) -> Key {
-        Key {
-            run: run.clone(),
-            topic: self,
-        }
+        let run = run.clone();
+        Key { run, topic: self }
     }
 
     /// Kind of its messages; `None` if they do not have this wire format.
@@ -134,17 +132,11 @@ impl Topic {
     fn from_chunks(chunks: &[&str]) -> Option<Result<Self, IdError>> {
         Some(match chunks {
             ["truth"] => Ok(Self::Truth),
-            ["control", verb] => Ok(Self::Control(
-                Verb::ALL
-                    .into_iter()
-                    .find(|known| known.as_str() == *verb)?,
-            )),
+            ["control", verb] => Ok(Self::Control(verb.parse().ok()?)),
             ["ready", process] => ProcessId::new(process).map(Self::Ready),
             ["stats", process] => ProcessId::new(process).map(Self::Stats),
             ["alive", role, cav] => {
-                let role = Role::ALL
-                    .into_iter()
-                    .find(|known| known.as_str() == *role)?;
+                let role: Role = role.parse().ok()?;
                 CavId::new(cav).map(|cav| Self::Alive { role, cav })
             }
             ["rx", ego, cav, stream @ ..] => {
@@ -190,10 +182,7 @@ impl FromStr for Topic {
         let chunks: Vec<&str> = text.split('/').collect();
         Self::from_chunks(&chunks)
             .ok_or_else(|| KeyError::unknown(text))?
-            .map_err(|source| KeyError::Id {
-                text: shown(text),
-                source,
-            })
+            .map_err(|source| KeyError::id(text, source))
     }
 }
 

@@ -98,20 +98,17 @@ pub fn decode_header<'a>(pieces: impl IntoIterator<Item = &'a [u8]>) -> Result<H
     let mut left = bytes.as_mut_slice();
     for piece in pieces {
         let (filled, rest) = left.split_at_mut(piece.len().min(left.len()));
-        filled
-            .iter_mut()
-            .zip(piece)
-            .for_each(|(byte, from)| *byte = *from);
+        for (byte, from) in filled.iter_mut().zip(piece) {
+            *byte = *from;
+        }
         left = rest;
         if left.is_empty() {
             return Header::from_bytes(&bytes);
         }
     }
-    let found = (HEADER_LEN - left.len()) as u64;
-    Err(WireError::Truncated {
-        expected: HEADER_LEN as u64,
-        found,
-    })
+    let expected = HEADER_LEN as u64;
+    let found = expected - left.len() as u64;
+    Err(WireError::Truncated { expected, found })
 }
 
 /// Decodes a message of a known kind from its pieces.
@@ -123,10 +120,10 @@ pub fn decode<'a, M: Payload>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     limits: &Limits,
 ) -> Result<(Header, M), WireError> {
-    let (header, reader) = open(pieces, limits)?;
-    header.check_kind(M::KIND)?;
-    let message = decode_payload(&header, reader, limits)?;
-    Ok((header, message))
+    let mut opened = open(pieces, limits)?;
+    opened.header.check_kind(M::KIND)?;
+    let message = opened.read()?;
+    Ok((opened.header, message))
 }
 
 /// Decodes a message of any kind.
@@ -137,89 +134,69 @@ pub fn decode_any<'a>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     limits: &Limits,
 ) -> Result<(Header, Message), WireError> {
-    let (header, reader) = open(pieces, limits)?;
-    let message = Message::read(
-        header.kind,
-        Opened {
-            header: &header,
-            reader,
-            limits,
-        },
-    )?;
-    Ok((header, message))
+    let mut opened = open(pieces, limits)?;
+    let message = Message::read(opened.header.kind, &mut opened)?;
+    Ok((opened.header, message))
 }
 
-/// Payload behind a header that has been checked.
+/// A message whose header and lengths have been checked.
 struct Opened<'a, 'b> {
-    header: &'a Header,
-    reader: PayloadReader<'b>,
-    limits: &'a Limits,
+    header: Header,
+    /// Holds exactly as many bytes as the header announces.
+    reader: PayloadReader<'a>,
+    limits: &'b Limits,
 }
 
-impl MessageSource for Opened<'_, '_> {
+impl MessageSource for &mut Opened<'_, '_> {
+    /// Reads the payload. The checksum is reported first: all other errors of a corrupted message are consequences.
     fn read<M: Payload>(self) -> Result<M, WireError> {
-        decode_payload(self.header, self.reader, self.limits)
+        let parts = self.read_parts::<M>();
+        let (expected, found) = (self.reader.finish(), self.header.payload_crc);
+        if expected != found {
+            return Err(WireError::Checksum { expected, found });
+        }
+        let (metadata, body, valid) = parts?;
+        // A second pass over the body, to name the first bad value: only for messages that are refused.
+        if !valid {
+            check_body(&body, self.limits.max_abs_value)?;
+        }
+        M::from_parts(metadata, body)
+    }
+}
+
+impl Opened<'_, '_> {
+    fn read_parts<M: Payload>(&mut self) -> Result<(M::Metadata, Body, bool), WireError> {
+        let len = self.header.metadata_len as usize;
+        let metadata: M::Metadata = metadata::decode(M::KIND, &self.reader.read_bytes(len))?;
+        let shape = M::check(&metadata, self.limits)?;
+        let most = self.limits.max_abs_value;
+        let (body, valid) = self.reader.read_body(self.header.body_len, shape, most)?;
+        Ok((metadata, body, valid))
     }
 }
 
 /// Reads the header and compares all lengths with each other and with the limits.
-fn open<'a>(
+fn open<'a, 'b>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
-    limits: &Limits,
-) -> Result<(Header, PayloadReader<'a>), WireError> {
+    limits: &'b Limits,
+) -> Result<Opened<'a, 'b>, WireError> {
     let pieces: Vec<&[u8]> = pieces.into_iter().collect();
     let found = pieces
         .iter()
         .fold(0u64, |sum, piece| sum + piece.len() as u64);
     let header = decode_header(pieces.iter().copied())?;
-    let Header {
-        metadata_len,
-        body_len,
-        ..
-    } = header;
     let max = limits.max_metadata_bytes.min(Limits::HARD_METADATA_BYTES);
-    check_limit("metadata bytes", metadata_len.into(), max.into())?;
-    check_limit("body bytes", body_len, limits.max_body_bytes)?;
-    let expected = body_len.saturating_add(HEADER_LEN as u64 + u64::from(metadata_len));
+    check_limit("metadata bytes", header.metadata_len.into(), max.into())?;
+    check_limit("body bytes", header.body_len, limits.max_body_bytes)?;
+    let before_body = HEADER_LEN as u64 + u64::from(header.metadata_len);
+    let expected = header.body_len.saturating_add(before_body);
     match found {
         _ if found < expected => Err(WireError::Truncated { expected, found }),
         _ if found > expected => Err(WireError::TrailingBytes { expected, found }),
-        _ => Ok((header, PayloadReader::new(pieces, HEADER_LEN))),
+        _ => Ok(Opened {
+            header,
+            reader: PayloadReader::new(pieces, HEADER_LEN),
+            limits,
+        }),
     }
-}
-
-/// Reads the payload; `reader` holds exactly as many bytes as the header announces.
-///
-/// The checksum is reported first: all other errors of a corrupted message are consequences.
-fn decode_payload<M: Payload>(
-    header: &Header,
-    mut reader: PayloadReader<'_>,
-    limits: &Limits,
-) -> Result<M, WireError> {
-    let parts = read_parts::<M>(header, &mut reader, limits);
-    let expected = reader.finish();
-    if expected != header.payload_crc {
-        return Err(WireError::Checksum {
-            expected,
-            found: header.payload_crc,
-        });
-    }
-    let (metadata, body, valid) = parts?;
-    // A second pass over the body, to name the first bad value: only for messages that are refused.
-    if !valid {
-        check_body(&body, limits.max_abs_value)?;
-    }
-    M::from_parts(metadata, body)
-}
-
-fn read_parts<M: Payload>(
-    header: &Header,
-    reader: &mut PayloadReader<'_>,
-    limits: &Limits,
-) -> Result<(M::Metadata, Body, bool), WireError> {
-    let metadata: M::Metadata =
-        metadata::decode(M::KIND, &reader.read_bytes(header.metadata_len as usize))?;
-    let shape = M::check(&metadata, limits)?;
-    let (body, valid) = reader.read_body(header.body_len, shape, limits.max_abs_value)?;
-    Ok((metadata, body, valid))
 }

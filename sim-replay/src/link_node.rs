@@ -16,7 +16,7 @@ use bus::{
     Arrival, Bus, BusError, Event, Inbox, InboxLimits, Membership, Publisher, PublisherOptions,
     Subscription,
 };
-use link::{Delivery, LinkEmulator, Outcome, Packet};
+use link::{Delivery, LinkEmulator, Packet};
 use support::nanos;
 
 /// Messages of one topic that may wait for processing, and that may wait for forwarding.
@@ -95,22 +95,17 @@ pub fn run(
     let mut node = Node::open(bus, emulator, options, stop)?;
     let presence = bus.announce(Role::Link)?;
     node.carry(stop)?;
-    let Node {
-        vehicles,
-        kept,
-        mut report,
-        ..
-    } = node;
-    report.under_way = kept.len() as u64;
-    let ages = kept.values().map(|arrival| arrival.at.elapsed());
+    let mut report = node.report;
+    report.under_way = node.kept.len() as u64;
+    let ages = node.kept.values().map(|arrival| arrival.at.elapsed());
     let longest = ages.max().unwrap_or_default();
     report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
     // Every message is accounted for: what the end of the run cuts off counts as stale.
-    for topic in kept.values().map(|arrival| &arrival.topic) {
-        bus.stats().dropped(topic, DropReason::Stale);
+    for arrival in node.kept.values() {
+        bus.stats().dropped(&arrival.topic, DropReason::Stale);
     }
+    let vehicles = node.vehicles.into_values();
     vehicles
-        .into_values()
         .flat_map(|vehicle| vehicle.publishers.into_values())
         .for_each(Publisher::finish);
     presence.withdraw()?;
@@ -158,11 +153,8 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         // One topic more per vehicle than streams: its GNSS.
-        let inbox = bus.limited_inbox(
-            PLACES,
-            MAX_VEHICLES * (options.streams.len() + 1),
-            options.inbox,
-        );
+        let topics = MAX_VEHICLES * (options.streams.len() + 1);
+        let inbox = bus.limited_inbox(PLACES, topics, options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
@@ -249,12 +241,12 @@ impl<'a> Node<'a> {
     /// Adds a new vehicle; if all slots are taken, it replaces one that has left.
     fn add(&mut self, cav: CavId) -> Result<(), BusError> {
         if self.vehicles.len() >= MAX_VEHICLES {
-            let Some(gone) = place_to_free(&self.vehicles, &self.options.ego, |cav: &CavId| {
-                self.kept
-                    .values()
-                    .any(|arrival| arrival.header.stamp.cav == *cav)
-            })
-            .cloned() else {
+            let kept = self.kept.values().map(|arrival| &arrival.header.stamp.cav);
+            let senders: BTreeSet<&CavId> = kept.collect();
+            let gone = place_to_free(&self.vehicles, &self.options.ego, |cav| {
+                senders.contains(cav)
+            });
+            let Some(gone) = gone.cloned() else {
                 self.reject(cav);
                 return Ok(());
             };
@@ -353,11 +345,10 @@ impl<'a> Node<'a> {
     /// Forwards the messages that have arrived by now.
     fn settle(&mut self) {
         let Some(began) = self.began else { return };
-        for Outcome {
-            packet, delivery, ..
-        } in self.emulator.advance(nanos::between(began, Instant::now()))
-        {
-            match delivery {
+        let now_nanos = nanos::between(began, Instant::now());
+        for outcome in self.emulator.advance(now_nanos) {
+            let packet = outcome.packet;
+            match outcome.delivery {
                 Delivery::Dropped(reason) => {
                     if let Some(lost) = self.release(packet.id) {
                         self.lose(&lost, reason);
@@ -372,10 +363,8 @@ impl<'a> Node<'a> {
     }
 
     fn forward(&mut self, packet: &Packet, is_copy: bool, is_repeated: bool) {
-        let publisher = self
-            .vehicles
-            .get(&packet.from)
-            .and_then(|vehicle| vehicle.publishers.get(&packet.stream));
+        let vehicle = self.vehicles.get(&packet.from);
+        let publisher = vehicle.and_then(|vehicle| vehicle.publishers.get(&packet.stream));
         let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&packet.id)) else {
             return;
         };
@@ -385,10 +374,8 @@ impl<'a> Node<'a> {
             scene_nanos => {
                 // A wrong clock of the senders drifts from the first message on.
                 let began_nanos = *self.began_nanos.get_or_insert(scene_nanos);
-                publisher.relay_as(
-                    arrival,
-                    self.emulator.clock().shown_since(began_nanos, scene_nanos),
-                );
+                let clock = self.emulator.clock();
+                publisher.relay_as(arrival, clock.shown_since(began_nanos, scene_nanos));
             }
         }
         if is_copy {
@@ -418,11 +405,10 @@ impl<'a> Node<'a> {
 
     fn next_moment(&self) -> Instant {
         let soon = Instant::now() + MEMBERSHIP_PERIOD;
-        let next = self
-            .began
-            .zip(self.emulator.next_nanos())
-            .map(|(began, nanos)| began + Duration::from_nanos(nanos));
-        next.map_or(soon, |next| next.min(soon))
+        let next = self.began.zip(self.emulator.next_nanos());
+        next.map_or(soon, |(began, nanos)| {
+            soon.min(began + Duration::from_nanos(nanos))
+        })
     }
 }
 

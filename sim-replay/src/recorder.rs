@@ -224,10 +224,8 @@ impl Recorder<'_> {
             return;
         }
         self.taken += 1;
-        self.span = Some((
-            self.span.map_or(raw.arrived_nanos, |(first, _)| first),
-            raw.arrived_nanos,
-        ));
+        let first_nanos = self.span.map_or(raw.arrived_nanos, |(first, _)| first);
+        self.span = Some((first_nanos, raw.arrived_nanos));
         self.attempt(|writer| writer.write(&raw.key, raw.arrived_nanos, &raw.bytes()));
     }
 

@@ -13,10 +13,9 @@ pub(super) enum Scale {
 
 impl Scale {
     pub(super) fn new([low, high]: [f64; 2], is_logarithmic: bool) -> Self {
-        if is_logarithmic {
-            Self::Logarithmic((low..high).log_scale().into())
-        } else {
-            Self::Linear((low..high).into())
+        match is_logarithmic {
+            true => Self::Logarithmic((low..high).log_scale().into()),
+            false => Self::Linear((low..high).into()),
         }
     }
 }

@@ -154,14 +154,8 @@ impl CovarianceScale {
 
     /// The scaled covariance.
     pub(crate) fn applied(&self, covariance: &[[f64; 6]; 6]) -> [[f64; 6]; 6] {
-        let Self {
-            planar,
-            height,
-            tilt,
-            yaw,
-            ..
-        } = *self;
-        let factors = [planar, planar, height, tilt, tilt, yaw];
+        let (planar, tilt) = (self.planar, self.tilt);
+        let factors = [planar, planar, self.height, tilt, tilt, self.yaw];
         scaled(covariance, &Vector6::from(factors))
     }
 }
@@ -189,10 +183,9 @@ fn limit(values: impl Iterator<Item = f64>, share: f64) -> Option<f64> {
 pub(crate) fn scaled(covariance: &[[f64; 6]; 6], factors: &Vector6<f64>) -> [[f64; 6]; 6] {
     let scale = Matrix6::from_diagonal(factors);
     let matrix = Matrix6::from_fn(|row, column| covariance[row][column]);
-    let scaled = scale * matrix * scale;
-    std::array::from_fn(|row| {
-        std::array::from_fn(|column| scaled[(row, column)].clamp(-MAX_VARIANCE, MAX_VARIANCE))
-    })
+    let scaled = (scale * matrix * scale).transpose();
+    let bounded = scaled.map(|entry| entry.clamp(-MAX_VARIANCE, MAX_VARIANCE));
+    bounded.data.0
 }
 
 fn planar(covariance: &[[f64; 6]; 6]) -> Matrix2<f64> {

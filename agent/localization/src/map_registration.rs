@@ -69,11 +69,13 @@ impl MapRegistration {
         }
     }
 
-    /// The registration from `start`, if it constrains the pose and stays near.
-    fn fit(&self, source: &IcpSource, start: &Isometry3<f64>) -> Option<IcpFit> {
+    /// The pose of the registration from `start`, if it constrains the pose, stays near and the map confirms it.
+    fn registered(&self, source: &IcpSource, start: &Isometry3<f64>) -> Option<FoundPose> {
         let fit = register(source, self.map.target(), start, &self.config).ok()?;
         let moved = fit.target_from_source.translation.vector - start.translation.vector;
-        (moved.norm() <= MOST_MOVED_M).then_some(fit)
+        let is_near = moved.norm() <= MOST_MOVED_M;
+        (is_near && fit.overlap_above_ground >= CONFIRMED)
+            .then(|| registered(&fit, self.map.covariance_scale()))
     }
 }
 
@@ -82,10 +84,9 @@ impl Localize for MapRegistration {
         let mut times = stopwatch();
         let source = IcpSource::of_sweep(&sweep.cloud.xyzi, &self.config);
         // Step: near the prediction. Where the map confirms it, the networks are not needed.
-        let near = sweep.predicted.and_then(|start| self.fit(&source, &start));
+        let near = (sweep.predicted).and_then(|start| self.registered(&source, &start));
         let registering = times.lap(REGISTER);
-        if let Some(fit) = near.filter(|fit| fit.overlap_above_ground >= CONFIRMED) {
-            let found = registered(&fit, self.map.covariance_scale());
+        if let Some(found) = near {
             return Ok(Localization::of_found(found, times));
         }
         let mut localization = self.localizer.localize(sweep)?;
@@ -93,9 +94,7 @@ impl Localize for MapRegistration {
         localization.times.add(REGISTER, registering);
         let published = localization.found.filter(|found| !found.is_rejected);
         if let Some(found) = published {
-            let fit = self.fit(&source, &found.world_from_sensor);
-            let confirmed = fit.filter(|fit| fit.overlap_above_ground >= CONFIRMED);
-            let registered = confirmed.map(|fit| registered(&fit, self.map.covariance_scale()));
+            let registered = self.registered(&source, &found.world_from_sensor);
             localization = judged(localization, &found, registered);
             localization.times.lap(REGISTER);
         }
@@ -139,24 +138,19 @@ fn judged(
 /// The pose of a registration. Its confidence is that of the expected squared error (Eq. 6).
 fn registered(fit: &IcpFit, covariance_scale: Option<CovarianceScale>) -> FoundPose {
     let [position, rotation] = LEAST_STD.map(|std: f64| std * std);
-    let least = Matrix6::from_diagonal(
-        &[position, position, position, rotation, rotation, rotation].into(),
-    );
+    let least = [position, position, position, rotation, rotation, rotation];
+    let least = Matrix6::from_diagonal(&least.into());
     // Added, not the larger entry of each: the sum of two covariances is a covariance.
     let covariance = fit.covariance * (STD_FACTOR * STD_FACTOR) + least;
     FoundPose {
         world_from_sensor: fit.target_from_source,
         evidence: PoseEvidence::none(),
-        cell_covariance: rows(&covariance),
+        cell_covariance: covariance.transpose().data.0,
         is_registered: true,
         covariance_scale,
         sigma: 1.0 / (1.0 + covariance[(0, 0)] + covariance[(1, 1)]),
         is_rejected: false,
     }
-}
-
-fn rows(matrix: &Matrix6<f64>) -> [[f64; 6]; 6] {
-    std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
 }
 
 #[cfg(test)]
@@ -206,7 +200,7 @@ mod tests {
         let found = FoundPose {
             world_from_sensor: start,
             evidence: PoseEvidence::none(),
-            cell_covariance: rows(&Matrix6::identity()),
+            cell_covariance: Matrix6::identity().data.0,
             is_registered: false,
             covariance_scale: None,
             sigma,

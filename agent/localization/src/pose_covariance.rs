@@ -26,18 +26,14 @@ pub fn unscaled_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
     if found.is_registered {
         return found.cell_covariance;
     }
-    let PoseMeasurement {
-        position_std_m,
-        yaw_std_rad,
-        ..
-    } = PoseMeasurement::new(0, found);
+    let measured = PoseMeasurement::new(0, found);
     let shape = &found.cell_covariance;
-    let position = f64::midpoint(shape[0][0], shape[1][1]);
-    let stds = [(position_std_m, position), (yaw_std_rad, shape[5][5])];
+    let variance_m2 = f64::midpoint(shape[0][0], shape[1][1]);
+    let position = (measured.position_std_m, variance_m2);
+    let rotation = (measured.yaw_std_rad, shape[5][5]);
     // Cells that constrain nothing leave no shape to scale: their variance stays the largest.
-    let [position, rotation] = stds.map(|(std, variance)| {
-        let is_constrained = variance > 0.0 && variance < MAX_VARIANCE;
-        if is_constrained {
+    let [position, rotation] = [position, rotation].map(|(std, variance)| {
+        if variance > 0.0 && variance < MAX_VARIANCE {
             std / variance.sqrt()
         } else {
             1.0

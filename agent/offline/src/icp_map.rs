@@ -114,13 +114,12 @@ pub fn read_map(
         if sweeps == 0 {
             let folder = folder.as_ref().display();
             let reasons = left_out.reasons();
+            let because = match reasons.is_empty() {
+                true => "",
+                false => "; left out: ",
+            };
             return Err(Error::Input(format!(
-                "{folder}: no sweep has a true pose to put it on the map with{}{reasons}",
-                if reasons.is_empty() {
-                    ""
-                } else {
-                    "; left out: "
-                }
+                "{folder}: no sweep has a true pose to put it on the map with{because}{reasons}"
             )));
         }
     }

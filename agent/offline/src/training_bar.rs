@@ -141,10 +141,9 @@ impl TrainingBar {
 
     /// Prints a line that stays.
     pub fn print_line(&self, text: &str) {
-        if self.is_watched {
-            self.bar.println(text)
-        } else {
-            output::note(text)
+        match self.is_watched {
+            true => self.bar.println(text),
+            false => output::note(text),
         }
     }
 
@@ -182,10 +181,9 @@ fn estimate(
 
 /// A duration in readable units.
 fn minutes(seconds: f64) -> String {
-    if seconds < 90.0 {
-        format!("{seconds:.0} s")
-    } else {
-        format!("{:.0} min", seconds / 60.0)
+    match seconds < 90.0 {
+        true => format!("{seconds:.0} s"),
+        false => format!("{:.0} min", seconds / 60.0),
     }
 }
 

@@ -22,13 +22,11 @@ impl Inference {
 
     /// On a device, in a number format; integers are for the CPU only.
     pub fn new(device: Device, precision: InferencePrecision) -> Self {
-        match device {
-            Device::Cpu => Self { device, precision },
-            _ => Self {
-                device,
-                precision: InferencePrecision::Float,
-            },
-        }
+        let precision = match device {
+            Device::Cpu => precision,
+            _ => InferencePrecision::Float,
+        };
+        Self { device, precision }
     }
 }
 

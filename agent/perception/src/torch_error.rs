@@ -4,10 +4,6 @@ use tch::TchError;
 
 /// First line of the message of an error.
 pub fn first_line(error: &TchError) -> String {
-    error
-        .to_string()
-        .lines()
-        .next()
-        .unwrap_or_default()
-        .to_owned()
+    let text = error.to_string();
+    text.lines().next().unwrap_or_default().to_owned()
 }

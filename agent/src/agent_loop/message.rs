@@ -68,12 +68,8 @@ impl MessageEncoder {
         stamp: &Stamp,
         turn: Option<&Turn>,
     ) -> Result<(Encoded, Option<RateChoice>), WireError> {
-        let Unsent {
-            capture_nanos,
-            content,
-            ..
-        } = *message;
-        match content {
+        let capture_nanos = message.capture_nanos;
+        match message.content {
             Content::Map {
                 pose,
                 features,

@@ -368,18 +368,16 @@ impl AgentLoop {
 
     /// Second step: the perception.
     fn perceive(&mut self, paired: PairedSweep<Sweep>, pose: PoseEstimate, sweep: EncodedSweep) {
+        let mut sweep = sweep;
         let capture_nanos = paired.capture_nanos;
-        let cloud = &paired.sweep.cloud;
+        let (cloud, arrived_nanos) = (&paired.sweep.cloud, paired.sweep.arrived_nanos);
         // Without a network the sweep itself is all there is to send.
-        let perceived = if self.options.needs_network() {
-            let perceived = self.agent.perceive_encoded(cloud, sweep);
-            perceived.map(|(perception, sweep)| (Some(perception), sweep))
-        } else {
-            Ok((None, sweep))
+        let perceived = match self.options.needs_network() {
+            true => self.agent.perceive_encoded(cloud, &mut sweep).map(Some),
+            false => Ok(None),
         };
-        let arrived_nanos = paired.sweep.arrived_nanos;
         match perceived {
-            Ok((perception, sweep)) => {
+            Ok(perception) => {
                 self.report.sweeps += 1;
                 let mut times = vec![StageTiming::new("agent", sweep.elapsed())];
                 if let Some(perception) = perception {
@@ -388,7 +386,7 @@ impl AgentLoop {
                 }
                 self.outputs.push(Output::Timed(times));
                 if self.options.publish.contains(&Stream::Points) {
-                    let points = self.agent.share_points(&paired.sweep.cloud);
+                    let points = self.agent.share_points(cloud);
                     let content = Content::Fixed(Message::Points(Points { pose, points }));
                     self.publish(Stream::Points, capture_nanos, content);
                 }
@@ -419,23 +417,17 @@ impl AgentLoop {
         pose: PoseEstimate,
         perception: Perception,
     ) {
-        let Perception {
-            features,
-            confidence,
-            detections,
-            ..
-        } = perception;
         // Boxes first: they are what an ego falls back on while a large map is on its way.
         if self.options.publish.contains(&Stream::Boxes) {
-            let boxes = self.agent.boxes(capture_nanos, pose, detections);
+            let boxes = self.agent.boxes(capture_nanos, pose, perception.detections);
             let content = Content::Fixed(Message::Boxes(boxes));
             self.publish(Stream::Boxes, capture_nanos, content);
         }
         if self.options.publish.contains(&Stream::Bev) {
             let content = Content::Map {
                 pose,
-                features,
-                confidence,
+                features: perception.features,
+                confidence: perception.confidence,
             };
             self.publish(Stream::Bev, capture_nanos, content);
         }

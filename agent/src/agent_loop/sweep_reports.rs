@@ -89,13 +89,8 @@ impl SweepReports {
             arrived_nanos,
         });
         let sweeps = sweeps.collect();
-        let descriptor = self.description.clone()?;
-        Some((
-            newest,
-            Descriptor {
-                sweeps,
-                ..descriptor
-            },
-        ))
+        let mut descriptor = self.description.clone()?;
+        descriptor.sweeps = sweeps;
+        Some((newest, descriptor))
     }
 }

@@ -89,12 +89,7 @@ impl Replay {
 
     /// Publishes a message as the run did, at the same turn and under the same stamp.
     fn publish(&mut self, recorded: &Published) -> anyhow::Result<Published> {
-        let Published {
-            stream,
-            turn,
-            ref stamp,
-            ..
-        } = *recorded;
+        let (stream, turn, stamp) = (recorded.stream, recorded.turn, &recorded.stamp);
         let message = self.unsent.remove(&(stream, turn.number));
         let message = message.with_context(|| {
             let number = turn.number;

@@ -29,13 +29,12 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let config = args.config.validated()?;
     let agent = agent(&config)?;
     let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config
-        .bus
-        .join(&stop, &config.run, Role::Agent, &config.cav)?;
+    let (run, cav) = (&config.run, &config.cav);
+    let bus = config.bus.join(&stop, run, Role::Agent, cav)?;
     if config.gives_poses_only() {
-        tracing::info!(cav = %config.cav, "ready: poses only");
+        tracing::info!(%cav, "ready: poses only");
     } else {
-        tracing::info!(cav = %config.cav, weights = %config.models.weights.display(), "ready");
+        tracing::info!(%cav, weights = %config.models.weights.display(), "ready");
     }
     let report = node::run(&bus, agent, &config.options(), &stop)?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {

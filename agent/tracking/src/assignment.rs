@@ -13,11 +13,10 @@ pub fn of_lowest_cost(costs: &DMatrix<f64>) -> Vec<(usize, usize)> {
     if costs.nrows() <= costs.ncols() {
         return Solver::new(costs).solve();
     }
-    let mut pairs: Vec<(usize, usize)> = Solver::new(&costs.transpose())
-        .solve()
-        .into_iter()
-        .map(|(column, row)| (row, column))
-        .collect();
+    let mut pairs = Solver::new(&costs.transpose()).solve();
+    for (column, row) in &mut pairs {
+        std::mem::swap(column, row);
+    }
     pairs.sort_unstable();
     pairs
 }
@@ -73,10 +72,9 @@ impl<'a> Solver<'a> {
         for row in 0..self.costs.nrows() {
             self.connect(row);
         }
-        let columns = self.column_of.into_iter().enumerate();
-        columns
-            .filter_map(|(row, column)| Some((row, column?)))
-            .collect()
+        let pairs = { self.column_of.into_iter().enumerate() }
+            .filter_map(|(row, column)| Some((row, column?)));
+        pairs.collect()
     }
 
     /// Connects a free row, with other columns for other rows where that is cheaper.

@@ -34,9 +34,8 @@ impl ConstantVelocity {
     pub fn at(position_m: Vector2<f64>, noise_m2: &Matrix2<f64>, sigma_mps: f64) -> Self {
         let mut covariance = Matrix4::zeros();
         covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(noise_m2);
-        covariance
-            .fixed_view_mut::<2, 2>(2, 2)
-            .fill_diagonal(sigma_mps * sigma_mps);
+        let mut of_velocity = covariance.fixed_view_mut::<2, 2>(2, 2);
+        of_velocity.fill_diagonal(sigma_mps * sigma_mps);
         Self {
             state: Vector4::new(position_m.x, position_m.y, 0.0, 0.0),
             covariance,

@@ -29,15 +29,12 @@ impl Measurement {
         pose_covariance: Option<&PlanarCovariance>,
         config: &TrackerConfig,
     ) -> Option<Self> {
-        let Box3d {
-            center_m,
-            size_m,
-            heading_rad,
-        } = detection.box3d;
-        let mut numbers = center_m.iter().chain(&size_m).chain([&heading_rad]);
+        let found = &detection.box3d;
+        let lengths = found.center_m.iter().chain(&found.size_m);
+        let mut numbers = lengths.chain([&found.heading_rad]);
         let score = f64::from(detection.score);
         let is_usable = numbers.all(|number| number.abs() <= MAX_ABS)
-            && size_m.iter().all(|size| *size >= 0.0)
+            && found.size_m.iter().all(|size| *size >= 0.0)
             && (0.0..=1.0).contains(&score);
         if !is_usable {
             return None;
@@ -64,14 +61,9 @@ impl Measurement {
 
 /// Covariance that the pose of the ego adds to a position at `offset_m` from it: its own, and that of its yaw across
 /// the line of sight. Numbers that are no covariance add nothing.
-fn of_pose(covariance: &PlanarCovariance, offset_m: Vector2<f64>) -> Matrix2<f64> {
-    let PlanarCovariance {
-        xx_m2,
-        xy_m2,
-        yy_m2,
-        yaw_rad2,
-    } = *covariance;
-    let [xx, xy, yy, yaw] = [xx_m2, xy_m2, yy_m2, yaw_rad2].map(f64::from);
+fn of_pose(pose: &PlanarCovariance, offset_m: Vector2<f64>) -> Matrix2<f64> {
+    let numbers = [pose.xx_m2, pose.xy_m2, pose.yy_m2, pose.yaw_rad2];
+    let [xx, xy, yy, yaw] = numbers.map(f64::from);
     // The tolerance covers the rounding of numbers in single precision.
     let is_covariance = xx >= 0.0 && yy >= 0.0 && yaw >= 0.0 && xy * xy <= xx * yy * (1.0 + 1e-4);
     if !is_covariance || !(xx + yy + yaw).is_finite() {

@@ -207,11 +207,8 @@ impl Tracker {
     }
 
     fn reported(&self, ego_from_world: &Isometry3<f64>) -> Vec<Track> {
-        let reported = self.tracks.iter();
-        reported
-            .filter(|track| track.is_reported(&self.config))
-            .map(|track| track.report(ego_from_world))
-            .collect()
+        let reported = { self.tracks.iter() }.filter(|track| track.is_reported(&self.config));
+        reported.map(|track| track.report(ego_from_world)).collect()
     }
 
     /// Time since the frame before, seconds; 0 for the first.
@@ -236,16 +233,13 @@ impl Tracker {
     /// distance and the logarithm of its covariance, a track without detection and a detection without track what these
     /// are worth together.
     fn assign(&mut self, measurements: &[Measurement]) -> Vec<Option<usize>> {
-        let innovations: Vec<Vec<Option<Innovation>>> = self
-            .tracks
-            .iter()
-            .map(|track| {
-                let innovations = measurements
-                    .iter()
-                    .map(|measured| track.innovation(measured));
-                innovations.collect()
-            })
-            .collect();
+        let innovations = self.tracks.iter().map(|track| {
+            let of_track = measurements
+                .iter()
+                .map(|measured| track.innovation(measured));
+            of_track.collect()
+        });
+        let innovations: Vec<Vec<Option<Innovation>>> = innovations.collect();
         let found = self.config.detection_probability;
         // Below this cost a pair is likelier than a miss and a new object or false alarm together.
         let unpaired = 2.0
@@ -262,11 +256,8 @@ impl Tracker {
         });
         let mut owners = vec![None; measurements.len()];
         for (track, column) in pairs {
-            let Some(measured) = measurements.get(column) else {
-                continue;
-            };
-            if let Some(innovation) = &innovations[track][column] {
-                self.tracks[track].hit(innovation, measured);
+            if let Some(Some(innovation)) = innovations[track].get(column) {
+                self.tracks[track].hit(innovation, &measurements[column]);
                 owners[column] = Some(track);
             }
         }
@@ -286,17 +277,11 @@ impl Tracker {
     }
 
     fn begin(&mut self, measurements: &[Measurement], owners: &[Option<usize>]) {
-        let free = measurements.iter().zip(owners);
-        let mut new: Vec<Measurement> = free
-            .filter(|(measured, owner)| {
-                owner.is_none() && measured.score >= self.config.birth_score
-            })
-            .map(|(measured, _)| *measured)
-            .collect();
-        let (found, room) = (
-            new.len(),
-            self.config.max_tracks.saturating_sub(self.tracks.len()),
-        );
+        let free = { measurements.iter().zip(owners) }.filter(|(_, owner)| owner.is_none());
+        let mut new: Vec<Measurement> = free.map(|(measured, _)| *measured).collect();
+        new.retain(|measured| measured.score >= self.config.birth_score);
+        let found = new.len();
+        let room = self.config.max_tracks.saturating_sub(self.tracks.len());
         keep_best(&mut new, room);
         self.left_out += (found - new.len()) as u64;
         for measured in &new {

@@ -2,6 +2,7 @@
 
 mod processes;
 mod routes;
+mod setup;
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -78,11 +79,8 @@ impl Fleet {
     /// An error that names what the scene or the weights lack.
     pub fn plan(scenario: &Scenario) -> Result<Self> {
         let mut scenario = scenario.clone();
-        scenario.models.weights = weights_of(
-            &scenario.models.weights,
-            scenario.method,
-            scenario.sends_boxes(),
-        )?;
+        let weights = &scenario.models.weights;
+        scenario.models.weights = weights_of(weights, scenario.method, scenario.sends_boxes())?;
         let weights = &scenario.models.weights;
         let detector = { Weights::load(weights) }
             .and_then(|weights| weights.detector_config())
@@ -188,10 +186,8 @@ impl Fleet {
 
     /// Name of the pose source that all vehicles share, or `mixed`.
     pub fn pose_source(&self) -> &'static str {
-        let mut names = self
-            .agents
-            .iter()
-            .map(|cav| self.scenario.settings_of(cav).pose.name());
+        let settings = { self.agents.iter() }.map(|cav| self.scenario.settings_of(cav));
+        let mut names = settings.map(|settings| settings.pose.name());
         let first = names.next().unwrap_or("recorded");
         if names.all(|name| name == first) {
             first
@@ -215,9 +211,8 @@ impl Fleet {
     /// [`KeyError`] when they cannot be made.
     pub fn keys(&self, folder: &RunFolder) -> Result<Option<RunKeys>, KeyError> {
         let security = self.scenario.security.as_ref();
-        security
-            .map(|security| RunKeys::of(security, self.parties(), folder.path()))
-            .transpose()
+        let keys = security.map(|of| RunKeys::of(of, self.parties(), folder.path()));
+        keys.transpose()
     }
 
     /// Digests of the programs, and of all files that the run reads.
@@ -235,9 +230,7 @@ impl Fleet {
         let vehicles = self.agents.iter().map(|cav| self.settings_of(cav));
         let vehicles: Vec<_> = vehicles.collect();
         // Opened before, when the run was planned.
-        let link = link
-            .as_ref()
-            .and_then(|link| LinkConfig::open(&link.model).ok());
+        let link = { link.as_ref() }.and_then(|link| LinkConfig::open(&link.model).ok());
         let link = link.as_ref().map(|(link, folder)| (link, folder.as_path()));
         let files = files_of(*method, models.weights.clone(), &vehicles, link);
         // Only the frames and vehicles of the run are hashed: no others are read.
@@ -253,10 +246,8 @@ impl Fleet {
 
     /// Executables of a fleet.
     pub fn programs(programs: &Path) -> Vec<PathBuf> {
-        ["agent", "ego-fuser", "sim-replay", RUNNER]
-            .iter()
-            .map(|name| programs.join(name))
-            .collect()
+        let names = ["agent", "ego-fuser", "sim-replay", RUNNER];
+        names.map(|name| programs.join(name)).into()
     }
 
     fn neighbours(&self) -> impl Iterator<Item = &CavId> {

@@ -11,7 +11,7 @@ mod watched_run;
 use std::path::Path;
 
 use anyhow::Context;
-use bus::{Bus, BusOptions, Endpoint, Identity, malloc_settings, process_id};
+use bus::{BusOptions, Endpoint, Identity, malloc_settings, process_id};
 use protocol::{CavId, Role, RunId};
 use support::cli::Outcome;
 use support::sibling_program::Sibling;
@@ -107,14 +107,7 @@ fn client(
     let identity = Identity::new(run.clone(), process_id(role, &cav), cav);
     let mut options = BusOptions::client(router.clone());
     if let Some(folder) = keys {
-        let credentials = credentials(folder, identity.process.as_str())?;
-        options = options.with_credentials(credentials);
+        options = options.with_credentials(credentials(folder, identity.process.as_str())?);
     }
     Ok((identity, options))
-}
-
-/// A connection to the router of a run as a viewer.
-fn viewer_bus(run: &RunId, router: &Endpoint, keys: Option<&Path>) -> anyhow::Result<Bus> {
-    let (identity, options) = client(run, Role::Viewer, router, keys)?;
-    Ok(Bus::join(&options, identity)?)
 }

@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use crate::operate::status::RunStatus;
-use crate::report::{Comparison, RunReport, TrackReport, TrackTable};
+use crate::report::{Comparison, ReportError, RunReport, TrackReport, TrackTable};
+use serde::Serialize;
 use support::output;
 
 use support::cli::{BadInput, Outcome};
@@ -31,47 +32,40 @@ impl Arguments {
         let newest = self.named.is_empty().then_some(None);
         let runs = self.named.iter().cloned().map(Some).chain(newest);
         let folders = runs.map(|run| RunStatus::folder(run, &self.runs).map_err(BadInput::of));
-        match folders.collect::<Result<Vec<_>, _>>()?.as_slice() {
-            folders if self.tracks => self.track(folders),
-            [folder] => self.print(folder),
-            several => self.compare(several),
-        }
-    }
-
-    fn print(&self, folder: &Path) -> anyhow::Result<Outcome> {
-        let report = RunReport::read(folder).map_err(BadInput::of)?;
-        if self.json {
-            output::line(serde_json::to_string_pretty(&report)?)?;
-        } else {
-            output::text(format_args!(
-                "run       {}, {} with {} poses, {} clock\n{report}",
-                report.run, report.method, report.pose_source, report.clock
-            ))?;
-        }
-        Ok(Outcome::Done)
-    }
-
-    fn track(&self, folders: &[PathBuf]) -> anyhow::Result<Outcome> {
-        let reports =
-            { folders.iter() }.map(|folder| TrackReport::read(folder).map_err(BadInput::of));
-        match reports.collect::<Result<Vec<_>, _>>()?.as_slice() {
-            [report] if self.json => output::line(serde_json::to_string_pretty(report)?)?,
-            reports if self.json => output::line(serde_json::to_string_pretty(reports)?)?,
-            reports => output::text(TrackTable(reports))?,
+        let folders = folders.collect::<Result<Vec<_>, _>>()?;
+        match (self.tracks, self.json, &folders[..]) {
+            (true, true, folders) => print_json(&read(folders, TrackReport::read)?)?,
+            (true, false, folders) => output::text(TrackTable(&read(folders, TrackReport::read)?))?,
+            (false, true, folders) => print_json(&read(folders, RunReport::read)?)?,
+            (false, false, [folder]) => {
+                let report = RunReport::read(folder).map_err(BadInput::of)?;
+                output::text(format_args!(
+                    "run       {}, {} with {} poses, {} clock\n{report}",
+                    report.run, report.method, report.pose_source, report.clock
+                ))?;
+            }
+            (false, false, several) => {
+                output::text(Comparison::read(several).map_err(BadInput::of)?)?;
+            }
         }
         Ok(Outcome::Done)
     }
+}
 
-    fn compare(&self, folders: &[PathBuf]) -> anyhow::Result<Outcome> {
-        if self.json {
-            let reports = folders.iter().map(|folder| RunReport::read(folder));
-            let reports = reports
-                .collect::<Result<Vec<_>, _>>()
-                .map_err(BadInput::of)?;
-            output::line(serde_json::to_string_pretty(&reports)?)?;
-        } else {
-            output::text(Comparison::read(folders).map_err(BadInput::of)?)?;
-        }
-        Ok(Outcome::Done)
+/// Reads the reports of some runs.
+fn read<T>(
+    folders: &[PathBuf],
+    read: impl Fn(&Path) -> Result<T, ReportError>,
+) -> Result<Vec<T>, BadInput> {
+    let reports = folders.iter().map(|folder| read(folder));
+    reports.collect::<Result<_, _>>().map_err(BadInput::of)
+}
+
+/// Prints a report, or a list of several.
+fn print_json(reports: &[impl Serialize]) -> anyhow::Result<()> {
+    match reports {
+        [report] => output::line(serde_json::to_string_pretty(report)?)?,
+        several => output::line(serde_json::to_string_pretty(several)?)?,
     }
+    Ok(())
 }

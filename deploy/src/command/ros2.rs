@@ -131,7 +131,10 @@ impl Arguments {
             session,
             domain_id,
             self.network.namespace.clone(),
-            self.distribution(),
+            match self.network.distro {
+                Distro::Humble => Distribution::Humble,
+                Distro::Jazzy => Distribution::Jazzy,
+            },
         )?;
         output::note(format_args!(
             "run {} on domain {domain_id} of the ROS 2 network at {router} (Ctrl-C ends it)",
@@ -162,13 +165,6 @@ impl Arguments {
         let has_router = self.network.ros_router.is_some() || self.keys.is_none();
         ensure!(has_router, BadInput::new(message));
         Ok(())
-    }
-
-    fn distribution(&self) -> Distribution {
-        match self.network.distro {
-            Distro::Humble => Distribution::Humble,
-            Distro::Jazzy => Distribution::Jazzy,
-        }
     }
 
     fn options(&self) -> NodeOptions {
@@ -224,18 +220,15 @@ impl Sensors {
     }
 
     fn motions(&self) -> Vec<MotionSource> {
-        let mut motions = Vec::new();
-        for (motion_type, sources) in [
-            (MotionType::Odometry, &self.odometry),
-            (MotionType::TwistStamped, &self.twist),
-            (MotionType::Imu, &self.imu),
-        ] {
-            motions.extend(sources.iter().cloned().map(|source| MotionSource {
-                motion_type,
-                source,
-            }));
-        }
-        motions
+        let odometry = self.odometry.iter().map(|of| (MotionType::Odometry, of));
+        let twist = self.twist.iter().map(|of| (MotionType::TwistStamped, of));
+        let imu = self.imu.iter().map(|of| (MotionType::Imu, of));
+        let motions = odometry.chain(twist).chain(imu);
+        let motions = motions.map(|(motion_type, source)| MotionSource {
+            motion_type,
+            source: source.clone(),
+        });
+        motions.collect()
     }
 }
 

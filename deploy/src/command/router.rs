@@ -55,11 +55,11 @@ pub(crate) struct Arguments {
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
-    let seconds: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    let is_allowed = (0.1..=3600.0).contains(&seconds);
-    is_allowed
-        .then_some(seconds)
-        .ok_or_else(|| "0.1 to 3600 s".to_owned())
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
+        Ok(_) => Err("0.1 to 3600 s".to_owned()),
+        Err(_) => Err("not a number".to_owned()),
+    }
 }
 
 impl Arguments {

@@ -37,10 +37,9 @@ impl Arguments {
     }
 
     fn print(&self, status: &impl serde::Serialize, table: &str) -> anyhow::Result<()> {
-        if self.json {
-            output::line(serde_json::to_string_pretty(status)?)?
-        } else {
-            output::text(table)?
+        match self.json {
+            true => output::line(serde_json::to_string_pretty(status)?)?,
+            false => output::text(table)?,
         }
         Ok(())
     }

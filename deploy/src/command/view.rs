@@ -62,8 +62,7 @@ impl Arguments {
     ) -> anyhow::Result<Outcome> {
         // On the machine of the run, the run has priority.
         let _ = rustix::process::nice(VIEWER_NICENESS);
-        let bus = self.run.bus(name, router)?;
-        let run = Arc::new(LiveRun::start(bus, protocol)?);
+        let run = Arc::new(LiveRun::start(self.run.bus(name, router)?, protocol)?);
         until_stopped(self.page, |address| serve_live(address, run))?;
         Ok(Outcome::Done)
     }

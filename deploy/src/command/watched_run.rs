@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 
 use bus::{Bus, Endpoint};
-use protocol::RunId;
+use protocol::{Role, RunId};
 use support::cli::BadInput;
 
-use super::viewer_bus;
+use super::client;
 use crate::operate::status::RunStatus;
 
 #[derive(Debug, clap::Args)]
@@ -41,6 +41,7 @@ impl WatchedRun {
 
     /// Session of a viewer.
     pub(crate) fn bus(&self, name: &RunId, router: &Endpoint) -> anyhow::Result<Bus> {
-        viewer_bus(name, router, self.keys.as_deref())
+        let (identity, options) = client(name, Role::Viewer, router, self.keys.as_deref())?;
+        Ok(Bus::join(&options, identity)?)
     }
 }

@@ -56,9 +56,7 @@ impl Failures {
     /// Description of each failure, after the name of its process.
     pub(crate) fn in_words(&self) -> Vec<String> {
         let failed = self.failed.iter();
-        failed
-            .map(|(name, text)| format!("{name}: {text}"))
-            .collect()
+        { failed.map(|(name, text)| format!("{name}: {text}")) }.collect()
     }
 }
 

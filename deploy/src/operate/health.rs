@@ -19,10 +19,11 @@ const SILENT: Duration = Duration::from_millis(1500);
 const OWN_PAUSE: Duration = Duration::from_secs(1);
 
 /// State of a process.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
     /// Running, no report yet.
+    #[default]
     Starting,
     /// Has joined the run and reports regularly.
     Ready,
@@ -40,7 +41,7 @@ pub enum State {
 }
 
 /// Status of a process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ProcessStatus {
     /// Name in messages, and of its log.
     pub name: String,
@@ -72,28 +73,11 @@ pub struct ProcessStatus {
 /// Record of one process.
 #[derive(Debug)]
 struct Noted {
-    state: State,
-    pid: Option<u32>,
+    /// What its events have shown; the rest is filled in when it is asked for.
+    status: ProcessStatus,
     started: Instant,
     /// Last report since this start.
     last_report: Option<Instant>,
-    restarts: u32,
-    last_fall: Option<String>,
-    failure: Option<String>,
-}
-
-impl Noted {
-    fn new(now: Instant) -> Self {
-        Self {
-            state: State::Starting,
-            pid: None,
-            started: now,
-            last_report: None,
-            restarts: 0,
-            last_fall: None,
-            failure: None,
-        }
-    }
 }
 
 /// Monitors the processes of a run.
@@ -120,32 +104,38 @@ impl Health {
 
     /// Records an event of a process.
     pub(crate) fn note(&mut self, event: &ProcessEvent, now: Instant) {
-        let noted = self
-            .processes
-            .entry(event.name.clone())
-            .or_insert_with(|| Noted::new(now));
+        let noted = self.processes.entry(event.name.clone());
+        let noted = noted.or_insert_with(|| Noted {
+            status: ProcessStatus {
+                name: event.name.clone(),
+                ..ProcessStatus::default()
+            },
+            started: now,
+            last_report: None,
+        });
+        let status = &mut noted.status;
         match &event.what {
             ProcessEventKind::Started { pid } => {
-                (noted.state, noted.pid) = (State::Starting, Some(*pid));
+                (status.state, status.pid) = (State::Starting, Some(*pid));
                 (noted.started, noted.last_report) = (now, None);
             }
             ProcessEventKind::Crashed { how, restart, .. } => {
-                (noted.state, noted.pid, noted.restarts) = (State::Crashed, None, *restart);
-                noted.last_fall = Some(how.clone());
+                (status.state, status.pid, status.restarts) = (State::Crashed, None, *restart);
+                status.last_fall = Some(how.clone());
             }
             ProcessEventKind::Logged { .. } => {}
             ProcessEventKind::GaveUp { how, .. } | ProcessEventKind::Failed { how } => {
-                (noted.state, noted.pid) = (State::Down, None);
-                noted.last_fall = Some(how.clone());
+                (status.state, status.pid) = (State::Down, None);
+                status.last_fall = Some(how.clone());
             }
-            ProcessEventKind::Done { .. } => (noted.state, noted.pid) = (State::Ended, None),
+            ProcessEventKind::Done { .. } => (status.state, status.pid) = (State::Ended, None),
         }
     }
 
     /// Records the failure of a process.
     pub(crate) fn fails(&mut self, name: &str, text: &str) {
         if let Some(noted) = self.processes.get_mut(name) {
-            noted.failure = Some(text.to_owned());
+            noted.status.failure = Some(text.to_owned());
         }
     }
 
@@ -163,7 +153,7 @@ impl Health {
         let network_is_up = last_reports.is_empty() || ages.any(|age| age <= SILENT);
         let mut hanging = Vec::new();
         for (name, noted) in &mut self.processes {
-            if noted.pid.is_none() {
+            if noted.status.pid.is_none() {
                 continue;
             }
             // The last reports of the previous process instance may arrive after its end.
@@ -179,10 +169,10 @@ impl Health {
                 Some(last_report) => (now.saturating_duration_since(last_report), self.hang),
                 None => (now.saturating_duration_since(noted.started), self.start),
             };
-            noted.state = match noted.last_report {
+            noted.status.state = match noted.last_report {
                 None => State::Starting,
                 Some(_) if since > SILENT => State::Silent,
-                Some(_) if noted.failure.is_some() => State::Failing,
+                Some(_) if noted.status.failure.is_some() => State::Failing,
                 Some(_) => State::Ready,
             };
             if since > timeout && network_is_up {
@@ -195,18 +185,19 @@ impl Health {
 
     /// Processes that crashed at least once.
     pub(crate) fn crashed(&self) -> Vec<String> {
-        let crashed = { self.processes.iter() }.filter(|(_, noted)| noted.last_fall.is_some());
-        crashed.map(|(name, _)| name.clone()).collect()
+        let statuses = self.processes.values().map(|noted| &noted.status);
+        let crashed = statuses.filter(|status| status.last_fall.is_some());
+        crashed.map(|status| status.name.clone()).collect()
     }
 
     /// Ends of processes that were unexpected, as text: `agent-4288 was ended by signal 9`.
     pub(crate) fn ends(&self) -> Vec<String> {
         let ends = self.processes.iter().filter_map(|(name, noted)| {
-            let times = match noted.restarts {
+            let times = match noted.status.restarts {
                 0 | 1 => String::new(),
                 restarts => format!(", restarted {restarts} times"),
             };
-            { noted.last_fall.as_ref() }.map(|how| format!("{name} {how}{times}"))
+            { noted.status.last_fall.as_ref() }.map(|how| format!("{name} {how}{times}"))
         });
         ends.collect()
     }
@@ -214,22 +205,18 @@ impl Health {
     /// Status of every process; `progress` has what they reported.
     pub(crate) fn statuses(&self, progress: &Progress, now: Instant) -> Vec<ProcessStatus> {
         let statuses = self.processes.iter().map(|(name, noted)| {
-            let usage = noted.pid.and_then(Usage::of).unwrap_or_default();
-            let runs = noted.pid.is_some();
+            let pid = noted.status.pid;
+            let usage = pid.and_then(Usage::of).unwrap_or_default();
+            let runs = pid.is_some();
             let problems = progress.problems.get(name).filter(|_| runs);
             ProcessStatus {
-                name: name.clone(),
-                state: noted.state,
-                pid: noted.pid,
-                up_s: noted.pid.map_or(0.0, |_| elapsed_s(noted.started, now)),
-                restarts: noted.restarts,
-                last_fall: noted.last_fall.clone(),
-                failure: noted.failure.clone(),
+                up_s: pid.map_or(0.0, |_| elapsed_s(noted.started, now)),
                 problems: problems.cloned().unwrap_or_default(),
                 silent_s: { noted.last_report.filter(|_| runs) }.map(|at| elapsed_s(at, now)),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,
                 descriptors: usage.descriptors,
+                ..noted.status.clone()
             }
         });
         statuses.collect()

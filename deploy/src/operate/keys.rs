@@ -15,7 +15,7 @@ use std::io::{self, Write};
 use std::net::IpAddr;
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, UNIX_EPOCH};
 
 use bus::{AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, MEMBERS_FILE, ROUTER};
 use protocol::Principal;
@@ -219,9 +219,8 @@ impl KeyStore<'_> {
 }
 
 fn at(path: &Path) -> impl Fn(io::Error) -> KeyError {
-    let path = path.to_owned();
     move |cause| KeyError::Io {
-        path: path.clone(),
+        path: path.to_owned(),
         cause,
     }
 }
@@ -247,8 +246,7 @@ fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyError>
     let mut params = CertificateParams::new(Vec::new()).map_err(unusable(name.to_owned()))?;
     params.distinguished_name = DistinguishedName::new();
     params.distinguished_name.push(DnType::CommonName, name);
-    let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    let now = now.unwrap_or_default();
+    let now = UNIX_EPOCH.elapsed().unwrap_or_default();
     let epoch = date_time_ymd(1970, 1, 1);
     params.not_before = epoch + now.saturating_sub(LEEWAY);
     params.not_after = epoch + now + lifetime;

@@ -5,6 +5,7 @@ pub mod health;
 pub mod keys;
 pub mod network;
 pub mod progress;
+pub mod refusal_watch;
 pub mod remote_status;
 pub mod router_panic;
 pub(crate) mod router_watch;

@@ -67,24 +67,21 @@ impl RouterEndpoint {
     /// # Errors
     /// [`BusError`] when the port is in use, no router answers, the endpoint is invalid or the keys do not fit.
     pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
-        let mut options = match &network.connect {
-            Some(router) => BusOptions::client(Endpoint::new(router)?),
-            None => BusOptions::router(with_port(&network.listen, keys.is_some())?),
-        };
-        if network.connect.is_none() {
-            options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
-            if network.shared_memory_mib > 0 {
-                options.shared_memory = SharedMemory::Attached;
-            }
-        }
-        if let Some(keys) = keys {
-            options = if network.connect.is_none() {
+        let options = match &network.connect {
+            Some(router) => as_scorer(BusOptions::client(Endpoint::new(router)?), keys)?,
+            None => {
+                let mut options = BusOptions::router(with_port(&network.listen, keys.is_some())?);
+                options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
+                if network.shared_memory_mib > 0 {
+                    options.shared_memory = SharedMemory::Attached;
+                }
                 let runs = RunScope::One(run.clone());
-                security::guarded(options, &keys.of_process(ROUTER), runs)?
-            } else {
-                as_scorer(options, keys)?
-            };
-        }
+                match keys {
+                    Some(keys) => security::guarded(options, &keys.of_process(ROUTER), runs)?,
+                    None => options,
+                }
+            }
+        };
         let session = open(&options)?;
         Ok(Self {
             session,
@@ -98,11 +95,8 @@ impl RouterEndpoint {
     pub fn probe(&self, run: &RunId, keys: Option<&RunKeys>) -> Option<RouterProbe> {
         let options = BusOptions::client(self.endpoint.clone());
         let reports = Key::stats(run, &process_id(Role::Scorer, &scorer_cav()));
-        let probe = match keys {
-            Some(keys) => as_scorer(options, keys),
-            None => Ok(options),
-        }
-        .and_then(|options| RouterProbe::of_key(&options, &KeyExpr::one(&reports)));
+        let probe = as_scorer(options, keys)
+            .and_then(|options| RouterProbe::of_key(&options, &KeyExpr::one(&reports)));
         probe
             .inspect_err(|error| tracing::warn!("the router is not watched: {error}"))
             .ok()
@@ -143,11 +137,11 @@ impl RouterEndpoint {
     }
 }
 
-/// The same with the keys of the scorer.
-fn as_scorer(options: BusOptions, keys: &RunKeys) -> Result<BusOptions, BusError> {
+/// The same with the keys of the scorer, if there are keys.
+fn as_scorer(options: BusOptions, keys: Option<&RunKeys>) -> Result<BusOptions, BusError> {
+    let Some(keys) = keys else { return Ok(options) };
     let name = Principal::of_role(Role::Scorer).to_string();
-    let credentials = security::credentials(&keys.of_process(&name), &name)?;
-    Ok(options.with_credentials(credentials))
+    Ok(options.with_credentials(security::credentials(&keys.of_process(&name), &name)?))
 }
 
 /// Endpoint as processes of this host reach it: an unspecified listening address becomes the loopback, whose name

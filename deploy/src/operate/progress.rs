@@ -47,10 +47,8 @@ impl Display {
                 self.last_line = Instant::now();
                 self.shown_frames = progress.frames;
                 let (frames, ticks) = (progress.frames, progress.ticks);
-                output::note(format_args!(
-                    "answered {frames}/{ticks}  {}",
-                    summary(progress)
-                ));
+                let summary = summary(progress);
+                output::note(format_args!("answered {frames}/{ticks}  {summary}"));
             }
             None => {}
         }

@@ -91,15 +91,13 @@ impl RouterWatch {
         lost_since: Option<Instant>,
         now: Instant,
     ) -> Option<Finding> {
-        let looked = self.looked.replace(now).unwrap_or(now);
-        let pause = now.saturating_duration_since(looked);
+        let pause = now.saturating_duration_since(self.looked.replace(now).unwrap_or(now));
         // A gap in the own loop says nothing about the router.
         if pause > LIMIT {
             self.pauses.add(pause);
             let seconds = pause.as_secs_f64();
-            return Some(Finding::Line(format!(
-                "the run was suspended for {seconds:.1} s"
-            )));
+            let line = format!("the run was suspended for {seconds:.1} s");
+            return Some(Finding::Line(line));
         }
         let is_silent = silence > LIMIT;
         if is_silent && self.is_here {
@@ -107,24 +105,21 @@ impl RouterWatch {
         }
         // A router elsewhere may come back, so its silence is an outage and no failure.
         let since = lost_since.or_else(|| is_silent.then(|| now.checked_sub(silence))?);
-        match (self.gone_since, since) {
+        let line = match (self.gone_since, since) {
             (None, Some(since)) => {
                 self.gone_since = Some(since);
-                Some(Finding::Line(
-                    "the router is gone: no message passes".into(),
-                ))
+                "the router is gone: no message passes".to_owned()
             }
             (Some(since), None) => {
                 let outage = now.saturating_duration_since(since);
                 self.gone_since = None;
                 self.outages.add(outage);
                 let seconds = outage.as_secs_f64();
-                Some(Finding::Line(format!(
-                    "the router is back after {seconds:.1} s"
-                )))
+                format!("the router is back after {seconds:.1} s")
             }
-            _ => None,
-        }
+            _ => return None,
+        };
+        Some(Finding::Line(line))
     }
 
     /// Time since which the router is gone.
@@ -134,9 +129,7 @@ impl RouterWatch {
 
     /// Outages and pauses so far, as text.
     pub(crate) fn causes(&self) -> Vec<String> {
-        let current = self
-            .gone_s()
-            .map(|seconds| format!("router gone for {seconds:.1} s"));
+        let current = { self.gone_s() }.map(|seconds| format!("router gone for {seconds:.1} s"));
         let over = [
             self.outages.sentence("router gone"),
             self.pauses.sentence("suspended"),

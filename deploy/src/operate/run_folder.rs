@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::UNIX_EPOCH;
 use std::{fs, io};
 
 use protocol::RunId;
@@ -29,9 +29,11 @@ pub enum RunFolderError {
     },
 }
 
-impl RunFolderError {
-    fn write(path: PathBuf, source: io::Error) -> Self {
-        Self::Write { path, source }
+/// The error of writing a file or folder at a path.
+fn at(path: &Path) -> impl FnOnce(io::Error) -> RunFolderError {
+    move |source| RunFolderError::Write {
+        path: path.to_owned(),
+        source,
     }
 }
 
@@ -56,20 +58,17 @@ impl RunFolder {
     pub fn create(runs: &Path, name: &RunId) -> Result<Self, RunFolderError> {
         let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
         let path = runs.join(name.as_str());
-        let created = fs::create_dir_all(&runs);
-        created.map_err(|source| RunFolderError::write(runs, source))?;
+        fs::create_dir_all(&runs).map_err(at(&runs))?;
         // One call that fails if the folder exists, so that two runs never share a folder.
         match fs::create_dir(&path) {
-            Ok(()) => {}
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
                 return Err(RunFolderError::Taken(path));
             }
-            Err(error) => return Err(RunFolderError::write(path, error)),
+            created => created.map_err(at(&path))?,
         }
         let log = path.join("log");
-        fs::create_dir(&log).map_err(|source| RunFolderError::write(log, source))?;
-        let kept = atomic_file::sync_name(&path);
-        kept.map_err(|source| RunFolderError::write(path.clone(), source))?;
+        fs::create_dir(&log).map_err(at(&log))?;
+        atomic_file::sync_name(&path).map_err(at(&path))?;
         Ok(Self { path })
     }
 
@@ -104,7 +103,7 @@ impl RunFolder {
     /// [`RunFolderError::Write`].
     pub fn write(&self, name: &str, text: &str) -> Result<(), RunFolderError> {
         let path = self.file(name);
-        atomic_file::write(&path, text).map_err(|source| RunFolderError::write(path, source))
+        atomic_file::write(&path, text).map_err(at(&path))
     }
 
     /// Writes the configuration of a process to `config/<process>.yaml`; returns its path.
@@ -121,7 +120,7 @@ impl RunFolder {
         let text = serde_saphyr::to_string(config)
             .map_err(|error| io::Error::other(error.to_string()))
             .and_then(|text| fs::create_dir_all(self.file("config")).map(|()| text))
-            .map_err(|source| RunFolderError::write(path.clone(), source))?;
+            .map_err(at(&path))?;
         self.write(&name, &text)?;
         Ok(path)
     }
@@ -132,7 +131,7 @@ impl RunFolder {
     /// [`RunFolderError::Write`].
     pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunFolderError> {
         let text = serde_json::to_string_pretty(value)
-            .map_err(|error| RunFolderError::write(self.file(name), error.into()))?;
+            .map_err(|error| at(&self.file(name))(error.into()))?;
         self.write(name, &(text + "\n"))
     }
 
@@ -228,8 +227,7 @@ pub fn plain(value: Option<impl ToString>) -> String {
 /// # Panics
 /// Never with a `prefix` of an identifier's characters, at most 16.
 pub fn name_of_now(prefix: &str) -> RunId {
-    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH);
-    let seconds = since_epoch.unwrap_or_default().as_secs();
+    let seconds = UNIX_EPOCH.elapsed().unwrap_or_default().as_secs();
     let name = format!("{prefix}-{}", time_stamp(seconds));
     RunId::new(&name).expect("a prefix and digits make an identifier")
 }

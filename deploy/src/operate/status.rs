@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::NeighbourState;
@@ -116,11 +116,9 @@ impl RunStatus {
         let supervisor = Usage::of(status.pid);
         // Another program may have the number of a supervisor that has ended, so the age counts too.
         if status.phase != Phase::Over && (supervisor.is_none() || status.age() > STALE) {
-            let is_stopped = supervisor.is_some_and(|usage| usage.is_stopped);
-            status.phase = if is_stopped {
-                Phase::Suspended
-            } else {
-                Phase::Lost
+            status.phase = match supervisor {
+                Some(usage) if usage.is_stopped => Phase::Suspended,
+                _ => Phase::Lost,
             };
         }
         Ok(status)
@@ -153,10 +151,8 @@ impl RunStatus {
             Some((file.modified().ok()?, entry.path()))
         });
         let newest = folders.max_by_key(|(written, _)| *written);
-        newest.map_or_else(
-            || Err(StatusError::NoRun(runs.to_owned())),
-            |(_, folder)| Ok(folder),
-        )
+        let (_, folder) = newest.ok_or_else(|| StatusError::NoRun(runs.to_owned()))?;
+        Ok(folder)
     }
 
     /// Problems as text: of processes during the run; of failed or crashed ones when it is over.
@@ -361,10 +357,7 @@ impl StatusWriter {
 }
 
 fn unix_ms() -> u64 {
-    let since = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default();
-    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+    u64::try_from(UNIX_EPOCH.elapsed().unwrap_or_default().as_millis()).unwrap_or(u64::MAX)
 }
 
 #[cfg(test)]

@@ -46,8 +46,7 @@ const ROWS: [Row; 16] = [
         number(report.pace.interval_ms.p95, 0)
     }),
     ("CPU per frame, all processes, ms", |report, _| {
-        let times = report.processes.iter().map(|of| of.cpu_ms_per_frame);
-        let of_all: Option<f64> = times.sum();
+        let of_all: Option<f64> = report.processes.iter().map(|of| of.cpu_ms_per_frame).sum();
         number(of_all.filter(|_| !report.processes.is_empty()), 0)
     }),
     ("bytes of a neighbour per frame", |_, metrics| {

@@ -50,7 +50,7 @@ pub struct ProcessResources {
 }
 
 /// Published messages of one stream, over all vehicles.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct StreamBytes {
     /// Name of the stream; those behind the link emulation as `rx/STREAM`.
     pub stream: String,
@@ -120,23 +120,19 @@ pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessR
 
 /// Published bytes by stream, the largest first.
 pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
-    let mut sums = BTreeMap::<String, (u64, u64)>::new();
+    let mut sums = BTreeMap::<String, StreamBytes>::new();
     for traffic in processes.iter().flat_map(|stats| &stats.traffic) {
         let stream = match &traffic.topic {
             Topic::Stream { stream, .. } => stream.to_string(),
             Topic::Received { stream, .. } => format!("rx/{stream}"),
             other => other.to_string(),
         };
-        let (messages, bytes) = sums.entry(stream).or_default();
-        *messages += traffic.messages;
-        *bytes = bytes.saturating_add(traffic.bytes);
+        let sum = sums.entry(stream.clone()).or_default();
+        sum.stream = stream;
+        sum.messages += traffic.messages;
+        sum.bytes = sum.bytes.saturating_add(traffic.bytes);
     }
-    let streams = { sums.into_iter() }.map(|(stream, (messages, bytes))| StreamBytes {
-        stream,
-        messages,
-        bytes,
-    });
-    let mut streams: Vec<StreamBytes> = streams.collect();
+    let mut streams: Vec<StreamBytes> = sums.into_values().collect();
     streams.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.stream.cmp(&b.stream)));
     streams
 }

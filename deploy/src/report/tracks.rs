@@ -114,11 +114,7 @@ impl TrackReport {
         }
         let name = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         let mut report = Self {
-            run: name
-                .file_name()
-                .unwrap_or_default()
-                .to_string_lossy()
-                .into_owned(),
+            run: { name.file_name() }.map_or(String::new(), |name| name.display().to_string()),
             method,
             recorded: !results.tracks.is_empty(),
             ..Self::default()
@@ -222,18 +218,15 @@ fn frame(truth: &GroundTruth, tracks: Vec<Track>) -> TrackedFrame {
 
 /// Distance to the nearest of some true boxes.
 fn nearest_m(others: &[TrueBox], box3d: &Box3d) -> f64 {
-    let distances = others.iter().map(|other| distance_m(&other.box3d, box3d));
+    let [x, y] = center_m(box3d);
+    let centers = others.iter().map(|other| center_m(&other.box3d));
+    let distances = centers.map(|[other_x, other_y]| (other_x - x).hypot(other_y - y));
     distances.fold(f64::INFINITY, f64::min)
 }
 
 fn center_m(box3d: &Box3d) -> [f64; 2] {
     let [x, y, _] = box3d.center_m;
     [x, y]
-}
-
-fn distance_m(a: &Box3d, b: &Box3d) -> f64 {
-    let ([x, y], [other_x, other_y]) = (center_m(a), center_m(b));
-    (x - other_x).hypot(y - other_y)
 }
 
 /// Reads a file of JSON lines, one at a time.

@@ -1,7 +1,7 @@
 //! Initial pose: the first fix of a vehicle on `/initialpose`, for a localizer that needs one.
 
 use protocol::{CavId, Message, PlanarCovariance};
-use ros2::{Mount, RosTopic};
+use ros2::Mount;
 
 /// Variances where the pose has none of its own: those that RViz gives the poses that a person draws.
 const DRAWN: PlanarCovariance = PlanarCovariance {
@@ -48,15 +48,9 @@ impl InitialPose {
         let lidar_from_base = self.mount.base_from_lidar.isometry().inverse();
         // The estimate is of the LiDAR: world_from_base = world_from_lidar * lidar_from_base.
         let world_from_base = (world_from_cav.isometry() * lidar_from_base).into();
-        let covariance = estimate.covariance().unwrap_or(&DRAWN);
-        Some(ros2::pose(
-            capture_nanos,
-            &world_from_base,
-            Some(covariance),
-        ))
+        let covariance = Some(estimate.covariance().unwrap_or(&DRAWN));
+        Some(ros2::pose(capture_nanos, &world_from_base, covariance))
     }
-
-    pub(super) const TOPIC: RosTopic = RosTopic::InitialPose;
 }
 
 #[cfg(test)]

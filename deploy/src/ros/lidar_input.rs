@@ -114,11 +114,8 @@ impl LidarInputs {
             let subscription =
                 session.subscribe(topic, ros_type, Qos::SENSOR_DATA, move |sample| {
                     let outcome = queue.push(lane.clone(), sample.payload().clone());
-                    match outcome {
-                        PushOutcome::Queued | PushOutcome::Closed(_) => {}
-                        PushOutcome::Replaced(_) | PushOutcome::NoLane(_) => {
-                            superseded.fetch_add(1, Ordering::Relaxed);
-                        }
+                    if let PushOutcome::Replaced(_) | PushOutcome::NoLane(_) = outcome {
+                        superseded.fetch_add(1, Ordering::Relaxed);
                     }
                 })?;
             let input = Input {

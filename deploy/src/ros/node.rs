@@ -170,7 +170,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
             left_out: 0,
         };
         let clock = publishes_clock.then_some(RosTopic::Clock);
-        let initial_pose = node.initial_pose.is_some().then_some(InitialPose::TOPIC);
+        let initial_pose = node.initial_pose.is_some().then_some(RosTopic::InitialPose);
         let topics = [RosTopic::Tf, RosTopic::TfStatic, RosTopic::Diagnostics].into_iter();
         topics
             .chain(clock)
@@ -317,7 +317,11 @@ impl<'scope, 'env> Node<'scope, 'env> {
         };
         let capture_nanos = header.stamp.capture_nanos;
         if let Topic::Stream { cav, stream } = topic {
-            self.publish_time(cav, *stream, capture_nanos)?;
+            let time_nanos = self.clock.advance(cav, *stream, capture_nanos);
+            // The clock before the message: nothing has a stamp in the future.
+            if let Some(nanos) = time_nanos.filter(|_| self.publishes_clock) {
+                self.publish(RosTopic::Clock, ros2::clock(nanos))?;
+            }
             self.publish_initial_pose(cav, capture_nanos, &message)?;
             if let Message::Pose(estimate) = &message {
                 let pose = estimate.world_from_cav().map(protocol::Pose::isometry);
@@ -330,15 +334,6 @@ impl<'scope, 'env> Node<'scope, 'env> {
         Ok(())
     }
 
-    /// The clock before the message: nothing has a stamp in the future.
-    fn publish_time(&mut self, cav: &CavId, stream: Stream, capture_nanos: u64) -> Result<()> {
-        let time_nanos = self.clock.advance(cav, stream, capture_nanos);
-        match time_nanos.filter(|_| self.publishes_clock) {
-            Some(nanos) => self.publish(RosTopic::Clock, ros2::clock(nanos)),
-            None => Ok(()),
-        }
-    }
-
     fn publish_initial_pose(
         &mut self,
         cav: &CavId,
@@ -348,12 +343,12 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let Some(initial) = &mut self.initial_pose else {
             return Ok(());
         };
-        let publisher = self.publishers.get(&InitialPose::TOPIC);
+        let publisher = self.publishers.get(&RosTopic::InitialPose);
         let cdr = initial.of_message(cav, capture_nanos, message, || {
             publisher.is_some_and(RosPublisher::is_wanted)
         });
         match cdr {
-            Some(cdr) => self.publish(InitialPose::TOPIC, cdr),
+            Some(cdr) => self.publish(RosTopic::InitialPose, cdr),
             None => Ok(()),
         }
     }

@@ -106,8 +106,7 @@ impl RobotFrames {
     /// A message of a robot's odometry: names of its frames, and its pose where tf has none.
     pub(super) fn note_odometry(&self, cav: &CavId, bytes: &[u8]) {
         // An unreadable message is named by the reader of its motion.
-        let read = PoseType::Odometry.read(bytes).unwrap_or_default();
-        for transform in read {
+        for transform in PoseType::Odometry.read(bytes).unwrap_or_default() {
             lock(&self.state).note_odometry(cav, &transform);
         }
     }

@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use super::time_series::seconds;
+
 /// Largest lead of a stamp over this machine's clock, nanoseconds: 0.1 s.
 const MAX_LEAD_NANOS: u64 = 100_000_000;
 /// Interval between two warnings of a kind.
@@ -71,10 +73,6 @@ impl StampCheck {
         }
         is_news
     }
-}
-
-fn seconds(nanos: u64) -> f64 {
-    nanos as f64 * 1e-9
 }
 
 #[cfg(test)]

@@ -52,8 +52,7 @@ impl<T: Copy> TimeSeries<T> {
     /// The last measurement before a time, and the first that is not.
     fn around(&self, nanos: u64) -> [Option<(u64, T)>; 2] {
         let next = self.0.partition_point(|(time, _)| *time < nanos);
-        let before = next.checked_sub(1);
-        [before, Some(next)].map(|index| self.0.get(index?).copied())
+        [next.checked_sub(1), Some(next)].map(|index| self.0.get(index?).copied())
     }
 }
 
@@ -110,7 +109,7 @@ impl TimeSeries<f64> {
     }
 }
 
-fn seconds(nanos: u64) -> f64 {
+pub(super) fn seconds(nanos: u64) -> f64 {
     nanos as f64 * 1e-9
 }
 

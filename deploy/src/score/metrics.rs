@@ -9,7 +9,7 @@ use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{CavId, Counts, DropReason, Ledger, PoseError};
 use serde::{Deserialize, Serialize};
 use support::provenance::Provenance;
-use support::statistics::{quantile, sorted};
+use support::statistics::{mean, quantile, sorted};
 
 use crate::score::{FrameScores, NeighbourRecord};
 
@@ -100,13 +100,11 @@ impl Metrics {
         ledger: &Ledger,
         sent_bytes: Option<u64>,
     ) -> Self {
-        let fused = scores.records().iter().map(|record| record.fused).sum();
+        let records = scores.records().iter();
+        let fused = records.clone().map(|record| record.fused).sum();
         let (ap_global, ap_frame_order) = scores.average_precision();
         let [ap_by_distance, ap_by_class] = scores.average_precision_by_part();
-        let latencies_ms = scores
-            .records()
-            .iter()
-            .filter_map(|record| record.latency_ms);
+        let latencies_ms = records.filter_map(|record| record.latency_ms);
         let (ticks, answered) = scores.ticks();
         Self {
             frames: answered,
@@ -270,10 +268,10 @@ impl PoseErrors {
         let tried = errors.len() as u64 + no_pose;
         let near = distances.partition_point(|distance| *distance < SUCCESS_M);
         Self {
-            mean_m: mean(distances.iter().copied()),
+            mean_m: mean(&distances),
             p50_m: quantile(&distances, 0.50),
             p95_m: quantile(&distances, 0.95),
-            mean_deg: mean(errors.iter().map(|error| error.angle_deg)),
+            mean_deg: mean(&Vec::from_iter(errors.iter().map(|error| error.angle_deg))),
             success_3m: (tried > 0).then(|| near as f64 / tried as f64),
             no_pose,
         }
@@ -283,20 +281,18 @@ impl PoseErrors {
 impl Communication {
     /// Summarises `(payload, wire)` bytes of every neighbour and frame; `nominal_values` is the size of a feature map.
     pub fn of(bytes: &[(u64, u64)], nominal_values: u64) -> Self {
-        let payload = mean(bytes.iter().map(|(payload, _)| *payload as f64));
+        let (payload, wire): (Vec<f64>, Vec<f64>) = { bytes.iter() }
+            .map(|(payload, wire)| (*payload as f64, *wire as f64))
+            .unzip();
+        let payload = mean(&payload);
         Self {
             payload_bytes_mean: payload,
-            wire_bytes_mean: mean(bytes.iter().map(|(_, wire)| *wire as f64)),
+            wire_bytes_mean: mean(&wire),
             // The logarithm of 0 is infinite, which JSON has no number for.
             log2_payload: payload.filter(|bytes| *bytes > 0.0).map(f64::log2),
             nominal_fp32_log2: (4.0 * nominal_values as f64).log2(),
         }
     }
-}
-
-fn mean(values: impl ExactSizeIterator<Item = f64>) -> Option<f64> {
-    let count = values.len();
-    (count > 0).then(|| values.sum::<f64>() / count as f64)
 }
 
 #[cfg(test)]

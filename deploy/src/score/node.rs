@@ -149,8 +149,7 @@ impl ScorerNode {
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
         let process = process_id(Role::Scorer, &cav);
-        let identity = Identity::new(run.clone(), process, cav);
-        let bus = Bus::over(session, identity)?;
+        let bus = Bus::over(session, Identity::new(run.clone(), process, cav))?;
         let inbox = bus.inbox(PLACES, 4 * agents.len() + 64);
         let detections = Topic::stream(ego, Stream::Detections);
         let mut subscriptions = vec![
@@ -159,8 +158,7 @@ impl ScorerNode {
             bus.subscribe_all(&KeyExpr::stats(run), &inbox)?,
         ];
         if tracks.is_some() {
-            let topic = Topic::stream(ego, Stream::Tracks);
-            subscriptions.push(bus.subscribe(topic, &inbox)?);
+            subscriptions.push(bus.subscribe(Topic::stream(ego, Stream::Tracks), &inbox)?);
         }
         for cav in agents {
             subscriptions.push(bus.subscribe(Topic::stream(cav, Stream::Pose), &inbox)?);

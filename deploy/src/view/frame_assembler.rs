@@ -114,31 +114,24 @@ impl FrameAssembler {
     /// Adds a message. A result of the ego, with its tracks if the ego tracks, completes its scene frame, which is returned;
     /// so is a scene frame without a result when too many wait. Invalid messages are ignored here and counted by their receivers.
     pub(crate) fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
-        if let Topic::Stats(_) = seen.topic {
-            self.keep_ledger(seen);
-            return None;
-        }
-        if let Topic::Stream { cav, .. } | Topic::Received { cav, .. } = seen.topic
-            && !self.admits(cav)
-        {
-            return None;
-        }
-        if let Topic::Stream { cav, stream } = seen.topic
-            && *stream == Stream::Descriptor
-        {
-            if let Some(Descriptor { grid, .. }) = decode(seen) {
-                self.areas.insert(cav.clone(), DetectionArea::from(&grid));
-            }
-            return None;
-        }
-        if *seen.topic == Topic::Truth {
-            self.begin_again_with(seen.header.stamp.epoch);
-        }
         let at = seen.header.stamp.capture_nanos;
-        if let Topic::Stream { cav, stream } = seen.topic
-            && *stream == Stream::Tracks
-        {
-            self.track(at, cav, seen);
+        match seen.topic {
+            Topic::Stats(_) => {
+                self.keep_ledger(seen);
+                return None;
+            }
+            Topic::Truth => self.begin_again_with(seen.header.stamp.epoch),
+            Topic::Stream { cav, .. } | Topic::Received { cav, .. } if !self.admits(cav) => {
+                return None;
+            }
+            Topic::Stream { cav, stream } if *stream == Stream::Descriptor => {
+                if let Some(Descriptor { grid, .. }) = decode(seen) {
+                    self.areas.insert(cav.clone(), DetectionArea::from(&grid));
+                }
+                return None;
+            }
+            Topic::Stream { cav, stream } if *stream == Stream::Tracks => self.track(at, cav, seen),
+            _ => {}
         }
         // Frames are shown in the order of capture: a late message of an earlier one has no place.
         if self.shown_until.is_some_and(|shown| at <= shown) {
@@ -148,8 +141,7 @@ impl FrameAssembler {
             return self.show(at);
         }
         if self.open.len() > MOST_OPEN {
-            let oldest = *self.open.keys().next()?;
-            return self.show(oldest);
+            return self.show(*self.open.keys().next()?);
         }
         None
     }

@@ -40,8 +40,7 @@ impl PaceCounter {
 
     pub(super) fn pace(&self) -> ShownPace {
         let ends = self.published.front().zip(self.published.back());
-        let nanos = ends.map_or(0, |(first, last)| last.saturating_sub(*first));
-        let seconds = nanos as f64 * 1e-9;
+        let seconds = ends.map_or(0, |(first, last)| last.saturating_sub(*first)) as f64 * 1e-9;
         let rate_hz = (seconds > 0.0).then(|| (self.published.len() - 1) as f64 / seconds);
         ShownPace {
             rate_hz,

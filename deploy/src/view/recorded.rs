@@ -303,7 +303,7 @@ impl RecordedRun {
         let (mut pace, mut judge) = (PaceCounter::default(), Judge::new(self.protocol.clone()));
         let mut summaries = Vec::with_capacity(self.moments.len());
         let mut tracks = Vec::with_capacity(self.moments.len());
-        for moment in &self.moments {
+        for (index, moment) in self.moments.iter().enumerate() {
             let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;
             summary.links = links.at(moment.capture_nanos, moment.began_nanos);
             if let Some(began) = moment.began_nanos {
@@ -311,12 +311,10 @@ impl RecordedRun {
                 pace.tick(done);
             }
             summaries.push(summary);
-            let topic = ego.as_ref().map(|ego| Topic::stream(ego, Stream::Tracks));
-            let entry = self
-                .entries_of(moment)
-                .find(|entry| topic.as_ref() == Some(&entry.key.topic));
-            let found = entry.map(|entry| self.published(entry)).transpose()?;
-            tracks.push(found.flatten().map(|(_, tracks)| tracks));
+            let ego = ego.as_ref();
+            let found = ego.map(|ego| self.message(index, ego, Stream::Tracks));
+            let found = found.transpose()?.flatten();
+            tracks.push(found.and_then(|bytes| decoded(&bytes)));
         }
         Ok(Timeline {
             ego,

@@ -39,10 +39,8 @@ pub fn until_stopped(
     stop.on_signals()?;
     let server = serve(listen)
         .map_err(|error| BadInput::new(format!("cannot serve at {listen}: {error}")))?;
-    output::note(format_args!(
-        "http://{}/ (Ctrl-C ends it)",
-        server.address()
-    ));
+    let address = server.address();
+    output::note(format_args!("http://{address}/ (Ctrl-C ends it)"));
     // The wait needs a deadline, the loop makes it endless.
     while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
     let dropped = server.readers().dropped();

@@ -45,7 +45,12 @@ impl BlockOrder {
         ]
         .concat();
         // Row and column of a level side by side, the largest windows first: then each window is one run.
-        let order = [vec![0], self.interleaved(), vec![2 * levels + 1]].concat();
+        let by_level = (0..levels).flat_map(|level| [1 + level, 1 + levels + level]);
+        let order: Vec<i64> = [0]
+            .into_iter()
+            .chain(by_level)
+            .chain([2 * levels + 1])
+            .collect();
         let channels_last = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         channels_last
             .f_view(shape.as_slice())?
@@ -60,21 +65,18 @@ impl BlockOrder {
     pub fn maps(&self, tokens: &Tensor, height: i64, width: i64) -> Result<Tensor, TchError> {
         let (count, _, channels) = tokens.size3()?;
         let (rows, columns) = (self.split(height), self.split(width));
-        let levels = rows.len();
+        let last = 2 * rows.len() as i64 + 1;
         let sizes = rows
             .iter()
             .zip(&columns)
             .flat_map(|(&row, &column)| [row, column]);
         let shape: Vec<i64> = [count].into_iter().chain(sizes).chain([channels]).collect();
         // The inverse: the rows of all levels, which are the odd dimensions, then the columns of all levels.
-        let halves = (0..levels).map(|level| 1 + 2 * level as i64);
-        let order = [
-            vec![0],
-            halves.clone().collect(),
-            halves.map(|at| at + 1).collect(),
-            vec![2 * levels as i64 + 1],
-        ];
-        let channels_last = tokens.f_view(shape.as_slice())?.f_permute(order.concat())?;
+        let halves = [1, 2]
+            .into_iter()
+            .flat_map(|first| (first..last).step_by(2));
+        let order: Vec<i64> = [0].into_iter().chain(halves).chain([last]).collect();
+        let channels_last = tokens.f_view(shape.as_slice())?.f_permute(order)?;
         channels_last
             .f_reshape([count, height, width, channels])?
             .f_permute([0, 3, 1, 2])?
@@ -108,14 +110,6 @@ impl BlockOrder {
         sizes.extend(self.edges.windows(2).rev().map(|pair| pair[1] / pair[0]));
         sizes.push(self.edges[0]);
         sizes
-    }
-
-    /// Row and column dimension of each level in turn, in a view `[N, rows by level.., columns by level.., C]`.
-    fn interleaved(&self) -> Vec<i64> {
-        let levels = self.edges.len() as i64 + 1;
-        (0..levels)
-            .flat_map(|level| [1 + level, 1 + levels + level])
-            .collect()
     }
 }
 

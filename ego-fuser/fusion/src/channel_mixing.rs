@@ -6,6 +6,7 @@
 //! directions in their channels unrotated. The channels are therefore mixed here by a learnt matrix that depends on the
 //! relative heading.
 
+use perception::tensor_values::tensor;
 use protocol::Pose;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
@@ -44,12 +45,10 @@ impl ChannelMixing {
         ego_from_cav: &[Pose],
         order: Order,
     ) -> Result<Tensor, TchError> {
-        let matrices = ego_from_cav
-            .iter()
-            .map(|pose| match *pose == Pose::IDENTITY {
-                true => Ok(None),
-                false => self.matrix(pose).map(Some),
-            });
+        let matrices = ego_from_cav.iter().map(|pose| {
+            let is_other = *pose != Pose::IDENTITY;
+            is_other.then(|| self.matrix(pose)).transpose()
+        });
         let matrices: Vec<Option<Tensor>> = matrices.collect::<Result<_, TchError>>()?;
         let learns = matrices.iter().flatten().any(Tensor::requires_grad);
         // Products that are written into a prepared tensor have no gradient.
@@ -79,17 +78,11 @@ impl ChannelMixing {
         let yaw_rad = ego_from_cav.yaw_rad();
         let ((sin, cos), (sin_2, cos_2)) = (yaw_rad.sin_cos(), (2.0 * yaw_rad).sin_cos());
         let basis = [1.0, cos, sin, cos_2, sin_2].map(|value| value as f32);
-        let basis = Tensor::f_from_slice(&basis)?
-            .f_view([BASIS, 1, 1])?
-            .f_to_device(self.weight.device())?;
+        let basis = tensor(&basis, &[BASIS, 1, 1], self.weight.device())?;
         let change =
             (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)?;
-        Ok(self.identity()? + change)
-    }
-
-    /// `[C, C]`.
-    fn identity(&self) -> Result<Tensor, TchError> {
-        Tensor::f_eye(self.weight.size3()?.1, (Kind::Float, self.weight.device()))
+        let options = (Kind::Float, self.weight.device());
+        Ok(Tensor::f_eye(self.weight.size3()?.1, options)? + change)
     }
 }
 

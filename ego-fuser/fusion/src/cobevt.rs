@@ -6,8 +6,7 @@
 //! and need not compute the others. `count_missing` restores the published behaviour.
 
 use perception::model_config::{ConfigError, DetectorConfig};
-use tch::nn;
-use tch::{TchError, Tensor};
+use tch::{TchError, Tensor, nn};
 
 use super::interface::{Fusion, FusionOutput};
 use super::maps::{AlignedMaps, MapMetadata};
@@ -15,6 +14,7 @@ use super::padding::Padding;
 use super::settings::{FusionSettings, of_size};
 use super::spec::MethodSpec;
 use super::swap_fusion::{Slots, SwapFusion, SwapFusionConfig};
+use super::warp::WarpedMaps;
 
 /// CoBEVT.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<SwapFusionConfig>(
@@ -48,9 +48,8 @@ impl Cobevt {
     /// [`ConfigError`] when no network can be built from `config`.
     pub fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let fusion = SwapFusion::new(path, config, true);
         Ok(Self {
-            fusion,
+            fusion: SwapFusion::new(path, config, true),
             window: config.window,
             count_missing: config.count_missing,
         })
@@ -61,33 +60,30 @@ impl Fusion for Cobevt {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let agents = maps.count()?;
         let order = nearest_first(&maps.metadata).to_device(maps.warped.features.device());
-        let [features, mask] =
-            [&maps.warped.features, &maps.warped.mask].map(|maps| maps.f_index_select(0, &order));
-        let (features, mask) = (features?, mask?);
+        let WarpedMaps { features, mask } =
+            maps.warped.each(|map| map.f_index_select(0, &order))?;
         // Where all maps reach every cell, neither the product with the mask nor masked attention is needed.
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let features = if sees_all { features } else { features * &mask };
         // For published weights: empty slots are maps of zeros that count in the mean at the end.
-        let empty = if self.count_missing {
-            (self.fusion.slots() - agents).max(0)
-        } else {
-            0
+        let empty = match self.count_missing {
+            true => (self.fusion.slots() - agents).max(0),
+            false => 0,
         };
         let padding = Padding::to_multiples(&features, self.window)?;
         let features = padding.maps(&features, empty)?;
-        let reach = if sees_all && empty == 0 && padding.is_empty() {
-            None
-        } else {
-            Some(padding.mask(&mask, empty)?.f_squeeze_dim(1)?)
+        let is_full = sees_all && empty == 0 && padding.is_empty();
+        let reach = match is_full {
+            true => None,
+            false => Some(padding.mask(&mask, empty)?.f_squeeze_dim(1)?),
         };
         let slots = Slots {
             asked: agents,
             reach: reach.as_ref(),
             count_missing: self.count_missing,
         };
-        Ok(padding
-            .crop(&self.fusion.forward(&features, slots, maps.is_training)?)?
-            .into())
+        let fused = self.fusion.forward(&features, slots, maps.is_training)?;
+        Ok(padding.crop(&fused)?.into())
     }
 }
 

@@ -113,20 +113,16 @@ impl ConvGru {
             .try_fold(x.shallow_clone(), |x, Cell { gates, candidate }| {
                 let input = x.size4()?.1;
                 // Update gate and candidate in one convolution over the input alone.
-                let kernels = [
-                    gates.weight.f_narrow(0, hidden, hidden)?,
-                    candidate.weight.shallow_clone(),
-                ];
+                let [kernel, bias] = [
+                    (&gates.weight, &candidate.weight),
+                    (&gates.bias, &candidate.bias),
+                ]
+                .map(|(gates, candidate)| {
+                    Tensor::f_cat(&[&gates.f_narrow(0, hidden, hidden)?, candidate], 0)
+                });
                 // Only the weights of the input: those of the state would multiply zeros.
-                let kernel = Tensor::f_cat(&kernels, 0)?.f_narrow(1, 0, input)?;
-                let bias = Tensor::f_cat(
-                    &[
-                        gates.bias.f_narrow(0, hidden, hidden)?,
-                        candidate.bias.shallow_clone(),
-                    ],
-                    0,
-                )?;
-                let both = convolve(&x, &kernel, Some(&bias))?;
+                let kernel = kernel?.f_narrow(1, 0, input)?;
+                let both = convolve(&x, &kernel, Some(&bias?))?;
                 Ok(both.f_narrow(1, 0, hidden)?.f_sigmoid()?
                     * both.f_narrow(1, hidden, hidden)?.f_tanh()?)
             })

@@ -11,6 +11,7 @@ use tch::nn;
 use tch::{TchError, Tensor};
 
 use super::conv_gru::Conv;
+use super::f64_tensor::sum_over_first;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
 use super::settings::FusionSettings;
@@ -123,9 +124,7 @@ impl Fusion for DiscoNet {
         let weights = scores
             .f_masked_fill(&maps.warped.mask.f_eq(0.0)?, f64::NEG_INFINITY)?
             .f_softmax(0, None)?;
-        Ok((weights * features)
-            .f_sum_dim_intlist([0i64].as_slice(), false, None)?
-            .into())
+        Ok(sum_over_first(&(weights * features))?.into())
     }
 }
 

@@ -108,6 +108,14 @@ pub(crate) fn sum_over_first(tensor: &Tensor) -> Result<Tensor, TchError> {
     tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None)
 }
 
+/// Column and row of each cell of a square relative to that in its middle, up to `radius` away, row by row.
+pub(crate) fn offsets_around(radius: i64) -> Vec<i64> {
+    let side = -radius..=radius;
+    side.clone()
+        .flat_map(|row| side.clone().flat_map(move |column| [column, row]))
+        .collect()
+}
+
 /// `[C, H * W]` of a map `[C, H, W]`, without a copy in either memory order.
 pub(crate) fn flat(map: &Tensor) -> Result<Tensor, TchError> {
     map.f_flatten(1, 2)

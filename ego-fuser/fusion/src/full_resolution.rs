@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use perception::tensor_values::tensor;
 use protocol::{BevGrid, Pose};
 use tch::{Kind, Result, Tensor};
 
@@ -69,8 +70,7 @@ impl FullResolutionMap {
         }
     }
 
-    /// The same map; nothing is copied.
-    pub(crate) fn shallow_clone(&self) -> Self {
+    fn shallow_clone(&self) -> Self {
         match self {
             Self::Numbers { cells, size, sent } => Self::Numbers {
                 cells: cells.shallow_clone(),
@@ -82,6 +82,11 @@ impl FullResolutionMap {
                 sent: sent.shallow_clone(),
             },
         }
+    }
+
+    /// The same maps; nothing is copied.
+    pub(crate) fn shallow_clones<'a>(maps: impl IntoIterator<Item = &'a Self>) -> Vec<Self> {
+        maps.into_iter().map(Self::shallow_clone).collect()
     }
 
     /// Features of `maps` on `grid`, each with its time step and its sender's pose, at some `cells` (row and column) of
@@ -116,9 +121,7 @@ impl FullResolutionMap {
                 })
             }
             Self::Tensors { map, sent } => {
-                let sampling_grid = Tensor::f_from_slice(places)?
-                    .f_view([1, 1, -1, 2])?
-                    .f_to_device(map.device())?;
+                let sampling_grid = tensor(places, &[1, 1, -1, 2], map.device())?;
                 let [features, mask] = [(map, BILINEAR), (sent, NEAREST)].map(|(map, how)| {
                     let read = map.f_grid_sampler(&sampling_grid, how, PADDING_ZEROS, false)?;
                     read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)

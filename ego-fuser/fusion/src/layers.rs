@@ -150,6 +150,31 @@ impl FeedForward {
     }
 }
 
+/// A feed-forward network with pre-norm and a residual: `norm` and `fn`.
+#[derive(Debug)]
+pub(crate) struct FeedForwardBlock {
+    norm: LayerNorm,
+    feed_forward: FeedForward,
+}
+
+impl FeedForwardBlock {
+    /// From `channels` to `hidden` and back.
+    pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
+        Self {
+            norm: LayerNorm::new(&(path / "norm"), channels),
+            feed_forward: FeedForward::new(&(path / "fn"), channels, hidden, dropout),
+        }
+    }
+
+    /// `[..., channels]` to the same.
+    ///
+    /// # Errors
+    /// [`TchError`] when the number of channels differs.
+    pub(crate) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        Ok(x + self.feed_forward.forward(&self.norm.forward(x)?, train)?)
+    }
+}
+
 /// Leaves out values at random in training.
 ///
 /// # Errors
@@ -175,11 +200,8 @@ pub(crate) fn attend(
     bias: Option<&Tensor>,
 ) -> Result<Tensor, TchError> {
     let (groups, tokens, heads, channels) = query.size4()?;
-    let [query, key, value] = [
-        query.f_transpose(1, 2)?,
-        key.f_transpose(1, 2)?,
-        value.f_transpose(1, 2)?,
-    ];
+    let [query, key, value] = [query, key, value].map(|tokens| tokens.f_transpose(1, 2));
+    let (query, key, value) = (query?, key?, value?);
     let seen = match bias {
         Some(bias) if bias.requires_grad() => attend_and_learn_bias(&query, &key, &value, bias)?,
         _ => Tensor::f_scaled_dot_product_attention(

@@ -1,6 +1,7 @@
 //! Stages of feature maps before a fusion: as received, warped onto the ego's grid ([`WarpedMaps`]), aligned with
 //! metadata.
 
+use perception::tensor_values::values;
 use protocol::{BevGrid, Pose};
 use tch::{TchError, Tensor};
 
@@ -54,25 +55,22 @@ impl ReceivedMaps {
         }
     }
 
+    /// Other maps of which the same cells were sent.
+    pub(crate) fn with_maps(&self, maps: Tensor) -> Self {
+        Self::new(maps, self.sent.as_ref().map(Tensor::shallow_clone))
+    }
+
     /// The entries from `first` up to `end`.
     ///
     /// # Errors
     /// [`TchError`] when there are fewer.
     pub fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
-        let sent = match &self.sent {
-            Some(sent) => Some(sent.f_narrow(0, first, end - first)?),
-            None => None,
-        };
-        let full_resolution = self
-            .full_resolution
-            .get(first as usize..end as usize)
-            .unwrap_or_default();
+        let only = |maps: &Tensor| maps.f_narrow(0, first, end - first);
+        let sent = self.sent.as_ref().map(only).transpose()?;
+        let full_resolution = self.full_resolution.get(first as usize..end as usize);
         Ok(Self {
-            full_resolution: full_resolution
-                .iter()
-                .map(FullResolutionMap::shallow_clone)
-                .collect(),
-            ..Self::new(self.maps.f_narrow(0, first, end - first)?, sent)
+            full_resolution: FullResolutionMap::shallow_clones(full_resolution.unwrap_or_default()),
+            ..Self::new(only(&self.maps)?, sent)
         })
     }
 
@@ -90,14 +88,11 @@ impl ReceivedMaps {
             });
             Tensor::f_cat(&cells.collect::<Result<Vec<_>, TchError>>()?, 0)
         });
+        let full_resolution = all.iter().flat_map(|maps| &maps.full_resolution);
         Ok(Self {
             maps: Tensor::f_cat(&maps, 0)?,
             sent: sent.transpose()?,
-            full_resolution: all
-                .iter()
-                .flat_map(|maps| &maps.full_resolution)
-                .map(FullResolutionMap::shallow_clone)
-                .collect(),
+            full_resolution: FullResolutionMap::shallow_clones(full_resolution),
         })
     }
 }
@@ -141,6 +136,11 @@ impl AlignedMaps {
         }
     }
 
+    /// Earlier maps at full resolution, and the class head.
+    pub(crate) fn earlier_full_resolution(&self) -> Option<&(Vec<FullResolutionMap>, Classes)> {
+        self.earlier.as_ref()?.full_resolution.as_ref()
+    }
+
     /// Number of agents with a newest map, or of maps of any age where earlier ones are not separate.
     ///
     /// # Errors
@@ -168,14 +168,8 @@ pub(crate) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError
         return Ok(maps.shallow_clone());
     }
     if height % cells != 0 || width % cells != 0 {
-        return maps.f_avg_pool2d(
-            [cells, cells],
-            [cells, cells],
-            [0_i64, 0],
-            true,
-            false,
-            None::<i64>,
-        );
+        let (edges, none) = ([cells; 2], [0_i64; 2]);
+        return maps.f_avg_pool2d(edges, edges, none, true, false, None::<i64>);
     }
     // The tensor library's pooling takes three times as long.
     let rows = sum_of_every(maps, 2, cells)?;
@@ -184,11 +178,9 @@ pub(crate) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError
 
 /// The sums of each `count` neighbours along `dim`.
 fn sum_of_every(maps: &Tensor, dim: i64, count: i64) -> Result<Tensor, TchError> {
-    let mut sum = maps.f_slice(dim, 0_i64, None, count)?;
-    for first in 1..count {
-        sum = sum.f_add(&maps.f_slice(dim, first, None, count)?)?;
-    }
-    Ok(sum)
+    (1..count).try_fold(maps.f_slice(dim, 0_i64, None, count)?, |sum, first| {
+        sum.f_add(&maps.f_slice(dim, first, None, count)?)
+    })
 }
 
 /// The grid of pooled maps.
@@ -205,11 +197,7 @@ pub(crate) fn with_cells_of(grid: &BevGrid, cells: i64) -> BevGrid {
 
 /// Indices of the entries of `mask` `[N, 1, H, W]` that reach any cell; `with_ego`: the first is always one.
 pub(crate) fn reaching(mask: &Tensor, with_ego: bool) -> Result<Vec<i64>, TchError> {
-    let most = mask.f_amax([1i64, 2, 3].as_slice(), false)?;
-    let most = Vec::<f32>::try_from(
-        most.f_to_kind(tch::Kind::Float)?
-            .f_to_device(tch::Device::Cpu)?,
-    )?;
+    let most = values(&mask.f_amax([1i64, 2, 3].as_slice(), false)?)?;
     Ok((0i64..)
         .zip(most)
         .filter(|(entry, most)| (with_ego && *entry == 0) || *most > 0.0)

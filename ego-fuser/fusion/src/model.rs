@@ -14,6 +14,7 @@ use perception::layers::head::HeadOutput;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::pillars::batch::PillarBatch;
 use perception::pillars::point_pillars::PointPillars;
+use perception::tensor_values::values;
 use perception::train::ComputePrecision;
 use perception::weights::{CONFIG_KEY, FileError, METHOD_KEY, Weights};
 use protocol::Detection;
@@ -27,9 +28,7 @@ use crate::own::OwnConfig;
 use crate::targets::{AnchorGridError, TargetAssigner, TargetRule};
 use crate::warp::WarpError;
 use crate::where2comm::most_confident;
-use crate::{
-    AlignedMaps, FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing,
-};
+use crate::{FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing};
 
 use stage::{FUSION_PREFIX, stored_config};
 pub use stage::{FusionStage, StageError};
@@ -270,11 +269,8 @@ impl CooperativeModel {
         train: bool,
     ) -> Result<CooperativeOutput, ModelError> {
         let features = self.network.features(pillars, train);
-        self.fuse_and_detect(
-            &self.network.through_compressor(&features, train),
-            facts,
-            train,
-        )
+        let features = self.network.through_compressor(&features, train);
+        self.fuse_and_detect(&features, facts, train)
     }
 
     /// Second half of the forward pass, from the maps of all views `[sum(views), C, H, W]` on, each in its own frame.
@@ -294,26 +290,19 @@ impl CooperativeModel {
         }
         // One view per sample and no fusion: the views already are the batch of the head.
         if self.fusion.config().settings::<OwnConfig>().is_some() && described == facts.len() {
-            let corrections = facts.iter().map(|_| None).collect();
             return Ok(CooperativeOutput {
                 head: self.network.heads(features)?,
-                corrections,
+                corrections: facts.iter().map(|_| None).collect(),
             });
         }
-        let (mut fused, mut corrections) = (
-            Vec::with_capacity(facts.len()),
-            Vec::with_capacity(facts.len()),
-        );
+        let (mut fused, mut corrections) = (Vec::new(), Vec::new());
         let mut first = 0;
         for facts in facts {
             let maps = features.f_narrow(0, first, facts.len() as i64)?;
             first += facts.len() as i64;
-            let FusionOutput {
-                map,
-                corrections: shifts,
-            } = self.fuse(maps, facts, train)?;
-            fused.push(map);
-            corrections.push(shifts);
+            let output = self.fuse(maps, facts, train)?;
+            fused.push(output.map);
+            corrections.push(output.corrections);
         }
         Ok(CooperativeOutput {
             head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?,
@@ -328,16 +317,10 @@ impl CooperativeModel {
         facts: &[MapMetadata],
         train: bool,
     ) -> Result<FusionOutput, ModelError> {
-        let sent = if train {
-            self.sent_in_training(&maps)?
-        } else {
-            None
-        };
-        let aligned = self.fusion.align(&ReceivedMaps::new(maps, sent), facts)?;
-        Ok(self.fusion.fuse(&AlignedMaps {
-            is_training: train,
-            ..aligned
-        })?)
+        let sent = self.sent(&maps, train)?;
+        let mut aligned = self.fusion.align(&ReceivedMaps::new(maps, sent), facts)?;
+        aligned.is_training = train;
+        Ok(self.fusion.fuse(&aligned)?)
     }
 
     /// Output for samples of maps `[N, C, H, W]`, their metadata and boxes of neighbours without a map: the method runs
@@ -351,10 +334,8 @@ impl CooperativeModel {
     ) -> Result<HeadOutput, ModelError> {
         let heads = samples.iter().map(|(maps, facts, boxes)| {
             let (fused, head) = tch::no_grad(|| {
-                let fused = self
-                    .fuse(maps.shallow_clone(), facts, false)?
-                    .map
-                    .f_unsqueeze(0)?;
+                let fused = self.fuse(maps.shallow_clone(), facts, false)?;
+                let fused = fused.map.f_unsqueeze(0)?;
                 let head = self.network.heads(&fused)?;
                 Ok::<_, ModelError>((fused, head))
             })?;
@@ -372,9 +353,9 @@ impl CooperativeModel {
     /// Mask of the cells of maps `[N, C, H, W]` that agents would have sent, for a method in which they select: in
     /// training a random share of the most confident cells, so that every threshold is learnt. The ego keeps all of its
     /// own.
-    fn sent_in_training(&self, features: &Tensor) -> Result<Option<Tensor>, TchError> {
-        let agents = features.size4()?.0;
-        if !self.fusion.requirements().partial_maps_in_training || agents < 2 {
+    fn sent(&self, features: &Tensor, train: bool) -> Result<Option<Tensor>, TchError> {
+        let selects = train && self.fusion.requirements().partial_maps_in_training;
+        if !selects || features.size4()?.0 < 2 {
             return Ok(None);
         }
         tch::no_grad(|| {
@@ -395,19 +376,13 @@ impl CooperativeModel {
         output: &HeadOutput,
         limits: &PostprocessConfig,
     ) -> Result<Vec<Vec<Detection>>, ModelError> {
-        let samples = output.scores.size4()?.0;
-        (0..samples)
-            .map(|sample| {
-                let scores = flat(&output.scores, sample)?;
-                let decoded = decode(
-                    &scores,
-                    &flat(&output.offsets, sample)?,
-                    &self.anchors,
-                    limits.score_threshold,
-                )?;
-                Ok(detections(&decoded, limits))
-            })
-            .collect()
+        let samples = (0..output.scores.size4()?.0).map(|sample| {
+            let [scores, offsets] =
+                [&output.scores, &output.offsets].map(|map| values(&map.f_get(sample)?));
+            let decoded = decode(&scores?, &offsets?, &self.anchors, limits.score_threshold)?;
+            Ok(detections(&decoded, limits))
+        });
+        samples.collect()
     }
 
     /// Post-processing limits of this network: boxes lie completely over its area.
@@ -425,14 +400,4 @@ impl CooperativeModel {
         let shape = [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len()];
         TargetAssigner::new(boxes.collect(), shape, TargetRule::default())
     }
-}
-
-/// The values of one sample of a map, row-major.
-fn flat(map: &Tensor, sample: i64) -> Result<Vec<f32>, TchError> {
-    Vec::try_from(
-        map.f_get(sample)?
-            .f_to_device(Device::Cpu)?
-            .f_to_kind(Kind::Float)?
-            .f_reshape([-1])?,
-    )
 }

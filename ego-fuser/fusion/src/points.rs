@@ -16,12 +16,11 @@ pub fn merge_points<'a>(
             continue;
         }
         let ego_from_cav = pose.isometry().cast::<f32>();
-        merged
-            .xyzi
-            .extend(cloud.xyzi.iter().map(|&[x, y, z, intensity]| {
-                let moved = ego_from_cav * Point3::new(x, y, z);
-                [moved.x, moved.y, moved.z, intensity]
-            }));
+        let points = cloud.xyzi.iter().map(|&[x, y, z, intensity]| {
+            let moved = ego_from_cav * Point3::new(x, y, z);
+            [moved.x, moved.y, moved.z, intensity]
+        });
+        merged.xyzi.extend(points);
     }
     merged
 }

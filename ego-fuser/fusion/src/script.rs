@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use perception::model_config::{ConfigError, DetectorConfig};
+use perception::tensor_values::tensor;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
-use tch::{CModule, Device, TchError, Tensor, nn};
+use tch::{CModule, Device, TchError, nn};
 use zip::ZipArchive;
 
 use crate::interface::{Fusion, FusionOutput};
@@ -142,14 +143,12 @@ impl Fusion for ScriptFusion {
         let features = &maps.warped.features;
         let device = features.device();
         let poses: Vec<f32> = maps.metadata.iter().flat_map(planar).collect();
-        let poses = Tensor::f_from_slice(&poses)?
-            .f_view([-1, 3])?
-            .f_to_device(device)?;
+        let poses = tensor(&poses, &[-1, 3], device)?;
         let about: (Vec<f32>, Vec<f32>) = { maps.metadata.iter() }
             .map(|map| (map.confidence as f32, map.age_secs as f32))
             .unzip();
-        let confidence = Tensor::f_from_slice(&about.0)?.f_to_device(device)?;
-        let age_s = Tensor::f_from_slice(&about.1)?.f_to_device(device)?;
+        let confidence = tensor(&about.0, &[-1], device)?;
+        let age_s = tensor(&about.1, &[-1], device)?;
         let arguments = [features, &maps.warped.mask, &poses, &confidence, &age_s];
         let expected = &features.size()[1..];
         let fused = match self.module.forward_ts(&arguments) {
@@ -193,7 +192,7 @@ mod tests {
     use std::io::Write;
 
     use protocol::{BevGrid, Pose};
-    use tch::Kind;
+    use tch::{Kind, Tensor};
     use zip::write::FileOptions;
     use zip::{CompressionMethod, ZipWriter};
 

@@ -120,12 +120,12 @@ impl FusionConfig {
 
     /// JSON with the tag first, as weights files hold it.
     pub fn to_json(&self) -> String {
-        self.0.to_json(Style::Compact)
+        self.0.to_json(false)
     }
 
     /// The same over several lines, for readers.
     pub fn to_json_pretty(&self) -> String {
-        self.0.to_json(Style::Pretty)
+        self.0.to_json(true)
     }
 }
 
@@ -141,15 +141,9 @@ trait AnySettings: Debug + Send + Sync {
     fn as_any(&self) -> &dyn Any;
     fn requirements(&self) -> Requirements;
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError>;
-    fn to_json(&self, style: Style) -> String;
+    /// `is_pretty`: over several lines.
+    fn to_json(&self, is_pretty: bool) -> String;
     fn equals(&self, other: &dyn AnySettings) -> bool;
-}
-
-/// Layout of JSON.
-#[derive(Debug, Clone, Copy)]
-enum Style {
-    Compact,
-    Pretty,
 }
 
 #[derive(Serialize)]
@@ -176,14 +170,14 @@ impl<S: FusionSettings> AnySettings for S {
         FusionSettings::build(self, path)
     }
 
-    fn to_json(&self, style: Style) -> String {
+    fn to_json(&self, is_pretty: bool) -> String {
         let tagged = Tagged {
             kind: S::KIND,
             settings: self,
         };
-        let text = match style {
-            Style::Compact => serde_json::to_string(&tagged),
-            Style::Pretty => serde_json::to_string_pretty(&tagged),
+        let text = match is_pretty {
+            false => serde_json::to_string(&tagged),
+            true => serde_json::to_string_pretty(&tagged),
         };
         text.expect("settings are JSON")
     }

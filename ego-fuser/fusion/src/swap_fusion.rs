@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 use tch::nn;
 use tch::{Device, Kind, Tensor};
 
-use super::layers::{FeedForward, LayerNorm, Linear, SMALL, attend, dropout, unseen};
+use super::f64_tensor::sum_over_first;
+use super::layers::{FeedForwardBlock, LayerNorm, Linear, SMALL, attend, dropout, unseen};
 use super::partition::{Partition, shape_error};
 
 /// Tokens that are computed at once outside training: intermediate results then stay in the cache.
@@ -94,7 +95,7 @@ impl SwapFusionConfig {
 pub(super) struct OffsetTable {
     slots: i64,
     window: i64,
-    heads: i64,
+    pub(super) heads: i64,
     /// `[(2 * slots - 1) * (2 * window - 1)^2, M]`.
     table: Tensor,
 }
@@ -131,12 +132,26 @@ impl OffsetTable {
         let bias = self.table.f_index_select(0, &index)?.f_view(shape)?;
         bias.f_permute([2, 0, 1])?.f_contiguous()
     }
+
+    /// The same of all `count` slots, with the mask of what they do not see: broadcastable to
+    /// `[G, M, count * cells, asked * cells]`.
+    pub(super) fn masked_bias(
+        &self,
+        count: i64,
+        slots: Slots<'_>,
+        partition: Partition,
+    ) -> tch::Result<Tensor> {
+        let bias = self.bias(count, slots.asked)?.f_unsqueeze(0)?;
+        Ok(match slots.unseen(partition, self.window)? {
+            Some(unseen) => bias + unseen,
+            None => bias,
+        })
+    }
 }
 
 /// Attention among the tokens of a group.
 #[derive(Debug)]
 struct GroupAttention {
-    heads: i64,
     to_qkv: Linear,
     offsets: OffsetTable,
     out: Linear,
@@ -147,7 +162,6 @@ impl GroupAttention {
     fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
         let channels = config.channels;
         Self {
-            heads: channels / config.head_channels,
             to_qkv: Linear::new(&(path / "to_qkv"), channels, 3 * channels, false),
             offsets: OffsetTable::new(path, config),
             out: Linear::residual(&(path / "to_out" / 0), channels, channels, false),
@@ -160,7 +174,7 @@ impl GroupAttention {
         let &[_, slots, _, channels] = &x.size()[..] else {
             return Err(shape_error(x));
         };
-        let by_head = [self.heads, channels / self.heads];
+        let by_head = [self.offsets.heads, channels / self.offsets.heads];
         let parts = if asked == slots {
             let parts = self.to_qkv.forward(x)?.f_flatten(1, 2)?;
             parts.f_split(channels, 2)?
@@ -175,12 +189,8 @@ impl GroupAttention {
                 .chain(key_value.f_flatten(1, 2)?.f_split(channels, 2)?)
                 .collect()
         };
-        let seen = attend(
-            &parts[0].f_unflatten(-1, by_head)?,
-            &parts[1].f_unflatten(-1, by_head)?,
-            &parts[2].f_unflatten(-1, by_head)?,
-            Some(bias),
-        )?;
+        let [query, key, value] = [0, 1, 2].map(|part: usize| parts[part].f_unflatten(-1, by_head));
+        let seen = attend(&query?, &key?, &value?, Some(bias))?;
         dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(x)
     }
 }
@@ -191,8 +201,7 @@ pub(super) struct HalfBlock {
     partition: Partition,
     norm: LayerNorm,
     attention: GroupAttention,
-    feed_norm: LayerNorm,
-    feed_forward: FeedForward,
+    feed_forward: FeedForwardBlock,
 }
 
 impl HalfBlock {
@@ -207,19 +216,14 @@ impl HalfBlock {
             partition,
             norm: LayerNorm::new(&(attention / "norm"), channels),
             attention: GroupAttention::new(&(attention / "fn"), config),
-            feed_norm: LayerNorm::new(&(feed / "norm"), channels),
-            feed_forward: FeedForward::new(&(feed / "fn"), channels, hidden, config.dropout),
+            feed_forward: FeedForwardBlock::new(feed, channels, hidden, config.dropout),
         }
     }
 
     fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> tch::Result<Tensor> {
-        let x = x + self
-            .attention
-            .forward(&self.norm.forward(x)?, asked, bias, train)?;
-        Ok(&x
-            + self
-                .feed_forward
-                .forward(&self.feed_norm.forward(&x)?, train)?)
+        let normed = self.norm.forward(x)?;
+        let seen = self.attention.forward(&normed, asked, bias, train)?;
+        self.feed_forward.forward(&(x + seen), train)
     }
 
     /// On all groups of a map `[S, H, W, C]` at once, by operations with fast gradients: the groups.
@@ -231,15 +235,8 @@ impl HalfBlock {
         train: bool,
     ) -> tch::Result<Tensor> {
         let x = self.partition.cut(map, window)?;
-        let bias = self
-            .attention
-            .offsets
-            .bias(x.size()[1], slots.asked)?
-            .f_unsqueeze(0)?;
-        let bias = match slots.unseen(self.partition, window)? {
-            Some(unseen) => bias + unseen,
-            None => bias,
-        };
+        let offsets = &self.attention.offsets;
+        let bias = offsets.masked_bias(x.size()[1], slots, self.partition)?;
         self.forward(&x, slots.asked, &bias, train)
     }
 }
@@ -289,8 +286,8 @@ impl MeanHead {
             Some(reach) if !slots.count_missing => {
                 let reach = reach.f_unsqueeze(3)?.f_to_kind(x.kind())?;
                 // At least 1, as the first slot reaches every cell.
-                let count = reach.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
-                (x * reach).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / count
+                let count = sum_over_first(&reach)?;
+                sum_over_first(&(x * reach))? / count
             }
             _ => x.f_mean_dim([0i64].as_slice(), false, None::<Kind>)?,
         };
@@ -380,27 +377,23 @@ impl SwapFusion {
         halves: usize,
         train: bool,
     ) -> tch::Result<Tensor> {
-        let map = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
-        let size = [map.size()[1], map.size()[2]];
-        let mut x = map;
+        let mut x = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let size = [x.size()[1], x.size()[2]];
+        let as_map = |x: &Tensor, lies_in: Option<Partition>| match lies_in {
+            Some(partition) => partition.map(x, size, self.window),
+            None => Ok(x.shallow_clone()),
+        };
         // Between two halves the tokens stay in the order of their groups; the next partition rearranges them.
         let mut lies_in = None;
         for half in &self.halves[..halves.min(self.halves.len())] {
             x = if train {
-                let map = lies_in.map_or_else(
-                    || Ok(x.shallow_clone()),
-                    |p: Partition| p.map(&x, size, self.window),
-                )?;
-                half.whole(&map, slots, self.window, true)?
+                half.whole(&as_map(&x, lies_in)?, slots, self.window, true)?
             } else {
                 self.chunked(half, &x, lies_in, slots, size)?
             };
             lies_in = Some(half.partition);
         }
-        lies_in.map_or_else(
-            || Ok(x.shallow_clone()),
-            |partition| partition.map(&x, size, self.window),
-        )
+        as_map(&x, lies_in)
     }
 
     /// The same some groups at a time, gathered from their places in memory.
@@ -426,11 +419,8 @@ impl SwapFusion {
             None => order.f_view([count, size[0], size[1], 1])?,
         };
         let order = half.partition.cut(&order, self.window)?.f_view([-1])?;
-        let bias = half
-            .attention
-            .offsets
-            .bias(count, slots.asked)?
-            .f_unsqueeze(0)?;
+        let offsets = &half.attention.offsets;
+        let bias = offsets.bias(count, slots.asked)?.f_unsqueeze(0)?;
         let unseen = slots.unseen(half.partition, self.window)?;
         let step = (CHUNK / (count * cells)).max(1);
         let mut done = Vec::new();

@@ -7,6 +7,7 @@
 //! neither multiplied here nor trained.
 
 use perception::model_config::{ConfigError, DetectorConfig};
+use perception::tensor_values::tensor;
 use protocol::config::{require, within};
 use protocol::{BevGrid, Pose};
 use serde::{Deserialize, Serialize};
@@ -14,6 +15,7 @@ use tch::nn;
 use tch::{Device, Kind, TchError, Tensor};
 
 use super::conv_gru::{Conv, ConvGru};
+use super::f64_tensor::picked;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::{AlignedMaps, MapMetadata, reaching};
 use super::settings::{FusionSettings, of_size};
@@ -150,13 +152,10 @@ impl V2vNet {
     /// [`TchError`] when shapes do not fit.
     pub fn propagate(&self, maps: &Tensor, incoming: &[Incoming]) -> Result<Tensor, TchError> {
         let mut nodes = maps.shallow_clone();
-        for round in 1..=self.config.rounds {
+        let last = self.config.rounds;
+        for round in 1..=last {
             // Of the last round only the ego's update is used.
-            let receivers = if round == self.config.rounds {
-                1
-            } else {
-                incoming.len()
-            };
+            let receivers = if round == last { 1 } else { incoming.len() };
             nodes = self.round(&nodes, &incoming[..receivers])?;
         }
         self.mlp.apply(&nodes.f_narrow(0, 0, 1)?)?.f_squeeze_dim(0)
@@ -192,15 +191,9 @@ impl V2vNet {
 
 impl Incoming {
     fn warp(&self, maps: &Tensor) -> Result<Tensor, TchError> {
-        let theta = self.theta.f_to_kind(maps.kind())?;
-        let sampling_grid =
-            Tensor::f_affine_grid_generator(&theta, maps.size(), self.corners_aligned)?;
-        maps.f_grid_sampler(
-            &sampling_grid,
-            BILINEAR,
-            PADDING_ZEROS,
-            self.corners_aligned,
-        )
+        let (theta, corners_aligned) = (self.theta.f_to_kind(maps.kind())?, self.corners_aligned);
+        let places = Tensor::f_affine_grid_generator(&theta, maps.size(), corners_aligned)?;
+        maps.f_grid_sampler(&places, BILINEAR, PADDING_ZEROS, corners_aligned)
     }
 
     /// Incoming maps of `receiver` from all, by the poses of their maps; `reach` is given for the ego and computed for
@@ -217,17 +210,12 @@ impl Incoming {
             let receiver_from_cav = receiver_from_ego * node.ego_from_cav.isometry();
             cav_from_ego_normalized(&Pose::from(receiver_from_cav), grid)
         });
-        let theta = Tensor::f_from_slice(&entries.collect::<Vec<f32>>())?.f_view([-1, 2, 3])?;
-        let theta = theta.f_to_device(device)?;
+        let theta = tensor(&entries.collect::<Vec<f32>>(), &[-1, 2, 3], device)?;
         let mask = match reach {
             Some(reach) => reach.shallow_clone(),
             None => {
-                let size = [
-                    nodes.len() as i64,
-                    1,
-                    i64::from(grid.height),
-                    i64::from(grid.width),
-                ];
+                let [height, width] = [grid.height, grid.width].map(i64::from);
+                let size = [nodes.len() as i64, 1, height, width];
                 let everywhere = Tensor::f_ones(size, (Kind::Float, theta.device()))?;
                 let sampling_grid = Tensor::f_affine_grid_generator(&theta, size, false)?;
                 everywhere.f_grid_sampler(&sampling_grid, NEAREST, PADDING_ZEROS, false)?
@@ -251,26 +239,18 @@ impl Fusion for V2vNet {
             .iter()
             .map(|&entry| aligned.metadata[entry as usize])
             .collect();
-        let device = warped.features.device();
-        let index = Tensor::f_from_slice(&entries)?.f_to_device(device)?;
-        let (maps, mask) = (
-            // As received: each node warps them to its own frame.
-            aligned.received.maps.f_index_select(0, &index)?,
-            warped.mask.f_index_select(0, &index)?,
-        );
+        // As received: each node warps them to its own frame.
+        let maps = picked(&aligned.received.maps, &entries)?;
+        let mask = picked(&warped.mask, &entries)?;
         // With a single round only the ego receives.
-        let receivers = if self.config.rounds > 1 {
-            nodes.len()
-        } else {
-            1
-        };
+        let is_single = self.config.rounds <= 1;
+        let receivers = if is_single { 1 } else { nodes.len() };
         let incoming = (0..receivers).map(|receiver| {
             let reach = (receiver == 0).then_some(&mask);
-            Incoming::between(receiver, &nodes, &aligned.grid, reach, device)
+            Incoming::between(receiver, &nodes, &aligned.grid, reach, mask.device())
         });
-        Ok(self
-            .propagate(&maps, &incoming.collect::<Result<Vec<_>, _>>()?)?
-            .into())
+        let incoming: Vec<Incoming> = incoming.collect::<Result<_, _>>()?;
+        Ok(self.propagate(&maps, &incoming)?.into())
     }
 }
 

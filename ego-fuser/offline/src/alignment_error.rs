@@ -74,10 +74,8 @@ impl AlignmentMeter {
     /// # Errors
     /// [`EgoError`] names the file and what is wrong with it.
     pub fn load(weights: &Weights) -> Result<Self, EgoError> {
-        let method = weights
-            .metadata(METHOD_KEY)
-            .unwrap_or(Method::NONE.name())
-            .parse()?;
+        let method = weights.metadata(METHOD_KEY);
+        let method = method.unwrap_or(Method::NONE.name()).parse()?;
         let detector = Detector::from_weights(weights, &weights.detector_config()?, Device::Cpu)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config(), Device::Cpu)?;
         Ok(Self { detector, fusion })
@@ -109,11 +107,9 @@ impl AlignmentMeter {
                 }
             }
         }
-        Ok(offsets
-            .iter()
-            .zip(&errors)
-            .map(|(offset, errors)| summary(offset, errors))
-            .collect())
+        let measured = offsets.iter().zip(&errors);
+        let summaries = measured.map(|(offset, errors)| summary(offset, errors));
+        Ok(summaries.collect())
     }
 
     /// The ego with each of its neighbours in range.
@@ -165,18 +161,11 @@ impl AlignmentMeter {
     ) -> Result<[[f64; 2]; 2], AlignmentMeterError> {
         let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
         let turn_rad = offset.turn_deg.to_radians() * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-        let off = moved(
-            &pair.ego_from_cav,
-            [offset.shift_m * cos, offset.shift_m * sin, turn_rad],
-        );
-        let correction = self
-            .correction(&pair.maps, off)?
-            .ok_or(AlignmentMeterError::NoAlignment)?;
-        let corrected = moved(&off, correction);
-        Ok([
-            error(&pair.ego_from_cav, &off),
-            error(&pair.ego_from_cav, &corrected),
-        ])
+        let shift = [offset.shift_m * cos, offset.shift_m * sin, turn_rad];
+        let off = moved(&pair.ego_from_cav, shift);
+        let correction = self.correction(&pair.maps, off)?;
+        let corrected = moved(&off, correction.ok_or(AlignmentMeterError::NoAlignment)?);
+        Ok([off, corrected].map(|found| error(&pair.ego_from_cav, &found)))
     }
 
     /// The method's correction of the pose of the second of two maps: x and y, metres, and heading, radians.

@@ -196,11 +196,8 @@ impl Evaluator {
         let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
         let publish = needed.map_or_else(Vec::new, |stream| settings.sent_for(stream));
-        Ok(Participant::new(
-            agent.with_attack(attack),
-            settings.loop_options(publish),
-            settings.weights.is_some(),
-        ))
+        let (agent, options) = (agent.with_attack(attack), settings.loop_options(publish));
+        Ok(Participant::new(agent, options, settings.weights.is_some()))
     }
 
     /// The detector of a vehicle: its own network, or that of the run.
@@ -210,11 +207,8 @@ impl Evaluator {
             .transpose()?;
         let own = own.map(|weights| weights.with_precision(self.setup.models.precision));
         let weights = own.as_ref().unwrap_or(&self.weights);
-        Ok(Detector::from_weights(
-            weights,
-            &weights.detector_config()?,
-            Device::Cpu,
-        )?)
+        let config = weights.detector_config()?;
+        Ok(Detector::from_weights(weights, &config, Device::Cpu)?)
     }
 
     /// The descriptor of a neighbour with these settings, where the method needs a `stream`.

@@ -13,7 +13,7 @@ use support::cli::Outcome;
 use support::{bounded_file, output};
 
 use crate::config::EgoConfig;
-use crate::ego_loop::recorded::{KIND, Published, Record};
+use crate::ego_loop::recorded::{KIND, Record};
 use crate::ego_loop::{EgoLoop, Output};
 use crate::node::NodeOptions;
 
@@ -63,14 +63,11 @@ impl Arguments {
         for record in &mut records {
             let (now_nanos, input) = match record {
                 Record::Input { now_nanos, input } => (now_nanos, input),
-                Record::Published(Published {
-                    stream,
-                    stamp,
-                    stages,
-                }) => {
-                    if (stream == Stream::Tracks) != self.tracks {
+                Record::Published(published) => {
+                    if (published.stream == Stream::Tracks) != self.tracks {
                         continue;
                     }
+                    let stamp = &published.stamp;
                     let capture_nanos = stamp.capture_nanos;
                     let missing =
                         || format!("no result of the frame captured at {capture_nanos} ns");
@@ -79,11 +76,11 @@ impl Arguments {
                     let tick = ticks.get(&capture_nanos).copied();
                     output::line(if self.tracks {
                         let tracks = tracks.with_context(missing)?;
-                        FrameReport::new(&stamp, tick, tracks).to_json()
+                        FrameReport::new(stamp, tick, tracks).to_json()
                     } else {
                         // Durations as measured in the run, not those of the replay.
-                        let result = Detections { stages, ..result };
-                        FrameReport::new(&stamp, tick, result).to_json()
+                        let stages = published.stages;
+                        FrameReport::new(stamp, tick, Detections { stages, ..result }).to_json()
                     })?;
                     continue;
                 }
@@ -92,10 +89,8 @@ impl Arguments {
             let decoded =
                 input.try_map(|message| message.decode(&ego_loop, &Limits::DEFAULT).map(Box::new));
             let Ok(input) = decoded else {
-                bail!(
-                    "{}: a recorded message cannot be decoded",
-                    self.file.display()
-                );
+                let file = self.file.display();
+                bail!("{file}: a recorded message cannot be decoded");
             };
             for output in ego_loop.handle(&mut ego, input, now_nanos) {
                 if let Output::Publish {
@@ -121,11 +116,9 @@ impl Arguments {
         let text = text.with_context(|| path.display().to_string())?;
         let mut ticks = BTreeMap::new();
         for line in text.lines() {
-            let Tick {
-                tick,
-                capture_nanos,
-            } = serde_json::from_str(line).with_context(|| path.display().to_string())?;
-            ticks.insert(capture_nanos, tick);
+            let line = serde_json::from_str(line);
+            let line: Tick = line.with_context(|| path.display().to_string())?;
+            ticks.insert(line.capture_nanos, line.tick);
         }
         Ok(ticks)
     }

@@ -2,7 +2,6 @@
 
 use crate::config::EgoConfig;
 use crate::ego::{Ego, EgoError};
-use crate::ego_loop::LoopReport;
 use crate::node::{self, NodeOptions};
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
@@ -26,13 +25,10 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         log_to_stderr();
         let config = self.config.validated()?;
-        let EgoConfig {
-            run, models, bus, ..
-        } = &config;
         let (cav, ego) = build(&config)?;
-        let stop = bus.stop().context("installing signal handlers")?;
-        let bus = bus.join(&stop, run, Role::Ego, &cav)?;
-        tracing::info!(ego = %cav, method = %ego.method(), weights = %models.weights.display(), "ready");
+        let stop = config.bus.stop().context("installing signal handlers")?;
+        let bus = config.bus.join(&stop, &config.run, Role::Ego, &cav)?;
+        tracing::info!(ego = %cav, method = %ego.method(), weights = %config.models.weights.display(), "ready");
         let report = node::run(&bus, &cav, ego, &NodeOptions::from(&config), &stop)?;
         if let Err(overdue) = bus.leave(STOP_LIMIT) {
             tracing::warn!("{overdue}");
@@ -40,23 +36,15 @@ impl Arguments {
         if self.json {
             output::line(serde_json::to_string(&report)?)?;
         } else {
-            let LoopReport {
-                frames,
-                fused,
-                fused_boxes,
-                refused_boxes,
-                refused_velocities,
-                at_deadline,
-                failed,
-                failure,
-            } = &report;
-            let reason = { failure.as_ref() }
+            let (frames, fused, failed) = (report.frames, report.fused, report.failed);
+            let at_deadline = report.at_deadline;
+            let reason = { report.failure.as_ref() }
                 .map_or(String::new(), |reason| format!(", the first: {reason}"));
-            let boxes = match fused_boxes {
+            let boxes = match report.fused_boxes {
                 0 => String::new(),
                 boxes => format!(" ({boxes} of them boxes)"),
             };
-            let refused = match (refused_boxes, refused_velocities) {
+            let refused = match (report.refused_boxes, report.refused_velocities) {
                 (0, 0) => String::new(),
                 (boxes, velocities) => {
                     format!(", {boxes} boxes and the velocities of {velocities} messages refused")

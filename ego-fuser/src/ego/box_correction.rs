@@ -29,10 +29,8 @@ pub(super) fn correct_by_boxes(
     if metadata.len() < 2 {
         return Ok(());
     }
-    let boxes = maps
-        .iter()
-        .map(|map| boxes_in(map, detector))
-        .collect::<Result<Vec<_>, _>>()?;
+    let boxes = maps.iter().map(|map| boxes_in(map, detector));
+    let boxes = boxes.collect::<Result<Vec<_>, _>>()?;
     let observers: Vec<Observer<'_>> = (metadata.iter().zip(&boxes))
         .map(|(map, boxes)| Observer {
             ego_from_agent: map.ego_from_cav,

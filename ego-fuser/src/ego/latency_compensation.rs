@@ -52,9 +52,8 @@ impl LatencyCompensation {
         let objects = followed.objects(view, sent, &mut self.refused);
         let age_s = (now_nanos as f64 - view.capture_nanos as f64) * 1e-9;
         let age_s = age_s.clamp(-MAX_AGE_S, MAX_AGE_S);
-        let carried = objects
-            .iter()
-            .map(|object| extrapolated(object.clone(), age_s));
+        let objects = objects.iter().cloned();
+        let carried = objects.map(|object| extrapolated(object, age_s));
         Cow::Owned(View {
             content: Content::Boxes(carried.collect()),
             ..view.clone()

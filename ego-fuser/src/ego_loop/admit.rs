@@ -1,10 +1,7 @@
 //! Messages of an ego's loop: decoded, dated and queued.
 
 use protocol::message::{Bev, Boxes, Descriptor, Payload, Points};
-use protocol::{
-    CavId, DropReason, HEADER_LEN, Header, Kind, Limits, PoseEstimate, Stamp, Stream, WireError,
-    wire,
-};
+use protocol::{CavId, DropReason, HEADER_LEN, Header, Kind, Limits, Stream, WireError, wire};
 
 use super::{EgoLoop, Message, Output, OwnFrame, Reception, Source};
 use crate::capture_clock::SweepTime;
@@ -67,7 +64,9 @@ impl EgoLoop {
             }
         };
         let payload_bytes = u64::from(header.metadata_len) + header.body_len;
-        let wire_bytes = payload_bytes + HEADER_LEN as u64 + pose_bytes(&header.stamp, pose);
+        // With the neighbour's `pose` message for the same frame: its content equals the pose inside this one.
+        let pose_bytes =
+            wire::encode(&header.stamp, pose).map_or(0, |encoded| encoded.wire_bytes());
         let view = View {
             cav: cav.clone(),
             pose,
@@ -79,7 +78,7 @@ impl EgoLoop {
             view,
             sequence: header.stamp.sequence,
             payload_bytes,
-            wire_bytes,
+            wire_bytes: payload_bytes + (HEADER_LEN + pose_bytes) as u64,
         })
     }
 
@@ -131,10 +130,9 @@ impl EgoLoop {
         let capture_nanos = message.view.capture_nanos;
         self.keep_time(ego, capture_nanos);
         // In the inbox, while another frame was fused, or behind one that waits for its neighbours.
-        let waited_nanos = if self.frames.is_empty() {
-            now_nanos.saturating_sub(message.reception.arrived_nanos)
-        } else {
-            u64::MAX
+        let waited_nanos = match self.frames.is_empty() {
+            true => now_nanos.saturating_sub(message.reception.arrived_nanos),
+            false => u64::MAX,
         };
         if let Some(pace) = self.pace.judge(capture_nanos, waited_nanos, now_nanos) {
             self.outputs.push(Output::Pace(pace));
@@ -294,9 +292,4 @@ fn payload<'a, M: Payload>(
     limits: &Limits,
 ) -> Result<M, WireError> {
     wire::decode(pieces, limits).map(|(_, message)| message)
-}
-
-/// Wire size of the neighbour's `pose` message for the same frame, bytes: its content equals the pose inside this one.
-fn pose_bytes(stamp: &Stamp, pose: PoseEstimate) -> u64 {
-    wire::encode(stamp, pose).map_or(0, |encoded| encoded.wire_bytes() as u64)
 }

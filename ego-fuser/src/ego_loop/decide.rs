@@ -6,9 +6,8 @@ use protocol::message::{FusedNeighbour, NeighbourState, SkippedNeighbour, StageT
 use protocol::{CavId, Detections, DropReason, Stream};
 
 use super::{EgoLoop, Output, OwnFrame, Source};
-use crate::ego::{Ego, EgoOutput, Skipped, View};
-use crate::misbehaviour::{self, Assessment};
-use crate::pairing::Paired;
+use crate::ego::{Ego, Skipped, View};
+use crate::misbehaviour::Assessment;
 use crate::silence::SILENT_AFTER;
 
 /// The neighbours' messages for a frame, and the neighbours without one.
@@ -104,30 +103,22 @@ impl EgoLoop {
         let waited = Duration::from_nanos(now_nanos.saturating_sub(frame.begun_nanos));
         let mut choice = self.choose(own.capture_nanos);
         match ego.detect(&own, &choice.views) {
-            Ok(EgoOutput {
-                detections,
-                fused,
-                skipped,
-                beliefs,
-                refused_boxes,
-                refused_velocities,
-                stages,
-            }) => {
-                self.report.refused_boxes += refused_boxes;
-                self.report.refused_velocities += refused_velocities;
-                let neighbours = self.neighbour_reports(&beliefs, &choice.views);
+            Ok(output) => {
+                self.report.refused_boxes += output.refused_boxes;
+                self.report.refused_velocities += output.refused_velocities;
+                let neighbours = self.neighbour_reports(&output.beliefs, &choice.views);
                 self.outputs.push(Output::Received(self.own_source()));
-                self.leave_out(&skipped, &fused, &mut choice);
-                let fused = self.use_messages(&own, &fused, &choice);
+                self.leave_out(&output.skipped, &output.fused, &mut choice);
+                let fused = self.use_messages(&own, &output.fused, &choice);
                 let transport =
                     { frame.transport }.map(|transport| StageTiming::new("transport", transport));
-                let wait = StageTiming::new("wait", waited);
+                let (wait, stages) = (StageTiming::new("wait", waited), output.stages);
                 let result = Detections {
                     ego: self.cav.clone(),
                     agent_frame: frame.agent_frame,
                     method: ego.method().name().to_owned(),
                     pose: own.pose,
-                    detections,
+                    detections: output.detections,
                     fused,
                     skipped: choice.skipped,
                     neighbours,
@@ -171,10 +162,17 @@ impl EgoLoop {
         assessments: &[(usize, Assessment)],
         views: &[View],
     ) -> Vec<NeighbourState> {
-        let mut reports = misbehaviour::neighbour_states(assessments, views);
-        for report in &mut reports {
-            report.clock_offset_s = self.clock_offsets_s.get(&report.cav).copied();
-        }
+        let reports = views.iter().enumerate().map(|(index, view)| {
+            let assessment = assessments.iter().find(|(known, _)| *known == index);
+            let assessment = assessment.map(|(_, assessment)| assessment);
+            NeighbourState {
+                trust: assessment.map(|assessment| assessment.trust),
+                misbehaviour: assessment.and_then(|assessment| assessment.misbehaviour),
+                clock_offset_s: self.clock_offsets_s.get(&view.cav).copied(),
+                ..NeighbourState::new(view.cav.clone())
+            }
+        });
+        let mut reports: Vec<_> = reports.collect();
         self.clocks.describe(&mut reports);
         reports
     }
@@ -183,20 +181,14 @@ impl EgoLoop {
     fn choose(&mut self, capture_nanos: u64) -> Choice {
         let (paired, dropped) = self.pairing.pair(capture_nanos);
         let mut choice = Choice::default();
-        for Paired {
-            sender: (_, stream),
-            is_first_use,
-            message,
-            ..
-        } in paired
-        {
+        for paired in paired {
             // A copy, as the message may serve the next frame too.
-            choice.views.push(message.view.clone());
+            choice.views.push(paired.message.view.clone());
             choice.messages.push(MessageInfo {
-                stream: *stream,
-                is_first_use,
-                payload_bytes: message.payload_bytes,
-                wire_bytes: message.wire_bytes,
+                stream: paired.sender.1,
+                is_first_use: paired.is_first_use,
+                payload_bytes: paired.message.payload_bytes,
+                wire_bytes: paired.message.wire_bytes,
             });
         }
         for lost in dropped.iter().cloned() {

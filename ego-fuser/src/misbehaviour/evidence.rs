@@ -171,10 +171,9 @@ impl Evidence {
             (true, true) => 2,
         };
         let most = if self.strange >= enough { -3.6 } else { 0.0 };
-        let plain = if self.in_full_view > 0 {
-            FULL_VIEW
-        } else {
-            0.0
+        let plain = match self.in_full_view {
+            0 => 0.0,
+            _ => FULL_VIEW,
         };
         let odds = odds[(self.contradicted as usize).min(odds.len() - 1)];
         let odds = odds.min(most).min(plain);
@@ -183,17 +182,14 @@ impl Evidence {
 
     /// Evidence against values of no network, against a copier, against unrelated successive maps and against jumps.
     fn against_other_attacks(&self) -> Option<(f64, MisbehaviourReason)> {
+        use MisbehaviourReason::{Duplicated, ImplausibleMotion, ImplausibleValues, Inconsistent};
         let is_torn = !self.boxes_only && self.like_before.is_some_and(|like| like < SUCCESSIVE);
         let is_copied = self.like_another > COPY;
         let sure = [
-            (
-                self.is_out_of_range,
-                -8.0,
-                MisbehaviourReason::ImplausibleValues,
-            ),
-            (is_copied, -8.0, MisbehaviourReason::Duplicated),
-            (self.jumped, -4.0, MisbehaviourReason::ImplausibleMotion),
-            (is_torn, -3.0, MisbehaviourReason::Inconsistent),
+            (self.is_out_of_range, -8.0, ImplausibleValues),
+            (is_copied, -8.0, Duplicated),
+            (self.jumped, -4.0, ImplausibleMotion),
+            (is_torn, -3.0, Inconsistent),
         ];
         sure.into_iter()
             .find_map(|(is_so, odds, reason)| is_so.then_some((odds, reason)))

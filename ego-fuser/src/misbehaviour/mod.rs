@@ -16,7 +16,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::Isometry2;
 use perception::detector::{Detector, DetectorError};
-use protocol::message::NeighbourState;
 use protocol::{CavId, MisbehaviourReason, PointCloud, Pose};
 
 use crate::view::View;
@@ -84,23 +83,6 @@ impl Assessment {
     }
 }
 
-/// Report of the assessed neighbours, without clock data; `assessments` are the `beliefs` of an `EgoOutput`.
-pub fn neighbour_states(
-    assessments: &[(usize, Assessment)],
-    views: &[View],
-) -> Vec<NeighbourState> {
-    let states = views.iter().enumerate().map(|(index, view)| {
-        let assessment = assessments.iter().find(|(known, _)| *known == index);
-        let assessment = assessment.map(|(_, assessment)| assessment);
-        NeighbourState {
-            trust: assessment.map(|assessment| assessment.trust),
-            misbehaviour: assessment.and_then(|assessment| assessment.misbehaviour),
-            ..NeighbourState::new(view.cav.clone())
-        }
-    });
-    states.collect()
-}
-
 impl MisbehaviourDetector {
     /// Starts with all neighbours trusted.
     pub(crate) fn new(detector: &mut Detector) -> Result<Self, DetectorError> {
@@ -134,13 +116,13 @@ impl MisbehaviourDetector {
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
             // A map from which the head makes values or boxes of no detector is evidence against its sender only.
-            let seen = match Observation::in_message(&view.content, detector, &self.empty) {
+            let seen = Observation::in_message(&view.content, detector, &self.empty);
+            all.push(match seen {
                 Err(DetectorError::Values { .. } | DetectorError::Box(_)) => {
                     Observation::implausible()
                 }
                 seen => seen?,
-            };
-            all.push(seen);
+            });
         }
         let mut evidence = Vec::with_capacity(neighbours.len());
         for ((view, ego_from_cav), seen) in neighbours.iter().zip(&all) {
@@ -164,10 +146,8 @@ impl MisbehaviourDetector {
         let of_cav: BTreeMap<_, _> = of_cav
             .map(|(cav, found)| (cav, self.add_up(own.capture_nanos, cav, found, probation)))
             .collect();
-        let assessments = neighbours
-            .iter()
-            .map(|(view, _)| of_cav[&view.cav])
-            .collect();
+        let assessments = neighbours.iter().map(|(view, _)| of_cav[&view.cav]);
+        let assessments = assessments.collect();
         for ((view, _), seen) in neighbours.iter().zip(all) {
             if let (Some(reputation), Some(pose)) =
                 (self.peers.get_mut(&view.cav), view.pose.world_from_cav())
@@ -295,10 +275,9 @@ fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
 fn alike(one: &[f32], other: &[f32]) -> f64 {
     const ENOUGH: usize = 9;
     if one.len() < ENOUGH {
-        0.0
-    } else {
-        cosine_similarity(one, other)
+        return 0.0;
     }
+    cosine_similarity(one, other)
 }
 
 /// True if no vehicle can drive from one pose to the other in that time, with the largest pose errors added.

@@ -15,7 +15,7 @@ use bus::{
 };
 use protocol::message::{FrameReport, StageTiming};
 use protocol::{
-    Body, CavId, Detections, Encoded, Limits, Payload, Role, Stamp, Stream, Topic, Tracks, wire,
+    Body, CavId, Detections, Encoded, Limits, Payload, Role, Stamp, Stream, Topic, wire,
 };
 use serde::Serialize;
 
@@ -115,20 +115,13 @@ pub fn run(
     let mut node = Node::open(bus, cav, ego, options, stop)?;
     let presence = bus.announce(Role::Ego)?;
     node.receive(stop)?;
-    let Node {
-        detections,
-        tracks,
-        pace,
-        ego_loop,
-        ..
-    } = node;
-    pace.finish();
-    detections.finish();
-    if let Some(tracks) = tracks {
+    node.pace.finish();
+    node.detections.finish();
+    if let Some(tracks) = node.tracks {
         tracks.finish();
     }
     presence.withdraw()?;
-    Ok(ego_loop.report().clone())
+    Ok(node.ego_loop.report().clone())
 }
 
 /// Publishers of one kind of result: as a message, and as JSON.
@@ -226,15 +219,9 @@ impl<'a> Node<'a> {
         // An ego-only method needs no messages of others.
         let neighbourhood = (ego.method().exchange() != Exchange::Nothing)
             .then(|| {
-                Neighbourhood::watch(
-                    bus,
-                    cav,
-                    { ego_loop.neighbour_streams() }
-                        .chain([Stream::Descriptor])
-                        .collect(),
-                    options.over_link,
-                    options.neighbours.clone(),
-                )
+                let streams = ego_loop.neighbour_streams().chain([Stream::Descriptor]);
+                let allowed = options.neighbours.clone();
+                Neighbourhood::watch(bus, cav, streams.collect(), options.over_link, allowed)
             })
             .transpose()?;
         Ok(Self {
@@ -315,8 +302,11 @@ impl<'a> Node<'a> {
                     tracks,
                 } => {
                     self.publish(capture_nanos, *result);
-                    if let Some(tracks) = tracks {
-                        self.publish_tracks(capture_nanos, tracks);
+                    if let (Some(results), Some(tracks)) = (&self.tracks, tracks) {
+                        let log = self.log.clone();
+                        results.submit(capture_nanos, tracks, move |stamp, _| {
+                            note(log, Stream::Tracks, stamp, Vec::new());
+                        });
                     }
                 }
                 Output::Failed {
@@ -360,15 +350,6 @@ impl<'a> Node<'a> {
                 result.stages.push(StageTiming::new("send", sending));
                 note(log, Stream::Detections, stamp, result.stages.clone());
             });
-    }
-
-    fn publish_tracks(&self, capture_nanos: u64, tracks: Tracks) {
-        if let Some(results) = &self.tracks {
-            let log = self.log.clone();
-            results.submit(capture_nanos, tracks, move |stamp, _| {
-                note(log, Stream::Tracks, stamp, Vec::new());
-            });
-        }
     }
 
     fn topic(&self, (cav, stream): &Source) -> Topic {

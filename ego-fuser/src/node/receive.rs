@@ -30,9 +30,8 @@ impl Node<'_> {
             clock_offset_s: stats.measured_clock_offset_s(cav),
         };
         let (header, limits) = (&arrival.header, &self.options.limits);
-        let decoded = self
-            .ego_loop
-            .decode(&reception, header, arrival.pieces(), limits);
+        let ego_loop = &self.ego_loop;
+        let decoded = ego_loop.decode(&reception, header, arrival.pieces(), limits);
         let message = match decoded {
             Ok(message) => message,
             Err(Refusal::Unneeded(reason)) => return stats.dropped(&arrival.topic, reason),
@@ -76,10 +75,9 @@ impl Node<'_> {
 
     /// Longest transit time of a message, seconds; the own agent's, which takes no link, has one clock with the ego.
     fn longest_transit_s(&self) -> f64 {
-        if self.options.over_link {
-            LINK_TRANSIT_S
-        } else {
-            NETWORK_TRANSIT_S
+        match self.options.over_link {
+            true => LINK_TRANSIT_S,
+            false => NETWORK_TRANSIT_S,
         }
     }
 }

@@ -77,9 +77,8 @@ impl FeatureStore {
         digests: &FileDigests,
     ) -> Result<PathBuf, Error> {
         let program = digests.program_sha256().at(&kept.folder)?;
-        let scales = weights
-            .activation_scales()?
-            .map(|scales| scales.sha256_of(is_encoder));
+        let scales = weights.activation_scales()?;
+        let scales = scales.map(|scales| scales.sha256_of(is_encoder));
         let settings = format!(
             "{:?} {:?} {} {scales:?} {program} {WIRE_VERSION}",
             weights.detector_config()?,
@@ -91,12 +90,8 @@ impl FeatureStore {
             dataset::content_sha256(scenarios, None, digests),
             hex(&Sha256::digest(settings)),
         ];
-        let parts: Vec<String> = parts
-            .iter()
-            .map(|digest| digest.chars().take(HASH_DIGITS).collect())
-            .collect();
-        let name = format!("{}.maps", parts.join("-"));
-        Ok(kept.folder.join(name))
+        let parts = parts.map(|digest| digest.chars().take(HASH_DIGITS).collect::<String>());
+        Ok(kept.folder.join(format!("{}.maps", parts.join("-"))))
     }
 
     /// Opens the file of these scenarios and encodes the missing sweeps on `threads` CPU threads, up to its size;
@@ -153,7 +148,7 @@ impl FeatureStore {
 
     fn fill(
         &mut self,
-        encoder: SweepEncoder,
+        mut encoder: SweepEncoder,
         limit_bytes: u64,
         threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
@@ -162,11 +157,10 @@ impl FeatureStore {
         if stored == all || self.bytes() >= limit_bytes {
             return Ok(());
         }
-        let mut encoder = encoder;
-        let mut messages =
-            Prefetch::start(threads.min(all - stored), stored as u64, move |sweep| {
-                encoder.message(sweep as usize)
-            });
+        let threads = threads.min(all - stored);
+        let mut messages = Prefetch::start(threads, stored as u64, move |sweep| {
+            encoder.message(sweep as usize)
+        });
         while self.sweeps().0 < all && self.bytes() < limit_bytes {
             let message = messages.next_batch()??;
             let length = u32::try_from(message.len())
@@ -225,20 +219,17 @@ const LENGTH_BYTES: u64 = 4;
 fn starts(file: &File) -> io::Result<Vec<u64>> {
     let end = file.metadata()?.len();
     let mut starts = vec![0];
-    loop {
-        let start = starts[starts.len() - 1];
-        // The last record is incomplete where a process ended while it wrote.
-        if start + LENGTH_BYTES > end {
-            return Ok(starts);
-        }
+    let mut next = 0;
+    // The last record is incomplete where a process ended while it wrote.
+    while next + LENGTH_BYTES <= end {
         let mut length = [0; LENGTH_BYTES as usize];
-        file.read_exact_at(&mut length, start)?;
-        let next = start + LENGTH_BYTES + u64::from(u32::from_le_bytes(length));
-        if next > end {
-            return Ok(starts);
+        file.read_exact_at(&mut length, next)?;
+        next += LENGTH_BYTES + u64::from(u32::from_le_bytes(length));
+        if next <= end {
+            starts.push(next);
         }
-        starts.push(next);
     }
+    Ok(starts)
 }
 
 /// Maps from a store, and from the encoder for sweeps that it does not hold.

@@ -24,35 +24,26 @@ impl AccessControl {
     /// zenoh's `access_control`.
     pub(super) fn rules(&self) -> Value {
         // Publishers ask the router for subscribers, so that they do not send messages without any.
-        let subscriber_rule = json!({
-            "id": SUBSCRIBERS_RULE,
-            "permission": "allow",
-            "flows": ["egress"],
-            "messages": ["declare_subscriber"],
-            "key_exprs": KeyExpr::all_of(&self.runs).each_ref().map(KeyExpr::as_str),
-        });
-        let mut rules = vec![subscriber_rule];
+        let all = KeyExpr::all_of(&self.runs);
+        let all = all.each_ref().map(KeyExpr::as_str);
+        let subscribers = rule(SUBSCRIBERS_RULE, &["egress"], &["declare_subscriber"], &all);
+        let mut rules = vec![subscribers];
         let (mut subjects, mut policies) = (Vec::new(), Vec::new());
         for member in &self.members {
             let name = member.to_string();
             let own = rules_of(&name, &member.rights(&self.runs));
-            let names: Vec<Value> = [json!(SUBSCRIBERS_RULE)]
-                .into_iter()
-                .chain(own.iter().map(|rule| rule["id"].clone()))
-                .collect();
+            let names = own.iter().map(|rule| rule["id"].clone());
+            let names = [json!(SUBSCRIBERS_RULE)].into_iter().chain(names);
+            let names: Vec<Value> = names.collect();
             rules.extend(own);
             subjects
                 .push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]}));
             policies.push(json!({"id": name, "rules": names, "subjects": [name]}));
         }
         // The process of the router receives its own probes over a second session.
-        rules.push(json!({
-            "id": PROBE_KEY,
-            "permission": "allow",
-            "flows": ["ingress", "egress"],
-            "messages": ["declare_subscriber", "put"],
-            "key_exprs": [PROBE_KEY],
-        }));
+        let messages = ["declare_subscriber", "put"];
+        let probes = rule(PROBE_KEY, &["ingress", "egress"], &messages, &[PROBE_KEY]);
+        rules.push(probes);
         subjects
             .push(json!({"id": ROUTER, "cert_common_names": [ROUTER], "link_protocols": ["quic"]}));
         policies.push(json!({"id": ROUTER, "rules": [PROBE_KEY], "subjects": [ROUTER]}));
@@ -85,6 +76,16 @@ pub(super) fn size_limits() -> Value {
 
 const SUBSCRIBERS_RULE: &str = "subscribers";
 
+fn rule(id: &str, flows: &[&str], messages: &[&str], keys: &[&str]) -> Value {
+    json!({
+        "id": id,
+        "permission": "allow",
+        "flows": flows,
+        "messages": messages,
+        "key_exprs": keys,
+    })
+}
+
 /// Two rules for every operation: messages from the principal, and messages to it.
 fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
     let mut keys: BTreeMap<Operation, Vec<&str>> = BTreeMap::new();
@@ -106,13 +107,8 @@ fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
         // Seen from the router: ingress comes from the principal, egress goes to it.
         for (flow, messages) in [("ingress", from), ("egress", to)] {
             if !messages.is_empty() {
-                rules.push(json!({
-                    "id": format!("{name} {act:?} {flow}").to_lowercase(),
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": messages,
-                    "key_exprs": keys,
-                }));
+                let id = format!("{name} {act:?} {flow}").to_lowercase();
+                rules.push(rule(&id, &[flow], messages, &keys));
             }
         }
     }

@@ -176,15 +176,11 @@ const MIB: f64 = (1 << 20) as f64;
 
 impl Default for InboxConfig {
     fn default() -> Self {
-        let InboxLimits {
-            messages_per_s,
-            bytes_per_s,
-            waiting_bytes,
-        } = InboxLimits::PEERS;
+        let peers = InboxLimits::PEERS;
         Self {
-            messages_per_s,
-            mib_per_s: bytes_per_s / MIB,
-            waiting_mib: waiting_bytes >> 20,
+            messages_per_s: peers.messages_per_s,
+            mib_per_s: peers.bytes_per_s / MIB,
+            waiting_mib: peers.waiting_bytes >> 20,
         }
     }
 }
@@ -233,10 +229,7 @@ pub fn log_to_stderr() {
 /// Filter with the project's own crates at a level.
 fn ours_at(level: &str) -> String {
     let crates = ["protocol", "sim_replay", "agent", "ego_fuser", "deploy"];
-    let ours: String = crates
-        .iter()
-        .map(|name| format!(",{name}={level}"))
-        .collect();
+    let ours = crates.map(|name| format!(",{name}={level}")).concat();
     // A router that does not answer is an error of ours, which names the endpoint and the remedy.
     format!("warn,zenoh_link_commons::quic=error,zenoh::net::runtime::orchestrator=error{ours}")
 }

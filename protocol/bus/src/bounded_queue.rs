@@ -5,7 +5,7 @@
 //! which counts it.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Condvar, Mutex, MutexGuard};
+use std::sync::{Condvar, Mutex};
 use std::time::Instant;
 
 use support::sync::{lock, wait, wait_at_most};
@@ -44,6 +44,7 @@ struct State<K, T> {
 
 /// Lanes of at most `lane_capacity` items each; safe to share between threads.
 pub struct BoundedQueue<K, T> {
+    // A panic elsewhere leaves no half-done change: every method changes the state in one step.
     state: Mutex<State<K, T>>,
     changed: Condvar,
     lane_capacity: usize,
@@ -72,37 +73,17 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
 
     /// [`Self::push`] for a lane of another capacity than the others.
     pub(crate) fn push_within(&self, lane_capacity: usize, key: K, item: T) -> PushOutcome<T> {
-        let mut state = self.lock();
-        let replaced = match self.make_lane(&mut state, &key, lane_capacity.max(1)) {
-            Err(Full::Closed) => return PushOutcome::Closed(item),
-            Err(Full::NoLane) => return PushOutcome::NoLane(item),
-            Err(Full::Lane) => state.lanes.get_mut(&key).and_then(VecDeque::pop_front),
-            Ok(()) => None,
-        };
-        self.append(state, key, item);
-        replaced.map_or(PushOutcome::Queued, |(_, older)| {
-            PushOutcome::Replaced(older)
-        })
+        self.append(key, item, lane_capacity.max(1), false)
     }
 
     /// Appends `item` to its lane, waiting for room without a time limit.
     pub(crate) fn push_waiting(&self, key: K, item: T) -> PushOutcome<T> {
-        let mut state = self.lock();
-        loop {
-            match self.make_lane(&mut state, &key, self.lane_capacity) {
-                Ok(()) => break,
-                Err(Full::Closed) => return PushOutcome::Closed(item),
-                Err(Full::NoLane) => return PushOutcome::NoLane(item),
-                Err(Full::Lane) => state = wait(&self.changed, state),
-            }
-        }
-        self.append(state, key, item);
-        PushOutcome::Queued
+        self.append(key, item, self.lane_capacity, true)
     }
 
     /// Takes the oldest item, waiting for one until `deadline` (without a limit if `None`).
     pub fn take(&self, deadline: Option<Instant>) -> Pop<K, T> {
-        let mut state = self.lock();
+        let mut state = lock(&self.state);
         loop {
             if let Some((key, item)) = pop_oldest(&mut state.lanes) {
                 // All of them: producers and consumers wait on the same condition variable.
@@ -127,13 +108,13 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
 
     /// Rejects further items; items inside can still be taken.
     pub fn close(&self) {
-        self.lock().closed = true;
+        lock(&self.state).closed = true;
         self.changed.notify_all();
     }
 
     /// Takes all items at once, oldest first.
     pub fn drain(&self) -> Vec<(K, T)> {
-        let mut state = self.lock();
+        let mut state = lock(&self.state);
         let drained = std::iter::from_fn(|| pop_oldest(&mut state.lanes)).collect();
         self.changed.notify_all();
         drained
@@ -141,7 +122,7 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
 
     /// Number of items.
     pub fn len(&self) -> usize {
-        self.lock().lanes.values().map(VecDeque::len).sum()
+        lock(&self.state).lanes.values().map(VecDeque::len).sum()
     }
 
     /// True if there is no item.
@@ -149,40 +130,34 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
         self.len() == 0
     }
 
-    // A panic elsewhere leaves no half-done change: every method changes the state in one step.
-    fn lock(&self) -> MutexGuard<'_, State<K, T>> {
-        lock(&self.state)
-    }
-
-    fn make_lane(&self, state: &mut State<K, T>, key: &K, capacity: usize) -> Result<(), Full> {
-        if state.closed {
-            return Err(Full::Closed);
-        }
-        match state.lanes.get(key) {
-            Some(lane) if lane.len() >= capacity => Err(Full::Lane),
-            None if state.lanes.len() >= self.max_lanes => Err(Full::NoLane),
-            _ => Ok(()),
-        }
-    }
-
-    fn append(&self, mut state: MutexGuard<'_, State<K, T>>, key: K, item: T) {
+    /// Appends `item` to its lane; one of `capacity` items is waited for (`waits`), or gives up its oldest item.
+    fn append(&self, key: K, item: T, capacity: usize, waits: bool) -> PushOutcome<T> {
+        let mut state = lock(&self.state);
+        let replaced = loop {
+            if state.closed {
+                return PushOutcome::Closed(item);
+            }
+            match state.lanes.get(&key) {
+                Some(lane) if lane.len() >= capacity => {}
+                None if state.lanes.len() >= self.max_lanes => return PushOutcome::NoLane(item),
+                _ => break None,
+            }
+            if !waits {
+                break state.lanes.get_mut(&key).and_then(VecDeque::pop_front);
+            }
+            state = wait(&self.changed, state);
+        };
         let arrival = state.next_arrival;
         state.next_arrival += 1;
-        state
-            .lanes
-            .entry(key)
-            .or_default()
-            .push_back((arrival, item));
+        let lane = state.lanes.entry(key).or_default();
+        lane.push_back((arrival, item));
         // The woken thread may run at once: the lock must be free then.
         drop(state);
         self.changed.notify_all();
+        replaced.map_or(PushOutcome::Queued, |(_, older)| {
+            PushOutcome::Replaced(older)
+        })
     }
-}
-
-enum Full {
-    Closed,
-    NoLane,
-    Lane,
 }
 
 /// Empty lanes are removed, so that peers that join and leave do not use the lanes up.

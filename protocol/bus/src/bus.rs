@@ -11,6 +11,7 @@ use zenoh::qos::Priority;
 use zenoh::{Session, Wait};
 
 use super::flush_barrier::FlushBarrier;
+use super::heartbeat::Heartbeat;
 use super::inbox_limits::InboxLimits;
 use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
 use super::metrics::{MetricsPeer, MetricsServer};
@@ -21,7 +22,6 @@ use super::shared_pool::SharedPool;
 use super::shutdown::{self, Overdue, Stop};
 use super::status_publisher::{StatusPublisher, StatusSender};
 use super::subscriber::{Inbox, Subscription};
-use super::watchdog::Heartbeat;
 use super::{BusError, BusOptions, MessageStats, open, open_unless};
 use crate::Result;
 
@@ -187,7 +187,7 @@ impl Bus {
             Topic::Stream { cav, .. } | Topic::Received { cav, .. } => cav.clone(),
             _ => self.identity.cav.clone(),
         };
-        let key = topic.in_run(&self.identity.run);
+        let key = self.key(topic);
         Publisher::new(
             &self.session,
             (&key, &cav),
@@ -224,12 +224,8 @@ impl Bus {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn subscribe(&self, topic: Topic, inbox: &Arc<Inbox>) -> Result<Subscription> {
-        Subscription::to_key(
-            &self.session,
-            &topic.in_run(&self.identity.run),
-            (inbox, None),
-            &self.status,
-        )
+        let key = self.key(topic);
+        Subscription::to_key(&self.session, &key, (inbox, None), &self.status)
     }
 
     /// [`Self::subscribe`] with another queue length than that of the inbox.
@@ -242,12 +238,8 @@ impl Bus {
         places: usize,
         inbox: &Arc<Inbox>,
     ) -> Result<Subscription> {
-        Subscription::to_key(
-            &self.session,
-            &topic.in_run(&self.identity.run),
-            (inbox, Some(places)),
-            &self.status,
-        )
+        let key = self.key(topic);
+        Subscription::to_key(&self.session, &key, (inbox, Some(places)), &self.status)
     }
 
     /// Delivers every topic of `selector` into `inbox`.
@@ -290,11 +282,8 @@ impl Bus {
         role: Role,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
     ) -> Result<LivelinessSubscription> {
-        LivelinessSubscription::begin(
-            &self.session,
-            &KeyExpr::alive(&self.identity.run, role),
-            report,
-        )
+        let tokens = KeyExpr::alive(&self.identity.run, role);
+        LivelinessSubscription::begin(&self.session, &tokens, report)
     }
 
     /// The key of a topic in this run.
@@ -308,24 +297,16 @@ impl Bus {
     /// # Errors
     /// [`Overdue`] when the session does not close in time; the end of the process closes it.
     pub fn leave(self, limit: Duration) -> Result<(), Overdue> {
-        let Self {
-            session,
-            identity,
-            status,
-            status_thread,
-            pool,
-            ..
-        } = self;
-        drop(pool);
+        drop(self.pool);
         // Order: the final ledger goes out, then the flush is confirmed, then the session closes.
-        status.close();
+        self.status.close();
         shutdown::within(limit, "the zenoh session", move || {
-            if status_thread.join().is_err() {
+            if self.status_thread.join().is_err() {
                 tracing::error!("the status thread panicked");
             }
             // A connection that is closed discards the messages in its buffers.
-            FlushBarrier::new(&session, &identity.run, Priority::Background).wait(limit);
-            if let Err(cause) = session.close().wait() {
+            FlushBarrier::new(&self.session, &self.identity.run, Priority::Background).wait(limit);
+            if let Err(cause) = self.session.close().wait() {
                 tracing::warn!("closing the zenoh session: {cause}");
             }
         })

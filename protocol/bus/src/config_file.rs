@@ -37,12 +37,10 @@ pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, FileErro
             _ => fields_of(text),
         };
         let reason = unknown_field::explained(reason(&error), &fields);
+        let problem = field.map_or(reason.clone(), |field| format!("{field}: {reason}"));
         FileError {
             line: error.location().map(|location| location.line()),
-            ..FileError::new(
-                path,
-                field.map_or(reason.clone(), |field| format!("{field}: {reason}")),
-            )
+            ..FileError::new(path, problem)
         }
     })
 }

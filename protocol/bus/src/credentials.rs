@@ -44,10 +44,8 @@ impl Credentials {
             readable(&folder.join(file))?;
         }
         let key = folder.join(KEY_FILE);
-        let mode = fs::metadata(&key)
-            .map_err(|cause| bad(&key, &cause))?
-            .permissions()
-            .mode();
+        let metadata = fs::metadata(&key).map_err(|cause| bad(&key, &cause))?;
+        let mode = metadata.permissions().mode();
         if mode & 0o077 != 0 {
             tracing::warn!(
                 "{}: others on this machine can read this key (mode {:03o})",
@@ -73,13 +71,11 @@ impl Credentials {
             return Ok(());
         }
         let certificate = self.folder.join(CERTIFICATE_FILE);
-        Err(bad(
-            &certificate,
-            &format!(
-                "this is the certificate of {}, and {wanted} needs its own",
-                self.name
-            ),
-        ))
+        let what = format!(
+            "this is the certificate of {}, and {wanted} needs its own",
+            self.name
+        );
+        Err(bad(&certificate, &what))
     }
 
     /// Path of one of the files, as text for zenoh.
@@ -105,10 +101,8 @@ impl Credentials {
 }
 
 fn bad(path: &Path, what: &impl ToString) -> BusError {
-    BusError::Keys {
-        path: path.to_path_buf(),
-        what: what.to_string(),
-    }
+    let (path, what) = (path.to_path_buf(), what.to_string());
+    BusError::Keys { path, what }
 }
 
 fn readable(path: &Path) -> Result<String, BusError> {
@@ -120,11 +114,8 @@ fn name_of(path: &Path, now: SystemTime) -> Result<String, BusError> {
     let text = readable(path)?;
     let (_, pem) = parse_x509_pem(text.as_bytes()).map_err(|cause| bad(path, &cause))?;
     let certificate = pem.parse_x509().map_err(|cause| bad(path, &cause))?;
-    let name = certificate
-        .subject()
-        .iter_common_name()
-        .next()
-        .and_then(|name| name.as_str().ok());
+    let mut names = certificate.subject().iter_common_name();
+    let name = names.next().and_then(|name| name.as_str().ok());
     let name = name
         .ok_or_else(|| bad(path, &"this certificate has no common name"))?
         .to_owned();
@@ -134,16 +125,13 @@ fn name_of(path: &Path, now: SystemTime) -> Result<String, BusError> {
         .unwrap_or(i64::MAX);
     let (from, until) = (validity.not_before, validity.not_after);
     if now > until.timestamp() {
-        return Err(bad(
-            path,
-            &format!("the certificate of {name} expired on {until}"),
-        ));
+        let what = format!("the certificate of {name} expired on {until}");
+        return Err(bad(path, &what));
     }
     if now < from.timestamp() {
-        return Err(bad(
-            path,
-            &format!("the certificate of {name} holds from {from} on only: is the clock right?"),
-        ));
+        let what =
+            format!("the certificate of {name} holds from {from} on only: is the clock right?");
+        return Err(bad(path, &what));
     }
     if until.timestamp() - now < SOON.as_secs().cast_signed() {
         tracing::info!("the certificate of {name} expires on {until}");

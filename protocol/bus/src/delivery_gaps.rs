@@ -34,17 +34,17 @@ impl DeliveryGaps {
         let after = number.wrapping_add(u32::from(!is_notice));
         if let Some((known, next)) = self.next.get_mut(topic) {
             // A restarted publisher begins anew.
-            let skipped = if *known == publisher {
-                number.wrapping_sub(*next)
-            } else {
-                0
-            };
-            // Numbers wrap around: more than half the range ahead is behind, as of a repeated message.
-            let is_behind = skipped > u32::MAX / 2;
-            if *known != publisher || !is_behind {
+            if *known != publisher {
                 (*known, *next) = (publisher, after);
+                return 0;
             }
-            return if is_behind { 0 } else { skipped };
+            let skipped = number.wrapping_sub(*next);
+            // Numbers wrap around: more than half the range ahead is behind, as of a repeated message.
+            if skipped > u32::MAX / 2 {
+                return 0;
+            }
+            *next = after;
+            return skipped;
         }
         if self.next.len() < TOPICS {
             self.next.insert(topic.clone(), (publisher, after));

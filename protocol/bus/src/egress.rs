@@ -71,12 +71,8 @@ fn rules() -> Value {
     let large = json!({"payload_size": format!("{LARGE_BYTES}..{}", u32::MAX)});
     let tensors = TENSOR_PRIORITIES.map(|priority| {
         let filter = json!({"congestion_control": "block", "priority": priority});
-        rule(
-            &format!("egress-{priority}"),
-            &filter,
-            "block_first",
-            &large,
-        )
+        let id = format!("egress-{priority}");
+        rule(&id, &filter, "block_first", &large)
     });
     let others = [
         rule(

@@ -147,9 +147,7 @@ impl BusError {
 
     /// An error of zenoh during an operation.
     pub fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
-        Self::Zenoh {
-            doing: doing.into(),
-            cause: cause.to_string(),
-        }
+        let (doing, cause) = (doing.into(), cause.to_string());
+        Self::Zenoh { doing, cause }
     }
 }

@@ -32,21 +32,16 @@ impl FrameStats {
             self.latency_sum_s += latency_s;
             self.latencies += 1;
             let bucket = LATENCY_BUCKETS_S.partition_point(|end| *end < latency_s);
-            self.buckets
-                .iter_mut()
-                .skip(bucket)
-                .take(1)
-                .for_each(|count| *count += 1);
+            if let Some(count) = self.buckets.get_mut(bucket) {
+                *count += 1;
+            }
         }
     }
 
     /// Upper bound in seconds and number of frames of every bucket of the latency; the last is unbounded
     /// ([`f64::MAX`]).
     pub fn latency_buckets(&self) -> Vec<(f64, u64)> {
-        LATENCY_BUCKETS_S
-            .into_iter()
-            .chain([f64::MAX])
-            .zip(self.buckets)
-            .collect()
+        let ends = LATENCY_BUCKETS_S.into_iter().chain([f64::MAX]);
+        ends.zip(self.buckets).collect()
     }
 }

@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 
+use support::sync::lock;
 use tracing::field::{Field, Visit};
 use tracing::{Event, Subscriber};
 use tracing_subscriber::layer::{Context, Layer};
@@ -38,25 +39,19 @@ impl<S: Subscriber> Layer<S> for HandshakeCounter {
         let mut text = EventText(String::new());
         event.record(&mut text);
         if text.0.contains(FAILED) {
-            *counts().entry(cause(&text.0)).or_default() += 1;
+            *lock(&COUNTS).entry(cause(&text.0)).or_default() += 1;
         }
     }
 }
 
 /// Number of failed handshakes so far, by cause.
 pub(super) fn failed() -> BTreeMap<&'static str, u64> {
-    counts().clone()
-}
-
-fn counts() -> MutexGuard<'static, BTreeMap<&'static str, u64>> {
-    COUNTS.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&COUNTS).clone()
 }
 
 fn cause(text: &str) -> &'static str {
-    CAUSES
-        .iter()
-        .find(|(pattern, _)| text.contains(pattern))
-        .map_or(OTHER, |(_, cause)| cause)
+    let known = CAUSES.iter().find(|(pattern, _)| text.contains(pattern));
+    known.map_or(OTHER, |(_, cause)| cause)
 }
 
 /// The text of an event.

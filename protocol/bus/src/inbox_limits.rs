@@ -3,10 +3,11 @@
 //! A topic names its sender, and the router rejects other publishers of it, so a limit by topic is a limit by peer.
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 use std::time::Instant;
 
 use protocol::Topic;
+use support::sync::lock;
 
 /// Maximum number of topics with a meter of their own; further topics share one meter.
 const MAX_METERS: usize = 1024;
@@ -54,10 +55,8 @@ struct Meter {
 
 impl RateLimiter {
     pub(super) fn new(limits: InboxLimits) -> Self {
-        Self {
-            limits,
-            meters: Mutex::default(),
-        }
+        let meters = Mutex::default();
+        Self { limits, meters }
     }
 
     /// True if a message of `bytes` bytes keeps within the rates.
@@ -70,14 +69,11 @@ impl RateLimiter {
         if messages_per_s.is_infinite() && bytes_per_s.is_infinite() {
             return true;
         }
-        let mut meters = self.meters.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut meters = lock(&self.meters);
         let own = Some(topic.clone());
         // Topics beyond the limit share a meter: a flood of forged topics gets the rate of one sender.
-        let key = if meters.len() < MAX_METERS || meters.contains_key(&own) {
-            own
-        } else {
-            None
-        };
+        let has_own = meters.len() < MAX_METERS || meters.contains_key(&own);
+        let key = if has_own { own } else { None };
         // A rate far below one message per second still admits one from time to time.
         let burst = (messages_per_s * BURST_S).max(1.0);
         let meter = meters.entry(key).or_insert_with(|| Meter {

@@ -38,10 +38,8 @@ impl LivelinessToken {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn withdraw(self) -> Result<()> {
-        self.0
-            .undeclare()
-            .wait()
-            .map_err(|cause| BusError::zenoh("withdrawing a liveliness token", &cause))
+        let withdrawn = self.0.undeclare().wait();
+        withdrawn.map_err(|cause| BusError::zenoh("withdrawing a liveliness token", &cause))
     }
 }
 
@@ -50,26 +48,22 @@ impl LivelinessToken {
 /// # Errors
 /// [`BusError::Zenoh`] when the session is closed.
 pub fn present(session: &Session, selector: &str) -> Result<BTreeSet<ProcessId>> {
-    let tokens = session
-        .liveliness()
-        .get(selector)
-        .timeout(QUERY_TIMEOUT)
-        .wait();
+    let liveliness = session.liveliness();
+    let tokens = liveliness.get(selector).timeout(QUERY_TIMEOUT).wait();
     let tokens =
         tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
     Ok(std::iter::from_fn(|| tokens.recv().ok())
-        .filter_map(|reply| process_of(&reply))
+        .filter_map(|reply| holder(reply.result().ok()?.key_expr().as_str()))
+        .map(|(role, cav)| process_id(role, &cav))
         .collect())
 }
 
-fn process_of(token: &zenoh::query::Reply) -> Option<ProcessId> {
-    match token.result().ok()?.key_expr().as_str().parse() {
-        Ok(Key {
-            topic: Topic::Alive { role, cav },
-            ..
-        }) => Some(process_id(role, &cav)),
-        _ => None,
-    }
+/// Role and vehicle of the process that holds a token; `None` for a token outside this key grammar.
+fn holder(token: &str) -> Option<(Role, CavId)> {
+    let Topic::Alive { role, cav } = token.parse::<Key>().ok()?.topic else {
+        return None;
+    };
+    Some((role, cav))
 }
 
 /// A process joined or left.
@@ -114,12 +108,7 @@ impl LivelinessSubscription {
             .declare_subscriber(selector.as_str())
             .history(true)
             .callback(move |sample| {
-                // Tokens outside this key grammar are ignored.
-                if let Ok(Key {
-                    topic: Topic::Alive { role, cav },
-                    ..
-                }) = sample.key_expr().as_str().parse()
-                {
+                if let Some((role, cav)) = holder(sample.key_expr().as_str()) {
                     report(match sample.kind() {
                         SampleKind::Put => LivelinessEvent::Joined { role, cav },
                         SampleKind::Delete => LivelinessEvent::Left { role, cav },

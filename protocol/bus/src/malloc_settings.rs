@@ -52,11 +52,8 @@ pub fn ensure(settings: &[Setting]) -> io::Result<()> {
 }
 
 fn missing(settings: &[Setting], is_set: impl Fn(&str) -> bool) -> Vec<Setting> {
-    settings
-        .iter()
-        .filter(|(name, _)| !is_set(name))
-        .copied()
-        .collect()
+    let unset = settings.iter().filter(|(name, _)| !is_set(name));
+    unset.copied().collect()
 }
 
 #[cfg(test)]

@@ -120,10 +120,8 @@ struct Timings {
 impl MessageStats {
     /// Counters of `process`, all zero.
     pub fn new(process: ProcessId) -> Self {
-        Self {
-            process,
-            state: Arc::default(),
-        }
+        let state = Arc::default();
+        Self { process, state }
     }
 
     /// Process of these counters.
@@ -235,15 +233,9 @@ impl MessageStats {
             let mut state = self.lock();
             let has_room =
                 state.rejections.len() < MAX_ACCOUNTS || state.rejections.contains_key(topic);
-            let times = state
-                .rejections
-                .entry(if has_room {
-                    topic.clone()
-                } else {
-                    // Topics beyond the limit share one counter, that of the truth.
-                    Topic::Truth
-                })
-                .or_default();
+            // Topics beyond the limit share one counter, that of the truth.
+            let counted = if has_room { topic } else { &Topic::Truth };
+            let times = state.rejections.entry(counted.clone()).or_default();
             *times += 1;
             *times
         };
@@ -292,11 +284,8 @@ impl MessageStats {
     /// `longest_transit_s` looks like a clock that is behind.
     pub fn system_clock_offset_s(&self, cav: &CavId, longest_transit_s: f64) -> f64 {
         let offset_s = self.measured_clock_offset_s(cav).unwrap_or(0.0);
-        if is_same_clock(offset_s, longest_transit_s) {
-            0.0
-        } else {
-            offset_s
-        }
+        let is_same = is_same_clock(offset_s, longest_transit_s);
+        if is_same { 0.0 } else { offset_s }
     }
 
     /// Time from the publication of a message to its arrival; `None` if its sender has another clock.
@@ -423,11 +412,9 @@ impl MessageStats {
     /// Summary of every stage over its most recent frames.
     pub fn stages(&self) -> Vec<StageSummary> {
         let state = self.lock();
-        state
-            .stages
-            .iter()
-            .map(|(stage, timings)| timings.summary(stage))
-            .collect()
+        let stages = state.stages.iter();
+        let summaries = stages.map(|(stage, timings)| timings.summary(stage));
+        summaries.collect()
     }
 
     /// Histogram of every stage over all its frames.
@@ -492,11 +479,8 @@ impl State {
 
 impl Timings {
     fn summary(&self, stage: &str) -> StageSummary {
-        let ms: Vec<f64> = self
-            .last
-            .iter()
-            .map(|time| time.as_secs_f64() * 1e3)
-            .collect();
+        let seconds = self.last.iter().map(Duration::as_secs_f64);
+        let ms: Vec<f64> = seconds.map(|seconds| seconds * 1e3).collect();
         let ms = sorted(&ms);
         let [p50_ms, p95_ms, p99_ms] = [0.50, 0.95, 0.99].map(|q| quantile(&ms, q).unwrap_or(0.0));
         StageSummary {

@@ -8,9 +8,9 @@ use std::net::SocketAddr;
 
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric, text};
-use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
+use prometheus_client::metrics::{MetricType, TypedMetric};
 use prometheus_client::registry::{Registry, Unit};
 
 use protocol::Account;
@@ -83,51 +83,39 @@ struct ProcessCollector;
 impl Collector for ProcessCollector {
     fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
         let usage = process_usage();
-        let (help, seconds) = ("User and system time of all threads", Some(&Unit::Seconds));
-        let cpu = encoder.encode_descriptor("process_cpu", help, seconds, MetricType::Counter)?;
-        ConstCounter::new(usage.cpu_s).encode(cpu)?;
-        let bytes = Some(&Unit::Bytes);
-        for (name, help, value) in [
-            (
-                "process_resident_memory",
-                "Resident memory",
-                usage.resident_bytes,
-            ),
-            (
-                "process_peak_resident_memory",
-                "Largest resident memory so far",
-                usage.peak_resident_bytes,
-            ),
-        ] {
-            let memory = encoder.encode_descriptor(name, help, bytes, MetricType::Gauge)?;
-            ConstGauge::new(i64::try_from(value).unwrap_or(i64::MAX)).encode(memory)?;
-        }
-        Ok(())
+        let cpu = ("process_cpu", "User and system time of all threads");
+        let seconds = ConstCounter::new(usage.cpu_s);
+        encode_value(&mut encoder, cpu, Some(&Unit::Seconds), &seconds)?;
+        let resident = ("process_resident_memory", "Resident memory");
+        let bytes = gauge(usage.resident_bytes);
+        encode_value(&mut encoder, resident, Some(&Unit::Bytes), &bytes)?;
+        let help = "Largest resident memory so far";
+        let peak = ("process_peak_resident_memory", help);
+        let bytes = gauge(usage.peak_resident_bytes);
+        encode_value(&mut encoder, peak, Some(&Unit::Bytes), &bytes)
     }
 }
+
+fn gauge(count: u64) -> ConstGauge {
+    ConstGauge::new(i64::try_from(count).unwrap_or(i64::MAX))
+}
+
+type NoLabels = [(&'static str, &'static str); 0];
 
 /// Encodes ticks, answers, fused neighbours and latency of a process that has frames.
 fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fmt::Result {
     if frames.ticks > 0 {
-        let ticks =
-            encoder.encode_descriptor("ticks", "Ticks of the scene", None, MetricType::Counter)?;
-        ConstCounter::new(frames.ticks).encode(ticks)?;
+        let about = ("ticks", "Ticks of the scene");
+        encode_value(encoder, about, None, &ConstCounter::new(frames.ticks))?;
     }
     if frames.ticks + frames.answered == 0 {
         return Ok(());
     }
-    let counters = [
-        ("answered_ticks", "Ticks with detections", frames.answered),
-        (
-            "fused_neighbours",
-            "Neighbours whose data were fused, over all frames",
-            frames.fused_neighbours,
-        ),
-    ];
-    for (name, help, value) in counters {
-        let counter = encoder.encode_descriptor(name, help, None, MetricType::Counter)?;
-        ConstCounter::new(value).encode(counter)?;
-    }
+    let about = ("answered_ticks", "Ticks with detections");
+    encode_value(encoder, about, None, &ConstCounter::new(frames.answered))?;
+    let help = "Neighbours whose data were fused, over all frames";
+    let fused = ConstCounter::new(frames.fused_neighbours);
+    encode_value(encoder, ("fused_neighbours", help), None, &fused)?;
     if frames.latencies == 0 {
         return Ok(());
     }
@@ -139,27 +127,31 @@ fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fm
         MetricType::Histogram,
     )?;
     let buckets = frames.latency_buckets();
-    latency.encode_histogram::<[(&str, &str); 0]>(
-        frames.latency_sum_s,
-        frames.latencies,
-        &buckets,
-        None,
-    )
+    latency.encode_histogram::<NoLabels>(frames.latency_sum_s, frames.latencies, &buckets, None)
 }
 
 /// Encodes a metric, given by name and help: a value for each set of labels.
-fn encode_series<L: EncodeLabelSet, M: EncodeMetric>(
+fn encode_series<L: EncodeLabelSet, M: EncodeMetric + TypedMetric>(
     encoder: &mut DescriptorEncoder<'_>,
     (name, help): (&str, &str),
     unit: Option<&Unit>,
-    metric_type: MetricType,
     series: impl IntoIterator<Item = (L, M)>,
 ) -> fmt::Result {
-    let mut metric = encoder.encode_descriptor(name, help, unit, metric_type)?;
+    let mut metric = encoder.encode_descriptor(name, help, unit, M::TYPE)?;
     for (labels, value) in series {
         value.encode(metric.encode_family(&labels)?)?;
     }
     Ok(())
+}
+
+/// Encodes a metric of one value, given by name and help.
+fn encode_value<M: EncodeMetric + TypedMetric>(
+    encoder: &mut DescriptorEncoder<'_>,
+    (name, help): (&str, &str),
+    unit: Option<&Unit>,
+    value: &M,
+) -> fmt::Result {
+    value.encode(encoder.encode_descriptor(name, help, unit, M::TYPE)?)
 }
 
 fn topic_label(account: &Account) -> (&'static str, String) {
@@ -191,11 +183,11 @@ impl Collector for StatsCollector {
         let help = ("messages_sent", "Messages published");
         let series =
             sent.map(|(account, counts)| ([topic_label(account)], ConstCounter::new(counts.sent)));
-        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        encode_series(&mut encoder, help, None, series)?;
         let help = ("messages_received", "Messages accepted and used");
         let series = received
             .map(|(account, counts)| ([topic_label(account)], ConstCounter::new(counts.received)));
-        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        encode_series(&mut encoder, help, None, series)?;
         let help = ("messages_dropped", "Messages lost, by reason");
         let series = ledger.iter().flat_map(|(account, counts)| {
             let [topic, side] = topic_and_side(account);
@@ -207,20 +199,19 @@ impl Collector for StatsCollector {
                 )
             })
         });
-        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        encode_series(&mut encoder, help, None, series)?;
         let help = ("messages_in_flight", "Messages in flight");
-        let series = ledger.iter().map(|(account, counts)| {
-            let count = i64::try_from(counts.in_flight).unwrap_or(i64::MAX);
-            (topic_and_side(account), ConstGauge::new(count))
-        });
-        encode_series(&mut encoder, help, None, MetricType::Gauge, series)?;
+        let series = ledger
+            .iter()
+            .map(|(account, counts)| (topic_and_side(account), gauge(counts.in_flight)));
+        encode_series(&mut encoder, help, None, series)?;
         let help = (
             "shared_memory_messages",
             "Large messages of a process with a pool of shared memory, by their way",
         );
         let series = self.0.shared_memory().into_iter();
         let series = series.map(|(way, count)| ([("way", way.as_str())], ConstCounter::new(count)));
-        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        encode_series(&mut encoder, help, None, series)?;
         let help = (
             "published",
             "Bytes of published messages, each counted once for all its receivers",
@@ -229,13 +220,7 @@ impl Collector for StatsCollector {
             let topic = ("topic", traffic.topic.to_string());
             ([topic], ConstCounter::new(traffic.bytes))
         });
-        encode_series(
-            &mut encoder,
-            help,
-            Some(&Unit::Bytes),
-            MetricType::Counter,
-            series,
-        )?;
+        encode_series(&mut encoder, help, Some(&Unit::Bytes), series)?;
         encode_frames(&self.0.frames(), &mut encoder)?;
         let peers = self.0.peers();
         let help = (
@@ -246,24 +231,19 @@ impl Collector for StatsCollector {
         let series = peers
             .iter()
             .filter_map(|peer| Some((vehicle_label(peer), ConstGauge::new(peer.clock_offset_s?))));
-        encode_series(&mut encoder, help, seconds, MetricType::Gauge, series)?;
+        encode_series(&mut encoder, help, seconds, series)?;
         let help = ("trust", "Trust score of a vehicle, 0 to 1");
         let series = peers
             .iter()
             .filter_map(|peer| Some((vehicle_label(peer), ConstGauge::new(peer.trust?))));
-        encode_series(&mut encoder, help, None, MetricType::Gauge, series)?;
+        encode_series(&mut encoder, help, None, series)?;
         let help = "Duration of a stage for one frame";
         let mut stages =
             encoder.encode_descriptor("stage", help, seconds, MetricType::Histogram)?;
-        for histogram in self.0.histograms() {
-            let labels = [("stage", histogram.stage.as_str())];
+        for stage in self.0.histograms() {
+            let labels = [("stage", stage.stage.as_str())];
             let mut family = stages.encode_family(&labels)?;
-            family.encode_histogram::<[(&str, &str); 0]>(
-                histogram.sum_s,
-                histogram.count,
-                &histogram.buckets,
-                None,
-            )?;
+            family.encode_histogram::<NoLabels>(stage.sum_s, stage.count, &stage.buckets, None)?;
         }
         Ok(())
     }

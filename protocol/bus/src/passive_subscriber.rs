@@ -8,7 +8,6 @@ use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use protocol::{Control, Key, KeyExpr, Kind, Limits, Topic, wire};
-use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
 
@@ -16,6 +15,7 @@ use support::sync::lock;
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::delivery_gaps::DeliveryGaps;
+use super::session::declare_subscriber;
 use super::status_publisher::StatusPublisher;
 use super::subscriber::has_notifications;
 use super::{BusError, unix_nanos};
@@ -87,17 +87,13 @@ impl PassiveSubscriber {
             gaps: Mutex::default(),
             undelivered: AtomicU64::new(0),
         });
-        let mut subscribers = Vec::with_capacity(selectors.len());
-        for selector in selectors {
+        let subscribers = selectors.iter().map(|selector| {
             let (shared, status) = (Arc::clone(&shared), status.clone());
-            let subscriber = session.declare_subscriber(selector.as_str());
-            let subscriber = subscriber
-                .callback(move |sample| shared.admit(&sample, &status))
-                .wait();
-            subscribers.push(subscriber.map_err(|cause| {
-                BusError::zenoh(format!("subscribing to {}", selector.as_str()), &cause)
-            })?);
-        }
+            declare_subscriber(session, selector.as_str(), move |sample| {
+                shared.admit(&sample, &status);
+            })
+        });
+        let subscribers = subscribers.collect::<Result<_, _>>()?;
         Ok(Self {
             shared,
             _subscribers: subscribers,

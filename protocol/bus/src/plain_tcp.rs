@@ -37,11 +37,9 @@ impl PlainTcp {
 
     /// Closes waiting connections without reading a byte. Returns their total number so far.
     pub(super) fn reject(&mut self) -> u64 {
-        for _ in 0..MAX_PER_CALL {
-            // Whatever the error, the other connections can wait until the next call.
-            let Ok((client, _)) = self.listener.accept() else {
-                break;
-            };
+        // Whatever the error, the other connections can wait until the next call.
+        let waiting = (0..MAX_PER_CALL).map_while(|_| self.listener.accept().ok());
+        for (client, _) in waiting {
             let _ = client.shutdown(Shutdown::Both);
             self.turned_away += 1;
         }

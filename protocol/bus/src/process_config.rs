@@ -70,18 +70,14 @@ impl<C: ProcessConfig> Configured<C> {
 
 impl<C: ProcessConfig> FromArgMatches for Configured<C> {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        Self::from_arg_matches_mut(&mut matches.clone())
-    }
-
-    fn from_arg_matches_mut(matches: &mut ArgMatches) -> Result<Self, clap::Error> {
-        let file = matches.remove_one::<PathBuf>("config");
+        let file = matches.get_one::<PathBuf>("config").cloned();
         // Step 1: the file, or required options over the defaults.
         let mut config: C = match &file {
             Some(path) => config_file::read(path).map_err(refused)?,
             None => minimal(|option| text_of(matches, option)).map_err(refused)?,
         };
         // Step 2: the options that are given override it, the others keep its values.
-        config.update_from_arg_matches_mut(matches)?;
+        config.update_from_arg_matches(matches)?;
         Ok(Self { file, config })
     }
 
@@ -119,13 +115,8 @@ impl<C: ProcessConfig> Args for Configured<C> {
         let options =
             // The help must not quote the placeholder of a required field as its default.
             options_of::<C>().filter(|option| !required.contains(&option.get_id().as_str()));
-        let heading = None::<&str>;
-        document(
-            C::augment_args_for_update(command.arg(config)),
-            options,
-            &defaults,
-        )
-        .next_help_heading(heading)
+        let command = C::augment_args_for_update(command.arg(config));
+        document(command, options, &defaults).next_help_heading(None::<&str>)
     }
 
     fn augment_args_for_update(command: Command) -> Command {

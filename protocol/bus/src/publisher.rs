@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use protocol::wire::{self, Encoded};
 use protocol::{
@@ -110,10 +110,8 @@ impl PublisherOptions {
 
 type Encode = Box<dyn FnOnce(&Stamp, &SharedPool) -> Result<ZBytes, WireError> + Send>;
 
-struct Submission {
-    capture_nanos: u64,
-    encode: Encode,
-}
+/// Capture time of a message, and what makes its bytes.
+type Submission = (u64, Encode);
 
 /// Publisher of one topic of this process. A thread of its own encodes and sends submitted messages.
 ///
@@ -247,16 +245,12 @@ impl Publisher {
         }
         let mut header = arrival.header.clone();
         header.stamp.capture_nanos = capture_nanos;
-        let rest = arrival
-            .payload()
-            .to_bytes()
-            .get(HEADER_LEN..)
-            .unwrap_or_default()
-            .to_vec();
+        let whole = arrival.payload().to_bytes();
+        let rest = whole.get(HEADER_LEN..).unwrap_or_default();
         let mut writer = ZBytes::writer();
         // The checksum of the payload does not cover the header, which has a new one of its own.
         writer.append(header.to_bytes().to_vec().into());
-        writer.append(rest.into());
+        writer.append(rest.to_vec().into());
         let bytes = writer.finish();
         self.push(capture_nanos, |_, _| Ok(bytes));
     }
@@ -266,11 +260,7 @@ impl Publisher {
         E: FnOnce(&Stamp, &SharedPool) -> Result<ZBytes, WireError> + Send + 'static,
     {
         self.stats.submitted(&self.topic);
-        let encode = Box::new(encode);
-        let submission = Submission {
-            capture_nanos,
-            encode,
-        };
+        let submission: Submission = (capture_nanos, Box::new(encode));
         let pushed = match self.overflow {
             Overflow::KeepLast(_) => self.queue.push((), submission),
             Overflow::Wait(_) => self.queue.push_waiting((), submission),
@@ -328,20 +318,16 @@ impl Sender {
         loop {
             // The first message confirms the route as a probe does, so probes end with it.
             let probing = self.has_notifications && self.sequence == 0;
-            match self
-                .queue
-                .take(probing.then(|| Instant::now() + PROBE_PERIOD))
-            {
+            let deadline = probing.then(|| Instant::now() + PROBE_PERIOD);
+            match self.queue.take(deadline) {
                 Pop::Item((), submission) => self.send(submission),
                 Pop::TimedOut => self.notify(Control::Probe),
                 Pop::Closed => break,
             }
         }
         if self.has_notifications && self.announces_end {
-            let sent = vec![TopicCount {
-                topic: self.topic.clone(),
-                messages: self.sequence,
-            }];
+            let (topic, messages) = (self.topic.clone(), self.sequence);
+            let sent = vec![TopicCount { topic, messages }];
             self.notify(Control::End {
                 ticks: self.sequence,
                 sent,
@@ -349,8 +335,7 @@ impl Sender {
         }
     }
 
-    fn send(&mut self, submission: Submission) {
-        let (capture_nanos, encode) = (submission.capture_nanos, submission.encode);
+    fn send(&mut self, (capture_nanos, encode): Submission) {
         let began = Instant::now();
         match encode(&self.stamp(capture_nanos), &self.pool) {
             Ok(bytes) => {
@@ -435,10 +420,7 @@ pub(super) fn payload(encoded: Encoded) -> ZBytes {
 
 /// Current time on the Unix clock, nanoseconds.
 pub fn unix_nanos() -> u64 {
-    let since = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default();
-    nanos::of(since)
+    nanos::of(UNIX_EPOCH.elapsed().unwrap_or_default())
 }
 
 #[cfg(test)]

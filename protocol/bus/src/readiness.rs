@@ -8,7 +8,7 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::sync::{Arc, Condvar, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -112,10 +112,9 @@ pub struct Barrier {
 impl Barrier {
     /// A barrier that opens when all of `expected` are confirmed; at once if there are none.
     pub fn new(expected: impl IntoIterator<Item = Route>) -> Self {
-        Self {
-            missing: Mutex::new(expected.into_iter().collect()),
-            changed: Condvar::new(),
-        }
+        let missing = Mutex::new(expected.into_iter().collect());
+        let changed = Condvar::new();
+        Self { missing, changed }
     }
 
     /// Subscribes on `bus` to the answers to probes.
@@ -161,14 +160,14 @@ impl Barrier {
 
     /// Marks `route` as confirmed. Routes that are not expected change nothing.
     fn confirm(&self, route: &Route) {
-        if self.lock().remove(route) {
+        if lock(&self.missing).remove(route) {
             self.changed.notify_all();
         }
     }
 
     /// Routes still missing.
     pub fn missing(&self) -> Vec<Route> {
-        self.lock().iter().cloned().collect()
+        lock(&self.missing).iter().cloned().collect()
     }
 
     /// Waits until the barrier is open, at most for `timeout`.
@@ -189,25 +188,18 @@ impl Barrier {
         given_up: impl Fn() -> bool,
     ) -> Result<(), NotReady> {
         let began = Instant::now();
-        let mut missing = self.lock();
+        let mut missing = lock(&self.missing);
         while !missing.is_empty() {
             let left = timeout.saturating_sub(began.elapsed());
             if left.is_zero() || given_up() {
-                let waited = began.elapsed();
-                return Err(NotReady {
-                    missing: missing.iter().cloned().collect(),
-                    waited,
-                });
+                let (missing, waited) = (missing.iter().cloned().collect(), began.elapsed());
+                return Err(NotReady { missing, waited });
             }
             // Short waits: nothing wakes this thread when `given_up` becomes true.
             let pause = left.min(POLL_PERIOD);
             missing = wait_at_most(&self.changed, missing, pause);
         }
         Ok(())
-    }
-
-    fn lock(&self) -> MutexGuard<'_, BTreeSet<Route>> {
-        lock(&self.missing)
     }
 }
 

@@ -67,21 +67,20 @@ impl RejectionLog {
             .timeout(QUERY_TIMEOUT);
         let Ok(answers) = query.wait() else { return };
         while let Ok(answer) = answers.recv() {
-            let Ok(sample) = answer.result() else {
-                continue;
-            };
-            let Ok(text) = sample.payload().try_to_string() else {
-                continue;
-            };
-            for ((rejection, connection), count) in text.lines().filter_map(rejected) {
-                if self.seen.len() < MAX_REJECTIONS
-                    || self
-                        .seen
-                        .contains_key(&(rejection.clone(), connection.clone()))
-                {
-                    // A count of zenoh is the total of its connection so far: it replaces the one before.
-                    self.seen.insert((rejection, connection), count);
-                }
+            if let Ok(sample) = answer.result()
+                && let Ok(text) = sample.payload().try_to_string()
+            {
+                self.note(&text);
+            }
+        }
+    }
+
+    /// Adds the counts of zenoh's metrics.
+    fn note(&mut self, metrics: &str) {
+        for (connection, count) in metrics.lines().filter_map(rejected) {
+            if self.seen.len() < MAX_REJECTIONS || self.seen.contains_key(&connection) {
+                // A count of zenoh is the total of its connection so far: it replaces the one before.
+                self.seen.insert(connection, count);
             }
         }
     }
@@ -92,17 +91,15 @@ impl RejectionLog {
         for ((rejection, _), count) in &self.seen {
             *counts.entry(rejection.clone()).or_default() += count;
         }
-        counts.extend(self.failed_handshakes.iter().map(|(cause, count)| {
+        for (cause, count) in &self.failed_handshakes {
             let [peer, reason, message] = [UNAUTHORISED, "handshake", *cause].map(str::to_owned);
-            (
-                Rejection {
-                    peer,
-                    reason,
-                    message,
-                },
-                *count,
-            )
-        }));
+            let rejection = Rejection {
+                peer,
+                reason,
+                message,
+            };
+            counts.insert(rejection, *count);
+        }
         counts
     }
 }

@@ -73,10 +73,8 @@ impl ReplayWindow {
         }
         // The topic that has been silent for longest gives up its place.
         if self.topics.len() >= TOPICS {
-            let oldest = self
-                .topics
-                .iter()
-                .min_by_key(|(_, senders)| senders.current.last_seen);
+            let topics = self.topics.iter();
+            let oldest = topics.min_by_key(|(_, senders)| senders.current.last_seen);
             if let Some(oldest) = oldest.map(|(topic, _)| topic.clone()) {
                 self.topics.remove(&oldest);
             }
@@ -191,13 +189,9 @@ impl SequenceWindow {
     /// Adds a sequence number; returns the drop reason if it is rejected. Overtaken messages are stale.
     fn note(&mut self, sequence: u64) -> Option<DropReason> {
         if sequence > self.highest {
-            let ahead = sequence - self.highest;
-            // Bit n stands for the number n below the highest. A shift by 64 or more would overflow.
-            self.came = if ahead < 64 {
-                self.came << ahead | 1
-            } else {
-                1
-            };
+            // Bit n stands for the number n below the highest.
+            let ahead = u32::try_from(sequence - self.highest).unwrap_or(u32::MAX);
+            self.came = self.came.unbounded_shl(ahead) | 1;
             self.highest = sequence;
             return None;
         }

@@ -59,10 +59,8 @@ impl RouterContact {
     /// Time without a connection so far.
     pub(super) fn lost(&self) -> Duration {
         let state = lock(&self.0);
-        state.lost
-            + state
-                .lost_at
-                .map_or(Duration::ZERO, |lost_at| lost_at.elapsed())
+        let since = state.lost_at.as_ref().map(Instant::elapsed);
+        state.lost + since.unwrap_or_default()
     }
 }
 

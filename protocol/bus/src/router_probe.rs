@@ -11,6 +11,7 @@ use protocol::KeyExpr;
 use support::sync::lock;
 use zenoh::{Session, Wait};
 
+use super::session::declare_subscriber;
 use super::shutdown;
 use super::{BusError, BusOptions, open};
 
@@ -66,10 +67,8 @@ impl RouterProbe {
         let now = Instant::now();
         let arrived = Arc::new(Mutex::new(now));
         let noted = Arc::clone(&arrived);
-        let subscriber = { session.declare_subscriber(key) }
-            .callback(move |_| *lock(&noted) = Instant::now())
-            .wait()
-            .map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))?;
+        let subscriber =
+            declare_subscriber(&session, key, move |_| *lock(&noted) = Instant::now())?;
         Ok(Self {
             arrived,
             looked: (now, now, Duration::ZERO),

@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use support::cli::Interrupted;
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::Sample;
 use zenoh::{Config, Session, Wait};
 
 use super::access_control::{self, AccessControl};
@@ -158,6 +160,14 @@ impl BusOptions {
             Role::Router => ("router", own, vec![]),
             Role::Client => ("client", vec![], own),
         };
+        let retry = json!({
+            "period_init_ms": millis(RETRY_FIRST),
+            "period_max_ms": millis(RETRY_LONGEST),
+            "period_increase_factor": 2.0,
+        });
+        let batches = json!(TENSOR_BATCHES);
+        let transport = self.credentials.as_ref().map_or("tcp", |_| "quic");
+        let is_attached = self.shared_memory != SharedMemory::Off;
         let mut settings = vec![
             ("mode", json!(mode)),
             ("listen/endpoints", json!(listen)),
@@ -166,14 +176,7 @@ impl BusOptions {
             ("connect/endpoints", json!(connect)),
             ("connect/timeout_ms", json!(millis(self.connect_timeout))),
             ("connect/exit_on_failure", json!(true)),
-            (
-                "connect/retry",
-                json!({
-                    "period_init_ms": millis(RETRY_FIRST),
-                    "period_max_ms": millis(RETRY_LONGEST),
-                    "period_increase_factor": 2.0,
-                }),
-            ),
+            ("connect/retry", retry),
             // A fleet of another user on the same network must not join this run.
             ("scouting/multicast/enabled", json!(false)),
             ("scouting/gossip/enabled", json!(false)),
@@ -188,27 +191,14 @@ impl BusOptions {
             ("transport/unicast/open_timeout", json!(millis(OPEN_LIMIT))),
             // Tensors: with zenoh's two batches the writing and the sending thread wait for each other after every 64
             // KiB, which costs a fifth of the time of 8 MiB.
-            ("transport/link/tx/queue/size/data", json!(TENSOR_BATCHES)),
-            (
-                "transport/link/tx/queue/size/data_low",
-                json!(TENSOR_BATCHES),
-            ),
-            (
-                "transport/link/tx/queue/size/real_time",
-                json!(TENSOR_BATCHES),
-            ),
+            ("transport/link/tx/queue/size/data", batches.clone()),
+            ("transport/link/tx/queue/size/data_low", batches.clone()),
+            ("transport/link/tx/queue/size/real_time", batches),
             (
                 "transport/link/rx/max_message_size",
                 json!(self.max_message_bytes),
             ),
-            (
-                "transport/link/protocols",
-                json!([if self.credentials.is_some() {
-                    "quic"
-                } else {
-                    "tcp"
-                }]),
-            ),
+            ("transport/link/protocols", json!([transport])),
             ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
             ("transport/unicast/max_links", json!(1)),
             ("transport/unicast/accept_pending", json!(MAX_PENDING)),
@@ -216,10 +206,7 @@ impl BusOptions {
                 "transport/link/tx/queue/congestion_control/block/wait_before_close",
                 json!(u64::try_from(self.stall_limit.as_micros()).unwrap_or(u64::MAX)),
             ),
-            (
-                "transport/shared_memory/enabled",
-                json!(self.shared_memory != SharedMemory::Off),
-            ),
+            ("transport/shared_memory/enabled", json!(is_attached)),
             // Publishers put their messages there themselves, and count those for which there is no room.
             (
                 "transport/shared_memory/transport_optimization/enabled",
@@ -310,11 +297,19 @@ pub fn open_unless(stop: &Stop, options: &BusOptions) -> Result<Session, BusErro
         .name("open".into())
         .spawn(move || drop(result.send(Some(open(&wanted)))))
         .map_err(BusError::thread("opening a session"))?;
-    let stopped = BusError::Stopped {
-        endpoint: options.endpoint.clone(),
-        source: Interrupted,
-    };
+    let (endpoint, source) = (options.endpoint.clone(), Interrupted);
+    let stopped = BusError::Stopped { endpoint, source };
     first.recv().ok().flatten().unwrap_or(Err(stopped))
+}
+
+/// Delivers the messages on a key to `callback`, which runs on zenoh's receive thread.
+pub(super) fn declare_subscriber(
+    session: &Session,
+    key: &str,
+    callback: impl Fn(Sample) + Send + Sync + 'static,
+) -> Result<Subscriber<()>, BusError> {
+    let declared = session.declare_subscriber(key).callback(callback).wait();
+    declared.map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
 }
 
 fn port_in_use(endpoint: &Endpoint) -> bool {
@@ -330,30 +325,24 @@ fn port_in_use(endpoint: &Endpoint) -> bool {
 fn config(options: &BusOptions) -> Result<Config, BusError> {
     let mut config = Config::default();
     for (key, wanted) in options.settings() {
-        config
-            .insert_json5(key, &wanted.to_string())
-            .map_err(|cause| BusError::Setting {
-                key,
-                wanted: wanted.clone(),
-                found: format!("rejected: {cause}"),
-            })?;
+        let inserted = config.insert_json5(key, &wanted.to_string());
+        inserted.map_err(|cause| refused(key, &wanted, format!("rejected: {cause}")))?;
     }
     // zenoh accepts some keys and ignores them: the values are read back.
     for (key, wanted) in options.settings() {
-        let found = config.get_json(key).map_err(|cause| BusError::Setting {
-            key,
-            wanted: wanted.clone(),
-            found: format!("cannot be read back: {cause}"),
-        })?;
+        let found = config
+            .get_json(key)
+            .map_err(|cause| refused(key, &wanted, format!("cannot be read back: {cause}")))?;
         if !serde_json::from_str::<Value>(&found).is_ok_and(|found| same(&found, &wanted)) {
-            return Err(BusError::Setting {
-                key,
-                wanted,
-                found: format!("reads back as {found}"),
-            });
+            return Err(refused(key, &wanted, format!("reads back as {found}")));
         }
     }
     Ok(config)
+}
+
+fn refused(key: &'static str, wanted: &Value, found: String) -> BusError {
+    let wanted = wanted.clone();
+    BusError::Setting { key, wanted, found }
 }
 
 /// Equality that treats `1` and `1.0` as the same, and compares only the keys that were set.

@@ -74,36 +74,30 @@ impl SharedPool {
 
     /// A copy of a large body in the pool.
     fn shared(&self, body: &[u8]) -> Option<ZShmMut> {
-        let Pool {
-            provider,
-            session,
-            stats,
-        } = self.0.as_deref().filter(|_| body.len() >= SMALL_BYTES)?;
-        if !is_router_attached(session) {
-            stats.shared(SharedMemoryUse::RouterNotAttached);
+        let pool = self.0.as_deref().filter(|_| body.len() >= SMALL_BYTES)?;
+        if !is_router_attached(&pool.session) {
+            pool.stats.shared(SharedMemoryUse::RouterNotAttached);
             return None;
         }
         // Without waiting: a receiver that holds many messages must not delay the others.
-        let place = provider
+        let place = pool
+            .provider
             .alloc(body.len())
             .with_policy::<Defragment<GarbageCollect>>()
             .wait();
         let Ok(mut place) = place else {
-            stats.shared(SharedMemoryUse::PoolFull);
+            pool.stats.shared(SharedMemoryUse::PoolFull);
             return None;
         };
         place.as_mut().copy_from_slice(body);
-        stats.shared(SharedMemoryUse::Carried);
+        pool.stats.shared(SharedMemoryUse::Carried);
         Some(place)
     }
 }
 
 fn is_router_attached(session: &Session) -> bool {
-    session
-        .info()
-        .transports()
-        .wait()
-        .any(|transport| transport.is_shm())
+    let info = session.info();
+    info.transports().wait().any(|transport| transport.is_shm())
 }
 
 /// Checks that the system has room for pools of `bytes` together: a segment is made without its memory, and a process

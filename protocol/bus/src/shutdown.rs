@@ -28,7 +28,7 @@ impl Stop {
     /// Requests the stop; the first request runs the reactions.
     pub fn request(&self) {
         let reactions = {
-            let mut state = self.lock();
+            let mut state = lock(&self.0.0);
             state.requested = true;
             std::mem::take(&mut state.reactions)
         };
@@ -41,13 +41,13 @@ impl Stop {
 
     /// True if the stop has been requested.
     pub fn requested(&self) -> bool {
-        self.lock().requested
+        lock(&self.0.0).requested
     }
 
     /// Runs `reaction` at the request, at once if it has been made. It must not wait: it is meant for closing the queue
     /// at which a thread waits.
     pub fn on_request(&self, reaction: impl FnOnce() + Send + 'static) {
-        let mut state = self.lock();
+        let mut state = lock(&self.0.0);
         if state.requested {
             // Released first: the reaction may use this request, whose lock is not reentrant.
             drop(state);
@@ -59,7 +59,7 @@ impl Stop {
 
     /// Waits for the request, at most until `deadline`; true if it was made.
     pub fn wait_until(&self, deadline: Instant) -> bool {
-        let mut state = self.lock();
+        let mut state = lock(&self.0.0);
         while !state.requested {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
@@ -138,10 +138,6 @@ impl Stop {
                     std::process::exit(1);
                 });
         });
-    }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
-        lock(&self.0.0)
     }
 }
 

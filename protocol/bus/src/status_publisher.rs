@@ -30,10 +30,8 @@ const MAX_CONFIRMED: usize = 512;
 
 enum Request {
     Ready,
-    Control {
-        control: Control,
-        capture_nanos: u64,
-    },
+    /// With its capture time, nanoseconds.
+    Control(Control, u64),
 }
 
 /// A handle to the status thread of this process.
@@ -78,10 +76,7 @@ impl StatusPublisher {
 
     /// Publishes `control`.
     pub(super) fn publish(&self, control: Control, capture_nanos: u64) {
-        self.push(Request::Control {
-            control,
-            capture_nanos,
-        });
+        self.push(Request::Control(control, capture_nanos));
     }
 
     /// Heartbeats are published only while this thread works; `None`: always.
@@ -96,7 +91,7 @@ impl StatusPublisher {
 
     fn push(&self, request: Request) {
         let outcome = self.0.queue.push((), request);
-        if let PushOutcome::Replaced(Request::Control { control, .. }) = outcome {
+        if let PushOutcome::Replaced(Request::Control(control, _)) = outcome {
             tracing::error!("the network is stalled: {control:?} was not sent");
         }
     }
@@ -129,15 +124,7 @@ impl StatusSender {
         loop {
             match shared.queue.take(Some(next)) {
                 Pop::Item((), Request::Ready) => self.ready(shared),
-                Pop::Item(
-                    (),
-                    Request::Control {
-                        control,
-                        capture_nanos,
-                    },
-                ) => {
-                    self.control(control, capture_nanos);
-                }
+                Pop::Item((), Request::Control(control, nanos)) => self.control(control, nanos),
                 Pop::TimedOut => {
                     // From now, not from the time due: no burst of heartbeats follows a stall.
                     next = Instant::now() + PERIOD;
@@ -206,10 +193,8 @@ impl StatusSender {
             Err(error) => return tracing::error!(%key, "status cannot be sent: {error}"),
         };
         let put = self.session.put(key.to_string(), payload(encoded));
-        let put = put
-            .congestion_control(CongestionControl::Block)
-            .priority(priority)
-            .express(true);
+        let put = put.congestion_control(CongestionControl::Block);
+        let put = put.priority(priority).express(true);
         if let Err(cause) = put.wait() {
             tracing::error!(%key, "zenoh rejected a status: {cause}");
         }

@@ -10,7 +10,6 @@ use protocol::{
 };
 use support::nanos;
 use support::sync::lock;
-use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SourceInfo};
 
@@ -18,7 +17,8 @@ use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::delivery_gaps::DeliveryGaps;
 use super::inbox_limits::{InboxLimits, RateLimiter};
 use super::publisher::unix_nanos;
-use super::replay_window::{Admission, ReplayWindow};
+use super::replay_window::ReplayWindow;
+use super::session::declare_subscriber;
 use super::status_publisher::StatusPublisher;
 use super::watchdog::Watchdog;
 use super::{BusError, MessageStats};
@@ -26,12 +26,8 @@ use super::{BusError, MessageStats};
 /// Maximum size of a notification. Larger messages are not read to find out whether they are one.
 const MAX_NOTICE_BYTES: usize = 16 << 10;
 
-/// Key of a queue lane: data and notifications of one topic are separate, so that a notification never replaces data.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-struct Lane {
-    topic: Topic,
-    is_notice: bool,
-}
+/// Key of a queue lane, a topic and true for its notifications: separate from its data, which they must never replace.
+type Lane = (Topic, bool);
 
 /// An item of an inbox.
 #[derive(Debug)]
@@ -147,10 +143,10 @@ impl Inbox {
     /// The oldest event, waiting until `deadline` for one.
     pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, Event> {
         match self.watchdog.wait(|| self.queue.take(deadline)) {
-            Pop::Item(lane, event) => {
+            Pop::Item((topic, _), event) => {
                 self.waiting_bytes
                     .fetch_sub(event.bytes(), Ordering::Relaxed);
-                Pop::Item(lane.topic, event)
+                Pop::Item(topic, event)
             }
             Pop::TimedOut => Pop::TimedOut,
             Pop::Closed => Pop::Closed,
@@ -177,18 +173,12 @@ impl Inbox {
 
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
         let is_notice = matches!(event, Event::End { .. });
-        let lane = Lane {
-            topic: topic.clone(),
-            is_notice,
-        };
+        let lane = (topic.clone(), is_notice);
         // Limit on the bytes of all topics together; a message beyond it is lost.
         let bytes = event.bytes();
         // Added before the push: the consumer may take the event, and subtract its bytes, at once.
-        let waiting = self
-            .waiting_bytes
-            .fetch_add(bytes, Ordering::Relaxed)
-            .saturating_add(bytes);
-        if waiting > self.max_waiting && !is_notice {
+        let waiting = self.waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
+        if waiting.saturating_add(bytes) > self.max_waiting && !is_notice {
             self.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
             return self
                 .stats
@@ -256,15 +246,12 @@ impl Subscription {
         filter: IngressFilter,
         topic: impl Fn(&Sample) -> Option<Topic> + Send + Sync + 'static,
     ) -> Result<Self, BusError> {
-        let subscriber = session.declare_subscriber(key).callback(move |sample| {
+        let declared = declare_subscriber(session, key, move |sample| {
             if let Some(topic) = topic(&sample) {
                 filter.admit(topic, sample.payload(), sample.source_info());
             }
         });
-        subscriber
-            .wait()
-            .map(Self)
-            .map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
+        declared.map(Self)
     }
 }
 
@@ -272,11 +259,8 @@ impl Subscription {
 /// only.
 pub(super) fn has_notifications(topic: &Topic) -> bool {
     match topic {
-        Topic::Stream {
-            stream: Stream::Preview,
-            ..
-        } => false,
-        Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
+        Topic::Stream { stream, .. } => *stream != Stream::Preview,
+        Topic::Received { .. } | Topic::Truth => true,
         Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => false,
     }
 }
@@ -301,11 +285,8 @@ impl IngressFilter {
         // First: messages that are refused below have numbers too, and must not look like gaps.
         self.count_gap(&topic, payload, source);
         // Before the message is read: a flood must cost next to nothing.
-        if !self
-            .inbox
-            .meters
-            .admit(&topic, payload.len(), Instant::now())
-        {
+        let meters = &self.inbox.meters;
+        if !meters.admit(&topic, payload.len(), Instant::now()) {
             return self.reject(&topic, payload);
         }
         let header = match header_of(&topic, payload) {
@@ -381,22 +362,20 @@ impl IngressFilter {
     /// Drop reason of a duplicate or stale message, or of one under quarantine.
     fn reject_stale(&self, topic: &Topic, header: &Header, at: Instant) -> Option<DropReason> {
         let stamp = &header.stamp;
-        let Admission {
-            dropped,
-            quarantine,
-        } = lock(&self.inbox.replay_window).admit(topic, stamp.epoch, stamp.sequence, at);
-        if let Some(is_twice) = quarantine {
+        let window = &self.inbox.replay_window;
+        let admission = lock(window).admit(topic, stamp.epoch, stamp.sequence, at);
+        if let Some(is_twice) = admission.quarantine {
             let text = format!("two senders use {topic}: both are rejected");
             let problem = is_twice.then(|| (text.clone(), at));
             self.inbox.stats.set_problems(&text, problem);
         }
         // Under quarantine two senders, each with a clock of its own, use the id.
-        if dropped.is_none() {
+        if admission.dropped.is_none() {
             self.inbox
                 .stats
                 .observe_clock(&stamp.cav, stamp.publish_nanos, unix_nanos(), at);
         }
-        dropped
+        admission.dropped
     }
 }
 

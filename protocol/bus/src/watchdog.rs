@@ -2,10 +2,7 @@
 //!
 //! The status is published by a thread of its own, which would continue while the worker thread is stalled.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-
-use super::status_publisher::StatusPublisher;
 
 /// Activity of the thread that takes from an inbox.
 #[derive(Debug, Default)]
@@ -16,7 +13,7 @@ pub(super) struct Watchdog {
 
 impl Watchdog {
     /// Records activity of the thread.
-    fn beat(&self) {
+    pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 
@@ -34,34 +31,6 @@ impl Watchdog {
     pub(super) fn is_alive(&self, beats: &mut u64) -> bool {
         let before = std::mem::replace(beats, self.beats.load(Ordering::Relaxed));
         *beats != before || self.waits.load(Ordering::Relaxed)
-    }
-}
-
-/// Ties the status of a process to the activity of a thread, see [`super::Bus::works_from`]; until this is dropped.
-#[must_use = "the watchdog is released when this is dropped"]
-pub struct Heartbeat {
-    status: StatusPublisher,
-    watchdog: Arc<Watchdog>,
-}
-
-impl Heartbeat {
-    pub(super) fn begin(status: &StatusPublisher, watchdog: &Arc<Watchdog>) -> Self {
-        status.watch(Some(Arc::clone(watchdog)));
-        Self {
-            status: status.clone(),
-            watchdog: Arc::clone(watchdog),
-        }
-    }
-
-    /// Records activity of the thread without taking from the inbox.
-    pub fn beat(&self) {
-        self.watchdog.beat();
-    }
-}
-
-impl Drop for Heartbeat {
-    fn drop(&mut self) {
-        self.status.watch(None);
     }
 }
 

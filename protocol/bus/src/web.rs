@@ -128,10 +128,9 @@ impl WebServer {
             .build()?;
         let listener = runtime.block_on(TcpListener::bind(address))?;
         let address = listener.local_addr()?;
-        let readers = Arc::new(Readers {
-            places: Arc::new(Semaphore::new(MAX_CONNECTIONS)),
-            dropped: AtomicU64::new(0),
-        });
+        let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+        let dropped = AtomicU64::new(0);
+        let readers = Arc::new(Readers { places, dropped });
         runtime.spawn(accept(listener, Arc::new(handler), Arc::clone(&readers)));
         Ok(Self {
             address,
@@ -232,10 +231,8 @@ async fn answer(
         let message = format!("this server is called localhost, not {name:?}");
         return Ok(refuse(StatusCode::FORBIDDEN, message));
     }
-    let (path, query) = (
-        request.uri().path().to_owned(),
-        request.uri().query().unwrap_or_default().to_owned(),
-    );
+    let path = request.uri().path().to_owned();
+    let query = request.uri().query().unwrap_or_default().to_owned();
     // A slow handler must not hold the only worker thread, which serves all other readers.
     let answer = tokio::task::spawn_blocking(move || handler(&Request { path, query })).await;
     Ok(match answer {
@@ -298,15 +295,11 @@ pub(crate) fn fetch_within(
     write!(connection, "GET {path} HTTP/1.0\r\n\r\n")?;
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer)?;
-    let end = answer
-        .windows(4)
-        .position(|bytes| bytes == b"\r\n\r\n")
-        .ok_or(io::ErrorKind::InvalidData)?;
-    let status = String::from_utf8_lossy(answer.get(..end).unwrap_or_default())
-        .lines()
-        .next()
-        .unwrap_or_default()
-        .to_owned();
+    let mut windows = answer.windows(4);
+    let end = windows.position(|bytes| bytes == b"\r\n\r\n");
+    let end = end.ok_or(io::ErrorKind::InvalidData)?;
+    let head = String::from_utf8_lossy(answer.get(..end).unwrap_or_default());
+    let status = head.lines().next().unwrap_or_default().to_owned();
     Ok((status, answer.get(end + 4..).unwrap_or_default().to_vec()))
 }
 

@@ -49,13 +49,8 @@ pub(crate) fn boxes<'a>(
 }
 
 /// Covariance of x, y (square metres) and yaw (square radians) as `[3, 3]`.
-pub(crate) fn covariance(py: Python<'_>, covariance: &PlanarCovariance) -> PyResult<Matrix> {
-    let PlanarCovariance {
-        xx_m2,
-        xy_m2,
-        yy_m2,
-        yaw_rad2,
-    } = *covariance;
-    let [xx, xy, yy, yaw] = [xx_m2, xy_m2, yy_m2, yaw_rad2].map(f64::from);
+pub(crate) fn covariance(py: Python<'_>, found: &PlanarCovariance) -> PyResult<Matrix> {
+    let [xx, xy, yy] = [found.xx_m2, found.xy_m2, found.yy_m2].map(f64::from);
+    let yaw = found.yaw_rad2.into();
     rows(py, vec![[xx, xy, 0.0], [xy, yy, 0.0], [0.0, 0.0, yaw]])
 }

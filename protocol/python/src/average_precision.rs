@@ -30,16 +30,10 @@ pub(crate) fn average_precision<'py>(
         }
     };
     let frames = frames(detections, truth)?;
-    let single = match iou {
-        None => Some(0.5),
-        Some(iou) => iou.extract::<f64>().ok(),
-    };
-    let thresholds = match (single, iou) {
-        (Some(iou), _) => vec![iou],
-        (None, iou) => iou
-            .map(PyAnyMethods::extract)
-            .transpose()?
-            .unwrap_or_default(),
+    let single = iou.map_or(Some(0.5), |iou| iou.extract::<f64>().ok());
+    let thresholds: Vec<f64> = match (single, iou) {
+        (None, Some(iou)) => iou.extract()?,
+        (single, _) => single.into_iter().collect(),
     };
     if let Some(bad) = thresholds.iter().find(|iou| !(**iou > 0.0 && **iou <= 1.0)) {
         return Err(error(format!(

@@ -53,19 +53,17 @@ impl DataSet {
             let loaded = scenario.load_tick(tick, scenario.present_agents(tick), &self.options);
             let mut parts = FrameParts::empty(&scenario.name, at.capture_nanos, &self.protocol);
             parts.tick = Some(tick as u64);
-            parts.problems.extend(
-                loaded
-                    .unreadable
-                    .into_iter()
-                    .map(|(_, problem)| problem.message),
-            );
+            let unreadable = loaded.unreadable.into_iter();
+            parts
+                .problems
+                .extend(unreadable.map(|(_, problem)| problem.message));
             for (_, frame) in loaded.frames {
+                let problems = frame.problems.iter();
                 parts
                     .problems
-                    .extend(frame.problems.iter().map(|problem| problem.message.clone()));
-                parts
-                    .agents
-                    .push(AgentParts::recorded(frame, self.options.points));
+                    .extend(problems.map(|problem| problem.message.clone()));
+                let agent = AgentParts::recorded(frame, self.options.points);
+                parts.agents.push(agent);
             }
             return Some(parts);
         }
@@ -92,10 +90,8 @@ impl DataSet {
         } else {
             usize::try_from(index).ok()
         };
-        let frame = wanted
-            .map(|index| self.frame(py, index))
-            .transpose()?
-            .flatten();
+        let frame = wanted.map(|index| self.frame(py, index)).transpose()?;
+        let frame = frame.flatten();
         frame.ok_or_else(|| PyIndexError::new_err(format!("frame {index} of {count}")))
     }
 

@@ -119,10 +119,8 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
         }
         WireMessage::Gnss(gnss) => {
             let made = json::to_python(py, &gnss)?;
-            made.set_item(
-                "world_from_lidar",
-                arrays::pose(py, &gnss.world_from_lidar)?,
-            )?;
+            let pose = arrays::pose(py, &gnss.world_from_lidar)?;
+            made.set_item("world_from_lidar", pose)?;
             made.unbind()
         }
         WireMessage::Imu(motion) => json::to_python(py, &motion)?.unbind(),
@@ -138,10 +136,8 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
 #[pymethods]
 impl Message {
     fn __repr__(&self) -> String {
-        let (seconds, place) = (
-            self.capture_time_ns as f64 * 1e-9,
-            self.key.as_deref().unwrap_or(&self.cav),
-        );
+        let seconds = self.capture_time_ns as f64 * 1e-9;
+        let place = self.key.as_deref().unwrap_or(&self.cav);
         format!(
             "Message({}, {place:?}, t={seconds:.3} s, {} bytes)",
             self.kind, self.wire_bytes
@@ -154,10 +150,7 @@ impl Message {
 pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<Message> {
     // Every key has slashes, and no kind has one.
     if !kind_or_key.contains('/') {
-        let kind = Kind::ALL
-            .into_iter()
-            .find(|kind| kind.to_string() == kind_or_key);
-        let kind = kind.ok_or_else(|| {
+        let kind = kind_or_key.parse::<Kind>().map_err(|_| {
             let known = Kind::ALL.map(|kind| kind.to_string()).join(", ");
             error(format!(
                 "{kind_or_key:?} is no kind of message; there are {known}"

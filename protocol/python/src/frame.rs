@@ -88,11 +88,8 @@ impl Agent {
             ("boxes", self.boxes.is_some()),
             ("cameras", !self.cameras.bind(py).is_empty()),
         ];
-        parts.extend(
-            here.iter()
-                .filter(|(_, is_here)| *is_here)
-                .map(|(name, _)| (*name).to_owned()),
-        );
+        let here = here.iter().filter(|(_, is_here)| *is_here);
+        parts.extend(here.map(|(name, _)| (*name).to_owned()));
         format!("Agent({})", parts.join(", "))
     }
 }
@@ -136,10 +133,8 @@ impl Frame {
             tracks.set_item(found.ego.as_str(), Tracks::new(py, found)?)?;
         }
         // Without detections the first agent: the ego comes first in the order of a scene.
-        let ego = (parts.detections)
-            .first()
-            .map(|result| &result.ego)
-            .or(truth.first().map(|agent| &agent.cav));
+        let first = parts.detections.first().map(|result| &result.ego);
+        let ego = first.or(truth.first().map(|agent| &agent.cav));
         Ok(Self {
             source: parts.source,
             tick: parts.tick,
@@ -180,10 +175,8 @@ impl Frame {
         let protocol = self.rule(protocol)?;
         let rule = area_m.map_or(protocol.ground_truth, |area_m| protocol.rule_within(area_m));
         let ego = ego.or_else(|| self.ego.clone()).unwrap_or_default();
-        let index = self
-            .truth
-            .iter()
-            .position(|agent| agent.cav.as_str() == ego);
+        let mut agents = self.truth.iter();
+        let index = agents.position(|agent| agent.cav.as_str() == ego);
         let index = index.filter(|&index| self.truth[index].world_from_lidar.is_some());
         let index = index.ok_or_else(|| {
             let frame = self.__repr__(py);

@@ -96,10 +96,8 @@ impl FrameParts {
             let known = others
                 .iter()
                 .position(|other| other.recorded.cav == agent.cav);
-            let mut parts = known.map_or_else(
-                || AgentParts::empty(&agent.cav),
-                |index| others.swap_remove(index),
-            );
+            let known = known.map(|index| others.swap_remove(index));
+            let mut parts = known.unwrap_or_else(|| AgentParts::empty(&agent.cav));
             parts.recorded.world_from_lidar = truth.world_from_lidar;
             parts.recorded.objects = truth.objects;
             self.agents.push(parts);
@@ -108,10 +106,8 @@ impl FrameParts {
     }
 
     fn agent(&mut self, cav: &CavId) -> &mut AgentParts {
-        let known = self
-            .agents
-            .iter()
-            .position(|agent| agent.recorded.cav == *cav);
+        let mut agents = self.agents.iter();
+        let known = agents.position(|agent| agent.recorded.cav == *cav);
         let index = known.unwrap_or_else(|| {
             self.agents.push(AgentParts::empty(cav));
             self.agents.len() - 1

@@ -34,10 +34,8 @@ fn of_value<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> 
         },
         Value::String(text) => text.into_pyobject(py)?.into_any(),
         Value::Array(values) => {
-            let values: Vec<_> = values
-                .iter()
-                .map(|value| of_value(py, value))
-                .collect::<PyResult<_>>()?;
+            let values = values.iter().map(|value| of_value(py, value));
+            let values: Vec<_> = values.collect::<PyResult<_>>()?;
             PyList::new(py, values)?.into_any()
         }
         Value::Object(fields) => {

@@ -16,7 +16,7 @@ use crate::error::error;
 use crate::frame::Frame;
 use crate::frame_parts::is_part_of_frames;
 use crate::live_frames::LiveFrames;
-use crate::subscriptions::{self, Access};
+use crate::subscriptions;
 
 /// Interval between two checks for Ctrl-C.
 const POLL: Duration = Duration::from_millis(50);
@@ -123,9 +123,8 @@ impl Listener {
     fn next_message(&mut self, py: Python<'_>) -> PyResult<Option<Message>> {
         loop {
             let message = match self.step(py, POLL)? {
-                Step::Message(message) if message.key.topic.is_json() => continue,
-                Step::Message(message) => message,
-                Step::Waiting => continue,
+                Step::Message(message) if !message.key.topic.is_json() => message,
+                Step::Message(_) | Step::Waiting => continue,
                 Step::End => return Ok(None),
             };
             match py.detach(|| Decoded::of_key(&message.key, &message.bytes())) {
@@ -233,11 +232,7 @@ impl Listener {
     }
 
     fn __repr__(&self) -> String {
-        let state = if self.connection.is_some() {
-            ""
-        } else {
-            ", closed"
-        };
+        let state = self.connection.as_ref().map_or(", closed", |_| "");
         format!(
             "Listener(run={:?}, {} messages{state})",
             self.run.as_str(),
@@ -288,11 +283,11 @@ pub(crate) fn listen(
     let settle = seconds_of("settle_s", settle_s)?;
     let mut options = BusOptions::client(endpoint.clone());
     options.connect_timeout = timeout.unwrap_or(CONNECT_LIMIT).min(CONNECT_LIMIT);
-    let (mut principal, mut access) = (anonymous()?, Access::All);
+    let (mut principal, mut access) = (anonymous()?, None);
     if let Some(folder) = credentials {
         let credentials = Credentials::read(&folder).map_err(error)?;
         principal = credentials.name().parse().map_err(error)?;
-        access = Access::of(&principal, &run);
+        access = subscriptions::access_of(&principal, &run);
         options = options.with_credentials(credentials);
     }
     let selectors = subscriptions::selectors(&run, streams, &access)?;

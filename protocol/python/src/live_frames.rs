@@ -71,11 +71,8 @@ impl LiveFrames {
 
     /// A replay that is started anew begins at its own first tick.
     fn begin_again_with(&mut self, epoch: u64) {
-        if self
-            .replay_epoch
-            .replace(epoch)
-            .is_some_and(|known| known != epoch)
-        {
+        let known = self.replay_epoch.replace(epoch);
+        if known.is_some_and(|known| known != epoch) {
             self.finish();
             self.handed_over = None;
         }

@@ -63,13 +63,9 @@ impl PoseEstimate {
         let [cos, sin, x, y, z] = [[0_usize, 0], [1, 0], [0, 3], [1, 3], [2, 3]]
             .map(|place| matrix.get(place).copied().unwrap_or(f64::NAN));
         let yaw_deg = sin.atan2(cos).to_degrees();
+        let covariance = self.covariance.as_ref().map_or("", |_| ", covariance");
         format!(
-            "PoseEstimate(x={x:.2}, y={y:.2}, z={z:.2} m, yaw={yaw_deg:.1} deg, confidence={confidence:.3}{})",
-            if self.covariance.is_some() {
-                ", covariance"
-            } else {
-                ""
-            }
+            "PoseEstimate(x={x:.2}, y={y:.2}, z={z:.2} m, yaw={yaw_deg:.1} deg, confidence={confidence:.3}{covariance})"
         )
     }
 }
@@ -139,13 +135,8 @@ impl Bev {
 #[pymethods]
 impl Bev {
     fn __repr__(&self, py: Python<'_>) -> String {
-        let shape = self
-            .features
-            .bind(py)
-            .readonly()
-            .as_array()
-            .shape()
-            .to_vec();
+        let features = self.features.bind(py).readonly();
+        let shape = features.as_array().shape().to_vec();
         let part = if self.mask.is_some() { ", masked" } else { "" };
         format!(
             "Bev({shape:?}, cells of {} m, {} bytes of {}{part})",
@@ -242,10 +233,8 @@ impl Detections {
 impl Detections {
     fn __repr__(&self, py: Python<'_>) -> String {
         let count = self.__len__(py);
-        let method = self
-            .method
-            .as_deref()
-            .map_or(String::new(), |method| format!(", method={method:?}"));
+        let method = self.method.as_deref();
+        let method = method.map_or(String::new(), |method| format!(", method={method:?}"));
         format!("Detections(cav={:?}, {count} boxes{method})", self.cav)
     }
 
@@ -356,10 +345,8 @@ impl Objects {
         truth: Option<GroundTruth>,
     ) -> PyResult<Py<Self>> {
         let boxes = boxes.map(|boxes| arrays::boxes(py, boxes.iter()));
-        let poses: Vec<Pose> = objects
-            .iter()
-            .map(|object| object.world_from_object)
-            .collect();
+        let poses = objects.iter().map(|object| object.world_from_object);
+        let poses: Vec<Pose> = poses.collect();
         let speeds = objects
             .iter()
             // NaN where unknown: an array of numbers has no `None`.

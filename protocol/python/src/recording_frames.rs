@@ -30,17 +30,13 @@ impl RecordingFrames {
         let mut frames: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
         for (index, Entry { key, header, .. }) in recording.entries().iter().enumerate() {
             if is_part_of_frames(&key.topic) && is_wanted(&key.topic, options) {
-                frames
-                    .entry(header.stamp.capture_nanos)
-                    .or_default()
-                    .push(index);
+                let messages = frames.entry(header.stamp.capture_nanos).or_default();
+                messages.push(index);
             }
         }
-        let run = recording
-            .entries()
-            .first()
-            .map(|entry| entry.key.run.to_string())
-            .unwrap_or_default();
+        let first = recording.entries().first();
+        let run = first.map(|entry| entry.key.run.to_string());
+        let run = run.unwrap_or_default();
         Ok(Self {
             recording,
             run,
@@ -55,31 +51,24 @@ impl RecordingFrames {
 
     /// Parts of the file that cannot be read.
     pub(crate) fn problems(&self) -> Vec<String> {
-        self.recording
-            .damage()
-            .iter()
-            .map(ToString::to_string)
-            .collect()
+        let damage = self.recording.damage().iter();
+        damage.map(ToString::to_string).collect()
     }
 
     /// Reads the messages of a frame. One that cannot be read or decoded is left out and named.
     pub(crate) fn load(&self, index: usize) -> Option<FrameParts> {
         let (capture_nanos, messages) = self.frames.get(index)?;
         let mut parts = FrameParts::empty(&self.run, *capture_nanos, &self.protocol);
-        for entry in messages
-            .iter()
-            .filter_map(|&index| self.recording.entries().get(index))
-        {
-            let problem = match self.recording.read(entry) {
-                Ok(bytes) => parts
-                    .add(&entry.key.topic, [bytes.as_slice()])
-                    .err()
-                    .map(|cause| cause.to_string()),
-                Err(cause) => Some(cause.to_string()),
-            };
-            parts
-                .problems
-                .extend(problem.map(|cause| format!("{}: {cause}", entry.key)));
+        let entries = self.recording.entries();
+        for entry in messages.iter().filter_map(|&index| entries.get(index)) {
+            let bytes = self.recording.read(entry);
+            let added = bytes.map_err(|cause| cause.to_string()).and_then(|bytes| {
+                let added = parts.add(&entry.key.topic, [bytes.as_slice()]);
+                added.map_err(|cause| cause.to_string())
+            });
+            if let Err(cause) = added {
+                parts.problems.push(format!("{}: {cause}", entry.key));
+            }
         }
         Some(parts)
     }

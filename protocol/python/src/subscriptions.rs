@@ -18,30 +18,22 @@ const STREAMS: [&str; 9] = [
     "truth",
 ];
 
-/// Key expressions that a listener may subscribe to.
-pub(crate) enum Access {
-    /// A run without access control.
-    All,
-    /// Those of a principal.
-    Of(Principal, Vec<KeyExpr>),
+/// A principal, and the key expressions that its certificate permits; `None`: a run without access control.
+pub(crate) type Access = Option<(Principal, Vec<KeyExpr>)>;
+
+/// Streams that the certificate of `principal` permits in a run.
+pub(crate) fn access_of(principal: &Principal, run: &RunId) -> Access {
+    let rights = principal.rights(&RunScope::One(run.clone())).into_iter();
+    let subscribed = rights
+        .filter(|right| right.act == Operation::Subscribe)
+        .map(|right| right.keys);
+    Some((principal.clone(), subscribed.collect()))
 }
 
-impl Access {
-    /// Streams that a certificate permits in a run.
-    pub(crate) fn of(principal: &Principal, run: &RunId) -> Self {
-        let rights = principal.rights(&RunScope::One(run.clone())).into_iter();
-        let subscribed = rights
-            .filter(|right| right.act == Operation::Subscribe)
-            .map(|right| right.keys);
-        Self::Of(principal.clone(), subscribed.collect())
-    }
-
-    fn permits(&self, wanted: &KeyExpr) -> bool {
-        match self {
-            Self::All => true,
-            Self::Of(_, permitted) => permitted.iter().any(|keys| keys.includes(wanted)),
-        }
-    }
+fn permits(access: &Access, wanted: &KeyExpr) -> bool {
+    access
+        .as_ref()
+        .is_none_or(|(_, permitted)| { permitted.iter() }.any(|keys| keys.includes(wanted)))
 }
 
 /// Key expressions of the streams, and of the end of the run. Without names: those of [`STREAMS`] that are permitted.
@@ -54,18 +46,16 @@ pub(crate) fn selectors(
     let is_choice = names.is_some();
     for name in names.unwrap_or_else(|| STREAMS.map(str::to_owned).into()) {
         let wanted = selector(run, &name)?;
-        match access {
-            _ if access.permits(&wanted) => selectors.push(wanted),
-            Access::Of(principal, _) if is_choice => {
-                return Err(error(format!(
-                    "streams: a certificate of {principal} does not permit {name:?}"
-                )));
-            }
-            _ => {}
+        if permits(access, &wanted) {
+            selectors.push(wanted);
+        } else if is_choice && let Some((principal, _)) = access {
+            return Err(error(format!(
+                "streams: a certificate of {principal} does not permit {name:?}"
+            )));
         }
     }
     // Control messages, with the end of the run, are not permitted to every principal.
-    selectors.retain(|wanted| access.permits(wanted));
+    selectors.retain(|wanted| permits(access, wanted));
     Ok(selectors)
 }
 

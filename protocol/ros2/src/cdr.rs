@@ -31,21 +31,22 @@ pub(crate) fn time(cdr: &mut Cdr<'_>, nanos: u64) {
 
 /// `geometry_msgs/Point` or `Vector3`.
 pub(crate) fn xyz(cdr: &mut Cdr<'_>, values: [f64; 3]) {
-    values.into_iter().for_each(|value| cdr.write_f64(value));
+    f64s(cdr, &values);
 }
 
 /// `geometry_msgs/Pose` or `Transform`.
 pub(crate) fn pose(cdr: &mut Cdr<'_>, pose: &Pose) {
     let [w, x, y, z] = pose.rotation_wxyz;
     xyz(cdr, pose.translation_m);
-    [x, y, z, w]
-        .into_iter()
-        .for_each(|value| cdr.write_f64(value));
+    f64s(cdr, &[x, y, z, w]);
 }
 
 /// `float64[36]`: rows of x, y, z, and of the rotations about them.
 pub(crate) fn covariance(cdr: &mut Cdr<'_>, rows: &[[f64; 6]; 6]) {
-    rows.as_flattened()
-        .iter()
-        .for_each(|value| cdr.write_f64(*value));
+    f64s(cdr, rows.as_flattened());
+}
+
+/// `float64[N]`.
+pub(crate) fn f64s(cdr: &mut Cdr<'_>, values: &[f64]) {
+    values.iter().for_each(|value| cdr.write_f64(*value));
 }

@@ -103,11 +103,7 @@ impl Node {
     pub fn name_in_network(&self) -> NodeName {
         NodeName {
             zid: self.zid.clone(),
-            namespace: self
-                .namespace
-                .as_ref()
-                .map_or("/", RosName::as_str)
-                .to_owned(),
+            namespace: self.namespace_or_root().to_owned(),
             name: self.name.clone(),
         }
     }
@@ -126,23 +122,14 @@ impl Node {
 
     /// Liveliness token of one of its endpoints.
     pub fn endpoint_token(&self, endpoint: &Endpoint) -> String {
-        let Endpoint {
-            id,
-            kind,
-            topic,
-            ros_type,
-            qos,
-        } = endpoint;
-        let kind = match kind {
+        let Endpoint { id, qos, .. } = endpoint;
+        let kind = match endpoint.kind {
             EndpointKind::Publisher => "MP",
             EndpointKind::Subscription => "MS",
         };
-        let (topic, name, hash) = (
-            mangled(topic.as_str()),
-            ros_type.dds_name(),
-            ros_type.hash(self.distribution),
-        );
-        let identity = self.identity();
+        let (identity, topic) = (self.identity(), mangled(endpoint.topic.as_str()));
+        let name = endpoint.ros_type.dds_name();
+        let hash = endpoint.ros_type.hash(self.distribution);
         format!(
             "{TOKEN_ROOT}/{}/{}/0/{id}/{kind}/{identity}/{topic}/{name}/{hash}/{qos}",
             self.domain_id, self.zid
@@ -170,8 +157,12 @@ impl Node {
 
     /// Enclave, namespace and name in tokens.
     fn identity(&self) -> String {
-        let namespace = self.namespace.as_ref().map_or("/", RosName::as_str);
-        format!("%/{}/{}", mangled(namespace), mangled(&self.name))
+        let namespace = mangled(self.namespace_or_root());
+        format!("%/{namespace}/{}", mangled(&self.name))
+    }
+
+    fn namespace_or_root(&self) -> &str {
+        self.namespace.as_ref().map_or("/", RosName::as_str)
     }
 }
 
@@ -200,17 +191,12 @@ pub struct Attachment {
 impl Attachment {
     /// The bytes on the wire.
     pub fn to_bytes(&self) -> [u8; ATTACHMENT_LEN] {
-        let Self {
-            sequence,
-            source_nanos,
-            gid,
-        } = self;
         let mut bytes = [0; ATTACHMENT_LEN];
         let parts = [
-            &sequence.to_le_bytes()[..],
-            &source_nanos.to_le_bytes(),
+            &self.sequence.to_le_bytes()[..],
+            &self.source_nanos.to_le_bytes(),
             &[16],
-            gid,
+            &self.gid,
         ];
         for (place, byte) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
             *place = *byte;

@@ -90,10 +90,8 @@ impl MotionType {
                 message.read("child_frame_id", CdrReader::read_str)?;
                 message.f64s::<7>("pose.pose")?;
                 message.f64s::<36>("pose.covariance")?;
-                let motion = read_twist(
-                    &mut message,
-                    ["twist.twist.linear.x", "twist.twist.angular.z"],
-                )?;
+                let fields = ["twist.twist.linear.x", "twist.twist.angular.z"];
+                let motion = read_twist(&mut message, fields)?;
                 let covariance: [f64; 36] = message.f64s("twist.covariance")?;
                 measured(motion, &covariance)?
             }
@@ -105,10 +103,8 @@ impl MotionType {
                 let [first, ..] = message.f64s::<9>("angular_velocity_covariance")?;
                 // REP-145: the first element is -1 where a sensor has no such measurement.
                 if first.to_bits() == (-1.0_f64).to_bits() {
-                    return Err(MotionError::Unmeasured {
-                        field: "angular_velocity_covariance[0]",
-                        found: first,
-                    });
+                    let (field, found) = ("angular_velocity_covariance[0]", first);
+                    return Err(MotionError::Unmeasured { field, found });
                 }
                 EgoMotion {
                     speed_mps: None,
@@ -130,9 +126,8 @@ fn read_twist<BO: ByteOrder>(
 ) -> Result<EgoMotion, MotionError> {
     let [speed_mps, _, _] = message.f64s(speed_field)?;
     let [_, _, z] = message.f64s(yaw_rate_field)?;
-    let speed_mps = within(speed_field, speed_mps, EgoMotion::MAX_SPEED_MPS)?;
     Ok(EgoMotion {
-        speed_mps: Some(speed_mps),
+        speed_mps: Some(within(speed_field, speed_mps, EgoMotion::MAX_SPEED_MPS)?),
         yaw_rate_rad_s: Some(yaw_rate(yaw_rate_field, z)?),
     })
 }
@@ -145,10 +140,8 @@ fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, Moti
     let speed_mps = (motion.speed_mps).filter(|_| *speed_variance < UNMEASURED);
     let yaw_rate_rad_s = (motion.yaw_rate_rad_s).filter(|_| *yaw_rate_variance < UNMEASURED);
     if speed_mps.is_none() && yaw_rate_rad_s.is_none() {
-        return Err(MotionError::Unmeasured {
-            field: "twist.covariance[0]",
-            found: *speed_variance,
-        });
+        let (field, found) = ("twist.covariance[0]", *speed_variance);
+        return Err(MotionError::Unmeasured { field, found });
     }
     Ok(EgoMotion {
         speed_mps,
@@ -163,14 +156,13 @@ fn yaw_rate(field: &'static str, found: f64) -> Result<f64, MotionError> {
 fn within(field: &'static str, found: f64, limit: f64) -> Result<f64, MotionError> {
     // A value that is no number is within nothing.
     if found.abs() <= limit {
-        Ok(found)
-    } else {
-        Err(MotionError::Value {
-            field,
-            found,
-            limit,
-        })
+        return Ok(found);
     }
+    Err(MotionError::Value {
+        field,
+        found,
+        limit,
+    })
 }
 
 #[cfg(test)]

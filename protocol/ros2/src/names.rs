@@ -102,9 +102,8 @@ impl FrameNames {
     pub fn within(namespace: Option<&RosName>) -> Self {
         // Unlike topics, frames begin with no slash.
         let prefix = namespace.map(|name| format!("{}/", &name.as_str().trim_start_matches('/')));
-        Self {
-            prefix: prefix.unwrap_or_default(),
-        }
+        let prefix = prefix.unwrap_or_default();
+        Self { prefix }
     }
 
     /// Frame of a vehicle's LiDAR, at its estimated pose.

@@ -181,10 +181,8 @@ struct Columns<'a> {
 impl<'a> Columns<'a> {
     fn find(fields: &[Field<'a>]) -> Result<Self, PointCloudError> {
         let [x, y, z] = ["x", "y", "z"].map(|name| coordinate(fields, name));
-        Ok(Self {
-            xyz: [x?, y?, z?],
-            intensity: intensity(fields)?,
-        })
+        let (xyz, intensity) = ([x?, y?, z?], intensity(fields)?);
+        Ok(Self { xyz, intensity })
     }
 
     fn end(&self) -> u64 {
@@ -291,28 +289,16 @@ impl Layout {
         limits: SweepLimits,
     ) -> Result<(), PointCloudError> {
         let points = u64::from(self.height) * u64::from(self.width);
-        if points > limits.max_points {
-            return Err(PointCloudError::TooMany {
-                what: "height x width",
-                found: points,
-                max: limits.max_points,
-            });
-        }
-        at_least(
-            "point_step",
-            self.point_step.into(),
-            columns.end(),
-            "end of the last field",
-        )?;
+        at_most("height x width", points, limits.max_points)?;
+        let step = self.point_step.into();
+        at_least("point_step", step, columns.end(), "end of the last field")?;
         let row = u64::from(self.width) * u64::from(self.point_step);
         at_least("row_step", self.stride(), row, "width x point_step")?;
-        let rows = u64::from(self.height.saturating_sub(1));
-        let needed = if self.height == 0 {
-            0
-        } else {
-            // The last row needs its points only, not the padding up to the next row.
-            rows.saturating_mul(self.stride()).saturating_add(row)
-        };
+        // The last row needs its points only, not the padding up to the next row.
+        let needed = self.height.checked_sub(1).map_or(0, |rows| {
+            let padded = u64::from(rows).saturating_mul(self.stride());
+            padded.saturating_add(row)
+        });
         at_least("length of data", data_len as u64, needed, "rows x row_step")
     }
 }
@@ -332,6 +318,13 @@ fn at_least(
         needed,
         why,
     })
+}
+
+fn at_most(what: &'static str, found: u64, max: u64) -> Result<(), PointCloudError> {
+    if found <= max {
+        return Ok(());
+    }
+    Err(PointCloudError::TooMany { what, found, max })
 }
 
 fn read_sweep<BO: ByteOrder>(
@@ -373,13 +366,7 @@ fn read_fields<'a, BO: ByteOrder>(
     message: &mut Reader<'a, BO>,
 ) -> Result<Vec<Field<'a>>, PointCloudError> {
     let count = message.u32("length of fields")?;
-    if count > MAX_FIELDS {
-        return Err(PointCloudError::TooMany {
-            what: "fields",
-            found: count.into(),
-            max: MAX_FIELDS.into(),
-        });
-    }
+    at_most("fields", count.into(), MAX_FIELDS.into())?;
     let fields = (0..count).map(|_| {
         Ok(Field {
             name: message.read("fields.name", CdrReader::read_str)?,
@@ -402,12 +389,8 @@ impl Sweep {
     ) {
         let (stride, step) = (layout.stride(), layout.point_step as usize);
         // Rows of no points may be as many as they like.
-        let rows = if layout.width == 0 {
-            0
-        } else {
-            u64::from(layout.height)
-        };
-        for row in 0..rows {
+        let rows = if layout.width == 0 { 0 } else { layout.height };
+        for row in 0..u64::from(rows) {
             let begin = usize::try_from(row * stride).unwrap_or(usize::MAX);
             let row = data.get(begin..).unwrap_or_default();
             // A step of 0 was refused: it ends before the last field.
@@ -436,10 +419,8 @@ impl Sweep {
                 Some((_, column, _)) => column.value::<BO>(point),
                 None => None,
             };
-            let intensity = intensity
-                .filter(|value| value.is_finite())
-                .unwrap_or(0.0)
-                .clamp(-limit, limit);
+            let intensity = intensity.filter(|value| value.is_finite());
+            let intensity = intensity.unwrap_or(0.0).clamp(-limit, limit);
             let [x, y, z] = xyz;
             self.points.xyzi.push([x, y, z, intensity].map(single));
         }

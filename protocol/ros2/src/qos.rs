@@ -38,7 +38,7 @@ impl Qos {
 
     /// As `offered_qos_profiles` of a channel, in the numbers that rosbag2 of every distribution reads.
     pub fn offered_profiles(self) -> String {
-        let (reliability, durability) = self.policies();
+        let [reliability, durability] = self.policies();
         // i64::MAX nanoseconds in seconds and nanoseconds: no limit.
         let forever = "    sec: 9223372036\n    nsec: 854775807\n";
         format!(
@@ -50,11 +50,8 @@ impl Qos {
     }
 
     /// Reliability and durability in the numbers of `rmw/types.h`.
-    fn policies(self) -> (u8, u8) {
-        (
-            if self.is_reliable { 1 } else { 2 },
-            if self.is_latched { 1 } else { 2 },
-        )
+    fn policies(self) -> [u32; 2] {
+        [self.is_reliable, self.is_latched].map(|is_set| if is_set { 1 } else { 2 })
     }
 }
 
@@ -62,10 +59,10 @@ impl Qos {
 /// rmw_zenoh's defaults left out.
 impl fmt::Display for Qos {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (reliability, durability) = self.policies();
+        let [reliability, durability] = self.policies();
         let [reliability, durability, depth] = [
-            (u32::from(reliability), 1),
-            (u32::from(durability), 2),
+            (reliability, 1),
+            (durability, 2),
             (self.depth, DEFAULT_DEPTH),
         ]
         .map(|(value, default)| match value == default {

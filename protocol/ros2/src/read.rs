@@ -1,5 +1,6 @@
 //! Reading of ROS 2 messages in CDR: encapsulation header, byte order, header of the message, errors by field.
 
+use protocol::Pose;
 use re_cdr::{BigEndian, ByteOrder, CdrReader, LittleEndian};
 
 /// Error of a message that cannot be read.
@@ -107,6 +108,16 @@ impl<'a, BO: ByteOrder> Reader<'a, BO> {
         Ok(values)
     }
 
+    /// `geometry_msgs/Pose` or `Transform`.
+    pub(crate) fn pose(&mut self, field: &'static str) -> Result<Pose, ReadError> {
+        let [x, y, z, qx, qy, qz, qw] = self.f64s(field)?;
+        Ok(Pose {
+            translation_m: [x, y, z],
+            // ROS writes w last, `Pose` has it first.
+            rotation_wxyz: [qw, qx, qy, qz],
+        })
+    }
+
     /// `std_msgs/Header`.
     pub(crate) fn header(&mut self) -> Result<Header<'a>, ReadError> {
         let sec = self.read("header.stamp.sec", CdrReader::read_i32)?;
@@ -114,9 +125,7 @@ impl<'a, BO: ByteOrder> Reader<'a, BO> {
         let seconds = u64::try_from(sec).ok().filter(|_| nanosec < 1_000_000_000);
         let seconds = seconds.ok_or(ReadError::Stamp { sec, nanosec })?;
         let frame_id = self.read("header.frame_id", CdrReader::read_str)?;
-        Ok(Header {
-            nanos: seconds * 1_000_000_000 + u64::from(nanosec),
-            frame_id,
-        })
+        let nanos = seconds * 1_000_000_000 + u64::from(nanosec);
+        Ok(Header { nanos, frame_id })
     }
 }

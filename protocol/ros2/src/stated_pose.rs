@@ -64,12 +64,7 @@ fn read<BO: ByteOrder>(mut message: Reader<'_, BO>) -> Result<StatedPose, Stated
         let found = header.frame_id.to_owned();
         return Err(StatedPoseError::Frame { found });
     }
-    let [x, y, z, qx, qy, qz, qw] = message.f64s("pose")?;
-    let world_from_base = Pose {
-        translation_m: [x, y, z],
-        // ROS writes w last, `Pose` has it first.
-        rotation_wxyz: [qw, qx, qy, qz],
-    };
+    let world_from_base = message.pose("pose")?;
     world_from_base.validate()?;
     let covariance: [f64; 36] = message.f64s("covariance")?;
     // Row-major 6 x 6: variances of x, y and yaw are at 0, 7 and 35.

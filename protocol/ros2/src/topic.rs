@@ -6,7 +6,7 @@ use protocol::CavId;
 
 use super::names::{RosName, vehicle};
 use super::qos::Qos;
-use super::ros_type::RosType;
+use super::ros_type::RosType::{self, PoseWithCovarianceStamped};
 
 /// A topic of one vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -35,11 +35,7 @@ impl VehicleTopic {
     /// Its name below the vehicle's, the type of its messages, and its quality of service.
     fn row(self) -> (Cow<'static, str>, RosType, Qos) {
         match self {
-            Self::Pose => (
-                "pose".into(),
-                RosType::PoseWithCovarianceStamped,
-                Qos::DEFAULT,
-            ),
+            Self::Pose => ("pose".into(), PoseWithCovarianceStamped, Qos::DEFAULT),
             Self::Odometry => ("odometry".into(), RosType::Odometry, Qos::DEFAULT),
             Self::Points => ("points".into(), RosType::PointCloud2, Qos::SENSOR_DATA),
             Self::Image(number) => {
@@ -89,11 +85,7 @@ impl RosTopic {
             Self::TfStatic => ("/tf_static", RosType::TfMessage, Qos::TF_STATIC),
             Self::Clock => ("/clock", RosType::Clock, Qos::CLOCK),
             Self::Diagnostics => ("/diagnostics", RosType::DiagnosticArray, Qos::DEFAULT),
-            Self::InitialPose => (
-                "/initialpose",
-                RosType::PoseWithCovarianceStamped,
-                Qos::DEFAULT,
-            ),
+            Self::InitialPose => ("/initialpose", PoseWithCovarianceStamped, Qos::DEFAULT),
             Self::Truth => ("/truth", RosType::MarkerArray, Qos::DEFAULT),
         };
         (name.into(), ros_type, qos)

@@ -78,7 +78,7 @@ impl PoseType {
             }
             Self::PoseStamped | Self::PoseWithCovarianceStamped => None,
         };
-        let [x, y, z, qx, qy, qz, qw] = message.f64s(match self {
+        let parent_from_child = message.pose(match self {
             Self::TfMessage => "transform",
             _ => "pose",
         })?;
@@ -86,11 +86,7 @@ impl PoseType {
             nanos: header.nanos,
             parent: frame(header.frame_id),
             child,
-            parent_from_child: Pose {
-                translation_m: [x, y, z],
-                // ROS writes w last, `Pose` has it first.
-                rotation_wxyz: [qw, qx, qy, qz],
-            },
+            parent_from_child,
         })
     }
 }

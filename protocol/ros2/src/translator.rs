@@ -70,17 +70,13 @@ impl Translator {
 
     /// True if messages of `topic` have to be passed to [`Self::translate`].
     pub fn wants(topic: &Topic) -> bool {
+        use Stream::{Camera, Detections, Imu, Lidar, Pose, Tracks};
+
         match topic {
             Topic::Truth | Topic::Stats(_) => true,
-            Topic::Stream { stream, .. } => matches!(
-                stream,
-                Stream::Lidar
-                    | Stream::Imu
-                    | Stream::Camera(_)
-                    | Stream::Pose
-                    | Stream::Detections
-                    | Stream::Tracks
-            ),
+            Topic::Stream { stream, .. } => {
+                matches!(stream, Lidar | Imu | Camera(_) | Pose | Detections | Tracks)
+            }
             _ => false,
         }
     }
@@ -183,11 +179,8 @@ impl Translator {
             let cdr = encode::camera_info(at, &frame, metadata, &pinhole);
             of_vehicle(cav, VehicleTopic::CameraInfo(number), cdr)
         });
-        let encoded = of_vehicle(
-            cav,
-            VehicleTopic::Image(number),
-            encode::compressed_image(at, &frame, image),
-        );
+        let image = encode::compressed_image(at, &frame, image);
+        let encoded = of_vehicle(cav, VehicleTopic::Image(number), image);
         place.into_iter().chain(info).chain([encoded]).collect()
     }
 
@@ -200,14 +193,11 @@ impl Translator {
             // Several agents annotate the same object, and its id is the same in all.
             .filter(|object| seen.insert(object.id));
         let boxes: Vec<Marked> = objects.map(encode::truth_marker).collect();
-        let frames: Vec<_> = truth
-            .agents
-            .iter()
-            .map(|agent| {
-                let name = self.names.truth(&agent.cav);
-                (MAP_FRAME.to_owned(), name, agent.world_from_lidar)
-            })
-            .collect();
+        let frames = truth.agents.iter().map(|agent| {
+            let name = self.names.truth(&agent.cav);
+            (MAP_FRAME.to_owned(), name, agent.world_from_lidar)
+        });
+        let frames: Vec<_> = frames.collect();
         let markers = encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes);
         vec![
             transforms(at, &frames),
@@ -236,10 +226,8 @@ impl Translator {
                 .map(|(what, ms)| (format!("{} {what} (ms)", stage.stage), format!("{ms:.2}")))
         }));
         values.push(("CPU time (s)".into(), format!("{:.1}", stats.usage.cpu_s)));
-        values.push((
-            "resident memory (bytes)".into(),
-            stats.usage.resident_bytes.to_string(),
-        ));
+        let resident = stats.usage.resident_bytes.to_string();
+        values.push(("resident memory (bytes)".into(), resident));
         Status {
             level: if new > 0 { Level::Warn } else { Level::Ok },
             name: format!("v2vloc: {}", stats.process),

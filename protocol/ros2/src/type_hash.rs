@@ -3,8 +3,7 @@
 //! The description is JSON with a fixed order of keys and a space after each `,` and `:`; constants, comments and default
 //! values are not part of it.
 
-use std::fmt::Write;
-
+use protocol::text::hex;
 use sha2::{Digest, Sha256};
 
 use super::definitions::Definition;
@@ -60,12 +59,7 @@ pub(crate) fn type_hash(own: Definition, mut contained: Vec<Definition>) -> Stri
         description(own),
         references.join(", ")
     );
-    let mut hash = String::from(PREFIX);
-    for byte in Sha256::digest(text) {
-        // Writing to a string does not fail.
-        let _ = write!(hash, "{byte:02x}");
-    }
-    hash
+    format!("{PREFIX}{}", hex(&Sha256::digest(text)))
 }
 
 fn description((name, fields): Definition) -> String {
@@ -74,9 +68,7 @@ fn description((name, fields): Definition) -> String {
         // A line with `=` defines a constant.
         .filter(|line| !line.contains('='))
         .filter_map(|line| line.split_once(' '));
-    let fields: Vec<String> = fields
-        .map(|(type_name, name)| field(type_name, name))
-        .collect();
+    let fields: Vec<String> = fields.map(field).collect();
     format!(
         r#"{{"type_name": "{}", "fields": [{}]}}"#,
         full_name(name),
@@ -84,7 +76,7 @@ fn description((name, fields): Definition) -> String {
     )
 }
 
-fn field(type_name: &str, name: &str) -> String {
+fn field((type_name, name): (&str, &str)) -> String {
     let (value, length) = type_name
         .trim_end_matches(']')
         .split_once('[')
@@ -94,15 +86,9 @@ fn field(type_name: &str, name: &str) -> String {
         "" => SEQUENCE,
         _ => ARRAY,
     };
-    let id = TYPE_IDS
-        .iter()
-        .find(|(known, _)| *known == value)
-        .map(|(_, id)| *id);
-    let nested = if id.is_none() {
-        full_name(value)
-    } else {
-        String::new()
-    };
+    let known = TYPE_IDS.iter().find(|(known, _)| *known == value);
+    let id = known.map(|(_, id)| *id);
+    let nested = id.map_or_else(|| full_name(value), |_| String::new());
     let id = id.unwrap_or(NESTED) + many;
     let capacity = if length.is_empty() { "0" } else { length };
     format!(

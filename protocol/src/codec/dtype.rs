@@ -1,6 +1,6 @@
 //! Number formats of feature values: `f32`, `f16` and scaled `i8`.
 
-use bytemuck::{cast_slice, cast_slice_mut};
+use bytemuck::{cast_slice, cast_slice_mut, pod_read_unaligned};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 use serde::{Deserialize, Serialize};
@@ -37,6 +37,14 @@ impl Dtype {
             Self::F32 => 4,
             Self::F16 => 2,
             Self::I8 => 1,
+        }
+    }
+
+    /// Bytes of the scales of so many channels.
+    pub(super) fn scale_bytes(self, channels: u32) -> u64 {
+        match self {
+            Self::F32 | Self::F16 => 0,
+            Self::I8 => 4 * u64::from(channels),
         }
     }
 }
@@ -133,11 +141,7 @@ pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -
     let mut values =
         Vec::with_capacity(usize::try_from(bytes.len() as u64 / dtype.size()).unwrap_or_default());
     match dtype {
-        Dtype::F32 => values.extend(
-            bytes
-                .chunks_exact(4)
-                .map(bytemuck::pod_read_unaligned::<f32>),
-        ),
+        Dtype::F32 => values.extend(bytes.chunks_exact(4).map(pod_read_unaligned::<f32>)),
         Dtype::F16 => {
             let (mut halves, mut floats) = ([f16::ZERO; BLOCK], [0f32; BLOCK]);
             for chunk in bytes.chunks(2 * BLOCK) {

@@ -83,10 +83,8 @@ impl FromStr for Smoothing {
         let (kernel, sigma) = text
             .split_once(',')
             .ok_or_else(|| format!("{text:?} is not CELLS,SIGMA or none"))?;
-        Ok(Self {
-            kernel: number("window", kernel)?,
-            sigma: number("sigma", sigma)?,
-        })
+        let (kernel, sigma) = (number("window", kernel)?, number("sigma", sigma)?);
+        Ok(Self { kernel, sigma })
     }
 }
 
@@ -116,11 +114,8 @@ impl ConfidenceGate {
         }
         let rule =
             format!("must be below {highest:.3}, the highest confidence, for any cell to be sent");
-        Err(FieldError::new(
-            "codec.gate.threshold",
-            self.threshold,
-            rule,
-        ))
+        let field = "codec.gate.threshold";
+        Err(FieldError::new(field, self.threshold, rule))
     }
 
     /// The cells that pass, in row-major order; `confidence` is `[H, W]` on `grid`, one finite value per cell.
@@ -150,10 +145,8 @@ impl Smoothing {
         let width = grid.width as usize;
         // Step 1 of the separable window: along rows.
         let mut along_rows = vec![0f32; values.len()];
-        for (row, smoothed) in values
-            .chunks_exact(width)
-            .zip(along_rows.chunks_exact_mut(width))
-        {
+        let rows = values.chunks_exact(width);
+        for (row, smoothed) in rows.zip(along_rows.chunks_exact_mut(width)) {
             convolve(row, &weights, smoothed);
         }
         // Step 2: along columns, a row at a time, so that memory is read in order.
@@ -165,10 +158,9 @@ impl Smoothing {
             for source in first..(row + half + 1).min(height) {
                 let weight = weights[source + half - row];
                 let values = &along_rows[source * width..][..width];
-                target
-                    .iter_mut()
-                    .zip(values)
-                    .for_each(|(target, value)| *target += weight * value);
+                for (target, value) in target.iter_mut().zip(values) {
+                    *target += weight * value;
+                }
             }
         }
         Ok(smoothed)

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::{Codec, Dtype, Selection};
+use super::{Codec, Selection};
 use crate::checks::{check_limit, check_size};
 use crate::{BevGrid, Limits, WireError};
 
@@ -49,17 +49,11 @@ impl Layout {
             Selection::TopK { cells: selected } => (u64::from(selected), cells.div_ceil(8)),
         };
         check_limit("selected cells", selected, cells)?;
-        let scale_bytes = if codec.dtype == Dtype::I8 {
-            4 * channel_count
-        } else {
-            0
-        };
+        let scale_bytes = codec.dtype.scale_bytes(channels);
         // Below the size of the whole feature map, which fits: the products cannot overflow.
         let value_bytes = selected * channel_count * codec.dtype.size();
-        let (mask, values) = (
-            scale_bytes + mask_bytes,
-            scale_bytes + mask_bytes + value_bytes,
-        );
+        let mask = scale_bytes + mask_bytes;
+        let values = mask + value_bytes;
         let [cells, selected, scales, mask, values] =
             [cells, selected, scale_bytes, mask, values].map(|count| count as usize);
         Ok(Self {

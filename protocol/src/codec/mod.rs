@@ -175,15 +175,11 @@ pub fn encode_features(
     if config.gate.is_none() && budget.is_none() {
         return encode_selected(features, dense, None, config.zstd_level);
     }
-    let confidence = confidence.ok_or(WireError::NoConfidence {
-        cells: layout.cells as u64,
-    })?;
+    let cells = layout.cells as u64;
+    let confidence = confidence.ok_or(WireError::NoConfidence { cells })?;
     selection::check_confidence(confidence, layout.cells)?;
-    let gated = config
-        .gate
-        .map(|gate| gate.cells(confidence, &grid))
-        .transpose()?;
-    let selected = match (gated, budget) {
+    let gated = config.gate.map(|gate| gate.cells(confidence, &grid));
+    let selected = match (gated.transpose()?, budget) {
         (gated, Some(budget)) => {
             selection::within_budget(confidence, gated.as_deref(), channels, config.dtype, budget)?
         }
@@ -191,25 +187,18 @@ pub fn encode_features(
         // All cells pass the gate: a mask would only add bytes.
         _ => return encode_selected(features, dense, None, config.zstd_level),
     };
-    let codec = Codec {
-        selection: Selection::TopK {
-            cells: u32::try_from(selected.len()).unwrap_or(u32::MAX),
-        },
-        ..dense
-    };
+    let cells = u32::try_from(selected.len()).unwrap_or(u32::MAX);
+    let selection = Selection::TopK { cells };
+    let codec = Codec { selection, ..dense };
     let values = selection::gather(&features.values, layout.cells, &selected);
-    encode_selected(
-        BevFeatures { values, ..features },
-        codec,
-        Some(&selected),
-        config.zstd_level,
-    )
+    let features = BevFeatures { values, ..features };
+    encode_selected(features, codec, Some(&selected), config.zstd_level)
 }
 
 /// Writes the values of the selected cells, `[C, K]`. Dense uncompressed `f32` is checked by its receiver.
 fn encode_selected(
     features: BevFeatures,
-    codec: Codec,
+    mut codec: Codec,
     selected: Option<&[u32]>,
     zstd_level: Option<i32>,
 ) -> Result<EncodedFeatures> {
@@ -223,25 +212,17 @@ fn encode_selected(
     if !is_sent_as_it_is || zstd_level.is_some() {
         check_values("feature", &values, Limits::SENDER.max_abs_value)?;
     }
-    let body = if is_sent_as_it_is {
+    let mut body = if is_sent_as_it_is {
         Body::Floats(values)
     } else {
         Body::Bytes(unpacked_body(&grid, channels, &codec, &values, selected)?)
     };
-    let packed = zstd_level
-        .map(|level| compression::pack(body.as_bytes(), level))
-        .transpose()?
-        .flatten();
-    let (codec, body) = match packed {
-        Some(packed) => (
-            Codec {
-                compression: Compression::Zstd,
-                ..codec
-            },
-            Body::Bytes(packed),
-        ),
-        None => (codec, body),
-    };
+    if let Some(level) = zstd_level
+        && let Some(packed) = compression::pack(body.as_bytes(), level)?
+    {
+        codec.compression = Compression::Zstd;
+        body = Body::Bytes(packed);
+    }
     Ok(EncodedFeatures {
         grid,
         channels,
@@ -287,19 +268,12 @@ impl EncodedFeatures {
         limits: &Limits,
     ) -> Result<BodyShape> {
         let layout = Layout::new(grid, channels, codec, limits)?;
+        let len = layout.len() as u64;
         Ok(match (codec.compression, codec.dtype, codec.selection) {
-            (Compression::Raw, Dtype::F32, Selection::Dense) => {
-                BodyShape::Floats((layout.values.len() / 4) as u64)
-            }
-            (Compression::Raw, ..) => BodyShape::Bytes {
-                min: layout.len() as u64,
-                max: layout.len() as u64,
-            },
+            (Compression::Raw, Dtype::F32, Selection::Dense) => BodyShape::Floats(len / 4),
+            (Compression::Raw, ..) => BodyShape::Bytes { min: len, max: len },
             // A body that compression does not make smaller is sent uncompressed.
-            (Compression::Zstd, ..) => BodyShape::Bytes {
-                min: 1,
-                max: layout.len() as u64,
-            },
+            (Compression::Zstd, ..) => BodyShape::Bytes { min: 1, max: len },
         })
     }
 
@@ -309,10 +283,8 @@ impl EncodedFeatures {
     /// [`WireError::Grid`] and [`WireError::Shape`] state both.
     pub fn check_shape(&self, grid: &BevGrid, channels: u32, code_of: Option<u32>) -> Result<()> {
         if self.grid != *grid {
-            return Err(WireError::Grid {
-                expected: grid.to_string(),
-                found: self.grid.to_string(),
-            });
+            let (expected, found) = (grid.to_string(), self.grid.to_string());
+            return Err(WireError::Grid { expected, found });
         }
         check_size("channels", self.channels.into(), channels.into())?;
         if self.code_of != code_of {
@@ -331,16 +303,8 @@ impl EncodedFeatures {
     /// [`WireError`] when sizes exceed `limits`, the body does not match shape and codec, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
     pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures> {
-        let Self {
-            grid,
-            channels,
-            code_of,
-            codec,
-            rate: _,
-            body,
-        } = self;
-        let layout = Layout::new(&grid, channels, &codec, limits)?;
-        let (values, sent) = match (body, codec) {
+        let layout = Layout::new(&self.grid, self.channels, &self.codec, limits)?;
+        let (values, sent) = match (self.body, self.codec) {
             (
                 Body::Floats(values),
                 Codec {
@@ -354,19 +318,19 @@ impl EncodedFeatures {
                 (values, None)
             }
             (body, _) => {
-                let raw = unpack(body, codec.compression, layout.len())?;
+                let raw = unpack(body, self.codec.compression, layout.len())?;
                 let [scales, mask, values] =
                     [layout.scales, layout.mask, layout.values].map(|range| {
                         let (expected, found) = (range.end as u64, raw.len() as u64);
                         let missing = WireError::shape("bytes of a feature map", expected, found);
                         raw.get(range).ok_or(missing)
                     });
-                let values = dtype::read(codec.dtype, scales?, values?, layout.selected)?;
+                let values = dtype::read(self.codec.dtype, scales?, values?, layout.selected)?;
                 check_values("feature", &values, limits.max_abs_value)?;
-                match codec.selection {
+                match self.codec.selection {
                     Selection::Dense => (values, None),
                     Selection::TopK { .. } => {
-                        let (cells, channels) = (layout.cells, channels as usize);
+                        let (cells, channels) = (layout.cells, self.channels as usize);
                         let selected = selection::read_mask(mask?, cells, layout.selected)?;
                         // Freed before the map is allocated: a receiver holds two bodies at most (`Limits`).
                         drop(raw);
@@ -377,9 +341,9 @@ impl EncodedFeatures {
             }
         };
         let features = BevFeatures {
-            grid,
-            channels,
-            code_of,
+            grid: self.grid,
+            channels: self.channels,
+            code_of: self.code_of,
             values,
         };
         Ok(DecodedFeatures { features, sent })

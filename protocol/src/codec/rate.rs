@@ -68,14 +68,6 @@ pub struct RateChoice {
     pub limit_bytes: u64,
 }
 
-/// Reduction that the limit required.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum ReducedBy {
-    Nothing,
-    Exactness,
-    Cells,
-}
-
 /// Encodes a feature map so that its whole message keeps within `limit`: in the configured format if all cells that
 /// pass the gate fit, else in a coarser one, else in the coarsest with as many cells as fit, the most confident first.
 /// The same map, confidence and limit give the same bytes.
@@ -93,11 +85,9 @@ pub fn encode_within(
     limit: &ByteLimit,
     confidence: Option<&[f32]>,
 ) -> Result<EncodedFeatures> {
-    let budget = limit
-        .bytes
-        .saturating_sub(HEAD_BYTES)
-        .min(config.budget_bytes.unwrap_or(u64::MAX));
-    let (dtype, reduced_by) = choose(&features, config, budget, confidence)?;
+    let most = config.budget_bytes.unwrap_or(u64::MAX);
+    let budget = limit.bytes.saturating_sub(HEAD_BYTES).min(most);
+    let (dtype, reason) = choose(&features, config, limit.by, budget, confidence)?;
     let config = CodecConfig {
         dtype,
         budget_bytes: Some(budget),
@@ -105,7 +95,7 @@ pub fn encode_within(
     };
     let encoded = encode_features(features, &config, confidence)?;
     let rate = Some(RateChoice {
-        reason: reason(limit.by, reduced_by),
+        reason,
         limit_bytes: limit.bytes,
     });
     Ok(EncodedFeatures { rate, ..encoded })
@@ -127,36 +117,37 @@ pub fn smallest_message(features: &BevFeatures) -> Result<u64> {
     Ok(HEAD_BYTES + body_bytes(features, Dtype::I8, Selection::TopK { cells: 0 })?)
 }
 
-/// The most precise format in which all wanted cells fit, or the coarsest.
+/// The most precise format in which all wanted cells fit, or the coarsest, and the reason.
 fn choose(
     features: &BevFeatures,
     config: &CodecConfig,
+    by: LimitedBy,
     budget: u64,
     confidence: Option<&[f32]>,
-) -> Result<(Dtype, ReducedBy)> {
+) -> Result<(Dtype, RateReason)> {
+    let [coarser, fewer_cells] = match by {
+        LimitedBy::MessageSize => [RateReason::SizeCoarser, RateReason::SizeFewerCells],
+        LimitedBy::ByteRate => [RateReason::RateCoarser, RateReason::RateFewerCells],
+        LimitedBy::Queue => [RateReason::QueueCoarser, RateReason::QueueFewerCells],
+    };
     let wanted = wanted(features, config, confidence)?;
-    let coarser = DTYPES_BY_PRECISION
+    let dtypes = DTYPES_BY_PRECISION
         .into_iter()
         .skip_while(|dtype| *dtype != config.dtype);
-    for dtype in coarser {
+    for dtype in dtypes {
         if body_bytes(features, dtype, wanted)? > budget {
             continue;
         }
-        let reduced_by = if dtype == config.dtype {
-            ReducedBy::Nothing
-        } else {
-            ReducedBy::Exactness
-        };
+        if dtype == config.dtype {
+            return Ok((dtype, RateReason::Fits));
+        }
         // Tested last: an overflow of half precision is rare, and the search for it takes time.
-        if reduced_by == ReducedBy::Nothing
-            || dtype != Dtype::F16
-            || features.values.iter().all(|value| value.abs() <= F16_MAX)
-        {
-            return Ok((dtype, reduced_by));
+        if dtype != Dtype::F16 || features.values.iter().all(|value| value.abs() <= F16_MAX) {
+            return Ok((dtype, coarser));
         }
     }
     // No format holds all wanted cells: the coarsest has room for the most of them.
-    Ok((Dtype::I8, ReducedBy::Cells))
+    Ok((Dtype::I8, fewer_cells))
 }
 
 /// Selection without a limit.
@@ -172,13 +163,11 @@ fn wanted(
     let cells = features.grid.cells();
     selection::check_confidence(confidence, cells)?;
     let passed = gate.cells(confidence, &features.grid)?.len();
-    Ok(if passed < cells {
-        Selection::TopK {
-            cells: u32::try_from(passed).unwrap_or(u32::MAX),
-        }
-    } else {
-        Selection::Dense
-    })
+    if passed >= cells {
+        return Ok(Selection::Dense);
+    }
+    let cells = u32::try_from(passed).unwrap_or(u32::MAX);
+    Ok(Selection::TopK { cells })
 }
 
 fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Result<u64> {
@@ -188,18 +177,6 @@ fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Res
         compression: Compression::Raw,
     };
     Ok(Layout::new(&features.grid, features.channels, &codec, &Limits::SENDER)?.len() as u64)
-}
-
-fn reason(by: LimitedBy, reduced_by: ReducedBy) -> RateReason {
-    match (by, reduced_by) {
-        (_, ReducedBy::Nothing) => RateReason::Fits,
-        (LimitedBy::MessageSize, ReducedBy::Exactness) => RateReason::SizeCoarser,
-        (LimitedBy::MessageSize, ReducedBy::Cells) => RateReason::SizeFewerCells,
-        (LimitedBy::ByteRate, ReducedBy::Exactness) => RateReason::RateCoarser,
-        (LimitedBy::ByteRate, ReducedBy::Cells) => RateReason::RateFewerCells,
-        (LimitedBy::Queue, ReducedBy::Exactness) => RateReason::QueueCoarser,
-        (LimitedBy::Queue, ReducedBy::Cells) => RateReason::QueueFewerCells,
-    }
 }
 
 #[cfg(test)]

@@ -10,12 +10,8 @@ use crate::{Result, WireError};
 /// [`WireError`] states the first that is not finite, or both counts.
 pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<()> {
     check_size("confidence map", confidence.len() as u64, cells as u64)?;
-    check_each(
-        "confidence",
-        confidence,
-        [f32::MIN, f32::MAX],
-        f32::is_finite,
-    )
+    let bounds = [f32::MIN, f32::MAX];
+    check_each("confidence", confidence, bounds, f32::is_finite)
 }
 
 /// The cells with the highest confidence that fit into `budget` bytes, among `candidates` (`None`: all cells), in
@@ -30,12 +26,7 @@ pub(super) fn within_budget(
     dtype: Dtype,
     budget: u64,
 ) -> Result<Vec<u32>> {
-    let scale_bytes = if dtype == Dtype::I8 {
-        4 * u64::from(channels)
-    } else {
-        0
-    };
-    let needed = scale_bytes + confidence.len().div_ceil(8) as u64;
+    let needed = dtype.scale_bytes(channels) + confidence.len().div_ceil(8) as u64;
     let for_cells = budget
         .checked_sub(needed)
         .ok_or(WireError::Budget { budget, needed })?;
@@ -103,16 +94,10 @@ pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<V
     let found: u64 = mask.iter().map(|byte| u64::from(byte.count_ones())).sum();
     check_size("cells in the mask", found, announced as u64)?;
     let mut selected = Vec::with_capacity(announced);
-    for (byte, first) in mask
-        .iter()
-        .zip((0u32..).step_by(8))
-        .filter(|(byte, _)| **byte != 0)
-    {
-        selected.extend(
-            (0..8u32)
-                .filter(|bit| byte & (1 << bit) != 0)
-                .map(|bit| first + bit),
-        );
+    let bytes = mask.iter().zip((0u32..).step_by(8));
+    for (byte, first) in bytes.filter(|(byte, _)| **byte != 0) {
+        let bits = (0..8u32).filter(|bit| byte & (1 << bit) != 0);
+        selected.extend(bits.map(|bit| first + bit));
     }
     match selected.last() {
         // The last byte of the mask may have bits beyond the grid.
@@ -140,10 +125,8 @@ pub(super) fn scatter(
         }
     }
     if !selected.is_empty() {
-        for (plane, values) in map
-            .chunks_exact_mut(cells)
-            .zip(values.chunks_exact(selected.len()))
-        {
+        let planes = map.chunks_exact_mut(cells);
+        for (plane, values) in planes.zip(values.chunks_exact(selected.len())) {
             for (cell, value) in selected.iter().zip(values) {
                 if let Some(target) = plane.get_mut(*cell as usize) {
                     *target = *value;

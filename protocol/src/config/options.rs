@@ -13,12 +13,8 @@ pub struct Section<T>(pub T);
 
 impl<T: Args + Default + Serialize> FromArgMatches for Section<T> {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        Self::from_arg_matches_mut(&mut matches.clone())
-    }
-
-    fn from_arg_matches_mut(matches: &mut ArgMatches) -> Result<Self, clap::Error> {
         let mut section = T::default();
-        section.update_from_arg_matches_mut(matches)?;
+        section.update_from_arg_matches(matches)?;
         Ok(Self(section))
     }
 
@@ -30,13 +26,8 @@ impl<T: Args + Default + Serialize> FromArgMatches for Section<T> {
 impl<T: Args + Default + Serialize> Args for Section<T> {
     fn augment_args(command: Command) -> Command {
         let defaults = serde_json::to_value(T::default()).unwrap_or_default();
-        let heading = None::<&str>;
-        document(
-            T::augment_args_for_update(command),
-            options_of::<T>(),
-            &defaults,
-        )
-        .next_help_heading(heading)
+        let command = T::augment_args_for_update(command);
+        document(command, options_of::<T>(), &defaults).next_help_heading(None::<&str>)
     }
 
     fn augment_args_for_update(command: Command) -> Command {
@@ -47,11 +38,8 @@ impl<T: Args + Default + Serialize> Args for Section<T> {
 /// The options of a type that a configuration consists of.
 pub fn options_of<A: Args>() -> impl Iterator<Item = Arg> {
     let command = A::augment_args_for_update(Command::new("options"));
-    command
-        .get_arguments()
-        .cloned()
-        .collect::<Vec<_>>()
-        .into_iter()
+    let options: Vec<Arg> = command.get_arguments().cloned().collect();
+    options.into_iter()
 }
 
 /// Appends its default to the help of each of `options`, and lets flags be switched off (`--flag=false`), so that they
@@ -80,13 +68,9 @@ fn switchable(option: Arg) -> Arg {
     if !matches!(option.get_action(), ArgAction::SetTrue) {
         return option;
     }
-    let option = option
-        .action(ArgAction::Set)
-        .num_args(0..=1)
-        .require_equals(true);
-    option
-        .default_missing_value("true")
-        .value_name("true|false")
+    let option = option.action(ArgAction::Set).num_args(0..=1);
+    let option = option.require_equals(true).value_name("true|false");
+    option.default_missing_value("true")
 }
 
 /// Values by the names that an option for them may have: the field alone, or with its sections, joined by `_`.
@@ -97,13 +81,9 @@ fn names(defaults: &Value) -> BTreeMap<String, Value> {
     for (path, value) in &leaves {
         for start in 0..path.len() {
             let name = path.get(start..).unwrap_or_default();
-            let is_unique = leaves
-                .iter()
-                .filter(|(other, _)| other.ends_with(name))
-                .count()
-                == 1;
+            let named = leaves.iter().filter(|(other, _)| other.ends_with(name));
             // A short name that two sections share names neither. The whole path (start 0) is kept.
-            if is_unique || start == 0 {
+            if named.count() == 1 || start == 0 {
                 names.insert(name.join("_"), value.clone());
             }
         }

@@ -12,12 +12,12 @@ pub struct Boxes {
     /// Pose of the sender.
     pub pose: PoseEstimate,
     /// Objects in the frame of the sender's LiDAR, all of the sender.
-    #[serde(with = "compact")]
     objects: Vec<PerceivedObject>,
 }
 
 /// A detection, and the track of the same object where its vehicle has one.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(from = "CompactBox", into = "CompactBox")]
 pub struct PerceivedObject {
     /// The detection in the frame of the sender's LiDAR.
     pub detection: Detection,
@@ -56,7 +56,7 @@ impl Boxes {
     /// precision. The source that a detection names is left out, and a track that no receiver would take.
     pub fn new(pose: PoseEstimate, objects: &[PerceivedObject]) -> Self {
         let objects = objects.iter().map(|object| {
-            let PerceivedObject { detection, track } = CompactBox::of(object).object();
+            let PerceivedObject { detection, track } = CompactBox::from(object.clone()).into();
             // Checked as rounded: a variance beyond half precision is infinite there.
             let track = track.filter(|track| track.check_values().is_ok());
             PerceivedObject { detection, track }
@@ -134,18 +134,18 @@ struct CompactTrack {
 /// Half precision, little-endian: the encoding of integers would take three bytes.
 type HalfBytes = [u8; 2];
 
-impl CompactBox {
+impl From<PerceivedObject> for CompactBox {
     #[expect(
         clippy::cast_possible_truncation,
         reason = "numbers are transmitted in single precision"
     )]
-    fn of(object: &PerceivedObject) -> Self {
-        let Detection { box3d, score, .. } = &object.detection;
+    fn from(object: PerceivedObject) -> Self {
+        let Detection { box3d, score, .. } = object.detection;
         Self {
             center_m: box3d.center_m.map(|value| value as f32),
             size_m: box3d.size_m.map(|value| value as f32),
             heading_rad: box3d.heading_rad as f32,
-            score: *score,
+            score,
             track: object.track.map(|track| CompactTrack {
                 id: track.id,
                 velocity_mps: track.velocity_mps,
@@ -154,24 +154,26 @@ impl CompactBox {
             }),
         }
     }
+}
 
-    fn object(&self) -> PerceivedObject {
+impl From<CompactBox> for PerceivedObject {
+    fn from(compact: CompactBox) -> Self {
         let detection = Detection {
             box3d: Box3d {
-                center_m: self.center_m.map(f64::from),
-                size_m: self.size_m.map(f64::from),
-                heading_rad: self.heading_rad.into(),
+                center_m: compact.center_m.map(f64::from),
+                size_m: compact.size_m.map(f64::from),
+                heading_rad: compact.heading_rad.into(),
             },
-            score: self.score,
+            score: compact.score,
             source: None,
         };
-        let track = self.track.as_ref().map(|track| ObjectTrack {
+        let track = compact.track.map(|track| ObjectTrack {
             id: track.id,
             velocity_mps: track.velocity_mps,
             position_covariance: track.position_covariance.map(single_precision),
             velocity_covariance: track.velocity_covariance.map(single_precision),
         });
-        PerceivedObject { detection, track }
+        Self { detection, track }
     }
 }
 
@@ -181,27 +183,6 @@ fn half_precision(value: f32) -> HalfBytes {
 
 fn single_precision(bytes: HalfBytes) -> f32 {
     f16::from_le_bytes(bytes).to_f32()
-}
-
-/// Serialisation of objects as [`CompactBox`].
-mod compact {
-    use serde::{Deserialize, Deserializer, Serializer};
-
-    use super::{CompactBox, PerceivedObject};
-
-    pub(super) fn serialize<S: Serializer>(
-        objects: &[PerceivedObject],
-        serializer: S,
-    ) -> Result<S::Ok, S::Error> {
-        serializer.collect_seq(objects.iter().map(CompactBox::of))
-    }
-
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(
-        deserializer: D,
-    ) -> Result<Vec<PerceivedObject>, D::Error> {
-        let boxes = Vec::<CompactBox>::deserialize(deserializer)?;
-        Ok(boxes.iter().map(CompactBox::object).collect())
-    }
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use super::{Payload, check_pose, check_within, private, wrong_body};
 use crate::{Body, BodyShape, Kind, Limits, Pose, WireError};
 
 /// Largest edge of an image, pixels.
-const MAX_EDGE_PX: u32 = 1 << 14;
+const MAX_EDGE_PX: f64 = 16_384.0;
 
 /// Encoding of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, strum::IntoStaticStr)]
@@ -105,36 +105,22 @@ impl Payload for Camera {
     }
 
     fn check(metadata: &CameraMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
-        for (what, edge_px) in [
-            ("width_px", metadata.width_px),
-            ("height_px", metadata.height_px),
-        ] {
-            check_within(what, edge_px.into(), 1.0, MAX_EDGE_PX.into())?;
+        check_within("width_px", metadata.width_px.into(), 1.0, MAX_EDGE_PX)?;
+        check_within("height_px", metadata.height_px.into(), 1.0, MAX_EDGE_PX)?;
+        if let Some(pinhole) = &metadata.pinhole {
+            pinhole.check_values()?;
         }
-        metadata
-            .pinhole
-            .iter()
-            .try_for_each(Pinhole::check_values)?;
-        metadata
-            .lidar_from_camera
-            .iter()
-            .try_for_each(|pose| check_pose("lidar_from_camera", pose))?;
-        Ok(BodyShape::Bytes {
-            min: 1,
-            max: limits.max_body_bytes,
-        })
+        if let Some(pose) = &metadata.lidar_from_camera {
+            check_pose("lidar_from_camera", pose)?;
+        }
+        let max = limits.max_body_bytes;
+        Ok(BodyShape::Bytes { min: 1, max })
     }
 
     fn from_parts(metadata: CameraMetadata, body: Body) -> Result<Self, WireError> {
         match body {
             Body::Bytes(image) => Ok(Self { metadata, image }),
-            body => Err(wrong_body(
-                BodyShape::Bytes {
-                    min: 1,
-                    max: u64::MAX,
-                },
-                &body,
-            )),
+            body => Err(wrong_body(1, &body)),
         }
     }
 }

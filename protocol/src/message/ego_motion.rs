@@ -22,14 +22,10 @@ impl EgoMotion {
     pub const MAX_YAW_RATE_RAD_S: f64 = 20.0;
 
     fn check_values(&self, _: &Limits) -> Result<(), WireError> {
-        let [speed, yaw_rate] = [Self::MAX_SPEED_MPS, Self::MAX_YAW_RATE_RAD_S];
-        check_within("speed_mps", self.speed_mps.unwrap_or(0.0), -speed, speed)?;
-        check_within(
-            "yaw_rate_rad_s",
-            self.yaw_rate_rad_s.unwrap_or(0.0),
-            -yaw_rate,
-            yaw_rate,
-        )
+        let most = Self::MAX_SPEED_MPS;
+        check_within("speed_mps", self.speed_mps.unwrap_or(0.0), -most, most)?;
+        let (turn, most) = (self.yaw_rate_rad_s.unwrap_or(0.0), Self::MAX_YAW_RATE_RAD_S);
+        check_within("yaw_rate_rad_s", turn, -most, most)
     }
 }
 

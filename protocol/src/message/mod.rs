@@ -111,8 +111,7 @@ fn check_name(what: &'static str, name: &str) -> Result<()> {
     check_count(what, name.len(), 64)
 }
 
-fn wrong_body(shape: BodyShape, body: &Body) -> WireError {
-    let (expected, _) = shape.bounds();
+fn wrong_body(expected: u64, body: &Body) -> WireError {
     WireError::shape("body bytes", expected, body.len() as u64)
 }
 

@@ -62,12 +62,7 @@ impl Pace {
     }
 
     fn check_values(&self, _: &Limits) -> Result<(), WireError> {
-        check_within(
-            "computed",
-            f64::from(self.computed),
-            1.0,
-            f64::from(self.of),
-        )?;
+        check_within("computed", self.computed.into(), 1.0, self.of.into())?;
         let found = u64::try_from(self.mean_interval().as_nanos()).unwrap_or(u64::MAX);
         check_limit("mean interval, nanoseconds", found, MAX_INTERVAL_NANOS)
     }

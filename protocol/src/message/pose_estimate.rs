@@ -60,17 +60,14 @@ impl PlanarCovariance {
     }
 
     fn check_values(&self) -> Result<(), WireError> {
-        check_within("covariance xx_m2", self.xx_m2.into(), 0.0, MAX_VARIANCE)?;
-        check_within("covariance yy_m2", self.yy_m2.into(), 0.0, MAX_VARIANCE)?;
-        check_within(
-            "covariance yaw_rad2",
-            self.yaw_rad2.into(),
-            0.0,
-            MAX_VARIANCE,
-        )?;
+        let [xx, xy, yy] = [self.xx_m2, self.xy_m2, self.yy_m2].map(f64::from);
+        let yaw = self.yaw_rad2.into();
+        check_within("covariance xx_m2", xx, 0.0, MAX_VARIANCE)?;
+        check_within("covariance yy_m2", yy, 0.0, MAX_VARIANCE)?;
+        check_within("covariance yaw_rad2", yaw, 0.0, MAX_VARIANCE)?;
         // Rounding to single precision may exceed the bound by a little.
-        let bound = (f64::from(self.xx_m2) * f64::from(self.yy_m2)).sqrt() * (1.0 + 1e-5);
-        check_within("covariance xy_m2", self.xy_m2.into(), -bound, bound)
+        let bound = (xx * yy).sqrt() * (1.0 + 1e-5);
+        check_within("covariance xy_m2", xy, -bound, bound)
     }
 }
 

@@ -58,7 +58,7 @@ fn check_points(count: u64, limits: &Limits) -> Result<BodyShape, WireError> {
 fn points_of(body: Body, count: u64) -> Result<PointCloud, WireError> {
     match body {
         Body::Points(xyzi) => Ok(PointCloud { xyzi }),
-        body => Err(wrong_body(BodyShape::Points(count), &body)),
+        body => Err(wrong_body(BodyShape::Points(count).bounds().0, &body)),
     }
 }
 
@@ -71,12 +71,8 @@ macro_rules! sweep {
             type Metadata = SweepMetadata;
 
             fn into_parts(self) -> (SweepMetadata, Body) {
-                (
-                    SweepMetadata {
-                        count: self.points.len() as u64,
-                    },
-                    Body::Points(self.points.xyzi),
-                )
+                let count = self.points.len() as u64;
+                (SweepMetadata { count }, Body::Points(self.points.xyzi))
             }
 
             fn check(metadata: &SweepMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
@@ -84,9 +80,8 @@ macro_rules! sweep {
             }
 
             fn from_parts(metadata: SweepMetadata, body: Body) -> Result<Self, WireError> {
-                Ok(Self {
-                    points: points_of(body, metadata.count)?,
-                })
+                let points = points_of(body, metadata.count)?;
+                Ok(Self { points })
             }
         }
     };
@@ -102,13 +97,8 @@ impl Payload for Points {
 
     fn into_parts(self) -> (PointsMetadata, Body) {
         let Self { pose, points } = self;
-        (
-            PointsMetadata {
-                pose,
-                count: points.len() as u64,
-            },
-            Body::Points(points.xyzi),
-        )
+        let count = points.len() as u64;
+        (PointsMetadata { pose, count }, Body::Points(points.xyzi))
     }
 
     fn check(metadata: &PointsMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
@@ -117,9 +107,8 @@ impl Payload for Points {
     }
 
     fn from_parts(metadata: PointsMetadata, body: Body) -> Result<Self, WireError> {
-        Ok(Self {
-            pose: metadata.pose,
-            points: points_of(body, metadata.count)?,
-        })
+        let PointsMetadata { pose, count } = metadata;
+        let points = points_of(body, count)?;
+        Ok(Self { pose, points })
     }
 }

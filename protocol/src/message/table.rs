@@ -1,7 +1,5 @@
 //! Message table: one row per message. Kinds, the enum of all messages and their dispatch are generated from it.
 
-use std::fmt;
-
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -29,11 +27,14 @@ pub(crate) trait MessageSource {
 macro_rules! messages {
     ($($(#[$doc:meta])* $number:literal => $variant:ident($payload:ty) = $name:literal,)+) => {
         /// Kind of a message. The numbers are on the wire: never reuse one.
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[derive(
+            Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, strum::Display,
+            strum::EnumString,
+        )]
         #[serde(rename_all = "snake_case")]
         #[repr(u8)]
         pub enum Kind {
-            $($(#[$doc])* $variant = $number,)+
+            $($(#[$doc])* #[strum(serialize = $name)] $variant = $number,)+
         }
 
         impl Kind {
@@ -43,14 +44,6 @@ macro_rules! messages {
             /// Kind of a number on the wire.
             pub(crate) fn from_wire(found: u8) -> Result<Self, WireError> {
                 Self::ALL.into_iter().find(|kind| *kind as u8 == found).ok_or(WireError::UnknownKind { found })
-            }
-        }
-
-        impl fmt::Display for Kind {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str(match self {
-                    $(Self::$variant => $name,)+
-                })
             }
         }
 
@@ -125,8 +118,6 @@ mod tests {
     /// A table of its own, with one message that the protocol does not have.
     #[allow(unreachable_pub)]
     mod dummy {
-        use std::fmt;
-
         use serde::{Deserialize, Serialize};
 
         use super::super::{MessageSource, MessageVisitor, Payload};

@@ -49,10 +49,9 @@ impl Truth {
         check_count("objects", objects, limits.max_boxes)?;
         for agent in &self.agents {
             check_pose("world_from_lidar", &agent.world_from_lidar)?;
-            agent
-                .objects
-                .iter()
-                .try_for_each(TrueObject::check_values)?;
+            for object in &agent.objects {
+                object.check_values()?;
+            }
         }
         Ok(())
     }

@@ -87,11 +87,8 @@ pub fn exit_code(
             output::error(chain_of(&error));
             let mut causes = error.chain();
             let is_bad = causes.any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
-            ExitCode::from(if is_bad && !is_of_writing(&error) {
-                2
-            } else {
-                1
-            })
+            let is_of_input = is_bad && !is_of_writing(&error);
+            ExitCode::from(if is_of_input { 2 } else { 1 })
         }
     }
 }

@@ -8,8 +8,7 @@ use csv::{ReaderBuilder, StringRecord, Terminator, Trim, Writer, WriterBuilder};
 use protocol::text::excerpt;
 
 use crate::bounded_file;
-use crate::file_error::FileError;
-use crate::file_error::Result;
+use crate::file_error::{FileError, Result};
 
 /// Maximum number of characters of a foreign field or line in an error.
 const SHOWN_CHARS: usize = 80;
@@ -90,11 +89,8 @@ impl CsvRow<'_> {
     /// # Errors
     /// [`FileError`] states the field.
     pub fn number(&self, column: usize, range: RangeInclusive<f64>, must: &str) -> Result<f64> {
-        let number = self
-            .field(column)
-            .parse()
-            .ok()
-            .filter(|number| range.contains(number));
+        let number = self.field(column).parse().ok();
+        let number = number.filter(|number| range.contains(number));
         number.ok_or_else(|| self.wrong(column, must))
     }
 
@@ -113,10 +109,8 @@ impl CsvRow<'_> {
     }
 
     fn shown(&self) -> String {
-        excerpt(
-            &self.record.iter().collect::<Vec<_>>().join(","),
-            SHOWN_CHARS,
-        )
+        let fields: Vec<&str> = self.record.iter().collect();
+        excerpt(&fields.join(","), SHOWN_CHARS)
     }
 }
 

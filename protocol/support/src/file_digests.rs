@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::fs::{File, Metadata};
-use std::io::{self, Read};
+use std::io::{self, BufReader};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::Mutex;
@@ -87,20 +87,12 @@ impl FileDigests {
             return Ok(*digest);
         }
         // Without the lock: two threads may hash one file at the same time, with the same result.
-        let digest = digest(File::open(path)?)?;
+        let mut hash = Sha256::new();
+        let mut file = BufReader::with_capacity(CHUNK_BYTES, File::open(path)?);
+        io::copy(&mut file, &mut hash)?;
+        let digest = hash.finalize().into();
         lock(&self.known).insert(version, digest);
         Ok(digest)
-    }
-}
-
-fn digest(mut file: File) -> io::Result<[u8; 32]> {
-    let mut hash = Sha256::new();
-    let mut chunk = vec![0; CHUNK_BYTES];
-    loop {
-        match file.read(&mut chunk)? {
-            0 => return Ok(hash.finalize().into()),
-            count => hash.update(chunk.get(..count).unwrap_or_default()),
-        }
     }
 }
 

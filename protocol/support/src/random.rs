@@ -32,9 +32,7 @@ impl SplitMix64 {
     /// The stream of one `purpose` under `seed`, for example the noise of one sweep: streams of different labels do not
     /// overlap in practice, and no stream depends on the number of draws of another.
     pub fn derived(seed: u64, purpose: &[u64]) -> Self {
-        Self {
-            state: derive_seed(seed, purpose),
-        }
+        Self::new(derive_seed(seed, purpose))
     }
 
     /// Uniform random number in 0..1.

@@ -27,11 +27,8 @@ pub fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
     let rank = q * last as f64;
     let below = (rank.floor() as usize).min(last);
     let above = (below + 1).min(last);
-    let (low, high, share) = (
-        *sorted.get(below)?,
-        *sorted.get(above)?,
-        rank - below as f64,
-    );
+    let (low, high) = (*sorted.get(below)?, *sorted.get(above)?);
+    let share = rank - below as f64;
     // The difference of infinite values is undefined.
     Some(if share == 0.0 || low == high {
         low

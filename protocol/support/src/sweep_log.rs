@@ -20,11 +20,8 @@ impl SweepLog {
     /// # Errors
     /// The system's, if the file cannot be written.
     pub fn open(path: &Path) -> io::Result<Self> {
-        OpenOptions::new()
-            .create(true)
-            .append(true)
-            .open(path)
-            .map(Self)
+        let file = OpenOptions::new().create(true).append(true).open(path);
+        file.map(Self)
     }
 
     /// Appends a sweep.

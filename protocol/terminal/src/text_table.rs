@@ -2,19 +2,13 @@
 
 use std::fmt;
 
-use comfy_table::{CellAlignment, Table, presets};
+use comfy_table::{Table, presets};
 
 /// Characters between two columns.
 pub const GAP: u16 = 2;
 
-/// Alignment of the cells of a column.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Side {
-    /// Left, for texts.
-    Left,
-    /// Right, for numbers.
-    Right,
-}
+/// Alignment of the cells of a column: texts to the left, numbers to the right.
+pub use comfy_table::CellAlignment as Side;
 
 /// A table for people, as lines that each end in a line end.
 #[derive(Debug, Clone)]
@@ -28,10 +22,7 @@ impl TextTable {
         table.load_style(presets::NOTHING).set_header(names);
         for (column, side) in table.column_iter_mut().zip(sides) {
             column.set_padding((0, GAP));
-            column.set_cell_alignment(match side {
-                Side::Left => CellAlignment::Left,
-                Side::Right => CellAlignment::Right,
-            });
+            column.set_cell_alignment(side);
         }
         Self(table)
     }

@@ -76,11 +76,7 @@ pub(super) fn is_agent(dir: &Path) -> bool {
 /// True for names that are CARLA actor ids (negative for roadside units) if there is any frame; for other names if
 /// there is a complete frame and no folder below has one: a scenario may hold a stray folder.
 fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
-    let name = dir
-        .file_name()
-        .and_then(|name| name.to_str())
-        .unwrap_or_default();
-    if is_number(name) {
+    if is_number(&name_of(dir)) {
         return listing
             .files
             .iter()
@@ -145,10 +141,8 @@ impl ScenarioFolder {
         let listed = agents_in(dir, problems)?;
         // Bare floats are used only where no agent has a PCD: a scenario has one kind of sweeps.
         let mut suffixes = [PCD, BIN].into_iter();
-        let suffix = suffixes.find(|suffix| {
-            let mut listings = listed.iter().map(|(_, listing)| listing);
-            listings.any(|listing| holds_pairs(listing, suffix))
-        });
+        let suffix = suffixes
+            .find(|suffix| (listed.iter()).any(|(_, listing)| holds_pairs(listing, suffix)));
         let suffix = suffix.unwrap_or(PCD);
         let mut by_agent = BTreeMap::new();
         for (id, listing) in &listed {
@@ -182,10 +176,8 @@ impl ScenarioFolder {
         problems.extend(without_common_frame(dir, &agents, &by_agent));
         // The set is in text order, where 10 comes before 9.
         stems.sort_by(|first, second| files::natural_order(first, second));
-        let variants: BTreeSet<String> = by_agent
-            .values()
-            .flat_map(|agent| agent.variants.iter().cloned())
-            .collect();
+        let variants = by_agent.values().flat_map(|agent| &agent.variants);
+        let variants: BTreeSet<String> = variants.cloned().collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
         let cameras = by_agent
             .iter()
@@ -224,18 +216,17 @@ impl ScenarioFolder {
 
     /// The plain sweep of a frame, or a variant of it.
     pub(super) fn pcd(&self, agent: &CavId, stem: &str, variant: Option<&str>) -> PathBuf {
-        let suffix = variant
-            .map(|variant| format!("_{variant}"))
-            .unwrap_or_default();
-        self.agent_dir(agent)
-            .join(format!("{stem}{suffix}{}", self.suffix))
+        let name = match variant {
+            Some(variant) => format!("{stem}_{variant}{}", self.suffix),
+            None => format!("{stem}{}", self.suffix),
+        };
+        self.agent_dir(agent).join(name)
     }
 
     /// The reader of all agents' sweeps.
     pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
-        let missing: HashSet<(&CavId, &str)> = self
-            .missing
-            .iter()
+        let missing = self.missing.iter();
+        let missing: HashSet<(&CavId, &str)> = missing
             .map(|frame| (&frame.agent, frame.stem.as_str()))
             .collect();
         let sweeps = Sweeps::new(SweepStorage::ByName, options);
@@ -269,24 +260,18 @@ impl ScenarioFolder {
                 .iter()
                 .map(|number| number.saturating_mul(nanos))
                 .collect(),
-            (Some(numbers), None) => {
-                let step = numbers
-                    .array_windows()
-                    .map(|[a, b]| b.saturating_sub(*a))
-                    .filter(|&step| step > 0)
-                    .min()
-                    .unwrap_or(1);
+            (numbers, _) => {
+                let numbers = numbers.unwrap_or_else(|| (0..self.stems.len() as u64).collect());
+                let steps = numbers.array_windows().map(|[a, b]| b.saturating_sub(*a));
+                let step = steps.filter(|&step| step > 0).min().unwrap_or(1);
                 let first = numbers.first().copied().unwrap_or(0);
-                numbers
+                let steps = numbers
                     .iter()
-                    .map(|number| {
-                        (number.saturating_sub(first) / step).saturating_mul(period_nanos)
-                    })
+                    .map(|number| number.saturating_sub(first) / step);
+                steps
+                    .map(|steps| steps.saturating_mul(period_nanos))
                     .collect()
             }
-            (None, _) => (0..self.stems.len() as u64)
-                .map(|index| index.saturating_mul(period_nanos))
-                .collect(),
         };
         let ticks = self.stems.iter().zip(times);
         ticks

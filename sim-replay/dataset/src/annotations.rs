@@ -9,7 +9,7 @@ use protocol::{EgoMotion, Handedness, InvalidPose, Pose};
 use super::yaml::{Field, Value};
 use super::{Problem, ReadError, Result, classes};
 use crate::carla_pose::CarlaPose;
-use crate::frame::{Object, ObjectClass};
+use crate::frame::{Frame, Object, ObjectClass};
 
 /// Kilometres per hour in a metre per second.
 const KMH_PER_MPS: f64 = 3.6;
@@ -65,35 +65,36 @@ impl<'a> Annotations<'a> {
         value.ok()
     }
 
-    /// The vehicle's own motion: what its sensors measured (`imu` of generated scenes), and otherwise its `ego_speed`. A
-    /// yaw rate of left-handed files is clockwise.
-    pub(super) fn motion(&mut self, handedness: Handedness) -> EgoMotion {
-        let imu = self.root.optional("imu").ok().flatten();
-        let counter_clockwise = if handedness == Handedness::Left {
-            -1.0
-        } else {
-            1.0
-        };
-        let yaw_rate_rad_s = imu.as_ref().and_then(|imu| {
-            self.optional_of(imu, &["yaw_rate_degps"], |field| {
+    /// Adds what a vehicle recorded of itself to its frame: its motion as its sensors measured it (`imu` of generated
+    /// scenes), and otherwise its `ego_speed`, and its poses, which `pose` reads. A yaw rate of left-handed files is
+    /// clockwise.
+    pub(super) fn add_vehicle(
+        &mut self,
+        frame: &mut Frame,
+        pose: impl Fn(&Field<'a>) -> Result<Pose>,
+    ) {
+        if let Some(imu) = self.root.optional("imu").ok().flatten() {
+            let counter_clockwise = match frame.source_handedness {
+                Handedness::Left => -1.0,
+                Handedness::Right => 1.0,
+            };
+            frame.yaw_rate_rad_s = self.optional_of(&imu, &["yaw_rate_degps"], |field| {
                 let most_degps = EgoMotion::MAX_YAW_RATE_RAD_S.to_degrees();
                 let yaw_rate_degps = within(field, field.number()?, most_degps, "degrees/s")?;
                 Ok(counter_clockwise * yaw_rate_degps.to_radians())
-            })
-        });
-        let speed_mps = imu.as_ref().and_then(|imu| {
-            self.optional_of(imu, &["speed_mps"], |field| {
+            });
+            frame.speed_mps = self.optional_of(&imu, &["speed_mps"], |field| {
                 own_speed_mps(field, field.number()?)
+            });
+        }
+        frame.speed_mps = frame.speed_mps.or_else(|| {
+            self.optional(&["ego_speed"], |field| {
+                own_speed_mps(field, speed_mps_of_kmh(field)?)
             })
         });
-        EgoMotion {
-            speed_mps: speed_mps.or_else(|| {
-                self.optional(&["ego_speed"], |field| {
-                    own_speed_mps(field, speed_mps_of_kmh(field)?)
-                })
-            }),
-            yaw_rate_rad_s,
-        }
+        frame.world_from_vehicle = self.optional(&["true_ego_pos", "true_ego_pose"], &pose);
+        frame.gnss_world_from_vehicle =
+            self.optional(&["predicted_ego_pos", "predicted_ego_pose"], &pose);
     }
 
     /// All valid objects. `id` gives the id of an object of the listed number, `pose` transforms its pose from the file
@@ -108,11 +109,8 @@ impl<'a> Annotations<'a> {
             Vec::new()
         });
         // Python keeps the last of equal keys. The others are reported.
-        let last: HashMap<&str, usize> = entries
-            .iter()
-            .enumerate()
-            .map(|(index, (key, _))| (*key, index))
-            .collect();
+        let keys = entries.iter().map(|(key, _)| *key);
+        let last: HashMap<&str, usize> = keys.zip(0..).collect();
         let mut objects = Vec::with_capacity(entries.len());
         for (index, (key, field)) in entries.iter().enumerate() {
             let object = if last.get(key) == Some(&index) {
@@ -175,23 +173,17 @@ impl<'a> Annotations<'a> {
         let Some((key, kind)) = kind else {
             return ObjectClass::Car;
         };
-        kind.text()
-            .ok()
-            .and_then(classes::of_name)
-            .unwrap_or_else(|| {
-                self.unknown_class(key, &kind.found());
-                ObjectClass::Other
-            })
+        let class = kind.text().ok().and_then(classes::of_name);
+        class.unwrap_or_else(|| {
+            self.unknown_class(key, &kind.found());
+            ObjectClass::Other
+        })
     }
 
     fn unknown_class(&mut self, key: &str, found: &str) {
         // The scenario's folder: the same finding in several agents' frames is one then.
-        let scenario = self
-            .root
-            .path()
-            .parent()
-            .and_then(Path::parent)
-            .unwrap_or(Path::new(""));
+        let mut folders = self.root.path().ancestors().skip(2);
+        let scenario = folders.next().unwrap_or(Path::new(""));
         let problem = classes::unknown(scenario, key, found);
         if !self.problems.contains(&problem) {
             self.problems.push(problem);
@@ -260,11 +252,8 @@ fn own_speed_mps(field: &Field<'_>, speed_mps: f64) -> Result<f64> {
 fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64> {
     let kmh = field.number().or_else(|error| {
         let vector = field.array().map_err(|_| error)?.values;
-        Ok(vector
-            .iter()
-            .map(|component| component * component)
-            .sum::<f64>()
-            .sqrt())
+        let squares = vector.iter().map(|component| component * component);
+        Ok(squares.sum::<f64>().sqrt())
     });
     Ok(kmh? / KMH_PER_MPS)
 }
@@ -272,10 +261,8 @@ fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64> {
 /// The value, if its size is at most `most`.
 fn within(field: &Field<'_>, value: f64, most: f64, unit: &str) -> Result<f64> {
     // NaN does not satisfy this comparison.
-    let is_within = value.abs() <= most;
-    if is_within {
-        Ok(value)
-    } else {
-        Err(field.error(format!("{value} {unit}, expected at most {most:.0}")))
+    match value.abs() <= most {
+        true => Ok(value),
+        false => Err(field.error(format!("{value} {unit}, expected at most {most:.0}"))),
     }
 }

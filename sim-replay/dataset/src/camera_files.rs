@@ -36,9 +36,7 @@ fn number(name: &str) -> Option<u8> {
         .iter()
         .any(|known| ending.eq_ignore_ascii_case(known));
     let is_number = digits.len() <= MAX_DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit());
-    (is_image && is_number)
-        .then(|| digits.parse().ok())
-        .flatten()
+    digits.parse().ok().filter(|_| is_image && is_number)
 }
 
 /// The names of a camera: its number may have zeros in front.
@@ -138,9 +136,8 @@ pub fn body_from_optical() -> Isometry3<f64> {
 }
 
 fn lidar_from_camera(world_from_lidar: &Pose, world_from_body: &Pose) -> Pose {
-    let lidar_from_body = world_from_lidar
-        .isometry()
-        .inv_mul(&world_from_body.isometry());
+    let (lidar, body) = (world_from_lidar.isometry(), world_from_body.isometry());
+    let lidar_from_body = lidar.inv_mul(&body);
     (lidar_from_body * body_from_optical()).into()
 }
 

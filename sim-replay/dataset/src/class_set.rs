@@ -30,19 +30,12 @@ impl ClassSet {
     /// Their names; `vehicle` if all four kinds of vehicles are in the set.
     pub fn names(self) -> Vec<String> {
         let has_vehicles = self.0 & Self::VEHICLES.0 == Self::VEHICLES.0;
-        has_vehicles
-            .then(|| VEHICLE.to_owned())
-            .into_iter()
-            .chain(
-                ObjectClass::ALL
-                    .iter()
-                    .filter(|class| {
-                        self.contains(**class)
-                            && !(has_vehicles && Self::VEHICLES.contains(**class))
-                    })
-                    .map(|class| class.name().to_owned()),
-            )
-            .collect()
+        let others = ObjectClass::ALL.iter().filter(|class| {
+            self.contains(**class) && !(has_vehicles && Self::VEHICLES.contains(**class))
+        });
+        let vehicle = has_vehicles.then_some(VEHICLE).into_iter();
+        let names = vehicle.chain(others.map(|class| class.name()));
+        names.map(str::to_owned).collect()
     }
 
     fn of<'a>(names: impl IntoIterator<Item = &'a str>) -> Result<Self, String> {
@@ -64,12 +57,9 @@ impl ClassSet {
     }
 }
 
+/// The bits follow the order of the enum, on which the constants above rely.
 fn bit(class: ObjectClass) -> u8 {
-    ObjectClass::ALL
-        .iter()
-        .position(|known| *known == class)
-        // The bits follow the order of the enum, on which the constants above rely.
-        .map_or(0, |index| 1 << index)
+    1 << class as u8
 }
 
 impl FromStr for ClassSet {

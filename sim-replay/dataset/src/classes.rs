@@ -5,6 +5,8 @@
 
 use std::path::Path;
 
+use protocol::text::excerpt;
+
 use super::{Problem, ReadError};
 use crate::frame::ObjectClass;
 
@@ -66,6 +68,12 @@ pub(super) fn unknown(dir: &Path, field: &str, found: &str) -> Problem {
     let reason =
         format!("{found} is an unknown type of object: it counts as other, not as a vehicle");
     Problem::from(&ReadError::malformed_at(dir, None, Some(field), reason))
+}
+
+/// The finding about the type of an object in a list of labels, if that is unknown.
+pub(super) fn unknown_label(path: &Path, kind: &str) -> Option<Problem> {
+    let (dir, shown) = (path.parent().unwrap_or(path), excerpt(kind, 40));
+    (of_name(kind).is_none()).then(|| unknown(dir, "type", &format!("{shown:?}")))
 }
 
 /// Names with dots: nuScenes' categories and CARLA's blueprints.

@@ -81,12 +81,8 @@ fn listed(path: &Path) -> Result<Vec<Listed>> {
     if !clouds.is_empty() {
         return Ok(clouds.into_iter().map(Listed::File).collect());
     }
-    let sweeps: Vec<Listed> = crate::open(path)?
-        .scenarios
-        .into_iter()
-        .flat_map(frames_of)
-        .map(Listed::Known)
-        .collect();
+    let scenarios = crate::open(path)?.scenarios.into_iter();
+    let sweeps: Vec<Listed> = scenarios.flat_map(frames_of).map(Listed::Known).collect();
     match sweeps.is_empty() {
         true => Err(ReadError::malformed(
             path,
@@ -153,30 +149,21 @@ impl Folders {
         let known = scene_of(&path).and_then(|scene| {
             let frames = self.scenes.entry(scene.clone()).or_insert_with(|| {
                 // A folder may only look like a scene: then its files are read by themselves.
-                let scenarios = crate::open(&scene)
-                    .map(|dataset| dataset.scenarios)
-                    .unwrap_or_default();
-                scenarios
+                let scenarios = crate::open(&scene).map(|dataset| dataset.scenarios);
+                let frames = scenarios
+                    .unwrap_or_default()
                     .into_iter()
-                    .flat_map(frames_of)
-                    .map(|file| (canonical(&file.path), file))
-                    .collect()
+                    .flat_map(frames_of);
+                frames.map(|file| (canonical(&file.path), file)).collect()
             });
             // A relative path or a link may name the same file as the scene does.
             frames.get(&canonical(&path)).cloned()
         });
-        let alone = self
-            .alone
-            .get(&folder_of(&path))
-            .cloned()
-            .unwrap_or_default();
-        known.map_or(
-            CloudFile {
-                path: path.clone(),
-                source: Source::File(alone),
-            },
-            |known| CloudFile { path, ..known },
-        )
+        let source = known.map(|known| known.source).unwrap_or_else(|| {
+            let alone = self.alone.get(&folder_of(&path)).cloned();
+            Source::File(alone.unwrap_or_default())
+        });
+        CloudFile { path, source }
     }
 }
 

@@ -1,6 +1,6 @@
 //! Read errors: faults of a dataset, with their position.
 
-use std::fmt;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 /// The result of reading: a [`ReadError`] if nothing else is named.
@@ -26,7 +26,7 @@ pub enum ReadError {
         reason: String,
     },
     /// A file has invalid content.
-    #[error("{}{}: {}{reason}", path.display(), Line(*.line), Field(field.as_deref()))]
+    #[error("{}{}: {}{reason}", path.display(), shown(":", *line, ""), shown("", field.as_ref(), ": "))]
     Malformed {
         /// The file.
         path: PathBuf,
@@ -139,20 +139,9 @@ impl ReadError {
     }
 }
 
-struct Line(Option<u64>);
-
-impl fmt::Display for Line {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.map_or(Ok(()), |line| write!(f, ":{line}"))
-    }
-}
-
-struct Field<'a>(Option<&'a str>);
-
-impl fmt::Display for Field<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.map_or(Ok(()), |field| write!(f, "{field}: "))
-    }
+/// A part of a message between two texts; nothing where it is missing.
+pub(crate) fn shown(before: &str, part: Option<impl Display>, after: &str) -> String {
+    part.map_or_else(String::new, |part| format!("{before}{part}{after}"))
 }
 
 #[cfg(test)]

@@ -130,11 +130,7 @@ impl EvaluationProtocol {
         };
         // From the end: the ego and the first agents stay.
         order.truncate(self.max_agents);
-        if order.is_empty() {
-            None
-        } else {
-            Some(scenario.arranged(&order))
-        }
+        (!order.is_empty()).then(|| scenario.arranged(&order))
     }
 }
 

@@ -21,21 +21,13 @@ pub(super) fn list(dir: &Path) -> Result<Listing> {
     let mut listing = Listing::default();
     for entry in fs::read_dir(dir).map_err(|error| ReadError::io(dir, error))? {
         let entry = entry.map_err(|error| ReadError::io(dir, error))?;
-        let Some(name) = entry
-            .file_name()
-            .to_str()
-            .filter(|name| !name.starts_with('.'))
-            .map(str::to_owned)
-        else {
+        let name = entry.file_name().into_string();
+        let Some(name) = name.ok().filter(|name| !name.starts_with('.')) else {
             continue;
         };
         // Data often lies behind symbolic links, so these are followed.
         let kind = entry.file_type().ok().filter(|kind| !kind.is_symlink());
-        match kind.or_else(|| {
-            fs::metadata(entry.path())
-                .ok()
-                .map(|metadata| metadata.file_type())
-        }) {
+        match kind.or_else(|| Some(fs::metadata(entry.path()).ok()?.file_type())) {
             Some(kind) if kind.is_dir() => listing.folders.push(name),
             Some(_) => listing.files.push(name),
             None => {}
@@ -108,11 +100,10 @@ pub(super) fn holds(dir: &Path, suffix: &str) -> bool {
 }
 
 /// The stems of the files that end in `suffix`, in the order given.
-pub(super) fn stems<'a>(files: &'a [String], suffix: &str) -> Vec<&'a str> {
+pub(super) fn stems<'a>(files: &'a [String], suffix: &'a str) -> impl Iterator<Item = &'a str> {
     files
         .iter()
-        .filter_map(|name| name.strip_suffix(suffix))
-        .collect()
+        .filter_map(move |name| name.strip_suffix(suffix))
 }
 
 /// Paths of a folder: as given, absolute, and canonical. `.` or `00` shows little of the folders above; a symbolic link

@@ -9,7 +9,7 @@ use protocol::{
 use serde::{Deserialize, Serialize};
 use strum::{EnumString, IntoStaticStr, VariantArray};
 
-use crate::Problem;
+use crate::{Problem, Result};
 
 /// Class of an annotated object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -167,6 +167,14 @@ impl Frame {
         }
     }
 
+    /// Adds the image of a camera, or the reason why there is none.
+    pub(crate) fn add_camera(&mut self, number: u8, image: Result<Camera>) {
+        match image {
+            Ok(image) => self.cameras.push((number, image)),
+            Err(error) => self.problems.push(Problem::from(&error)),
+        }
+    }
+
     /// Pose and objects of a message of the ground truth.
     pub fn of_truth(truth: &AgentTruth) -> Self {
         Self {
@@ -179,10 +187,8 @@ impl Frame {
     /// The GNSS estimate carried over to the LiDAR by the true mount of the LiDAR on the vehicle.
     pub fn gnss_world_from_lidar(&self) -> Option<Pose> {
         let gnss = self.gnss_world_from_vehicle?.isometry();
-        let vehicle_from_lidar = self
-            .world_from_vehicle?
-            .isometry()
-            .inv_mul(&self.world_from_lidar?.isometry());
+        let vehicle = self.world_from_vehicle?.isometry();
+        let vehicle_from_lidar = vehicle.inv_mul(&self.world_from_lidar?.isometry());
         Some((gnss * vehicle_from_lidar).into())
     }
 }

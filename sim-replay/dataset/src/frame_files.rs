@@ -29,14 +29,12 @@ pub(super) struct AgentFolder {
 /// True if a folder has a frame's YAML and its sweep of the given suffix.
 pub(super) fn holds_pairs(listing: &Listing, suffix: &str) -> bool {
     let yamls: BTreeSet<&str> = yaml_stems(listing).collect();
-    files::stems(&listing.files, suffix)
-        .iter()
-        .any(|stem| yamls.contains(stem))
+    files::stems(&listing.files, suffix).any(|stem| yamls.contains(stem))
 }
 
 fn yaml_stems(listing: &Listing) -> impl Iterator<Item = &str> {
-    let stems = files::stems(&listing.files, ".yaml").into_iter();
-    stems.filter(|stem| !NOT_FRAMES.iter().any(|text| stem.contains(text)))
+    files::stems(&listing.files, ".yaml")
+        .filter(|stem| !NOT_FRAMES.iter().any(|text| stem.contains(text)))
 }
 
 /// True for digits: frames are numbered.
@@ -83,7 +81,7 @@ impl AgentFolder {
         let is_without_yaml = listed.is_empty();
         if is_without_yaml {
             // Sweeps alone are frames without poses and boxes.
-            let sweeps = files::stems(&listing.files, suffix).into_iter();
+            let sweeps = files::stems(&listing.files, suffix);
             // A name with an underscore is that of a variant, `<stem>_<variant>`, and no frame.
             listed.extend(sweeps.filter(|stem| !stem.contains('_')));
         }

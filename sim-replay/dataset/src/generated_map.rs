@@ -1,7 +1,7 @@
 //! Map of a generated scenario, from its `data_protocol.yaml`.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::Path;
 
 use super::yaml::{self, Field};
 use super::{Result, Scenario};
@@ -28,12 +28,8 @@ impl Scenario {
     /// [`crate::ReadError`] when there is no protocol of a generation in the scenario's folder, or it names no map.
     pub fn generated_map(&self) -> Result<GeneratedMap> {
         let points = self.points_path(0, 0, None)?;
-        let folder = points
-            .ancestors()
-            // `<scenario>/<agent>/<frame>`: the folder two levels above a sweep.
-            .nth(2)
-            .map(PathBuf::from)
-            .unwrap_or_default();
+        // `<scenario>/<agent>/<frame>`: the folder two levels above a sweep.
+        let folder = points.ancestors().nth(2).unwrap_or(Path::new(""));
         let path = folder.join("data_protocol.yaml");
         let node = yaml::read(&path)?;
         let generator = Field::root(&path, &node).required("generator")?;

@@ -218,16 +218,15 @@ pub fn annotations<'a>(frames_of_tick: &[&'a Frame]) -> Vec<&'a [Object]> {
     let holder = frames_of_tick
         .iter()
         .position(|frame| frame.cooperative_objects.is_some());
-    frames_of_tick
-        .iter()
-        .enumerate()
-        .map(
-            |(index, frame)| match (holder, &frame.cooperative_objects) {
-                (None, _) => frame.objects.as_slice(),
-                (Some(holder), Some(objects)) if holder == index => objects.as_slice(),
-                _ => &[],
-            },
-        )
+    let lists = frames_of_tick.iter().zip(0..);
+    lists
+        .map(|(frame, index)| match holder {
+            None => frame.objects.as_slice(),
+            Some(holder) if holder == index => {
+                frame.cooperative_objects.as_deref().unwrap_or_default()
+            }
+            Some(_) => &[],
+        })
         .collect()
 }
 

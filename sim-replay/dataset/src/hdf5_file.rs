@@ -84,15 +84,10 @@ fn superblock(end: usize) -> Vec<u8> {
 
 /// The bytes of a file with these time stamps and rows.
 pub fn poses_file(stamps: &[i64], poses: &[[f64; 12]]) -> Vec<u8> {
-    let stamp_bytes: Vec<u8> = stamps
-        .iter()
-        .flat_map(|stamp| stamp.to_le_bytes())
-        .collect();
-    let pose_bytes: Vec<u8> = poses
-        .iter()
-        .flatten()
-        .flat_map(|value| value.to_le_bytes())
-        .collect();
+    let values = stamps.iter();
+    let stamp_bytes: Vec<u8> = values.flat_map(|stamp| stamp.to_le_bytes()).collect();
+    let values = poses.as_flattened().iter();
+    let pose_bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();
     let (stamps, poses) = ([stamps.len() as u64], [poses.len() as u64, 12]);
     let (stamp_len, pose_len) = (stamp_bytes.len(), pose_bytes.len());
     // Headers have the same length for every address.

@@ -7,11 +7,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use hdf5_reader::{Dataset, Datatype, Hdf5File, OpenOptions};
-use nalgebra::Matrix4;
-use protocol::Pose;
+use protocol::{InvalidPose, Pose};
 
 use super::faults::Faults;
-use super::{ReadError, Result, files};
+use super::{ReadError, Result, files, poses};
 use support::rounding;
 
 /// Largest HDF5 file, and largest dataset in it, that is read, bytes: a million poses.
@@ -79,23 +78,12 @@ fn parse(
     Ok(by_time)
 }
 
-#[expect(
-    clippy::indexing_slicing,
-    reason = "three lines of four columns are twelve numbers"
-)]
-fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::InvalidPose> {
-    let mut matrix = Matrix4::identity();
-    for line in 0..3 {
-        for column in 0..4 {
-            let place = match (order, column) {
-                (RowOrder::Matrix, _) => 4 * line + column,
-                (RowOrder::RotationFirst, 3) => 9 + line,
-                (RowOrder::RotationFirst, _) => 3 * line + column,
-            };
-            matrix[(line, column)] = row[place];
-        }
-    }
-    Pose::from_matrix(&matrix)
+fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, InvalidPose> {
+    let &[a, b, c, d, e, f, g, h, i, x, y, z] = row;
+    poses::of_rows(&match order {
+        RowOrder::Matrix => *row,
+        RowOrder::RotationFirst => [a, b, c, x, d, e, f, y, g, h, i, z],
+    })
 }
 
 fn wrong(path: &Path, field: &str, reason: String) -> ReadError {

@@ -104,23 +104,20 @@ impl<'a> Field<'a> {
 
     /// The items of a list.
     pub(super) fn items(&self) -> Result<impl ExactSizeIterator<Item = Self>> {
-        let items = self
-            .value
-            .as_array()
-            .ok_or_else(|| self.expected("a list"))?;
+        let Some(items) = self.value.as_array() else {
+            return Err(self.expected("a list"));
+        };
         let items = items.iter().enumerate();
         Ok(items.map(|(index, item)| self.child(&index.to_string(), item)))
     }
 
     /// An entry that may be missing, null or an empty text.
     pub(super) fn optional(&self, key: &str) -> Result<Option<Self>> {
-        let map = self
-            .value
-            .as_object()
-            .ok_or_else(|| self.expected("a map"))?;
-        let found = map
-            .get(key)
-            .filter(|value| !value.is_null() && value.as_str() != Some(""));
+        let Some(map) = self.value.as_object() else {
+            return Err(self.expected("a map"));
+        };
+        let found = map.get(key);
+        let found = found.filter(|value| !value.is_null() && value.as_str() != Some(""));
         Ok(found.map(|value| self.child(key, value)))
     }
 

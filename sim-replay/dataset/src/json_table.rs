@@ -5,7 +5,6 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use serde::Deserialize;
-use serde_json::Value;
 
 use super::json::{self, Field};
 use super::{ReadError, Result};
@@ -64,8 +63,11 @@ pub(super) fn read(
         if is_unneeded {
             return;
         }
-        match parse_row(path, index, raw).and_then(|value| row(&Field::entry(path, index, &value)))
-        {
+        let value = json::parse(raw).map_err(|error| {
+            let reason = format!("no sound JSON: {error}");
+            ReadError::malformed_at(path, None, Some(&index.to_string()), reason)
+        });
+        match value.and_then(|value| row(&Field::entry(path, index, &value))) {
             Ok(()) => used += 1,
             Err(problem) => {
                 unusable += 1;
@@ -89,13 +91,6 @@ pub(super) fn read(
         Ok(()) => {}
     }
     Ok(used)
-}
-
-fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value> {
-    json::parse(raw).map_err(|error| {
-        let reason = format!("no sound JSON: {error}");
-        ReadError::malformed_at(path, None, Some(&index.to_string()), reason)
-    })
 }
 
 /// Passes on the entries of the list in the order of the file. An entry need not be valid: it ends when its brackets
@@ -219,6 +214,8 @@ impl RowSplitter {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::Value;
+
     use super::*;
 
     /// Values read from a table of numbers, the problems, and the result.

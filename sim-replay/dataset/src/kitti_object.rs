@@ -59,7 +59,7 @@ pub(super) fn open(
 ) -> Result<Scenario> {
     let velodyne = dir.join("velodyne");
     let listing = files::list(&velodyne)?;
-    let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").into_iter().collect());
+    let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").collect());
     let strays: Vec<String> = strays
         .into_iter()
         .map(|stem| format!("{stem}.bin"))
@@ -86,12 +86,14 @@ impl FrameSource for Split {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(Pose::IDENTITY);
         if self.has_labels {
-            let calibration = Calibration::read(&self.calibration(tick))?;
+            let calibration = Calibration::read(&self.file("calib", tick, "txt"))?;
             let rectified = calibration.rotation("R0_rect")?.isometry();
             // Labels are in the frame of the rectified camera: R0_rect follows Tr_velo_to_cam.
             let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
-            (frame.objects, frame.problems) =
-                objects(&self.labels(tick), &camera_from_lidar.inverse())?;
+            (frame.objects, frame.problems) = objects(
+                &self.file("label_2", tick, "txt"),
+                &camera_from_lidar.inverse(),
+            )?;
         }
         Ok(frame)
     }
@@ -102,28 +104,28 @@ impl FrameSource for Split {
     }
 
     fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        self.sweeps.samples(agent)
+        self.sweeps.samples(agent, [])
     }
 
     fn frame_files(&self, _agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
         if !self.has_labels {
             return Vec::new();
         }
-        vec![self.calibration(tick), self.labels(tick)]
+        vec![
+            self.file("calib", tick, "txt"),
+            self.file("label_2", tick, "txt"),
+        ]
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
-        self.dir.join("velodyne").join(format!("{}.bin", tick.stem))
+        self.file("velodyne", tick, "bin")
     }
 }
 
 impl Split {
-    fn labels(&self, tick: &Tick) -> PathBuf {
-        self.dir.join("label_2").join(format!("{}.txt", tick.stem))
-    }
-
-    fn calibration(&self, tick: &Tick) -> PathBuf {
-        self.dir.join("calib").join(format!("{}.txt", tick.stem))
+    fn file(&self, folder: &str, tick: &Tick, ending: &str) -> PathBuf {
+        let name = format!("{}.{ending}", tick.stem);
+        self.dir.join(folder).join(name)
     }
 }
 
@@ -136,19 +138,10 @@ fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Objec
         if kind == "DontCare" {
             continue;
         }
-        match object(
-            (path, line),
-            kind,
-            numbers,
-            objects.len() as i64,
-            lidar_from_camera,
-        ) {
+        let id = objects.len() as i64;
+        match object((path, line), kind, numbers, id, lidar_from_camera) {
             Ok(object) => {
-                if classes::of_name(kind).is_none() {
-                    let dir = path.parent().unwrap_or(path);
-                    let name: String = kind.chars().take(40).collect();
-                    problems.push(classes::unknown(dir, "type", &format!("{name:?}")));
-                }
+                problems.extend(classes::unknown_label(path, kind));
                 objects.push(object);
             }
             Err(error) => problems.push(Problem::from(
@@ -171,11 +164,8 @@ fn object(
     let count = numbers.split_ascii_whitespace().count();
     // A score may follow.
     let has_score = count == LABEL_NUMBERS + 1;
-    let numbers = numbers
-        .trim()
-        .rsplit_once(' ')
-        .filter(|_| has_score)
-        .map_or(numbers, |(numbers, _)| numbers);
+    let without_score = numbers.trim().rsplit_once(' ').filter(|_| has_score);
+    let numbers = without_score.map_or(numbers, |(numbers, _)| numbers);
     let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(&field), numbers)?;
     // KITTI has height, width, length. Sizes here are length, width, height.
     let [.., height, width, length, x, y, z, rotation_y] = values;

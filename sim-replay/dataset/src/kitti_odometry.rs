@@ -4,20 +4,14 @@
 //! `poses_cam0.txt` beside these, or in the release's `poses/<sequence>.txt`. The line of the poses is the scan's
 //! number. The pose of the LiDAR is `inverse(Tr) * P * Tr`, in the frame of the first scan's LiDAR.
 
+use protocol::Pose;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-
-use protocol::{CavId, Handedness, Pose};
 
 use super::faults::Faults;
 use super::kitti_text::{self, Calibration};
 use super::layout::{LayoutRow, Reader};
-use super::points::{SweepStorage, Sweeps};
-use super::{
-    FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
-};
-use crate::frame::Frame;
-use crate::pcd::PcdCloud;
+use super::points::SweepStorage;
+use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence};
 use support::rounding;
 
 /// KITTI odometry.
@@ -32,15 +26,6 @@ pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
         open,
     }),
 };
-
-/// A sequence.
-#[derive(Debug)]
-struct Sequence {
-    dir: PathBuf,
-    /// Poses of the LiDAR by scan number, if the sequence has poses and the scan a valid one.
-    world_from_lidar: Option<Vec<Option<Pose>>>,
-    sweeps: Sweeps,
-}
 
 /// True for a folder with scans and a calibration file.
 pub(super) fn is_sequence(dir: &Path) -> bool {
@@ -69,29 +54,25 @@ pub(super) fn open(
         );
         joins.extend(is_joined.then_some(line));
     }
-    let ticks = scans.into_iter().map(|(scan, stem)| {
+    let clouds = scans.into_iter().map(|(scan, stem)| {
         let capture_nanos = match &times {
             Some(times) => times.get(scan).copied().flatten().unwrap_or_default(),
             None => options.period_nanos.saturating_mul(scan as u64),
         };
-        Tick::new(stem, capture_nanos)
+        let file = velodyne.join(format!("{stem}.bin"));
+        let pose = poses.as_ref().and_then(|poses| *poses.get(scan)?);
+        (Tick::new(stem, capture_nanos), file, pose)
     });
-    let mut ticks: Vec<Tick> = ticks.collect();
+    let mut clouds: Vec<(Tick, PathBuf, Option<Pose>)> = clouds.collect();
     // Names without leading zeros are listed in another order than their numbers.
-    ticks.sort_by_key(|tick| tick.capture_nanos);
-    let files = ticks
-        .iter()
-        .map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
-    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
-    let source = Sequence {
-        dir: dir.to_owned(),
-        world_from_lidar: poses,
-        sweeps,
-    };
+    clouds.sort_by_key(|(tick, ..)| tick.capture_nanos);
     let name = files::name_below(root, dir);
+    let storage = (SweepStorage::ByName, options);
+    let files = ["calib.txt", "times.txt"].map(|name| dir.join(name));
+    let files = files.into_iter().chain(poses_path(dir)).collect();
     Ok(Scenario {
         joins,
-        ..single_vehicle(name, Layout::KITTI_ODOMETRY, ticks, Arc::new(source))
+        ..sequence::scenario(name, Layout::KITTI_ODOMETRY, clouds, storage, files, false)
     })
 }
 
@@ -99,10 +80,14 @@ pub(super) fn open(
 fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, String)>> {
     let mut strays = Faults::default();
     let listing = files::list(velodyne)?;
-    let stems = files::stems(&listing.files, ".bin").into_iter();
-    let scans = stems
-        .filter_map(|stem| Some((strays.take(scan_number(velodyne, stem))?, stem.to_owned())))
-        .collect();
+    let scans = files::stems(&listing.files, ".bin").filter_map(|stem| {
+        let number = stem.parse::<usize>().map_err(|_| {
+            let path = velodyne.join(format!("{stem}.bin"));
+            ReadError::malformed(&path, format!("{stem:?} is no scan number"))
+        });
+        Some((strays.take(number)?, stem.to_owned()))
+    });
+    let scans = scans.collect();
     strays.report("file", problems);
     Ok(scans)
 }
@@ -166,39 +151,6 @@ fn keep_those_with<T>(
     faults.report("scan", problems);
 }
 
-impl FrameSource for Sequence {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
-        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
-        if let Some(poses) = &self.world_from_lidar {
-            let scan = scan_number(&self.dir.join("velodyne"), &tick.stem)?;
-            frame.world_from_lidar = poses.get(scan).copied().flatten();
-        }
-        Ok(frame)
-    }
-
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
-        self.sweeps
-            .read(agent, &self.points_path(agent, tick, variant))
-    }
-
-    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        let mut files = self.sweeps.samples(agent);
-        files.extend(["calib.txt", "times.txt"].map(|name| self.dir.join(name)));
-        files.extend(poses_path(&self.dir));
-        files
-    }
-
-    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
-        self.dir.join("velodyne").join(format!("{}.bin", tick.stem))
-    }
-}
-
-fn scan_number(velodyne: &Path, stem: &str) -> Result<usize> {
-    let path = velodyne.join(format!("{stem}.bin"));
-    stem.parse()
-        .map_err(|_| ReadError::malformed(&path, format!("{stem:?} is no scan number")))
-}
-
 /// Path of the sequence's poses: beside the scans, or in the release's common folder.
 fn poses_path(dir: &Path) -> Option<PathBuf> {
     let beside = ["poses.txt", "poses_cam0.txt"]
@@ -208,13 +160,8 @@ fn poses_path(dir: &Path) -> Option<PathBuf> {
     beside.or_else(|| {
         files::names_of(dir).find_map(|dir| {
             let name = dir.file_name()?.to_str()?;
-            Some(
-                dir.parent()?
-                    .parent()?
-                    .join("poses")
-                    .join(format!("{name}.txt")),
-            )
-            .filter(|path| path.is_file())
+            let poses = dir.parent()?.parent()?.join("poses");
+            Some(poses.join(format!("{name}.txt"))).filter(|path| path.is_file())
         })
     })
 }

@@ -2,12 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use nalgebra::Matrix4;
 use protocol::Pose;
 use protocol::text::excerpt;
 
 use super::faults::Faults;
-use super::{ReadError, Result, files};
+use super::{ReadError, Result, files, poses};
 
 /// Largest text file that is read, bytes: poses of a hundred thousand scans.
 const MAX_BYTES: u64 = 32 << 20;
@@ -91,20 +90,7 @@ pub(super) fn numbers<const N: usize>(
 
 /// A rigid transform from a row-major 3x4 matrix.
 pub(super) fn rigid(path: &Path, line: u64, field: Option<&str>, rows: &[f64; 12]) -> Result<Pose> {
-    Pose::from_matrix(&matrix(rows))
-        .map_err(|error| malformed(path, line, field, error.to_string()))
-}
-
-#[expect(
-    clippy::indexing_slicing,
-    reason = "twelve numbers are three lines of four columns"
-)]
-fn matrix(rows: &[f64; 12]) -> Matrix4<f64> {
-    let mut matrix = Matrix4::identity();
-    for (index, value) in rows.iter().enumerate() {
-        matrix[(index / 4, index % 4)] = *value;
-    }
-    matrix
+    poses::of_rows(rows).map_err(|error| malformed(path, line, field, error.to_string()))
 }
 
 impl Calibration {
@@ -121,12 +107,8 @@ impl Calibration {
 
     fn numbers<const N: usize>(&self, name: &str) -> Result<(u64, [f64; N])> {
         let Some((_, line, values)) = self.entries.iter().find(|(found, ..)| found == name) else {
-            return Err(ReadError::malformed_at(
-                &self.path,
-                None,
-                Some(name),
-                "missing",
-            ));
+            let missing = ReadError::malformed_at(&self.path, None, Some(name), "missing");
+            return Err(missing);
         };
         Ok((*line, numbers(&self.path, *line, Some(name), values)?))
     }

@@ -77,7 +77,7 @@ impl Serialize for Layout {
 pub(super) fn opened(
     dir: &Path,
     scenarios: Vec<Scenario>,
-    problems: Vec<ReadError>,
+    mut problems: Vec<ReadError>,
 ) -> Result<Option<Dataset>> {
     match scenarios.first().map(|scenario| scenario.layout) {
         Some(layout) => Ok(Some(Dataset {
@@ -85,18 +85,13 @@ pub(super) fn opened(
             scenarios,
             problems,
         })),
-        None if problems.is_empty() => Ok(None),
-        None => Err(nothing_opened(dir, problems)),
-    }
-}
-
-/// The only fault, or all of them, or an unknown layout.
-fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
-    match problems.len() {
-        1 => problems.swap_remove(0),
-        _ => ReadError::Layout {
-            path: dir.to_owned(),
-            reason: format!("nothing can be opened: {}", listed(&problems)),
+        None => match problems.len() {
+            0 => Ok(None),
+            1 => Err(problems.swap_remove(0)),
+            _ => {
+                let reason = format!("nothing can be opened: {}", listed(&problems));
+                Err(ReadError::layout(dir, reason))
+            }
         },
     }
 }

@@ -54,14 +54,12 @@ impl LeftOut {
     /// Adds the missing and unreadable frames of a tick.
     pub fn add_tick(&mut self, loaded: &LoadedTick) {
         self.absent_frames += loaded.absent as u64;
-        loaded
-            .frames
-            .iter()
-            .for_each(|(_, frame)| self.add_parts(frame));
-        loaded
-            .unreadable
-            .iter()
-            .for_each(|(agent, problem)| self.add_unreadable(*agent, problem.clone()));
+        for (_, frame) in &loaded.frames {
+            self.add_parts(frame);
+        }
+        for (agent, problem) in &loaded.unreadable {
+            self.add_unreadable(*agent, problem.clone());
+        }
     }
 
     /// Adds a frame that cannot be read; the ego is agent 0.
@@ -88,10 +86,9 @@ impl LeftOut {
     /// Adds the parts left out of a frame.
     fn add_parts(&mut self, frame: &Frame) {
         self.parts += frame.problems.len() as u64;
-        frame
-            .problems
-            .iter()
-            .for_each(|problem| self.keep(problem.clone()));
+        for problem in &frame.problems {
+            self.keep(problem.clone());
+        }
     }
 
     /// Adds another account.
@@ -103,10 +100,9 @@ impl LeftOut {
         self.failed += other.failed;
         self.files += other.files;
         self.add_findings(other.findings.iter().cloned());
-        other
-            .problems
-            .iter()
-            .for_each(|problem| self.keep(problem.clone()));
+        for problem in &other.problems {
+            self.keep(problem.clone());
+        }
     }
 
     /// True if nothing was lost. Absent agents are no loss.
@@ -149,11 +145,9 @@ impl fmt::Display for LeftOut {
             (self.failed, "frames that could not be computed"),
             (self.files, "files or folders"),
         ];
-        let left_out: Vec<String> = counts
-            .iter()
-            .filter(|(count, _)| *count > 0)
-            .map(|(count, kind)| format!("{count} {kind}"))
-            .collect();
+        let counts = counts.into_iter().filter(|(count, _)| *count > 0);
+        let left_out = counts.map(|(count, kind)| format!("{count} {kind}"));
+        let left_out: Vec<String> = left_out.collect();
         if !left_out.is_empty() {
             write!(f, "left out: {}", left_out.join(", "))?;
         }

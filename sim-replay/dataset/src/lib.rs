@@ -69,6 +69,7 @@ mod recorded_motion;
 mod roots;
 mod rosbag;
 mod scalar;
+mod sequence;
 mod time_stamps;
 mod trajectory;
 mod unfinished;
@@ -80,7 +81,7 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use protocol::{Camera, CavId, Handedness};
+use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
@@ -217,23 +218,6 @@ impl LoadOptions {
     }
 }
 
-/// Images of the cameras of a frame, by number.
-#[derive(Debug, Default)]
-struct CameraImages {
-    images: Vec<(u8, Camera)>,
-    problems: Vec<Problem>,
-}
-
-impl CameraImages {
-    /// Adds the image of a camera, or the reason why there is none.
-    fn add(&mut self, number: u8, image: Result<Camera>) {
-        match image {
-            Ok(image) => self.images.push((number, image)),
-            Err(error) => self.problems.push(Problem::from(&error)),
-        }
-    }
-}
-
 /// Reader of a layout's frames, in the conventions of [`protocol`].
 trait FrameSource: std::fmt::Debug + Send + Sync {
     /// Reads a frame without its points.
@@ -251,10 +235,8 @@ trait FrameSource: std::fmt::Debug + Send + Sync {
         ))
     }
 
-    /// Reads the images of some cameras, by number; those that are missing or unreadable are named.
-    fn cameras(&self, _agent: &CavId, _tick: &Tick, _numbers: &[u8]) -> CameraImages {
-        CameraImages::default()
-    }
+    /// Adds the images of some cameras, by number, to a frame; those that are missing or unreadable are named.
+    fn cameras(&self, _agent: &CavId, _tick: &Tick, _numbers: &[u8], _frame: &mut Frame) {}
 
     /// The files that all frames of an agent are read from: tables, poses, times, and the sweeps that determine how the
     /// others are read. A change of any file of a frame is a change of the data ([`content_sha256`]).
@@ -326,9 +308,7 @@ impl Scenario {
             frame.radar = Some(self.load_radar(agent_index, tick_index)?.points);
         }
         if options.cameras && !self.cameras.is_empty() {
-            let CameraImages { images, problems } = self.source.cameras(agent, tick, &self.cameras);
-            frame.cameras = images;
-            frame.problems.extend(problems);
+            self.source.cameras(agent, tick, &self.cameras, &mut frame);
         }
         Ok(frame)
     }

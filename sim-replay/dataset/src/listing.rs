@@ -57,14 +57,12 @@ pub fn content_sha256<'a>(
 
 fn list(scenario: &Scenario, hash: &mut Sha256) {
     hash.update(scenario.name.as_bytes());
-    scenario
-        .agents
-        .iter()
-        .for_each(|agent| hash.update(format!("/{agent}")));
-    scenario
-        .ticks
-        .iter()
-        .for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
+    for agent in &scenario.agents {
+        hash.update(format!("/{agent}"));
+    }
+    for tick in &scenario.ticks {
+        hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos));
+    }
 }
 
 /// Every file that the frames of a scenario are read from; images and radar points are not evaluated.

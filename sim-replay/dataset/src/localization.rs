@@ -15,23 +15,18 @@
 //! about x, `C = diag(1, -1, -1)`: a point becomes `C p`, a pose `C M C`. It is a rotation, so distances, chirality and
 //! the motion between scans are unchanged.
 
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use protocol::Pose;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-
-use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
-use protocol::{CavId, Handedness, Pose};
 
 use super::hdf5_poses::{self, RowOrder};
 use super::kitti_text::{lines, numbers};
 use super::layout::{LayoutRow, Reader};
-use super::nclt_ground_truth::{self, GroundTruth};
-use super::points::{SweepStorage, Sweeps};
+use super::points::SweepStorage;
 use super::{
-    FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
+    Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, nclt_ground_truth, sequence,
 };
-use crate::frame::Frame;
-use crate::pcd::PcdCloud;
 
 /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
 pub(crate) static NCLT: LayoutRow = LayoutRow {
@@ -68,34 +63,6 @@ const PLAIN_POSES: &str = "velodyne_left_False.h5";
 /// LightLoc's names of the scenes.
 const SCENES: [&str; 3] = ["NCLT", "Oxford", "QEOxford"];
 
-/// Storage of the points of a sequence.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Storage {
-    NcltRaw,
-    NcltConverted,
-    Oxford,
-}
-
-impl Storage {
-    fn of_sweeps(self) -> SweepStorage {
-        match self {
-            Self::NcltRaw => SweepStorage::NcltRaw,
-            Self::NcltConverted => SweepStorage::ByName,
-            Self::Oxford => SweepStorage::Planar,
-        }
-    }
-}
-
-#[derive(Debug)]
-struct Sequence {
-    points_dir: PathBuf,
-    /// Files of poses, whether or not they exist.
-    pose_files: Vec<PathBuf>,
-    /// By microseconds; empty if no file has any.
-    world_from_lidar: BTreeMap<u64, Pose>,
-    sweeps: Sweeps,
-}
-
 /// True if a folder is a sequence.
 pub(super) fn is_sequence(dir: &Path) -> bool {
     [CONVERTED, RAW]
@@ -111,10 +78,9 @@ pub(super) fn open(
     problems: &mut Vec<ReadError>,
 ) -> Result<Scenario> {
     let storage = storage(dir);
-    let points_dir = dir.join(if storage == Storage::NcltRaw {
-        RAW
-    } else {
-        CONVERTED
+    let points_dir = dir.join(match storage {
+        SweepStorage::NcltRaw => RAW,
+        _ => CONVERTED,
     });
     let mut stamps = BTreeMap::new();
     for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
@@ -144,41 +110,32 @@ pub(super) fn open(
             problems.push(ReadError::malformed(dir, reason));
         }
     }
-    let ticks = stamps.into_iter();
-    let ticks = ticks.map(|(micros, stem)| Tick::new(stem, micros.saturating_mul(1000)));
-    let ticks: Vec<Tick> = ticks.collect();
-    let layout = if storage == Storage::Oxford {
-        Layout::OXFORD
-    } else {
-        Layout::NCLT
+    let layout = match storage {
+        SweepStorage::Planar => Layout::OXFORD,
+        _ => Layout::NCLT,
     };
-    let files = ticks
-        .iter()
-        .map(|tick| points_dir.join(format!("{}.bin", tick.stem)));
-    let sweeps = Sweeps::of_single_vehicle(storage.of_sweeps(), files, options);
-    let joined = poses
-        .as_ref()
-        .map(|_| format!("{} poses by time", ticks.len()));
-    let source = Sequence {
-        points_dir,
-        pose_files: pose_files(dir),
-        world_from_lidar: poses.unwrap_or_default(),
-        sweeps,
-    };
-    let name = files::name_below(root, dir);
+    let join = (poses.as_ref()).map(|_| format!("{} poses by time", stamps.len()));
+    let poses = poses.unwrap_or_default();
+    let clouds = stamps.into_iter().map(|(micros, stem)| {
+        let file = points_dir.join(format!("{stem}.bin"));
+        let tick = Tick::new(stem, micros.saturating_mul(1000));
+        (tick, file, poses.get(&micros).copied())
+    });
+    let (name, clouds) = (files::name_below(root, dir), clouds.collect());
+    let files = pose_files(dir);
     Ok(Scenario {
-        joins: joined.into_iter().collect(),
-        ..single_vehicle(name, layout, ticks, Arc::new(source))
+        joins: join.into_iter().collect(),
+        ..sequence::scenario(name, layout, clouds, (storage, options), files, true)
     })
 }
 
 /// NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and time and more.
-fn storage(dir: &Path) -> Storage {
+fn storage(dir: &Path) -> SweepStorage {
     let is_nclt = dir.join(RAW).is_dir() || own_name(dir).len() == "2012-01-22".len();
     match (is_nclt, files::holds(&dir.join(CONVERTED), ".bin")) {
-        (true, true) => Storage::NcltConverted,
-        (true, false) => Storage::NcltRaw,
-        (false, _) => Storage::Oxford,
+        (true, true) => SweepStorage::ByName,
+        (true, false) => SweepStorage::NcltRaw,
+        (false, _) => SweepStorage::Planar,
     }
 }
 
@@ -186,53 +143,41 @@ fn storage(dir: &Path) -> Storage {
 /// up.
 fn poses(
     dir: &Path,
-    storage: Storage,
+    storage: SweepStorage,
     stamps: &BTreeMap<u64, String>,
     problems: &mut Vec<ReadError>,
 ) -> Result<Option<BTreeMap<u64, Pose>>> {
-    let Some((scene, mut poses)) = poses_as_stored(dir, storage, stamps, problems)? else {
+    let is_nclt = storage != SweepStorage::Planar;
+    let (aligned, plain) = (dir.join(ALIGNED_POSES), dir.join(PLAIN_POSES));
+    let (scene, mut poses) = if aligned.is_file() {
+        let poses = hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?;
+        ("QEOxford", poses)
+    } else if plain.is_file() {
+        let scene = if is_nclt { "NCLT" } else { "Oxford" };
+        (scene, hdf5_poses::read(&plain, RowOrder::Matrix, problems)?)
+    } else if is_nclt && let Some(path) = nclt_ground_truth::find(dir, &own_name(dir)) {
+        let truth = nclt_ground_truth::read(&path, problems)?;
+        let poses = (stamps.keys())
+            .filter_map(|&micros| Some((micros, Pose::from(truth.at(micros).ok()?))));
+        ("NCLT", poses.collect())
+    } else {
         return Ok(None);
     };
-    let middle = Isometry3::from(middle_m(dir, scene)?);
-    let turn = half_turn();
+    // The mean that LightLoc subtracts from all positions of a scene, in the axes of their file.
+    let middle = match middle_file(dir, scene) {
+        Some(path) => Isometry3::from(Translation3::from(first_row(&path)?)),
+        None => Isometry3::identity(),
+    };
+    // z down to z up: half a turn about x.
+    let turn = Isometry3::from_parts(
+        Vector3::zeros().into(),
+        UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
+    );
     for pose in poses.values_mut() {
         // The mean is in the axes of the file: it is subtracted before the turn.
         *pose = (turn * middle.inverse() * pose.isometry() * turn.inverse()).into();
     }
     Ok(Some(poses))
-}
-
-/// LightLoc's name of the scene, and the poses by microseconds in the axes of their file.
-type StoredPoses = (&'static str, BTreeMap<u64, Pose>);
-
-/// The poses of the best available file, as stored.
-fn poses_as_stored(
-    dir: &Path,
-    storage: Storage,
-    stamps: &BTreeMap<u64, String>,
-    problems: &mut Vec<ReadError>,
-) -> Result<Option<StoredPoses>> {
-    let is_nclt = storage != Storage::Oxford;
-    let aligned = dir.join(ALIGNED_POSES);
-    if aligned.is_file() {
-        let poses = hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?;
-        return Ok(Some(("QEOxford", poses)));
-    }
-    let plain = dir.join(PLAIN_POSES);
-    if plain.is_file() {
-        let scene = if is_nclt { "NCLT" } else { "Oxford" };
-        let poses = hdf5_poses::read(&plain, RowOrder::Matrix, problems)?;
-        return Ok(Some((scene, poses)));
-    }
-    let Some(path) = is_nclt
-        .then(|| nclt_ground_truth::find(dir, &own_name(dir)))
-        .flatten()
-    else {
-        return Ok(None);
-    };
-    let truth = GroundTruth::read(&path, problems)?;
-    let poses = (stamps.keys()).filter_map(|&micros| Some((micros, Pose::from(truth.at(micros)?))));
-    Ok(Some(("NCLT", poses.collect())))
 }
 
 /// File of the mean position of a scene's training sequences.
@@ -249,16 +194,6 @@ fn pose_files(dir: &Path) -> Vec<PathBuf> {
     files.extend(nclt_ground_truth::find(dir, &own_name(dir)));
     files.extend(SCENES.iter().filter_map(|scene| middle_file(dir, scene)));
     files
-}
-
-/// Mean that LightLoc subtracts from all positions of a scene, metres in the axes of the poses' file; zero without its
-/// file.
-fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>> {
-    let Some(path) = middle_file(dir, scene) else {
-        return Ok(Translation3::identity());
-    };
-    let [x, y, z] = first_row(&path)?;
-    Ok(Translation3::new(x, y, z))
 }
 
 /// The mean of positions: LightLoc writes three numbers, one a line; SGLoc, LiSA, DiffLoc and others a row of three,
@@ -285,46 +220,6 @@ fn own_name(dir: &Path) -> String {
         .ok()
         .and_then(|dir| Some(dir.file_name()?.to_string_lossy().into_owned()));
     name.unwrap_or_default()
-}
-
-/// z down to z up: half a turn about x.
-fn half_turn() -> Isometry3<f64> {
-    Isometry3::from_parts(
-        Vector3::zeros().into(),
-        UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
-    )
-}
-
-impl FrameSource for Sequence {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
-        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
-        frame.world_from_lidar = self
-            .world_from_lidar
-            .get(&(tick.capture_nanos / 1000))
-            .copied();
-        Ok(frame)
-    }
-
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
-        let mut cloud = self
-            .sweeps
-            .read(agent, &self.points_path(agent, tick, variant))?;
-        for [_, y, z, _] in &mut cloud.points.xyzi {
-            // The half turn of the poses, for the points: `C = diag(1, -1, -1)`.
-            (*y, *z) = (-*y, -*z);
-        }
-        Ok(cloud)
-    }
-
-    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        let mut files = self.sweeps.samples(agent);
-        files.extend_from_slice(&self.pose_files);
-        files
-    }
-
-    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
-        self.points_dir.join(format!("{}.bin", tick.stem))
-    }
 }
 
 #[cfg(test)]

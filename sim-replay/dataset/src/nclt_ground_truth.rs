@@ -22,13 +22,6 @@ const MAX_GAP_MICROS: u64 = 1_000_000;
 /// Names of the columns, for messages.
 const COLUMNS: [&str; 7] = ["utime", "x", "y", "z", "roll", "pitch", "heading"];
 
-/// The poses of one day, in the axes of the file.
-#[derive(Debug)]
-pub(super) struct GroundTruth {
-    /// `world_from_body` by microseconds.
-    poses: Trajectory,
-}
-
 /// The file that belongs to a sequence: `groundtruth_<day>.csv` in its folder or the one above, or in a folder
 /// `ground_truth` there.
 pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
@@ -39,37 +32,30 @@ pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
     places.find(|path| path.is_file())
 }
 
-impl GroundTruth {
-    /// Reads a file. Rows that cannot be read, or whose time is not between their neighbours', are left out and
-    /// reported.
-    pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Self> {
-        let text = files::read_text(path, MAX_BYTES)?;
-        Ok(Self::parse(path, &text, problems))
-    }
+/// Reads the poses of one day, `world_from_body` by microseconds in the axes of the file. Rows that cannot be read, or
+/// whose time is not between their neighbours', are left out and reported.
+pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Trajectory> {
+    let text = files::read_text(path, MAX_BYTES)?;
+    Ok(parse(path, &text, problems))
+}
 
-    fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Self {
-        let mut faults = Faults::default();
-        let mut rows = Vec::new();
-        for (number, record) in csv_file::records(text) {
-            let row = faults.take(row(path, number, &record)).flatten();
-            rows.extend(row.map(|(micros, pose)| (number, micros, pose)));
-        }
-        let timed = rows.iter().map(|(_, micros, pose)| (*micros, *pose));
-        let (poses, out_of_order) = Trajectory::new(timed.collect(), MAX_GAP_MICROS);
-        for index in out_of_order {
-            if let Some((number, micros, _)) = rows.get(index) {
-                let reason = format!("{micros} is not between the times around it");
-                faults.push(wrong(path, *number, 0, reason));
-            }
-        }
-        faults.report("row", problems);
-        Self { poses }
+fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Trajectory {
+    let mut faults = Faults::default();
+    let mut rows = Vec::new();
+    for (number, record) in csv_file::records(text) {
+        let row = faults.take(row(path, number, &record)).flatten();
+        rows.extend(row.map(|(micros, pose)| (number, micros, pose)));
     }
-
-    /// The pose at a time; `None` before the first, after the last and in gaps.
-    pub(super) fn at(&self, micros: u64) -> Option<Isometry3<f64>> {
-        self.poses.at(micros).ok()
+    let timed = rows.iter().map(|(_, micros, pose)| (*micros, *pose));
+    let (poses, out_of_order) = Trajectory::new(timed.collect(), MAX_GAP_MICROS);
+    for index in out_of_order {
+        if let Some((number, micros, _)) = rows.get(index) {
+            let reason = format!("{micros} is not between the times around it");
+            faults.push(wrong(path, *number, 0, reason));
+        }
     }
+    faults.report("row", problems);
+    poses
 }
 
 /// Time and pose of a row; `None` if it holds no pose.
@@ -110,14 +96,13 @@ mod tests {
 
     const T0: u64 = 1_326_652_795_000_000;
 
-    fn parse(text: &str) -> (GroundTruth, Vec<String>) {
+    fn parse(text: &str) -> (Trajectory, Vec<String>) {
         let mut problems = Vec::new();
-        let truth =
-            GroundTruth::parse(Path::new("groundtruth_2012-01-15.csv"), text, &mut problems);
+        let truth = super::parse(Path::new("groundtruth_2012-01-15.csv"), text, &mut problems);
         (truth, problems.iter().map(ToString::to_string).collect())
     }
 
-    fn sound(text: &str) -> GroundTruth {
+    fn sound(text: &str) -> Trajectory {
         let (truth, problems) = parse(text);
         assert!(problems.is_empty(), "{problems:?}");
         truth
@@ -131,7 +116,7 @@ mod tests {
             (T0 + 100_000) as f64
         );
         let truth = sound(&text);
-        assert_eq!(truth.at(T0 - 5_000), None);
+        assert_eq!(truth.at(T0 - 5_000).ok(), None);
         assert_eq!(
             truth.at(T0).unwrap().translation.vector.as_slice(),
             [10.0, 20.0, -1.0]
@@ -143,7 +128,7 @@ mod tests {
         // The shorter rotation, through pi.
         let (_, _, heading) = truth.at(T0 + 50_000).unwrap().rotation.euler_angles();
         assert!(heading.abs() > 3.13, "{heading}");
-        assert_eq!(truth.at(T0 + 100_001), None);
+        assert_eq!(truth.at(T0 + 100_001).ok(), None);
     }
 
     #[test]
@@ -165,8 +150,8 @@ mod tests {
             "{T0},0,0,0,0,0,0\n{},9,0,0,0,0,0\n",
             T0 + 1_000_001
         ));
-        assert_eq!(truth.at(T0 + 500_000), None);
-        assert!(truth.at(T0 + 1_000_001).is_some());
+        assert_eq!(truth.at(T0 + 500_000).ok(), None);
+        assert!(truth.at(T0 + 1_000_001).is_ok());
     }
 
     #[test]
@@ -203,11 +188,11 @@ mod tests {
             );
             // Of two rows of one time the first may be left out.
             assert_eq!(truth.at(T0 + 20).unwrap().translation.vector.x, 3.0);
-            assert_eq!(truth.poses.len(), 3);
+            assert_eq!(truth.len(), 3);
         }
         let (_, problems) = parse("a\nb\n1,2,3,4,5,6,7\n");
         let expected = "groundtruth_2012-01-15.csv:1: 1 columns, expected 7: 2 rows are left out, this is the first";
         assert_eq!(problems, [expected]);
-        assert!(sound("").at(0).is_none());
+        assert!(sound("").at(0).is_err());
     }
 }

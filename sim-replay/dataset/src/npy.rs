@@ -31,13 +31,17 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let (header, body) = split(bytes)?;
     let descr = entry(header, "descr").ok_or("no entry descr")?;
     let shape = shape_of(header)?;
-    let columns = match descr.strip_prefix('[') {
-        Some(fields) => named(fields, &shape)?,
-        None => numbered(number_of(descr)?, &shape, is_fortran(header))?,
-    };
-    let size_of_one = match descr.strip_prefix('[') {
-        Some(fields) => size_of(&fields_of(fields)?),
-        None => number_of(descr)?.size,
+    let (columns, size_of_one) = match descr.strip_prefix('[') {
+        Some(fields) => {
+            let columns = named(fields, &shape)?;
+            let size = columns.step;
+            (columns, size)
+        }
+        None => {
+            let number = number_of(descr)?;
+            let columns = numbered(number, &shape, is_fortran(header))?;
+            (columns, number.size)
+        }
     };
     let (stated, found) = (product(size_of_one, &shape), body.len());
     // Before anything is allocated by the shape. No product means that the shape overflows.

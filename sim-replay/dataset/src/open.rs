@@ -40,10 +40,10 @@ fn check_file_system(dir: &Path) -> Result<()> {
     let canonical = dir.canonicalize().unwrap_or_default();
     let mut kernels = KERNEL_FOLDERS.iter();
     match kernels.any(|kernel| canonical.starts_with(kernel)) {
-        true => Err(ReadError::Layout {
-            path: dir.to_owned(),
-            reason: "no data set: a folder of the kernel".to_owned(),
-        }),
+        true => Err(ReadError::layout(
+            dir,
+            "no data set: a folder of the kernel",
+        )),
         false => Ok(()),
     }
 }
@@ -115,10 +115,7 @@ fn unknown(dir: &Path) -> ReadError {
             layouts.trim_end()
         )
     };
-    ReadError::Layout {
-        path: dir.to_owned(),
-        reason,
-    }
+    ReadError::layout(dir, reason)
 }
 
 fn has_below(dir: &Path, path: &str) -> bool {

@@ -12,7 +12,7 @@ use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
-use super::{CameraImages, FrameSource, Problem, Result, Tick, camera_files, points};
+use super::{FrameSource, Problem, Result, Tick, camera_files, points};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
@@ -27,16 +27,22 @@ pub(super) struct Opv2v {
 
 impl FrameSource for Opv2v {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, self.handedness);
         if self.folder.without_yaml.contains(agent) {
-            return Ok(Frame::empty(
-                agent.clone(),
-                tick.capture_nanos,
-                self.handedness,
-            ));
+            return Ok(frame);
         }
         let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        self.frame_without_points(agent, tick, Field::root(&path, &node))
+        let root = Field::root(&path, &node);
+        // A faulty LiDAR pose is an error of the frame: all else in it is relative to it.
+        if let Some(field) = root.optional("lidar_pose")? {
+            frame.world_from_lidar = Some(self.six_numbers(&field)?);
+        }
+        let mut annotations = Annotations::new(root);
+        annotations.add_vehicle(&mut frame, |field| self.six_numbers(field));
+        frame.objects = annotations.objects(|id, _| Ok(id), |place| self.world_from(place));
+        frame.problems = annotations.into_problems();
+        Ok(frame)
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
@@ -50,22 +56,16 @@ impl FrameSource for Opv2v {
             .map(|cloud| self.right_handed(cloud))
     }
 
-    fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8]) -> CameraImages {
+    fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8], frame: &mut Frame) {
         if self.folder.without_yaml.contains(agent) {
-            return CameraImages::default();
+            return;
         }
         let path = self.folder.yaml(agent, &tick.stem);
         let node = match yaml::read(&path) {
             Ok(node) => node,
-            Err(error) => {
-                return CameraImages {
-                    problems: vec![Problem::from(&error)],
-                    ..CameraImages::default()
-                };
-            }
+            Err(error) => return frame.problems.push(Problem::from(&error)),
         };
         let (root, dir) = (Field::root(&path, &node), self.folder.agent_dir(agent));
-        let mut found = CameraImages::default();
         // An agent may have fewer cameras than others.
         let own = self.folder.cameras.get(agent);
         for &number in numbers
@@ -75,15 +75,12 @@ impl FrameSource for Opv2v {
             let camera = camera_files::find(&dir, &tick.stem, number).and_then(|file| {
                 camera_files::read(&file, number, &root, &|field| self.six_numbers(field))
             });
-            found.add(number, camera);
+            frame.add_camera(number, camera);
         }
-        found
     }
 
     fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        let mut files = self.sweeps.samples(agent);
-        files.push(self.folder.tick_length());
-        files
+        self.sweeps.samples(agent, [self.folder.tick_length()])
     }
 
     fn frame_files(&self, agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
@@ -99,31 +96,6 @@ impl FrameSource for Opv2v {
 }
 
 impl Opv2v {
-    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame> {
-        // A faulty LiDAR pose is an error of the frame: all else in it is relative to it.
-        let world_from_lidar = root
-            .optional("lidar_pose")?
-            .map(|field| self.six_numbers(&field))
-            .transpose()?;
-        let mut annotations = Annotations::new(root);
-        let motion = annotations.motion(self.handedness);
-        Ok(Frame {
-            world_from_lidar,
-            world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], |field| {
-                self.six_numbers(field)
-            }),
-            gnss_world_from_vehicle: annotations
-                .optional(&["predicted_ego_pos", "predicted_ego_pose"], |field| {
-                    self.six_numbers(field)
-                }),
-            speed_mps: motion.speed_mps,
-            yaw_rate_rad_s: motion.yaw_rate_rad_s,
-            objects: annotations.objects(|id, _| Ok(id), |place| self.world_from(place)),
-            problems: annotations.into_problems(),
-            ..Frame::empty(agent.clone(), tick.capture_nanos, self.handedness)
-        })
-    }
-
     /// x, y, z, roll, yaw, pitch in metres and degrees.
     fn six_numbers(&self, field: &Field<'_>) -> Result<Pose> {
         match WrittenPose::read(field)? {

@@ -10,11 +10,10 @@ use super::agent_folders::{self, ScenarioFolder};
 use super::layout::{LayoutRow, Reader, opened};
 use super::options::OpenOptions;
 use super::opv2v::Opv2v;
-use super::presence::AbsentFrames;
 use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
-use super::{Dataset, FrameSource, Layout, ReadError, Result, Scenario, Tick, files};
+use super::{Dataset, FrameSource, Layout, ReadError, Result, Scenario, files};
 
 /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
 pub(crate) static OPV2V: LayoutRow = LayoutRow {
@@ -90,12 +89,6 @@ fn agent_folder_scenario(
     };
     let moments = folder.ticks(options.period_nanos, problems);
     let (agents, missing) = (folder.agents.clone(), folder.missing.clone());
-    let ticks = moments.iter().filter(|tick| {
-        let mut of_tick = missing.iter().filter(|frame| frame.stem == tick.stem);
-        !of_tick.any(|frame| Some(&frame.agent) == agents.first())
-    });
-    let ticks: Vec<Tick> = ticks.cloned().collect();
-    let absent_at = AbsentFrames::new(&agents, &ticks, &missing).among(moments);
     let name = files::name_below(root, &folder.dir);
     let (lidar_variants, has_radar) = (folder.variants.clone(), folder.has_radar);
     let (cameras, source): (_, Arc<dyn FrameSource>) = match layout == Layout::V2V4REAL {
@@ -111,14 +104,13 @@ fn agent_folder_scenario(
         }
     };
     Scenario {
-        absent_at,
-        missing,
         lidar_variants,
         has_radar,
         cameras: cameras.into_iter().collect(),
         source_handedness: handedness,
-        ..Scenario::new(name, layout, agents, ticks, source)
+        ..Scenario::new(name, layout, agents, Vec::new(), source)
     }
+    .among(moments, missing)
 }
 
 /// The layout by the shape of the first pose that can be read, and then by the kind of sweeps. Frames with another

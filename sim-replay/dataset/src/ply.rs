@@ -104,7 +104,7 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     for (number, line) in (1..).zip(text.lines()) {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match *words {
-            ["format", name, _] => storage = Some((name.to_owned(), number)),
+            ["format", name, _] => storage = Some(name),
             ["element", name, count] => {
                 let count = count
                     .parse()
@@ -136,7 +136,7 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
             _ => {}
         }
     }
-    let storage = match storage.as_ref().map(|(name, _)| name.as_str()) {
+    let storage = match storage {
         Some("ascii") => Storage::Ascii,
         Some("binary_little_endian") => Storage::LittleEndian,
         Some("binary_big_endian") => Storage::BigEndian,

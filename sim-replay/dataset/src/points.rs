@@ -92,10 +92,15 @@ impl Sweeps {
         Self::new(storage, options).with_agent(super::single_vehicle_id(), files)
     }
 
-    /// Files of an agent that may determine how its others are read.
-    pub(super) fn samples(&self, agent: &CavId) -> Vec<PathBuf> {
-        let agent = self.agents.get(agent);
-        agent.map_or_else(Vec::new, |agent| agent.files.clone())
+    /// Files of an agent that may determine how its others are read, and `others` that its frames are read from.
+    pub(super) fn samples(
+        &self,
+        agent: &CavId,
+        others: impl IntoIterator<Item = PathBuf>,
+    ) -> Vec<PathBuf> {
+        let own = self.agents.get(agent).into_iter();
+        let own = own.flat_map(|agent| agent.files.iter().cloned());
+        own.chain(others).collect()
     }
 
     /// Reads a sweep of an agent: plain or a variant, in the frame and handedness of the file, intensities 0 to 1.

@@ -1,9 +1,35 @@
-//! Check that a scenario has poses, for operations that need them.
+//! Poses in the numbers of files, and the check that a scenario has poses, for operations that need them.
+
+use nalgebra::{Isometry3, Matrix4, Quaternion};
+use protocol::{InvalidPose, Pose};
 
 use super::{LoadOptions, Scenario};
 
+/// Largest deviation of a quaternion's length from 1: tf2's own.
+const UNIT_TOLERANCE: f64 = 0.01;
 /// Frames that are tried, since the first of them may be damaged.
 const FRAMES_TO_TRY: usize = 10;
+
+/// The pose of a 3x4 matrix, row by row.
+pub(super) fn of_rows(rows: &[f64; 12]) -> Result<Pose, InvalidPose> {
+    let rows = [&rows[..], &[0.0, 0.0, 0.0, 1.0]].concat();
+    Pose::from_matrix(&Matrix4::from_row_slice(&rows))
+}
+
+/// The rigid transform of a pose whose quaternion may be rounded.
+pub(super) fn of_rounded(pose: &Pose) -> Result<Isometry3<f64>, String> {
+    let [w, x, y, z] = pose.rotation_wxyz;
+    let length = Quaternion::new(w, x, y, z).norm();
+    let is_unit = (length - 1.0).abs() < UNIT_TOLERANCE;
+    if !is_unit {
+        return Err(format!("quaternion of length {length:.3}, expected 1"));
+    }
+    let isometry = pose.isometry();
+    let checked = Pose::from(isometry).validate();
+    checked
+        .map(|()| isometry)
+        .map_err(|error| error.to_string())
+}
 
 impl Scenario {
     /// True if the recording gives the pose of an agent's LiDAR, according to the first readable frame from `tick` on.

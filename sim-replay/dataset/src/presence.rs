@@ -20,16 +20,9 @@ pub(super) struct AbsentFrames {
 impl AbsentFrames {
     /// The missing frames of `agents` at `ticks`; other missing frames are ignored.
     pub(super) fn new(agents: &[CavId], ticks: &[Tick], missing: &[MissingFrame]) -> Self {
-        let agents: HashMap<&CavId, usize> = agents
-            .iter()
-            .enumerate()
-            .map(|(index, agent)| (agent, index))
-            .collect();
-        let ticks: HashMap<&str, usize> = ticks
-            .iter()
-            .enumerate()
-            .map(|(index, tick)| (tick.stem.as_str(), index))
-            .collect();
+        let agents: HashMap<&CavId, usize> = agents.iter().zip(0..).collect();
+        let stems = ticks.iter().map(|tick| tick.stem.as_str());
+        let ticks: HashMap<&str, usize> = stems.zip(0..).collect();
         let pairs = missing.iter().filter_map(|frame| {
             Some((*agents.get(&frame.agent)?, *ticks.get(frame.stem.as_str())?))
         });
@@ -38,12 +31,16 @@ impl AbsentFrames {
             moments: None,
         }
     }
+}
 
-    /// The same with further capture times of other agents; `moments` are all of them.
-    pub(super) fn among(mut self, moments: Vec<Tick>) -> Self {
-        self.moments = Some(Arc::new(moments));
-        self
-    }
+/// The moments at which the first of `agents`, the ego, has a frame.
+fn ticks_of_ego(moments: &[Tick], agents: &[CavId], missing: &[MissingFrame]) -> Vec<Tick> {
+    let lacking: HashSet<&str> = (missing.iter())
+        .filter(|frame| Some(&frame.agent) == agents.first())
+        .map(|frame| frame.stem.as_str())
+        .collect();
+    let ticks = (moments.iter()).filter(|tick| !lacking.contains(tick.stem.as_str()));
+    ticks.cloned().collect()
 }
 
 /// The frames of one tick that could be read.
@@ -59,6 +56,22 @@ pub struct LoadedTick {
 }
 
 impl Scenario {
+    /// The scenario with the capture times at which any agent has a frame, and the frames that some of them lack: its
+    /// ticks are those of the ego.
+    pub(super) fn among(self, moments: Vec<Tick>, missing: Vec<MissingFrame>) -> Self {
+        let ticks = ticks_of_ego(&moments, &self.agents, &missing);
+        let absent_at = AbsentFrames {
+            moments: Some(Arc::new(moments)),
+            ..AbsentFrames::new(&self.agents, &ticks, &missing)
+        };
+        Self {
+            ticks,
+            missing,
+            absent_at,
+            ..self
+        }
+    }
+
     /// True if an agent has a frame at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
     pub fn is_present(&self, agent_index: usize, tick_index: usize) -> bool {
         !self.absent_at.pairs.contains(&(agent_index, tick_index))
@@ -78,24 +91,15 @@ impl Scenario {
             .collect();
         let missing = (self.missing.iter()).filter(|frame| agents.contains(&frame.agent));
         let missing: Vec<MissingFrame> = missing.cloned().collect();
-        let lacking: HashSet<&str> = (missing.iter())
-            .filter(|frame| Some(&frame.agent) == agents.first())
-            .map(|frame| frame.stem.as_str())
-            .collect();
         // Not only the present ticks: the new ego may have frames where the old one has none.
         let moments = self.absent_at.moments.as_deref().unwrap_or(&self.ticks);
-        let ticks = (moments.iter()).filter(|tick| !lacking.contains(tick.stem.as_str()));
-        let ticks: Vec<Tick> = ticks.cloned().collect();
+        let ticks = ticks_of_ego(moments, &agents, &missing);
         let absent_at = AbsentFrames {
             moments: self.absent_at.moments.clone(),
             ..AbsentFrames::new(&agents, &ticks, &missing)
         };
-        let roadside_units = self
-            .roadside_units
-            .iter()
-            .filter(|unit| agents.contains(unit))
-            .cloned()
-            .collect();
+        let units = (self.roadside_units.iter()).filter(|unit| agents.contains(unit));
+        let roadside_units = units.cloned().collect();
         Self {
             agents,
             ticks,
@@ -108,11 +112,8 @@ impl Scenario {
 
     /// Number of missing frames of agents other than the ego at its ticks.
     pub fn absent_frames(&self) -> usize {
-        self.absent_at
-            .pairs
-            .iter()
-            .filter(|(_, tick)| *tick < self.ticks.len())
-            .count()
+        let pairs = self.absent_at.pairs.iter();
+        pairs.filter(|(_, tick)| *tick < self.ticks.len()).count()
     }
 
     /// Reads the frames of `agents` (indices) at a tick, of those present and readable.

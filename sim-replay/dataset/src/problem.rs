@@ -20,20 +20,29 @@ pub struct Problem {
     pub message: String,
 }
 
+impl Problem {
+    /// A finding about a field of data as a whole; the message begins with their path.
+    pub(crate) fn about(path: &str, field: &str, reason: &str) -> Self {
+        Self {
+            path: path.to_owned(),
+            line: None,
+            field: Some(field.to_owned()),
+            message: format!("{path}: {reason}"),
+        }
+    }
+}
+
 /// Largest number of faults that one error lists.
 const LISTED: usize = 5;
 
 /// The first faults as one text, and the number of the others.
 pub(crate) fn listed<P: Display>(problems: impl IntoIterator<Item = P>) -> String {
     let mut problems = problems.into_iter();
-    let first: Vec<String> = problems
-        .by_ref()
-        .take(LISTED)
-        .map(|one| one.to_string())
-        .collect();
+    let first = problems.by_ref().take(LISTED).map(|one| one.to_string());
+    let first = first.collect::<Vec<_>>().join("; ");
     match problems.count() {
-        0 => first.join("; "),
-        more => format!("{}; and {more} more", first.join("; ")),
+        0 => first,
+        more => format!("{first}; and {more} more"),
     }
 }
 

@@ -12,8 +12,7 @@ use protocol::{
 use super::layout::{LayoutRow, Reader};
 use super::presence::AbsentFrames;
 use super::{
-    CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result,
-    Scenario, Tick,
+    Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
 };
 use crate::frame::{Frame, Object};
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
@@ -56,13 +55,11 @@ fn open_given(path: &Path, _: &OpenOptions) -> Result<Option<Dataset>> {
 
 /// Opens a recording as a data set of one scenario. A truncated end is reported in [`Dataset::problems`].
 fn open(file: &Path, recording: Recording) -> Result<Dataset> {
-    let mut problems = Vec::new();
-    for damage in recording.damage() {
-        problems.push(ReadError::malformed(file, damage.to_string()));
-    }
-    let name = file.file_stem().map_or("recording".into(), |stem| {
-        stem.to_string_lossy().into_owned()
-    });
+    let damage = recording.damage().iter().map(ToString::to_string);
+    let damage = damage.map(|damage| ReadError::malformed(file, damage));
+    let mut problems: Vec<ReadError> = damage.collect();
+    let name = file.file_stem().unwrap_or("recording".as_ref());
+    let name = name.to_string_lossy().into_owned();
     let source = Recorded::new(recording, &mut problems)?;
     let agents = source.agents.clone();
     let (ticks, missing) = source.ticks();
@@ -191,13 +188,10 @@ impl Recorded {
 
     /// Numbers of the cameras that have images.
     fn cameras(&self) -> Vec<u8> {
-        let numbers = self
-            .sensors
-            .keys()
-            .filter_map(|(_, _, stream)| match stream {
-                Stream::Camera(number) => Some(*number),
-                _ => None,
-            });
+        let numbers = (self.sensors.keys()).filter_map(|(_, _, stream)| match stream {
+            Stream::Camera(number) => Some(*number),
+            _ => None,
+        });
         numbers.collect::<BTreeSet<u8>>().into_iter().collect()
     }
 
@@ -258,15 +252,13 @@ impl FrameSource for Recorded {
         })
     }
 
-    fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8]) -> CameraImages {
-        let mut found = CameraImages::default();
+    fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8], frame: &mut Frame) {
         for &number in numbers {
             let stream = Stream::Camera(number);
             if self.has(agent, tick.capture_nanos, stream) {
-                found.add(number, self.sensor(agent, tick, stream));
+                frame.add_camera(number, self.sensor(agent, tick, stream));
             }
         }
-        found
     }
 
     /// None besides that of the sweeps.

@@ -29,11 +29,8 @@ struct Speeds {
 /// Compares all agents. The recorded motion of an agent whose poses contradict it is not used from here on, and a
 /// problem of the data set names both speeds.
 pub(super) fn check(dataset: &mut Dataset) {
-    let problems: Vec<ReadError> = dataset
-        .scenarios
-        .par_iter_mut()
-        .flat_map_iter(check_scenario)
-        .collect();
+    let scenarios = dataset.scenarios.par_iter_mut();
+    let problems: Vec<ReadError> = scenarios.flat_map_iter(check_scenario).collect();
     dataset.problems.extend(problems);
 }
 
@@ -60,18 +57,15 @@ fn check_scenario(scenario: &mut Scenario) -> Vec<ReadError> {
 
 /// Medians of the speeds that disagree, if those are most of the stretches in which the agent moves.
 fn contradiction(stretches: &[Speeds]) -> Option<Speeds> {
-    let moving: Vec<Speeds> = stretches
-        .iter()
-        .filter(|speeds| speeds.recorded.max(speeds.of_poses) >= LEAST_MPS)
-        .copied()
-        .collect();
-    let (recorded, of_poses): (Vec<f64>, Vec<f64>) = moving
-        .iter()
+    let moving =
+        (stretches.iter()).filter(|speeds| speeds.recorded.max(speeds.of_poses) >= LEAST_MPS);
+    let (recorded, of_poses): (Vec<f64>, Vec<f64>) = (moving.clone())
         .filter(|speeds| !speeds.agree())
         .map(|speeds| (speeds.recorded, speeds.of_poses))
         .unzip();
     // A quarter of all stretches as well: an agent that hardly moves is not judged by a single one.
-    (2 * recorded.len() > moving.len() && 4 * recorded.len() >= stretches.len()).then_some(Speeds {
+    let is_most = 2 * recorded.len() > moving.count() && 4 * recorded.len() >= stretches.len();
+    is_most.then_some(Speeds {
         recorded: statistics::median(&recorded)?,
         of_poses: statistics::median(&of_poses)?,
     })

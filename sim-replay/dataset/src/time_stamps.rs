@@ -1,5 +1,7 @@
 //! Time stamps in tables: microseconds, unless the numbers of a file show another unit.
 
+use support::rounding;
+
 /// Above this, stamps count nanoseconds: as microseconds they would be beyond the year 5000.
 const LEAST_NANOS: f64 = 1e17;
 /// Stamps with fractions below this count milliseconds: as microseconds they would be before 1974.
@@ -24,13 +26,8 @@ pub(super) fn micros_per_unit(stamps: impl IntoIterator<Item = f64>) -> f64 {
 }
 
 /// A stamp from 0 as whole microseconds.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "from 0, and larger ones saturate"
-)]
 pub(super) fn micros(stamp: f64, micros_per_unit: f64) -> u64 {
-    (stamp * micros_per_unit).round() as u64
+    rounding::to_u64(stamp * micros_per_unit)
 }
 
 #[cfg(test)]

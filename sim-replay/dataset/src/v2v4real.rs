@@ -28,9 +28,25 @@ pub(super) struct V2v4Real {
 
 impl FrameSource for V2v4Real {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        self.frame_without_points(agent, tick, Field::root(&path, &node))
+        let root = Field::root(&path, &node);
+        let world_from_lidar = lidar_pose(&root.required("lidar_pose")?)?;
+        frame.world_from_lidar = Some(world_from_lidar);
+        let mut annotations = Annotations::new(root);
+        frame.objects = annotations.objects(
+            |id, field| self.associated_id(agent, id, field),
+            |place| {
+                let lidar_from_object = Pose::from_matrix(&place.left_handed_matrix())?;
+                let pose: Pose =
+                    (world_from_lidar.isometry() * lidar_from_object.isometry()).into();
+                pose.validate().map(|()| pose)
+            },
+        );
+        annotations.add_vehicle(&mut frame, pose);
+        frame.problems = annotations.into_problems();
+        Ok(frame)
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
@@ -39,9 +55,7 @@ impl FrameSource for V2v4Real {
     }
 
     fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        let mut files = self.sweeps.samples(agent);
-        files.push(self.folder.tick_length());
-        files
+        self.sweeps.samples(agent, [self.folder.tick_length()])
     }
 
     fn frame_files(&self, agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
@@ -54,39 +68,10 @@ impl FrameSource for V2v4Real {
 }
 
 impl V2v4Real {
-    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame> {
-        let world_from_lidar = lidar_pose(&root.required("lidar_pose")?)?;
-        let mut annotations = Annotations::new(root);
-        let objects = annotations.objects(
-            |id, field| self.associated_id(agent, id, field),
-            |place| {
-                let lidar_from_object = Pose::from_matrix(&place.left_handed_matrix())?;
-                let pose: Pose =
-                    (world_from_lidar.isometry() * lidar_from_object.isometry()).into();
-                pose.validate().map(|()| pose)
-            },
-        );
-        let motion = annotations.motion(Handedness::Right);
-        Ok(Frame {
-            world_from_lidar: Some(world_from_lidar),
-            world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
-            gnss_world_from_vehicle: annotations
-                .optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
-            speed_mps: motion.speed_mps,
-            yaw_rate_rad_s: motion.yaw_rate_rad_s,
-            objects,
-            problems: annotations.into_problems(),
-            ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right)
-        })
-    }
-
     /// `ass_id` is the id that both agents share; -1 means that only this agent has the object.
     fn associated_id(&self, agent: &CavId, listed_id: i64, field: &Field<'_>) -> Result<i64> {
-        match field
-            .optional("ass_id")?
-            .map(|id| id.integer())
-            .transpose()?
-        {
+        let associated = field.optional("ass_id")?;
+        match associated.map(|id| id.integer()).transpose()? {
             None => Ok(listed_id),
             Some(-1) => {
                 // Agents with names count by their index.

@@ -80,10 +80,8 @@ impl Capacity {
             Self::Unlimited => 0,
             Self::Constant(rate) => u128::from(*rate) * u128::from(nanos),
             Self::Steps(steps) => {
-                let index = steps
-                    .partition_point(|(step, _)| step.from_nanos <= nanos)
-                    .saturating_sub(1);
-                let Some((step, before)) = steps.get(index) else {
+                let after = steps.partition_point(|(step, _)| step.from_nanos <= nanos);
+                let Some((step, before)) = steps.get(after.saturating_sub(1)) else {
                     return 0;
                 };
                 before + u128::from(step.bits_per_s) * u128::from(nanos - step.from_nanos)
@@ -110,10 +108,8 @@ impl Capacity {
             // Rounded up: before the last nanosecond has passed, the last bit is not sent.
             Self::Constant(rate) => u64::try_from(wanted.div_ceil(u128::from(*rate))).ok(),
             Self::Steps(steps) => {
-                let index = steps
-                    .partition_point(|(_, before)| *before < wanted)
-                    .saturating_sub(1);
-                let (step, before) = steps.get(index)?;
+                let after = steps.partition_point(|(_, before)| *before < wanted);
+                let (step, before) = steps.get(after.saturating_sub(1))?;
                 let left = wanted.saturating_sub(*before);
                 if left == 0 {
                     return Some(step.from_nanos);
@@ -129,10 +125,8 @@ impl Capacity {
                 let count = wanted.div_ceil(work(OPPORTUNITY_BYTES)).max(1) - 1;
                 let (rounds, place) = (count / times.len() as u128, count % times.len() as u128);
                 let (period, time) = (times.last()?, times.get(usize::try_from(place).ok()?)?);
-                u64::try_from(rounds)
-                    .ok()?
-                    .checked_mul(*period)?
-                    .checked_add(*time)
+                let began = u64::try_from(rounds).ok()?.checked_mul(*period)?;
+                began.checked_add(*time)
             }
             Self::Later {
                 all,

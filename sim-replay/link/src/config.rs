@@ -323,13 +323,9 @@ impl LinkConfig {
                 }
             }
         }
-        if let Some(ReorderConfig {
-            probability: share,
-            extra_ms,
-        }) = self.reorder
-        {
-            probability("reorder.probability", share)?;
-            time("reorder.extra_ms", extra_ms)?;
+        if let Some(reorder) = self.reorder {
+            probability("reorder.probability", reorder.probability)?;
+            time("reorder.extra_ms", reorder.extra_ms)?;
         }
         probability("duplicate", self.duplicate)?;
         if let Some(trace) = self.capacity.trace() {

@@ -46,9 +46,8 @@ impl DeviceClock {
     )]
     fn ahead_nanos(&self, since_nanos: u64) -> i128 {
         // The step is at a time of the scene, not of the clock, which would reach it twice after a step back.
-        let set = self
-            .step
-            .filter(|step| since_nanos as f64 >= step.at_s * 1e9);
+        let step = self.step.as_ref();
+        let set = step.filter(|step| since_nanos as f64 >= step.at_s * 1e9);
         let offset_ms = self.offset_ms + set.map_or(0.0, |step| step.by_ms);
         (offset_ms * 1e6 + self.drift_ppm * 1e-6 * since_nanos as f64).round() as i128
     }

@@ -114,10 +114,8 @@ impl LinkEmulator {
         };
         let mut left = Vec::new();
         let rules = rules(&self.config, &self.capacity);
-        self.lines
-            .entry(key)
-            .or_default()
-            .submit(packet, &rules, &mut left);
+        let line = self.lines.entry(key).or_default();
+        line.submit(packet, &rules, &mut left);
         left.into_iter().for_each(|left| self.settle(left));
         // An unlimited link without delay delivers at once, and a full queue drops at once.
         self.collect(self.now_nanos);
@@ -132,10 +130,8 @@ impl LinkEmulator {
     /// Time of the next outcome; `None` if nothing is in flight.
     pub fn next_nanos(&self) -> Option<u64> {
         let rules = rules(&self.config, &self.capacity);
-        let sent = self
-            .lines
-            .values()
-            .filter_map(|line| line.next_nanos(&rules));
+        let lines = self.lines.values();
+        let sent = lines.filter_map(|line| line.next_nanos(&rules));
         // Outcomes that were collected but not fetched yet come before everything in flight.
         let known = self.outcomes.first().map(|outcome| outcome.nanos);
         let ahead = self.under_way.keys().next().map(|(nanos, _)| *nanos);
@@ -146,14 +142,10 @@ impl LinkEmulator {
     fn run(&mut self, until_nanos: u64) {
         loop {
             let rules = rules(&self.config, &self.capacity);
-            let next = self
-                .lines
-                .iter_mut()
-                .filter_map(|(_, line)| Some((line.next_nanos(&rules)?, line)));
-            let Some((nanos, line)) = next
-                .min_by_key(|(nanos, _)| *nanos)
-                .filter(|(nanos, _)| *nanos <= until_nanos)
-            else {
+            let lines = self.lines.values_mut();
+            let next = lines.filter_map(|line| Some((line.next_nanos(&rules)?, line)));
+            let next = next.min_by_key(|(nanos, _)| *nanos);
+            let Some((nanos, line)) = next.filter(|(nanos, _)| *nanos <= until_nanos) else {
                 break;
             };
             let mut left = Vec::new();
@@ -189,18 +181,13 @@ impl LinkEmulator {
     }
 
     fn propagate(&mut self, packet: Packet, start_nanos: u64, end_nanos: u64) {
-        let Self {
-            config,
-            trace,
-            seed,
-            directions,
-            ..
-        } = self;
+        let (config, trace) = (&self.config, self.trace.as_ref());
         // By direction even on a shared medium: losses and order concern one pair of vehicles.
-        let direction = directions
+        let direction = self
+            .directions
             .entry((packet.from.clone(), packet.to.clone()))
             .or_insert_with(|| Direction {
-                chance: Chance::new(*seed, &packet.from, &packet.to),
+                chance: Chance::new(self.seed, &packet.from, &packet.to),
                 loss: LossState::default(),
                 latest_nanos: BTreeMap::new(),
             });
@@ -212,19 +199,15 @@ impl LinkEmulator {
             sent_nanos: end_nanos,
         };
         // Drawn for every sent message, also during an outage: the Markov chain takes one step for each.
-        let is_lost = direction.loss.loses(
-            &config.loss,
-            config.loss_unit,
-            &message,
-            trace.as_ref(),
-            &mut chance.of(Purpose::Loss, stream, packet.sequence),
-        );
+        let random = &mut chance.of(Purpose::Loss, stream, packet.sequence);
+        let (law, loss) = (&config.loss, &mut direction.loss);
+        let is_lost = loss.loses(law, config.loss_unit, &message, trace, random);
         if is_lost || config.is_cut(start_nanos, end_nanos) {
             self.schedule(end_nanos, packet, Delivery::Dropped(DropReason::LinkLoss));
             return;
         }
         let mut delay = chance.of(Purpose::Delay, stream, packet.sequence);
-        let delay_nanos = config.latency.draw(&mut delay, trace.as_ref(), &message);
+        let delay_nanos = config.latency.draw(&mut delay, trace, &message);
         let exact_nanos = end_nanos.saturating_add(delay_nanos);
         // No packet arrives before its last bit was sent, also with rounding.
         let arrival_nanos = config.floored(packet.submitted_nanos, exact_nanos);
@@ -250,7 +233,7 @@ impl LinkEmulator {
         // The delay of the copy has a stream of its own too, so that it differs from the first delay.
         let is_repeated = config.duplicate > 0.0 && twice.chance(config.duplicate);
         let copy_nanos = is_repeated.then(|| {
-            let again_nanos = config.latency.draw(&mut twice, trace.as_ref(), &message);
+            let again_nanos = config.latency.draw(&mut twice, trace, &message);
             let exact_nanos = exact_nanos.saturating_add(again_nanos);
             arrival_nanos.max(config.floored(packet.submitted_nanos, exact_nanos))
         });

@@ -65,14 +65,11 @@ impl LossState {
 
 /// Linear interpolation through `points` at `x`, constant beyond both ends; 0 without points.
 fn interpolate(points: &[[f64; 2]], x: f64) -> f64 {
-    let after = points.partition_point(|point| point[0] <= x);
-    match (
-        after.checked_sub(1).and_then(|before| points.get(before)),
-        points.get(after),
-    ) {
-        (None, None) => 0.0,
-        (None, Some(&[_, y])) | (Some(&[_, y]), None) => y,
-        (Some(&[x0, y0]), Some(&[x1, y1])) => y0 + (y1 - y0) * (x - x0) / (x1 - x0),
+    let (before, after) = points.split_at(points.partition_point(|point| point[0] <= x));
+    match (before, after) {
+        ([], []) => 0.0,
+        ([], [[_, y], ..]) | ([.., [_, y]], []) => *y,
+        ([.., [x0, y0]], [[x1, y1], ..]) => y0 + (y1 - y0) * (x - x0) / (x1 - x0),
     }
 }
 

@@ -101,18 +101,14 @@ impl QueueServer {
 
     /// Advances to `nanos`; the packets sent by then are added to `left`, in that order.
     pub(super) fn advance(&mut self, nanos: u64, rules: &Rules<'_>, left: &mut Vec<Departure>) {
-        while let Some((end_nanos, is_urgent)) = self
-            .next(rules)
-            .filter(|(end_nanos, _)| *end_nanos <= nanos)
+        while let Some((end_nanos, is_urgent)) = self.next(rules)
+            && end_nanos <= nanos
         {
-            let sent = if is_urgent {
-                self.urgent.pop_front()
-            } else {
-                self.sending.take()
+            let sent = match is_urgent {
+                true => self.urgent.pop_front(),
+                false => self.sending.take(),
             };
-            let Some(sent) = sent else {
-                return;
-            };
+            let Some(sent) = sent else { return };
             left.push(Departure::Sent {
                 packet: sent.packet,
                 start_nanos: sent.start_nanos,
@@ -134,11 +130,10 @@ impl QueueServer {
     /// The same, with true for an urgent packet.
     fn next(&self, rules: &Rules<'_>) -> Option<(u64, bool)> {
         let [urgent, usual] = [self.urgent.front(), self.sending.as_ref()].map(|sending| {
-            let Sending {
-                start_nanos, end, ..
-            } = sending?;
+            let sending = sending?;
             // With a burst the work may have been available before the packet was submitted.
-            Some(rules.capacity.time_of(*end)?.max(*start_nanos))
+            let end_nanos = rules.capacity.time_of(sending.end)?;
+            Some(end_nanos.max(sending.start_nanos))
         });
         match (urgent, usual) {
             (Some(urgent), Some(usual)) if usual < urgent => Some((usual, false)),
@@ -149,10 +144,8 @@ impl QueueServer {
 
     fn send(&mut self, packet: Packet, nanos: u64, rules: &Rules<'_>) {
         // Capacity unused before now is lost, except for the burst.
-        let idle = rules
-            .capacity
-            .done_by(nanos)
-            .saturating_sub(work(rules.burst_bytes));
+        let done = rules.capacity.done_by(nanos);
+        let idle = done.saturating_sub(work(rules.burst_bytes));
         self.used = self.used.max(idle) + work(packet.bytes);
         self.sending = Some(Sending {
             packet,

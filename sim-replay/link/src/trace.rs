@@ -49,12 +49,11 @@ impl Trace {
         for row in CsvFile::read(path, HEADER, MAX_FILE_BYTES)?.rows() {
             let row = row.complete()?;
             let step = step(&row)?;
-            let is_later = steps
-                .last()
+            let is_later = match steps.last() {
+                Some(last) => step.from_nanos > last.from_nanos,
                 // The first step must cover the beginning of the link: before it there is no rate.
-                .map_or(step.from_nanos <= offset_nanos, |last| {
-                    step.from_nanos > last.from_nanos
-                });
+                None => step.from_nanos <= offset_nanos,
+            };
             if !is_later {
                 let must = "later than the line before, the first at offset_s (0) or before";
                 return Err(row.wrong(0, must));
@@ -62,19 +61,15 @@ impl Trace {
             steps.push(step);
         }
         // The last step has no end, so any offset would do: one behind the last line counts as a mistake.
-        let is_past = steps
-            .last()
-            .is_some_and(|last| last.from_nanos < offset_nanos);
-        if is_past {
+        let last = steps.last();
+        if last.is_some_and(|last| last.from_nanos < offset_nanos) {
             let offset_s = offset_nanos as f64 * 1e-9;
             let problem = format_args!("offset_s is {offset_s}, behind the last line");
             return Err(FileError::new(path, problem));
         }
         // The step in force at the offset becomes the first one, and its start is clipped to 0 by the shift.
-        let begin = steps
-            .partition_point(|step| step.from_nanos <= offset_nanos)
-            .saturating_sub(1);
-        let left = steps.get(begin..).unwrap_or_default();
+        let after = steps.partition_point(|step| step.from_nanos <= offset_nanos);
+        let left = steps.get(after.saturating_sub(1)..).unwrap_or_default();
         if left.is_empty() {
             return Err(FileError::new(path, NO_NUMBERS));
         }
@@ -91,27 +86,16 @@ impl Trace {
     /// [`FileError`] with the file and the line.
     pub fn read_mahimahi(path: &Path) -> Result<Self, FileError> {
         let mut times = Vec::new();
-        for (index, line) in bounded_file::read_text(path, MAX_FILE_BYTES)
-            .at(path)?
-            .lines()
-            .enumerate()
-            .filter(|(_, line)| !line.trim().is_empty())
-        {
-            let time = line
-                .trim()
-                .parse::<u64>()
-                .ok()
-                .and_then(|ms| ms.checked_mul(1_000_000));
-            match time {
+        let text = bounded_file::read_text(path, MAX_FILE_BYTES).at(path)?;
+        let lines = text.lines().enumerate();
+        for (index, line) in lines.filter(|(_, line)| !line.trim().is_empty()) {
+            let ms = line.trim().parse::<u64>().ok();
+            match ms.and_then(|ms| ms.checked_mul(1_000_000)) {
                 // Equal times are several packets in one millisecond.
                 Some(time) if times.last().is_none_or(|&last| time >= last) => times.push(time),
                 _ => {
-                    return Err(wrong(
-                        path,
-                        index,
-                        line,
-                        "whole milliseconds, not before the line above",
-                    ));
+                    let must = "whole milliseconds, not before the line above";
+                    return Err(wrong(path, index, line, must));
                 }
             }
         }
@@ -126,11 +110,10 @@ impl Trace {
     /// The step at a time; `None` for opportunities.
     pub(super) fn at(&self, nanos: u64) -> Option<&Step> {
         match self {
-            Self::Steps(steps) => steps.get(
-                steps
-                    .partition_point(|step| step.from_nanos <= nanos)
-                    .saturating_sub(1),
-            ),
+            Self::Steps(steps) => {
+                let after = steps.partition_point(|step| step.from_nanos <= nanos);
+                steps.get(after.saturating_sub(1))
+            }
             Self::Opportunities(_) => None,
         }
     }

@@ -22,23 +22,14 @@ pub struct Damage {
 
 impl fmt::Display for Damage {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            begin_bytes,
-            lost_bytes,
-            from_s,
-            to_s,
-            reason,
-        } = self;
-        write!(
-            f,
-            "{lost_bytes} bytes from byte {begin_bytes} on are lost, "
-        )?;
-        match (from_s, to_s) {
+        let (begin, lost) = (self.begin_bytes, self.lost_bytes);
+        write!(f, "{lost} bytes from byte {begin} on are lost, ")?;
+        match (self.from_s, self.to_s) {
             (Some(from), Some(to)) => write!(f, "from {from:.1} s to {to:.1} s")?,
             (Some(from), None) => write!(f, "from {from:.1} s on")?,
             (None, Some(to)) => write!(f, "until {to:.1} s after its first message")?,
             (None, None) => write!(f, "with all its messages")?,
         }
-        write!(f, ": {reason}")
+        write!(f, ": {}", self.reason)
     }
 }

@@ -78,12 +78,4 @@ impl RecordingError {
             reason: reason.into(),
         }
     }
-
-    pub(super) fn malformed(path: &Path, offset: u64, reason: impl Into<String>) -> Self {
-        Self::Malformed {
-            path: path.into(),
-            offset,
-            reason: reason.into(),
-        }
-    }
 }

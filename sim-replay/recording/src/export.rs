@@ -46,11 +46,9 @@ pub fn export_ros2(
     zstd_level: Option<u32>,
 ) -> Result<ExportReport, RecordingError> {
     let recording = Recording::open(from)?;
-    let wanted: Vec<&Entry> = recording
-        .entries()
-        .iter()
-        .filter(|entry| Translator::wants(&entry.key.topic))
-        .collect();
+    let entries = recording.entries().iter();
+    let wanted = entries.filter(|entry| Translator::wants(&entry.key.topic));
+    let wanted: Vec<&Entry> = wanted.collect();
     let timed = in_order(&wanted, |entry| match times {
         ExportTimes::Capture if matches!(entry.key.topic, Topic::Stats(_)) => None,
         ExportTimes::Capture => Some(entry.header.stamp.capture_nanos),
@@ -65,10 +63,11 @@ pub fn export_ros2(
         contents: Contents::Ros2,
     };
     let mut writer = RecordingWriter::create(to, options)?;
-    let vehicles: BTreeSet<CavId> = wanted
-        .iter()
-        .filter_map(|entry| vehicle(&entry.key.topic))
-        .collect();
+    let vehicles = wanted.iter().filter_map(|entry| match &entry.key.topic {
+        Topic::Stream { cav, .. } => Some(cav.clone()),
+        _ => None,
+    });
+    let vehicles: BTreeSet<CavId> = vehicles.collect();
     // The mounts come before the first sweep, whose frame refers to them.
     if let Some((first, _)) = timed.first().filter(|_| !vehicles.is_empty()) {
         writer.write_static_transforms(*first, &vehicles, mount)?;
@@ -78,10 +77,9 @@ pub fn export_ros2(
     }
     writer.finish()?;
     let messages = writer.whole_messages();
-    let left_out = (recording.entries().len() as u64).saturating_sub(messages);
     Ok(ExportReport {
         messages,
-        left_out,
+        left_out: (recording.entries().len() as u64).saturating_sub(messages),
         damage: recording.damage().to_vec(),
     })
 }
@@ -91,8 +89,7 @@ fn in_order<'a>(
     entries: &[&'a Entry],
     nanos: impl Fn(&Entry) -> Option<u64>,
 ) -> Vec<(u64, &'a Entry)> {
-    let first = entries.iter().find_map(|entry| nanos(entry)).unwrap_or(0);
-    let mut latest = first;
+    let mut latest = entries.iter().find_map(|entry| nanos(entry)).unwrap_or(0);
     let timed = entries.iter().map(|entry| {
         latest = nanos(entry).unwrap_or(latest);
         (latest, *entry)
@@ -101,11 +98,4 @@ fn in_order<'a>(
     // A stable sort: messages of the same time keep the order of the recording.
     timed.sort_by_key(|(nanos, _)| *nanos);
     timed
-}
-
-fn vehicle(topic: &Topic) -> Option<CavId> {
-    match topic {
-        Topic::Stream { cav, .. } => Some(cav.clone()),
-        _ => None,
-    }
 }

@@ -86,10 +86,8 @@ pub(super) fn message(record: &[u8]) -> Option<(u16, &[u8])> {
 /// The length of a message of this program, from its header; `None` without a valid header.
 pub(super) fn own_message(payload: &[u8]) -> Option<u64> {
     let header = wire::decode_header([payload]).ok()?;
-    header
-        .body_len
-        .checked_add(u64::from(header.metadata_len))?
-        .checked_add(HEADER_LEN as u64)
+    let payload_len = header.body_len.checked_add(header.metadata_len.into())?;
+    payload_len.checked_add(HEADER_LEN as u64)
 }
 
 fn chunk_fits(chunk: &[u8]) -> Option<()> {

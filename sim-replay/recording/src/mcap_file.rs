@@ -93,23 +93,19 @@ impl McapFile {
             most_unpacked: bounded_file::most_unpacked(size),
             visit,
         };
-        contents
-            .look_through(&mut records, size)
-            .map_err(RecordingError::io(path))?;
+        let read = contents.look_through(&mut records, size);
+        read.map_err(RecordingError::io(path))?;
         let damage = contents.damage();
-        let Contents {
-            channels, holders, ..
-        } = contents;
-        let unpacked = Mutex::new(Unpacked {
-            channels,
+        let unpacked = Unpacked {
+            channels: contents.channels,
             kept: VecDeque::new(),
-        });
+        };
         Ok(Self {
             path: path.into(),
-            file,
-            holders,
+            holders: contents.holders,
             damage,
-            unpacked,
+            unpacked: Mutex::new(unpacked),
+            file,
         })
     }
 
@@ -141,11 +137,11 @@ impl McapFile {
     }
 
     fn changed(&self, holder: usize, reason: impl Into<String>) -> RecordingError {
-        RecordingError::malformed(
-            &self.path,
-            self.holders.get(holder).map_or(0, |holder| holder.begin),
-            reason,
-        )
+        RecordingError::Malformed {
+            path: self.path.clone(),
+            offset: self.holders.get(holder).map_or(0, |holder| holder.begin),
+            reason: reason.into(),
+        }
     }
 
     fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
@@ -154,20 +150,14 @@ impl McapFile {
         if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
             return Ok(Arc::clone(messages));
         }
-        let Some(&Holder {
-            begin,
-            len,
-            is_chunk,
-        }) = self.holders.get(holder)
-        else {
+        let Some(held) = self.holders.get(holder) else {
             return Err(self.changed(holder, "there is no such chunk"));
         };
-        let mut body = vec![0; len];
-        let read = self
-            .file
-            .read_exact_at(&mut body, begin + RECORD_HEAD as u64);
+        let mut body = vec![0; held.len];
+        let begin = held.begin + RECORD_HEAD as u64;
+        let read = self.file.read_exact_at(&mut body, begin);
         read.map_err(RecordingError::io(&self.path))?;
-        let messages = match is_chunk {
+        let messages = match held.is_chunk {
             true => unpack(&body, &mut unpacked.channels).map(|chunk| chunk.messages),
             false => unpacked
                 .channels
@@ -250,12 +240,8 @@ impl Contents<'_> {
 
     /// Processes the next record of the file; ends with the checksum of the data section.
     fn take(&mut self, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
-        let RawRecord {
-            begin,
-            opcode,
-            body,
-        } = *record;
-        let added = match opcode {
+        let (begin, body) = (record.begin, record.body);
+        match record.opcode {
             op::DATA_END => {
                 let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
                 return Ok(ControlFlow::Break(crc));
@@ -277,33 +263,26 @@ impl Contents<'_> {
                     let what = format!("{orphans} messages of channels that are described nowhere");
                     self.lose((begin, begin), what);
                 }
-                Ok(())
             }
             op::MESSAGE => self.take_message(begin, body)?,
-            _ => self.channels.add(opcode, body),
-        };
-        added.map(|()| ControlFlow::Continue(())).map_err(in_words)
+            opcode => self.channels.add(opcode, body).map_err(in_words)?,
+        }
+        Ok(ControlFlow::Continue(()))
     }
 
     /// A message outside of chunks has no checksum but its own.
-    fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<mcap::McapResult<()>, String> {
+    fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<(), String> {
         let message = self.channels.message(body).map_err(in_words)?;
         let message = message.ok_or("a message of a channel that is described nowhere")?;
         if is_own(&message.channel.message_encoding) {
-            match lengths::own_message(&message.data) {
-                Some(stated) if stated == message.data.len() as u64 => {}
-                Some(_) => {
-                    return Err("a message whose length differs from the one in its header".into());
-                }
-                None => {
-                    return Err(
-                        "a damaged message, or one of another version of this program".into(),
-                    );
-                }
+            let stated = lengths::own_message(&message.data)
+                .ok_or("a damaged message, or one of another version of this program")?;
+            if stated != message.data.len() as u64 {
+                return Err("a message whose length differs from the one in its header".into());
             }
         }
         self.add(begin, body.len(), false, &[message]);
-        Ok(Ok(()))
+        Ok(())
     }
 
     fn add(&mut self, begin: u64, len: usize, is_chunk: bool, messages: &[Message<'static>]) {
@@ -346,10 +325,8 @@ impl Contents<'_> {
             && self.lost.is_empty()
             && self.holders.iter().all(|holder| !holder.is_chunk)
         {
-            self.lose(
-                (end, end),
-                "the checksum of the data does not agree with them".into(),
-            );
+            let reason = "the checksum of the data does not agree with them";
+            self.lose((end, end), reason.into());
         }
     }
 

@@ -59,10 +59,8 @@ impl Recording {
             is_kept
         })?;
         if !has_own {
-            let what = file
-                .damage()
-                .first()
-                .map_or(String::new(), |damage| format!("; {damage}"));
+            let first = file.damage().first();
+            let what = first.map_or(String::new(), |damage| format!("; {damage}"));
             // Messages of other programs, or none in a whole file: foreign. Else damage may have taken ours.
             return Err(match has_any || file.damage().is_empty() {
                 true => RecordingError::foreign(path, what),

@@ -117,16 +117,12 @@ impl<'a> Records<'a> {
         while begin < self.size {
             let left = self.size - begin;
             // Windows overlap by the bytes that recognise a record: one at their border is found.
-            let len = usize::try_from(left)
-                .unwrap_or(usize::MAX)
-                .min(WINDOW + KNOWN_BY);
+            let len = usize::try_from(left).unwrap_or(usize::MAX);
+            let len = len.min(WINDOW + KNOWN_BY);
             window.resize(len, 0);
             self.file.read_exact_at(&mut window, begin)?;
-            let known = window
-                .iter()
-                .take(WINDOW)
-                .enumerate()
-                .filter(|(_, opcode)| is_known(**opcode));
+            let opcodes = window.iter().take(WINDOW).enumerate();
+            let known = opcodes.filter(|(_, opcode)| is_known(**opcode));
             let mut known = known.map(|(place, _)| (place as u64, window.get(place..)));
             let found = known.find(|(place, bytes)| {
                 bytes.is_some_and(|bytes| is_record(bytes, left - place, &is_own))
@@ -195,13 +191,12 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
 
 /// True if the bytes after an apparent end of the data are those of a summary or footer.
 fn begins_summary(bytes: &[u8]) -> bool {
-    bytes
-        .split_first_chunk::<RECORD_HEAD>()
-        .is_some_and(|(&head, _)| {
-            let (opcode, len) = split_head(head);
-            matches!(
-                opcode,
-                op::FOOTER | op::SCHEMA | op::CHANNEL | op::CHUNK_INDEX | op::STATISTICS
-            ) && len < 1 << 32
-        })
+    let Some((&head, _)) = bytes.split_first_chunk::<RECORD_HEAD>() else {
+        return false;
+    };
+    let (opcode, len) = split_head(head);
+    matches!(
+        opcode,
+        op::FOOTER | op::SCHEMA | op::CHANNEL | op::CHUNK_INDEX | op::STATISTICS
+    ) && len < 1 << 32
 }

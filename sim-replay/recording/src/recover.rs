@@ -26,13 +26,10 @@ pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<Reco
     let mut messages = 0;
     for held in recording.all() {
         for message in held?.iter() {
-            let (topic, encoding) = (
-                &message.channel.topic,
-                message.channel.message_encoding.as_str(),
-            );
+            let encoding = message.channel.message_encoding.as_str();
             // The channels for ROS 2 are derived from these.
             if matches!(encoding, OWN_ENCODING | "json")
-                && let Ok(key) = topic.parse()
+                && let Ok(key) = message.channel.topic.parse()
             {
                 messages += 1;
                 writer.write(&key, message.log_time, &message.data)?;

@@ -52,10 +52,9 @@ impl<S> WholeChunks<S> {
     }
 
     fn check(&self) -> io::Result<()> {
-        if self.has_failed {
-            Err(io::Error::other("writing has failed before"))
-        } else {
-            Ok(())
+        match self.has_failed {
+            true => Err(io::Error::other("writing has failed before")),
+            false => Ok(()),
         }
     }
 }
@@ -69,10 +68,8 @@ impl<S: Store> Write for WholeChunks<S> {
 
     fn flush(&mut self) -> io::Result<()> {
         self.check()?;
-        let taken = self
-            .store
-            .write_all(&self.pending)
-            .and_then(|()| self.store.flush());
+        let written = self.store.write_all(&self.pending);
+        let taken = written.and_then(|()| self.store.flush());
         if taken.is_ok() {
             self.whole += self.pending.len() as u64;
         } else {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
 use mcap::{Compression, McapError, McapResult, WriteOptions};
-use protocol::{CavId, Key, Limits, RunId, Topic, wire};
+use protocol::{CavId, Header, Key, Limits, RunId, Topic, wire};
 use ros2::{Distribution, Mount, RosMessage, RosTopic, Translator};
 
 use super::sink::{Store, WholeChunks};
@@ -85,13 +85,13 @@ impl<S: Store> RecordingWriter<S> {
     /// # Errors
     /// [`RecordingError::Io`] if the header cannot be written.
     pub fn over(store: S, path: &Path, options: RecordingOptions) -> Result<Self> {
+        // The profile promises that every channel is one of ROS 2.
+        let profile = match options.contents {
+            Contents::Ros2 => "ros2",
+            Contents::All | Contents::Messages => "",
+        };
         let format = WriteOptions::new()
-            // The profile promises that every channel is one of ROS 2.
-            .profile(if options.contents == Contents::Ros2 {
-                "ros2"
-            } else {
-                ""
-            })
+            .profile(profile)
             .library(concat!("v2vloc ", env!("CARGO_PKG_VERSION")))
             .compression(options.zstd_level.map(|_| Compression::Zstd))
             .compression_level(options.zstd_level.unwrap_or_default())
@@ -129,10 +129,9 @@ impl<S: Store> RecordingWriter<S> {
         let added = self.add(key, arrived_nanos, payload);
         self.checked(added)?;
         if self.open.1 > CHUNK_BYTES {
-            self.flush()
-        } else {
-            Ok(())
+            self.flush()?;
         }
+        Ok(())
     }
 
     #[expect(
@@ -140,18 +139,15 @@ impl<S: Store> RecordingWriter<S> {
         reason = "MCAP has 32 bits for the sequence number, which may wrap"
     )]
     fn add(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> McapResult<()> {
-        let header = wire::decode_header([payload]).ok();
-        let sequence = header
-            .as_ref()
-            .map_or(0, |header| header.stamp.sequence as u32);
-        if self.options.contents != Contents::Ros2 {
-            let publish_time = header
-                .as_ref()
-                // Without a valid header the arrival is the only time that is known.
-                .map_or(arrived_nanos, |header| header.stamp.publish_nanos);
-            let channel_id = self.own_channel(key)?;
+        // Without a valid header the arrival is the only time that is known.
+        let (sequence, publish_time) = match wire::decode_header([payload]) {
+            Ok(Header { stamp, .. }) => (stamp.sequence as u32, stamp.publish_nanos),
+            Err(_) => (0, arrived_nanos),
+        };
+        let is_bag = self.options.contents == Contents::Ros2;
+        if !is_bag {
             let head = MessageHeader {
-                channel_id,
+                channel_id: self.own_channel(key)?,
                 sequence,
                 log_time: arrived_nanos,
                 publish_time,
@@ -159,18 +155,16 @@ impl<S: Store> RecordingWriter<S> {
             self.put(&head, payload)?;
         }
         let translations = self.translated(key, payload);
-        let is_counted = self.options.contents == Contents::Ros2 && !translations.is_empty();
-        self.open.0 += u64::from(is_counted || self.options.contents != Contents::Ros2);
+        self.open.0 += u64::from(!is_bag || !translations.is_empty());
         translations
             .iter()
             .try_for_each(|message| self.add_ros(arrived_nanos, sequence, message))
     }
 
     fn add_ros(&mut self, nanos: u64, sequence: u32, message: &RosMessage) -> McapResult<()> {
-        let channel_id = self.ros_channel(&message.topic)?;
         // Published at the time of its arrival: several senders share /tf, whose times have to be in order.
         let head = MessageHeader {
-            channel_id,
+            channel_id: self.ros_channel(&message.topic)?,
             sequence,
             log_time: nanos,
             publish_time: nanos,
@@ -235,7 +229,9 @@ impl<S: Store> RecordingWriter<S> {
         let topic = key.to_string();
         match self.channels.get(&topic) {
             Some(id) => Ok(*id),
-            None => self.add_channel(topic, 0, encoding_of(&key.topic), &BTreeMap::new()),
+            // The topic alone decides: an invalid first message must not affect those after it.
+            None if key.topic.is_json() => self.add_channel(topic, 0, "json", &BTreeMap::new()),
+            None => self.add_channel(topic, 0, OWN_ENCODING, &BTreeMap::new()),
         }
     }
 
@@ -249,15 +245,11 @@ impl<S: Store> RecordingWriter<S> {
         let schema_id =
             self.mcap
                 .add_schema(&ros_type.name(), "ros2msg", ros_type.schema().as_bytes())?;
+        let profiles = topic.qos().offered_profiles();
+        let hash = ros_type.hash(Distribution::Jazzy);
         let metadata = [
-            (
-                "offered_qos_profiles".to_owned(),
-                topic.qos().offered_profiles(),
-            ),
-            (
-                "topic_type_hash".to_owned(),
-                ros_type.hash(Distribution::Jazzy),
-            ),
+            ("offered_qos_profiles".to_owned(), profiles),
+            ("topic_type_hash".to_owned(), hash),
         ];
         self.add_channel(name, schema_id, "cdr", &metadata.into())
     }
@@ -313,15 +305,6 @@ impl<S: Store> RecordingWriter<S> {
             self.ended = Some(error.to_string());
             error
         })
-    }
-}
-
-/// Encoding of the messages of a topic. The topic alone decides: an invalid first message must not affect those after
-/// it.
-fn encoding_of(topic: &Topic) -> &'static str {
-    match topic.is_json() {
-        true => "json",
-        false => OWN_ENCODING,
     }
 }
 

@@ -95,12 +95,8 @@ fn real(path: &Path) -> Option<PathBuf> {
 }
 
 fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
-    let Converted {
-        scenarios,
-        agent_frames,
-        omitted,
-        left_out,
-    } = converted;
+    let (scenarios, agent_frames) = (converted.scenarios, converted.agent_frames);
+    let (omitted, left_out) = (&converted.omitted, &converted.left_out);
     for problem in left_out.problems().take(SHOWN_PROBLEMS) {
         output::note(format_args!("left out: {}", problem.message));
     }
@@ -117,11 +113,9 @@ fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
         args.layout.name()
     ))?;
     super::synth::print_omitted(omitted)?;
-    let summary = left_out.to_string();
-    if summary.is_empty() {
-        Ok(())
-    } else {
-        output::line(summary)
+    match left_out.to_string().as_str() {
+        "" => Ok(()),
+        summary => output::line(summary),
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::print_json;
 use bus::log_to_stderr;
-use recording::{ExportReport, ExportTimes, export_ros2};
+use recording::{ExportTimes, export_ros2};
 use ros2::Mount;
 use support::cli::Outcome;
 use support::output;
@@ -64,23 +64,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if args.json {
         print_json(&report)?;
     } else {
-        print(&report, args)?;
+        let (messages, left_out, to) = (report.messages, report.left_out, args.to.display());
+        output::line(format_args!(
+            "{messages} messages in {to}; {left_out} others have no type in ROS 2"
+        ))?;
+        for damage in &report.damage {
+            output::line(damage)?;
+        }
     }
     Ok(Outcome::of(!report.damage.is_empty()))
-}
-
-fn print(report: &ExportReport, args: &Args) -> anyhow::Result<()> {
-    let ExportReport {
-        messages,
-        left_out,
-        damage,
-    } = report;
-    output::line(format_args!(
-        "{messages} messages in {}; {left_out} others have no type in ROS 2",
-        args.to.display()
-    ))?;
-    for damage in damage {
-        output::line(damage)?;
-    }
-    Ok(())
 }

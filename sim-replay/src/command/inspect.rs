@@ -1,12 +1,12 @@
 //! `sim-replay inspect`: contents and faults of a dataset.
 
 use std::fmt::Display;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::{IntensityScale, OpenOptions, layouts_text};
 use serde::Serialize;
-use sim_replay::inspect::{Report, inspect, inspect_map};
+use sim_replay::inspect::{inspect, inspect_map};
 use support::output;
 use terminal::progress;
 
@@ -34,12 +34,8 @@ pub(crate) struct Args {
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     // The folder of a data set may end in .xodr too.
-    if args
-        .dir
-        .extension()
-        .is_some_and(|extension| extension.eq_ignore_ascii_case("xodr"))
-        && args.dir.is_file()
-    {
+    let extension = args.dir.extension();
+    if extension.is_some_and(|it| it.eq_ignore_ascii_case("xodr")) && args.dir.is_file() {
         if args.protocol != ProtocolConfig::default()
             || args.intensity_scale != IntensityScale::default()
         {
@@ -48,39 +44,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
                 "{map}: a map has no intensities and no protocol: leave such options out"
             )));
         }
-        return run_map(&args.dir, args.json);
+        return match inspect_map(&args.dir) {
+            Ok(report) => print(&report, args.json).map(|()| Outcome::Done),
+            Err(error) => refuse(&error),
+        };
     }
-    let report = with_progress(args);
-    print(&report, args.json)?;
-    Ok(if report.problems.is_empty() {
-        Outcome::Done
-    } else {
-        Outcome::BadInput
-    })
-}
-
-/// Prints the contents of a map to standard output.
-fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
-    let report = match inspect_map(path) {
-        Ok(report) => report,
-        Err(error) => return refuse(&error),
-    };
-    print(&report, json)?;
-    Ok(Outcome::Done)
-}
-
-/// As JSON, or as a table.
-fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> {
-    if json {
-        output::line(serde_json::to_string_pretty(report)?)?;
-    } else {
-        output::line(report)?;
-    }
-    Ok(())
-}
-
-/// Reads everything, with a progress bar on a terminal.
-fn with_progress(args: &Args) -> Report {
     // The bar hides itself if stderr is no terminal.
     let bar = progress::bar(0, "frames");
     let options = OpenOptions {
@@ -92,5 +60,20 @@ fn with_progress(args: &Args) -> Report {
         bar.set_position(done as u64);
     });
     bar.finish_and_clear();
-    report
+    print(&report, args.json)?;
+    Ok(if report.problems.is_empty() {
+        Outcome::Done
+    } else {
+        Outcome::BadInput
+    })
+}
+
+/// As JSON, or as a table.
+fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> {
+    if json {
+        output::line(serde_json::to_string_pretty(report)?)?;
+    } else {
+        output::line(report)?;
+    }
+    Ok(())
 }

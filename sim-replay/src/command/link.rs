@@ -1,6 +1,5 @@
 //! `sim-replay link`: link emulation between the agents of a run and an ego.
 
-use anyhow::Context;
 use bus::{Configured, log_to_stderr};
 use clap::{Arg, ArgMatches, Command, FromArgMatches};
 use link::{LinkConfig, LinkEmulator};
@@ -9,7 +8,7 @@ use sim_replay::config::LinkProcessConfig;
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use support::output;
 
-use super::{leave, print_json};
+use super::{join, leave, print_json};
 use support::cli::Outcome;
 
 /// Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost.
@@ -82,10 +81,7 @@ fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
         Ok(emulator) => emulator,
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
-    let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config
-        .bus
-        .join(&stop, &config.run, Role::Link, &config.ego)?;
+    let (stop, bus) = join(&config.bus, &config.run, Role::Link, &config.ego)?;
     let options = NodeOptions {
         keeps_running: config.keep_running || config.bus.supervised,
         inbox: config.inbox.limits(),
@@ -101,23 +97,17 @@ fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
         return print_json(report);
     }
-    let LinkReport {
-        submitted,
-        arrived,
-        copies,
-        under_way,
-        longest_ms,
-        dropped,
-    } = report;
+    let (submitted, under_way) = (report.submitted, report.under_way);
+    let (arrived, copies) = (report.arrived, report.copies);
     output::line(format_args!(
         "{submitted} messages: {arrived} arrived, {copies} of them twice, {under_way} still in flight"
     ))?;
-    for (reason, count) in dropped {
+    for (reason, count) in &report.dropped {
         output::line(format_args!("{count} dropped: {reason}"))?;
     }
     // The losses of the run are printed last.
     if !report.is_complete() {
-        let seconds = *longest_ms as f64 * 1e-3;
+        let seconds = report.longest_ms as f64 * 1e-3;
         output::line(format_args!(
             "{under_way} of {submitted} messages were still in flight at the end, the oldest for {seconds:.1} s"
         ))?;

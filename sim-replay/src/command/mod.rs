@@ -11,7 +11,10 @@ pub(crate) mod synth;
 
 use std::fmt::Display;
 
-use bus::{Bus, STOP_LIMIT};
+use anyhow::Context;
+use bus::shutdown::Stop;
+use bus::{Bus, BusConfig, STOP_LIMIT};
+use protocol::{CavId, Role, RunId};
 use serde::Serialize;
 use support::cli::Outcome;
 use support::output;
@@ -25,6 +28,13 @@ fn print_json(report: &impl Serialize) -> anyhow::Result<()> {
 fn refuse(error: &dyn Display) -> anyhow::Result<Outcome> {
     output::note(format_args!("error: {error}"));
     Ok(Outcome::BadInput)
+}
+
+/// Joins a run under a name; signals request its stop.
+fn join(bus: &BusConfig, run: &RunId, role: Role, name: &CavId) -> anyhow::Result<(Stop, Bus)> {
+    let stop = bus.stop().context("installing signal handlers")?;
+    let bus = bus.join(&stop, run, role, name)?;
+    Ok((stop, bus))
 }
 
 /// Leaves the bus; a process ends even if the router does not answer.

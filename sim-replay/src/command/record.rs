@@ -1,13 +1,12 @@
 //! `sim-replay record`: records a live run into a file.
 
-use anyhow::Context;
 use bus::{Configured, log_to_stderr};
 use protocol::{CavId, Role};
 use sim_replay::config::RecorderConfig;
 use sim_replay::recorder::{self, RecordReport, RecorderError};
 use support::output;
 
-use super::{leave, print_json};
+use super::{join, leave, print_json};
 use support::cli::Outcome;
 
 /// Write all messages of a run into an MCAP file, which `sim-replay stream` replays and Foxglove opens.
@@ -26,10 +25,8 @@ pub(crate) struct Args {
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = args.config.validated()?;
-    let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config
-        .bus
-        .join(&stop, &config.run, Role::Recorder, &CavId::new("recorder")?)?;
+    let name = CavId::new("recorder")?;
+    let (stop, bus) = join(&config.bus, &config.run, Role::Recorder, &name)?;
     let options = config.options();
     // A failure is reported at once to a process that waits for the report; the last line is the final report.
     let report = recorder::record(&bus, &options, &stop, &mut |report: &RecordReport| {
@@ -51,11 +48,10 @@ fn print(report: &RecordReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
         return print_json(report);
     }
+    let (messages, file) = (report.messages, report.file.display());
+    let megabytes = report.bytes as f64 / 1e6;
     output::line(format_args!(
-        "{} messages, {:.1} MB in {}",
-        report.messages,
-        report.bytes as f64 / 1e6,
-        report.file.display()
+        "{messages} messages, {megabytes:.1} MB in {file}"
     ))?;
     report
         .loss_in_words()

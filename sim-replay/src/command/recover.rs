@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use bus::log_to_stderr;
-use recording::{Contents, RecordingOptions, recover};
+use recording::recover;
+use sim_replay::config::RecordingConfig;
 use support::output;
 
 use super::{print_json, refuse};
@@ -30,27 +31,19 @@ pub(crate) struct Args {
 /// Copies and reports the losses.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let contents = if args.plain {
-        Contents::Messages
-    } else {
-        Contents::All
+    let config = RecordingConfig {
+        plain: args.plain,
+        ..RecordingConfig::default()
     };
-    let options = RecordingOptions {
-        contents,
-        ..RecordingOptions::default()
-    };
-    let report = match recover(&args.from, &args.out, options) {
+    let report = match recover(&args.from, &args.out, config.options()) {
         Ok(report) => report,
         Err(error) => return refuse(&error),
     };
     if args.json {
         print_json(&report)?;
     } else {
-        output::line(format_args!(
-            "{} messages in {}",
-            report.messages,
-            args.out.display()
-        ))?;
+        let (messages, out) = (report.messages, args.out.display());
+        output::line(format_args!("{messages} messages in {out}"))?;
         for damage in &report.damage {
             output::line(damage)?;
         }

@@ -7,10 +7,10 @@ use bus::{Configured, log_to_stderr};
 use dataset::{self, OpenOptions, Scenario};
 use protocol::{CavId, DropReason, Role};
 use sim_replay::config::{ReplayConfig, SceneConfig};
-use sim_replay::stream::{Replay, SensorLinkReport, StreamError, StreamReport};
+use sim_replay::stream::{Replay, StreamError, StreamReport};
 use support::output;
 
-use super::{leave, print_json};
+use super::{join, leave, print_json};
 use support::cli::Outcome;
 
 /// Publish a scene as if its vehicles were driving now.
@@ -37,10 +37,8 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Ok(scenario) => scenario,
         Err(error) => return Ok(Outcome::bad_input(&format_args!("{error:#}"))),
     };
-    let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config
-        .bus
-        .join(&stop, &config.run, Role::Replay, &CavId::new("replay")?)?;
+    let name = CavId::new("replay")?;
+    let (stop, bus) = join(&config.bus, &config.run, Role::Replay, &name)?;
     let replay = match Replay::prepare(&bus, &scenario, config.options(), &stop) {
         Ok(replay) => replay,
         // Faults of the input, exit code 2. All other errors are failures of the run.
@@ -107,25 +105,17 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
         "late by p50 {:.1} ms, p95 {:.1} ms, at most {:.1} ms; {} ticks over 5 ms",
         lateness.p50_ms, lateness.p95_ms, lateness.max_ms, lateness.late_ticks
     ))?;
-    if let Some(SensorLinkReport {
-        submitted,
-        arrived,
-        dropped,
-    }) = &report.sensor_link
-    {
+    if let Some(link) = &report.sensor_link {
+        let (submitted, arrived, dropped) =
+            (link.submitted, link.arrived, by_reason(&link.dropped));
         output::line(format_args!(
-            "{submitted} sensor frames crossed a link: {arrived} arrived{}",
-            by_reason(dropped)
+            "{submitted} sensor frames crossed a link: {arrived} arrived{dropped}"
         ))?;
     }
-    counted(
-        report.absent_frames,
-        "frames do not exist: their vehicles joined later or have left",
-    )?;
-    counted(
-        report.left_out_parts,
-        "objects or other parts of frames were left out, see the log",
-    )?;
+    let absent = "frames do not exist: their vehicles joined later or have left";
+    counted(report.absent_frames, absent)?;
+    let left_out = "objects or other parts of frames were left out, see the log";
+    counted(report.left_out_parts, left_out)?;
     if !report.unsent.is_empty() {
         let unsent: u64 = report.unsent.values().sum();
         output::line(format_args!(

@@ -132,12 +132,8 @@ fn print_findings(summary: &Summary) {
     for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
         output::note(format_args!("map: {finding}"));
     }
-    if let Some(further) = summary
-        .findings
-        .len()
-        .checked_sub(PRINTED_FINDINGS)
-        .filter(|&further| further > 0)
-    {
+    let further = summary.findings.len().saturating_sub(PRINTED_FINDINGS);
+    if further > 0 {
         output::note(format_args!(
             "map: {further} further findings; all are in data_protocol.yaml of each scenario"
         ));
@@ -145,22 +141,15 @@ fn print_findings(summary: &Summary) {
 }
 
 fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) -> io::Result<()> {
-    let Summary {
-        layout,
-        scenarios,
-        agent_frames,
-        points,
-        annotations,
-        omitted,
-        findings,
-    } = summary;
-    let [points, vehicles] =
-        [points, annotations].map(|count| *count as f64 / (*agent_frames).max(1) as f64);
+    let (scenarios, agent_frames) = (summary.scenarios, summary.agent_frames);
+    let (layout, omitted) = (summary.layout, &summary.omitted);
+    let [points, vehicles] = [summary.points, summary.annotations]
+        .map(|count| count as f64 / agent_frames.max(1) as f64);
     if json {
         let report = serde_json::json!({
             "out": options.out, "layout": layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
             "points_per_frame": points, "vehicles_per_frame": vehicles, "omitted": omitted,
-            "seconds": seconds, "map_findings": findings,
+            "seconds": seconds, "map_findings": summary.findings,
         });
         return output::line(report);
     }
@@ -174,7 +163,7 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) ->
     ))?;
     output::line(format_args!(
         "{seconds:.1} s, {:.0} agent-frames a second",
-        *agent_frames as f64 / seconds
+        agent_frames as f64 / seconds
     ))?;
     print_omitted(omitted)
 }

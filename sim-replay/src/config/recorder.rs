@@ -63,6 +63,17 @@ impl RecordingConfig {
     pub fn validate(&self) -> Result<(), FieldError> {
         within("record.zstd_level", self.zstd_level.unwrap_or(1), 1, 22)
     }
+
+    /// The options of the file.
+    pub fn options(&self) -> RecordingOptions {
+        RecordingOptions {
+            zstd_level: self.zstd_level,
+            contents: match self.plain {
+                true => Contents::Messages,
+                false => Contents::All,
+            },
+        }
+    }
 }
 
 impl ProcessConfig for RecorderConfig {
@@ -77,24 +88,10 @@ impl ProcessConfig for RecorderConfig {
 impl RecorderConfig {
     /// The options of the recorder.
     pub fn options(&self) -> RecorderOptions {
-        let RecordingConfig {
-            without,
-            plain,
-            zstd_level,
-            inputs: _,
-        } = self.record.clone();
-        let contents = if plain {
-            Contents::Messages
-        } else {
-            Contents::All
-        };
         RecorderOptions {
             out: self.out.clone(),
-            recording: RecordingOptions {
-                zstd_level,
-                contents,
-            },
-            without,
+            recording: self.record.options(),
+            without: self.record.without.clone(),
             keeps_running: self.keep_running || self.bus.supervised,
         }
     }

@@ -106,24 +106,18 @@ pub struct SensorLinkConfig {
 impl SensorLinkConfig {
     /// The stages of the link; `None` if nothing is set.
     pub fn stages(&self) -> Option<LinkConfig> {
-        let Self {
-            latency_ms,
-            jitter_ms,
-            bandwidth_mbps,
-            loss,
-            ..
-        } = *self;
-        if latency_ms.is_none() && bandwidth_mbps.is_none() && loss.is_none() {
+        if self.latency_ms.is_none() && self.bandwidth_mbps.is_none() && self.loss.is_none() {
             return None;
         }
+        let rate_mbps = self.bandwidth_mbps;
         Some(LinkConfig {
-            latency: match (latency_ms, jitter_ms) {
+            latency: match (self.latency_ms, self.jitter_ms) {
                 (None, _) => LatencyModel::None,
                 (Some(mean_ms), None) => LatencyModel::ConstantMs(mean_ms),
                 (Some(mean_ms), Some(std_ms)) => LatencyModel::Normal { mean_ms, std_ms },
             },
-            capacity: bandwidth_mbps.map_or(CapacityConfig::Unlimited, CapacityConfig::of_mbps),
-            loss: loss.map_or(LossModel::None, LossModel::Bernoulli),
+            capacity: rate_mbps.map_or(CapacityConfig::Unlimited, CapacityConfig::of_mbps),
+            loss: self.loss.map_or(LossModel::None, LossModel::Bernoulli),
             // A vehicle's own bus does not reorder.
             keep_order: true,
             ..LinkConfig::default()
@@ -136,41 +130,26 @@ impl ProcessConfig for ReplayConfig {
 
     fn validate(&self) -> Result<(), FieldError> {
         self.scene.validate()?;
-        within("wait.ready_timeout_s", self.wait.ready_timeout_s, 0.0, 1e6)?;
-        within(
-            "wait.answer_timeout_s",
-            self.wait.answer_timeout_s,
-            0.0,
-            1e6,
-        )?;
-        if self.scene.lockstep && self.wait.egos.is_empty() {
-            return Err(FieldError::new(
-                "wait.egos",
-                "empty",
-                "must name the egos that scene.lockstep waits for",
-            ));
+        let wait = &self.wait;
+        within("wait.ready_timeout_s", wait.ready_timeout_s, 0.0, 1e6)?;
+        within("wait.answer_timeout_s", wait.answer_timeout_s, 0.0, 1e6)?;
+        if self.scene.lockstep && wait.egos.is_empty() {
+            let rule = "must name the egos that scene.lockstep waits for";
+            return Err(FieldError::new("wait.egos", "empty", rule));
         }
-        if self.sensor_link.jitter_ms.is_some() && self.sensor_link.latency_ms.is_none() {
-            return Err(FieldError::new(
-                "sensor_link.latency_ms",
-                "absent",
-                "must be given with jitter_ms",
-            ));
+        let link = &self.sensor_link;
+        if link.jitter_ms.is_some() && link.latency_ms.is_none() {
+            let (field, rule) = ("sensor_link.latency_ms", "must be given with jitter_ms");
+            return Err(FieldError::new(field, "absent", rule));
         }
-        if self.sensor_link.seed != 0 && self.sensor_link.stages().is_none() {
-            return Err(FieldError::new(
-                "sensor_link.seed",
-                self.sensor_link.seed,
-                "must be left out without a link: give latency_ms, bandwidth_mbps or loss",
-            ));
+        if link.seed != 0 && link.stages().is_none() {
+            let rule = "must be left out without a link: give latency_ms, bandwidth_mbps or loss";
+            return Err(FieldError::new("sensor_link.seed", link.seed, rule));
         }
         // `options` takes lockstep from the egos alone, so they must not be named without it.
-        if let (false, [ego, ..]) = (self.scene.lockstep, &self.wait.egos[..]) {
-            return Err(FieldError::new(
-                "wait.egos",
-                ego,
-                "must be left out unless scene.lockstep is true",
-            ));
+        if let (false, [ego, ..]) = (self.scene.lockstep, &wait.egos[..]) {
+            let rule = "must be left out unless scene.lockstep is true";
+            return Err(FieldError::new("wait.egos", ego, rule));
         }
         self.bus.validate()
     }
@@ -179,7 +158,7 @@ impl ProcessConfig for ReplayConfig {
 impl ReplayConfig {
     /// The options of the replay.
     pub fn options(&self) -> StreamOptions {
-        let Self { scene, wait, .. } = self;
+        let (scene, wait, sensor_link) = (&self.scene, &self.wait, &self.sensor_link);
         let [ready_timeout, answer_timeout] = [wait.ready_timeout_s, wait.answer_timeout_s]
             .map(|seconds| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX));
         StreamOptions {
@@ -199,10 +178,7 @@ impl ReplayConfig {
             ready_timeout,
             lockstep: wait.egos.clone(),
             answer_timeout,
-            link: self
-                .sensor_link
-                .stages()
-                .map(|link| (link, self.sensor_link.seed)),
+            link: { sensor_link.stages() }.map(|link| (link, sensor_link.seed)),
             checkpoint: self.checkpoint.clone(),
         }
     }

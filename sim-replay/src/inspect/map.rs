@@ -43,13 +43,15 @@ pub struct MapReport {
 /// [`FileError`] if the file cannot be read or is no usable map.
 pub fn inspect_map(path: &Path) -> Result<MapReport, FileError> {
     let Map { network, lanes } = read_map(path)?;
-    let roads = &network.roads;
-    let points = lanes.lanes.iter().flat_map(|lane| &lane.centerline);
+    let (roads, lanes) = (&network.roads, &lanes.lanes);
+    let points = lanes.iter().flat_map(|lane| &lane.centerline);
     let heights = points.map(|point| point[2]);
     let range = [
         heights.clone().fold(f64::INFINITY, f64::min),
         heights.fold(f64::NEG_INFINITY, f64::max),
     ];
+    let direct = network.junctions.iter().filter(|junction| junction.direct);
+    let dead_ends = lanes.iter().filter(|lane| lane.successors.is_empty());
     Ok(MapReport {
         path: path.display().to_string(),
         roads: roads.len(),
@@ -57,19 +59,11 @@ pub fn inspect_map(path: &Path) -> Result<MapReport, FileError> {
         left_hand_roads: roads.iter().filter(|road| road.left_hand).count(),
         banked_roads: roads.iter().filter(|road| !road.lateral.is_level()).count(),
         junctions: network.junctions.len(),
-        direct_junctions: network
-            .junctions
-            .iter()
-            .filter(|junction| junction.direct)
-            .count(),
-        lanes: lanes.lanes.len(),
-        lanes_m: lanes.lanes.iter().map(|lane| lane.length_m).sum(),
-        dead_ends: lanes
-            .lanes
-            .iter()
-            .filter(|lane| lane.successors.is_empty())
-            .count(),
-        heights_m: (!lanes.lanes.is_empty()).then_some(range),
+        direct_junctions: direct.count(),
+        lanes: lanes.len(),
+        lanes_m: lanes.iter().map(|lane| lane.length_m).sum(),
+        dead_ends: dead_ends.count(),
+        heights_m: (!lanes.is_empty()).then_some(range),
         findings: network.findings,
     })
 }
@@ -87,11 +81,8 @@ impl fmt::Display for MapReport {
             "roads      {} of {:.0} m, {keeps}, {} not level across",
             self.roads, self.roads_m, self.banked_roads
         )?;
-        writeln!(
-            out,
-            "junctions  {}, {} of them direct",
-            self.junctions, self.direct_junctions
-        )?;
+        let (junctions, direct) = (self.junctions, self.direct_junctions);
+        writeln!(out, "junctions  {junctions}, {direct} of them direct")?;
         writeln!(
             out,
             "lanes      {} of {:.0} m to drive on, {} with none after it",

@@ -8,6 +8,7 @@ use protocol::CavId;
 use rayon::prelude::*;
 
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
+use crate::stream::median_step_nanos;
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::findings::{self, FrameFindings, SweepReport};
 use dataset::frame::Frame;
@@ -67,14 +68,9 @@ pub fn inspect(
         }
     };
     report.protocol = Some(protocol.clone());
-    report
-        .problems
-        .extend(dataset.problems.iter().map(Problem::from));
-    let total = dataset
-        .scenarios
-        .iter()
-        .map(|scenario| scenario.ticks.len())
-        .sum();
+    let mut problems: Vec<_> = dataset.problems.iter().map(Problem::from).collect();
+    let scenarios = dataset.scenarios.iter();
+    let total = scenarios.map(|scenario| scenario.ticks.len()).sum();
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         let findings: Vec<TickFindings> = (0..scenario.ticks.len())
@@ -87,17 +83,13 @@ pub fn inspect(
             .collect();
         report.scenarios.push(summarize(scenario, &findings));
         let scale = open.intensity_scale;
-        report
-            .problems
-            .extend(scenario_problems(scenario, &findings, scale));
+        problems.extend(scenario_problems(scenario, &findings, scale));
         for tick in findings {
             report.ticks.extend(tick.merged);
-            report
-                .problems
-                .extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
+            problems.extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
         }
     }
-    report.problems = counted(report.problems);
+    report.problems = counted(problems);
     report
 }
 
@@ -135,11 +127,8 @@ fn scenario_problems(
         let targets = ticks.iter().map(|tick| tick.targets).sum();
         let merged = ticks.iter().flat_map(|tick| &tick.merged);
         let merged = merged.map(|tick| tick.merged_boxes).sum();
-        problems.extend(findings::without_ground_truth(
-            &scenario.name,
-            targets,
-            merged,
-        ));
+        let problem = findings::without_ground_truth(&scenario.name, targets, merged);
+        problems.extend(problem);
     }
     problems
 }
@@ -270,19 +259,8 @@ fn merged_counts(
 }
 
 fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
-    let times: Vec<u64> = scenario
-        .ticks
-        .iter()
-        .map(|tick| tick.capture_nanos)
-        .collect();
-    // Times of a faulty data set may fall: a step back counts as 0.
-    let mut steps: Vec<u64> = times
-        .windows(2)
-        .map(|pair| pair[1].saturating_sub(pair[0]))
-        .collect();
-    steps.sort_unstable();
-    // The median step, since a gap in the recording would lower a mean rate.
-    let median = steps.get(steps.len() / 2).copied().filter(|&step| step > 0);
+    let times = scenario.ticks.iter().map(|tick| tick.capture_nanos);
+    let times: Vec<u64> = times.collect();
     let span = times
         .last()
         .zip(times.first())
@@ -293,7 +271,7 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         handedness: scenario.source_handedness,
         frames: scenario.ticks.len(),
         seconds: span as f64 / 1e9,
-        rate_hz: median.map(|step| 1e9 / step as f64),
+        rate_hz: median_step_nanos(&times).map(|step| 1e9 / step as f64),
         agents: (0..scenario.agents.len())
             .map(|agent| {
                 let frames: Vec<&FrameSurvey> =
@@ -315,10 +293,8 @@ fn summarize_agent(id: &CavId, frames: &[&FrameSurvey]) -> AgentReport {
         .filter_map(|frame| Some(frame.world_from_lidar?.translation_m))
         .collect();
     let steps = positions.windows(2).map(|pair| {
-        (0..3)
-            .map(|axis| (pair[1][axis] - pair[0][axis]).powi(2))
-            .sum::<f64>()
-            .sqrt()
+        let squares = (0..3).map(|axis| (pair[1][axis] - pair[0][axis]).powi(2));
+        squares.sum::<f64>().sqrt()
     });
     let sweeps: Vec<_> = (findings.clone())
         .filter_map(|frame| frame.sweep.as_ref())

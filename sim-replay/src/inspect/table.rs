@@ -5,7 +5,7 @@ use std::fmt;
 
 use protocol::Handedness;
 
-use super::{AgentReport, Report, ScenarioReport, Summary, TickReport};
+use super::{AgentReport, Report, ScenarioReport, Summary};
 use dataset::Layout;
 use terminal::text_table::{Side, TextTable};
 
@@ -16,13 +16,9 @@ impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let layout = self.layout.map_or("no supported layout", Layout::name);
         let frames: usize = self.scenarios.iter().map(|scenario| scenario.frames).sum();
-        writeln!(
-            f,
-            "{}: {layout}, {}, {}",
-            self.path,
-            count(self.scenarios.len(), "scenario"),
-            count(frames, "frame")
-        )?;
+        let scenarios = count(self.scenarios.len(), "scenario");
+        let frames = count(frames, "frame");
+        writeln!(f, "{}: {layout}, {scenarios}, {frames}", self.path)?;
         let agents = self.scenarios.iter().flat_map(|scenario| &scenario.agents);
         let has_boxes = agents
             .filter_map(|agent| agent.boxes)
@@ -53,16 +49,13 @@ impl Report {
             Handedness::Left => "left-handed",
             Handedness::Right => "right-handed",
         };
-        let rate = scenario
-            .rate_hz
-            .map(|rate| format!(" at {rate:.1} Hz"))
-            .unwrap_or_default();
-        let seconds = scenario.seconds;
+        let rate = scenario.rate_hz;
+        let rate = rate.map_or(String::new(), |rate| format!(" at {rate:.1} Hz"));
+        let (name, seconds) = (&scenario.name, scenario.seconds);
+        let frames = count(scenario.frames, "frame");
         writeln!(
             f,
-            "\n{}: {}{rate}, {seconds:.1} s, {axes} on disk",
-            scenario.name,
-            count(scenario.frames, "frame")
+            "\n{name}: {frames}{rate}, {seconds:.1} s, {axes} on disk"
         )?;
         write!(f, "{}", agents_table(&scenario.agents))?;
         for agent in &scenario.agents {
@@ -71,11 +64,8 @@ impl Report {
             }
         }
         if !scenario.lidar_variants.is_empty() {
-            writeln!(
-                f,
-                "  LiDAR variants: {}",
-                scenario.lidar_variants.join(", ")
-            )?;
+            let names = scenario.lidar_variants.join(", ");
+            writeln!(f, "  LiDAR variants: {names}")?;
         }
         if !scenario.cameras.is_empty() {
             let numbers: Vec<String> = scenario.cameras.iter().map(u8::to_string).collect();
@@ -90,30 +80,22 @@ impl Report {
 
     /// One line per ego: boxes ego-only, and with the other agents.
     fn write_merged(&self, f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
-        let of_scenario = self
-            .ticks
-            .iter()
-            .filter(|tick| tick.scenario == scenario.name);
+        let ticks = self.ticks.iter();
         let mut by_ego: BTreeMap<&str, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
-        for TickReport {
-            ego,
-            agents,
-            merged_boxes,
-            ..
-        } in of_scenario
-        {
-            let (alone, together) = by_ego.entry(ego.as_str()).or_default();
-            if agents.len() == 1 { alone } else { together }.push(*merged_boxes);
+        for tick in ticks.filter(|tick| tick.scenario == scenario.name) {
+            let (alone, together) = by_ego.entry(tick.ego.as_str()).or_default();
+            let is_alone = tick.agents.len() == 1;
+            if is_alone { alone } else { together }.push(tick.merged_boxes);
         }
         for (ego, (alone, together)) in by_ego {
             let with_others = match Summary::of(&together) {
                 Some(summary) => format!(", {} with those in range", shown(Some(summary))),
                 None => String::new(),
             };
+            let alone = shown(Summary::of(&alone));
             writeln!(
                 f,
-                "  ground truth of ego {ego}: {} ego-only{with_others}",
-                shown(Summary::of(&alone))
+                "  ground truth of ego {ego}: {alone} ego-only{with_others}"
             )?;
         }
         Ok(())
@@ -123,19 +105,15 @@ impl Report {
 /// One line for every agent that lacks frames which others have; at those that the ego lacks there is no tick.
 fn write_missing(f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
     for (index, AgentReport { id, .. }) in scenario.agents.iter().enumerate() {
-        let lacking: Vec<_> = scenario
-            .missing
-            .iter()
-            .filter(|frame| frame.agent == *id)
-            .collect();
+        let missing = scenario.missing.iter();
+        let lacking: Vec<_> = missing.filter(|frame| frame.agent == *id).collect();
         let (Some(first), Some(last)) = (lacking.first(), lacking.last()) else {
             continue;
         };
         let frames = count(lacking.len(), "frame");
-        let consequence = if index == 0 {
-            "the frames of others are not used there"
-        } else {
-            "absent there"
+        let consequence = match index {
+            0 => "the frames of others are not used there",
+            _ => "absent there",
         };
         writeln!(
             f,

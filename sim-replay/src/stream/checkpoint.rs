@@ -44,29 +44,22 @@ impl Place {
         scenario: &str,
         ticks: usize,
     ) -> Result<Option<Self>, CheckpointError> {
-        let text = match bounded_file::read_text(path, MAX_BYTES) {
+        let (read, path) = (bounded_file::read_text(path, MAX_BYTES), path.to_owned());
+        let text = match read {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(source) => {
-                return Err(CheckpointError::Read {
-                    path: path.into(),
-                    source,
-                });
-            }
+            Err(source) => return Err(CheckpointError::Read { path, source }),
         };
-        let place: Self = serde_json::from_str(&text).map_err(|source| CheckpointError::Text {
-            path: path.into(),
-            source,
-        })?;
+        let place: Self = match serde_json::from_str(&text) {
+            Ok(place) => place,
+            Err(source) => return Err(CheckpointError::Text { path, source }),
+        };
         // A next tick equal to `ticks` is valid: the scene was played to its end.
         if place.scenario != scenario || place.position.next_tick > ticks {
-            let position = format!(
-                "is tick {} of scenario {}",
-                place.position.next_tick, place.scenario
-            );
+            let (tick, of) = (place.position.next_tick, place.scenario);
             return Err(CheckpointError::Elsewhere {
-                path: path.into(),
-                place: position,
+                path,
+                place: format!("is tick {tick} of scenario {of}"),
                 scenario: scenario.into(),
                 ticks,
             });
@@ -154,11 +147,8 @@ impl Drop for Checkpoint {
     fn drop(&mut self) {
         // The thread still writes the last place, since a closed queue gives out what it holds.
         self.newest.close();
-        if self
-            .writing
-            .take()
-            .is_some_and(|writing| writing.join().is_err())
-        {
+        let writing = self.writing.take();
+        if writing.is_some_and(|writing| writing.join().is_err()) {
             tracing::error!("the thread that writes checkpoints panicked");
         }
     }

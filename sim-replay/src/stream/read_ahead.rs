@@ -19,15 +19,6 @@ struct State {
     is_closed: bool,
 }
 
-impl State {
-    fn next(&self) -> Option<usize> {
-        self.wanted
-            .iter()
-            .copied()
-            .find(|index| !self.ready.contains_key(index))
-    }
-}
-
 /// A thread that reads the requested ticks, in order, and keeps no others.
 pub(crate) struct ReadAhead {
     shared: Arc<(Mutex<State>, Condvar)>,
@@ -114,7 +105,8 @@ fn next_wanted(shared: &(Mutex<State>, Condvar)) -> Option<usize> {
         if state.is_closed {
             return None;
         }
-        if let Some(tick) = state.next() {
+        let mut wanted = state.wanted.iter();
+        if let Some(&tick) = wanted.find(|&tick| !state.ready.contains_key(tick)) {
             return Some(tick);
         }
         state = wait(&shared.1, state);

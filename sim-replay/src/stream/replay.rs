@@ -171,6 +171,7 @@ impl<'a> Replay<'a> {
         options: StreamOptions,
         stop: &Stop,
     ) -> Result<Self, StreamError> {
+        use Verb::{Pause, Resume, Seek, Start, Step};
         let agents = agent_indices(scenario, &options.agents)?;
         check(scenario, &options)?;
         let cavs = agents.iter().map(|&index| scenario.agents[index].clone());
@@ -201,35 +202,20 @@ impl<'a> Replay<'a> {
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let verbs = [
-            Verb::Start,
-            Verb::Pause,
-            Verb::Resume,
-            Verb::Step,
-            Verb::Seek,
-        ]
-        .map(Topic::Control);
+        let verbs = [Start, Pause, Resume, Step, Seek].map(Topic::Control);
         let answers = options.lockstep.iter();
         let answers = answers.map(|ego| Topic::stream(ego, Stream::Detections));
-        let subscriptions = verbs
-            .into_iter()
-            .chain(answers)
-            .map(|topic| bus.subscribe(topic, &inbox));
-        let sensor_link = options
-            .link
-            .as_ref()
-            .map(|(link, seed)| SensorLink::new(link, *seed))
-            .transpose()?;
+        let topics = verbs.into_iter().chain(answers);
+        let subscriptions = topics.map(|topic| bus.subscribe(topic, &inbox));
+        let link = options.link.as_ref();
+        let sensor_link = link.map(|(link, seed)| SensorLink::new(link, *seed));
+        let sensor_link = sensor_link.transpose()?;
+        let checkpoint = options.checkpoint.clone().map(Checkpoint::open);
         Ok(Self {
             bus,
             scenario: scenario.name.clone(),
             tick_count: scenario.ticks.len(),
-            checkpoint: options
-                .checkpoint
-                .clone()
-                .map(Checkpoint::open)
-                .transpose()
-                .map_err(StreamError::Thread)?,
+            checkpoint: checkpoint.transpose().map_err(StreamError::Thread)?,
             is_resumed: place.is_some(),
             reading,
             schedule,
@@ -293,28 +279,23 @@ impl<'a> Replay<'a> {
             // Noted last: a process that dies before this plays the tick once more.
             self.note_place();
         }
-        self.await_the_last();
+        // After the last tick: waits for the frames in flight, unless a stop is requested.
+        while let Some(next) = self.next_arrival().filter(|_| !self.stop.requested()) {
+            if matches!(self.inbox.take(Some(next)), Pop::Closed) {
+                break;
+            }
+            self.deliver();
+        }
         // The loop has ended: otherwise the process would count as stalled while it sends its queues.
         drop(working);
-        let Self {
-            bus,
-            publisher,
-            sensor_link,
-            mut report,
-            ..
-        } = self;
-        report.sensor_link = sensor_link.map(|link| link.report.clone());
+        let mut report = self.report;
+        report.sensor_link = self.sensor_link.map(|link| link.report);
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
-        report.sent = publisher.finish();
-        report.count_unsent(&bus.stats().ledger());
-        bus.publish_control(
-            Control::End {
-                ticks: report.ticks,
-                sent: report.sent.clone(),
-            },
-            0,
-        );
+        report.sent = self.publisher.finish();
+        report.count_unsent(&self.bus.stats().ledger());
+        let (ticks, sent) = (report.ticks, report.sent.clone());
+        self.bus.publish_control(Control::End { ticks, sent }, 0);
         report
     }
 
@@ -323,11 +304,8 @@ impl<'a> Replay<'a> {
             topic: Topic::stream(ego, Stream::Detections),
             receiver: self.bus.identity().process.clone(),
         });
-        let agents = self
-            .options
-            .agents
-            .iter()
-            .filter(|_| self.options.await_agents);
+        let options = &self.options;
+        let agents = options.agents.iter().filter(|_| options.await_agents);
         agents
             .flat_map(|cav| {
                 [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| {
@@ -346,12 +324,9 @@ impl<'a> Replay<'a> {
             let planned = self.schedule.clone().next()?;
             let due = self.clock.due(planned.capture_nanos, Instant::now());
             self.deliver();
-            match due {
-                Some(due) if due <= Instant::now() && !self.stop.requested() => {
-                    self.schedule.next();
-                    return Some((planned, due));
-                }
-                _ => {}
+            if let Some(due) = due.filter(|due| *due <= Instant::now() && !self.stop.requested()) {
+                self.schedule.next();
+                return Some((planned, due));
             }
             // While halted nothing is due: then only an arrival, a command or a stop wakes the loop.
             let until = due.into_iter().chain(self.next_arrival()).min();
@@ -382,16 +357,6 @@ impl<'a> Replay<'a> {
         for sweep in link.arrived(Instant::now()) {
             let (agent, nanos) = (sweep.agent, sweep.capture_nanos);
             self.publisher.submit(agent, nanos, sweep.frame);
-        }
-    }
-
-    /// After the last tick: waits for the frames in flight, unless a stop is requested.
-    fn await_the_last(&mut self) {
-        while let Some(next) = self.next_arrival().filter(|_| !self.stop.requested()) {
-            if matches!(self.inbox.take(Some(next)), Pop::Closed) {
-                return;
-            }
-            self.deliver();
         }
     }
 
@@ -432,19 +397,13 @@ impl<'a> Replay<'a> {
     }
 
     fn publish(&mut self, planned: Planned, due: Instant) {
-        let Planned {
-            tick_index,
-            capture_nanos,
-        } = planned;
-        let frames: TickFrames = self.reading.take(tick_index);
+        let capture_nanos = planned.capture_nanos;
+        let frames: TickFrames = self.reading.take(planned.tick_index);
         self.reading.want(&self.schedule.ahead(READ_AHEAD));
         // Taken before the frames are handed over. The truth takes no link: it is sent even if they are lost.
-        let agents = truth_of(&frames.iter().flatten().collect::<Vec<_>>());
-        self.present = frames
-            .iter()
-            .flatten()
-            .map(|frame| frame.cav.clone())
-            .collect();
+        let read: Vec<_> = frames.iter().flatten().collect();
+        let agents = truth_of(&read);
+        self.present = read.iter().map(|frame| frame.cav.clone()).collect();
         if self.options.lockstep.is_empty() && self.options.rate > 0.0 {
             self.report.lateness.add(due.elapsed());
         }
@@ -468,7 +427,7 @@ impl<'a> Replay<'a> {
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
-        let tick = tick_index as u64;
+        let tick = planned.tick_index as u64;
         let truth = Truth { tick, agents };
         self.publisher.submit_truth(capture_nanos, truth);
         self.deliver();

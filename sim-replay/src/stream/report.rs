@@ -111,9 +111,7 @@ impl Lateness {
     const KEPT: usize = 1 << 16;
 
     pub(super) fn add(&mut self, late: Duration) {
-        if late > LATE {
-            self.late_ticks += 1;
-        }
+        self.late_ticks += u64::from(late > LATE);
         // The maximum covers all ticks, the quantiles only the samples that are kept.
         self.max_ms = self.max_ms.max(late.as_secs_f64() * 1e3);
         if self.samples.len() < Self::KEPT {
@@ -122,12 +120,8 @@ impl Lateness {
     }
 
     pub(super) fn sum_up(&mut self) {
-        let ms: Vec<f64> = self
-            .samples
-            .iter()
-            .map(|late| late.as_secs_f64() * 1e3)
-            .collect();
-        let ms = sorted(&ms);
+        let ms = self.samples.iter().map(|late| late.as_secs_f64() * 1e3);
+        let ms = sorted(&ms.collect::<Vec<_>>());
         [self.p50_ms, self.p95_ms] = [0.5, 0.95].map(|q| quantile(&ms, q).unwrap_or(0.0));
     }
 }

@@ -72,26 +72,19 @@ impl Schedule {
 
     /// The next ticks, at most `count`.
     pub fn ahead(&self, count: usize) -> Vec<usize> {
-        self.clone()
-            .take(count)
-            .map(|planned| planned.tick_index)
-            .collect()
+        let ahead = self.clone().take(count);
+        ahead.map(|planned| planned.tick_index).collect()
     }
+}
 
-    fn period_nanos(&self) -> u64 {
-        let mut steps: Vec<u64> = self
-            .captures
-            .windows(2)
-            .map(|pair| pair[1].saturating_sub(pair[0]))
-            .collect();
-        // The median, so that a gap in the recording does not become the pace after a jump back.
-        steps.sort_unstable();
-        steps
-            .get(steps.len() / 2)
-            .copied()
-            .filter(|step| *step > 0)
-            .unwrap_or(SINGLE_TICK_PERIOD)
-    }
+/// The median step between capture times, nanoseconds, if it is above 0: a gap in the recording does not change it, as it
+/// would a mean. A step back, in a faulty data set, counts as 0.
+pub(crate) fn median_step_nanos(captures: &[u64]) -> Option<u64> {
+    let steps = captures.windows(2);
+    let steps = steps.map(|pair| pair[1].saturating_sub(pair[0]));
+    let mut steps: Vec<u64> = steps.collect();
+    steps.sort_unstable();
+    steps.get(steps.len() / 2).copied().filter(|&step| step > 0)
 }
 
 impl Iterator for Schedule {
@@ -109,9 +102,8 @@ impl Iterator for Schedule {
         if let Some(last) = self.position.last_nanos
             && recorded.saturating_add(self.position.shift_nanos) <= last
         {
-            self.position.shift_nanos = last
-                .saturating_add(self.period_nanos())
-                .saturating_sub(recorded);
+            let period_nanos = median_step_nanos(&self.captures).unwrap_or(SINGLE_TICK_PERIOD);
+            self.position.shift_nanos = last.saturating_add(period_nanos).saturating_sub(recorded);
         }
         let capture_nanos = recorded.saturating_add(self.position.shift_nanos);
         self.position.next_tick += 1;

@@ -8,7 +8,7 @@ use protocol::{CavId, DropReason, HEADER_LEN, Stream};
 use serde::Serialize;
 
 use dataset::frame::Frame;
-use link::{Delivery, LinkConfig, LinkEmulator, LinkError, Outcome, Packet};
+use link::{Delivery, LinkConfig, LinkEmulator, LinkError, Packet};
 use support::nanos;
 
 /// x, y, z and intensity of a point, bytes; for a radar's its velocity.
@@ -61,15 +61,10 @@ impl SensorLink {
 
     /// Submits the current frame of a vehicle. Data of all its sensors at a tick are transmitted together.
     pub(super) fn submit(&mut self, held: DelayedSweep, now: Instant) {
-        let Frame {
-            cav,
-            points,
-            radar,
-            cameras,
-            ..
-        } = &held.frame;
-        let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
-        let images: usize = cameras.iter().map(|(_, camera)| camera.image.len()).sum();
+        let (cav, frame) = (&held.frame.cav, &held.frame);
+        let points = frame.points.len() + frame.radar.as_ref().map_or(0, |radar| radar.len());
+        let cameras = frame.cameras.iter();
+        let images: usize = cameras.map(|(_, camera)| camera.image.len()).sum();
         let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64 + images as u64;
         let id = self.next_id;
         self.next_id += 1;
@@ -93,28 +88,25 @@ impl SensorLink {
 
     /// Time at which the next frame can arrive; `None` while none is in flight.
     pub(super) fn next(&self) -> Option<Instant> {
-        self.emulator
-            .next_nanos()
-            .map(|nanos| self.began + Duration::from_nanos(nanos))
+        let next_nanos = self.emulator.next_nanos()?;
+        Some(self.began + Duration::from_nanos(next_nanos))
     }
 
     /// Frames that have arrived by now.
     pub(super) fn arrived(&mut self, now: Instant) -> Vec<DelayedSweep> {
         let mut arrived = Vec::new();
-        for Outcome {
-            packet, delivery, ..
-        } in self.emulator.advance(nanos::between(self.began, now))
-        {
-            match delivery {
+        for outcome in self.emulator.advance(nanos::between(self.began, now)) {
+            let id = outcome.packet.id;
+            match outcome.delivery {
                 Delivery::Dropped(reason) => {
-                    self.held.remove(&packet.id);
+                    self.held.remove(&id);
                     *self.report.dropped.entry(reason).or_default() += 1;
                 }
                 // Its copy follows, so the frame stays held.
                 Delivery::Arrived {
                     is_repeated: true, ..
-                } => arrived.extend(self.held.get(&packet.id).cloned()),
-                Delivery::Arrived { .. } => arrived.extend(self.held.remove(&packet.id)),
+                } => arrived.extend(self.held.get(&id).cloned()),
+                Delivery::Arrived { .. } => arrived.extend(self.held.remove(&id)),
             }
         }
         self.report.arrived += arrived.len() as u64;

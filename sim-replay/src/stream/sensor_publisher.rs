@@ -1,11 +1,11 @@
 //! Publishers of a replayed scene: each vehicle's sensors, and the ground truth.
 
-use protocol::message::{AgentTruth, TrueObject};
+use protocol::message::{AgentTruth, Payload, TrueObject};
 use protocol::{CavId, Lidar, Radar, Stream, Topic, TopicCount, Truth};
 
 use bus::{Bus, BusError, Publisher, PublisherOptions};
 use dataset::LoadOptions;
-use dataset::frame::{Frame, Object};
+use dataset::frame::Frame;
 use dataset::ground_truth::annotations;
 
 /// Queue length of a lossless topic.
@@ -76,10 +76,8 @@ impl SensorPublisher {
             })
         });
         // Waits for a place even in a replay that is not paced: a tick without truth cannot be scored.
-        let truth = bus.publisher(
-            Topic::Truth,
-            PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES),
-        )?;
+        let waiting = PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES);
+        let truth = bus.publisher(Topic::Truth, waiting)?;
         Ok(Self {
             sensors: sensors.collect::<Result<_, _>>()?,
             truth,
@@ -94,62 +92,56 @@ impl SensorPublisher {
         };
         if let Some(gnss) = frame.gnss() {
             // The pose is sent first: it is small, and the sweep cannot be used without it.
-            sensors.gnss.submit(capture_nanos, gnss);
-            count(&mut self.sent, sensors.gnss.topic());
+            send(&mut self.sent, &sensors.gnss, capture_nanos, gnss);
         }
         // Empty where nothing is recorded: the agent need not wait for it.
-        sensors.imu.submit(capture_nanos, frame.motion());
-        count(&mut self.sent, sensors.imu.topic());
+        send(&mut self.sent, &sensors.imu, capture_nanos, frame.motion());
         // Not counted as sent, since zenoh may drop previews.
         if sensors.preview.is_wanted() {
             let points = frame.points.decimate(PREVIEW_POINTS);
             sensors.preview.submit(capture_nanos, Lidar { points });
         }
         let points = frame.points;
-        sensors.lidar.submit(capture_nanos, Lidar { points });
-        count(&mut self.sent, sensors.lidar.topic());
+        let sweep = Lidar { points };
+        send(&mut self.sent, &sensors.lidar, capture_nanos, sweep);
         if let (Some(publisher), Some(points)) = (&sensors.radar, frame.radar) {
-            publisher.submit(capture_nanos, Radar { points });
-            count(&mut self.sent, publisher.topic());
+            send(&mut self.sent, publisher, capture_nanos, Radar { points });
         }
         for (number, image) in frame.cameras {
             let mut cameras = sensors.cameras.iter();
             if let Some((_, publisher)) = cameras.find(|(known, _)| *known == number) {
-                publisher.submit(capture_nanos, image);
-                count(&mut self.sent, publisher.topic());
+                send(&mut self.sent, publisher, capture_nanos, image);
             }
         }
     }
 
     /// Submits the ground truth of one tick.
     pub(super) fn submit_truth(&mut self, capture_nanos: u64, truth: Truth) {
-        self.truth.submit(capture_nanos, truth);
-        count(&mut self.sent, self.truth.topic());
+        send(&mut self.sent, &self.truth, capture_nanos, truth);
     }
 
     /// Sends queued messages and ends every topic; returns the number of submitted messages by topic.
     pub(super) fn finish(self) -> Vec<TopicCount> {
-        for Sensors {
-            lidar,
-            gnss,
-            imu,
-            radar,
-            cameras,
-            preview,
-        } in self.sensors
-        {
-            [Some(lidar), Some(gnss), Some(imu), radar, Some(preview)]
-                .into_iter()
-                .flatten()
-                .chain(cameras.into_iter().map(|(_, camera)| camera))
-                .for_each(Publisher::finish);
+        for all in self.sensors {
+            let single = [Some(all.lidar), Some(all.gnss), Some(all.imu), all.radar];
+            let cameras = all.cameras.into_iter().map(|(_, camera)| camera);
+            let single = single.into_iter().flatten().chain([all.preview]);
+            single.chain(cameras).for_each(Publisher::finish);
         }
         self.truth.finish();
         self.sent
     }
 }
 
-fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
+/// Submits a message and counts it as sent.
+fn send<M: Payload + Send + 'static>(
+    sent: &mut Vec<TopicCount>,
+    publisher: &Publisher,
+    capture_nanos: u64,
+    message: M,
+) {
+    publisher.submit(capture_nanos, message);
+    let topic = publisher.topic();
     match sent.iter_mut().find(|count| count.topic == *topic) {
         Some(count) => count.messages += 1,
         None => sent.push(TopicCount {
@@ -167,22 +159,18 @@ pub(super) fn truth_of(frames_of_tick: &[&Frame]) -> Vec<AgentTruth> {
         .zip(annotations(frames_of_tick))
         .filter_map(|(frame, objects)| {
             let world_from_lidar = frame.world_from_lidar?;
-            let objects = objects.iter().map(true_object).collect();
+            let objects = objects.iter().map(|object| TrueObject {
+                id: object.id,
+                class: object.class.name().to_owned(),
+                world_from_object: object.world_from_object,
+                size_m: object.size_m,
+                speed_mps: object.speed_mps,
+            });
             Some(AgentTruth {
                 cav: frame.cav.clone(),
                 world_from_lidar,
-                objects,
+                objects: objects.collect(),
             })
         })
         .collect()
-}
-
-fn true_object(object: &Object) -> TrueObject {
-    TrueObject {
-        id: object.id,
-        class: object.class.name().to_owned(),
-        world_from_object: object.world_from_object,
-        size_m: object.size_m,
-        speed_mps: object.speed_mps,
-    }
 }

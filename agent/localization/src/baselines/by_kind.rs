@@ -10,18 +10,14 @@ use super::hypliloc::HypLiLocLocalizer;
 use super::polar_retrieval::DescribePolar;
 use super::sgloc::SgLocLocalizer;
 use crate::pgc::pose_solver::PoseSolver;
-use crate::pgc::{Localize, LocalizerError};
+use crate::pgc::{Localize, Result};
 
 /// Reads the weights of a baseline; `solver` is for those that regress coordinates.
 ///
 /// # Errors
 /// [`LocalizerError`] when the file is missing, truncated or of no baseline, or its tensors are not those of its
 /// configuration.
-pub fn load_baseline(
-    path: &Path,
-    device: Device,
-    solver: PoseSolver,
-) -> Result<Box<dyn Localize>, LocalizerError> {
+pub fn load_baseline(path: &Path, device: Device, solver: PoseSolver) -> Result<Box<dyn Localize>> {
     match Weights::load(path)?.metadata(KIND_KEY) {
         Some(DiffLocLocalizer::KIND) => Ok(Box::new(DiffLocLocalizer::load(path, device)?)),
         Some(HypLiLocLocalizer::KIND) => Ok(Box::new(HypLiLocLocalizer::load(path, device)?)),
@@ -33,10 +29,7 @@ pub fn load_baseline(
 ///
 /// # Errors
 /// As [`load_baseline`], and for other baselines.
-pub fn load_descriptor(
-    path: &Path,
-    device: Device,
-) -> Result<Box<dyn DescribePolar>, LocalizerError> {
+pub fn load_descriptor(path: &Path, device: Device) -> Result<Box<dyn DescribePolar>> {
     match Weights::load(path)?.metadata(KIND_KEY) {
         Some(DiffLocLocalizer::KIND) => Ok(Box::new(DiffLocLocalizer::load(path, device)?)),
         _ => Ok(Box::new(HypLiLocLocalizer::load(path, device)?)),

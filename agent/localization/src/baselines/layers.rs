@@ -1,7 +1,7 @@
 //! Layers that several baselines share.
 
+use tch::Tensor;
 use tch::nn::{self, BatchNormConfig, Init, ModuleT};
-use tch::{TchError, Tensor};
 
 use crate::pgc::dense::Dense;
 
@@ -24,7 +24,7 @@ impl LayerNorm {
     }
 
     /// `[.., width]` to the same.
-    pub(super) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, x: &Tensor) -> tch::Result<Tensor> {
         let weight = self.weight.f_to_kind(x.kind())?;
         let bias = self.bias.f_to_kind(x.kind())?;
         x.f_layer_norm(self.weight.size(), Some(weight), Some(bias), self.eps, true)
@@ -40,15 +40,15 @@ pub(super) struct DenseNorm {
 
 impl DenseNorm {
     /// Builds the layers below `path`.
-    pub(super) fn new(path: &nn::Path<'_>, io: [i64; 2], config: BatchNormConfig) -> Self {
+    pub(super) fn new(path: &nn::Path<'_>, io: [i64; 2]) -> Self {
         Self {
             dense: Dense::new(path, io[0], io[1], 1.0),
-            norm: nn::batch_norm1d(path / "norm", io[1], config),
+            norm: nn::batch_norm1d(path / "norm", io[1], BatchNormConfig::default()),
         }
     }
 
     /// `[N, C]` to `[N, C']`, in the precision of `x`.
-    pub(super) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, x: &Tensor, train: bool) -> tch::Result<Tensor> {
         Ok(self.norm.forward_t(&self.dense.forward(x)?, train))
     }
 }

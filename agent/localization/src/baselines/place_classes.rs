@@ -5,7 +5,7 @@
 
 use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, Tensor, no_grad};
 
 use crate::pgc::dense::Dense;
 
@@ -35,12 +35,9 @@ impl PlaceClasses {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn set(&mut self, centres_m: &[[f64; POSE as usize]]) -> Result<(), TchError> {
-        let centres_m = tensor(
-            centres_m.as_flattened(),
-            &[-1, POSE],
-            self.centres_m.device(),
-        )?;
+    pub fn set(&mut self, centres_m: &[[f64; POSE as usize]]) -> tch::Result<()> {
+        let device = self.centres_m.device();
+        let centres_m = tensor(centres_m.as_flattened(), &[-1, POSE], device)?;
         // As they are stored.
         no_grad(|| self.centres_m.f_copy_(&centres_m.f_to_kind(Kind::Half)?))
     }
@@ -49,7 +46,7 @@ impl PlaceClasses {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn in_metres(poses: &Tensor) -> Result<Tensor, TchError> {
+    pub fn in_metres(poses: &Tensor) -> tch::Result<Tensor> {
         let heading = poses.f_narrow(1, 3, 2)?.f_mul_scalar(HEADING_M)?;
         Tensor::f_cat(&[poses.f_narrow(1, 0, 3)?, heading], 1)
     }
@@ -58,7 +55,7 @@ impl PlaceClasses {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn nearest(&self, poses: &Tensor) -> Result<Tensor, TchError> {
+    pub fn nearest(&self, poses: &Tensor) -> tch::Result<Tensor> {
         Tensor::f_cdist(&Self::in_metres(poses)?, &self.centres_m, 2.0, None)?.f_argmin(1, false)
     }
 
@@ -66,7 +63,7 @@ impl PlaceClasses {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn relative(&self, poses: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+    pub fn relative(&self, poses: &Tensor, classes: &Tensor) -> tch::Result<Tensor> {
         let position = poses.f_narrow(1, 0, 3)?.f_sub(&self.positions(classes)?)? / UNIT_M;
         Tensor::f_cat(&[position, poses.f_narrow(1, 3, 2)?], 1)
     }
@@ -75,13 +72,13 @@ impl PlaceClasses {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn absolute(&self, relative: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+    pub fn absolute(&self, relative: &Tensor, classes: &Tensor) -> tch::Result<Tensor> {
         // Headings are absolute already: only positions are relative to the class.
         let position = relative.f_narrow(1, 0, 3)? * UNIT_M + self.positions(classes)?;
         Tensor::f_cat(&[position, relative.f_narrow(1, 3, 2)?], 1)
     }
 
-    fn positions(&self, classes: &Tensor) -> Result<Tensor, TchError> {
+    fn positions(&self, classes: &Tensor) -> tch::Result<Tensor> {
         self.centres_m.f_index_select(0, classes)?.f_narrow(1, 0, 3)
     }
 }
@@ -107,12 +104,12 @@ impl PlaceHead {
     }
 
     /// `[N, K]` logits of features `[N, width]`.
-    pub(super) fn classify(&self, features: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn classify(&self, features: &Tensor) -> tch::Result<Tensor> {
         self.logits.forward(features)
     }
 
     /// The features scaled and shifted as `classes` `[N]` have learnt.
-    pub(super) fn of_class(&self, features: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn of_class(&self, features: &Tensor, classes: &Tensor) -> tch::Result<Tensor> {
         let scale = self.scale.f_index_select(0, classes)?;
         let shift = self.shift.f_index_select(0, classes)?;
         features.f_mul(&scale)?.f_add(&shift)

@@ -6,7 +6,7 @@ use std::fmt::Debug;
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use protocol::{NoPoseReason, PointCloud};
 use support::stage_times::StageTimes;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
 
 use super::regressed_pose::{PoseRegressor, RegressPose, localization, no_pose};
 use super::tokens::{RINGS, SECTORS};
@@ -20,8 +20,7 @@ pub trait DescribePolar: Debug + Send {
     ///
     /// # Errors
     /// Those of the tensor library.
-    fn polar(&self, cloud: &PointCloud, times: &mut StageTimes)
-    -> Result<Option<Tensor>, TchError>;
+    fn polar(&self, cloud: &PointCloud, times: &mut StageTimes) -> tch::Result<Option<Tensor>>;
 }
 
 /// Scan Context (Kim and Kim 2018): the greatest height of points in 20 rings and 60 sectors.
@@ -51,11 +50,7 @@ impl ScanContext {
 }
 
 impl DescribePolar for ScanContext {
-    fn polar(
-        &self,
-        cloud: &PointCloud,
-        times: &mut StageTimes,
-    ) -> Result<Option<Tensor>, TchError> {
+    fn polar(&self, cloud: &PointCloud, times: &mut StageTimes) -> tch::Result<Option<Tensor>> {
         let heights = Self::heights(cloud);
         let device = tch::Device::Cpu;
         let described = heights.iter().any(|&height| height > 0.0);
@@ -68,11 +63,7 @@ impl DescribePolar for ScanContext {
 
 impl<N: RegressPose> DescribePolar for PoseRegressor<N> {
     /// Tokens, ring beside ring.
-    fn polar(
-        &self,
-        cloud: &PointCloud,
-        times: &mut StageTimes,
-    ) -> Result<Option<Tensor>, TchError> {
+    fn polar(&self, cloud: &PointCloud, times: &mut StageTimes) -> tch::Result<Option<Tensor>> {
         let Some(tokens) = self.tokens(cloud, times)? else {
             return Ok(None);
         };
@@ -98,7 +89,7 @@ impl PolarRetrieval {
     pub fn new(
         describe: Box<dyn DescribePolar>,
         sweeps: Vec<(Tensor, Isometry3<f64>)>,
-    ) -> Result<Self, TchError> {
+    ) -> tch::Result<Self> {
         let (descriptors, world_from_sensor): (Vec<_>, Vec<_>) = sweeps.into_iter().unzip();
         let rows = descriptors.iter().map(|of| normalised(of)?.f_view([-1]));
         let rows: Vec<Tensor> = rows.collect::<Result<_, _>>()?;
@@ -110,7 +101,7 @@ impl PolarRetrieval {
     }
 
     /// Pose of a sensor whose sweep is described so: that of the sweep with the greatest mean cosine of sectors, turned.
-    fn nearest(&self, descriptor: &Tensor) -> Result<Isometry3<f64>, TchError> {
+    fn nearest(&self, descriptor: &Tensor) -> tch::Result<Isometry3<f64>> {
         let descriptor = normalised(descriptor)?;
         let sectors = descriptor.size()[0];
         // A sensor turned k sectors to the left sees all things k sectors further right: a roll undoes it.
@@ -125,7 +116,7 @@ impl PolarRetrieval {
     }
 }
 
-fn normalised(descriptor: &Tensor) -> Result<Tensor, TchError> {
+fn normalised(descriptor: &Tensor) -> tch::Result<Tensor> {
     let length = descriptor
         .f_square()?
         .f_sum_dim_intlist(1_i64, true, Kind::Float)?;

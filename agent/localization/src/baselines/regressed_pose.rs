@@ -9,8 +9,9 @@ use perception::weights::{FileError, KIND_KEY, Weights};
 use protocol::config::{require, within};
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use support::stage_times::StageTimes;
-use tch::{Device, Kind, TchError, Tensor, nn, no_grad};
+use tch::{Device, Kind, Tensor, nn, no_grad};
 
 use super::place_classes::PlaceClasses;
 use super::tokens::{TokenProjection, pool};
@@ -44,15 +45,14 @@ pub trait RegressPose: Debug + Send + Sized {
     ///
     /// # Errors
     /// Those of the tensor library.
-    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> Result<Self, TchError>;
+    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> tch::Result<Self>;
 
     /// `[N, 5]` positions relative to the origin in metres, cosines and sines of headings, of sweeps with tokens
     /// `[N, TOKENS, channels]`; products are computed in `kind`.
     ///
     /// # Errors
     /// Those of the tensor library.
-    fn poses(&self, tokens: &Tensor, places: &PlaceClasses, kind: Kind)
-    -> Result<Tensor, TchError>;
+    fn poses(&self, tokens: &Tensor, places: &PlaceClasses, kind: Kind) -> tch::Result<Tensor>;
 }
 
 /// Encoder, tokens, place classes and network of one scene. Every pose has full confidence: no error is predicted.
@@ -102,13 +102,9 @@ impl<N: RegressPose> PoseRegressor<N> {
     /// place of the encoder, or its tensors are not those of its configuration.
     pub fn load(path: &Path, device: Device) -> Result<Self, LocalizerError> {
         let weights = Weights::load(path)?;
-        let kind = weights.metadata(KIND_KEY);
+        let is_own = weights.metadata(KIND_KEY) == Some(N::KIND);
         // Without this check the error would be of a missing field and not say what to do.
-        if kind == Some(N::KIND)
-            && (weights.config::<serde_json::Value>()?)
-                .get("encoder")
-                .is_none()
-        {
+        if is_own && weights.config::<Value>()?.get("encoder").is_none() {
             let problem = format!(
                 "weights of kind {:?} have no encoder: they are of an earlier version, whose network had layers of its \
                  own there; train anew (agent train {})",
@@ -133,7 +129,7 @@ impl<N: RegressPose> PoseRegressor<N> {
         &self,
         cloud: &PointCloud,
         times: &mut StageTimes,
-    ) -> Result<Option<Tensor>, TchError> {
+    ) -> tch::Result<Option<Tensor>> {
         let config = self.encoder.config();
         let sweep = SweepVoxels::new(cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]), config);
         times.lap(VOXELISE);
@@ -142,9 +138,8 @@ impl<N: RegressPose> PoseRegressor<N> {
         }
         let batch = VoxelBatch::new(&[&sweep], config, self.device)?;
         let features = self.encoder.encode(&batch, Kind::Float)?;
-        let tokens = self
-            .projection
-            .forward(&pool(sweep.cells(), &features.cells)?)?;
+        let pooled = pool(sweep.cells(), &features.cells)?;
+        let tokens = self.projection.forward(&pooled)?;
         times.lap(ENCODE);
         Ok(Some(tokens))
     }
@@ -175,12 +170,7 @@ pub(super) fn localization(pose: Option<Isometry3<f64>>, times: StageTimes) -> L
 }
 
 pub(super) fn no_pose(reason: NoPoseReason, times: StageTimes) -> Localization {
-    let inlier_count = 0;
-    let none = PoseEstimate::NoPose {
-        reason,
-        inlier_count,
-    };
-    Localization::from_estimate(none, times)
+    Localization::from_estimate(PoseEstimate::no_pose(reason, 0), times)
 }
 
 /// Shortest vector of cosine and sine that is a direction.

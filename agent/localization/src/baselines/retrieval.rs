@@ -45,13 +45,12 @@ impl SweepDatabase {
             scale: scale.collect(),
             mean,
             descriptors: Vec::new(),
-            world_from_sensor: Vec::new(),
+            world_from_sensor: (sweeps.iter().map(|sweep| sweep.world_from_sensor)).collect(),
         };
-        for sweep in sweeps {
-            let normalised = database.normalise(&sweep.descriptor);
-            database.descriptors.extend(normalised);
-            database.world_from_sensor.push(sweep.world_from_sensor);
-        }
+        let normalised = sweeps
+            .iter()
+            .flat_map(|sweep| database.normalise(&sweep.descriptor));
+        database.descriptors = normalised.collect();
         Some(database)
     }
 
@@ -69,9 +68,8 @@ impl SweepDatabase {
 
     fn normalise(&self, descriptor: &[f32]) -> Vec<f32> {
         let channels = descriptor.iter().zip(&self.mean).zip(&self.scale);
-        channels
-            .map(|((value, mean), scale)| (value - mean) * scale)
-            .collect()
+        let normalised = channels.map(|((value, mean), scale)| (value - mean) * scale);
+        normalised.collect()
     }
 }
 
@@ -95,9 +93,8 @@ impl Retrieval {
 impl Localize for Retrieval {
     /// Every pose has full confidence: nothing tells a good one from a bad one.
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
-        let cloud = sweep.cloud;
         let mut times = stopwatch();
-        let Some(descriptor) = self.localizer.sweep_features(cloud, &mut times)? else {
+        let Some(descriptor) = self.localizer.sweep_features(sweep.cloud, &mut times)? else {
             return Ok(no_pose(NoPoseReason::TooFewPoints, times));
         };
         let pose = self.database.nearest(&descriptor);

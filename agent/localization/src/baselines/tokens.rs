@@ -6,7 +6,7 @@
 use std::f32::consts::{PI, TAU};
 
 use perception::tensor_values::tensor;
-use tch::{Kind, TchError, Tensor, nn, no_grad};
+use tch::{Kind, Tensor, nn, no_grad};
 
 use crate::pgc::Cell;
 
@@ -42,7 +42,7 @@ pub fn token_of([x, y, _]: [f32; 3]) -> (usize, f32) {
 ///
 /// # Errors
 /// Those of the tensor library.
-pub fn pool(cells: &[Cell], features: &Tensor) -> Result<Tensor, TchError> {
+pub fn pool(cells: &[Cell], features: &Tensor) -> tch::Result<Tensor> {
     let (mut rows, mut tokens) = (Vec::new(), Vec::new());
     let mut geometry =
         vec![[0.0, 0.0, f32::INFINITY, 0.0, f32::NEG_INFINITY, 0.0]; TOKENS as usize];
@@ -60,21 +60,12 @@ pub fn pool(cells: &[Cell], features: &Tensor) -> Result<Tensor, TchError> {
     let device = features.device();
     let counts: Vec<f32> = geometry.iter().map(|of| of[0].max(1.0)).collect();
     for of in &mut geometry {
-        let count = of[0];
+        let [count, ranges, nearest, heights, top, directions] = *of;
+        let [range, height, direction] = [ranges, heights, directions].map(|sum| sum / count);
+        // Counts span orders of magnitude. Never 0 in an occupied token, which marks it as such.
+        let occupied = count.ln_1p() / 3.0;
         *of = match count > 0.0 {
-            true => {
-                let [_, ranges, nearest, heights, top, directions] = *of;
-                let means = [ranges, heights, directions].map(|sum| sum / count);
-                [
-                    // Counts span orders of magnitude. Never 0 in an occupied token, which marks it as such.
-                    count.ln_1p() / 3.0,
-                    means[0],
-                    nearest,
-                    means[1],
-                    top,
-                    means[2],
-                ]
-            }
+            true => [occupied, range, nearest, height, top, direction],
             false => [0.0; GEOMETRY as usize],
         };
     }
@@ -113,7 +104,7 @@ impl TokenProjection {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn fit(&mut self, pooled: &Tensor) -> Result<(), TchError> {
+    pub fn fit(&mut self, pooled: &Tensor) -> tch::Result<()> {
         let (channels, components) = self.basis.size2()?;
         let pooled = pooled.f_reshape([-1, channels + GEOMETRY])?;
         // Empty tokens are all 0 and would pull the mean towards it.
@@ -150,7 +141,7 @@ impl TokenProjection {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn forward(&self, pooled: &Tensor) -> Result<Tensor, TchError> {
+    pub fn forward(&self, pooled: &Tensor) -> tch::Result<Tensor> {
         let pooled = pooled.f_to_kind(Kind::Float)?;
         let channels = self.basis.size()[0];
         let geometry = pooled.f_narrow(-1, channels, GEOMETRY)?;

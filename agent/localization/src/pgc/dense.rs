@@ -1,8 +1,8 @@
 //! Dense layer: a linear map of features.
 
 use perception::int8::{Int8Linear, LayerFormat};
+use tch::Tensor;
 use tch::nn::{self, Init};
-use tch::{TchError, Tensor};
 
 /// `x W + b` in the precision of `x`.
 #[derive(Debug)]
@@ -15,18 +15,15 @@ impl Dense {
     /// He-initialised, times `gain`.
     pub(crate) fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64, gain: f64) -> Self {
         let stdev = gain * (2.0 / inputs as f64).sqrt();
+        let random = Init::Randn { mean: 0.0, stdev };
         Self {
-            weight: path.var(
-                "weight",
-                &[inputs, outputs],
-                Init::Randn { mean: 0.0, stdev },
-            ),
+            weight: path.var("weight", &[inputs, outputs], random),
             bias: path.var("bias", &[outputs], Init::Const(0.0)),
         }
     }
 
     /// `[.., inputs]` to `[.., outputs]`.
-    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub(crate) fn forward(&self, x: &Tensor) -> tch::Result<Tensor> {
         let (inputs, outputs) = self.weight.size2()?;
         let mut shape = x.size();
         shape.pop();
@@ -37,7 +34,7 @@ impl Dense {
     }
 
     /// The same in integers.
-    pub(crate) fn int8(&self, format: LayerFormat) -> Result<Int8Linear, TchError> {
+    pub(crate) fn int8(&self, format: LayerFormat) -> tch::Result<Int8Linear> {
         int8_linear(&self.weight, Some(&self.bias), format)
     }
 }
@@ -47,7 +44,7 @@ pub(super) fn int8_linear(
     weight: &Tensor,
     bias: Option<&Tensor>,
     format: LayerFormat,
-) -> Result<Int8Linear, TchError> {
+) -> tch::Result<Int8Linear> {
     // Stored `[C_in, C_out]`: integer layers take the transpose.
     Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
 }

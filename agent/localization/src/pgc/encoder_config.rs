@@ -111,30 +111,20 @@ impl SceneEncoderConfig {
 
     /// Edge of the cells that scene coordinates are regressed for, metres.
     pub fn cell_m(&self) -> f64 {
-        if self.fine_cells {
-            0.5 * self.coarse_cell_m()
-        } else {
-            self.coarse_cell_m()
-        }
+        let share = if self.fine_cells { 0.5 } else { 1.0 };
+        share * self.coarse_cell_m()
     }
 
     /// Channels of the last level.
     pub(crate) fn coarse_channels(&self) -> i64 {
-        self.residual_widths
-            .last()
-            .or(self.widths.last())
-            .copied()
-            .unwrap_or(0)
+        let last = self.residual_widths.last().or(self.widths.last());
+        last.copied().unwrap_or(0)
     }
 
     /// Channels of a cell before its surroundings are added.
     pub fn local_channels(&self) -> i64 {
-        let fine = if self.fine_cells {
-            self.widths[self.levels() - 2]
-        } else {
-            0
-        };
-        fine + self.coarse_channels()
+        let fine = self.fine_cells.then(|| self.widths[self.levels() - 2]);
+        fine.unwrap_or(0) + self.coarse_channels()
     }
 
     /// Channels of a cell.
@@ -179,17 +169,12 @@ impl SceneEncoderConfig {
     fn parameters(&self) -> i64 {
         let before_last = self.widths[self.levels() - 2];
         let mut products = self.input.channels() * self.widths[0];
-        products += self
-            .widths
-            .windows(2)
-            .map(|pair| pair[0] * pair[1])
-            .sum::<i64>();
+        let between = self.widths.windows(2).map(|pair| pair[0] * pair[1]);
+        products += between.sum::<i64>();
         // A residual group has two: from its inputs to its outputs, and between its outputs.
-        products += if self.fine_cells {
-            2 * before_last * before_last
-        } else {
-            0
-        };
+        if self.fine_cells {
+            products += 2 * before_last * before_last;
+        }
         let mut channels = self.widths[self.levels() - 1];
         for &width in &self.residual_widths {
             products += (channels + width) * width;

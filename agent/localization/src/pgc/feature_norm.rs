@@ -1,7 +1,6 @@
 //! Normalisation of features to mean 0 and deviation 1.
 
-use tch::nn;
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, Tensor, nn, no_grad};
 
 /// Smallest deviation: constant channels are scaled as if they had this one.
 const LEAST_DEVIATION: f64 = 1e-4;
@@ -23,7 +22,7 @@ impl FeatureNorm {
     }
 
     /// Sets mean and deviation of `[N, channels]`.
-    pub(crate) fn fit(&mut self, features: &Tensor) -> Result<(), TchError> {
+    pub(crate) fn fit(&mut self, features: &Tensor) -> tch::Result<()> {
         let features = features.f_to_kind(Kind::Float)?;
         let deviation = features.f_std_dim(0_i64, false, false)?;
         no_grad(|| {
@@ -35,7 +34,7 @@ impl FeatureNorm {
     }
 
     /// In single precision.
-    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub(crate) fn forward(&self, x: &Tensor) -> tch::Result<Tensor> {
         Ok((x.f_to_kind(Kind::Float)? - &self.mean) * &self.scale)
     }
 }

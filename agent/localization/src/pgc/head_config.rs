@@ -5,8 +5,7 @@ use std::path::Path;
 use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
-use super::error::LocalizerError;
-use crate::pgc::Result;
+use super::error::{LocalizerError, Result};
 
 /// Largest number of values of a key grid.
 const MAX_KEY_GRID: i64 = 64_000_000;
@@ -168,10 +167,8 @@ impl SceneHeadConfig {
         }
         let is_place = self.origin_m.iter().all(|axis| axis.is_finite());
         require(is_place, "origin_m", self.origin_m, "must be finite")?;
-        let field = format!(
-            "width {} with {} blocks: parameters",
-            self.width, self.blocks
-        );
+        let (width, blocks) = (self.width, self.blocks);
+        let field = format!("width {width} with {blocks} blocks: parameters");
         within(&field, self.parameters(), 0, MAX_PARAMETERS)
     }
 

@@ -49,10 +49,7 @@ fn released_file(head: &Path, kind: &str, prefix: &str, trained: &str) -> Result
     }
     let folders = weights_folders();
     let name = head.display();
-    let names = [
-        format!("{prefix}{name}.{ENDING}"),
-        format!("{name}.{ENDING}"),
-    ];
+    let names = [prefix, ""].map(|prefix| format!("{prefix}{name}.{ENDING}"));
     let mut files = folders
         .iter()
         .flat_map(|folder| names.iter().map(move |name| folder.join(name)));

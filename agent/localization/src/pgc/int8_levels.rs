@@ -1,6 +1,6 @@
 //! Levels of the scene encoder in 8-bit integers.
 
-use tch::{TchError, Tensor};
+use tch::Tensor;
 
 use super::residual_group::Int8ResidualGroup;
 use super::voxel_batch::VoxelBatch;
@@ -28,7 +28,7 @@ impl Int8Levels {
         &self,
         first: &Tensor,
         batch: &VoxelBatch,
-    ) -> Result<(Option<Tensor>, Tensor), TchError> {
+    ) -> tch::Result<(Option<Tensor>, Tensor)> {
         let mut x = self.first.quantise(first)?;
         let mut fine = None;
         for (level, conv) in self.down.iter().enumerate() {

@@ -59,24 +59,18 @@ impl Localization {
 
     /// Result of a method without cells: its estimate is the only evidence.
     pub fn from_estimate(estimate: PoseEstimate, times: StageTimes) -> Self {
-        let (found, inlier_count) = match estimate {
-            PoseEstimate::Pose {
-                world_from_cav,
-                confidence,
-                ..
-            } => {
-                let found = FoundPose {
-                    world_from_sensor: world_from_cav.isometry(),
-                    evidence: PoseEvidence::none(),
-                    cell_covariance: PoseStd::UNBOUNDED.covariance,
-                    is_registered: false,
-                    covariance_scale: None,
-                    sigma: f64::from(confidence),
-                    is_rejected: false,
-                };
-                (Some(found), 0)
-            }
-            PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
+        let found = estimate.world_from_cav().map(|world_from_cav| FoundPose {
+            world_from_sensor: world_from_cav.isometry(),
+            evidence: PoseEvidence::none(),
+            cell_covariance: PoseStd::UNBOUNDED.covariance,
+            is_registered: false,
+            covariance_scale: None,
+            sigma: f64::from(estimate.confidence()),
+            is_rejected: false,
+        });
+        let inlier_count = match estimate {
+            PoseEstimate::Pose { .. } => 0,
+            PoseEstimate::NoPose { inlier_count, .. } => inlier_count,
         };
         Self {
             estimate,

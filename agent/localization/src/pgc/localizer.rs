@@ -4,18 +4,18 @@ use std::path::Path;
 
 use perception::inference::Inference;
 use perception::int8::ScaleSearch;
-use perception::tensor_values::{tensor, values};
+use perception::tensor_values::values;
 use perception::weights::Weights;
 use protocol::PointCloud;
 use protocol::config::FieldError;
 use serde::de::DeserializeOwned;
 use support::stage_times::StageTimes;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Kind, Tensor, no_grad};
 
 use super::cell_choice::choose_evenly;
 use super::cell_encoder::{CellEncoder, PreparedSweep};
 use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
-use super::error::LocalizerError;
+use super::error::{LocalizerError, Result};
 use super::extensions::other_parts::MOST_PARTS;
 use super::head_config::SceneHeadConfig;
 use super::localization::{ENCODE, REGRESS, VOXELISE, stopwatch};
@@ -26,7 +26,6 @@ use super::scene_coordinates::SceneCoordinates;
 use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
 use crate::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
-use crate::pgc::Result;
 
 /// Largest number of regressed cells, where the head allows for more: more cells hardly improve poses, and they take
 /// time.
@@ -49,7 +48,6 @@ pub struct Localizer {
     pub(super) head: SceneHead,
     pub(super) solver: PoseSolver,
     pub(super) most_parts: usize,
-    device: Device,
     pub(super) sha256: [String; 2],
 }
 
@@ -101,7 +99,6 @@ impl Localizer {
             head: scene_head,
             solver: PoseSolver::default(),
             most_parts: MOST_PARTS,
-            device,
             sha256: [encoder_sha256, weights.sha256().to_owned()],
         };
         Ok((localizer, weights))
@@ -115,12 +112,10 @@ impl Localizer {
         let Some(encoded) = self.encode(LocalizerInput::of(cloud), &mut stopwatch())? else {
             return Ok(());
         };
-        let EncodedSweep {
-            sweep, features, ..
-        } = &encoded;
+        let (sweep, features) = (&encoded.sweep, &encoded.features);
         self.encoder.observe(sweep, search)?;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
-        let cells = self.pick(sweep, features, &chosen)?.features;
+        let cells = SweepCells::pick(sweep.cells(), features, &chosen)?.features;
         no_grad(|| {
             let logits = self.head.classify(&features.sweeps, false)?;
             let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
@@ -166,10 +161,9 @@ impl Localizer {
         cloud: &PointCloud,
         times: &mut StageTimes,
     ) -> Result<Option<Vec<f32>>> {
-        let Some(encoded) = self.encode(LocalizerInput::of(cloud), times)? else {
-            return Ok(None);
-        };
-        Ok(Some(values(&encoded.features.sweeps)?))
+        let encoded = self.encode(LocalizerInput::of(cloud), times)?;
+        let features = encoded.map(|encoded| values(&encoded.features.sweeps));
+        Ok(features.transpose()?)
     }
 
     /// Cells and features; `None` for a sweep without cells.
@@ -185,7 +179,7 @@ impl Localizer {
             return Ok(None);
         }
         let features = self.encoder.encode_one(&sweep, input.levels)?;
-        let refinement_cells = self.pick(&sweep, &features, &refined)?;
+        let refinement_cells = SweepCells::pick(sweep.cells(), &features, &refined)?;
         times.lap(ENCODE);
         Ok(Some(EncodedSweep {
             sweep,
@@ -195,7 +189,7 @@ impl Localizer {
     }
 
     /// Logits `[1, classes]` of the parts of the scene.
-    pub(super) fn classify(&self, encoded: &EncodedSweep) -> Result<Tensor, TchError> {
+    pub(super) fn classify(&self, encoded: &EncodedSweep) -> tch::Result<Tensor> {
         no_grad(|| self.head.classify(&encoded.features.sweeps, false))
     }
 
@@ -210,7 +204,7 @@ impl Localizer {
     ) -> Result<SceneCoordinates> {
         let sweep = &encoded.sweep;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(count));
-        let cells = self.pick(sweep, &encoded.features, &chosen)?;
+        let cells = SweepCells::pick(sweep.cells(), &encoded.features, &chosen)?;
         let regression = no_grad(|| {
             let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
             let features = self.head.normalise(&cells.features)?;
@@ -224,21 +218,6 @@ impl Localizer {
             world_m: world.as_chunks().0.to_vec(),
             epsilon_m,
             origin_m: self.head.config().origin_m,
-        })
-    }
-
-    fn pick(
-        &self,
-        sweep: &PreparedSweep,
-        features: &SceneFeatures,
-        chosen: &[usize],
-    ) -> Result<SweepCells, TchError> {
-        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
-        let rows = tensor(&rows, &[-1], self.device)?;
-        let centroids = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m);
-        Ok(SweepCells {
-            features: no_grad(|| features.cells.f_index_select(0, &rows))?,
-            sensor_m: centroids.collect(),
         })
     }
 
@@ -287,6 +266,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     use perception::weights::{self, Precision};
+    use tch::Device;
     use tch::nn::VarStore;
 
     use super::*;

@@ -50,9 +50,9 @@ pub use localize::{Localize, LocalizerInput};
 pub use localizer::{Localizer, stored_confidence};
 pub use pose_evidence::{PoseEvidence, RefinementEvidence};
 pub use refinement_network::Refiner;
-pub use scene_coordinates::{SceneCoordinates, sigma};
+pub use scene_coordinates::{Regression, SceneCoordinates, sigma};
 pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
-pub use scene_regression::{Regression, SceneHead};
+pub use scene_regression::SceneHead;
 pub use voxel_batch::VoxelBatch;
 pub use voxelise::{Cell, SweepVoxels};
 

@@ -63,36 +63,36 @@ impl PoseEvidence {
         second: Option<&RefinedPose>,
     ) -> Self {
         let std = std_of(coordinates, registration, second);
-        let (inliers, start) = (&registration.inliers, &registration.target_from_source);
-        Self {
-            cells: coordinates.sensor_m.len(),
-            inliers: inliers.len(),
-            inlier_ratio: registration.inlier_ratio,
-            rms_m: registration.rms_m,
-            inlier_epsilon_m: mean_over(inliers, &coordinates.epsilon_m, f64::from),
-            median_epsilon_m: median(&coordinates.epsilon_m),
-            inlier_sigma: mean_sigma(inliers, &coordinates.epsilon_m),
-            position_std_m: std.position_m,
-            rotation_std_rad: std.rotation_rad,
-            second: second.map(|second| RefinementEvidence::gather(start, second)),
-        }
+        let start = &registration.target_from_source;
+        let second = second.map(|second| RefinementEvidence::gather(start, second));
+        Self::of(registration, &coordinates.epsilon_m, &std, second)
     }
 
     /// Evidence of a pose that was refined from a predicted one, relative to the head's origin.
     pub(super) fn of_refinement(refined: &RefinedPose, start: &Isometry3<f64>) -> Self {
         let second = RefinementEvidence::gather(start, refined);
-        let inliers = &refined.registration.inliers;
+        let epsilon_m = &refined.epsilon_m;
+        Self::of(&refined.registration, epsilon_m, &refined.std, Some(second))
+    }
+
+    fn of(
+        registration: &Registration,
+        epsilon_m: &[f32],
+        std: &PoseStd,
+        second: Option<RefinementEvidence>,
+    ) -> Self {
+        let inliers = &registration.inliers;
         Self {
-            cells: refined.epsilon_m.len(),
+            cells: epsilon_m.len(),
             inliers: inliers.len(),
-            inlier_ratio: second.inlier_ratio,
-            rms_m: second.rms_m,
-            inlier_epsilon_m: mean_over(inliers, &refined.epsilon_m, f64::from),
-            median_epsilon_m: second.median_epsilon_m,
-            inlier_sigma: second.inlier_sigma,
-            position_std_m: refined.std.position_m,
-            rotation_std_rad: refined.std.rotation_rad,
-            second: Some(second),
+            inlier_ratio: registration.inlier_ratio,
+            rms_m: registration.rms_m,
+            inlier_epsilon_m: mean_over(inliers, epsilon_m, f64::from),
+            median_epsilon_m: median(epsilon_m),
+            inlier_sigma: mean_sigma(inliers, epsilon_m),
+            position_std_m: std.position_m,
+            rotation_std_rad: std.rotation_rad,
+            second,
         }
     }
 
@@ -146,11 +146,9 @@ fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f6
 /// Upper median over all cells; 0 for none. The fitted confidence model depends on this rule.
 fn median(epsilon_m: &[f32]) -> f64 {
     let mut sorted = epsilon_m.to_vec();
-    let middle = sorted.len() / 2;
-    match sorted.is_empty() {
-        true => 0.0,
-        false => f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1),
-    }
+    sorted.sort_unstable_by(f32::total_cmp);
+    let middle = sorted.get(sorted.len() / 2);
+    middle.copied().map_or(0.0, f64::from)
 }
 
 /// Standard deviations of a pose: of the refined one, if there is one.
@@ -159,11 +157,9 @@ pub(super) fn std_of(
     registration: &Registration,
     second: Option<&RefinedPose>,
 ) -> PoseStd {
-    second.map_or_else(|| first_std(coordinates, registration), |second| second.std)
-}
-
-/// Standard deviation of a coarse pose: its inliers are weighted by their confidences.
-fn first_std(coordinates: &SceneCoordinates, registration: &Registration) -> PoseStd {
+    if let Some(second) = second {
+        return second.std;
+    }
     let pairs = coordinates.correspondences();
     let inliers = registration.inliers.iter();
     let inliers = inliers.filter_map(|&cell| pairs.get(cell as usize));

@@ -2,10 +2,12 @@
 
 use nalgebra::{Isometry3, Point3, Vector3};
 use perception::tensor_values::{tensor, values};
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, Tensor, no_grad};
 
 use super::pose_std::PoseStd;
+use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
+use super::voxelise::Cell;
 use crate::registration::refine::{forgiveness, reweighted};
 use crate::registration::{Correspondence, Registration};
 
@@ -25,6 +27,23 @@ pub struct SweepCells {
     pub features: Tensor,
     /// `[N, 3]`: in the sensor frame, metres.
     pub sensor_m: Vec<[f32; 3]>,
+}
+
+impl SweepCells {
+    /// The chosen ones of the cells of a sweep, which has these features.
+    pub(crate) fn pick(
+        cells: &[Cell],
+        features: &SceneFeatures,
+        chosen: &[usize],
+    ) -> tch::Result<Self> {
+        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
+        let rows = tensor(&rows, &[-1], features.cells.device())?;
+        let centroids = chosen.iter().map(|&cell| cells[cell].centroid_m);
+        Ok(Self {
+            features: no_grad(|| features.cells.f_index_select(0, &rows))?,
+            sensor_m: centroids.collect(),
+        })
+    }
 }
 
 /// A refined pose and the predictions that it was fitted to.
@@ -54,7 +73,7 @@ pub(super) fn refine(
     start: &Isometry3<f64>,
     is_wide: bool,
     kind: Kind,
-) -> Result<Option<RefinedPose>, TchError> {
+) -> tch::Result<Option<RefinedPose>> {
     let Some(refiner) = head.refiner() else {
         return Ok(None);
     };
@@ -106,17 +125,13 @@ pub(super) fn refine(
             (pair, f64::from(pair.weight) * share)
         });
         let weighted: Vec<_> = weighted.collect();
-        let information_per_m2 = weighted.iter().map(|(_, weight)| weight).sum();
-        let std = PoseStd::of(&pose, weighted.into_iter());
-        let registration = Registration::judge(&pairs, pose, INLIER_M);
-        let residual_quartile_m =
-            lower_quartile(pairs.iter().map(|pair| distance_m(pair, &pose)).collect());
+        let distances_m = pairs.iter().map(|pair| distance_m(pair, &pose));
         answer = Some(RefinedPose {
-            registration,
+            registration: Registration::judge(&pairs, pose, INLIER_M),
             epsilon_m,
-            residual_quartile_m,
-            std,
-            information_per_m2,
+            residual_quartile_m: lower_quartile(distances_m.collect()),
+            information_per_m2: weighted.iter().map(|(_, weight)| weight).sum(),
+            std: PoseStd::of(&pose, weighted.into_iter()),
         });
     }
     Ok(answer)
@@ -132,11 +147,9 @@ fn distance_m(pair: &Correspondence, pose: &Isometry3<f64>) -> f64 {
 
 /// Lower quartile of the values; infinite if there are none. The fitted confidence model depends on this rule.
 fn lower_quartile(mut values: Vec<f64>) -> f64 {
-    let quarter = values.len() / 4;
-    match values.is_empty() {
-        true => f64::INFINITY,
-        false => *values.select_nth_unstable_by(quarter, f64::total_cmp).1,
-    }
+    values.sort_unstable_by(f64::total_cmp);
+    let quartile = values.get(values.len() / 4);
+    quartile.copied().unwrap_or(f64::INFINITY)
 }
 
 /// Weight of a prediction: the inverse of its expected squared error.

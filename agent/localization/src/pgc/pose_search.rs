@@ -1,7 +1,7 @@
 //! Pose search: from scene coordinates to a refined pose with its inliers.
 
 use support::stage_times::StageTimes;
-use tch::{Kind, TchError};
+use tch::Kind;
 
 use super::localization::{REFINE, SOLVE};
 use super::pose_refinement::{SweepCells, refine};
@@ -63,7 +63,7 @@ impl PoseSearch<'_> {
         coordinates: &SceneCoordinates,
         factor: f64,
         times: &mut StageTimes,
-    ) -> Result<Attempt, TchError> {
+    ) -> tch::Result<Attempt> {
         let coarse = self.solver.search_wider(coordinates, factor);
         times.lap(SOLVE);
         match coarse {
@@ -82,17 +82,15 @@ impl PoseSearch<'_> {
         coarse: &Registration,
         is_wide: bool,
         times: &mut StageTimes,
-    ) -> Result<Attempt, TchError> {
+    ) -> tch::Result<Attempt> {
         let start = &coarse.target_from_source;
         let refined = refine(self.head, self.refinement_cells, start, is_wide, self.kind)?;
         let solved = Ok(self.solver.judge(coordinates, coarse, refined.as_ref()));
-        let inlier_ratio = refined.map_or(coarse.inlier_ratio, |refined| {
-            refined.registration.inlier_ratio
-        });
+        let last = (refined.as_ref()).map_or(coarse, |refined| &refined.registration);
         times.lap(REFINE);
         Ok(Attempt {
             solved,
-            inlier_ratio,
+            inlier_ratio: last.inlier_ratio,
         })
     }
 }

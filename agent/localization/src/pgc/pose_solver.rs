@@ -24,6 +24,15 @@ pub enum Solver {
     Sc2Pcr(Sc2PcrConfig),
 }
 
+impl Solver {
+    fn inlier_threshold_m(&self) -> f64 {
+        match self {
+            Self::Ransac(config) => config.inlier_threshold_m,
+            Self::Sc2Pcr(config) => config.inlier_threshold_m,
+        }
+    }
+}
+
 impl Default for Solver {
     fn default() -> Self {
         Self::Ransac(RansacConfig::default())
@@ -100,22 +109,15 @@ impl PoseSolver {
                 required: MIN_CELLS,
             });
         }
-        let (found, threshold_m) = match &self.solver {
-            Solver::Ransac(config) => (
-                ransac::solve(&pairs, &config.wider(factor))?,
-                config.inlier_threshold_m,
-            ),
-            Solver::Sc2Pcr(config) => (
-                sc2pcr::solve(&pairs, &config.wider(factor))?,
-                config.inlier_threshold_m,
-            ),
+        let found = match &self.solver {
+            Solver::Ransac(config) => ransac::solve(&pairs, &config.wider(factor))?,
+            Solver::Sc2Pcr(config) => sc2pcr::solve(&pairs, &config.wider(factor))?,
         };
         // A wider search counts with a wider threshold: ratios of searches must be comparable.
-        let is_wider = factor > 1.0;
-        Ok(if is_wider {
-            Registration::judge(&pairs, found.target_from_source, threshold_m)
-        } else {
-            found
+        let threshold_m = self.solver.inlier_threshold_m();
+        Ok(match factor > 1.0 {
+            true => Registration::judge(&pairs, found.target_from_source, threshold_m),
+            false => found,
         })
     }
 
@@ -125,10 +127,7 @@ impl PoseSolver {
         coordinates: &SceneCoordinates,
         pose: Isometry3<f64>,
     ) -> Registration {
-        let threshold_m = match &self.solver {
-            Solver::Ransac(config) => config.inlier_threshold_m,
-            Solver::Sc2Pcr(config) => config.inlier_threshold_m,
-        };
+        let threshold_m = self.solver.inlier_threshold_m();
         Registration::judge(&coordinates.correspondences(), pose, threshold_m)
     }
 
@@ -145,16 +144,14 @@ impl PoseSolver {
         let mut world_from_sensor = last.target_from_source;
         // Added in double precision: the coordinates are single and relative to the origin.
         world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
-        let cell_covariance = std_of(coordinates, registration, second).covariance;
-        let is_rejected = self.confidence.rejects(sigma) || sigma < self.min_confidence;
         FoundPose {
             world_from_sensor,
             evidence,
-            cell_covariance,
+            cell_covariance: std_of(coordinates, registration, second).covariance,
             is_registered: false,
             covariance_scale: self.covariance,
             sigma,
-            is_rejected,
+            is_rejected: self.confidence.rejects(sigma) || sigma < self.min_confidence,
         }
     }
 }

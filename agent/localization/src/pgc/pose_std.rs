@@ -1,6 +1,6 @@
 //! Standard deviation of a fitted pose, from the cells that it was fitted to.
 
-use nalgebra::{Isometry3, Matrix3, Matrix6, Point3, SMatrix, Vector3};
+use nalgebra::{Isometry3, Matrix6, SMatrix, Vector3};
 
 use crate::registration::Correspondence;
 
@@ -37,18 +37,14 @@ impl PoseStd {
     ) -> Self {
         let (mut information, mut gradients) = (Matrix6::zeros(), Matrix6::zeros());
         for (pair, weight) in pairs {
-            let arm =
-                target_from_source.rotation * Point3::from(pair.source_m.map(f64::from)).coords;
+            let arm = target_from_source.rotation * Vector3::from(pair.source_m.map(f64::from));
             let residual = arm + target_from_source.translation.vector
                 - Vector3::from(pair.target_m.map(f64::from));
             // d(residual) = dt + dw x arm, for a small rotation dw about the sensor.
-            let mut jacobian = SMatrix::<f64, 3, 6>::zeros();
+            let mut jacobian = SMatrix::<f64, 3, 6>::identity();
             jacobian
-                .fixed_view_mut::<3, 3>(0, 0)
-                .copy_from(&Matrix3::identity());
-            jacobian
-                .fixed_view_mut::<3, 3>(0, 3)
-                .copy_from(&(-arm.cross_matrix()));
+                .fixed_columns_mut::<3>(3)
+                .copy_from(&-arm.cross_matrix());
             information += jacobian.transpose() * jacobian * weight;
             let gradient = jacobian.transpose() * residual * weight;
             gradients += gradient * gradient.transpose();
@@ -61,19 +57,14 @@ impl PoseStd {
             [0..3, 3..6].map(|axes| axes.map(|axis| covariance[(axis, axis)]).sum());
         let position = covariance.fixed_view::<3, 3>(0, 0);
         // A matrix that is not finite has no eigenvalues.
-        let worst_axis = if position.iter().all(|entry| entry.is_finite()) {
-            position.into_owned().symmetric_eigenvalues().max()
-        } else {
-            f64::NAN
-        };
+        let is_finite = position.iter().all(|entry| entry.is_finite());
+        let worst_axis = is_finite.then(|| position.into_owned().symmetric_eigenvalues().max());
         Self {
             position_m: bounded_std(position_m2, Self::UNBOUNDED.position_m),
-            worst_axis_m: bounded_std(worst_axis, Self::UNBOUNDED.worst_axis_m),
+            worst_axis_m: bounded_std(worst_axis.unwrap_or(f64::NAN), Self::UNBOUNDED.worst_axis_m),
             rotation_rad: bounded_std(rotation_rad2, Self::UNBOUNDED.rotation_rad),
             covariance: match covariance.iter().all(|entry| entry.is_finite()) {
-                true => std::array::from_fn(|row| {
-                    std::array::from_fn(|column| covariance[(row, column)])
-                }),
+                true => covariance.transpose().data.0,
                 false => Self::UNBOUNDED.covariance,
             },
         }

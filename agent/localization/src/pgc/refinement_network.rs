@@ -7,12 +7,12 @@
 
 use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
 
 use super::dense::Dense;
 use super::error::LocalizerError;
 use super::head_config::RefinerConfig;
-use super::scene_regression::Regression;
+use super::scene_coordinates::Regression;
 
 /// Initial factor of the similarities; learnt from there on.
 const FIRST_SHARPNESS: f64 = 2.0;
@@ -42,10 +42,8 @@ impl Refiner {
         let [columns, rows] = config.corners();
         let corners = columns * rows;
         let (keys, width) = (config.keys, config.width);
-        let key = Init::Randn {
-            mean: 0.0,
-            stdev: 0.2,
-        };
+        let stdev = 0.2;
+        let key = Init::Randn { mean: 0.0, stdev };
         Ok(Self {
             config: config.clone(),
             keys: path.var("keys", &[corners, keys], key),
@@ -81,7 +79,7 @@ impl Refiner {
         assumed_m: &Tensor,
         heading: &Tensor,
         kind: Kind,
-    ) -> Result<Regression, TchError> {
+    ) -> tch::Result<Regression> {
         let local = cells.f_narrow(1, 0, self.config.local_channels)?;
         let height = assumed_m.f_narrow(1, 2, 1)? / 10.0;
         let input = Tensor::f_cat(&[&local, heading, &height], 1)?.f_to_kind(kind)?;
@@ -112,7 +110,7 @@ impl Refiner {
     }
 
     /// The corners around each position.
-    fn window(&self, assumed_m: &Tensor) -> Result<Window, TchError> {
+    fn window(&self, assumed_m: &Tensor) -> tch::Result<Window> {
         let config = &self.config;
         let (spacing_m, reach, low_m) = (config.spacing_m, config.reach, config.low_m);
         let [columns, rows] = config.corners();
@@ -156,7 +154,7 @@ struct Window {
 }
 
 /// `[N, K, C]` rows of `[R, C]` by `[N, K]`; its gradient is fast because the index is expanded, not written out.
-fn gather(rows: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
+fn gather(rows: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
     let channels = rows.size()[1];
     let flat = index.f_reshape([-1, 1])?.f_expand([-1, channels], false)?;
     let gathered = rows.f_gather(0, &flat, false)?;

@@ -1,22 +1,20 @@
 //! Residual group of sparse convolutions, in floating point and in 8-bit integers.
 
+use tch::Tensor;
 use tch::nn::{self, Init};
-use tch::{TchError, Tensor};
 
-use super::dense::int8_linear;
+use super::dense::{Dense, int8_linear};
 use perception::int8::{ActivationScales, Int8Linear, LayerFormat, Quantisation, QuantiseError};
 use perception::sparse::{GatherIndex, Int8SparseConv, SparseConv};
 
 /// Called with the name and the values of an activation.
-pub(super) type OnActivation<'a> = dyn FnMut(&str, &Tensor) -> Result<(), TchError> + 'a;
+pub(super) type OnActivation<'a> = dyn FnMut(&str, &Tensor) -> tch::Result<()> + 'a;
 
 /// Two 3x3x3 convolutions with a 1x1 one between them, and a skip connection.
 #[derive(Debug)]
 pub(super) struct ResidualGroup {
     inward: SparseConv,
-    /// `[C_out, C_out]`.
-    middle: Tensor,
-    middle_bias: Tensor,
+    middle: Dense,
     outward: SparseConv,
     /// `[C_in, C_out]`; `None` if both are the same.
     skip: Option<Tensor>,
@@ -34,12 +32,14 @@ pub(super) struct Int8ResidualGroup {
 
 impl ResidualGroup {
     pub(super) fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
+        let stdev = (2.0 / inputs as f64).sqrt();
+        let random = Init::Randn { mean: 0.0, stdev };
         Self {
             inward: SparseConv::new(&(path / "inward"), inputs, outputs),
-            middle: pointwise(&(path / "middle"), outputs, outputs),
-            middle_bias: (path / "middle").var("bias", &[outputs], Init::Const(0.0)),
+            middle: Dense::new(&(path / "middle"), outputs, outputs, 1.0),
             outward: SparseConv::new(&(path / "outward"), outputs, outputs),
-            skip: (inputs != outputs).then(|| pointwise(&(path / "skip"), inputs, outputs)),
+            skip: (inputs != outputs)
+                .then(|| (path / "skip").var("weight", &[inputs, outputs], random)),
         }
     }
 
@@ -50,16 +50,14 @@ impl ResidualGroup {
         index: &GatherIndex,
         name: &str,
         on_activation: &mut OnActivation<'_>,
-    ) -> Result<Tensor, TchError> {
-        let kind = x.kind();
+    ) -> tch::Result<Tensor> {
         let inner = self.inward.forward(x, index)?.f_relu()?;
         on_activation(&inward_activation(name), &inner)?;
-        let bias = self.middle_bias.to_kind(kind);
-        let inner = bias.f_addmm(&inner, &self.middle.to_kind(kind))?.f_relu()?;
+        let inner = self.middle.forward(&inner)?.f_relu()?;
         on_activation(&middle_activation(name), &inner)?;
         let inner = self.outward.forward(&inner, index)?;
         match &self.skip {
-            Some(skip) => (inner + x.f_matmul(&skip.to_kind(kind))?).f_relu(),
+            Some(skip) => (inner + x.f_matmul(&skip.to_kind(x.kind()))?).f_relu(),
             None => (inner + x).f_relu(),
         }
     }
@@ -73,13 +71,12 @@ impl ResidualGroup {
     ) -> Result<Int8ResidualGroup, QuantiseError> {
         let inward = scales.get(&inward_activation(name))?;
         let middle = scales.get(&middle_activation(name))?;
-        let (bias, hidden) = (&self.middle_bias, LayerFormat::hidden(inward, middle));
         let skip = self.skip.as_ref();
         let skip = skip.map(|skip| int8_linear(skip, None, LayerFormat::last(input)));
         Ok(Int8ResidualGroup {
             input,
             inward: self.inward.int8(LayerFormat::hidden(input, inward))?,
-            middle: int8_linear(&self.middle, Some(bias), hidden)?,
+            middle: self.middle.int8(LayerFormat::hidden(inward, middle))?,
             outward: self.outward.int8(LayerFormat::last(middle))?,
             skip: skip.transpose()?,
         })
@@ -88,7 +85,7 @@ impl ResidualGroup {
 
 impl Int8ResidualGroup {
     /// `[N, C_in]`, `u8`, to `[N, C_out]`, `f32` and not negative.
-    pub(super) fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, x: &Tensor, index: &GatherIndex) -> tch::Result<Tensor> {
         let inner = self.middle.forward(&self.inward.forward(x, index)?)?;
         let skipped = match &self.skip {
             Some(skip) => skip.forward(x)?,
@@ -97,15 +94,6 @@ impl Int8ResidualGroup {
         let mut outer = self.outward.forward(&inner, index)?;
         outer.f_add_(&skipped)?.f_relu_()
     }
-}
-
-fn pointwise(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Tensor {
-    let stdev = (2.0 / inputs as f64).sqrt();
-    path.var(
-        "weight",
-        &[inputs, outputs],
-        Init::Randn { mean: 0.0, stdev },
-    )
 }
 
 fn inward_activation(name: &str) -> String {

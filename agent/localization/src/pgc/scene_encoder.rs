@@ -2,8 +2,7 @@
 
 use std::path::Path;
 
-use tch::nn;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Device, Kind, Tensor, nn, no_grad};
 
 use super::encoder_config::SceneEncoderConfig;
 use super::error::LocalizerError;
@@ -21,12 +20,6 @@ pub struct SceneFeatures {
     pub cells: Tensor,
     /// `[sweeps, sweep_channels]`: mean and maximum over the coarse cells.
     pub sweeps: Tensor,
-}
-
-impl SceneFeatures {
-    pub(super) fn new(cells: Tensor, sweeps: Tensor) -> Self {
-        Self { cells, sweeps }
-    }
 }
 
 /// Features of cells before their surroundings are added.
@@ -109,7 +102,7 @@ impl SceneEncoder {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn local(&self, batch: &VoxelBatch, kind: Kind) -> Result<LocalFeatures, TchError> {
+    pub fn local(&self, batch: &VoxelBatch, kind: Kind) -> tch::Result<LocalFeatures> {
         self.local_with(batch, kind, &mut |_, _| Ok(()))
     }
 
@@ -117,7 +110,7 @@ impl SceneEncoder {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn observe(&self, batch: &VoxelBatch, search: &mut ScaleSearch) -> Result<(), TchError> {
+    pub fn observe(&self, batch: &VoxelBatch, search: &mut ScaleSearch) -> tch::Result<()> {
         no_grad(|| {
             self.local_with(batch, Kind::Float, &mut |name, values| {
                 search.observe(name, values)
@@ -131,7 +124,7 @@ impl SceneEncoder {
         batch: &VoxelBatch,
         kind: Kind,
         on_activation: &mut OnActivation<'_>,
-    ) -> Result<LocalFeatures, TchError> {
+    ) -> tch::Result<LocalFeatures> {
         let input = batch.input.to_kind(kind);
         let mut x = self.first.forward(&input, &batch.first)?.f_relu()?;
         on_activation(&level_activation(0), &x)?;
@@ -194,7 +187,7 @@ impl SceneEncoder {
         &self,
         local: &LocalFeatures,
         batch: &VoxelBatch,
-    ) -> Result<SceneFeatures, TchError> {
+    ) -> tch::Result<SceneFeatures> {
         let mut parts = vec![local.cells.shallow_clone()];
         if !self.config.context_m.is_empty() {
             let plane = Plane::new(&local.coarse, batch)?;
@@ -227,7 +220,7 @@ impl SceneEncoder {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn encode(&self, batch: &VoxelBatch, kind: Kind) -> Result<SceneFeatures, TchError> {
+    pub fn encode(&self, batch: &VoxelBatch, kind: Kind) -> tch::Result<SceneFeatures> {
         no_grad(|| {
             let local = match &self.int8 {
                 Some(levels) => {
@@ -243,7 +236,7 @@ impl SceneEncoder {
 }
 
 impl LocalFeatures {
-    fn new(fine: Option<Tensor>, coarse: Tensor, batch: &VoxelBatch) -> Result<Self, TchError> {
+    fn new(fine: Option<Tensor>, coarse: Tensor, batch: &VoxelBatch) -> tch::Result<Self> {
         let spread = rows(&coarse, &batch.coarse_of_cell)?;
         let cells = match fine {
             Some(fine) => Tensor::f_cat(&[fine, spread], 1)?,
@@ -265,12 +258,10 @@ fn coarse_activation(group: usize) -> String {
 }
 
 /// Rows of `x` by index; its gradient is fast because the index is expanded, not written out.
-fn rows(x: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
-    x.f_gather(
-        0,
-        &index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?,
-        false,
-    )
+fn rows(x: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
+    let channels = x.size()[1];
+    let index = index.f_unsqueeze(1)?.f_expand([-1, channels], false)?;
+    x.f_gather(0, &index, false)
 }
 
 /// Coarse features summed over height into the plane of each sweep.
@@ -282,7 +273,7 @@ struct Plane {
 }
 
 impl Plane {
-    fn new(coarse: &Tensor, batch: &VoxelBatch) -> Result<Self, TchError> {
+    fn new(coarse: &Tensor, batch: &VoxelBatch) -> tch::Result<Self> {
         let coarse = coarse.f_to_kind(Kind::Float)?;
         let ones = coarse.f_new_ones([coarse.size()[0], 1], (Kind::Float, coarse.device()))?;
         Ok(Self {
@@ -292,7 +283,7 @@ impl Plane {
     }
 
     /// `[sweeps, channels, edge, edge]` of values of coarse cells `[N, channels]`.
-    fn sum_of(values: &Tensor, batch: &VoxelBatch) -> Result<Tensor, TchError> {
+    fn sum_of(values: &Tensor, batch: &VoxelBatch) -> tch::Result<Tensor> {
         let (sweeps, edge, channels) = (batch.sweeps(), batch.plane_edge, values.size()[1]);
         let float = (Kind::Float, values.device());
         let empty = values.f_new_zeros([sweeps * edge * edge, channels], float)?;
@@ -304,7 +295,7 @@ impl Plane {
     }
 
     /// `[sweeps * edge * edge, channels]`: mean over the coarse cells in a square window.
-    fn mean_over(&self, window: i64) -> Result<Tensor, TchError> {
+    fn mean_over(&self, window: i64) -> tch::Result<Tensor> {
         // Sums over counts: the area of the window, with the padding, cancels. Empty windows are 0 / 1e-6.
         let sum = mean_over(&self.sum, [window; 2], true)?;
         let mean = sum / mean_over(&self.count, [window; 2], true)?.f_clamp_min(1e-6)?;
@@ -319,7 +310,7 @@ pub(super) fn mean_over(
     maps: &Tensor,
     [height, width]: [i64; 2],
     counts_padding: bool,
-) -> Result<Tensor, TchError> {
+) -> tch::Result<Tensor> {
     let mut means = maps.shallow_clone();
     // One row after one column of the window: a fraction of the additions.
     for size in [[height, 1], [1, width]] {

@@ -10,6 +10,7 @@ use super::head_config::SceneHeadConfig;
 use super::int8_block::Int8Block;
 use super::refinement_network::Refiner;
 use super::residual_group::OnActivation;
+use super::scene_coordinates::Regression;
 use perception::int8::{ActivationScales, LayerFormat, QuantiseError, ScaleSearch};
 use perception::layers::convolution::Norm;
 
@@ -19,15 +20,6 @@ const CLASSIFIER_WIDTHS: [i64; 2] = [512, 256];
 const DROPOUT: f64 = 0.5;
 /// Unit of the offset from the weighted centres, metres.
 const OFFSET_SCALE_M: f64 = 10.0;
-
-/// Output of the head for some cells.
-#[derive(Debug)]
-pub struct Regression {
-    /// `[N, 3]`: world coordinates relative to the origin, metres.
-    pub coordinates_m: Tensor,
-    /// `[N]`: predicted L1 error, metres, not negative.
-    pub epsilon_m: Tensor,
-}
 
 /// Classifier of sweeps and regressor of cells.
 #[derive(Debug)]

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use perception::tensor_values::tensor;
-use tch::{Device, TchError, Tensor};
+use tch::{Device, Tensor};
 
 use super::encoder_config::SceneEncoderConfig;
 use super::voxelise::{SweepVoxels, plane_edge};
@@ -38,22 +38,21 @@ impl VoxelBatch {
         sweeps: &[&SweepVoxels],
         config: &SceneEncoderConfig,
         device: Device,
-    ) -> Result<Self, TchError> {
+    ) -> tch::Result<Self> {
         let input: Vec<f32> = (sweeps.iter().flat_map(|sweep| &sweep.input).copied()).collect();
-        let input = tensor(&input, &[-1, config.input.channels()], device)?;
         let down = (0..config.levels() - 1)
             .map(|level| Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.down[level]), device))
             .collect::<Result<_, _>>()?;
         let fine = sweeps.iter().filter_map(|sweep| sweep.fine.as_ref());
         let fine = (config.fine_cells).then(|| Rulebook::stacked(fine, device));
         let edge = i64::from(plane_edge(config));
-        let coarse_rows = ranges(sweeps, |sweep| sweep.columns.len());
+        let coarse_rows = ranges(sweeps.iter().map(|sweep| sweep.columns.len()));
         let planes = (0..sweeps.len() as i64).map(|sweep| sweep * edge * edge);
         let columns = sweeps.iter().map(|sweep| sweep.columns.as_slice());
         let starts = coarse_rows.iter().map(|rows| rows.start);
         let rows = sweeps.iter().map(|sweep| sweep.coarse_of_cell.as_slice());
         Ok(Self {
-            input,
+            input: tensor(&input, &[-1, config.input.channels()], device)?,
             first: Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.first), device)?,
             down,
             fine: fine.transpose()?,
@@ -62,7 +61,7 @@ impl VoxelBatch {
             columns: shifted(columns.zip(planes), device)?,
             plane_edge: edge,
             coarse_rows,
-            cell_rows: ranges(sweeps, |sweep| sweep.cells.len()),
+            cell_rows: ranges(sweeps.iter().map(|sweep| sweep.cells.len())),
         })
     }
 
@@ -77,11 +76,12 @@ impl VoxelBatch {
     }
 }
 
-fn ranges(sweeps: &[&SweepVoxels], count: impl Fn(&SweepVoxels) -> usize) -> Vec<Range<i64>> {
+/// Rows of sweeps one after another, which have so many each.
+pub(super) fn ranges(counts: impl Iterator<Item = usize>) -> Vec<Range<i64>> {
     let mut end = 0;
-    let ranges = sweeps.iter().map(|sweep| {
+    let ranges = counts.map(|count| {
         let start = end;
-        end += count(sweep) as i64;
+        end += count as i64;
         start..end
     });
     ranges.collect()
@@ -91,7 +91,7 @@ fn ranges(sweeps: &[&SweepVoxels], count: impl Fn(&SweepVoxels) -> usize) -> Vec
 fn shifted<'a>(
     sweeps: impl Iterator<Item = (&'a [u32], i64)>,
     device: Device,
-) -> Result<Tensor, TchError> {
+) -> tch::Result<Tensor> {
     let rows = sweeps.flat_map(|(rows, shift)| rows.iter().map(move |&row| shift + i64::from(row)));
     tensor(&rows.collect::<Vec<_>>(), &[-1], device)
 }

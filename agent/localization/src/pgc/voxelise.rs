@@ -27,6 +27,39 @@ impl Cell {
     }
 }
 
+/// Sums over the points of a cell.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct CellPoints {
+    sum_m: [f32; 3],
+    low_m: f32,
+    high_m: f32,
+    pub(super) count: u32,
+}
+
+impl CellPoints {
+    pub(super) const NONE: Self = Self {
+        sum_m: [0.0; 3],
+        low_m: f32::MAX,
+        high_m: f32::MIN,
+        count: 0,
+    };
+
+    pub(super) fn add(&mut self, point_m: [f32; 3]) {
+        (0..3).for_each(|axis| self.sum_m[axis] += point_m[axis]);
+        self.low_m = self.low_m.min(point_m[2]);
+        self.high_m = self.high_m.max(point_m[2]);
+        self.count += 1;
+    }
+
+    pub(super) fn cell(&self) -> Cell {
+        Cell {
+            centroid_m: self.sum_m.map(|sum| sum / self.count as f32),
+            extent_m: self.high_m - self.low_m,
+            points: self.count,
+        }
+    }
+}
+
 /// One sweep, ready for the encoder.
 #[derive(Debug, Clone)]
 pub struct SweepVoxels {
@@ -54,12 +87,11 @@ impl SweepVoxels {
         let inside = points.into_iter().filter(|point| is_inside(point, config));
         let points: Vec<[f32; 3]> = inside.collect();
         let voxel_m = config.voxel_m as f32;
-        let (voxels, voxel_of_point) = Sites::collect(
-            points
-                .iter()
-                // Rounded down: a cast alone would merge the voxels on both sides of 0.
-                .map(|point| point.map(|axis| (axis / voxel_m).floor() as i32)),
-        );
+        let voxels = points.iter().map(|point| {
+            // Rounded down: a cast alone would merge the voxels on both sides of 0.
+            point.map(|axis| (axis / voxel_m).floor() as i32)
+        });
+        let (voxels, voxel_of_point) = Sites::collect(voxels);
         let input = describe(&points, &voxel_of_point, &voxels, config);
 
         let first = Rulebook::submanifold(&voxels);
@@ -85,17 +117,15 @@ impl SweepVoxels {
         if !config.fine_cells {
             coarse_of_cell = (0..sites.len() as u32).collect();
         }
-        let cells = cells(&points, &cell_of_point, coarse_of_cell.len());
-        let columns = columns(&sites, config);
         Self {
             input,
             first,
             down,
             fine,
             coarse: Rulebook::submanifold(&sites),
+            cells: cells(&points, &cell_of_point, coarse_of_cell.len()),
             coarse_of_cell,
-            columns,
-            cells,
+            columns: columns(&sites, config),
         }
     }
 
@@ -129,16 +159,11 @@ fn describe(
     voxels: &Sites,
     config: &SceneEncoderConfig,
 ) -> Vec<f32> {
-    let mut sums = vec![[0.0_f32; 4]; voxels.len()];
-    for (point, &row) in points.iter().zip(rows) {
-        let sum = &mut sums[row as usize];
-        (0..3).for_each(|axis| sum[axis] += point[axis]);
-        sum[3] += 1.0;
-    }
     let voxel_m = config.voxel_m as f32;
     let mut input = Vec::with_capacity(voxels.len() * config.input.channels() as usize);
-    for (sum, coord) in sums.iter().zip(voxels.coords()) {
-        let mean: [f32; 3] = std::array::from_fn(|axis| sum[axis] / sum[3]);
+    let cells = cells(points, rows, voxels.len());
+    for (cell, coord) in cells.iter().zip(voxels.coords()) {
+        let mean = cell.centroid_m;
         match config.input {
             VoxelInput::Coordinates => input.extend(mean.map(|axis| axis / INPUT_SCALE_M)),
             VoxelInput::Offsets => {
@@ -151,19 +176,11 @@ fn describe(
 }
 
 fn cells(points: &[[f32; 3]], rows: &[u32], count: usize) -> Vec<Cell> {
-    let mut cells = vec![Cell::default(); count];
-    let mut heights = vec![[f32::MAX, f32::MIN]; count];
+    let mut cells = vec![CellPoints::NONE; count];
     for (point, &row) in points.iter().zip(rows) {
-        let (cell, height) = (&mut cells[row as usize], &mut heights[row as usize]);
-        (0..3).for_each(|axis| cell.centroid_m[axis] += point[axis]);
-        cell.points += 1;
-        *height = [height[0].min(point[2]), height[1].max(point[2])];
+        cells[row as usize].add(*point);
     }
-    for (cell, [low, high]) in cells.iter_mut().zip(heights) {
-        cell.centroid_m = cell.centroid_m.map(|axis| axis / cell.points as f32);
-        cell.extent_m = high - low;
-    }
-    cells
+    cells.iter().map(CellPoints::cell).collect()
 }
 
 fn columns(sites: &Sites, config: &SceneEncoderConfig) -> Vec<u32> {

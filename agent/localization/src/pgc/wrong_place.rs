@@ -17,12 +17,8 @@ const LEVEL_M: f32 = 0.3;
 pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> String {
     let place = Weights::load(head).and_then(|weights| weights.config::<SceneHeadConfig>());
     let place = place.ok().map(|config| config.scene_name);
-    hint(
-        sweeps,
-        &head.display().to_string(),
-        place.as_deref(),
-        scene_map,
-    )
+    let head = head.display().to_string();
+    hint(sweeps, &head, place.as_deref(), scene_map)
 }
 
 /// The hint that sweeps are those of another LiDAR, if their median number of points is far from that of

@@ -43,10 +43,8 @@ impl ErrorTable {
     /// # Errors
     /// [`FileError`] names the file, the line and the column.
     pub fn read(path: &Path) -> Result<Self, FileError> {
-        let rows = CsvFile::read(path, HEADER, MAX_BYTES)?
-            .rows()
-            .map(parse_row)
-            .collect::<Result<Vec<_>, _>>()?;
+        let file = CsvFile::read(path, HEADER, MAX_BYTES)?;
+        let rows: Vec<TableRow> = file.rows().map(parse_row).collect::<Result<_, _>>()?;
         if rows.is_empty() {
             Err(FileError::new(path, "no row below the header"))
         } else {
@@ -72,16 +70,13 @@ fn parse_row(row: CsvRow<'_>) -> Result<TableRow, FileError> {
     for (column, metres) in position_m.iter_mut().enumerate() {
         *metres = row.number(column, -MAX_ERROR_M..=MAX_ERROR_M, "metres within 100 km")?;
     }
-    let yaw_rad = row
-        .number(3, -360.0..=360.0, "degrees within a turn")?
-        .to_radians();
-    let confidence = row.number(4, 0.0..=1.0, "0 to 1")? as f32;
+    let yaw_deg = row.number(3, -360.0..=360.0, "degrees within a turn")?;
     Ok(TableRow::Pose {
         error: PlanarError {
             position_m,
-            yaw_rad,
+            yaw_rad: yaw_deg.to_radians(),
         },
-        confidence,
+        confidence: row.number(4, 0.0..=1.0, "0 to 1")? as f32,
     })
 }
 

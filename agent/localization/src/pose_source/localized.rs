@@ -9,7 +9,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::motion_gate::{MotionGate, MotionGateConfig};
-use super::settings::{PoseBasis, PoseSettings, require_file};
+use super::settings::{PoseSettings, require_file};
 use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
 use crate::baselines::{LightLoc, load_baseline};
 use crate::map_registration::MapRegistration;
@@ -111,10 +111,6 @@ impl LocalizedPose {
 }
 
 impl PoseSettings for PgcConfig {
-    fn basis(&self) -> PoseBasis {
-        PoseBasis::Sweep
-    }
-
     fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
         Ok(Box::new(LocalizedPose::pgc(self, inference)?))
     }
@@ -134,10 +130,6 @@ impl PoseSettings for PgcConfig {
 }
 
 impl PoseSettings for BaselinePoseConfig {
-    fn basis(&self) -> PoseBasis {
-        PoseBasis::Sweep
-    }
-
     fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
         Ok(Box::new(LocalizedPose::baseline(self, inference)?))
     }
@@ -165,23 +157,14 @@ impl PoseSource for LocalizedPose {
                 return no_pose(NoPoseReason::Failed);
             }
         };
-        match estimate {
-            PoseEstimate::Pose {
-                world_from_cav,
-                confidence,
-                ..
-            } => {
-                // A jump is published, with less confidence: the accepted pose may be the wrong one.
-                let verdict = self
-                    .motion_gate
-                    .judge(input.capture_nanos, &world_from_cav.isometry());
-                PoseEstimate::new(
-                    world_from_cav,
-                    confidence * self.motion_gate.factor(verdict) as f32,
-                )
-            }
-            none @ PoseEstimate::NoPose { .. } => none,
-        }
+        let Some(world_from_cav) = estimate.world_from_cav() else {
+            return estimate;
+        };
+        // A jump is published, with less confidence: the accepted pose may be the wrong one.
+        let pose = world_from_cav.isometry();
+        let verdict = self.motion_gate.judge(input.capture_nanos, &pose);
+        let factor = self.motion_gate.factor(verdict) as f32;
+        PoseEstimate::new(*world_from_cav, estimate.confidence() * factor)
     }
 
     fn detector_encoder(&self) -> Option<&str> {

@@ -74,14 +74,12 @@ pub trait PoseSource: std::fmt::Debug + Send {
 
     /// Second step of a sweep, after its pose and its feature map were published: measures for later sweeps. True if
     /// the sweep was measured.
-    fn observe(&mut self, input: &PoseInput<'_>) -> bool {
-        let _ = input;
+    fn observe(&mut self, _input: &PoseInput<'_>) -> bool {
         false
     }
 
     /// Starts anew at a pose that is stated, not measured. False of sources that follow no vehicle.
-    fn start_at(&mut self, stated: &PoseMeasurement) -> bool {
-        let _ = stated;
+    fn start_at(&mut self, _stated: &PoseMeasurement) -> bool {
         false
     }
 
@@ -180,9 +178,8 @@ impl PoseSourceConfig {
     pub fn with_networks(mut self) -> Result<Self, FileError> {
         let networks = self.settings_mut().and_then(|settings| settings.networks());
         // A head that is not given is refused by the check of the values.
-        if let Some([encoder, head, map]) =
-            networks.filter(|[_, head, _]| !head.as_os_str().is_empty())
-        {
+        let given = networks.filter(|[_, head, _]| !head.as_os_str().is_empty());
+        if let Some([encoder, head, map]) = given {
             *head = head_file(head)?;
             if !map.as_os_str().is_empty() {
                 *map = surfel_map_file(map)?;
@@ -202,11 +199,8 @@ impl PoseSourceConfig {
 
     /// The same with the paths of its files changed. The name of a released head is no path.
     pub fn map_files(mut self, change: impl Fn(&Path) -> PathBuf) -> Self {
-        for file in self
-            .settings_mut()
-            .into_iter()
-            .flat_map(|settings| settings.files())
-        {
+        let files = self.settings_mut().map(|settings| settings.files());
+        for file in files.into_iter().flatten() {
             let changed = change(file);
             // A single word may be a file or a released head: the file wins.
             let is_path = changed.exists() || !is_name(file);

@@ -111,12 +111,8 @@ impl MotionGate {
             capture_nanos,
             world_from_lidar: *world_from_lidar,
         };
-        let last = self
-            .accepted
-            .back()
-            .copied()
-            .filter(|last| self.remembers(last, &pose));
-        let Some(last) = last else {
+        let last = self.accepted.back().copied();
+        let Some(last) = last.filter(|last| self.remembers(last, &pose)) else {
             // There is no pose yet, or the scene restarted.
             self.accepted.clear();
             self.accept(pose);
@@ -148,13 +144,8 @@ impl MotionGate {
     fn accept(&mut self, pose: TimedPose) {
         self.elsewhere.clear();
         self.accepted.push_back(pose);
-        while self
-            .accepted
-            .front()
-            .is_some_and(|first| seconds(first, &pose) > SPEED_WINDOW_S)
-        {
-            self.accepted.pop_front();
-        }
+        self.accepted
+            .retain(|kept| seconds(kept, &pose) <= SPEED_WINDOW_S);
     }
 
     /// True if a pose is recent enough to check a later one against.
@@ -178,11 +169,8 @@ impl MotionGate {
             speed + config.position_slack_m / SPEED_WINDOW_S + config.max_acceleration_mps2 * time_s
         });
         let reach_m = config.position_slack_m + fastest.min(config.max_speed_mps) * time_s;
-        let turn_deg = from
-            .world_from_lidar
-            .rotation
-            .angle_to(&to.world_from_lidar.rotation)
-            .to_degrees();
+        let [before, after] = [from, to].map(|pose| pose.world_from_lidar.rotation);
+        let turn_deg = before.angle_to(&after).to_degrees();
         let may_turn_deg = config.rotation_slack_deg + config.max_turn_deg_per_s * time_s;
         distance_m(from, to) <= reach_m && turn_deg <= may_turn_deg
     }

@@ -174,11 +174,8 @@ impl NoisyPose {
     /// [`PoseSourceError`] names the field or the file.
     pub fn new(config: &NoisyPoseConfig) -> Result<Self, PoseSourceError> {
         config.validate()?;
-        let noise = PoseNoise::new(
-            config.position_std_m,
-            config.heading_std_deg.to_radians(),
-            config.seed,
-        );
+        let yaw_std_rad = config.heading_std_deg.to_radians();
+        let noise = PoseNoise::new(config.position_std_m, yaw_std_rad, config.seed);
         let kind = match config.mode {
             NoiseMode::Fixed => Kind::Fixed(noise),
             NoiseMode::Independent => Kind::Independent(noise),

@@ -59,11 +59,9 @@ impl PoseTable {
         for row in CsvFile::read(path, HEADER, MAX_BYTES)?.rows() {
             let row = row.complete()?;
             let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
+            let before = of_scenario.insert(sweep_key(&row)?, estimate(&row)?);
             // Two rows of one sweep, as in a table that was appended to twice: neither can be preferred.
-            if of_scenario
-                .insert(sweep_key(&row)?, estimate(&row)?)
-                .is_some()
-            {
+            if before.is_some() {
                 return Err(row.fault("duplicate row of the sweep"));
             }
         }
@@ -87,9 +85,8 @@ impl PoseTable {
 
     /// Estimate of a sweep.
     pub fn get(&self, scenario: &str, cav: &CavId, capture_nanos: u64) -> Option<&PoseEstimate> {
-        self.scenarios
-            .get(last_part(scenario))?
-            .get(&(cav.clone(), capture_nanos))
+        let of_scenario = self.scenarios.get(last_part(scenario))?;
+        of_scenario.get(&(cav.clone(), capture_nanos))
     }
 
     /// Appends the rows of a scenario to a file, which gets its header where it is new.
@@ -185,10 +182,8 @@ impl PoseSettings for CachedPoseConfig {
 impl PoseSource for CachedPose {
     /// Ignores sweep and measured pose; a sweep that is not in the table has no source.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
-        self.poses
-            .get(&(input.cav.clone(), input.capture_nanos))
-            .copied()
-            .unwrap_or(NO_SOURCE)
+        let pose = self.poses.get(&(input.cav.clone(), input.capture_nanos));
+        pose.copied().unwrap_or(NO_SOURCE)
     }
 }
 
@@ -198,42 +193,27 @@ fn last_part(scenario: &str) -> &str {
 }
 
 fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
-    let PoseRow {
-        cav,
-        capture_nanos,
-        estimate,
-    } = row;
     let mut fields: [String; 13] = Default::default();
-    fields[..3].clone_from_slice(&[
-        scenario.to_owned(),
-        cav.to_string(),
-        capture_nanos.to_string(),
-    ]);
-    match estimate {
+    fields[0] = scenario.to_owned();
+    fields[1] = row.cav.to_string();
+    fields[2] = row.capture_nanos.to_string();
+    match &row.estimate {
         PoseEstimate::Pose {
-            world_from_cav:
-                Pose {
-                    translation_m,
-                    rotation_wxyz,
-                },
+            world_from_cav: pose,
             confidence,
             ..
         } => {
             // To a hundredth of a millimetre. The covariance is not stored: a cached pose has none.
-            fields[3..6].clone_from_slice(&translation_m.map(|metres| format!("{metres:.5}")));
-            fields[6..10].clone_from_slice(&rotation_wxyz.map(|part| format!("{part:.9}")));
+            fields[3..6].clone_from_slice(&pose.translation_m.map(|metres| format!("{metres:.5}")));
+            fields[6..10].clone_from_slice(&pose.rotation_wxyz.map(|part| format!("{part:.9}")));
             fields[10] = format!("{confidence:.6}");
         }
         PoseEstimate::NoPose {
             reason,
             inlier_count,
         } => {
-            let reason = serde_json::to_value(reason).ok();
-            fields[11] = reason
-                .as_ref()
-                .and_then(serde_json::Value::as_str)
-                .unwrap_or_default()
-                .to_owned();
+            let reason = serde_json::to_value(reason).unwrap_or_default();
+            fields[11] = reason.as_str().unwrap_or_default().to_owned();
             fields[12] = inlier_count.to_string();
         }
     }
@@ -242,12 +222,9 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
 
 fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey> {
     let cav = CavId::new(row.field(1)).map_err(|error| row.fault(format_args!("cav: {error}")))?;
-    Ok((
-        cav,
-        row.field(2)
-            .parse()
-            .map_err(|_| row.wrong(2, "integer nanoseconds"))?,
-    ))
+    let capture_nanos = row.field(2).parse::<u64>();
+    let capture_nanos = capture_nanos.map_err(|_| row.wrong(2, "integer nanoseconds"))?;
+    Ok((cav, capture_nanos))
 }
 
 fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate> {
@@ -264,26 +241,21 @@ fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
         *number = row.number(column, f64::MIN..=f64::MAX, "a finite number")?;
     }
     let [x, y, z, rotation_wxyz @ ..] = numbers;
-    let world_from_cav = Pose {
+    let pose = Pose {
         translation_m: [x, y, z],
         rotation_wxyz,
     };
-    world_from_cav
-        .validate()
-        .map_err(|error| row.fault(error))?;
+    pose.validate().map_err(|error| row.fault(error))?;
     let confidence = row.number(10, 0.0..=1.0, "0 to 1")?;
-    Ok(PoseEstimate::new(world_from_cav, confidence as f32))
+    Ok(PoseEstimate::new(pose, confidence as f32))
 }
 
 fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
-    let reason: NoPoseReason =
-        serde_json::from_value(serde_json::Value::String(row.field(11).to_owned()))
-            .map_err(|_| row.wrong(11, "a reason for no pose"))?;
-    let inlier_count = row
-        .field(12)
-        .parse()
-        .map_err(|_| row.wrong(12, "a count"))?;
-    Ok(PoseEstimate::no_pose(reason, inlier_count))
+    let reason = serde_json::from_value::<NoPoseReason>(row.field(11).into());
+    let reason = reason.map_err(|_| row.wrong(11, "a reason for no pose"))?;
+    let inliers = row.field(12).parse::<u32>();
+    let inliers = inliers.map_err(|_| row.wrong(12, "a count"))?;
+    Ok(PoseEstimate::no_pose(reason, inliers))
 }
 
 #[cfg(test)]

@@ -21,8 +21,10 @@ pub(crate) enum PoseBasis {
 
 /// Settings of a pose source. Its file implements this, and its row is in `table.rs`.
 pub(crate) trait PoseSettings {
-    /// Input from which the poses are made.
-    fn basis(&self) -> PoseBasis;
+    /// Input from which the poses are made: the sweep, unless a source states another one.
+    fn basis(&self) -> PoseBasis {
+        PoseBasis::Sweep
+    }
 
     /// Sets the source up with checked settings and reads its files.
     fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError>;

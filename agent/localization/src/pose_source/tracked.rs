@@ -11,7 +11,7 @@ use protocol::{EgoMotion, NoPoseReason, PlanarCovariance, PoseEstimate, StageTim
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::settings::{PoseBasis, PoseSettings, require_file};
+use super::settings::{PoseSettings, require_file};
 use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
 use crate::map_registration::MapRegistration;
 use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
@@ -83,10 +83,6 @@ impl TrackedPoseConfig {
 }
 
 impl PoseSettings for TrackedPoseConfig {
-    fn basis(&self) -> PoseBasis {
-        PoseBasis::Sweep
-    }
-
     fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
         Ok(Box::new(TrackedPose::load(self, inference)?))
     }
@@ -118,10 +114,9 @@ impl PoseSettings for TrackedPoseConfig {
 
     /// Without yaw rate the prediction lags in turns.
     fn measuring_interval(&self, motion: &EgoMotion) -> u32 {
-        if motion.yaw_rate_rad_s.is_some() {
-            self.measure_every
-        } else {
-            self.measure_every.div_ceil(2)
+        match motion.yaw_rate_rad_s {
+            Some(_) => self.measure_every,
+            None => self.measure_every.div_ceil(2),
         }
     }
 }
@@ -154,10 +149,8 @@ impl TrackedPose {
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn load(config: &TrackedPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
-        Ok(Self::new(
-            Self::localizer(config, inference)?,
-            config.clone(),
-        ))
+        let localizer = Self::localizer(config, inference)?;
+        Ok(Self::new(localizer, config.clone()))
     }
 
     /// The localizer of a tracked vehicle.
@@ -172,10 +165,8 @@ impl TrackedPose {
         localizer.set_most_parts(MOST_PARTS);
         localizer.set_min_confidence(config.min_confidence);
         // Outermost: near a prediction the registration alone may suffice, without the networks.
-        Ok(MapRegistration::of(
-            Box::new(localizer),
-            &config.surfel_map,
-        )?)
+        let localizer = MapRegistration::of(Box::new(localizer), &config.surfel_map);
+        Ok(localizer?)
     }
 
     /// Follows a vehicle with another localizer.
@@ -184,11 +175,10 @@ impl TrackedPose {
             max_coast_s: config.max_coast_s,
             max_position_std_m: MAX_POSITION_STD_M,
         };
-        let tracker = PoseTracker::new(limits);
         Self {
             localizer,
             config,
-            tracker,
+            tracker: PoseTracker::new(limits),
             sweeps: 0,
             measured_nanos: None,
             global_nanos: None,
@@ -231,10 +221,8 @@ impl TrackedPose {
         let Some(found) = published.and(localization.found.as_ref()) else {
             return;
         };
-        match self
-            .tracker
-            .correct(&PoseMeasurement::new(capture_nanos, found))
-        {
+        let measurement = PoseMeasurement::new(capture_nanos, found);
+        match self.tracker.correct(&measurement) {
             Correction::Rejected | Correction::Relocated => self.jumps += 1,
             Correction::Started | Correction::Accepted => {}
         }
@@ -242,11 +230,8 @@ impl TrackedPose {
 
     /// Names a speed that is not used from here on, once.
     fn report_speed(&mut self, input: &PoseInput<'_>) {
-        let Some(refuted) = self
-            .tracker
-            .refuted_speed()
-            .filter(|_| !self.is_speed_refuted)
-        else {
+        let refuted = self.tracker.refuted_speed();
+        let Some(refuted) = refuted.filter(|_| !self.is_speed_refuted) else {
             return;
         };
         self.is_speed_refuted = true;
@@ -305,11 +290,8 @@ impl PoseSource for TrackedPose {
 
     fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let is_measured = self.measured_nanos == Some(input.capture_nanos);
-        let Some(state) = self
-            .tracker
-            .state()
-            .filter(|_| !is_measured && self.is_due(&input.motion))
-        else {
+        let state = self.tracker.state();
+        let Some(state) = state.filter(|_| !is_measured && self.is_due(&input.motion)) else {
             return false;
         };
         let predicted = (!self.is_global_due(input.capture_nanos)).then_some(&state);

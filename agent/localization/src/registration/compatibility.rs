@@ -65,11 +65,9 @@ pub(super) fn leading_eigenvectors(matrices: &[f32], size: usize, iterations: us
                 normalised(matrix.chunks(size).map(|row| dot(row, vector)).collect())
             })
             .collect();
-        let stands_still = next
-            .iter()
-            .zip(&vectors)
-            // The default tolerances of torch.allclose.
-            .all(|(a, b)| (a - b).abs() <= 1e-8 + 1e-5 * b.abs());
+        let mut entries = next.iter().zip(&vectors);
+        // The default tolerances of torch.allclose.
+        let stands_still = entries.all(|(a, b)| (a - b).abs() <= 1e-8 + 1e-5 * b.abs());
         vectors = next;
         if stands_still {
             break;

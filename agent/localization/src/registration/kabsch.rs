@@ -1,6 +1,6 @@
 //! Kabsch's algorithm: the rigid motion that fits weighted pairs best (Kabsch 1976, with the determinant kept at +1).
 
-use nalgebra::{Isometry3, Matrix3, Rotation3, SVD, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Rotation3, SVD, UnitQuaternion, Vector3};
 
 /// Ratio of the second to the first singular value below which the pairs lie on a line, and any rotation about it fits.
 const COLLINEAR: f64 = 1e-9;
@@ -55,19 +55,9 @@ impl PairMoments {
     /// # Errors
     /// See [`Self::fit`].
     pub fn fit_biased(&self, epsilon: f64) -> Result<Isometry3<f64>, Degenerate> {
-        let Self {
-            weight,
-            source,
-            target,
-            cross,
-        } = *self;
-        if !(weight.is_finite()
-            && cross
-                .iter()
-                .chain(source.iter())
-                .chain(target.iter())
-                .all(|sum| sum.is_finite()))
-        {
+        let (weight, source, target) = (self.weight, self.source, self.target);
+        let mut sums = self.cross.iter().chain(source.iter()).chain(target.iter());
+        if !(weight.is_finite() && sums.all(|sum| sum.is_finite())) {
             return Err(Degenerate::NotFinite);
         }
         if weight <= 0.0 {
@@ -76,14 +66,11 @@ impl PairMoments {
         let from = source / (weight + epsilon);
         let to = target / (weight + epsilon);
         // Sum of w (a - from) (b - to)^T, multiplied out. With a bias its last three terms do not merge.
-        let covariance = cross - from * target.transpose() - source * to.transpose()
+        let covariance = self.cross - from * target.transpose() - source * to.transpose()
             + from * to.transpose() * weight;
         let rotation = rotation_of(&(covariance / weight))?;
-        let translation = Translation3::from(to - rotation * from);
-        Ok(Isometry3::from_parts(
-            translation,
-            UnitQuaternion::from_rotation_matrix(&rotation),
-        ))
+        let turn = UnitQuaternion::from_rotation_matrix(&rotation);
+        Ok(Isometry3::from_parts((to - rotation * from).into(), turn))
     }
 }
 
@@ -116,6 +103,7 @@ fn rotation_of(covariance: &Matrix3<f64>) -> Result<Rotation3<f64>, Degenerate> 
 mod tests {
     use std::f64::consts::PI;
 
+    use nalgebra::Translation3;
     use proptest::prelude::*;
 
     use super::*;

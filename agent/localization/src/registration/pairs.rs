@@ -5,6 +5,7 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
 use super::Correspondence;
+use super::refine::WeightedPair;
 
 /// Number of pairs that are scored at once; a multiple of the width of vector units.
 const LANES: usize = 16;
@@ -21,14 +22,6 @@ pub(super) struct Gain {
     pub prefix: f32,
     /// Score over all pairs.
     pub total: f32,
-}
-
-impl Gain {
-    /// True if a motion with this prefix is not worth scoring further when `self` is the best so far. Over a few
-    /// hundred pairs, a motion as good as the best practically never scores less than half of it.
-    fn rules_out(&self, prefix: f32) -> bool {
-        prefix < 0.5 * self.prefix
-    }
 }
 
 fn column(pairs: &[&Correspondence], value: impl Fn(&Correspondence) -> f32) -> Column {
@@ -94,11 +87,7 @@ impl Pairs {
     }
 
     /// Source, target and weight of the pairs within `radius_m` of their positions under `motion`.
-    pub(super) fn near(
-        &self,
-        motion: &Isometry3<f64>,
-        radius_m: f64,
-    ) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
+    pub(super) fn near(&self, motion: &Isometry3<f64>, radius_m: f64) -> Vec<WeightedPair> {
         let model = Model::new(motion);
         let limit = (radius_m * radius_m) as f32;
         let mut near = Vec::with_capacity(self.count);
@@ -127,7 +116,8 @@ impl Pairs {
         let scale = (1.0 / (threshold_m * threshold_m)) as f32;
         let blocks = self.weight.len();
         let prefix = self.block_gain(&model, scale, 0..PREFIX_BLOCKS.min(blocks));
-        if best.rules_out(prefix) {
+        // Over a few hundred pairs, a motion as good as the best practically never scores less than half of it.
+        if prefix < 0.5 * best.prefix {
             return None;
         }
         let rest = self.block_gain(&model, scale, PREFIX_BLOCKS.min(blocks)..blocks);

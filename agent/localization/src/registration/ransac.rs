@@ -101,13 +101,6 @@ impl RansacConfig {
         }
     }
 
-    fn sample_size(&self) -> i32 {
-        match self.minimal {
-            MinimalSolver::UprightTwoPoint => 2,
-            MinimalSolver::ThreePoint => 3,
-        }
-    }
-
     fn sample_test(&self) -> SampleTest {
         SampleTest {
             min_edge_m: self.min_edge_m,
@@ -124,9 +117,13 @@ impl RansacConfig {
 
     /// Number of draws after which a motion with `inliers` of `count` would have been found.
     fn draws_needed(&self, inliers: usize, count: usize) -> u32 {
+        let sample_size = match self.minimal {
+            MinimalSolver::UprightTwoPoint => 2,
+            MinimalSolver::ThreePoint => 3,
+        };
         let ratio = inliers as f64 / count.max(1) as f64;
         // n = ln(1 - confidence) / ln(1 - hit). The clamps keep both logarithms finite and other than 0.
-        let hit = (SAMPLE_YIELD * ratio.powi(self.sample_size())).clamp(1e-12, 1.0 - 1e-12);
+        let hit = (SAMPLE_YIELD * ratio.powi(sample_size)).clamp(1e-12, 1.0 - 1e-12);
         let draws = (1.0 - self.confidence).max(1e-12).ln() / (1.0 - hit).ln();
         (draws.ceil().min(f64::from(self.max_draws)) as u32).max(self.min_draws)
     }

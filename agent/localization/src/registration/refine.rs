@@ -13,6 +13,9 @@ pub(super) const CUTOFF_SCALES: f64 = 3.0;
 /// Step below which the iteration has converged: metres and radians.
 const CONVERGED: f64 = 1e-4;
 
+/// A point of the source, the same point of the target, and their weight.
+pub(crate) type WeightedPair = (Vector3<f64>, Vector3<f64>, f64);
+
 /// Re-fits a motion once for every scale of `scales_m`, in turn.
 ///
 /// `pairs` are source point, target point and weight, all finite.
@@ -20,20 +23,17 @@ const CONVERGED: f64 = 1e-4;
 /// # Errors
 /// [`Degenerate`] when the pairs near the motion do not constrain it.
 pub(crate) fn reweighted(
-    pairs: &[(Vector3<f64>, Vector3<f64>, f64)],
+    pairs: &[WeightedPair],
     start: &Isometry3<f64>,
     scales_m: impl IntoIterator<Item = f64>,
 ) -> Result<Isometry3<f64>, Degenerate> {
-    let mut motion = *start;
-    for scale_m in scales_m {
-        motion = step(pairs, &motion, scale_m)?;
-    }
-    Ok(motion)
+    let mut scales_m = scales_m.into_iter();
+    scales_m.try_fold(*start, |motion, scale_m| step(pairs, &motion, scale_m))
 }
 
 /// Re-fits a motion at one scale until it converges, at most `max_steps` times.
 pub(crate) fn converge(
-    pairs: &[(Vector3<f64>, Vector3<f64>, f64)],
+    pairs: &[WeightedPair],
     start: &Isometry3<f64>,
     scale_m: f64,
     max_steps: usize,
@@ -63,7 +63,7 @@ pub(crate) fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
 
 /// One weighted fit with the weights of the residuals of `motion`.
 fn step(
-    pairs: &[(Vector3<f64>, Vector3<f64>, f64)],
+    pairs: &[WeightedPair],
     motion: &Isometry3<f64>,
     scale_m: f64,
 ) -> Result<Isometry3<f64>, Degenerate> {

@@ -1,6 +1,6 @@
 //! Minimal samples: draws of pairs and the motion that they determine.
 
-use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -70,11 +70,8 @@ pub(super) fn two_points(
         return None;
     }
     let yaw_rad = to.y.atan2(to.x) - from.y.atan2(from.x);
-    Some(motion(
-        Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad),
-        &source,
-        &target,
-    ))
+    let rotation = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad);
+    Some(motion(rotation, &source, &target))
 }
 
 /// The motion with this rotation that maps one centre to the other.
@@ -84,10 +81,8 @@ fn motion<const N: usize>(
     target: &[Vector3<f64>; N],
 ) -> Isometry3<f64> {
     let [from, to] = [source, target].map(|points| points.iter().sum::<Vector3<f64>>() / N as f64);
-    Isometry3::from_parts(
-        Translation3::from(to - rotation * from),
-        UnitQuaternion::from_rotation_matrix(&rotation),
-    )
+    let turn = UnitQuaternion::from_rotation_matrix(&rotation);
+    Isometry3::from_parts((to - rotation * from).into(), turn)
 }
 
 /// Right-handed axes of a triangle, as columns; `None` for a degenerate one.
@@ -100,11 +95,8 @@ fn axes(points: &[Vector3<f64>; 3]) -> Option<Matrix3<f64>> {
         return None;
     }
     let normal = normal.try_normalize(1e-9)?;
-    Some(Matrix3::from_columns(&[
-        first,
-        normal.cross(&first),
-        normal,
-    ]))
+    let third = normal.cross(&first);
+    Some(Matrix3::from_columns(&[first, third, normal]))
 }
 
 /// `N` distinct indices below `count`; the caller ensures that there are at least `N`.

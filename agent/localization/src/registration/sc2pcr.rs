@@ -315,10 +315,8 @@ impl Points {
     /// The paper weights by the second order here; the published implementation computes that and then leaves it out.
     fn soft_compatibility(&self, set: &[usize], config: &Sc2PcrConfig) -> Vec<f32> {
         let threshold = config.distance_threshold_m as f32;
-        let mut compatibility = self.changes_within(set);
-        for change in &mut compatibility {
-            *change = soft(*change, threshold);
-        }
+        let changes = self.changes_within(set).into_iter();
+        let mut compatibility: Vec<f32> = changes.map(|change| soft(change, threshold)).collect();
         for own in compatibility.iter_mut().step_by(set.len() + 1) {
             *own = 0.0;
         }

@@ -29,31 +29,25 @@ pub struct PoseMeasurement {
 
 impl PoseMeasurement {
     /// Measurement from an estimated pose. The variance is the squared error that its sigma stands for (Eq. 6), spread
-    /// over two axes.
+    /// over two axes; of a pose that was registered to a map its covariance holds.
     pub fn new(capture_nanos: u64, found: &FoundPose) -> Self {
-        if found.is_registered {
-            return Self::registered(capture_nanos, found);
-        }
-        // Eq. 6 solved for the error. The clamp keeps a sigma of 0 finite.
-        let error_m: f64 = (1.0 / found.sigma.clamp(1e-6, 1.0) - 1.0).sqrt();
         let [least, most] = YAW_STD_RAD;
+        let (position_std_m, yaw_std_rad) = if found.is_registered {
+            let covariance = &found.cell_covariance;
+            let variance_m2 = f64::midpoint(covariance[0][0], covariance[1][1]);
+            (variance_m2.sqrt(), covariance[5][5].sqrt().min(most))
+        } else {
+            // Eq. 6 solved for the error. The clamp keeps a sigma of 0 finite.
+            let error_m: f64 = (1.0 / found.sigma.clamp(1e-6, 1.0) - 1.0).sqrt();
+            let std_m = POSITION_FACTOR * error_m / std::f64::consts::SQRT_2;
+            let std_rad = ROTATION_FACTOR * found.evidence.rotation_std_rad;
+            (std_m.max(LEAST_POSITION_STD_M), std_rad.clamp(least, most))
+        };
         Self {
             capture_nanos,
             world_from_lidar: found.world_from_sensor,
-            position_std_m: (POSITION_FACTOR * error_m / std::f64::consts::SQRT_2)
-                .max(LEAST_POSITION_STD_M),
-            yaw_std_rad: (ROTATION_FACTOR * found.evidence.rotation_std_rad).clamp(least, most),
-        }
-    }
-
-    /// Measurement from a pose that was registered to a map: its covariance holds.
-    fn registered(capture_nanos: u64, found: &FoundPose) -> Self {
-        let covariance = &found.cell_covariance;
-        Self {
-            capture_nanos,
-            world_from_lidar: found.world_from_sensor,
-            position_std_m: f64::midpoint(covariance[0][0], covariance[1][1]).sqrt(),
-            yaw_std_rad: covariance[5][5].sqrt().min(YAW_STD_RAD[1]),
+            position_std_m,
+            yaw_std_rad,
         }
     }
 }

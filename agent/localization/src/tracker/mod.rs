@@ -92,7 +92,8 @@ impl PoseTracker {
         }
         let track = self.track.as_mut()?;
         track.advance(capture_nanos, motion, &mut self.speed_trust);
-        if track.covariance().worst_variance_m2() > self.limits.max_position_std_m.powi(2) {
+        let covariance = track.filter.planar_covariance();
+        if covariance.worst_variance_m2() > self.limits.max_position_std_m.powi(2) {
             self.track = None;
         }
         self.state()
@@ -110,7 +111,7 @@ impl PoseTracker {
     /// Current state, if the vehicle is not lost.
     pub fn state(&self) -> Option<TrackedState> {
         let track = self.track.as_ref()?;
-        let mut covariance = track.covariance();
+        let mut covariance = track.filter.planar_covariance();
         if self.is_contradicted() {
             // Two places that are equally likely.
             let variance = (self.contradiction_m / 2.0).powi(2) as f32;

@@ -5,10 +5,9 @@
 
 use std::f64::consts::{PI, TAU};
 
-use nalgebra::Vector3;
 use nalgebra::{
     Isometry3, Matrix2, RowSVector, RowVector2, SMatrix, SVector, Translation3, UnitQuaternion,
-    Vector2,
+    Vector2, Vector3,
 };
 use protocol::PlanarCovariance;
 
@@ -109,19 +108,15 @@ impl MotionFilter {
         let time_s = capture_nanos.saturating_sub(self.capture_nanos) as f64 * 1e-9;
         self.capture_nanos = capture_nanos;
         let measured = measured_yaw_rate_rad_s.filter(|rate| rate.is_finite());
+        let yaw_acceleration_std = match measured {
+            Some(_) => RESIDUAL_YAW_ACCELERATION_STD,
+            None => YAW_ACCELERATION_STD,
+        };
         // Before the state moves: the rate is that of the interval which ends now.
         if let Some(rate) = measured {
             self.set_yaw_rate(rate);
         }
-        let is_measured = measured.is_some();
-        self.advance_plane(
-            time_s,
-            if is_measured {
-                RESIDUAL_YAW_ACCELERATION_STD
-            } else {
-                YAW_ACCELERATION_STD
-            },
-        );
+        self.advance_plane(time_s, yaw_acceleration_std);
         self.advance_height(time_s);
     }
 
@@ -148,16 +143,11 @@ impl MotionFilter {
         step[(YAW, YAW_RATE)] = time_s;
         let half_square = time_s * time_s / 2.0;
         // Step: process noise. An acceleration is constant within a step: its effects are fully correlated.
-        let pushed = State::from([
-            half_square * cos,
-            half_square * sin,
-            0.0,
-            time_s,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ]) * ACCELERATION_STD;
+        let mut pushed = State::zeros();
+        pushed[X] = half_square * cos;
+        pushed[Y] = half_square * sin;
+        pushed[SPEED] = time_s;
+        pushed *= ACCELERATION_STD;
         let turned =
             State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0, 0.0]) * yaw_acceleration_std;
         // A random walk: its variance, not its deviation, grows with time.
@@ -232,8 +222,7 @@ impl MotionFilter {
             return;
         };
         let gain = self.covariance.fixed_columns::<3>(0) * inverse;
-        let mut selects = SMatrix::<f64, 3, STATES>::zeros();
-        selects.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
+        let selects = SMatrix::<f64, 3, STATES>::identity();
         self.move_by(&(gain * off), &(Covariance::identity() - gain * selects));
 
         // The height has a filter of its own: its errors count as independent of those in the plane.
@@ -249,10 +238,8 @@ impl MotionFilter {
     /// Roll and pitch move towards the measured ones, the further the longer ago the last measurement was.
     fn correct_tilt(&mut self, measurement: &PoseMeasurement) {
         let (roll_rad, pitch_rad, _) = measurement.world_from_lidar.rotation.euler_angles();
-        let time_s = measurement
-            .capture_nanos
-            .saturating_sub(self.measured_nanos) as f64
-            * 1e-9;
+        let (before, now) = (self.measured_nanos, measurement.capture_nanos);
+        let time_s = now.saturating_sub(before) as f64 * 1e-9;
         let weight = 1.0 - (-time_s / TILT_TIME_S).exp();
         self.roll_rad += weight * wrapped_rad(roll_rad - self.roll_rad);
         self.pitch_rad += weight * wrapped_rad(pitch_rad - self.pitch_rad);

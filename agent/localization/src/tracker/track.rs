@@ -1,6 +1,6 @@
 //! Track: motion filter that uses the vehicle's speed, and one beside it that does not and so can contradict that speed.
 
-use protocol::{EgoMotion, PlanarCovariance};
+use protocol::EgoMotion;
 
 use super::measurement::PoseMeasurement;
 use super::motion_filter::MotionFilter;
@@ -104,11 +104,6 @@ impl Track {
         self.filter.correct(measurement);
         self.unaided.correct(measurement);
         true
-    }
-
-    /// Covariance of the pose.
-    pub(super) fn covariance(&self) -> PlanarCovariance {
-        self.filter.planar_covariance()
     }
 
     /// Standard deviation of the speed that the poses alone give, metres per second.

@@ -18,7 +18,7 @@ use localization::map_registration::MapRegistration;
 use localization::pgc::confidence::{
     CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Labelled, Rejection,
 };
-use localization::pgc::head_files::{encoder_or_named, surfel_map_file};
+use localization::pgc::head_files::encoder_or_named;
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer, stored_confidence};
@@ -38,7 +38,7 @@ use support::output;
 use support::provenance::Provenance;
 
 use super::retrieval::{self, Bar, RetrievalBy};
-use super::scene_heads::{SceneHeadFile, by_head, with_files};
+use super::scene_heads::{SceneHeadFile, by_head, surfel_map, with_files};
 use support::cli::{BadInput, Outcome};
 
 /// Options that change the tracker alone.
@@ -268,7 +268,7 @@ impl Args {
         }
         let mut files: Vec<PathBuf> = self.baseline.iter().cloned().collect();
         if self.surfel_map.is_some() {
-            files.push(self.surfel_map_file()?);
+            files.push(surfel_map(self.surfel_map.as_deref())?);
         }
         for head in heads.filter(|_| self.uses_head()) {
             files.extend([self.encoder(head)?, head.to_owned()]);
@@ -347,15 +347,10 @@ impl Args {
         self.registered(Box::new(localizer))
     }
 
-    /// File of the surfel map; empty without one.
-    fn surfel_map_file(&self) -> Result<PathBuf, BadInput> {
-        let file = self.surfel_map.as_deref().map(surfel_map_file).transpose();
-        Ok(file.map_err(BadInput::of)?.unwrap_or_default())
-    }
-
     /// The localizer behind the surfel map, if there is one.
     fn registered(&self, localizer: Box<dyn Localize>) -> Result<Box<dyn Localize>, BadInput> {
-        MapRegistration::of(localizer, &self.surfel_map_file()?).map_err(BadInput::of)
+        let map = surfel_map(self.surfel_map.as_deref())?;
+        MapRegistration::of(localizer, &map).map_err(BadInput::of)
     }
 
     fn encoder(&self, head: &Path) -> Result<PathBuf, BadInput> {
@@ -376,12 +371,11 @@ impl Args {
             Subject::Source(mut source) => evaluate_source(&mut *source, &options, &mut on_sweep),
             Subject::Nearest(poses) => evaluate_nearest(&poses, &options, &mut on_sweep),
         };
-        match evaluated {
-            Ok(evaluated) => Ok(evaluated),
+        evaluated.map_err(|error| match error {
             // A network that fails is no fault of the input: exit code 1, not 2.
-            Err(error @ Error::Localizer(_)) => Err(error.into()),
-            Err(error) => Err(BadInput::of(error).into()),
-        }
+            Error::Localizer(_) => error.into(),
+            _ => BadInput::of(error).into(),
+        })
     }
 
     /// Choice of the threshold, and its option.
@@ -425,11 +419,11 @@ impl Args {
             write_fit(head, CONFIDENCE_KEY, &model)?;
             output::note(report_line(&report));
         }
-        let map = self.surfel_map_file()?;
-        match (scale, self.surfel_map.is_some()) {
-            (Ok(scale), true) => write_fit(&map, COVARIANCE_KEY, &scale),
-            (Ok(scale), false) => write_fit(head, COVARIANCE_KEY, &scale),
-            (Err(reason), _) => {
+        let map = surfel_map(self.surfel_map.as_deref())?;
+        match scale {
+            Ok(scale) if registered => write_fit(&map, COVARIANCE_KEY, &scale),
+            Ok(scale) => write_fit(head, COVARIANCE_KEY, &scale),
+            Err(reason) => {
                 output::note(format_args!("the covariances are not fitted: {reason}"));
                 Ok(())
             }
@@ -451,10 +445,8 @@ impl Args {
             let reason = format!("{}: has no confidence: --fit-confidence", head.display());
             return Err(BadInput::new(reason).into());
         };
-        let report = model
-            .choose_threshold(labelled, rejection)
-            .map_err(BadInput::of)?;
-        Ok((model, report))
+        let report = model.choose_threshold(labelled, rejection);
+        Ok((model, report.map_err(BadInput::of)?))
     }
 
     fn write(&self, sweeps: &[EvaluatedSweep]) -> anyhow::Result<()> {
@@ -506,6 +498,7 @@ fn report_line(report: &FitReport) -> String {
 /// Report as text.
 fn table(summary: &LocalizationSummary) -> String {
     let (rejected, ms) = (&summary.rejected, &summary.ms);
+    let [under_3m, under_1m] = [summary.success_3m, summary.success_1m].map(percent);
     let total = ms.get("total").copied();
     let stages = ms.iter().filter(|(stage, _)| *stage != "total");
     let stages: Vec<String> = stages
@@ -516,11 +509,7 @@ fn table(summary: &LocalizationSummary) -> String {
             "sweeps     {}, {} without a pose {:?}",
             summary.sweeps, summary.no_pose, summary.outcomes
         ),
-        format!(
-            "success    {} under 3 m, {} under 1 m",
-            percent(summary.success_3m),
-            percent(summary.success_1m)
-        ),
+        format!("success    {under_3m} under 3 m, {under_1m} under 1 m"),
         format!(
             "position   mean {} m, median {}, 95 % {}, 99 % {}, largest {}",
             number(summary.mean_m, 2),

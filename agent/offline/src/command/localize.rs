@@ -2,19 +2,18 @@
 
 use std::path::{Path, PathBuf};
 
+use agent_offline::evaluation::estimate_pose;
 use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, Scenario, findings};
 use indicatif::ProgressBar;
-use localization::pgc::head_files::{encoder_or_named, surfel_map_file};
+use localization::pgc::head_files::encoder_or_named;
 use localization::pgc::wrong_place::wrong_place_hint;
-use localization::pose_source::{
-    LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable,
-};
+use localization::pose_source::{LocalizedPose, PgcConfig, PoseRow, PoseTable};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use support::output;
 use terminal::progress;
 
-use super::scene_heads::{SceneHeadFile, head_of, with_files};
+use super::scene_heads::{SceneHeadFile, head_of, surfel_map, with_files};
 use support::cli::{BadInput, Outcome};
 use tch::Device;
 
@@ -62,10 +61,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     scenarios.retain(|scenario| !done.has(&scenario.name));
     // All heads are found before any is computed with.
     let files = with_files(&args.head)?;
-    let heads: Vec<&Path> = scenarios
-        .iter()
-        .map(|scenario| head_of(&files, scenario))
-        .collect::<Result<_, _>>()?;
+    let heads = scenarios.iter().map(|scenario| head_of(&files, scenario));
+    let heads: Vec<&Path> = heads.collect::<Result<_, _>>()?;
     let first_head = heads.first().copied();
     let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
@@ -103,9 +100,7 @@ impl Args {
         let config = PgcConfig {
             encoder: encoder_or_named(self.encoder.as_deref(), head).map_err(bad)?,
             head: head.to_owned(),
-            surfel_map: { self.surfel_map.as_deref().map(surfel_map_file).transpose() }
-                .map_err(bad)?
-                .unwrap_or_default(),
+            surfel_map: surfel_map(self.surfel_map.as_deref())?,
             ..PgcConfig::default()
         };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
@@ -121,29 +116,17 @@ impl Args {
                         continue;
                     }
                 };
-                let capture_nanos = frame.capture_nanos;
-                let input = PoseInput {
-                    cav,
-                    capture_nanos,
-                    cloud: &frame.points,
-                    levels: None,
-                    measured: None,
-                    motion: frame.motion(),
-                };
                 rows.push(PoseRow {
                     cav,
-                    capture_nanos,
-                    estimate: source.estimate(&input),
+                    capture_nanos: frame.capture_nanos,
+                    estimate: estimate_pose(&mut source, &frame, None),
                 });
-                source.observe(&input);
             }
         }
         // Appended as a whole: an interrupted scenario is not in the table and is done again.
         PoseTable::append(&self.out, &scenario.name, &rows)?;
-        let poses = rows
-            .iter()
-            .filter(|row| row.estimate.world_from_cav().is_some());
-        Ok(poses.count())
+        let poses = rows.iter().map(|row| row.estimate.world_from_cav());
+        Ok(poses.flatten().count())
     }
 }
 

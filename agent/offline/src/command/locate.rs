@@ -6,7 +6,7 @@ use dataset::IntensityScale;
 use dataset::cloud_files::{CloudFile, clouds_at};
 use dataset::findings::{self, SweepFindings};
 use localization::map_registration::MapRegistration;
-use localization::pgc::head_files::{encoder_or_named, head_file, surfel_map_file};
+use localization::pgc::head_files::{encoder_or_named, head_file};
 use localization::pgc::pose_solver::FoundPose;
 use localization::pgc::wrong_place::{lowest_m, other_lidar_hint, vehicle_frame_hint};
 use localization::pgc::{Localization, Localize, Localizer, LocalizerInput};
@@ -19,6 +19,8 @@ use serde::Serialize;
 use support::cli::{BadInput, Outcome};
 use support::output;
 use tch::Device;
+
+use super::scene_heads::surfel_map;
 
 /// Find the pose of single point clouds: no other sensor, no earlier pose.
 ///
@@ -129,8 +131,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let mut localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
     localizer.set_min_confidence(args.min_confidence);
     let head_config = localizer.head_config().clone();
-    let map = args.surfel_map.as_deref().map(surfel_map_file).transpose();
-    let map = map.map_err(BadInput::of)?.unwrap_or_default();
+    let map = surfel_map(args.surfel_map.as_deref())?;
     let localizer = MapRegistration::of(Box::new(localizer), &map);
     let mut localizer = localizer.map_err(BadInput::of)?;
     let (mut found, mut lost, mut bad) = (0, 0, 0);
@@ -198,7 +199,14 @@ impl Args {
         };
         let read = match read {
             Ok(read) => read,
-            Err(error) => return Ok(Located::unreadable(cloud, map, &error)),
+            Err(error) => {
+                return Ok(Located {
+                    cloud,
+                    map,
+                    error: Some(error.to_string()),
+                    ..Located::default()
+                });
+            }
         };
         let mut points = read.points;
         let count = points.len();
@@ -278,15 +286,6 @@ impl LocatedPose {
 }
 
 impl Located {
-    fn unreadable(cloud: String, map: String, error: &dataset::ReadError) -> Self {
-        Self {
-            cloud,
-            map,
-            error: Some(error.to_string()),
-            ..Self::default()
-        }
-    }
-
     /// One line for a person.
     fn text(&self) -> String {
         let (cloud, inliers, points) = (&self.cloud, self.inliers, self.points);

@@ -195,31 +195,26 @@ impl Args {
 
 fn name_of(folder: &Path) -> String {
     let absolute = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    let name = absolute
-        .file_name()
-        .map(|name| name.to_string_lossy().into_owned());
-    name.unwrap_or_else(|| "place".to_owned())
+    let name = absolute.file_name().map(|name| name.to_string_lossy());
+    name.map_or("place".to_owned(), |name| name.into_owned())
 }
 
 /// Report as text.
 fn text(report: &MapReport) -> String {
-    let accuracy = report
-        .held_out
-        .map_or("not measured: too few sweeps".to_owned(), |accuracy| {
-            accuracy.text()
-        });
-    let confidence = report
-        .confidence
-        .map_or("not fitted: too few poses".to_owned(), |fit| {
-            let good = fit.sweeps - fit.bad;
+    let accuracy = match &report.held_out {
+        Some(accuracy) => accuracy.text(),
+        None => "not measured: too few sweeps".to_owned(),
+    };
+    let confidence = match &report.confidence {
+        Some(fit) => {
+            let (bad, good, limit) = (fit.bad, fit.sweeps - fit.bad, 100.0 * fit.wrong_limit);
+            let (bad_rejected, good_rejected) = (fit.bad_rejected, fit.good_rejected);
             format!(
-                "rejects {} of {} wrong poses, {} of {good} right ones; of the others at most {:.1} % are wrong (95 % limit)",
-                fit.bad_rejected,
-                fit.bad,
-                fit.good_rejected,
-                100.0 * fit.wrong_limit
+                "rejects {bad_rejected} of {bad} wrong poses, {good_rejected} of {good} right ones; of the others at most {limit:.1} % are wrong (95 % limit)"
             )
-        });
+        }
+        None => "not fitted: too few poses".to_owned(),
+    };
     format!(
         "place      {}\ntraining   {}\naccuracy   {accuracy}\nconfidence {confidence}\ndriven     {}\n{}{}\n",
         report.place,
@@ -238,34 +233,26 @@ fn indented(text: &str) -> String {
 
 /// Writes the model card and the report.
 fn write(config: &MapConfig, report: &MapReport) -> anyhow::Result<()> {
-    let mut card = ModelCard::new(
-        &format!("Scene head of {}", report.place),
-        "World coordinates of cells on the features of a frozen encoder, made by `agent map`.",
-    );
-    let data = format!(
-        "{} sweeps of {} drives",
-        report.training_sweeps,
-        config.drives.len()
-    );
+    let title = format!("Scene head of {}", report.place);
+    let about =
+        "World coordinates of cells on the features of a frozen encoder, made by `agent map`.";
+    let mut card = ModelCard::new(&title, about);
+    let (sweeps, drives) = (report.training_sweeps, config.drives.len());
+    let data = format!("{sweeps} sweeps of {drives} drives");
     card.trained(&report.run, &report.trained, &data, "cells");
-    card.row(
-        "file with confidence and scales",
-        format_args!("SHA-256 `{}`", report.sha256),
-    );
+    let sha256 = format!("SHA-256 `{}`", report.sha256);
+    card.row("file with confidence and scales", sha256);
     card.row("copies of each sweep", report.copies);
     card.row("encoder", format_args!("`{ENCODER_FILE}` beside the head"));
     let accuracy = report.held_out.map(|accuracy| accuracy.text());
     card.row("accuracy", accuracy.as_deref().unwrap_or("not measured"));
     card.row("driven", report.coverage_text());
-    card.row(
-        "time of everything",
-        format_args!("{:.0} s", report.seconds),
-    );
+    let time = format!("{:.0} s", report.seconds);
+    card.row("time of everything", time);
     card.paragraph(&report.limits_text());
+    let (cell_m, picture) = (report.coverage.cell_m, report.coverage.picture());
     card.paragraph(&format!(
-        "Cells of {:.0} m with sweeps (#), north up:\n\n```\n{}```",
-        report.coverage.cell_m,
-        report.coverage.picture()
+        "Cells of {cell_m:.0} m with sweeps (#), north up:\n\n```\n{picture}```"
     ));
     card.write(&config.run.out)?;
     let path = config.run.out.join(REPORT_FILE);

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use anyhow::Context;
 use dataset::{self, GeneratedMap, Scenario};
-use localization::pgc::head_files::head_file;
+use localization::pgc::head_files::{head_file, surfel_map_file};
 
 use support::cli::BadInput;
 
@@ -46,13 +46,20 @@ impl FromStr for SceneHeadFile {
 /// # Errors
 /// [`BadInput`] for a head that does not exist.
 pub(crate) fn with_files(heads: &[SceneHeadFile]) -> Result<Vec<SceneHeadFile>, BadInput> {
-    let found = heads.iter().map(|head| {
-        Ok(SceneHeadFile {
-            map: head.map.clone(),
-            weights: head_file(&head.weights).map_err(BadInput::of)?,
-        })
-    });
-    found.collect()
+    let mut found = heads.to_vec();
+    for head in &mut found {
+        head.weights = head_file(&head.weights).map_err(BadInput::of)?;
+    }
+    Ok(found)
+}
+
+/// The file of a surfel map, where released ones are named; empty without one.
+///
+/// # Errors
+/// [`BadInput`] for a map that does not exist.
+pub(crate) fn surfel_map(named: Option<&Path>) -> Result<PathBuf, BadInput> {
+    let file = named.map(surfel_map_file).transpose();
+    Ok(file.map_err(BadInput::of)?.unwrap_or_default())
 }
 
 /// The weights of the head for a scenario.
@@ -73,9 +80,8 @@ pub(crate) fn head_of<'a>(
         )));
     }
     let map = scenario.generated_map();
-    let map = map
-        .with_context(|| format!("the map of scenario {}", scenario.name))
-        .map_err(BadInput::of)?;
+    let map = map.with_context(|| format!("the map of scenario {}", scenario.name));
+    let map = map.map_err(BadInput::of)?;
     let head = heads.iter().find(|head| head.map.as_ref() == Some(&map));
     Ok(&head
         .ok_or_else(|| BadInput::new(format!("{}: no --head for map {map}", scenario.name)))?
@@ -96,18 +102,14 @@ pub(crate) fn by_head<'a>(
     let mut groups: Vec<(&Path, Vec<PathBuf>)> = Vec::new();
     for folder in scenes {
         let scenarios = dataset::open(folder).map_err(BadInput::of)?.scenarios;
-        let needed = scenarios
-            .iter()
-            .map(|scenario| head_of(heads, scenario))
-            .collect::<Result<Vec<_>, _>>()?;
+        let needed = scenarios.iter().map(|scenario| head_of(heads, scenario));
+        let needed = needed.collect::<Result<Vec<_>, _>>()?;
         let &head = needed.first().ok_or_else(|| {
             BadInput::new(format!("{}: there is no scenario in it", folder.display()))
         })?;
         if needed.iter().any(|other| *other != head) {
-            return Err(BadInput::new(format!(
-                "{}: scenarios of several maps",
-                folder.display()
-            )));
+            let reason = format!("{}: scenarios of several maps", folder.display());
+            return Err(BadInput::new(reason));
         }
         match groups.iter_mut().find(|(of, _)| *of == head) {
             Some((_, folders)) => folders.push(folder.clone()),

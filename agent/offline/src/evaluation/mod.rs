@@ -55,11 +55,8 @@ pub struct EvaluatedSweep {
 impl EvaluatedSweep {
     /// Error of the estimated pose, rejected or not.
     pub fn error(&self) -> Option<PoseError> {
-        let found = self.localization.found?;
-        Some(PoseError::between(
-            &found.world_from_sensor.into(),
-            &self.truth,
-        ))
+        let pose: Pose = self.localization.found?.world_from_sensor.into();
+        Some(PoseError::between(&pose, &self.truth))
     }
 
     /// Error of the pose that is published, if there is one.
@@ -92,12 +89,9 @@ impl EvaluatedSweep {
 
     /// The same with the covariance that is published.
     fn published_sample(&self) -> Option<PoseSample> {
-        let covariance = pose_covariance(&self.localization.found?);
-        let sample = self.pose_sample()?;
-        Some(PoseSample {
-            covariance,
-            ..sample
-        })
+        let mut sample = self.pose_sample()?;
+        sample.covariance = pose_covariance(&self.localization.found?);
+        Some(sample)
     }
 
     /// Error in the plane of the localizer's published pose and its bound of one in 1,000, metres, if it has one.
@@ -228,10 +222,7 @@ fn evaluate_with(
         lidar_variant: options.variant.clone(),
         ..LoadOptions::default()
     };
-    let mut evaluated = Evaluated {
-        sweeps: Vec::with_capacity(chosen.len()),
-        left_out: LeftOut::default(),
-    };
+    let mut evaluated = Evaluated::default();
     for dataset in &datasets {
         evaluated.left_out.add_files(&dataset.problems);
         let findings = findings::sampled(&dataset.scenarios, IntensityScale::AUTO);

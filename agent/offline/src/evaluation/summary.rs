@@ -144,10 +144,8 @@ impl LocalizationSummary {
         }
         let totals = sweeps.iter().map(|sweep| sweep.localization.times.total());
         let total_ms: Vec<f64> = totals.map(|total| total.as_secs_f64() * 1e3).collect();
-        let gaps = calibration
-            .iter()
-            .map(|bin| (bin.sigma - bin.observed).abs());
-        let gaps: Vec<f64> = gaps.collect();
+        let bins = calibration.iter();
+        let gaps: Vec<f64> = bins.map(|bin| (bin.sigma - bin.observed).abs()).collect();
         Self {
             sweeps: sweeps.len(),
             success_3m,
@@ -289,14 +287,11 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         let points = poses.map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)));
         series(name, points.collect(), Mark::Dots)
     });
+    let (all, published) = (sweeps.len(), published.count());
     let groups = bins.iter().map(|bin| (bin.sigma, bin.observed)).collect();
     let diagonal = vec![(0.0, 0.0), (1.0, 1.0)];
     let reliability = Chart {
-        title: format!(
-            "Reliability, {} sweeps, {} poses published",
-            sweeps.len(),
-            published.count()
-        ),
+        title: format!("Reliability, {all} sweeps, {published} poses published"),
         x: Axis::linear("sigma", [0.0, 1.0]),
         y: Axis::linear("mean of 1 / (1 + e^2), e in m", [0.0, 1.0]),
         series: vec![

@@ -38,11 +38,8 @@ fn csv(sweeps: &[EvaluatedSweep]) -> String {
 
 fn row(sweep: &EvaluatedSweep) -> Vec<String> {
     let localization = &sweep.localization;
-    let mut fields = vec![
-        sweep.scenario.clone(),
-        sweep.cav.to_string(),
-        sweep.stem.clone(),
-    ];
+    let (scenario, stem) = (sweep.scenario.clone(), sweep.stem.clone());
+    let mut fields = vec![scenario, sweep.cav.to_string(), stem];
     fields.extend(pose(&sweep.truth));
     let outcome = outcome(&localization.estimate).to_owned();
     if let (Some(found), Some(error)) = (&localization.found, sweep.error()) {

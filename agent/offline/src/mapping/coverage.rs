@@ -62,11 +62,8 @@ impl Coverage {
             corner_m: cell.map(|k| k as f64 * cell_m),
             sweeps,
         });
-        let length_m = drives
-            .iter()
-            .flat_map(|drive| drive.windows(2))
-            .map(|pair| (pair[1] - pair[0]).norm())
-            .sum();
+        let steps = drives.iter().flat_map(|drive| drive.windows(2));
+        let length_m = steps.map(|pair| (pair[1] - pair[0]).norm()).sum();
         Some(Self {
             sweeps: all.count(),
             length_m,
@@ -79,11 +76,9 @@ impl Coverage {
 
     /// The grid as text, north up: `#` where there are sweeps, `.` where there are none.
     pub fn picture(&self) -> String {
-        let places: Vec<[i64; 2]> = (self.cells.iter())
-            .map(|cell| {
-                cell.corner_m
-                    .map(|metres| (metres / self.cell_m).round() as i64)
-            })
+        let corners_m = self.cells.iter().map(|cell| cell.corner_m);
+        let places: Vec<[i64; 2]> = corners_m
+            .map(|corner_m| corner_m.map(|metres| (metres / self.cell_m).round() as i64))
             .collect();
         let [xs, ys] = [0, 1].map(|axis: usize| places.iter().map(move |place| place[axis]));
         let (west, east) = (xs.clone().min().unwrap_or(0), xs.max().unwrap_or(-1));

@@ -37,15 +37,11 @@ pub(super) fn held_out(positions_m: &[Vector3<f64>]) -> Vec<bool> {
 
 /// Sweeps of a piece, from the median distance of neighbours.
 fn piece_sweeps(positions_m: &[Vector3<f64>]) -> usize {
-    let steps: Vec<f64> = positions_m
-        .windows(2)
-        .map(|pair| (pair[1] - pair[0]).norm())
-        .collect();
+    let pairs = positions_m.windows(2);
+    let steps: Vec<f64> = pairs.map(|pair| (pair[1] - pair[0]).norm()).collect();
+    let step_m = support::statistics::median(&steps).unwrap_or(PIECE_M);
     // A vehicle that stands has steps of 0, by which the length would be divided.
-    let step_m = support::statistics::median(&steps)
-        .unwrap_or(PIECE_M)
-        .max(1e-3);
-    ((PIECE_M / step_m) as usize + 1).min(PIECE_SWEEPS)
+    ((PIECE_M / step_m.max(1e-3)) as usize + 1).min(PIECE_SWEEPS)
 }
 
 #[cfg(test)]

@@ -135,19 +135,12 @@ struct Sweeps {
 impl Sweeps {
     /// Coverage of some sweeps.
     fn coverage(&self, indices: &[usize]) -> Option<Coverage> {
-        let mut drives: Vec<Vec<Vector3<f64>>> = Vec::new();
-        let mut last = None;
-        for &index in indices {
-            let (drive, Some(position)) = self.positions[index] else {
-                continue;
-            };
-            if last != Some(drive) {
-                drives.push(Vec::new());
-                last = Some(drive);
-            }
-            drives.last_mut()?.push(position);
-        }
-        Coverage::of(&drives)
+        let positions = indices.iter().map(|&index| self.positions[index]);
+        let known = positions.filter_map(|(drive, position)| Some((drive, position?)));
+        let known: Vec<(usize, Vector3<f64>)> = known.collect();
+        let drives = known.chunk_by(|(one, _), (next, _)| one == next);
+        let drives = drives.map(|drive| drive.iter().map(|(_, position)| *position).collect());
+        Coverage::of(&drives.collect::<Vec<Vec<_>>>())
     }
 }
 
@@ -242,8 +235,8 @@ impl Map<'_> {
         let mut first_s = 0.0;
         // The cache reports after every batch of 4 sweeps, so this number is met exactly.
         let first = 4.min(probes.len());
-        let built = FeatureCache::build(&probes, &encoder, unchanged, run, &mut |done, _| {
-            if done == first {
+        let built = FeatureCache::build(&probes, &encoder, unchanged, run, &mut |progress| {
+            if matches!(progress, Progress::Encoding(done, _) if *done == first) {
                 first_s = began.elapsed().as_secs_f64();
             }
         });

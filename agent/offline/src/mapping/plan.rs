@@ -10,7 +10,7 @@ use support::bounded_file::{self, MAX_TEXT_BYTES};
 use super::check::LEAST_CHECKED;
 use crate::Error;
 use crate::training::CELLS;
-use support::file_error::AtFile;
+use support::file_error::{AtFile, FileError};
 
 /// Largest share of the time before the check that is spent on encoding.
 const ENCODING_SHARE: f64 = 0.5;
@@ -69,9 +69,8 @@ impl Plan {
         let check_s = (checked_s * localized as f64).min(CHECK_SHARE * total_s);
         // The localization costs as much as the encoding here too.
         let affordable_scales = (SCALES_SHARE * total_s / (2.0 * sweep_s)) as usize;
-        let scale_sweeps = affordable_scales
-            .clamp(LEAST_SCALE_SWEEPS, MOST_SCALE_SWEEPS)
-            .min(training);
+        let scale_sweeps = affordable_scales.clamp(LEAST_SCALE_SWEEPS, MOST_SCALE_SWEEPS);
+        let scale_sweeps = scale_sweeps.min(training);
         let scales_s = 2.0 * sweep_s * scale_sweeps as f64;
         let affordable =
             ((total_s - check_s - scales_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
@@ -118,24 +117,16 @@ impl StoredPlan {
     /// The plan of a stopped map of `sweeps` sweeps.
     pub(super) fn read(out: &Path, sweeps: usize) -> Result<Plan, Error> {
         let path = out.join(Self::FILE);
-        let text =
-            bounded_file::read_text(&path, MAX_TEXT_BYTES).map_err(|error| error.to_string());
-        let stored = text.and_then(|text| {
-            serde_json::from_str::<Self>(&text).map_err(|error| error.to_string())
-        });
-        let stored = stored.and_then(|stored| match stored.sweeps {
-            before if before == sweeps => Ok(stored),
-            before => Err(format!(
-                "the stopped map was of {before} sweeps, the drives have {sweeps}"
+        let text = bounded_file::read_text(&path, MAX_TEXT_BYTES).at(&path);
+        let stored = text.and_then(|text| serde_json::from_str::<Self>(&text).at(&path));
+        let plan = stored.and_then(|stored| match stored.sweeps {
+            before if before == sweeps => Ok(stored.plan),
+            before => Err(FileError::new(
+                &path,
+                format_args!("the stopped map was of {before} sweeps, the drives have {sweeps}"),
             )),
         });
-        match stored {
-            Ok(stored) => Ok(stored.plan),
-            Err(reason) => Err(Error::Input(format!(
-                "--resume: {}: {reason}",
-                path.display()
-            ))),
-        }
+        plan.map_err(|error| Error::Input(format!("--resume: {error}")))
     }
 }
 
@@ -152,9 +143,8 @@ pub(super) fn too_little_memory(needed: u64) -> Option<u64> {
 
 /// Available memory by Linux's own estimate, bytes.
 fn available_memory(meminfo: &str) -> Option<u64> {
-    let line = meminfo
-        .lines()
-        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let mut lines = meminfo.lines();
+    let line = lines.find_map(|line| line.strip_prefix("MemAvailable:"))?;
     Some(line.split_ascii_whitespace().next()?.parse::<u64>().ok()? * 1024)
 }
 

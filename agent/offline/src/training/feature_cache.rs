@@ -13,7 +13,7 @@ use super::turned_sweep::{CELLS, TurnedSweep};
 use crate::Error;
 use localization::pgc::{Cell, CellEncoder, PreparedSweep};
 use perception::tensor_values::tensor;
-use perception::train::{Prefetch, RunConfig};
+use perception::train::{Observe, Prefetch, Progress, RunConfig};
 
 /// Number of sweeps of one forward pass.
 const BATCH: u64 = 4;
@@ -71,7 +71,7 @@ pub(crate) struct FeatureCache {
 }
 
 impl FeatureCache {
-    /// Encodes every sweep of `list` once per copy, on the device and in the precision of `run`; `progress` gets the
+    /// Encodes every sweep of `list` once per copy, on the device and in the precision of `run`; `observe` gets the
     /// number of sweeps done and of all.
     ///
     /// # Errors
@@ -81,7 +81,7 @@ impl FeatureCache {
         encoder: &CellEncoder,
         augmentation: SweepAugmentation,
         run: &RunConfig,
-        progress: &mut dyn FnMut(usize, usize),
+        observe: &mut Observe<'_>,
     ) -> Result<Self, Error> {
         let (seed, device) = (run.seed, run.device);
         let total = list.len() * augmentation.copies.max(1);
@@ -110,7 +110,7 @@ impl FeatureCache {
                 builder.add(&cells, &batch, encoder, run.precision.kind())?;
             }
             done = (done + BATCH as usize).min(total);
-            progress(done, total);
+            observe(&Progress::Encoding(done, total));
         }
         builder.finish(cells)
     }

@@ -146,10 +146,9 @@ impl PairMaker {
         let partner_places = places(sweep.cells(), &world_from_partner);
         let grid = Grid::new(&partner_places);
         let candidates = choose(anchor_sweep.cells(), CELLS, rng);
-        let matched: Vec<(usize, usize)> = candidates
-            .into_iter()
-            .filter_map(|cell| Some((cell, grid.nearest(anchor_places[cell])?)))
-            .collect();
+        let matched = { candidates.into_iter() }
+            .filter_map(|cell| Some((cell, grid.nearest(anchor_places[cell])?)));
+        let matched: Vec<(usize, usize)> = matched.collect();
         // The partners of the anchor's cells, and others as negatives.
         let mut rows: Vec<usize> = matched.iter().map(|&(_, partner)| partner).collect();
         rows.extend(choose(sweep.cells(), CELLS, rng));
@@ -266,11 +265,8 @@ fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
     let partners = store.sweeps.iter().enumerate().map(|(index, own)| {
         let (world, x, y) = bucket(own);
         let around = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (world, x + dx, y + dy)));
-        let candidates = around
-            .filter_map(|bucket| buckets.get(&bucket))
-            .flatten()
-            .copied();
-        let in_range = candidates.filter(|&other| {
+        let candidates = around.filter_map(|bucket| buckets.get(&bucket)).flatten();
+        let in_range = candidates.copied().filter(|&other| {
             // A bridge and the road below it are near in the plane alone.
             let other_m = store.sweeps[other as usize].world_from_sensor.translation;
             let offset = other_m.vector - own.world_from_sensor.translation.vector;

@@ -47,10 +47,7 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
-    let unchanged = SweepAugmentation::NONE;
-    let cache = FeatureCache::build(&list, &encoder, unchanged, run, &mut |done, total| {
-        observe(&Progress::Encoding(done, total));
-    })?;
+    let cache = FeatureCache::build(&list, &encoder, SweepAugmentation::NONE, run, observe)?;
     observe(&Progress::Read(list.data()));
     let network_config = SgLocConfig {
         scene_name: config.scene_name.clone(),
@@ -126,10 +123,8 @@ impl Task for Training<'_> {
 fn drawn_rows(cache: &FeatureCache, seed: u64, step: u64, wanted: usize) -> tch::Result<Tensor> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(step);
-    let rows: Vec<i64> = (0..wanted)
-        .map(|_| rng.random_range(0..cache.cell_count()))
-        .collect();
-    tensor(&rows, &[-1], cache.cells.device())
+    let rows = (0..wanted).map(|_| rng.random_range(0..cache.cell_count()));
+    tensor(&rows.collect::<Vec<i64>>(), &[-1], cache.cells.device())
 }
 
 /// Gives the encoder below `variables` the weights of a file and freezes it.

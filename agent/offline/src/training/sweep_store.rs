@@ -33,32 +33,6 @@ pub(crate) struct StoredSweep {
 }
 
 impl StoredSweep {
-    /// A sweep from points in metres.
-    pub(crate) fn new(
-        world: usize,
-        drive: usize,
-        world_from_sensor: Isometry3<f64>,
-        points: &[[f32; 4]],
-    ) -> Self {
-        Self {
-            world,
-            drive,
-            world_from_sensor,
-            // The cast saturates: coordinates beyond 327 m stay at the end of the range of i16.
-            points: points
-                .iter()
-                .map(|point| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16))
-                .collect(),
-        }
-    }
-
-    /// x, y, z of every point, metres in the sensor frame.
-    pub(crate) fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        self.points
-            .iter()
-            .map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
-    }
-
     /// The voxels of the same sweep for a sensor in another orientation, `turned_from_sensor`; each point is kept with
     /// a probability.
     pub(crate) fn turned_voxels(
@@ -70,8 +44,11 @@ impl StoredSweep {
     ) -> SweepVoxels {
         let turn: Isometry3<f32> = turned_from_sensor.cast();
         // 32 decisions from one draw of the generator would be faster still; this does not dominate the time.
-        let kept = (self.points()).filter(|_| keep >= 1.0 || rng.random_bool(keep));
-        let turned = kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into());
+        let kept = { self.points.iter() }.filter(|_| keep >= 1.0 || rng.random_bool(keep));
+        let turned = kept.map(|point| {
+            let metres = point.map(|axis| f32::from(axis) * UNIT_M);
+            (turn * nalgebra::Point3::from(metres)).into()
+        });
         SweepVoxels::new(turned, config)
     }
 }
@@ -96,7 +73,7 @@ pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
 }
 
 /// Paths of sweeps with true poses on disk. Each folder is one world: poses in different folders are unrelated.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct SweepList {
     places: Vec<Place>,
     sha256: String,
@@ -150,8 +127,7 @@ impl SweepList {
             places,
             sha256,
             problems,
-            without_pose: Mutex::default(),
-            unreadable: Mutex::default(),
+            ..Self::default()
         })
     }
 
@@ -173,8 +149,7 @@ impl SweepList {
             places: places.cloned().collect(),
             sha256: self.sha256.clone(),
             problems: self.problems.clone(),
-            without_pose: Mutex::default(),
-            unreadable: Mutex::default(),
+            ..Self::default()
         }
     }
 
@@ -229,10 +204,17 @@ impl SweepList {
     /// Reads one sweep, points within `range_m` of the sensor; `None` if its pose is unknown or it cannot be read, which
     /// is counted.
     pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
-        let (world, drive) = (self.places[index].world, self.places[index].drive);
         let sweep = self.posed_sweep(index, range_m)?;
-        let pose = sweep.world_from_sensor;
-        Some(StoredSweep::new(world, drive, pose, &sweep.points))
+        let points = sweep.points.iter().map(|point| {
+            // The cast saturates: coordinates beyond 327 m stay at the end of the range of i16.
+            std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16)
+        });
+        Some(StoredSweep {
+            world: self.places[index].world,
+            drive: self.places[index].drive,
+            world_from_sensor: sweep.world_from_sensor,
+            points: points.collect(),
+        })
     }
 
     /// The same with the values of the file.

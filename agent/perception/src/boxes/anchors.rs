@@ -25,13 +25,9 @@ impl Anchors {
     /// The anchors of a detector.
     pub fn for_detector(config: &DetectorConfig) -> Self {
         let stride = usize::try_from(config.feature_stride()).unwrap_or(1).max(1);
-        Self::new(
-            config.lidar_range_m,
-            config.voxel_size_m,
-            config.pillar_grid(),
-            stride,
-            &config.anchors,
-        )
+        let (range_m, voxel_m) = (config.lidar_range_m, config.voxel_size_m);
+        let grid = config.pillar_grid();
+        Self::new(range_m, voxel_m, grid, stride, &config.anchors)
     }
 
     /// Anchors over an area with `grid` pillars (x, y, z) of which each cell of the head covers `stride` along an axis.
@@ -48,22 +44,16 @@ impl Anchors {
     ) -> Self {
         let [x_m, y_m] = [0, 1].map(|axis: usize| {
             let low = lidar_range_m[axis] + voxel_size_m[axis];
-            linspace(
-                low,
-                lidar_range_m[axis + 3] - voxel_size_m[axis],
-                grid[axis] / stride,
-            )
+            let high = lidar_range_m[axis + 3] - voxel_size_m[axis];
+            linspace(low, high, grid[axis] / stride)
         });
+        let yaws_deg = anchors.yaws_deg.iter();
         Self {
             x_m,
             y_m,
             z_m: anchors.center_z_m,
             size_lwh_m: anchors.size_lwh_m,
-            yaws_rad: anchors
-                .yaws_deg
-                .iter()
-                .map(|yaw| yaw.to_radians())
-                .collect(),
+            yaws_rad: yaws_deg.map(|yaw| yaw.to_radians()).collect(),
         }
     }
 
@@ -85,15 +75,8 @@ impl Anchors {
         let (cell, anchor) = (index / self.yaws_rad.len(), index % self.yaws_rad.len());
         let (row, column) = (cell / self.x_m.len(), cell % self.x_m.len());
         let [l, w, h] = self.size_lwh_m;
-        [
-            self.x_m[column],
-            self.y_m[row],
-            self.z_m,
-            h,
-            w,
-            l,
-            self.yaws_rad[anchor],
-        ]
+        let (x, y, yaw) = (self.x_m[column], self.y_m[row], self.yaws_rad[anchor]);
+        [x, y, self.z_m, h, w, l, yaw]
     }
     /// The anchor with this index as a box.
     ///
@@ -112,15 +95,11 @@ impl Anchors {
 /// `count` numbers from `low` to `high`, both included.
 fn linspace(low: f64, high: f64, count: usize) -> Vec<f64> {
     let step = (high - low) / count.saturating_sub(1).max(1) as f64;
-    (0..count)
-        .map(|index| {
-            if index + 1 == count && index > 0 {
-                high
-            } else {
-                low + step * index as f64
-            }
-        })
-        .collect()
+    let mut numbers: Vec<f64> = (0..count).map(|index| low + step * index as f64).collect();
+    if let [_, .., last] = numbers.as_mut_slice() {
+        *last = high;
+    }
+    numbers
 }
 
 #[cfg(test)]

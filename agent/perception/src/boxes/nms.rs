@@ -22,10 +22,9 @@ pub fn rotated_nms(
     // A box is removed when a kept one suppresses it: the same result as striking out, without a table of pairs.
     let mut kept: Vec<usize> = Vec::new();
     for candidate in order {
-        let suppressed = kept
-            .iter()
-            .any(|&better| boxes[better].overlaps_more_than(&boxes[candidate], threshold));
-        if !suppressed {
+        let polygon = &boxes[candidate];
+        let mut better = kept.iter().map(|&better| &boxes[better]);
+        if !better.any(|better| better.overlaps_more_than(polygon, threshold)) {
             kept.push(candidate);
         }
     }

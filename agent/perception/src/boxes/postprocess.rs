@@ -181,10 +181,8 @@ impl Candidate {
 fn bounds(corners: &[[f64; 3]; 8]) -> [[f64; 2]; 3] {
     std::array::from_fn(|axis| {
         let values = corners.iter().map(|corner| corner[axis]);
-        [
-            values.clone().fold(f64::INFINITY, f64::min),
-            values.fold(f64::NEG_INFINITY, f64::max),
-        ]
+        let low = values.clone().fold(f64::INFINITY, f64::min);
+        [low, values.fold(f64::NEG_INFINITY, f64::max)]
     })
 }
 

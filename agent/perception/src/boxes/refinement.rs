@@ -131,11 +131,9 @@ pub fn corrected(mut detections: Vec<Detection>, corrections: &[f32]) -> Vec<Det
         let limited: [f64; 7] = std::array::from_fn(|index| {
             f64::from(numbers[index]).clamp(-MAX_CORRECTION, MAX_CORRECTION)
         });
-        let Box3d {
-            center_m,
-            size_m,
-            heading_rad,
-        } = &mut detection.box3d;
+        let found = &mut detection.box3d;
+        let (center_m, size_m) = (&mut found.center_m, &mut found.size_m);
+        let heading_rad = &mut found.heading_rad;
         let (sin, cos) = heading_rad.sin_cos();
         // In sizes of the uncorrected box, so positions come before sizes.
         let [along_m, across_m, up_m] = [0, 1, 2].map(|axis| limited[axis] * size_m[axis]);
@@ -156,24 +154,17 @@ pub fn correction(from: &Box3d, to: &Box3d) -> [f64; NUMBERS] {
     let [dx, dy, dz] = [0, 1, 2].map(|axis| to.center_m[axis] - from.center_m[axis]);
     let (sin, cos) = from.heading_rad.sin_cos();
     let [length_m, width_m, height_m] = from.size_m;
-    let logs = [0, 1, 2].map(|axis| (to.size_m[axis] / from.size_m[axis]).ln());
-    [
-        (cos * dx + sin * dy) / length_m,
-        (cos * dy - sin * dx) / width_m,
-        dz / height_m,
-        logs[0],
-        logs[1],
-        logs[2],
-        roi::within_quarter_turn(to.heading_rad - from.heading_rad),
-        0.0,
-    ]
+    let along = (cos * dx + sin * dy) / length_m;
+    let across = (cos * dy - sin * dx) / width_m;
+    let [l, w, h] = [0, 1, 2].map(|axis| (to.size_m[axis] / from.size_m[axis]).ln());
+    let turn = roi::within_quarter_turn(to.heading_rad - from.heading_rad);
+    [along, across, dz / height_m, l, w, h, turn, 0.0]
 }
 
 /// True if no number of a correction is beyond the largest one.
 pub fn is_within_limits(correction: &[f64; NUMBERS]) -> bool {
-    correction[..7]
-        .iter()
-        .all(|number| number.abs() <= MAX_CORRECTION)
+    let mut limited = correction[..7].iter();
+    limited.all(|number| number.abs() <= MAX_CORRECTION)
 }
 
 #[cfg(test)]

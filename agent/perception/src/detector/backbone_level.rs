@@ -18,12 +18,11 @@ pub struct BackboneLevel {
 impl BackboneLevel {
     /// Levels in single precision.
     pub(super) fn in_float(maps: Vec<Tensor>) -> Vec<Self> {
-        maps.into_iter()
-            .map(|values| Self {
-                values,
-                quantisation: None,
-            })
-            .collect()
+        let levels = maps.into_iter().map(|values| Self {
+            values,
+            quantisation: None,
+        });
+        levels.collect()
     }
 
     /// A level of quantised values.
@@ -52,10 +51,8 @@ impl BackboneLevel {
             return Ok(false);
         }
         let values = self.by_cell()?.f_slice(0, None, None, JUDGED_EVERY)?;
-        let largest = values
-            .f_eq(i64::from(u8::MAX))?
-            .f_count_nonzero(None::<i64>)?
-            .f_int64_value(&[])?;
+        let largest = values.f_eq(i64::from(u8::MAX))?;
+        let largest = largest.f_count_nonzero(None::<i64>)?.f_int64_value(&[])?;
         let above_zero = values.f_count_nonzero(None::<i64>)?.f_int64_value(&[])?;
         Ok(2 * largest > above_zero)
     }
@@ -79,19 +76,15 @@ impl BackboneLevel {
     /// `[H * W, C]`: a view if channels are innermost in memory.
     fn by_cell(&self) -> Result<Tensor, TchError> {
         let channels = self.values.size()[1];
-        self.values
-            .f_permute([0, 2, 3, 1])?
-            .f_reshape([-1, channels])
+        let cells = self.values.f_permute([0, 2, 3, 1])?;
+        cells.f_reshape([-1, channels])
     }
 
     fn in_single_precision(&self, values: &Tensor) -> Result<Tensor, TchError> {
-        let values = values.f_to_kind(Kind::Float)?;
-        let Some(Quantisation { scale, zero_point }) = self.quantisation else {
-            return Ok(values);
-        };
-        values
-            .f_sub_scalar(i64::from(zero_point))?
-            .f_mul_scalar(scale.step())
+        match self.quantisation {
+            Some(quantisation) => quantisation.dequantise(values),
+            None => values.f_to_kind(Kind::Float),
+        }
     }
 }
 

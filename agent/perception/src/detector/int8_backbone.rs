@@ -35,7 +35,8 @@ impl Int8Backbone {
         shrink: Option<&Shrink>,
         scales: &ActivationScales,
     ) -> Result<Option<Self>, QuantiseError> {
-        let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else {
+        let shrink = shrink.and_then(|shrink| shrink.layers.split_last());
+        let (Some((levels, up)), Some((last, hidden))) = (backbone.plain_layers(), shrink) else {
             return Ok(None);
         };
         let mut input = scales.get(CANVAS)?;
@@ -54,17 +55,12 @@ impl Int8Backbone {
         }
         let mut input = upsampled;
         let mut shrunk = Vec::new();
-        let count = shrink.layers.len();
-        for (position, layer) in shrink.layers.iter().enumerate() {
-            let is_last = position + 1 == count;
-            let output = if is_last {
-                None
-            } else {
-                Some(scales.get(&shrink_activation(position))?)
-            };
-            shrunk.push(layer.int8(input, output.map(|output| output.scale))?);
-            input = output.unwrap_or(input);
+        for (position, layer) in hidden.iter().enumerate() {
+            let output = scales.get(&shrink_activation(position))?;
+            shrunk.push(layer.int8(input, Some(output.scale))?);
+            input = output;
         }
+        shrunk.push(last.int8(input, None)?);
         Ok(Some(Self {
             blocks,
             quantisations,
@@ -86,11 +82,8 @@ impl Int8Backbone {
 
     /// Feature map `[1, C, H', W']`, `f32` and contiguous, of the levels' values.
     pub(super) fn features(&self, levels: &[Tensor]) -> Result<Tensor, TchError> {
-        let upsampled = self
-            .deblocks
-            .iter()
-            .zip(levels)
-            .map(|(deblock, level)| deblock.forward(level));
+        let upsampled = self.deblocks.iter().zip(levels);
+        let upsampled = upsampled.map(|(deblock, level)| deblock.forward(level));
         let upsampled: Vec<Tensor> = upsampled.collect::<Result<_, _>>()?;
         contiguous_map(&through(&self.shrink, Tensor::f_cat(&upsampled, 1)?)?)
     }
@@ -116,7 +109,9 @@ pub(super) fn observe_backbone(
     canvas: &Tensor,
     search: &mut ScaleSearch,
 ) -> Result<(), TchError> {
-    let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else {
+    // The output of the last layer is `f32` and has no scale.
+    let shrink = shrink.and_then(|shrink| shrink.layers.split_last());
+    let (Some((levels, up)), Some((_, hidden))) = (backbone.plain_layers(), shrink) else {
         return Ok(());
     };
     search.observe(CANVAS, canvas)?;
@@ -130,11 +125,6 @@ pub(super) fn observe_backbone(
         upsampled.push(deblock.forward(&x, false));
     }
     let wide = Tensor::f_cat(&upsampled, 1)?;
-    // The output of the last layer is `f32` and has no scale.
-    let hidden = shrink
-        .layers
-        .split_last()
-        .map_or(&[][..], |(_, hidden)| hidden);
     let mut x = wide.shallow_clone();
     for (position, layer) in hidden.iter().enumerate() {
         x = layer.forward(&x, false);

@@ -203,8 +203,7 @@ impl Detector {
     /// # Errors
     /// Those of the tensor library.
     pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded> {
-        let crop = self.crop;
-        self.encode_within(&crop, cloud)
+        self.encode_within(self.crop, cloud)
     }
 
     /// Encodes the points of several vehicles in one frame, for early fusion.
@@ -215,8 +214,7 @@ impl Detector {
     /// # Errors
     /// As [`Self::encode_sweep`].
     pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded> {
-        let crop = self.crop.range_only();
-        let encoded = self.encode_within(&crop, cloud)?;
+        let encoded = self.encode_within(self.crop.range_only(), cloud)?;
         self.checked_sweep(encoded, cloud)
     }
 
@@ -257,14 +255,13 @@ impl Detector {
     /// # Errors
     /// Those of the tensor library.
     pub fn observe(&mut self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<()> {
-        let crop = self.crop;
-        let pillars = self.pillars(&crop, cloud);
+        let pillars = self.pillars(self.crop, cloud);
         let canvas = self.encoder.scatter(&pillars)?;
         Ok(tch::no_grad(|| self.encoder.observe(&canvas, search))?)
     }
 
     /// Pillars of a cropped sweep in the network's frame.
-    fn pillars(&mut self, crop: &Crop, cloud: &PointCloud) -> Pillars {
+    fn pillars(&mut self, crop: Crop, cloud: &PointCloud) -> Pillars {
         self.cropped.clear();
         crop.keep(&cloud.xyzi, &mut self.cropped);
         // After the crop, which is in the vehicle's frame.
@@ -276,7 +273,7 @@ impl Detector {
         self.voxeliser.voxelise(&self.cropped)
     }
 
-    fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded> {
+    fn encode_within(&mut self, crop: Crop, cloud: &PointCloud) -> Result<Encoded> {
         let mut times = StageTimes::start();
         let pillars = self.pillars(crop, cloud);
         times.lap("voxelise");
@@ -352,14 +349,12 @@ impl Detector {
         }
         let code = tensor(values, &[1, expected, height, width], self.device)?;
         let decompressed = self.decompressed(&code)?;
-        match (sent, &self.compressor) {
-            // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
-            (Some(sent), Some(_)) => {
-                let sent = tensor(sent, &[1, 1, height, width], self.device)?;
-                Ok(decompressed.f_mul(&sent.f_to_kind(Kind::Float)?)?)
-            }
-            _ => Ok(decompressed),
-        }
+        let (Some(sent), Some(_)) = (sent, &self.compressor) else {
+            return Ok(decompressed);
+        };
+        // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
+        let sent = tensor(sent, &[1, 1, height, width], self.device)?;
+        Ok(decompressed.f_mul(&sent.f_to_kind(Kind::Float)?)?)
     }
 
     /// Scores, offsets and confidence of a feature map `[1, C, H, W]` or `[C, H, W]`, own or fused.
@@ -403,12 +398,10 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if the feature map is not of this detector.
     pub fn refined(&self, map: &Tensor, detections: Vec<Detection>) -> Result<Vec<Detection>> {
-        match &self.refinement {
-            Some(refinement) => {
-                Ok(refinement.refined(&checked(map, self.map_shape())?, detections)?)
-            }
-            None => Ok(detections),
-        }
+        let Some(refinement) = &self.refinement else {
+            return Ok(detections);
+        };
+        Ok(refinement.refined(&checked(map, self.map_shape())?, detections)?)
     }
 
     /// Message of a feature map in its transmitted form, see [`Self::compressed`].
@@ -416,14 +409,7 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if the tensor is not of this detector.
     pub fn to_message(&self, sent: &Tensor) -> Result<BevFeatures> {
-        let sent = one_map(sent, self.sent_shape())?;
-        let channels = self.config.sent_channels() as u32;
-        Ok(BevFeatures {
-            grid: self.grid(),
-            channels,
-            code_of: self.code_of(),
-            values: flat(&sent)?,
-        })
+        self.bev_features(sent, self.sent_shape(), self.code_of())
     }
 
     /// An encoded feature map `[1, C, H, W]` in its stored form, before the compressor.
@@ -431,13 +417,20 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if the tensor is not a feature map of this detector.
     pub fn to_kept(&self, features: &Tensor) -> Result<BevFeatures> {
-        let map = one_map(features, self.map_shape())?;
-        let channels = self.config.feature_channels() as u32;
+        self.bev_features(features, self.map_shape(), None)
+    }
+
+    fn bev_features(
+        &self,
+        map: &Tensor,
+        shape: [i64; 3],
+        code_of: Option<u32>,
+    ) -> Result<BevFeatures> {
         Ok(BevFeatures {
             grid: self.grid(),
-            channels,
-            code_of: None,
-            values: flat(&map)?,
+            channels: shape[0] as u32,
+            code_of,
+            values: flat(&one_map(map, shape)?)?,
         })
     }
 }

@@ -66,17 +66,13 @@ const MAX_ABS_VALUE: f64 = 1e9;
 pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorError> {
     let limit = MAX_ABS_VALUE;
     // Both are NaN for a tensor with NaN. In either memory order they are read without a copy.
-    let most = tensor
-        .f_amax([0_i64; 0].as_slice(), false)?
-        .f_double_value(&[])?;
-    let least = tensor
-        .f_amin([0_i64; 0].as_slice(), false)?
-        .f_double_value(&[])?;
+    let axes: &[i64] = &[];
+    let most = tensor.f_amax(axes, false)?.f_double_value(&[])?;
+    let least = tensor.f_amin(axes, false)?.f_double_value(&[])?;
     let value = most.max(-least);
-    if value <= limit {
-        Ok(())
-    } else {
-        Err(DetectorError::Values { what, value, limit })
+    match value <= limit {
+        true => Ok(()),
+        false => Err(DetectorError::Values { what, value, limit }),
     }
 }
 

@@ -14,7 +14,7 @@ pub const SCALES_KEY: &str = "activation_scales";
 /// Quantisation of each activation, by name: that of the layer whose output it is, below the prefixes of the weights.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
-pub struct ActivationScales(BTreeMap<String, Quantisation>);
+pub struct ActivationScales(pub(super) BTreeMap<String, Quantisation>);
 
 /// An activation whose scale is needed and missing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -27,10 +27,6 @@ pub struct MissingScale {
 }
 
 impl ActivationScales {
-    pub(super) fn new(scales: BTreeMap<String, Quantisation>) -> Self {
-        Self(scales)
-    }
-
     /// Quantisation of an activation.
     ///
     /// # Errors
@@ -45,9 +41,8 @@ impl ActivationScales {
     /// SHA-256 over the scales of the activations whose name is `wanted`.
     pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
         let mut hash = Sha256::new();
-        for (name, Quantisation { scale, zero_point }) in
-            self.0.iter().filter(|(name, _)| wanted(name))
-        {
+        let wanted = self.0.iter().filter(|(name, _)| wanted(name));
+        for (name, Quantisation { scale, zero_point }) in wanted {
             hash.update(format!("{name} {} {zero_point}\n", scale.exponent));
         }
         hex(&hash.finalize())

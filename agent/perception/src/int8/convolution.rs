@@ -51,10 +51,8 @@ impl Int8Convolution {
             ];
             operators.call("pack_convolution", &arguments)
         });
-        Ok(Self {
-            layer: layer?,
-            geometry,
-        })
+        let layer = layer?;
+        Ok(Self { layer, geometry })
     }
 
     /// `[1, C_in, H, W]`, `u8`, to `[1, C_out, H', W']`; channels innermost in memory.

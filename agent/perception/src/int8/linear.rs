@@ -20,10 +20,8 @@ impl Int8Linear {
         let inputs = weight.size2()?.1;
         let layer = Layer::new(weight, bias, format, |operators, quantised| {
             let shape = IValue::IntList(vec![USUAL_ROWS, inputs]);
-            operators.call(
-                "pack_linear",
-                &[IValue::Tensor(quantised.steps.shallow_clone()), shape],
-            )
+            let arguments = [IValue::Tensor(quantised.steps.shallow_clone()), shape];
+            operators.call("pack_linear", &arguments)
         });
         Ok(Self(layer?))
     }

@@ -26,9 +26,7 @@ impl Scale {
     /// The smallest scale with which `levels` steps reach `magnitude`, that is positive and finite.
     pub(super) fn reaching(magnitude: f64, levels: f64) -> Self {
         let exponent = (magnitude / levels).log2().ceil();
-        Self {
-            exponent: exponent.clamp(f64::from(i8::MIN), f64::from(i8::MAX)) as i8,
-        }
+        Self::of_exponent(exponent.clamp(f64::from(i8::MIN), f64::from(i8::MAX)) as i8)
     }
 
     /// Value of one step.
@@ -38,9 +36,7 @@ impl Scale {
 
     /// The next smaller scale.
     pub(super) fn finer(self) -> Self {
-        Self {
-            exponent: self.exponent.saturating_sub(1),
-        }
+        Self::of_exponent(self.exponent.saturating_sub(1))
     }
 }
 

@@ -38,10 +38,7 @@ impl ScaleSearch {
         let observed = self.activations.entry(name.to_owned()).or_default();
         observed.is_negative |= values.f_min()?.f_double_value(&[])? < 0.0;
         let largest = values.f_abs()?.f_max()?.f_double_value(&[])?;
-        let power = values
-            .f_square()?
-            .f_sum(Kind::Double)?
-            .f_double_value(&[])?;
+        let power = power(values)?;
         let count = values.numel() as f64;
         for exponent in EXPONENTS {
             let scale = Scale::of_exponent(exponent);
@@ -78,16 +75,19 @@ impl ScaleSearch {
             let scale = Scale::of_exponent(best.map_or(0, |(&exponent, _)| exponent));
             (name.clone(), Quantisation { scale, zero_point })
         });
-        ActivationScales::new(chosen.collect())
+        ActivationScales(chosen.collect())
     }
 }
 
 fn squared_error(values: &Tensor, quantisation: Quantisation) -> Result<f64, TchError> {
     let back = quantisation.dequantise(&quantisation.quantise(values)?)?;
-    back.f_sub(values)?
-        .f_square()?
-        .f_sum(Kind::Double)?
-        .f_double_value(&[])
+    power(&back.f_sub(values)?)
+}
+
+/// Sum of the squares of values.
+fn power(values: &Tensor) -> Result<f64, TchError> {
+    let squares = values.f_square()?;
+    squares.f_sum(Kind::Double)?.f_double_value(&[])
 }
 
 #[cfg(test)]

@@ -53,10 +53,8 @@ impl QuantisedWeight {
 
 /// Steps of a row, and its squared error.
 fn quantised(row: &Tensor, scale: Scale) -> Result<(Tensor, f64), TchError> {
-    let steps = row
-        .f_mul_scalar(scale.step().recip())?
-        .f_round()?
-        .f_clamp(-MAX_WEIGHT, MAX_WEIGHT)?;
+    let steps = row.f_mul_scalar(scale.step().recip())?.f_round()?;
+    let steps = steps.f_clamp(-MAX_WEIGHT, MAX_WEIGHT)?;
     let error = steps.f_mul_scalar(scale.step())?.f_sub(row)?;
     let error = error.f_square()?.f_sum(Kind::Double)?;
     Ok((steps, error.f_double_value(&[])?))

@@ -31,31 +31,20 @@ impl BevBackbone {
         };
         for (level, &filters) in config.num_filters.iter().enumerate() {
             let (layers, stride) = (config.layer_nums[level], config.layer_strides[level]);
+            let io = [input, filters];
             backbone.blocks.push(match config.blocks {
-                BlockKind::Plain => Block::Plain(block(
-                    &(path / "blocks" / level),
-                    [input, filters],
-                    layers,
-                    stride,
-                )),
+                BlockKind::Plain => {
+                    Block::Plain(block(&(path / "blocks" / level), io, layers, stride))
+                }
                 BlockKind::Residual => {
                     let path = path / "resnet" / format!("layer{level}");
-                    Block::Residual(ResidualBlock::chain(
-                        &path,
-                        [input, filters],
-                        layers,
-                        stride,
-                    ))
+                    Block::Residual(ResidualBlock::chain(&path, io, layers, stride))
                 }
             });
             let deblock = path / "deblocks" / level;
             let io = [filters, config.num_upsample_filters[level]];
-            let layer = ConvLayer::upsampling(
-                &(&deblock / 0),
-                &(&deblock / 1),
-                io,
-                config.upsample_strides[level],
-            );
+            let (conv, norm, up) = (&deblock / 0, &deblock / 1, config.upsample_strides[level]);
+            let layer = ConvLayer::upsampling(&conv, &norm, io, up);
             backbone.deblocks.push(layer);
             input = filters;
         }
@@ -75,12 +64,11 @@ impl BevBackbone {
     /// Outputs of all levels for a canvas `[N, C, H, W]`, each the input of the next.
     pub fn levels_of(&self, canvas: &Tensor, train: bool) -> Vec<Tensor> {
         let mut x = canvas.shallow_clone();
-        (0..self.levels())
-            .map(|level| {
-                x = self.level(level, &x, train);
-                x.shallow_clone()
-            })
-            .collect()
+        let levels = (0..self.levels()).map(|level| {
+            x = self.level(level, &x, train);
+            x.shallow_clone()
+        });
+        levels.collect()
     }
 
     /// Output of one level for the output of the level above it, or for the canvas.
@@ -96,29 +84,22 @@ impl BevBackbone {
 
     /// Up-samples the outputs of all levels, own or fused, to one BEV grid: `[N, sum of C_up, H', W']`.
     pub fn upsampled(&self, levels: &[Tensor], train: bool) -> Tensor {
-        let mut levels: Vec<Tensor> = self
-            .deblocks
-            .iter()
-            .zip(levels)
-            .map(|(deblock, level)| deblock.forward(level, train))
-            .collect();
-        if levels.len() == 1 {
-            levels.remove(0)
-        } else {
-            Tensor::cat(&levels, 1)
+        let levels = self.deblocks.iter().zip(levels);
+        let levels = levels.map(|(deblock, level)| deblock.forward(level, train));
+        let mut levels: Vec<Tensor> = levels.collect();
+        match levels.len() {
+            1 => levels.remove(0),
+            _ => Tensor::cat(&levels, 1),
         }
     }
 
     /// Layers of every level and up-sampling layers; `None` with residual blocks.
     pub(crate) fn plain_layers(&self) -> Option<(Vec<&[ConvLayer]>, &[ConvLayer])> {
-        let mut levels = Vec::with_capacity(self.blocks.len());
-        for block in &self.blocks {
-            let Block::Plain(layers) = block else {
-                return None;
-            };
-            levels.push(layers.as_slice());
-        }
-        Some((levels, &self.deblocks))
+        let levels = self.blocks.iter().map(|block| match block {
+            Block::Plain(layers) => Some(layers.as_slice()),
+            Block::Residual(_) => None,
+        });
+        Some((levels.collect::<Option<Vec<_>>>()?, &self.deblocks))
     }
 
     /// The same backbone for inference, norms folded into the convolutions.
@@ -146,13 +127,13 @@ fn block(
     layers: usize,
     stride: i64,
 ) -> Vec<ConvLayer> {
-    (0..=layers)
-        .map(|layer| {
-            let (position, io, stride) = match layer {
-                0 => (1, [input, filters], stride),
-                _ => (3 * layer + 1, [filters, filters], 1),
-            };
-            ConvLayer::normed(&(path / position), &(path / (position + 1)), io, 3, stride)
-        })
-        .collect()
+    let layers = (0..=layers).map(|layer| {
+        let (io, stride) = match layer {
+            0 => ([input, filters], stride),
+            _ => ([filters, filters], 1),
+        };
+        let (conv, norm) = (path / (3 * layer + 1), path / (3 * layer + 2));
+        ConvLayer::normed(&conv, &norm, io, 3, stride)
+    });
+    layers.collect()
 }

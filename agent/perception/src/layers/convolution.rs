@@ -115,19 +115,20 @@ impl ConvLayer {
 
     /// `kernel x kernel` convolution with bias and nothing after it.
     pub fn biased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
-        Self::down(conv, io, kernel, stride, kernel / 2, true)
+        Self::down(conv, io, kernel, stride, true)
     }
 
     /// `kernel x kernel` convolution without bias and with nothing after it.
     pub(crate) fn unbiased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
-        Self::down(conv, io, kernel, stride, kernel / 2, false)
+        Self::down(conv, io, kernel, stride, false)
     }
 
     /// Convolution whose kernel is its stride, so that every input counts once; batch norm, ReLU.
     pub fn patches(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], patch: i64) -> Self {
-        Self::down(conv, io, patch, patch, 0, false)
-            .with_norm(norm, io[1])
-            .with_relu()
+        Self {
+            padding: 0,
+            ..Self::normed(conv, norm, io, patch, patch)
+        }
     }
 
     /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
@@ -145,26 +146,17 @@ impl ConvLayer {
         layer.with_norm(norm, io[1]).with_relu()
     }
 
-    fn down(
-        path: &nn::Path<'_>,
-        [input, output]: [i64; 2],
-        kernel: i64,
-        stride: i64,
-        padding: i64,
-        bias: bool,
-    ) -> Self {
+    fn down(path: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64, bias: bool) -> Self {
         let config = nn::ConvConfig {
-            stride,
-            padding,
             bias,
             ..Default::default()
         };
-        let conv = nn::conv2d(path, input, output, kernel, config);
+        let conv = nn::conv2d(path, io[0], io[1], kernel, config);
         Self {
             weight: conv.ws,
             bias: conv.bs,
             stride,
-            padding,
+            padding: kernel / 2,
             direction: Direction::Down,
             norm: None,
             relu: false,
@@ -173,20 +165,13 @@ impl ConvLayer {
 
     /// The same with a batch norm after the convolution.
     pub(crate) fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
-        self.with_norm_of(norm, channels, (NORM_EPS, NORM_MOMENTUM))
+        self.normed_by(Norm::new(norm, channels))
     }
 
-    /// The same with a batch norm of another epsilon and momentum.
-    pub(crate) fn with_norm_of(
-        self,
-        norm: &nn::Path<'_>,
-        channels: i64,
-        (eps, momentum): (f64, f64),
-    ) -> Self {
-        Self {
-            norm: Some(Norm::with_eps(norm, channels, eps, momentum)),
-            ..self
-        }
+    /// The same with this batch norm after the convolution.
+    pub(crate) fn normed_by(self, norm: Norm) -> Self {
+        let norm = Some(norm);
+        Self { norm, ..self }
     }
 
     /// The same with a ReLU at the end.

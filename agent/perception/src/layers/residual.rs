@@ -2,10 +2,7 @@
 
 use tch::{Tensor, nn};
 
-use crate::layers::convolution::ConvLayer;
-
-/// Epsilon and momentum of the batch norms, PyTorch's own rather than those of PointPillars.
-const NORM: (f64, f64) = (1e-5, 0.1);
+use crate::layers::convolution::{ConvLayer, Norm};
 
 /// Two 3x3 convolutions with a skip connection, strided and projected if its shape has to change.
 #[derive(Debug)]
@@ -24,12 +21,11 @@ impl ResidualBlock {
         blocks: usize,
         stride: i64,
     ) -> Vec<Self> {
-        (0..blocks)
-            .map(|position| match position {
-                0 => Self::new(&(path / position), [input, filters], stride),
-                _ => Self::new(&(path / position), [filters, filters], 1),
-            })
-            .collect()
+        let blocks = (0..blocks).map(|position| match position {
+            0 => Self::new(&(path / position), [input, filters], stride),
+            _ => Self::new(&(path / position), [filters, filters], 1),
+        });
+        blocks.collect()
     }
 
     fn new(path: &nn::Path<'_>, [input, filters]: [i64; 2], stride: i64) -> Self {
@@ -68,7 +64,8 @@ impl ResidualBlock {
 }
 
 fn layer([conv, norm]: [nn::Path<'_>; 2], io: [i64; 2], kernel: i64, stride: i64) -> ConvLayer {
-    ConvLayer::unbiased(&conv, io, kernel, stride).with_norm_of(&norm, io[1], NORM)
+    // Epsilon and momentum are PyTorch's own rather than those of PointPillars.
+    ConvLayer::unbiased(&conv, io, kernel, stride).normed_by(Norm::with_defaults(&norm, io[1]))
 }
 
 #[cfg(test)]

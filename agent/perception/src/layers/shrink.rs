@@ -18,21 +18,13 @@ impl Shrink {
         let layers = match *config {
             ShrinkConfig::DoubleConv { channels, stride } => {
                 let double = layer / "double_conv";
-                let first =
-                    ConvLayer::biased(&(&double / 0), [input, channels], 3, stride).with_relu();
-                vec![
-                    first,
-                    ConvLayer::biased(&(&double / 2), [channels, channels], 3, 1).with_relu(),
-                ]
+                let first = ConvLayer::biased(&(&double / 0), [input, channels], 3, stride);
+                let second = ConvLayer::biased(&(&double / 2), [channels; 2], 3, 1);
+                vec![first.with_relu(), second.with_relu()]
             }
             ShrinkConfig::Pointwise { channels } => {
-                vec![ConvLayer::normed(
-                    &(&layer / 0),
-                    &(&layer / 1),
-                    [input, channels],
-                    1,
-                    1,
-                )]
+                let (conv, norm) = (&layer / 0, &layer / 1);
+                vec![ConvLayer::normed(&conv, &norm, [input, channels], 1, 1)]
             }
         };
         Self { layers }

@@ -121,10 +121,8 @@ impl PillarBatch {
     pub fn scatter(&self, rows: &Tensor, pillar_grid: &PillarGrid) -> Tensor {
         let (height, width) = (pillar_grid.height as i64, pillar_grid.width as i64);
         let channels = rows.size()[1];
-        let canvas = Tensor::zeros(
-            [self.sweeps * height * width, channels],
-            (Kind::Float, rows.device()),
-        );
+        let size = [self.sweeps * height * width, channels];
+        let canvas = Tensor::zeros(size, (Kind::Float, rows.device()));
         let canvas = canvas.index_copy(0, &self.cells, rows);
         canvas
             .view([self.sweeps, height, width, channels])

@@ -33,11 +33,10 @@ impl PillarEncoder {
     pub fn forward(&self, batch: &PillarBatch, train: bool) -> Tensor {
         let points = batch.points();
         // It passes through the same layer and becomes the floor of pillars with a free slot.
-        let zero_row = batch.features.new_zeros(
-            [1, POINT_FEATURES as i64],
-            (batch.features.kind(), batch.device()),
-        );
-        let rows = Tensor::cat(&[&batch.features, &zero_row], 0).matmul(&self.linear.tr());
+        let features = &batch.features;
+        let like = (features.kind(), features.device());
+        let zero_row = features.new_zeros([1, POINT_FEATURES as i64], like);
+        let rows = Tensor::cat(&[features, &zero_row], 0).matmul(&self.linear.tr());
         let rows = self.norm.forward(&rows, train).relu();
         let best = segment_max(&rows.narrow(0, 0, points), &batch.counts);
         let floor = rows.narrow(0, points, 1);
@@ -58,17 +57,9 @@ impl PillarEncoder {
 
 /// Maximum over runs of rows: `[P, C]` and `[M]` run lengths, each at least 1, to `[M, C]`.
 fn segment_max(rows: &Tensor, lengths: &Tensor) -> Tensor {
-    let absent = None::<&Tensor>;
-    Tensor::segment_reduce(
-        &rows.contiguous(),
-        "max",
-        Some(lengths),
-        absent,
-        absent,
-        0,
-        false,
-        f64::NEG_INFINITY,
-    )
+    let (rows, lengths, absent) = (rows.contiguous(), Some(lengths), None::<&Tensor>);
+    let initial = f64::NEG_INFINITY;
+    Tensor::segment_reduce(&rows, "max", lengths, absent, absent, 0, false, initial)
 }
 
 #[cfg(test)]

@@ -80,9 +80,8 @@ impl PillarProjection {
     pub fn scatter(&self, pillars: &Pillars, pillar_grid: &PillarGrid, canvas: &mut [f32]) {
         for (points, coord) in pillars.iter() {
             let cell = pillar_grid.cell(coord) * self.channels;
-            let (center, features) = (pillar_grid.center_m(coord), cell..cell + self.channels);
-            let has_free_slot = points.len() < pillar_grid.max_points;
-            self.pillar(points, center, has_free_slot, &mut canvas[features]);
+            let features = &mut canvas[cell..cell + self.channels];
+            self.pillar(points, coord, pillar_grid, features);
         }
     }
 
@@ -100,9 +99,7 @@ impl PillarProjection {
         let mut features = vec![0.0; self.channels];
         for (points, coord) in pillars.iter() {
             let cell = pillar_grid.cell(coord) * self.channels;
-            let center = pillar_grid.center_m(coord);
-            let has_free_slot = points.len() < pillar_grid.max_points;
-            self.pillar(points, center, has_free_slot, &mut features);
+            self.pillar(points, coord, pillar_grid, &mut features);
             quantisation.quantise_values(&features, &mut canvas[cell..cell + self.channels]);
         }
     }
@@ -110,49 +107,37 @@ impl PillarProjection {
     fn pillar(
         &self,
         points: &[[f32; 4]],
-        center: [f32; 3],
-        has_free_slot: bool,
+        coord: [i32; 3],
+        pillar_grid: &PillarGrid,
         output: &mut [f32],
     ) {
-        let mean = mean_xyz(points);
+        let (center, mean) = (pillar_grid.center_m(coord), mean_xyz(points));
+        let is_partial = points.len() < pillar_grid.max_points;
         for (block, output) in output.chunks_mut(LANES).enumerate() {
             let mut best = [f32::NEG_INFINITY; LANES];
             let weight = &self.point[block];
             for point in points {
-                let local = [
-                    point[0] - center[0],
-                    point[1] - center[1],
-                    point[2] - center[2],
-                    point[3],
-                ];
+                let [x, y, z] = [0, 1, 2].map(|axis: usize| point[axis] - center[axis]);
                 for lane in 0..LANES {
-                    let value = local[0] * weight[0][lane]
-                        + local[1] * weight[1][lane]
-                        + local[2] * weight[2][lane]
-                        + local[3] * weight[3][lane];
-                    best[lane] = if value > best[lane] {
-                        value
-                    } else {
-                        best[lane]
-                    };
+                    let value = x * weight[0][lane]
+                        + y * weight[1][lane]
+                        + z * weight[2][lane]
+                        + point[3] * weight[3][lane];
+                    let before = best[lane];
+                    best[lane] = if value > before { value } else { before };
                 }
             }
             for (lane, output) in output.iter_mut().enumerate() {
-                let offset: f32 = (0..3)
-                    .map(|axis| {
-                        self.center[block][axis][lane] * center[axis]
-                            + self.mean[block][axis][lane] * (mean[axis] - center[axis])
-                    })
-                    .sum();
+                let offsets = (0..3).map(|axis| {
+                    self.center[block][axis][lane] * center[axis]
+                        + self.mean[block][axis][lane] * (mean[axis] - center[axis])
+                });
+                let offset: f32 = offsets.sum();
                 let bias = self.bias[block][lane];
                 let value = best[lane] + offset + bias;
                 // An empty slot of the reference is a zero row: it contributes the bias alone.
-                *output = if has_free_slot {
-                    value.max(bias)
-                } else {
-                    value
-                }
-                .max(0.0);
+                let value = if is_partial { value.max(bias) } else { value };
+                *output = value.max(0.0);
             }
         }
     }

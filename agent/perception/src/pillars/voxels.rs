@@ -33,14 +33,12 @@ impl Pillars {
     /// The points of each pillar, in the order of the pillars.
     pub fn iter(&self) -> impl Iterator<Item = (&[[f32; 4]], [i32; 3])> {
         let mut rest = self.points.as_slice();
-        self.counts
-            .iter()
-            .zip(&self.coords)
-            .map(move |(&count, &coord)| {
-                let (points, tail) = rest.split_at(count as usize);
-                rest = tail;
-                (points, coord)
-            })
+        let counted = self.counts.iter().zip(&self.coords);
+        counted.map(move |(&count, &coord)| {
+            let (points, tail) = rest.split_at(count as usize);
+            rest = tail;
+            (points, coord)
+        })
     }
 
     /// The reference's layout: `[M, slots, 4]` row-major, unused slots zero.
@@ -96,13 +94,9 @@ impl Voxeliser {
 
     /// The voxeliser of a detector.
     pub fn for_detector(config: &DetectorConfig) -> Self {
-        Self::new(
-            config.lidar_range_m,
-            config.voxel_size_m,
-            config.pillar_grid(),
-            config.max_points_per_pillar,
-            config.max_pillars,
-        )
+        let (range_m, voxel_m) = (config.lidar_range_m, config.voxel_size_m);
+        let (points, pillars) = (config.max_points_per_pillar, config.max_pillars);
+        Self::new(range_m, voxel_m, config.pillar_grid(), points, pillars)
     }
 
     /// Sorts the points of one sweep into pillars; points outside the area and points that are not finite are dropped.

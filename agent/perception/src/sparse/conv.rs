@@ -20,13 +20,9 @@ impl SparseConv {
     /// He-initialised for the ReLU that follows; about ten of a kernel's neighbours exist on a surface.
     pub fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
         let stdev = (2.0 / (10.0 * inputs as f64)).sqrt();
-        let weight = path.var(
-            "weight",
-            &[KERNEL_VOLUME as i64 * inputs, outputs],
-            Init::Randn { mean: 0.0, stdev },
-        );
+        let shape = [KERNEL_VOLUME as i64 * inputs, outputs];
         Self {
-            weight,
+            weight: path.var("weight", &shape, Init::Randn { mean: 0.0, stdev }),
             bias: path.var("bias", &[outputs], Init::Const(0.0)),
         }
     }
@@ -36,12 +32,10 @@ impl SparseConv {
     /// # Errors
     /// Those of the tensor library, for example when the rows are not those of the rulebook.
     pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
-        let columns = index
-            .gather(x)?
-            .f_view([-1, KERNEL_VOLUME as i64 * x.size2()?.1])?;
-        self.bias
-            .to_kind(x.kind())
-            .f_addmm(&columns, &self.weight.to_kind(x.kind()))
+        let width = KERNEL_VOLUME as i64 * x.size2()?.1;
+        let columns = index.gather(x)?.f_view([-1, width])?;
+        let [bias, weight] = [&self.bias, &self.weight].map(|tensor| tensor.to_kind(x.kind()));
+        bias.f_addmm(&columns, &weight)
     }
 
     /// The same in integers, see [`Int8SparseConv`].

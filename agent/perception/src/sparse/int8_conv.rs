@@ -10,9 +10,7 @@ const WORD_BYTES: i64 = 4;
 
 /// A 3x3x3 convolution over sites of `u8` features that are never negative.
 #[derive(Debug)]
-pub struct Int8SparseConv {
-    linear: Int8Linear,
-}
+pub struct Int8SparseConv(Int8Linear);
 
 impl Int8SparseConv {
     /// Quantises a weight `[27 * C_in, C_out]` with bias `[C_out]`.
@@ -23,9 +21,8 @@ impl Int8SparseConv {
                 "{inputs} input channels, must be a multiple of {WORD_BYTES}"
             )));
         }
-        Ok(Self {
-            linear: Int8Linear::new(&weight.f_tr()?.f_contiguous()?, Some(bias), format)?,
-        })
+        let weight = weight.f_tr()?.f_contiguous()?;
+        Ok(Self(Int8Linear::new(&weight, Some(bias), format)?))
     }
 
     /// `[N_in, C_in]`, `u8`, to `[N_out, C_out]`.
@@ -37,10 +34,8 @@ impl Int8SparseConv {
         // The library gathers rows of floats many times faster than rows of bytes; nothing is computed with them here.
         // The zeros of missing neighbours are the quantised zero, as features are never negative.
         let words = index.gather(&x.f_view_dtype(Kind::Float)?)?;
-        self.linear.forward(
-            &words
-                .f_view_dtype(Kind::Uint8)?
-                .f_view([-1, KERNEL_VOLUME as i64 * channels])?,
-        )
+        let columns = words.f_view_dtype(Kind::Uint8)?;
+        let columns = columns.f_view([-1, KERNEL_VOLUME as i64 * channels])?;
+        self.0.forward(&columns)
     }
 }

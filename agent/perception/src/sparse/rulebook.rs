@@ -23,7 +23,8 @@ pub struct Rulebook {
 impl Rulebook {
     /// Stride 1: output sites are the input sites.
     pub fn submanifold(sites: &Sites) -> Self {
-        let mut rows = vec![NONE; sites.len() * KERNEL_VOLUME];
+        let inputs = sites.len();
+        let mut rows = vec![NONE; inputs * KERNEL_VOLUME];
         for (row, &[x, y, z]) in sites.coords().iter().enumerate() {
             rows[row * KERNEL_VOLUME + KERNEL_VOLUME / 2] = row as u32;
             // If b is the neighbour of a at offset k, a is that of b at 26 - k, so half of the kernel is looked up.
@@ -35,10 +36,7 @@ impl Rulebook {
                 }
             }
         }
-        Self {
-            inputs: sites.len(),
-            rows,
-        }
+        Self { inputs, rows }
     }
 
     /// Stride 2, from the sites of a level to those of the next: output `o` has the inputs `2 o + [-1, 1]^3`.
@@ -62,10 +60,8 @@ impl Rulebook {
                 }
             }
         }
-        Self {
-            inputs: sites.len(),
-            rows,
-        }
+        let inputs = sites.len();
+        Self { inputs, rows }
     }
 
     /// Number of output rows.
@@ -131,25 +127,16 @@ impl GatherIndex {
             )));
         }
         // A row of zeros stands for all missing neighbours.
-        let padded = Tensor::f_cat(
-            &[x, &x.f_new_zeros([1, channels], (x.kind(), x.device()))?],
-            0,
-        )?;
+        let zeros = x.f_new_zeros([1, channels], (x.kind(), x.device()))?;
+        let padded = Tensor::f_cat(&[x, &zeros], 0)?;
         // With an index that is expanded and not materialised, gather and its gradient copy whole rows.
-        padded.f_gather(
-            0,
-            &self.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?,
-            false,
-        )
+        let rows = self.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?;
+        padded.f_gather(0, &rows, false)
     }
 }
 
 fn offset(k: usize) -> [i32; 3] {
-    [
-        (k / 9) as i32 - 1,
-        (k / 3 % 3) as i32 - 1,
-        (k % 3) as i32 - 1,
-    ]
+    [k / 9, k / 3 % 3, k % 3].map(|axis| axis as i32 - 1)
 }
 
 fn index([dx, dy, dz]: [i32; 3]) -> usize {

@@ -38,9 +38,8 @@ impl Sites {
 
     /// True if a coordinate is near enough to zero to be a site.
     pub fn holds(coord: [i32; 3]) -> bool {
-        coord
-            .iter()
-            .all(|axis| (-HALF_RANGE..HALF_RANGE).contains(axis))
+        let mut axes = coord.iter();
+        axes.all(|axis| (-HALF_RANGE..HALF_RANGE).contains(axis))
     }
 
     /// Number of sites.
@@ -60,11 +59,9 @@ impl Sites {
 
     /// The row of a site.
     pub fn row(&self, coord: [i32; 3]) -> Option<u32> {
-        self.rows
-            .get(&key(coord))
-            .copied()
-            // The key of a coordinate out of range is that of another site.
-            .filter(|_| Self::holds(coord))
+        // The key of a coordinate out of range is that of another site.
+        let row = self.rows.get(&key(coord)).copied();
+        row.filter(|_| Self::holds(coord))
     }
 
     /// The sites of the next level, one for every 2x2x2 voxels with a site in them, and the row in it of each site.
@@ -77,9 +74,8 @@ impl Sites {
 fn key(coord: [i32; 3]) -> u64 {
     let axis_bits =
         |axis: i32| u64::from(axis.wrapping_add(HALF_RANGE) as u32 & ((1 << AXIS_BITS) - 1));
-    coord
-        .iter()
-        .fold(0, |key, &axis| key << AXIS_BITS | axis_bits(axis))
+    let axes = coord.into_iter();
+    axes.fold(0, |key, axis| key << AXIS_BITS | axis_bits(axis))
 }
 
 /// Hash by one multiplication: the keys are coordinates, and the table is used for one sweep.

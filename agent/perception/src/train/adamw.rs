@@ -153,11 +153,9 @@ impl AdamW {
         for entry in &mut self.entries {
             for (prefix, moment) in [("mean", &mut entry.mean), ("square", &mut entry.square)] {
                 let name = format!("{prefix}.{}", entry.name);
-                let stored = moments
-                    .get(&name)
-                    .filter(|stored| stored.size() == moment.size())
-                    .ok_or(name)?;
-                *moment = stored.to_device(moment.device());
+                let stored = moments.get(&name);
+                let stored = stored.filter(|stored| stored.size() == moment.size());
+                *moment = stored.ok_or(name)?.to_device(moment.device());
             }
         }
         self.steps = steps;

@@ -34,18 +34,14 @@ impl ModelCard {
         self.row("command", format_args!("`{}`", run.command));
         self.row("parameters", trained.parameters);
         self.row("weights", format_args!("SHA-256 `{}`", trained.sha256));
-        self.row(
-            "data",
-            format_args!("{data}, contents SHA-256 `{}`", trained.data.sha256),
-        );
+        let data = format!("{data}, contents SHA-256 `{}`", trained.data.sha256);
+        self.row("data", data);
         if let Some(left_out) = trained.data.left_out() {
             self.row("left out", left_out);
         }
         self.row("seed", run.seed);
-        self.row(
-            "steps",
-            format_args!("{} of {} {unit}", trained.steps, run.batch),
-        );
+        let steps = format!("{} of {} {unit}", trained.steps, run.batch);
+        self.row("steps", steps);
         self.row("numbers", format_args!("{:?}", run.precision));
         self.row("time", format_args!("{:.0} s", trained.seconds));
     }

@@ -36,7 +36,7 @@ pub fn save<P: Serialize>(
     optimizer: &AdamW,
     progress: &P,
 ) -> Result<(), FileError> {
-    let (moments, optimizer_steps) = optimizer.state();
+    let (moments, steps) = optimizer.state();
     let parameters = (variables.variables().into_iter())
         .map(|(name, tensor)| (format!("parameter.{name}"), tensor));
     let mut stored = Vec::new();
@@ -45,10 +45,7 @@ pub fn save<P: Serialize>(
         stored.push(Stored::new(name, &tensor, &values, Dtype::F32));
     }
     let progress = serde_json::to_string(progress).unwrap_or_default();
-    let texts = [
-        (PROGRESS_KEY, progress),
-        (STEPS_KEY, optimizer_steps.to_string()),
-    ];
+    let texts = [(PROGRESS_KEY, progress), (STEPS_KEY, steps.to_string())];
     let header = texts.map(|(key, text)| (key.to_owned(), text)).into();
     let bytes = file_bytes(&stored, header).at(path)?;
     atomic_file::write(path, bytes).at(path)
@@ -65,9 +62,8 @@ pub(crate) fn restore<P: DeserializeOwned>(
     optimizer: &mut AdamW,
 ) -> Result<P, FileError> {
     let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-    let (_, header) = SafeTensors::read_metadata(&bytes)
-        .map_err(incomplete)
-        .at(path)?;
+    let header = SafeTensors::read_metadata(&bytes).map_err(incomplete);
+    let (_, header) = header.at(path)?;
     let header = header.metadata().clone().unwrap_or_default();
     let [Some(progress), Some(steps)] = [PROGRESS_KEY, STEPS_KEY].map(|key| header.get(key)) else {
         let problem = format_args!("the header has no {PROGRESS_KEY:?} and {STEPS_KEY:?}");
@@ -79,16 +75,14 @@ pub(crate) fn restore<P: DeserializeOwned>(
     let mut targets = Vec::new();
     for (name, variable) in variables.variables() {
         let stored = tensors.get(&format!("parameter.{name}"));
-        let stored = stored
-            .filter(|stored| stored.size() == variable.size())
-            .ok_or_else(|| format!("no {name:?} of shape {:?}", variable.size()))
-            .at(path)?;
-        targets.push((variable, stored));
+        let size = variable.size();
+        let stored = stored.filter(|stored| stored.size() == size);
+        let stored = stored.ok_or_else(|| format!("no {name:?} of shape {size:?}"));
+        targets.push((variable, stored.at(path)?));
     }
-    optimizer
-        .restore(&tensors, steps)
-        .map_err(|name| format!("no {name:?} of the right shape"))
-        .at(path)?;
+    let restored = optimizer.restore(&tensors, steps);
+    let restored = restored.map_err(|name| format!("no {name:?} of the right shape"));
+    restored.at(path)?;
     // Parameters last: the optimizer may still refuse the file.
     for (mut variable, stored) in targets {
         no_grad(|| variable.f_copy_(stored)).at(path)?;

@@ -31,10 +31,8 @@ impl Curve {
         };
         atomic_file::write(path, kept).at(path)?;
         let file = OpenOptions::new().append(true).open(path).at(path)?;
-        Ok(Self {
-            path: path.to_owned(),
-            file,
-        })
+        let path = path.to_owned();
+        Ok(Self { path, file })
     }
 
     /// Path of the file.

@@ -17,10 +17,9 @@ impl DataListing {
     pub fn left_out(&self) -> Option<String> {
         let sweeps = (self.without_pose > 0)
             .then(|| format!("{} sweeps without a pose left out", self.without_pose));
-        let problems = self
-            .problems
-            .first()
-            .map(|first| format!("{} problems, the first: {first}", self.problems.len()));
+        let count = self.problems.len();
+        let first = self.problems.first();
+        let problems = first.map(|first| format!("{count} problems, the first: {first}"));
         let all: Vec<String> = sweeps.into_iter().chain(problems).collect();
         (!all.is_empty()).then(|| all.join("; "))
     }

@@ -27,11 +27,8 @@ impl Interruption {
         let ends_process = Arc::new(AtomicBool::new(true));
         for signal in [SIGINT, SIGTERM] {
             // In this order: the first signal is the one after which the flag is set.
-            flag::register_conditional_shutdown(
-                signal,
-                Interrupted::EXIT_CODE.into(),
-                Arc::clone(&ends_process),
-            )?;
+            let (status, ends) = (Interrupted::EXIT_CODE.into(), Arc::clone(&ends_process));
+            flag::register_conditional_shutdown(signal, status, ends)?;
             flag::register(signal, Arc::clone(&ends_process))?;
         }
         Ok(Self { ends_process })

@@ -28,16 +28,13 @@ impl<T: Send + 'static> Prefetch<T> {
         prepare: impl FnMut(u64) -> T + Clone + Send + 'static,
     ) -> Self {
         let count = threads.max(1);
-        let (queues, threads) = (0..count)
-            .map(|thread| {
-                let (sender, receiver) = sync_channel(AHEAD);
-                let prepare = prepare.clone();
-                (
-                    receiver,
-                    thread::spawn(move || work(prepare, first + thread as u64, count, &sender)),
-                )
-            })
-            .unzip();
+        let started = (0..count).map(|thread| {
+            let (sender, receiver) = sync_channel(AHEAD);
+            let (prepare, first) = (prepare.clone(), first + thread as u64);
+            let thread = thread::spawn(move || work(prepare, first, count, &sender));
+            (receiver, thread)
+        });
+        let (queues, threads) = started.unzip();
         Self {
             queues,
             threads,
@@ -52,9 +49,8 @@ impl<T: Send + 'static> Prefetch<T> {
     pub fn next_batch(&mut self) -> Result<T, TrainingError> {
         let queue = self.next;
         self.next = (queue + 1) % self.queues.len();
-        self.queues[queue]
-            .recv()
-            .map_err(|_| TrainingError::LoaderGone)
+        let batch = self.queues[queue].recv();
+        batch.map_err(|_| TrainingError::LoaderGone)
     }
 }
 

@@ -160,10 +160,9 @@ impl<const N: usize> Default for Means<N> {
 impl<const N: usize> Means<N> {
     /// Adds the numbers of a step.
     pub fn add(&mut self, values: [f64; N]) {
-        self.sums
-            .iter_mut()
-            .zip(values)
-            .for_each(|(sum, value)| *sum += value);
+        for (sum, value) in self.sums.iter_mut().zip(values) {
+            *sum += value;
+        }
         self.steps += 1;
     }
 

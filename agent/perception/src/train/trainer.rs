@@ -47,17 +47,16 @@ impl Progress {
             ("batch", self.batch.to_string(), requested.batch.to_string()),
             ("method", found, wanted),
         ];
-        match fields
-            .into_iter()
-            .find(|(_, found, requested)| found != requested)
-        {
-            Some((field, found, requested)) => Err(TrainingError::OtherTraining {
-                field,
-                found,
-                asked: requested,
-            }),
-            None => Ok(()),
-        }
+        let Some((field, found, asked)) =
+            fields.into_iter().find(|(_, found, asked)| found != asked)
+        else {
+            return Ok(());
+        };
+        Err(TrainingError::OtherTraining {
+            field,
+            found,
+            asked,
+        })
     }
 }
 
@@ -163,9 +162,8 @@ impl Trainer {
 
     /// Share of the training that is done after `epoch` passes over the data, 0 at the start, 1 or more at the end.
     pub fn share_done(&self, epoch: f64) -> f64 {
-        self.run
-            .length
-            .share_done(self.steps(), epoch, self.seconds())
+        let (steps, seconds) = (self.steps(), self.seconds());
+        self.run.length.share_done(steps, epoch, seconds)
     }
 
     /// The learning rate when a share is done.
@@ -196,12 +194,8 @@ impl Trainer {
     /// [`FileError`] when the file cannot be written.
     pub fn checkpoint(&mut self, variables: &VarStore) -> Result<(), FileError> {
         self.progress.seconds = self.seconds();
-        checkpoint::save(
-            &checkpoint_path(&self.run),
-            variables,
-            &self.optimizer,
-            &self.progress,
-        )
+        let path = checkpoint_path(&self.run);
+        checkpoint::save(&path, variables, &self.optimizer, &self.progress)
     }
 
     /// Ends the training if that was requested; writes a checkpoint before. To be called after each step.

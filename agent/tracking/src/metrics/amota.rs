@@ -74,10 +74,8 @@ impl Amota {
 
 impl OperatingPoint {
     fn of(sequences: &[Sequence], min_score: f64) -> Self {
-        let kept: Vec<Sequence> = sequences
-            .iter()
-            .map(|sequence| sequence.with_min_score(min_score))
-            .collect();
+        let kept = { sequences.iter() }.map(|sequence| sequence.with_min_score(min_score));
+        let kept: Vec<Sequence> = kept.collect();
         Self {
             min_score,
             counts: ClearMot::of(&kept, MATCH_DISTANCE_M),
@@ -108,10 +106,9 @@ fn thresholds(at_all: &ClearMot) -> Vec<Option<f64>> {
     let objects = at_all.objects as f64;
     let step = (1.0 - MIN_RECALL) / (THRESHOLDS - 1) as f64;
     let recalls = (0..THRESHOLDS).rev().map(|index| {
-        let recall = if index + 1 == THRESHOLDS {
-            1.0
-        } else {
-            MIN_RECALL + step * index as f64
+        let recall = match index + 1 {
+            THRESHOLDS => 1.0,
+            _ => MIN_RECALL + step * index as f64,
         };
         // Twelve decimals, so that 0.2 reaches 0.2.
         (recall * 1e12).round_ties_even() / 1e12

@@ -134,15 +134,12 @@ fn pairs(
     histories: &BTreeMap<i64, History>,
     max_distance_m: f64,
 ) -> Vec<(usize, usize)> {
-    let mut is_taken = (
-        vec![false; frame.objects.len()],
-        vec![false; frame.tracks.len()],
-    );
+    let (objects, tracks) = (frame.objects.len(), frame.tracks.len());
+    let mut is_taken = (vec![false; objects], vec![false; tracks]);
     let mut kept = Vec::new();
     for (index, object) in frame.objects.iter().enumerate() {
-        let last = histories
-            .get(&object.id)
-            .and_then(|history| history.last_track);
+        let history = histories.get(&object.id);
+        let last = history.and_then(|history| history.last_track);
         let track = last.and_then(|last| frame.tracks.iter().position(|track| track.id == last));
         // Two objects may have had the same track last: the first one in the frame keeps it.
         if let Some(track) = track
@@ -153,14 +150,10 @@ fn pairs(
             kept.push((index, track));
         }
     }
-    kept.extend(assignment::of_allowed(
-        frame.objects.len(),
-        frame.tracks.len(),
-        |object, track| {
-            let is_free = !is_taken.0[object] && !is_taken.1[track];
-            let distance_m = frame.distance_m(object, track);
-            (is_free && distance_m < max_distance_m).then_some(distance_m)
-        },
-    ));
+    kept.extend(assignment::of_allowed(objects, tracks, |object, track| {
+        let is_free = !is_taken.0[object] && !is_taken.1[track];
+        let distance_m = frame.distance_m(object, track);
+        (is_free && distance_m < max_distance_m).then_some(distance_m)
+    }));
     kept
 }

@@ -124,11 +124,10 @@ fn alignment(sequence: &Sequence, lengths: &(Lengths<i64>, Lengths<u64>)) -> Pai
             }
         }
     }
-    let mut alignment = weights;
-    for (pair, weight) in &mut alignment {
+    for (pair, weight) in &mut weights {
         *weight = jaccard(lengths, pair, *weight);
     }
-    alignment
+    weights
 }
 
 /// Frames that both have over frames that either has.

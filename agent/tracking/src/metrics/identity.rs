@@ -51,9 +51,7 @@ impl Identity {
             self.tracks += frame.tracks.len() as u64;
         }
         let best = assignment::of_lowest_cost(&-&shared);
-        self.matches += best
-            .into_iter()
-            .map(|pair| shared[pair] as u64)
-            .sum::<u64>();
+        let matches = best.into_iter().map(|pair| shared[pair] as u64);
+        self.matches += matches.sum::<u64>();
     }
 }

@@ -50,26 +50,20 @@ pub struct TrackQuality {
 impl TrackQuality {
     /// Quality of the tracks of all sequences.
     pub fn of(sequences: &[Sequence]) -> Self {
-        let Some(Amota {
-            amota,
-            amotp_m,
-            best,
-        }) = Amota::of(sequences)
-        else {
+        let Some(found) = Amota::of(sequences) else {
             return Self::default();
         };
         let averages = Self {
-            amota: Some(amota),
-            amotp_m: Some(amotp_m),
+            amota: Some(found.amota),
+            amotp_m: Some(found.amotp_m),
             ..Self::default()
         };
-        let Some(best) = best else {
+        let Some(best) = found.best else {
             return averages;
         };
-        let kept: Vec<Sequence> = sequences
-            .iter()
-            .map(|sequence| sequence.with_mean_scores().with_min_score(best.min_score))
-            .collect();
+        let averaged = sequences.iter().map(Sequence::with_mean_scores);
+        let kept = averaged.map(|sequence| sequence.with_min_score(best.min_score));
+        let kept: Vec<Sequence> = kept.collect();
         let hota = Hota::of(&kept);
         Self {
             min_score: Some(best.min_score),

@@ -79,11 +79,8 @@ impl Sequence {
             (*sum, *count) = (*sum + track.score, *count + 1.0);
         }
         let mut averaged = self.clone();
-        let tracks = averaged
-            .frames
-            .iter_mut()
-            .flat_map(|frame| &mut frame.tracks);
-        for track in tracks {
+        let frames = averaged.frames.iter_mut();
+        for track in frames.flat_map(|frame| &mut frame.tracks) {
             if let Some((sum, count)) = sums.get(&track.id) {
                 track.score = sum / count;
             }

@@ -99,9 +99,9 @@ impl Arguments {
             }
         }
         self.print(&results)?;
-        results
-            .iter()
-            .for_each(|result| report::print_loss(result, results.len() > 1));
+        for result in &results {
+            report::print_loss(result, results.len() > 1);
+        }
         if let Some(last) = results.last().filter(|last| self.view && !last.interrupted) {
             show_recorded(&last.folder.file("recording.mcap"), self.page)?;
         }
@@ -130,7 +130,13 @@ impl Arguments {
         let scenes = std::path::absolute(&self.scenes_dir)?;
         let name = format!("v2vdet-{}-{}x{}", self.seed, self.vehicles, self.frames);
         let folder = scenes.join(&name);
-        let options = self.options(folder.clone());
+        let vehicles = usize::from(self.vehicles);
+        let options = SynthOptions {
+            frames: self.frames,
+            agents: vehicles..=vehicles,
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            ..SynthOptions::new(Subset::V2vdet, self.seed, folder.clone())
+        };
         if generate::are_kept(&options).map_err(BadInput::of)? {
             return Ok(folder);
         }
@@ -143,21 +149,9 @@ impl Arguments {
         ));
         let began = Instant::now();
         generate(&options)?;
-        output::note(format_args!(
-            "generated in {:.1} s",
-            began.elapsed().as_secs_f64()
-        ));
+        let seconds = began.elapsed().as_secs_f64();
+        output::note(format_args!("generated in {seconds:.1} s"));
         Ok(folder)
-    }
-
-    fn options(&self, out: PathBuf) -> SynthOptions {
-        let vehicles = usize::from(self.vehicles);
-        SynthOptions {
-            frames: self.frames,
-            agents: vehicles..=vehicles,
-            threads: std::thread::available_parallelism().map_or(1, usize::from),
-            ..SynthOptions::new(Subset::V2vdet, self.seed, out)
-        }
     }
 
     fn print(&self, results: &[RunResult]) -> anyhow::Result<()> {
@@ -168,11 +162,8 @@ impl Arguments {
             output::line(serde_json::to_string_pretty(&last.metrics)?)?;
             return Ok(());
         }
-        let metrics: Vec<_> = results
-            .iter()
-            .map(|result| result.metrics.clone())
-            .collect();
-        output::text(report::table(&metrics))?;
+        let metrics = results.iter().map(|result| result.metrics.clone());
+        output::text(report::table(&Vec::from_iter(metrics)))?;
         output::text(report::run_notes(last))?;
         Ok(())
     }

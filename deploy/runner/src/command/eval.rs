@@ -160,10 +160,8 @@ pub(crate) struct Arguments {
 }
 
 fn of_one_table() -> impl Iterator<Item = &'static str> {
-    OF_ONE_TABLE
-        .iter()
-        .chain(PoseSourceConfig::OPTION_GROUPS)
-        .copied()
+    let options = OF_ONE_TABLE.iter();
+    options.chain(PoseSourceConfig::OPTION_GROUPS).copied()
 }
 
 fn at_most(count: u64) -> usize {
@@ -186,8 +184,7 @@ impl Arguments {
         let mut all = Vec::new();
         for &method in &self.method {
             bar.set_message(method.name());
-            let metrics = evaluate(&trial, &data, method, &mut || bar.inc(1));
-            all.push(metrics.map_err(BadInput::of)?);
+            all.push(evaluate(&trial, &data, method, &mut || bar.inc(1)).map_err(BadInput::of)?);
         }
         bar.finish_and_clear();
         match (self.json, &all[..]) {
@@ -359,13 +356,11 @@ fn tables(file: &Path, out: &Path, slices: &SliceArgs) -> anyhow::Result<Outcome
             "slice {slice} is computed; without --slice, this command writes the tables"
         ));
     }
-    filled
-        .iter()
-        .try_for_each(|table| output::line(table::markdown(table)))?;
-    let cells = filled
-        .iter()
-        .flat_map(|table| &table.rows)
-        .flat_map(|row| row.cells.iter().flatten());
+    for table in &filled {
+        output::line(table::markdown(table))?;
+    }
+    let rows = filled.iter().flat_map(|table| &table.rows);
+    let cells = rows.flat_map(|row| row.cells.iter().flatten());
     Ok(left_out(cells.map(|cell| &cell.metrics.left_out)))
 }
 
@@ -374,10 +369,8 @@ struct TableProgress(ProgressBar);
 
 impl TableObserver for TableProgress {
     fn cell(&mut self, table: &str, row: &str, column: &str, known: bool) {
-        let text = format!(
-            "{table}: {row}, {column}{}",
-            if known { ", known" } else { "" }
-        );
+        let known = if known { ", known" } else { "" };
+        let text = format!("{table}: {row}, {column}{known}");
         // Without a terminal the spinner shows nothing, so each cell gets a line of its own.
         if self.0.is_hidden() {
             output::note(&text);

@@ -81,8 +81,6 @@ pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
 /// Folder of the programs: they are built and installed together.
 pub(crate) fn programs() -> anyhow::Result<PathBuf> {
     let own = std::env::current_exe().context("folder of this program")?;
-    Ok(own
-        .parent()
-        .context("this program is in no folder")?
-        .to_path_buf())
+    let folder = own.parent().context("this program is in no folder")?;
+    Ok(folder.to_path_buf())
 }

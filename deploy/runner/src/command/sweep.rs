@@ -43,9 +43,7 @@ impl Arguments {
         // One thread for each process: parallel work comes from --jobs alone.
         tch::set_num_threads(1);
         let name = sweep::read(&self.experiment).map_err(BadInput::of)?.name;
-        let out = self
-            .out
-            .unwrap_or_else(|| PathBuf::from("sweeps").join(&name));
+        let out = { self.out }.unwrap_or_else(|| PathBuf::from("sweeps").join(&name));
         let (file, folder) = (self.experiment.to_string_lossy(), out.to_string_lossy());
         let command = ["v2vloc", "sweep", &*file, "--out", &*folder];
         let result = out.join(format!("{name}.csv"));
@@ -77,10 +75,7 @@ impl Arguments {
             false => output::text(&computed.table)?,
         }
         note_maps(&out.join("maps"));
-        output::note(format_args!(
-            "all columns and the report: {}",
-            out.display()
-        ));
+        output::note(format_args!("all columns and the report: {folder}"));
         Ok(left_out(
             computed.runs.iter().map(|run| &run.cell.metrics.left_out),
         ))
@@ -98,14 +93,12 @@ fn blamed(error: anyhow::Error) -> anyhow::Error {
 /// Prints how much space the feature maps take.
 fn note_maps(folder: &Path) {
     let files = fs::read_dir(folder).into_iter().flatten().flatten();
-    let bytes: u64 = files
-        .filter_map(|file| Some(file.metadata().ok()?.len()))
-        .sum();
+    let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
+    let bytes: u64 = sizes.sum();
     if bytes > 0 {
-        let megabytes = bytes as f64 / 1e6;
+        let (megabytes, folder) = (bytes as f64 / 1e6, folder.display());
         output::note(format_args!(
-            "{megabytes:.1} MB of feature maps in {}",
-            folder.display()
+            "{megabytes:.1} MB of feature maps in {folder}"
         ));
     }
 }

@@ -68,14 +68,12 @@ impl Arguments {
         scenario.network.metrics = self.metrics.or(scenario.network.metrics);
         // Only now: options may fill in or replace what the file says.
         scenario.check(&self.scenario).map_err(BadInput::of)?;
-        let result = run_scenario(
-            &scenario,
-            &RunOptions {
-                runs: self.runs,
-                programs: programs()?,
-                prefix: "up",
-            },
-        )?;
+        let options = RunOptions {
+            runs: self.runs,
+            programs: programs()?,
+            prefix: "up",
+        };
+        let result = run_scenario(&scenario, &options)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&result.metrics)?)?;
         } else {

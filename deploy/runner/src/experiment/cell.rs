@@ -62,10 +62,8 @@ impl Cell {
             Err(error) => return Err(error).with_context(|| path.display().to_string()),
         };
         let cell: Self = serde_json::from_str(&text).with_context(|| {
-            format!(
-                "{}: malformed; without the file it is computed anew",
-                path.display()
-            )
+            let path = path.display();
+            format!("{path}: malformed; without the file it is computed anew")
         })?;
         // Another key with the same first digits is no hit.
         Ok((cell.key.sha256 == key.sha256).then_some(cell))

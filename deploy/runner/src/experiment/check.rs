@@ -2,6 +2,7 @@
 
 use std::fmt::Debug;
 
+use anyhow::{Result, anyhow, bail, ensure};
 use bus::InboxConfig;
 use dataset::Scenario;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
@@ -16,7 +17,7 @@ use localization::pose_source::{NoiseMode, PoseSourceConfig};
 const MOST_RUNS: usize = 10_000;
 
 /// Checks everything that does not depend on the data.
-pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
+pub(super) fn check(experiment: &Experiment) -> Result<()> {
     let (grid, compute) = (&experiment.grid, experiment.compute);
     if experiment.tables.is_empty() {
         check_name("name", &experiment.name)?;
@@ -25,97 +26,91 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
         ("scenarios", experiment.scenarios),
         ("frames", experiment.frames),
     ] {
-        if value == Some(0) {
-            return Err(format!("{field} is 0: there would be nothing to evaluate"));
-        }
+        ensure!(
+            value != Some(0),
+            "{field} is 0: there would be nothing to evaluate"
+        );
     }
-    { experiment.ego.validate() }.map_err(|error| error.to_string())?;
-    { experiment.poses.validate() }.map_err(|error| format!("poses: {error}"))?;
-    { compute.validate("compute") }.map_err(|error| error.to_string())?;
+    experiment.ego.validate()?;
+    { experiment.poses.validate() }.map_err(|error| anyhow!("poses: {error}"))?;
+    compute.validate("compute")?;
     let limit_gb = experiment.feature_maps_limit_gb;
     number("feature_maps_limit_gb", limit_gb, 0.0, 10_000.0)?;
     of_link_alone(experiment)?;
     let link = experiment.link().map(LinkConfig::open).transpose();
-    let link = link.map_err(|error| format!("link: {error}"))?;
+    let link = link.map_err(|error| anyhow!("link: {error}"))?;
     if !experiment.tables.is_empty() {
         return tables(experiment);
     }
     axes(grid)?;
     contradictions(experiment, &link.unwrap_or_default().0)?;
     let runs = count(grid);
-    if runs > MOST_RUNS {
-        let hours = runs as f64 / 3600.0;
-        return Err(format!(
-            "the grid has {} = {runs} runs, {hours:.1} hours even at a second each; more than {MOST_RUNS} are refused",
-            product(grid)
-        ));
-    }
+    ensure!(
+        runs <= MOST_RUNS,
+        "the grid has {} = {runs} runs, {:.1} hours even at a second each; more than {MOST_RUNS} are refused",
+        product(grid),
+        runs as f64 / 3600.0
+    );
     Ok(())
 }
 
 /// Checks the tables, each by itself and beside the other settings.
-fn tables(experiment: &Experiment) -> Result<(), String> {
-    if experiment.grid != Grid::default() {
-        return Err("an experiment has a grid or tables, not both".into());
-    }
+fn tables(experiment: &Experiment) -> Result<()> {
+    let has_grid = experiment.grid != Grid::default();
+    ensure!(!has_grid, "an experiment has a grid or tables, not both");
     for (index, table) in experiment.tables.iter().enumerate() {
-        check_name("table name", &table.name)?;
+        let name = &table.name;
+        check_name("table name", name)?;
         let mut before = experiment.tables[..index].iter();
-        if before.any(|other| other.name == table.name) {
-            return Err(format!("two tables are called {:?}", table.name));
-        }
-        if table.rows.is_empty() || table.columns.is_empty() {
-            return Err(format!("table {:?} has no rows or no columns", table.name));
-        }
+        let is_known = before.any(|other| other.name == *name);
+        ensure!(!is_known, "two tables are called {name:?}");
+        let is_empty = table.rows.is_empty() || table.columns.is_empty();
+        ensure!(!is_empty, "table {name:?} has no rows or no columns");
         for vehicles in table.rows.iter().filter_map(|row| row.vehicles) {
-            let field = format!("table {:?}: vehicles", table.name);
+            let field = format!("table {name:?}: vehicles");
             number(&field, vehicles as f64, 1.0, 64.0)?;
         }
-        if experiment.link.is_some() && table.columns.iter().any(|column| column.delay_ms > 0) {
-            let name = &table.name;
-            return Err(format!(
-                "table {name:?}: delay_ms and link contradict each other"
-            ));
-        }
+        let is_late = table.columns.iter().any(|column| column.delay_ms > 0);
+        ensure!(
+            experiment.link.is_none() || !is_late,
+            "table {name:?}: delay_ms and link contradict each other"
+        );
     }
     Ok(())
 }
 
 /// Refuses settings that mean nothing without a link, or in an evaluation at all.
-fn of_link_alone(experiment: &Experiment) -> Result<(), String> {
+fn of_link_alone(experiment: &Experiment) -> Result<()> {
     let ego = &experiment.ego;
     if let Some(ego) = &ego.id {
-        return Err(format!(
-            "ego.id is {ego}: choose by protocol.ego_kind instead"
-        ));
+        bail!("ego.id is {ego}: choose by protocol.ego_kind instead");
     }
-    if ego.inbox != InboxConfig::default() {
-        return Err(
-            "ego.inbox is given, but receive limits do not apply in simulation time".into(),
-        );
-    }
-    if experiment.link().is_none() && experiment.compute != ComputeTimes::default() {
-        return Err("compute is given, but without link no time passes".into());
-    }
+    ensure!(
+        ego.inbox == InboxConfig::default(),
+        "ego.inbox is given, but receive limits do not apply in simulation time"
+    );
+    ensure!(
+        experiment.link().is_some() || experiment.compute == ComputeTimes::default(),
+        "compute is given, but without link no time passes"
+    );
     Ok(())
 }
 
 /// Refuses a name that cannot be one of files.
-fn check_name(field: &str, name: &str) -> Result<(), String> {
+fn check_name(field: &str, name: &str) -> Result<()> {
     let is_plain = { name.chars() }.all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
-    match !name.is_empty() && is_plain {
-        true => Ok(()),
-        false => Err(format!(
-            "{field} {name:?} is to name files: letters, digits, - and _"
-        )),
-    }
+    ensure!(
+        !name.is_empty() && is_plain,
+        "{field} {name:?} is to name files: letters, digits, - and _"
+    );
+    Ok(())
 }
 
 /// Checks everything that depends on the data.
 pub(super) fn check_scenes<'a>(
     experiment: &Experiment,
     scenarios: impl IntoIterator<Item = &'a Scenario>,
-) -> Result<(), String> {
+) -> Result<()> {
     for scenario in scenarios {
         let found = scenario.agents.len();
         let rows = experiment.tables.iter().flat_map(|table| &table.rows);
@@ -125,17 +120,15 @@ pub(super) fn check_scenes<'a>(
             .map(|count| ("grid.vehicles", *count))
             .chain(of_rows);
         if let Some((field, asked)) = asked.find(|(_, asked)| *asked > found) {
-            return Err(format!(
-                "{field} is {asked}, but scenario {} has {found} vehicles",
-                scenario.name
-            ));
+            let name = &scenario.name;
+            bail!("{field} is {asked}, but scenario {name} has {found} vehicles");
         }
     }
     Ok(())
 }
 
 /// Checks every axis on its own.
-fn axes(grid: &Grid) -> Result<(), String> {
+fn axes(grid: &Grid) -> Result<()> {
     values("grid.method", Some(&grid.method), |_| Ok(()))?;
     // A reference is a method of the same grid, so it may not repeat one of them.
     let all = [&grid.method[..], &grid.reference].concat();
@@ -164,12 +157,10 @@ fn axes(grid: &Grid) -> Result<(), String> {
     values("grid.seed", grid.seed.as_ref(), |_| Ok(()))
 }
 
-fn codec(codec: &CodecSpec) -> Result<(), String> {
+fn codec(codec: &CodecSpec) -> Result<()> {
     // Written as a negation, so that NaN is refused too.
     if let Some(keep) = codec.keep.filter(|keep| !(*keep > 0.0 && *keep <= 1.0)) {
-        return Err(format!(
-            "grid.codec: keep is {keep}, must be above 0 and at most 1"
-        ));
+        bail!("grid.codec: keep is {keep}, must be above 0 and at most 1");
     }
     number("grid.codec: fit", codec.fit.unwrap_or(1.0), 0.01, 1.0)?;
     let level = f64::from(codec.zstd_level.unwrap_or(1));
@@ -177,29 +168,28 @@ fn codec(codec: &CodecSpec) -> Result<(), String> {
 }
 
 /// Checks an axis of numbers from `low` to `high`.
-fn numbers(field: &str, axis: &Option<Vec<f64>>, low: f64, high: f64) -> Result<(), String> {
+fn numbers(field: &str, axis: &Option<Vec<f64>>, low: f64, high: f64) -> Result<()> {
     values(field, axis.as_ref(), |value| {
         number(field, *value, low, high)
     })
 }
 
 /// Contradictory or impossible combinations of fields.
-fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
+fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
     let (grid, ego, poses) = (&experiment.grid, &experiment.ego, &experiment.poses);
     let exchanges = grid.method.iter().map(|method| method.exchange());
-    if experiment.weights.is_none() {
-        return Err(
-            "weights is left out: name a file, or a folder with one for each method".into(),
-        );
-    }
-    if experiment.feature_maps.is_some() {
-        return Err(
-            "feature_maps is of tables: a sweep keeps its maps in the folder of --out".into(),
-        );
-    }
-    if experiment.noise_mode == NoiseMode::Replayed {
-        return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
-    }
+    ensure!(
+        experiment.weights.is_some(),
+        "weights is left out: name a file, or a folder with one for each method"
+    );
+    ensure!(
+        experiment.feature_maps.is_none(),
+        "feature_maps is of tables: a sweep keeps its maps in the folder of --out"
+    );
+    ensure!(
+        experiment.noise_mode != NoiseMode::Replayed,
+        "noise_mode is replayed, which needs a table: name it in poses instead"
+    );
     let has_latency = link.latency != LatencyModel::None;
     let has_capacity = link.capacity != CapacityConfig::Unlimited;
     let twice = if grid.latency_ms.is_some() && has_latency {
@@ -212,52 +202,52 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     };
     if let Some([axis, field]) = twice {
         let name = experiment.link.as_deref().unwrap_or_default();
-        return Err(format!(
-            "grid.{axis} and the {field} of link {name} contradict each other"
-        ));
+        bail!("grid.{axis} and the {field} of link {name} contradict each other");
     }
-    if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
-        return Err("grid.jitter_ms is the deviation of grid.latency_ms, which is left out".into());
-    }
-    if grid.bandwidth_mbps.is_none() && grid.codec.iter().flatten().any(|codec| codec.fit.is_some())
-    {
-        return Err("grid.codec.fit is a share of grid.bandwidth_mbps, which is left out".into());
-    }
+    ensure!(
+        grid.jitter_ms.is_none() || grid.latency_ms.is_some(),
+        "grid.jitter_ms is the deviation of grid.latency_ms, which is left out"
+    );
+    let mut codecs = grid.codec.iter().flatten();
+    ensure!(
+        grid.bandwidth_mbps.is_some() || codecs.all(|codec| codec.fit.is_none()),
+        "grid.codec.fit is a share of grid.bandwidth_mbps, which is left out"
+    );
     // A map captured at t can be fused until t + max_age_ms + deadline_ms: in the last frame that
     // still accepts its age, at the end of that frame's wait.
     let oldest_ms = ego.max_age_ms as f64 + ego.deadline_ms as f64;
     if let Some(ms) = { grid.latency_ms.iter().flatten() }.find(|ms| **ms > oldest_ms) {
-        return Err(format!(
+        bail!(
             "grid.latency_ms is {ms}, but ego.max_age_ms is {}: every message would be too old to be fused",
             ego.max_age_ms
-        ));
+        );
     }
-    if grid.pose_noise.is_some() && *poses != PoseSourceConfig::Recorded {
-        return Err(format!(
-            "grid.pose_noise is added to recorded poses, but poses is {}",
-            poses.name()
-        ));
-    }
+    ensure!(
+        grid.pose_noise.is_none() || *poses == PoseSourceConfig::Recorded,
+        "grid.pose_noise is added to recorded poses, but poses is {}",
+        poses.name()
+    );
     if grid.codec.is_some() && exchanges.clone().all(|it| it != Exchange::Features) {
         let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
-        return Err(format!(
+        bail!(
             "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
             names.join(", ")
-        ));
+        );
     }
-    if grid.vehicles.is_some() && exchanges.clone().all(|it| it == Exchange::Nothing) {
-        let reason = "grid.vehicles varies the transmitting vehicles, but grid.method is none: there are none";
-        return Err(reason.into());
-    }
+    ensure!(
+        grid.vehicles.is_none() || exchanges.clone().any(|it| it != Exchange::Nothing),
+        "grid.vehicles varies the transmitting vehicles, but grid.method is none: there are none"
+    );
     let (mut loss, mut noise) = (grid.loss.iter().flatten(), grid.pose_noise.iter().flatten());
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
     // A loss of 0 or 1 is certain, whatever the seed.
     let loses = loss.any(|share| *share > 0.0 && *share < 1.0);
     let errs = noise.any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
     let is_random = jitters || loses || errs || is_random(link);
-    if !is_random && grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1) {
-        return Err("grid.seed has several values, but nothing in the experiment is random".into());
-    }
+    ensure!(
+        is_random || grid.seed.as_ref().is_none_or(|seeds| seeds.len() <= 1),
+        "grid.seed has several values, but nothing in the experiment is random"
+    );
     Ok(())
 }
 
@@ -273,37 +263,32 @@ fn is_random(link: &LinkConfig) -> bool {
 fn values<T: PartialEq + Debug>(
     field: &str,
     values: Option<&Vec<T>>,
-    check: impl Fn(&T) -> Result<(), String>,
-) -> Result<(), String> {
+    check: impl Fn(&T) -> Result<()>,
+) -> Result<()> {
     let Some(values) = values else { return Ok(()) };
-    if values.is_empty() {
-        return Err(format!("{field} is empty: the grid has no run"));
-    }
+    ensure!(!values.is_empty(), "{field} is empty: the grid has no run");
     for (place, value) in values.iter().enumerate() {
         check(value)?;
-        if values[..place].contains(value) {
-            return Err(format!("{field} names {value:?} twice"));
-        }
+        let is_known = values[..place].contains(value);
+        ensure!(!is_known, "{field} names {value:?} twice");
     }
     Ok(())
 }
 
-fn number(field: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
+fn number(field: &str, value: f64, low: f64, high: f64) -> Result<()> {
     // NaN is in no range, so it is refused here.
-    match (low..=high).contains(&value) {
-        true => Ok(()),
-        false => Err(format!("{field} is {value}, must be {low} to {high}")),
-    }
+    let is_allowed = (low..=high).contains(&value);
+    ensure!(is_allowed, "{field} is {value}, must be {low} to {high}");
+    Ok(())
 }
 
 /// The axes with more than one value, multiplied: `3 method x 6 latency_ms`.
 pub(super) fn product(grid: &Grid) -> String {
     let sizes = sizes(grid).into_iter().filter(|(_, size)| *size > 1);
     let factors: Vec<String> = sizes.map(|(axis, size)| format!("{size} {axis}")).collect();
-    if factors.is_empty() {
-        "1".into()
-    } else {
-        factors.join(" x ")
+    match &factors[..] {
+        [] => "1".into(),
+        factors => factors.join(" x "),
     }
 }
 
@@ -314,7 +299,9 @@ mod tests {
     fn problem(text: &str) -> String {
         let text = format!("name: e\ndataset: d\nweights: w\n{text}");
         let experiment: Experiment = serde_saphyr::from_str(&text).unwrap();
-        check(&experiment).err().unwrap_or_default()
+        check(&experiment)
+            .err()
+            .map_or(String::new(), |error| error.to_string())
     }
 
     #[test]

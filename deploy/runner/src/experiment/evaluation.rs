@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use agent::config::AgentSettings;
 use anyhow::{Context, Result, anyhow, ensure};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario, findings};
@@ -84,15 +85,13 @@ impl OpenedData {
         let dataset = dataset::open_with(&trial.dataset, &options)?;
         let protocol = trial.protocol.resolve(dataset.layout);
         let protocol = protocol.map_err(|error| anyhow!("evaluation protocol: {error}"))?;
-        let mut scenarios: Vec<Scenario> = dataset
-            .scenarios
-            .iter()
-            .filter_map(|scenario| protocol.arrange(scenario))
-            .collect();
+        let arranged =
+            { dataset.scenarios.iter() }.filter_map(|scenario| protocol.arrange(scenario));
+        let mut scenarios: Vec<Scenario> = arranged.collect();
         let frames = trial.setup.frames.unwrap_or(usize::MAX);
-        scenarios
-            .iter_mut()
-            .for_each(|scenario| scenario.ticks.truncate(frames));
+        for scenario in &mut scenarios {
+            scenario.ticks.truncate(frames);
+        }
         Ok(Self {
             scenarios,
             protocol,
@@ -175,38 +174,26 @@ impl Trial {
         })
     }
 
+    /// Settings of all vehicles, then those of single ones.
+    fn settings(&self) -> impl Iterator<Item = &AgentSettings> {
+        std::iter::once(&self.setup.agents).chain(self.setup.vehicles.values())
+    }
+
     /// True if a vehicle sends boxes where a method fuses feature maps.
     fn sends_boxes(&self) -> bool {
-        let Setup {
-            agents, vehicles, ..
-        } = &self.setup;
-        let mut all = std::iter::once(agents).chain(vehicles.values());
-        all.any(|settings| settings.boxes.is_some())
+        self.settings().any(|settings| settings.boxes.is_some())
     }
 
     /// Digests of all that these settings are applied to.
     fn provenance(&self, data: &OpenedData, method: Method) -> Result<Provenance> {
-        let Setup {
-            models,
-            agents,
-            vehicles,
-            link,
-            lidar_variant,
-            ..
-        } = &self.setup;
-        let link = { link.as_ref() }.map(|link| (&link.config, link.folder.as_path()));
-        let vehicles = std::iter::once(agents).chain(vehicles.values());
-        let weights = weights_of(&models.weights, method, self.sends_boxes())?;
-        let files = files_of(method, weights, vehicles, link);
-        let data_sha256 = data.sha256(self.scenarios, lidar_variant.as_deref());
-        let commit = env!("V2VLOC_COMMIT");
-        Ok(Provenance::collect(
-            &[],
-            data_sha256,
-            files,
-            commit,
-            &data.digests,
-        )?)
+        let setup = &self.setup;
+        let link = { setup.link.as_ref() }.map(|link| (&link.config, link.folder.as_path()));
+        let weights = weights_of(&setup.models.weights, method, self.sends_boxes())?;
+        let files = files_of(method, weights, self.settings(), link);
+        let data_sha256 = data.sha256(self.scenarios, setup.lidar_variant.as_deref());
+        let (commit, digests) = (env!("V2VLOC_COMMIT"), &data.digests);
+        let collected = Provenance::collect(&[], data_sha256, files, commit, digests);
+        Ok(collected?)
     }
 }
 
@@ -245,12 +232,10 @@ pub fn compute(
     let (scores, evaluator) = judged(trial, data, key.method, on_frame)?;
     let mut messages = Counts::default();
     for (account, counts) in evaluator.ledger().iter() {
-        match account.topic {
-            Topic::Stream {
-                stream: Stream::Pose,
-                ..
-            } => {}
-            _ => messages.add(counts),
+        let is_pose =
+            matches!(&account.topic, Topic::Stream { stream, .. } if *stream == Stream::Pose);
+        if !is_pose {
+            messages.add(counts);
         }
     }
     let used = scores.records().iter().map(|record| record.fused as u64);

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use anyhow::{Result, anyhow};
 use bus::config_file;
 use link::LinkConfig;
 use support::file_error::FileError;
@@ -19,8 +20,7 @@ impl Experiment {
         if experiment.tables.is_empty() {
             experiment.resolve(path.parent().unwrap_or(Path::new(".")));
         }
-        let checked = experiment.find_networks();
-        checked
+        { experiment.find_networks() }
             .and_then(|()| check::check(&experiment))
             .map_err(|problem| FileError::new(path, problem))?;
         Ok(experiment)
@@ -36,19 +36,16 @@ impl Experiment {
         }
     }
 
-    fn find_networks(&mut self) -> Result<(), String> {
+    fn find_networks(&mut self) -> Result<()> {
         let mut all = vec![&mut self.poses];
         for Table { rows, columns, .. } in &mut self.tables {
             all.extend(rows.iter_mut().filter_map(|row| row.poses.as_mut()));
-            all.extend(
-                columns
-                    .iter_mut()
-                    .filter_map(|column| column.poses.as_mut()),
-            );
+            let columns = columns.iter_mut();
+            all.extend(columns.filter_map(|column| column.poses.as_mut()));
         }
         for poses in all {
             let found = std::mem::take(poses).with_networks();
-            *poses = found.map_err(|error| format!("poses: {error}"))?;
+            *poses = found.map_err(|error| anyhow!("poses: {error}"))?;
         }
         Ok(())
     }

@@ -50,114 +50,97 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
     };
     if metrics.pose.mean_m.is_none() && metrics.pose.no_pose > 0 {
         let dataset = dataset::open(scene).ok();
-        let first = dataset
-            .as_ref()
-            .and_then(|dataset| dataset.scenarios.first());
-        let map = first.and_then(|scenario| scenario.generated_map().ok());
-        let map = map.map(|map| map.to_string());
-        output::note(wrong_place_hint(
-            metrics.pose.no_pose,
-            &head,
-            map.as_deref(),
-        ));
+        let scenarios = dataset.map_or(Vec::new(), |dataset| dataset.scenarios);
+        let map = { scenarios.first() }.and_then(|scenario| scenario.generated_map().ok());
+        let (map, no_pose) = (map.map(|map| map.to_string()), metrics.pose.no_pose);
+        output::note(wrong_place_hint(no_pose, &head, map.as_deref()));
     }
 }
 
 /// Lines about one run below its row of the table.
 pub fn run_notes(result: &RunResult) -> String {
-    let mut text = String::new();
     let messages = &result.metrics.messages;
-    // Writing to a string cannot fail.
-    let _ = writeln!(
-        text,
+    let mut lines = vec![format!(
         "\nmessages  {} sent, {} received, {} in flight",
         messages.sent, messages.received, messages.in_flight
-    );
+    )];
     if messages.are_stuck() {
-        let _ = writeln!(
-            text,
-            "stuck     most messages were still in flight at the end: the link carries next to nothing"
-        );
+        let stuck =
+            "most messages were still in flight at the end: the link carries next to nothing";
+        lines.push(format!("stuck     {stuck}"));
     }
     let dropped = { messages.dropped.iter() }.map(|(reason, count)| format!("{count} {reason}"));
     let dropped = match messages.dropped.is_empty() {
         true => "none".into(),
         false => dropped.collect::<Vec<_>>().join(", "),
     };
-    let _ = writeln!(text, "dropped   {dropped}");
+    lines.push(format!("dropped   {dropped}"));
     let verdict = match result.balance.discrepancies.len() {
         0 => "every message is accounted for".into(),
         count => format!("{count} accounts do not add up, see ledger.json"),
     };
-    let _ = writeln!(text, "ledger    {verdict}");
-    let unreceived: u64 = { result.balance.unreceived.iter() }
-        .map(|topic| topic.messages)
-        .sum();
+    lines.push(format!("ledger    {verdict}"));
+    let unreceived = result.balance.unreceived.iter();
+    let unreceived: u64 = unreceived.map(|topic| topic.messages).sum();
     if unreceived > 0 {
-        let _ = writeln!(
-            text,
+        lines.push(format!(
             "topics    {unreceived} messages on topics without a receiver, see ledger.json"
-        );
+        ));
     }
-    if result.missed > 0 {
-        let _ = writeln!(text, "missed    {} ticks without a result", result.missed);
+    let missed = result.missed;
+    if missed > 0 {
+        lines.push(format!("missed    {missed} ticks without a result"));
     }
-    for process in &result.killed {
-        let _ = writeln!(text, "killed    {process} did not end in time");
-    }
-    for failure in &result.failures {
-        let _ = writeln!(text, "failed    {failure}");
-    }
-    for what in &result.unwritten {
-        let _ = writeln!(text, "unwritten {what}");
-    }
-    if let Some(picture) = &result.picture {
-        let _ = writeln!(text, "picture   {}", picture.display());
-    }
-    let _ = writeln!(text, "run       {}", result.folder.path().display());
-    text
+    let killed = result.killed.iter();
+    lines.extend(killed.map(|process| format!("killed    {process} did not end in time")));
+    let failures = result.failures.iter();
+    lines.extend(failures.map(|failure| format!("failed    {failure}")));
+    let unwritten = result.unwritten.iter();
+    lines.extend(unwritten.map(|what| format!("unwritten {what}")));
+    let picture = result.picture.iter();
+    lines.extend(picture.map(|picture| format!("picture   {}", picture.display())));
+    lines.push(format!("run       {}\n", result.folder.path().display()));
+    lines.join("\n")
 }
 
-/// Name, alignment and cells of a column.
-type Column = (&'static str, Side, fn(&Metrics) -> String);
+/// A column: whether it is shown, its name, alignment and cells.
+type Column = (bool, &'static str, Side, fn(&Metrics) -> String);
 
 /// One line per run or evaluation, and the facts that are needed to compare the lines.
 pub fn table(all: &[Metrics]) -> String {
     use Side::{Left, Right};
     // Streaming AP exists only where results have a time of publication.
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
+    let has_network = all.iter().any(|metrics| metrics.contribution.sent > 0);
     let name = if is_live { "answered" } else { "frames" };
-    let mut columns: Vec<Column> = vec![
-        ("method", Left, |of| of.method.clone()),
-        ("poses", Left, |of| of.pose_source.clone()),
-        (name, Right, frames),
-        ("AP@0.3", Right, |of| number(of.ap_global.at_30, 3)),
-        ("AP@0.5", Right, |of| number(of.ap_global.at_50, 3)),
-        ("AP@0.7", Right, |of| number(of.ap_global.at_70, 3)),
-    ];
-    if is_live {
-        columns.push(("AP@0.5 all", Right, |of| {
+    let columns: [Column; 13] = [
+        (true, "method", Left, |of| of.method.clone()),
+        (true, "poses", Left, |of| of.pose_source.clone()),
+        (true, name, Right, frames),
+        (true, "AP@0.3", Right, |of| number(of.ap_global.at_30, 3)),
+        (true, "AP@0.5", Right, |of| number(of.ap_global.at_50, 3)),
+        (true, "AP@0.7", Right, |of| number(of.ap_global.at_70, 3)),
+        (is_live, "AP@0.5 all", Right, |of| {
             number(of.ap_unanswered_empty.at_50, 3)
-        }));
-        columns.push(("sAP@0.5", Right, |of| {
+        }),
+        (is_live, "sAP@0.5", Right, |of| {
             number(of.ap_streaming.and_then(|ap| ap.at_50), 3)
-        }));
-    } else {
-        columns.push(("frame order 0.5", Right, |of| {
+        }),
+        (!is_live, "frame order 0.5", Right, |of| {
             number(of.ap_frame_order.at_50, 3)
-        }));
-    }
-    if all.iter().any(|metrics| metrics.contribution.sent > 0) {
-        columns.push(("fused", Right, |of| {
+        }),
+        (has_network, "fused", Right, |of| {
             number(of.contribution.fused_per_frame, 2)
-        }));
-    }
-    columns.push(("pose m", Right, |of| number(of.pose.mean_m, 2)));
-    columns.push(("latency ms", Right, latency));
-    columns.push(("bytes", Right, wire_bytes));
-    let mut table = TextTable::new(columns.iter().map(|(name, side, _)| (*name, *side)));
+        }),
+        (true, "pose m", Right, |of| number(of.pose.mean_m, 2)),
+        (true, "latency ms", Right, latency),
+        (true, "bytes", Right, wire_bytes),
+    ];
+    let columns = columns.into_iter().filter(|(is_shown, ..)| *is_shown);
+    let columns: Vec<Column> = columns.collect();
+    let mut table = TextTable::new(columns.iter().map(|(_, name, side, _)| (*name, *side)));
     for metrics in all {
-        table.row(columns.iter().map(|(_, _, cell)| cell(metrics)));
+        table.row(columns.iter().map(|(.., cell)| cell(metrics)));
     }
     table.to_string() + &comparison(all)
 }

@@ -53,8 +53,7 @@ impl FromStr for Slice {
     type Err = SliceError;
 
     fn from_str(text: &str) -> Result<Self, SliceError> {
-        let numbers = text.split_once('/');
-        let parsed = numbers.and_then(|(number, count)| {
+        let parsed = text.split_once('/').and_then(|(number, count)| {
             let (number, count) = (number.parse().ok()?, count.parse().ok()?);
             ((1..=count).contains(&number) && count <= MOST_SLICES)
                 .then_some(Self { number, count })
@@ -138,8 +137,7 @@ fn snakemake(command: &str, count: usize, result: &Path) -> String {
 
 /// A text as a string of Python, with braces that Snakemake leaves alone. JSON has the escapes that Python has.
 fn python(text: &str) -> String {
-    let text = text.replace('{', "{{").replace('}', "}}");
-    serde_json::Value::from(text).to_string()
+    serde_json::Value::from(text.replace('{', "{{").replace('}', "}}")).to_string()
 }
 
 /// A word as a shell reads it back.

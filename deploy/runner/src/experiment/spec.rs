@@ -144,7 +144,7 @@ pub struct Grid {
 }
 
 /// Encoding of feature maps.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CodecSpec {
     /// Number format of the values.
@@ -165,18 +165,6 @@ pub struct CodecSpec {
     pub boxes: Option<SentBoxes>,
 }
 
-impl Default for CodecSpec {
-    fn default() -> Self {
-        Self {
-            dtype: Dtype::F16,
-            keep: None,
-            zstd_level: None,
-            fit: None,
-            boxes: None,
-        }
-    }
-}
-
 impl CodecSpec {
     /// Label in tables and charts: the number format and the fraction of the link's rate, or boxes.
     pub fn name(&self) -> String {
@@ -185,9 +173,7 @@ impl CodecSpec {
             Some(SentBoxes::Beside) => " and boxes",
             None => "",
         };
-        let fitted = self
-            .fit
-            .map_or(String::new(), |share| format!(" fitted to {share}"));
+        let fitted = { self.fit }.map_or(String::new(), |share| format!(" fitted to {share}"));
         format!("{:?}{fitted}{boxes}", self.dtype).to_lowercase()
     }
 }
@@ -343,9 +329,8 @@ impl Experiment {
 impl Row {
     /// First column of the row.
     pub fn label(&self) -> String {
-        self.name
-            .clone()
-            .unwrap_or_else(|| self.method.name().to_owned())
+        let name = self.name.as_deref();
+        name.unwrap_or(self.method.name()).to_owned()
     }
 }
 

@@ -93,12 +93,10 @@ impl Fleet {
     }
 
     fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Planner<'a> {
+        let wanted_mib = self.scenario.network.shared_memory_mib;
         let bus = BusConfig {
             connect: context.endpoint.clone(),
-            shared_memory_mib: pool_mib(
-                self.scenario.network.shared_memory_mib,
-                self.process_count(),
-            ),
+            shared_memory_mib: pool_mib(wanted_mib, self.process_count()),
             supervised: true,
             ..BusConfig::default()
         };
@@ -241,7 +239,10 @@ impl Planner<'_> {
         life: RestartPolicy,
         config: impl FnOnce(BusConfig) -> C,
     ) -> Result<(), RunFolderError> {
-        self.metrics = self.metrics.and_then(port_behind);
+        self.metrics = self.metrics.and_then(|previous| {
+            let port = previous.port().checked_add(1)?;
+            Some(SocketAddr::new(previous.ip(), port))
+        });
         let bus = BusConfig {
             keys: self.context.keys.map(|keys| keys.of_process(&name)),
             metrics: self.metrics,
@@ -261,13 +262,6 @@ impl Planner<'_> {
         });
         Ok(())
     }
-}
-
-fn port_behind(address: SocketAddr) -> Option<SocketAddr> {
-    Some(SocketAddr::new(
-        address.ip(),
-        address.port().checked_add(1)?,
-    ))
 }
 
 /// Pool of each of some processes, MiB: the `wanted` one, or 0 with a warning where the system has no room for all.

@@ -41,14 +41,12 @@ impl Fleet {
                 // Over an emulated link a message takes two hops, and both have to be there.
                 if self.is_over_link() {
                     routes.push(route(cav, stream, &link));
-                    routes.push(Route {
-                        topic: Topic::Received {
-                            ego: self.ego.clone(),
-                            cav: cav.clone(),
-                            stream,
-                        },
-                        receiver: ego.clone(),
-                    });
+                    let received = Topic::Received {
+                        ego: self.ego.clone(),
+                        cav: cav.clone(),
+                        stream,
+                    };
+                    routes.push(Route::new(received, ego.clone()));
                 } else {
                     routes.push(route(cav, stream, &ego));
                 }
@@ -61,16 +59,15 @@ impl Fleet {
     /// published before it subscribes are not recorded.
     pub(super) fn recorded(&self, mut routes: Vec<Route>) -> Vec<Route> {
         if self.scenario.record.is_some() {
-            let receiver = process_id(Role::Recorder, &recorder_cav());
+            let recorder = CavId::new(RECORDER).expect("eight lower-case letters");
+            let receiver = process_id(Role::Recorder, &recorder);
             let sensors = self.agents.iter().flat_map(|cav| {
                 [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Topic::stream(cav, stream))
             });
             let topics = routes.iter().map(|route| route.topic.clone());
             let topics: BTreeSet<Topic> = topics.chain(sensors).collect();
-            routes.extend(topics.into_iter().map(|topic| Route {
-                topic,
-                receiver: receiver.clone(),
-            }));
+            let topics = topics.into_iter();
+            routes.extend(topics.map(|topic| Route::new(topic, receiver.clone())));
         }
         routes
     }
@@ -78,9 +75,4 @@ impl Fleet {
 
 fn route(cav: &CavId, stream: Stream, receiver: &ProcessId) -> Route {
     Route::new(Topic::stream(cav, stream), receiver.clone())
-}
-
-/// Id of the recorder in place of a vehicle's.
-fn recorder_cav() -> CavId {
-    CavId::new(RECORDER).expect("eight lower-case letters")
 }

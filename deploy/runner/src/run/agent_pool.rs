@@ -17,7 +17,7 @@ use protocol::{CavId, ProcessId, RunId};
 
 use crate::fleet::{Fleet, SessionContext};
 use crate::run::RunError;
-use crate::run::run_fleet::check_free;
+use crate::run::common::check_free;
 
 /// Name on the bus of the process that distributes the sweeps.
 const NAME: &str = "stepped";

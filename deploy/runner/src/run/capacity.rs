@@ -18,9 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::fleet::{Fleet, RUNNER};
 use crate::run::RunError;
-use crate::run::loss::listed;
 use crate::run::machine::{AVX2, this_machine};
-use crate::run::stepped::setup;
 
 /// Time for computing frames before a run; loading the models comes on top.
 pub(crate) const BUDGET: Duration = Duration::from_millis(600);
@@ -66,10 +64,8 @@ pub fn estimate(fleet: &Fleet, programs: &Path, budget: Duration) -> io::Result<
         .collect::<io::Result<_>>()?;
     // All have ended before the first error is returned: none computes beside the run.
     let ended: Vec<_> = children.into_iter().map(Child::wait_with_output).collect();
-    let measured = ended
-        .into_iter()
-        .map(|output| answer(output?))
-        .collect::<io::Result<Vec<Measured>>>()?;
+    let measured = ended.into_iter().map(|output| answer(output?));
+    let measured = measured.collect::<io::Result<Vec<Measured>>>()?;
     Ok(Some(capacity_of(
         machine,
         &measured,
@@ -113,7 +109,7 @@ fn answer<T: DeserializeOwned>(output: Output) -> io::Result<T> {
 /// [`RunError`] when models or frames cannot be loaded or computed.
 pub fn measure(fleet: &Fleet, budget: Duration) -> Result<Measured, RunError> {
     fleet.scenario.models.threads.apply();
-    let mut evaluator = Evaluator::new(setup(fleet)?)?;
+    let mut evaluator = Evaluator::new(fleet.setup().map_err(RunError::Fleet)?)?;
     let (began, before_s) = (Instant::now(), process_cpu_s());
     let estimated = evaluator.estimate(&fleet.recorded, fleet.agents.len(), budget)?;
     // Bounded: several threads give more than 1, and 0 would make a frame endless later on.
@@ -125,10 +121,8 @@ pub fn measure(fleet: &Fleet, budget: Duration) -> Result<Measured, RunError> {
         agent_ms: (steps.pose_ms + steps.map_ms) * free_share,
         fuse_ms: steps.fuse_ms * free_share,
         stages: estimated.stages.map(|stages| {
-            stages
-                .into_iter()
-                .map(|(stage, ms)| (stage, ms * free_share))
-                .collect()
+            let stages = stages.into_iter();
+            stages.map(|(stage, ms)| (stage, ms * free_share)).collect()
         }),
         free_share,
     })
@@ -146,13 +140,11 @@ fn period_ms(fleet: &Fleet) -> Option<f64> {
     let scene = &scenario.scene;
     let has_pace =
         !scene.lockstep && scene.rate > 0.0 && scenario.models.device == ComputeDevice::Cpu;
-    let steps = recorded
-        .ticks
-        .windows(2)
-        .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+    let times = recorded.ticks.iter().map(|tick| tick.capture_nanos);
+    let pairs = times.clone().zip(times.skip(1));
+    let steps = pairs.map(|(from, to)| to.saturating_sub(from));
     // The shortest step is the hardest to keep up with.
-    let least = steps.min().filter(|_| has_pace)?;
-    Some(least as f64 * 1e-6 / scene.rate)
+    Some(steps.min().filter(|_| has_pace)? as f64 * 1e-6 / scene.rate)
 }
 
 /// Megabytes of a frame: of each vehicle its sweep, and its map if it sends maps.
@@ -213,10 +205,7 @@ fn capacity_of(
         messages_ms,
         period_ms,
         unit_ms,
-        stages: measured
-            .first()
-            .map(|one| one.stages.clone())
-            .unwrap_or_default(),
+        stages: { measured.first() }.map_or_else(Default::default, |one| one.stages.clone()),
         free_share,
         needed_ms,
         available_ms,
@@ -227,32 +216,33 @@ fn capacity_of(
 /// Changes that let a fleet answer more ticks, the mildest first, as text: `tracked poses, method max or clock: stepped`.
 pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
     let scenario = &fleet.scenario;
-    let mut all = Vec::new();
-    if fleet.pose_source() == "pgc" {
-        all.push("tracked poses (agents.pose.tracked)".to_owned());
-    }
-    if scenario.method.exchange() == Exchange::Features && scenario.method != Method::MAX {
-        all.push("method max".to_owned());
-    }
-    if fleet.agents.len() > 2 {
-        all.push("fewer vehicles (scene.agents)".to_owned());
-    }
     let relative = capacity.map_or(0.5, Capacity::relative_rate);
     // At most two digits after the point.
     let rate = (relative * scenario.scene.rate * 100.0).round() / 100.0;
-    all.push(format!("--rate {rate}"));
+    let rate = format!("--rate {rate}");
+    let sends_maps = scenario.method.exchange() == Exchange::Features;
     // Simulation time refuses processes that are slower than the scene.
     let fits = capacity
         .is_none_or(|capacity| capacity.agent_ms.max(capacity.fuse_ms) < 0.9 * capacity.period_ms);
-    all.push(
-        if fits {
-            "clock: stepped"
-        } else {
-            "scene.lockstep: true"
-        }
-        .to_owned(),
-    );
-    listed(&all, "or")
+    let all = [
+        (fleet.pose_source() == "pgc").then_some("tracked poses (agents.pose.tracked)"),
+        (sends_maps && scenario.method != Method::MAX).then_some("method max"),
+        (fleet.agents.len() > 2).then_some("fewer vehicles (scene.agents)"),
+        Some(rate.as_str()),
+        fits.then_some("clock: stepped"),
+        (!fits).then_some("scene.lockstep: true"),
+    ];
+    let all = all.into_iter().flatten().map(str::to_owned);
+    listed(&Vec::from_iter(all), "or")
+}
+
+/// `a, b and c`.
+pub(super) fn listed(parts: &[String], word: &str) -> String {
+    match parts {
+        [] => String::new(),
+        [only] => only.clone(),
+        [first @ .., last] => format!("{} {word} {last}", first.join(", ")),
+    }
 }
 
 #[cfg(test)]

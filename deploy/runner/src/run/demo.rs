@@ -14,8 +14,7 @@ const MARGIN_M: f64 = 12.0;
 
 /// Draws that frame of a run. A picture that cannot be drawn is a warning: the run itself is complete.
 pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> {
-    let frame = board.showpiece()?;
-    match try_draw(fleet, frame, path) {
+    match try_draw(fleet, board.showpiece()?, path) {
         Ok(()) => Some(path.to_path_buf()),
         Err(error) => {
             tracing::warn!("no picture of the run: {error}");
@@ -58,21 +57,17 @@ fn try_draw(
             { loaded.iter() }.map(|(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
         around(boxes.chain(vehicles), limit)
     });
+    let views = loaded.iter().map(|(name, ego_from_cav, xyzi)| View {
+        name: name.clone(),
+        ego_from_cav: *ego_from_cav,
+        xyzi,
+    });
+    let (method, tick, name) = (fleet.scenario.method, frame.tick, &scenario.name);
     Picture {
-        title: format!(
-            "{}  tick {} (most neighbours)  {}",
-            fleet.scenario.method, frame.tick, scenario.name
-        ),
+        title: format!("{method}  tick {tick} (most neighbours)  {name}"),
         x_m,
         y_m,
-        views: loaded
-            .iter()
-            .map(|(name, ego_from_cav, xyzi)| View {
-                name: name.clone(),
-                ego_from_cav: *ego_from_cav,
-                xyzi,
-            })
-            .collect(),
+        views: views.collect(),
         truth: frame.truth.clone(),
         detections,
     }

@@ -2,10 +2,18 @@
 
 use protocol::DropReason;
 
-use crate::run::run_fleet::RunResult;
+use crate::run::capacity::listed;
+use crate::run::common::RunResult;
 
 /// Drop reasons of messages that came too late for a busy process, or were not computed for that.
 const OVERLOAD: [DropReason; 3] = [DropReason::Superseded, DropReason::Stale, DropReason::Paced];
+
+impl RunResult {
+    /// True if data were lost beyond the drops of the link.
+    pub fn lost_data(&self) -> bool {
+        sentence(self).is_some()
+    }
+}
 
 /// Reasons for exit code 3 and what would help; `None` if nothing was lost beyond the drops of the link.
 pub(crate) fn sentence(result: &RunResult) -> Option<String> {
@@ -15,42 +23,29 @@ pub(crate) fn sentence(result: &RunResult) -> Option<String> {
 }
 
 fn reasons(result: &RunResult) -> Vec<String> {
-    let mut reasons = Vec::new();
-    if result.interrupted && result.metrics.ticks == 0 {
-        reasons.push("ended before its first tick".into());
-    }
-    if result.missed > 0 {
-        reasons.push(format!(
-            "{} of {} ticks unanswered",
-            result.missed, result.metrics.ticks
-        ));
-    }
-    let messages = &result.metrics.messages;
+    let (missed, metrics) = (result.missed, &result.metrics);
+    let messages = &metrics.messages;
     let dropped = messages.dropped.iter();
     let lost = dropped.filter(|(reason, count)| reason.is_loss() && **count > 0);
-    let dropped =
-        lost.map(|(reason, count)| format!("{count} {}", reason.as_str().replace('_', " ")));
-    let dropped: Vec<String> = dropped.collect();
-    if !dropped.is_empty() {
-        reasons.push(format!("messages lost ({})", dropped.join(", ")));
-    }
-    if messages.are_stuck() {
-        reasons.push("most messages were still in flight at the end".into());
-    }
-    if !result.balance.is_exact() {
-        let count = result.balance.discrepancies.len();
-        reasons.push(format!("{count} accounts of ledger.json do not add up"));
-    }
-    let left_out = &result.metrics.left_out;
-    reasons.extend((!left_out.is_nothing()).then(|| left_out.to_string()));
-    reasons.extend(result.failures.iter().cloned());
+    let lost = lost.map(|(reason, count)| format!("{count} {}", reason.as_str().replace('_', " ")));
+    let lost: Vec<String> = lost.collect();
+    let has_begun = !result.interrupted || metrics.ticks > 0;
+    let (accounts, files) = (result.balance.discrepancies.len(), result.unwritten.len());
+    let counted = [
+        (!has_begun).then(|| "ended before its first tick".into()),
+        (missed > 0).then(|| format!("{missed} of {} ticks unanswered", metrics.ticks)),
+        (!lost.is_empty()).then(|| format!("messages lost ({})", lost.join(", "))),
+        { messages.are_stuck() }.then(|| "most messages were still in flight at the end".into()),
+        (!result.balance.is_exact())
+            .then(|| format!("{accounts} accounts of ledger.json do not add up")),
+        (!metrics.left_out.is_nothing()).then(|| metrics.left_out.to_string()),
+    ];
     let killed = result.killed.iter();
-    reasons.extend(killed.map(|process| format!("{process} did not end in time")));
-    if !result.unwritten.is_empty() {
-        let count = result.unwritten.len();
-        reasons.push(format!("{count} files of the run are incomplete"));
-    }
-    reasons
+    let killed = killed.map(|process| format!("{process} did not end in time"));
+    let reasons = counted.into_iter().flatten();
+    let reasons = reasons.chain(result.failures.iter().cloned()).chain(killed);
+    let unwritten = (files > 0).then(|| format!("{files} files of the run are incomplete"));
+    reasons.chain(unwritten).collect()
 }
 
 /// What would help, from the first cause that applies.
@@ -81,14 +76,5 @@ fn help(result: &RunResult) -> Option<String> {
         None
     } else {
         Some(log)
-    }
-}
-
-/// `a, b and c`.
-pub(super) fn listed(parts: &[String], word: &str) -> String {
-    match parts {
-        [] => String::new(),
-        [only] => only.clone(),
-        [first @ .., last] => format!("{} {word} {last}", first.join(", ")),
     }
 }

@@ -24,11 +24,9 @@ pub(crate) fn this_machine() -> Machine {
     let limits = AVX2
         .iter()
         .filter_map(|(name, _)| Some(format!("{name}={}", std::env::var(name).ok()?)));
-    let limits: Vec<String> = limits.collect();
-    let limited = if limits.is_empty() {
-        String::new()
-    } else {
-        format!(" (limited by {})", limits.join(" "))
+    let limited = match &Vec::from_iter(limits)[..] {
+        [] => String::new(),
+        limits => format!(" (limited by {})", limits.join(" ")),
     };
     Machine {
         cores,
@@ -39,27 +37,18 @@ pub(crate) fn this_machine() -> Machine {
 /// Vector instructions of the processor.
 #[cfg(target_arch = "x86_64")]
 fn instructions() -> String {
-    let has = [
-        (
-            "AVX2",
-            is_x86_feature_detected!("avx2") && !is_x86_feature_detected!("avx512f"),
-        ),
-        ("AVX-512", is_x86_feature_detected!("avx512f")),
-        (
-            "VNNI",
-            is_x86_feature_detected!("avx512vnni") || is_x86_feature_detected!("avxvnni"),
-        ),
-        ("AMX", has_amx()),
+    let has_avx512 = is_x86_feature_detected!("avx512f");
+    let has_avx2 = is_x86_feature_detected!("avx2");
+    let has_vnni = is_x86_feature_detected!("avx512vnni") || is_x86_feature_detected!("avxvnni");
+    let names = [
+        (has_avx2 && !has_avx512).then_some("AVX2"),
+        has_avx512.then_some("AVX-512"),
+        has_vnni.then_some("VNNI"),
+        has_amx().then_some("AMX"),
     ];
-    let names: Vec<&str> = has
-        .iter()
-        .filter(|(_, is_there)| *is_there)
-        .map(|(name, _)| *name)
-        .collect();
-    if names.is_empty() {
-        "no AVX2".into()
-    } else {
-        names.join(", ")
+    match &Vec::from_iter(names.into_iter().flatten())[..] {
+        [] => "no AVX2".into(),
+        names => names.join(", "),
     }
 }
 

@@ -2,6 +2,7 @@
 
 pub(crate) mod agent_pool;
 pub mod capacity;
+mod common;
 pub mod demo;
 pub(crate) mod ledger_report;
 pub(crate) mod loss;

@@ -127,10 +127,8 @@ impl Picture<'_> {
     }
 
     fn coloured_views(&self) -> impl DoubleEndedIterator<Item = (&View<'_>, RGBColor)> {
-        self.views
-            .iter()
-            .enumerate()
-            .map(|(index, view)| (view, CAV_COLOURS[index % CAV_COLOURS.len()]))
+        let views = self.views.iter().enumerate();
+        views.map(|(index, view)| (view, CAV_COLOURS[index % CAV_COLOURS.len()]))
     }
 
     /// True if a point is on the plan view or at most `margin_m` outside it.
@@ -168,10 +166,8 @@ impl Picture<'_> {
     /// The outline, with a stroke from the centre to the front.
     fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &Plane<'_>) -> Result<()> {
         let corners = shape.corners();
-        if !corners
-            .iter()
-            .all(|corner| self.is_near(corner[0], corner[1], BOX_MARGIN_M))
-        {
+        let mut places = corners.iter();
+        if !places.all(|[x, y, _]| self.is_near(*x, *y, BOX_MARGIN_M)) {
             return Ok(());
         }
         // Corners 0 to 3 are the bottom face, and 0 and 1 its front edge.
@@ -179,19 +175,14 @@ impl Picture<'_> {
         plane.draw(&PathElement::new(outline, stroke(colour)))?;
         let front = [0, 1].map(|axis| (corners[0][axis] + corners[1][axis]) / 2.0);
         let [x, y, _] = shape.center_m;
-        Ok(plane.draw(&PathElement::new(
-            [(x, y), (front[0], front[1])],
-            stroke(colour),
-        ))?)
+        let ahead = [(x, y), (front[0], front[1])];
+        Ok(plane.draw(&PathElement::new(ahead, stroke(colour)))?)
     }
 
     /// Detections whose score is written: the highest ones first, and none over another.
     fn labelled(&self) -> Vec<(&Box3d, f32)> {
-        let mut by_score: Vec<_> = self
-            .detections
-            .iter()
-            .map(|(found, score)| (found, *score))
-            .collect();
+        let scored = self.detections.iter().map(|(found, score)| (found, *score));
+        let mut by_score: Vec<_> = scored.collect();
         by_score.sort_by(|(_, a), (_, b)| b.total_cmp(a));
         let mut labelled: Vec<(&Box3d, f32)> = Vec::new();
         for (found, score) in by_score {
@@ -232,10 +223,9 @@ impl Picture<'_> {
         area.draw(&Text::new(self.title.as_str(), (14, 8), text(18, INK)))?;
         let mut x = 14;
         for (label, colour, is_outline) in self.legend() {
-            let style = if is_outline {
-                stroke(colour)
-            } else {
-                colour.filled()
+            let style = match is_outline {
+                true => stroke(colour),
+                false => colour.filled(),
             };
             area.draw(&Rectangle::new([(x, 39), (x + 12, 51)], style))?;
             area.draw(&Text::new(label.as_str(), (x + 18, 38), text(15, INK)))?;
@@ -245,19 +235,14 @@ impl Picture<'_> {
     }
 
     fn legend(&self) -> Vec<(String, RGBColor, bool)> {
-        let cavs = self
-            .coloured_views()
-            .enumerate()
-            .map(|(index, (view, colour))| {
-                let role = if index == 0 { "ego" } else { "CAV" };
-                (format!("{role} {}", view.name), colour, false)
-            });
+        let cavs = self.coloured_views().enumerate();
+        let cavs = cavs.map(|(index, (view, colour))| {
+            let role = if index == 0 { "ego" } else { "CAV" };
+            (format!("{role} {}", view.name), colour, false)
+        });
         let truth = (format!("truth ({})", self.truth.len()), TRUTH, true);
-        let detected = (
-            format!("detected ({})", self.detections.len()),
-            DETECTION,
-            true,
-        );
+        let found = self.detections.len();
+        let detected = (format!("detected ({found})"), DETECTION, true);
         cavs.chain([truth, detected]).collect()
     }
 }

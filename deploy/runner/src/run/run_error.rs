@@ -85,3 +85,9 @@ impl RunError {
         }
     }
 }
+
+impl From<EvaluateError> for RunError {
+    fn from(error: EvaluateError) -> Self {
+        Self::Evaluate(Box::new(error))
+    }
+}

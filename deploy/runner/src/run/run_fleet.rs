@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::mem;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::mpsc::channel;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -10,28 +10,32 @@ use std::time::{Duration, Instant};
 use bus::shutdown::Stop;
 use bus::{MetricsPeer, Rejection};
 use dataset::findings;
-use deploy::operate::network::{Network, RouterEndpoint};
+use deploy::operate::network::RouterEndpoint;
 use deploy::operate::progress::Display;
+use deploy::operate::refusal_watch::RefusalWatch;
 use deploy::operate::router_panic;
-use deploy::operate::run_folder::{RunFolder, SWEEP_LOG, name_of_now};
-use deploy::operate::security::RefusalWatch;
+use deploy::operate::run_folder::{RunFolder, SWEEP_LOG};
 use deploy::operate::status::Phase;
 use deploy::operate::status_reporter::{Ending, StatusReporter};
 use deploy::operate::supervise::{ProcessSpec, Supervisor};
+use deploy::operate::timeouts::Timeouts;
 use deploy::operate::{RECORDER, REPLAY};
 use deploy::report::{self, Capacity, RunReport};
 use deploy::score::metrics::Metrics;
 use deploy::score::{FrameScores, Progress, Scored, ScorerNode, TRACKS, offline_intervals};
-use protocol::{Ledger, Reconciliation, Role, RunId};
+use protocol::{Ledger, Role, RunId};
 use support::atomic_file;
 use support::output;
 use support::provenance::Provenance;
 
 use crate::fleet::{Fleet, SessionContext};
 use crate::run::capacity::{BUDGET, estimate, remedies};
+use crate::run::common::{check_free, in_folder};
 use crate::run::ledger_report::{LedgerReport, RefusedReport};
-use crate::run::{RunError, loss};
+use crate::run::{RunError, stepped};
 use crate::scenario::{Clock, Scenario};
+
+pub use crate::run::common::{RunOptions, RunResult};
 
 /// Update interval of the display.
 const BEAT: Duration = Duration::from_millis(100);
@@ -49,83 +53,19 @@ const LINES: [&str; 3] = ["detections.jsonl", "truth.jsonl", TRACKS];
 /// A run whose router, in this process, passes no message.
 const ROUTER_FAILED: &str = "the router of the run failed, and no message passed any more";
 
-/// Settings of a run beside its scenario.
-#[derive(Debug, Clone)]
-pub struct RunOptions {
-    /// Folder of the run folders.
-    pub runs: PathBuf,
-    /// Folder of the programs `agent`, `ego-fuser` and `sim-replay`.
-    pub programs: PathBuf,
-    /// First part of the name of an unnamed run.
-    pub prefix: &'static str,
-}
-
-/// Result of a run.
-#[derive(Debug)]
-pub struct RunResult {
-    /// Folder of the run.
-    pub folder: RunFolder,
-    /// Metrics of the run.
-    pub metrics: Metrics,
-    /// Message accounting: the discrepancies between senders and receivers.
-    pub balance: Reconciliation,
-    /// Number of ticks for which the ego published nothing.
-    pub missed: u64,
-    /// True if the run was interrupted before its end.
-    pub interrupted: bool,
-    /// Processes that did not end in time and were killed.
-    pub killed: Vec<String>,
-    /// Files of the run that could not be written, with the reason (for example a full disk).
-    pub unwritten: Vec<String>,
-    /// Processes that failed in their task, with the reason.
-    pub failures: Vec<String>,
-    /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
-    pub causes: Vec<String>,
-    /// Changes that would let the fleet answer more ticks; `None` in simulation time, where it answers all.
-    pub remedies: Option<String>,
-    /// Pace, stages and resources.
-    pub report: RunReport,
-    /// Picture of one fused frame, if one could be drawn.
-    pub picture: Option<PathBuf>,
-}
-
-impl RunResult {
-    /// True if data were lost beyond the drops of the link.
-    pub fn lost_data(&self) -> bool {
-        loss::sentence(self).is_some()
-    }
-}
-
 /// Runs a scenario to its end, or until Ctrl-C.
 ///
 /// # Errors
 /// [`RunError`] when the run cannot start, or a process stays down.
 pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
     if scenario.clock == Clock::Stepped {
-        return crate::run::stepped::run_scenario(scenario, options);
+        return stepped::run_scenario(scenario, options);
     }
     let fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
     in_folder(&fleet, options, |run, folder| {
         go(&fleet, options, run, folder)
     })
-}
-
-/// Computes a run in a folder of its own, which is removed if the run is refused.
-pub(super) fn in_folder(
-    fleet: &Fleet,
-    options: &RunOptions,
-    go: impl FnOnce(&RunId, &RunFolder) -> Result<RunResult, RunError>,
-) -> Result<RunResult, RunError> {
-    let named = fleet.scenario.run.clone();
-    let run = named.unwrap_or_else(|| name_of_now(options.prefix));
-    let folder = RunFolder::create(&options.runs, &run)?;
-    let result = go(&run, &folder);
-    // After a failure in the run the folder stays: it holds the logs.
-    if result.as_ref().is_err_and(RunError::is_refusal) {
-        folder.remove();
-    }
-    result
 }
 
 /// Prints what this machine can carry. A run whose pace cannot be estimated goes on without.
@@ -136,10 +76,8 @@ fn announce_capacity(fleet: &Fleet, programs: &Path) -> Option<Capacity> {
     })?;
     output::note(format_args!("this machine: {capacity}"));
     if !capacity.keeps_up() {
-        output::note(format_args!(
-            "it will not keep up; {} would help",
-            remedies(fleet, Some(&capacity))
-        ));
+        let remedies = remedies(fleet, Some(&capacity));
+        output::note(format_args!("it will not keep up; {remedies} would help"));
     }
     Some(capacity)
 }
@@ -198,7 +136,8 @@ fn go(
     }
     // Not returned at once on an error: scorer and router have to be ended first.
     let watched = watch(fleet, &context, specs, &place, &scorer, &stop);
-    let has_router = !{ watched.as_ref() }.is_ok_and(|watched| watched.router_failed());
+    let has_router = !{ watched.as_ref() }
+        .is_ok_and(|watched| matches!(watched.ending, Ending::RouterFailed { .. }));
     let (scored, refused) = if has_router {
         // Before the scorer closes the session.
         let refused = refused.finish();
@@ -232,27 +171,6 @@ fn go(
     }
 }
 
-/// Checks that none of the processes to start, nor a scorer, is already present on a shared router.
-///
-/// # Errors
-/// [`RunError::Live`] names those present; [`RunError::Network`] when the router does not answer.
-pub(super) fn check_free(
-    place: &RouterEndpoint,
-    network: &Network,
-    run: &RunId,
-    specs: &[ProcessSpec],
-) -> Result<(), RunError> {
-    let processes = place.present(network, run, specs)?;
-    if processes.is_empty() {
-        return Ok(());
-    }
-    Err(RunError::Live {
-        run: run.clone(),
-        router: place.endpoint.to_string(),
-        processes,
-    })
-}
-
 /// Observations of the supervisor during a run.
 struct Watched {
     ending: Ending,
@@ -266,20 +184,12 @@ struct Watched {
     causes: Vec<String>,
 }
 
-impl Watched {
-    fn router_failed(&self) -> bool {
-        matches!(self.ending, Ending::RouterFailed { .. })
-    }
-}
-
 /// Arrival time of each sweep at the ego's agent, by capture time. An agent on another host writes none.
 fn swept(log: &Path) -> BTreeMap<u64, u64> {
     support::sweep_log::read(log).unwrap_or_else(|error| {
         if error.kind() != std::io::ErrorKind::NotFound {
-            tracing::warn!(
-                "{}: {error}; frames.csv lacks the arrival times of the sweeps",
-                log.display()
-            );
+            let log = log.display();
+            tracing::warn!("{log}: {error}; frames.csv lacks the arrival times of the sweeps");
         }
         BTreeMap::new()
     })
@@ -327,23 +237,27 @@ fn watch(
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
     offline.extend(watch.crashed());
-    if let Ending::RouterFailed { how } = &ending {
-        display.print_line(&format!("{ROUTER_FAILED}: {how}"));
+    let router_failure = match &ending {
+        Ending::RouterFailed { how } => Some(format!("{ROUTER_FAILED}: {how}")),
+        _ => None,
+    };
+    if let Some(failure) = &router_failure {
+        display.print_line(failure);
     }
     // Messages of any process may have been lost in that time.
-    if watch.had_outages() || matches!(ending, Ending::RouterFailed { .. }) {
+    if watch.had_outages() || router_failure.is_some() {
         offline.extend(everyone);
     }
-    watch.end(matches!(ending, Ending::RouterFailed { .. }));
+    watch.end(router_failure.is_some());
     watch.write_status(Phase::Ending, &scorer.progress());
-    let limits = Limits::of(fleet, &ending);
+    let [replay_until, drain_until, all_until] = deadlines(&fleet.scenario.timeouts, &ending);
     // In the order of the data flow, so that messages on their way still arrive.
-    let mut killed = supervisor.end(|name| name == REPLAY, limits.replay);
-    drain(&supervisor, scorer, limits.drain, &mut display);
-    killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all));
-    killed.extend(supervisor.end(|name| name != RECORDER, limits.all));
+    let mut killed = supervisor.end(|name| name == REPLAY, replay_until);
+    drain(&supervisor, scorer, drain_until, &mut display);
+    killed.extend(supervisor.end(|name| name.starts_with("agent"), all_until));
+    killed.extend(supervisor.end(|name| name != RECORDER, all_until));
     // The recorder last, as it takes down what the others send until their end.
-    killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE));
+    killed.extend(supervisor.end(|_| true, all_until + RECORDER_SHARE));
     display.finish();
     // Events that came while the processes were ended, which nobody has read.
     while let Ok(event) = happened.try_recv() {
@@ -352,8 +266,7 @@ fn watch(
     watch.write_status(Phase::Over, &scorer.progress());
     offline.extend(killed.iter().cloned());
     let (mut failures, mut causes) = (watch.failures(), watch.causes());
-    if let Ending::RouterFailed { how } = &ending {
-        let failure = format!("{ROUTER_FAILED}: {how}");
+    if let Some(failure) = router_failure {
         failures.push(failure.clone());
         causes.push(failure);
         // They cannot take their leave without a router.
@@ -368,30 +281,20 @@ fn watch(
     })
 }
 
-/// Deadlines of the steps of the end.
-struct Limits {
-    replay: Instant,
-    drain: Instant,
-    all: Instant,
-}
-
-impl Limits {
-    /// After Ctrl-C everything has to end within `stop_s`; a run that is over waits for its last results first.
-    fn of(fleet: &Fleet, ending: &Ending) -> Self {
-        let timeouts = &fleet.scenario.timeouts;
-        let (drain_s, stop_s) = (timeouts.drain_s, timeouts.stop_s);
-        let limits_s = match ending {
-            // The replay has ended by itself.
-            Ending::Over => [0.0, drain_s, drain_s + stop_s],
-            Ending::Asked => [stop_s * REPLAY_SHARE, stop_s * DRAIN_SHARE, stop_s],
-            Ending::RouterFailed { .. } => [0.0, 0.0, stop_s],
-            // The run has failed, so no further results are waited for.
-            Ending::Failed { .. } => [stop_s, 0.0, stop_s],
-        };
-        let now = Instant::now();
-        let [replay, drain, all] = limits_s.map(|after_s| now + Duration::from_secs_f64(after_s));
-        Self { replay, drain, all }
-    }
+/// Deadlines of the steps of the end: of the replay, of the last results, of all others. After Ctrl-C everything has to
+/// end within `stop_s`; a run that is over waits for its last results first.
+fn deadlines(timeouts: &Timeouts, ending: &Ending) -> [Instant; 3] {
+    let (drain_s, stop_s) = (timeouts.drain_s, timeouts.stop_s);
+    let limits_s = match ending {
+        // The replay has ended by itself.
+        Ending::Over => [0.0, drain_s, drain_s + stop_s],
+        Ending::Asked => [stop_s * REPLAY_SHARE, stop_s * DRAIN_SHARE, stop_s],
+        Ending::RouterFailed { .. } => [0.0, 0.0, stop_s],
+        // The run has failed, so no further results are waited for.
+        Ending::Failed { .. } => [stop_s, 0.0, stop_s],
+    };
+    let now = Instant::now();
+    limits_s.map(|after_s| now + Duration::from_secs_f64(after_s))
 }
 
 /// Waits until the ego has reported every tick, or the time is over.
@@ -512,9 +415,7 @@ fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
 }
 
 fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
-    let span = progress
-        .span
-        .map(|(first, last)| last.duration_since(first));
+    let span = { progress.span }.map(|(first, last)| last.duration_since(first));
     let seconds = span.map_or(0.0, |span| span.as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     Metrics {

@@ -11,9 +11,7 @@ use deploy::operate::run_folder::{RunFolder, RunFolderError};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
 use deploy::score::metrics::Metrics;
-use ego_fuser_offline::evaluation::{
-    AgentPool, EmulatedLink, EvaluateError, EvaluatedFrame, Evaluator, Setup,
-};
+use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::RunId;
 use support::provenance::Provenance;
 use terminal::progress;
@@ -23,8 +21,8 @@ use crate::fleet::Fleet;
 use crate::frame_lines::FrameLines;
 use crate::run::RunError;
 use crate::run::agent_pool::CrewProcesses;
+use crate::run::common::{RunOptions, RunResult, in_folder};
 use crate::run::ledger_report::LedgerReport;
-use crate::run::run_fleet::{RunOptions, RunResult, in_folder};
 use crate::scenario::Scenario;
 
 /// Runs a scenario in simulation time to its end.
@@ -35,7 +33,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     let mut fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
     fleet.scenario.models.threads.apply();
-    let mut evaluator = Evaluator::new(setup(&fleet)?)?;
+    let mut evaluator = Evaluator::new(fleet.setup().map_err(RunError::Fleet)?)?;
     let stepped = fleet.scenario.stepped.get_or_insert_default();
     // Measured once before the run, so that all frames take the same times.
     let compute = match stepped.compute {
@@ -57,12 +55,8 @@ fn go(
     (run, folder): (&RunId, &RunFolder),
     options: &RunOptions,
 ) -> Result<RunResult, RunError> {
-    let processes = fleet
-        .scenario
-        .stepped
-        .is_some_and(|stepped| stepped.processes);
     let mut running = None;
-    if processes {
+    if { fleet.scenario.stepped }.is_some_and(|stepped| stepped.processes) {
         let (processes, remote) = CrewProcesses::start(fleet, run, folder, &options.programs)?;
         evaluator.set_processes(Some(remote));
         running = Some(processes);
@@ -72,42 +66,6 @@ fn go(
     let killed = running.map(CrewProcesses::end).unwrap_or_default();
     let result = write(fleet, evaluator, &board, (run, folder.clone()), options)?;
     Ok(RunResult { killed, ..result })
-}
-
-/// Setup of a fleet in simulation time, with the compute times of its scenario.
-pub(super) fn setup(fleet: &Fleet) -> Result<Setup, RunError> {
-    let Scenario {
-        scene,
-        models,
-        method,
-        agents,
-        vehicles,
-        ego,
-        link,
-        stepped,
-        ..
-    } = &fleet.scenario;
-    // Without a link in the scenario messages take the ideal one.
-    let link = link.clone().unwrap_or_default();
-    let link = EmulatedLink::open(&link.model, link.seed);
-    let vehicles = { vehicles.iter() }.map(|(cav, own)| (cav.clone(), own.over(agents)));
-    let others = fleet.agents.iter().filter(|cav| **cav != fleet.ego);
-    Ok(Setup {
-        models: models.clone(),
-        method: Some(*method),
-        agents: agents.clone(),
-        vehicles: vehicles.collect(),
-        attack: None,
-        ego: ego.clone(),
-        link: Some(link.map_err(|error| RunError::Fleet(error.into()))?),
-        delay_ms: 0,
-        compute: { stepped.and_then(|stepped| stepped.compute) }.unwrap_or_default(),
-        protocol: Some(fleet.protocol.clone()),
-        pool: AgentPool::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
-        seek: scene.seek,
-        frames: fleet.ticks,
-        lidar_variant: scene.variant.clone(),
-    })
 }
 
 /// Computes all ticks; detections are appended to their file.
@@ -128,10 +86,9 @@ fn play(
         bar.inc(1);
         let is_written = lines.add(None, &frame);
         judge(&mut board, frame, true);
-        if is_written {
-            ControlFlow::Continue(())
-        } else {
-            ControlFlow::Break(())
+        match is_written {
+            true => ControlFlow::Continue(()),
+            false => ControlFlow::Break(()),
         }
     })?;
     bar.finish_and_clear();
@@ -151,10 +108,9 @@ fn write(
     let (poses, seconds) = (fleet.pose_source(), board.seconds());
     let mut metrics = metrics(board, evaluator, "stepped", poses, seconds);
     metrics.left_out.add_findings(fleet.findings.clone());
-    let provenance = fleet.provenance(&options.programs);
-    let provenance = provenance
-        .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))
-        .ok();
+    let provenance = { fleet.provenance(&options.programs) }
+        .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"));
+    let provenance = provenance.ok();
     let metrics = Metrics {
         provenance: provenance.clone().map(Provenance::with_command),
         ..metrics
@@ -164,10 +120,8 @@ fn write(
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
     folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
-    folder.write_json(
-        "ledger.json",
-        &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)),
-    )?;
+    let ledger = LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0));
+    folder.write_json("ledger.json", &ledger)?;
     let resolved = Scenario {
         provenance,
         ..fleet.scenario.clone()
@@ -188,10 +142,4 @@ fn write(
         report,
         picture,
     })
-}
-
-impl From<EvaluateError> for RunError {
-    fn from(error: EvaluateError) -> Self {
-        Self::Evaluate(Box::new(error))
-    }
 }

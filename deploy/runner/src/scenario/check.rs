@@ -52,9 +52,7 @@ impl Scenario {
             settings.validate()?;
             settings.check_attack(&settings.sent_for(needed))
         })?;
-        self.record
-            .as_ref()
-            .map_or(Ok(()), |record| record.validate())
+        { self.record.iter() }.try_for_each(|record| record.validate())
     }
 
     fn check_network(&self) -> Result<(), FieldError> {
@@ -122,9 +120,7 @@ impl Scenario {
     fn check_clock(&self) -> Result<(), FieldError> {
         if self.clock == Clock::Wall {
             let rule = "must be left out unless clock is stepped";
-            let given = self
-                .stepped
-                .map(|_| FieldError::new("stepped", "given", rule));
+            let given = { self.stepped }.map(|_| FieldError::new("stepped", "given", rule));
             return given.map_or(Ok(()), Err);
         }
         let (scene, remote) = (&self.scene, self.remote_agents.first());
@@ -170,9 +166,9 @@ impl Scenario {
                 return Err(FieldError::new(field, found, rule));
             }
         }
-        let Some(compute) = self.stepped.and_then(|stepped| stepped.compute) else {
-            return Ok(());
-        };
-        compute.validate("stepped.compute")
+        match self.stepped.and_then(|stepped| stepped.compute) {
+            Some(compute) => compute.validate("stepped.compute"),
+            None => Ok(()),
+        }
     }
 }

@@ -20,8 +20,7 @@ pub(crate) fn files_of<'a>(
         files.extend(settings.pose.files());
         files.extend(settings.weights.clone());
     }
-    let trace = link.and_then(|(link, folder)| Some(folder.join(link.trace_file()?)));
-    files.extend(trace);
+    files.extend(link.and_then(|(link, folder)| Some(folder.join(link.trace_file()?))));
     files
 }
 

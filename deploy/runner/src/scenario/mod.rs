@@ -140,8 +140,7 @@ impl Scenario {
 
     /// True if a vehicle sends boxes where the method fuses feature maps.
     pub(crate) fn sends_boxes(&self) -> bool {
-        let mut vehicles = self.vehicles.keys().map(|cav| self.settings_of(cav));
-        self.agents.boxes.is_some() || vehicles.any(|settings| settings.boxes.is_some())
+        self.settings().any(|settings| settings.boxes.is_some())
     }
 
     /// Settings of vehicle `cav`: `agents`, with its own entry of `vehicles` on top.

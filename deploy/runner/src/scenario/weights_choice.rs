@@ -54,21 +54,17 @@ fn one_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
         return Ok(path.to_path_buf());
     }
     let candidates = method.weights_names();
-    let mut last = (method.name(), 0);
-    for &name in &candidates {
-        let mut files = files_of(path, name)?;
-        match (files.pop(), files.len()) {
-            (Some(file), 0) => return Ok(file),
-            (None, _) => last = (name, 0),
-            // Several files of a better name are an error, which a worse name must not hide.
-            (Some(_), others) => {
-                last = (name, others + 1);
-                break;
-            }
+    let (mut name, mut found) = (method.name(), Vec::new());
+    for &candidate in &candidates {
+        // Several files of a better name are an error, which a worse name must not hide.
+        if found.is_empty() {
+            (name, found) = (candidate, files_of(path, candidate)?);
         }
     }
-    let (name, found) = last;
-    let trained = path.join(TRAINED_FILE);
+    if let [file] = &found[..] {
+        return Ok(file.clone());
+    }
+    let (trained, found) = (path.join(TRAINED_FILE), found.len());
     if found == 0 && trained.is_file() {
         return trained_for(trained, method, &candidates);
     }
@@ -87,10 +83,8 @@ fn trained_for(file: PathBuf, method: Method, candidates: &[&str]) -> Result<Pat
                 "method {method} needs weights trained for {}",
                 candidates[0]
             );
-            Err(FileError::new(
-                file,
-                format_args!("trained for {trained}, and {needed}"),
-            ))
+            let problem = format!("trained for {trained}, and {needed}");
+            Err(FileError::new(file, problem))
         }
         _ => Ok(file),
     }

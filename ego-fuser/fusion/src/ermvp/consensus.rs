@@ -1,10 +1,11 @@
 //! Consensus alignment: estimates the motion that aligns a neighbour's feature map with the ego's by commonly observed
 //! cells.
 
+use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-use crate::f64_tensor::sum_over_first;
+use crate::f64_tensor::{offsets_around, sum_over_first};
 use crate::layers::Linear;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
@@ -72,7 +73,7 @@ impl Consensus {
             return Ok(None);
         }
         // Step: the same search window around each of these cells, in the map of the ego.
-        let offsets = self.offsets(ego)?;
+        let offsets = tensor(&offsets_around(self.reach), &[-1, 2], ego.device())?;
         let rows = best.f_divide_scalar_mode(width, "floor")?;
         let columns = best.f_remainder(width)?;
         // Beyond the edge the nearest cell is used: a few cells of a window hardly matter.
@@ -112,18 +113,6 @@ impl Consensus {
             .f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?
             + 1e-6;
         key.f_div(&norm.f_sqrt()?)
-    }
-
-    /// `[(2 * reach + 1)^2, 2]` columns and rows around a cell.
-    fn offsets(&self, like: &Tensor) -> Result<Tensor, TchError> {
-        let side = -self.reach..=self.reach;
-        let offsets: Vec<i64> = side
-            .clone()
-            .flat_map(|row| side.clone().flat_map(move |column| [column, row]))
-            .collect();
-        Tensor::f_from_slice(&offsets)?
-            .f_view([-1, 2])?
-            .f_to_device(like.device())
     }
 
     /// The motion of points `from` `[K, 2]` by `moved`, scaled by the learnt share.

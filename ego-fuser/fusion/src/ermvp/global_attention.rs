@@ -1,12 +1,10 @@
 //! Window attention with global queries: queries summarise the whole feature map and are the same for all windows.
 
-use tch::{Kind, Tensor};
-use tch::{Result, nn};
+use tch::{Kind, Result, Tensor, nn};
 
-use crate::layers::{FeedForward, LayerNorm, Linear, attend, dropout};
+use crate::layers::{FeedForwardBlock, LayerNorm, Linear, attend, dropout};
 use crate::partition::{Partition, shape_error};
-use crate::swap_fusion::SwapFusionConfig;
-use crate::swap_fusion::{OffsetTable, Slots};
+use crate::swap_fusion::{OffsetTable, Slots, SwapFusionConfig};
 
 /// Share of the channels inside a squeeze.
 const SQUEEZE: i64 = 4;
@@ -47,16 +45,11 @@ impl Extract {
             .f_gelu("none")?;
         // Squeeze and excitation: a gate for each channel, from the mean over the map.
         let mean = seen.f_mean_dim([2i64, 3].as_slice(), false, None::<Kind>)?;
-        let gate = self
-            .excite
-            .forward(&self.squeeze.forward(&mean)?.f_gelu("none")?)?
-            .f_sigmoid()?;
+        let squeezed = self.squeeze.forward(&mean)?.f_gelu("none")?;
+        let gate = self.excite.forward(&squeezed)?.f_sigmoid()?;
         let seen = seen * gate.f_unsqueeze(2)?.f_unsqueeze(3)?;
-        let seen = self
-            .mix
-            .forward(&seen.f_permute([0, 2, 3, 1])?)?
-            .f_permute([0, 3, 1, 2])?;
-        (x + seen).f_max_pool2d([3i64, 3], [2i64, 2], one, one, false)
+        let mixed = self.mix.forward(&seen.f_permute([0, 2, 3, 1])?)?;
+        (x + mixed.f_permute([0, 3, 1, 2])?).f_max_pool2d([3i64, 3], [2i64, 2], one, one, false)
     }
 }
 
@@ -68,9 +61,7 @@ pub(super) struct GlobalHalf {
     key_value: Linear,
     offsets: OffsetTable,
     out: Linear,
-    feed_norm: LayerNorm,
-    feed_forward: FeedForward,
-    heads: i64,
+    feed_forward: FeedForwardBlock,
     window: i64,
     dropout: f64,
 }
@@ -89,9 +80,7 @@ impl GlobalHalf {
             key_value: Linear::new(&(&inner / "qkv"), channels, 2 * channels, true),
             offsets: OffsetTable::new(&inner, config),
             out: Linear::residual(&(&inner / "to_out" / 0), channels, channels, false),
-            feed_norm: LayerNorm::new(&(&feed / "norm"), channels),
-            feed_forward: FeedForward::new(&(&feed / "fn"), channels, hidden, config.dropout),
-            heads: channels / config.head_channels,
+            feed_forward: FeedForwardBlock::new(&feed, channels, hidden, config.dropout),
             window: config.window,
             dropout: config.dropout,
         }
@@ -106,31 +95,18 @@ impl GlobalHalf {
         let query = self.queries(&x, slots)?;
         let groups = Partition::Window.cut(&x, self.window)?;
         let windows = groups.size()[0];
-        let by_head = [self.heads, channels / self.heads];
+        let by_head = [self.offsets.heads, channels / self.offsets.heads];
         let query = query.f_unflatten(-1, by_head)?;
         let query = query.f_expand([windows, -1, -1, -1], false)?;
-        let key_value = self
-            .key_value
-            .forward(&groups)?
-            .f_view([windows, -1, 2 * channels])?
-            .f_split(channels, 2)?;
-        let bias = self.offsets.bias(count, slots.asked)?.f_unsqueeze(0)?;
-        let bias = match slots.unseen(Partition::Window, self.window)? {
-            Some(unseen) => bias + unseen,
-            None => bias,
-        };
-        let seen = attend(
-            &query,
-            &key_value[0].f_unflatten(-1, by_head)?,
-            &key_value[1].f_unflatten(-1, by_head)?,
-            Some(&bias),
-        )?;
+        let key_value = self.key_value.forward(&groups)?;
+        let key_value = key_value.f_view([windows, -1, 2 * channels])?;
+        let parts = key_value.f_split(channels, 2)?;
+        let [key, value] = [0, 1].map(|part: usize| parts[part].f_unflatten(-1, by_head));
+        let bias = (self.offsets).masked_bias(count, slots, Partition::Window)?;
+        let seen = attend(&query, &key?, &value?, Some(&bias))?;
         let seen = dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(&groups)?;
         let x = map + Partition::Window.map(&seen, [height, width], self.window)?;
-        Ok(&x
-            + self
-                .feed_forward
-                .forward(&self.feed_norm.forward(&x)?, train)?)
+        self.feed_forward.forward(&x, train)
     }
 
     /// One query for each token of a window, `[1, S * P, C]`: the mean over all windows of a smaller feature map after
@@ -149,22 +125,14 @@ impl GlobalHalf {
             Some(reach) => {
                 // A cell of the small feature map is valid where any of its cells is.
                 let step = [REDUCTION, REDUCTION];
-                let reach =
-                    reach
-                        .f_unsqueeze(1)?
-                        .f_max_pool2d(step, step, [0i64, 0], [1i64, 1], false)?;
+                let reach = reach.f_unsqueeze(1)?;
+                let reach = reach.f_max_pool2d(step, step, [0i64, 0], [1i64, 1], false)?;
                 let reach = reach.f_squeeze_dim(1)?;
-                Slots {
-                    reach: Some(&reach),
-                    ..slots
-                }
-                .unseen(Partition::Window, self.window)?
+                let reach = Some(&reach);
+                Slots { reach, ..slots }.unseen(Partition::Window, self.window)?
             }
         };
-        attend(&tokens, &tokens, &tokens, unseen.as_ref())?.f_mean_dim(
-            [0i64].as_slice(),
-            true,
-            None::<Kind>,
-        )
+        let seen = attend(&tokens, &tokens, &tokens, unseen.as_ref())?;
+        seen.f_mean_dim([0i64].as_slice(), true, None::<Kind>)
     }
 }

@@ -24,8 +24,7 @@ mod sampling;
 use perception::model_config::{ConfigError, DetectorConfig};
 use protocol::config::{require, within};
 use serde::{Deserialize, Serialize};
-use tch::nn;
-use tch::{TchError, Tensor};
+use tch::{TchError, Tensor, nn};
 
 use self::consensus::Consensus;
 use self::global_attention::{GlobalHalf, REDUCTION};
@@ -38,6 +37,7 @@ use super::partition::Partition;
 use super::settings::{FusionSettings, of_size};
 use super::spec::MethodSpec;
 use super::swap_fusion::{HalfBlock, MeanHead, Slots, SwapFusionConfig};
+use super::warp::WarpedMaps;
 
 /// ERMVP.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<ErmvpConfig>(
@@ -86,11 +86,9 @@ impl ErmvpConfig {
         self.layers.validate()?;
         within("fusion.compared", self.compared, 1, 4096)?;
         within("fusion.search", self.search, 1, 16)?;
-        let (field, rule) = (
-            "fusion.layers.count_missing",
-            "must be false: only present agents are fused",
-        );
-        require(!self.layers.count_missing, field, true, rule)?;
+        let (field, holds) = ("fusion.layers.count_missing", !self.layers.count_missing);
+        let rule = "must be false: only present agents are fused";
+        require(holds, field, true, rule)?;
         let is_share = self.kept > 0.0 && self.kept <= 1.0;
         let rule = "must be a share above 0 and up to 1";
         Ok(require(is_share, "fusion.kept", self.kept, rule)?)
@@ -114,6 +112,16 @@ impl FusionSettings for ErmvpConfig {
 struct Layer {
     local: HalfBlock,
     global: GlobalHalf,
+}
+
+impl Layer {
+    fn new(path: &nn::Path<'_>, sizes: &SwapFusionConfig) -> Self {
+        let (attention, feed) = (path / "window_attention", path / "window_ffd");
+        Self {
+            local: HalfBlock::new(Partition::Window, &attention, &feed, sizes),
+            global: GlobalHalf::new(path, sizes),
+        }
+    }
 }
 
 /// The method behind the common interface.
@@ -143,15 +151,7 @@ impl Ermvp {
                 config.search,
             ),
             layers: (0..sizes.depth)
-                .map(|index| {
-                    let path = path / "layers" / index;
-                    let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
-                    let local = HalfBlock::new(Partition::Window, &attention, &feed, sizes);
-                    Layer {
-                        local,
-                        global: GlobalHalf::new(&path, sizes),
-                    }
-                })
+                .map(|index| Layer::new(&(path / "layers" / index), sizes))
                 .collect(),
             head: MeanHead::new(&(path / "mlp_head"), sizes.channels),
             window: sizes.window,
@@ -187,21 +187,17 @@ impl Fusion for Ermvp {
     fn fuse(&self, aligned: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let (warped, is_training) = (&aligned.warped, aligned.is_training);
         let order = nearest_first(&aligned.metadata).to_device(warped.features.device());
-        let features = warped.features.f_index_select(0, &order)?;
-        let mask = warped.mask.f_index_select(0, &order)?;
+        let WarpedMaps { features, mask } = warped.each(|map| map.f_index_select(0, &order))?;
         // Global queries come from a map reduced by REDUCTION, which needs whole windows too.
         let padding = Padding::to_multiples(&features, self.window * REDUCTION)?;
-        let maps = padding
-            .maps(&features, 0)?
-            .f_permute([0, 2, 3, 1])?
-            .f_contiguous()?;
-        let (maps, reach) = self.received(&maps, &padding.mask(&mask, 0)?.f_squeeze_dim(1)?)?;
+        let maps = padding.maps(&features, 0)?.f_permute([0, 2, 3, 1])?;
+        let maps = maps.f_contiguous()?;
+        let (mut x, reach) = self.received(&maps, &padding.mask(&mask, 0)?.f_squeeze_dim(1)?)?;
         let slots = Slots {
             asked: reach.size()[0],
             reach: Some(&reach),
             count_missing: false,
         };
-        let mut x = maps;
         for layer in &self.layers {
             let groups = layer.local.whole(&x, slots, self.window, is_training)?;
             x = Partition::Window.map(&groups, padding.size(), self.window)?;

@@ -1,7 +1,6 @@
 //! Sampling: selects the cells of a neighbour that are worth sending.
 
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor, nn};
 
 use crate::layers::Linear;
 
@@ -19,10 +18,8 @@ impl Sampler {
         let path = path / "score_pred_net";
         let score = Linear::residual(&(&path / 2), channels, 1, true);
         // Near one at the start, so that selected cells are passed on almost unchanged.
-        let _ = score
-            .bias
-            .as_ref()
-            .map(|bias| tch::no_grad(|| bias.shallow_clone().fill_(2.0)));
+        let bias = score.bias.as_ref();
+        let _ = bias.map(|bias| tch::no_grad(|| bias.shallow_clone().fill_(2.0)));
         Self {
             hidden: Linear::new(&(&path / 0), channels, channels, true),
             score,
@@ -54,18 +51,11 @@ impl Sampler {
         // Scores are above zero, so cells out of reach rank last.
         let ranked = (ranked * &reach_of_others).f_view([agents - 1, cells])?;
         let (_, best) = ranked.f_topk(count, 1, true, false)?;
-        let kept = ranked
-            .f_zeros_like()?
-            .f_scatter_value(1, &best, 1.0)?
-            .f_view([agents - 1, height, width])?;
-        Tensor::f_cat(
-            &[
-                reach.f_narrow(0, 0, 1)?,
-                // Where fewer cells are in reach than are kept, topk has filled up with others.
-                kept.f_to_kind(Kind::Float)? * reach_of_others,
-            ],
-            0,
-        )
+        let kept = ranked.f_zeros_like()?.f_scatter_value(1, &best, 1.0)?;
+        let kept = kept.f_view([agents - 1, height, width])?;
+        // Where fewer cells are in reach than are kept, topk has filled up with others.
+        let kept = kept.f_to_kind(Kind::Float)? * reach_of_others;
+        Tensor::f_cat(&[reach.f_narrow(0, 0, 1)?, kept], 0)
     }
 }
 

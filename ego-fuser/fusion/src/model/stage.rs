@@ -86,25 +86,19 @@ impl FusionStage {
         let shares_maps = method.exchange() == Exchange::Features;
         let mixing = shares_maps.then(|| ChannelMixing::new(path, detector.feature_channels()));
         let fusion = config.build(&(path / "fusion"))?;
-        let sizes = [
-            detector.feature_channels(),
-            detector.anchors.yaws_deg.len() as i64,
-        ];
+        let anchors = detector.anchors.yaws_deg.len() as i64;
+        let sizes = [detector.feature_channels(), anchors];
         let requirements = config.requirements();
-        let classes = requirements
-            .history
-            .full_resolution
-            .then(|| Classes::under(path, sizes));
-        let (grid, y_axis) = (detector.feature_grid(), detector.y_axis);
+        let needs_classes = requirements.history.full_resolution;
         Ok(Self {
             config: config.clone(),
             requirements,
             fusion,
             mixing,
             box_input: None,
-            classes,
-            grid,
-            y_axis,
+            classes: needs_classes.then(|| Classes::under(path, sizes)),
+            grid: detector.feature_grid(),
+            y_axis: detector.y_axis,
             search: None,
         })
     }
@@ -135,9 +129,8 @@ impl FusionStage {
             stage.mixing = None;
         }
         // On the CPU only: the operators in integers are those of oneDNN.
-        if let Some(scales) = weights
-            .activation_scales()?
-            .filter(|_| device == Device::Cpu)
+        if let Some(scales) = weights.activation_scales()?
+            && device == Device::Cpu
         {
             tch::no_grad(|| stage.fusion.quantise(&scales))
                 .map_err(|error| weights.quantise_error(error))?;
@@ -225,16 +218,10 @@ impl FusionStage {
         let earlier = received.only(newest, count)?;
         // As live, where a map at full resolution is kept in the axes that the ego had when the map was new.
         let then = then_from_cav(&self.of_network(metadata), newest as usize);
-        let turned = ReceivedMaps::new(
-            self.turned(&earlier.maps, &then, self.order())?,
-            earlier.sent.as_ref().map(Tensor::shallow_clone),
-        );
+        let turned = earlier.with_maps(self.turned(&earlier.maps, &then)?);
         let earlier = self.kept(&earlier, &turned)?;
-        self.align_with(
-            &received.only(0, newest.min(count))?,
-            Some(earlier),
-            metadata,
-        )
+        let newest = received.only(0, newest.min(count))?;
+        self.align_with(&newest, Some(earlier), metadata)
     }
 
     /// The form in which maps are kept for later frames, given the same maps in the axes of the ego, `turned`.
@@ -256,18 +243,11 @@ impl FusionStage {
                     .map(|sent| larger_cells(sent, cells)?.f_ceil())
                     .transpose()?,
             ),
-            None => ReceivedMaps::new(
-                maps.shallow_clone(),
-                sent.as_ref().map(Tensor::shallow_clone),
-            ),
+            None => received.with_maps(maps.shallow_clone()),
         };
         let full_resolution = match history.full_resolution {
             true if turned.full_resolution.is_empty() => full_resolution(turned)?,
-            true => turned
-                .full_resolution
-                .iter()
-                .map(FullResolutionMap::shallow_clone)
-                .collect(),
+            true => FullResolutionMap::shallow_clones(&turned.full_resolution),
             false => Vec::new(),
         };
         Ok(ReceivedMaps {
@@ -277,9 +257,9 @@ impl FusionStage {
     }
 
     /// Maps in the axes of the ego.
-    fn turned(&self, maps: &Tensor, poses: &[Pose], order: Order) -> tch::Result<Tensor> {
+    fn turned(&self, maps: &Tensor, poses: &[Pose]) -> tch::Result<Tensor> {
         match &self.mixing {
-            Some(mixing) => mixing.turn(maps, poses, order),
+            Some(mixing) => mixing.turn(maps, poses, self.order()),
             None => Ok(maps.shallow_clone()),
         }
     }
@@ -306,40 +286,30 @@ impl FusionStage {
     ) -> Result<AlignedMaps, WarpError> {
         let mut metadata = self.of_network(metadata).into_owned();
         let count = newest.maps.size4()?.0;
-        let maps = count
-            + earlier
-                .as_ref()
-                .map_or(Ok(0), |earlier| earlier.maps.size4().map(|size| size.0))?;
-        if maps != metadata.len() as i64 {
-            return Err(WarpError::PoseCount {
-                maps,
-                poses: metadata.len(),
-            });
+        let (mut maps, poses) = (count, metadata.len());
+        if let Some(earlier) = &earlier {
+            maps += earlier.maps.size4()?.0;
         }
-        let earlier = match (self.requirements.history.earlier_cells, earlier) {
-            (Some(cells), Some(earlier)) => {
-                // The outer `metadata` keeps those of the newest maps only.
-                let metadata = metadata.split_off(count as usize);
-                let (_, warped) =
-                    self.warped(&earlier, &metadata, &with_cells_of(&self.grid, cells))?;
-                let classes = self.classes.as_ref().map(Classes::shallow_clone);
-                let full_resolution = classes.map(|classes| (earlier.full_resolution, classes));
-                Some(EarlierMaps {
-                    warped,
-                    metadata,
-                    full_resolution,
-                })
-            }
-            (None, Some(earlier)) => {
-                return self.aligned(
-                    &ReceivedMaps::together(&[newest, &earlier])?,
-                    None,
-                    metadata,
-                );
-            }
-            (_, None) => None,
+        if maps != poses as i64 {
+            return Err(WarpError::PoseCount { maps, poses });
+        }
+        let Some(earlier) = earlier else {
+            return self.aligned(newest, None, metadata);
         };
-        self.aligned(newest, earlier, metadata)
+        let Some(cells) = self.requirements.history.earlier_cells else {
+            let together = ReceivedMaps::together(&[newest, &earlier])?;
+            return self.aligned(&together, None, metadata);
+        };
+        let of_earlier = metadata.split_off(count as usize);
+        let grid = with_cells_of(&self.grid, cells);
+        let (_, warped) = self.warped(&earlier, &of_earlier, &grid)?;
+        let classes = self.classes.as_ref().map(Classes::shallow_clone);
+        let earlier = EarlierMaps {
+            warped,
+            metadata: of_earlier,
+            full_resolution: classes.map(|classes| (earlier.full_resolution, classes)),
+        };
+        self.aligned(newest, Some(earlier), metadata)
     }
 
     fn aligned(
@@ -362,16 +332,15 @@ impl FusionStage {
     /// Maps in the axes of the ego, and the same warped onto the ego's `grid`.
     fn warped(
         &self,
-        ReceivedMaps { maps, sent, .. }: &ReceivedMaps,
+        received: &ReceivedMaps,
         metadata: &[MapMetadata],
         grid: &BevGrid,
     ) -> Result<(ReceivedMaps, WarpedMaps), WarpError> {
         let poses: Vec<Pose> = metadata.iter().map(|map| map.ego_from_cav).collect();
-        check(maps, &poses, grid)?;
-        let maps = self.turned(maps, &poses, self.order())?;
-        let mut turned = ReceivedMaps::new(maps, sent.as_ref().map(Tensor::shallow_clone));
+        check(&received.maps, &poses, grid)?;
+        let mut turned = received.with_maps(self.turned(&received.maps, &poses)?);
         if self.order() == Order::Planes || !are_numbers(&turned.maps) {
-            let warped = warp_to_ego(&turned.maps, sent.as_ref(), &poses, grid)?;
+            let warped = warp_to_ego(&turned.maps, turned.sent.as_ref(), &poses, grid)?;
             return Ok((turned, warped));
         }
         turned.full_resolution = full_resolution(&turned)?;
@@ -430,11 +399,9 @@ fn full_resolution(
 
 /// Number of leading entries that are the newest of their agents.
 fn newest(facts: &[MapMetadata]) -> usize {
-    let newest = facts
-        .iter()
-        .enumerate()
-        .take_while(|(entry, of)| facts[..*entry].iter().all(|other| other.agent != of.agent));
-    newest.count()
+    (0..facts.len())
+        .take_while(|&entry| step_of(entry, facts) == 0)
+        .count()
 }
 
 /// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents. The
@@ -481,16 +448,13 @@ pub(crate) fn stored_config(
     method: Method,
     detector: &DetectorConfig,
 ) -> Result<FusionConfig, FileError> {
-    let usual = method.default_fusion(detector);
-    if weights.metadata(FUSION_KEY).is_none() {
-        return Ok(usual);
+    if weights.metadata(FUSION_KEY).is_some() {
+        let stored: FusionConfig = weights.metadata_json(FUSION_KEY)?;
+        if method.has_fusion(&stored) {
+            return Ok(stored);
+        }
     }
-    let stored: FusionConfig = weights.metadata_json(FUSION_KEY)?;
-    Ok(if method.has_fusion(&stored) {
-        stored
-    } else {
-        usual
-    })
+    Ok(method.default_fusion(detector))
 }
 
 #[cfg(test)]

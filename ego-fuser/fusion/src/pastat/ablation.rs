@@ -36,31 +36,19 @@ pub fn ablated(
         let rule = "must be unchanged for methods other than pastat";
         return Err(FieldError::new("fusion", value, rule).into());
     };
-    let mut config = without
-        .iter()
-        .fold(config.clone(), |config, &part| without_part(config, part));
+    let mut config = config.clone();
+    for part in without {
+        match part {
+            Part::Ce => config.ce = false,
+            Part::Fsa => config.fsa = None,
+            Part::Te => config.te = None,
+            Part::TemporalMemory => config.temporal_memory = None,
+        }
+    }
     config.frames = frames.unwrap_or(config.frames);
     // With one time step there is nothing to remember.
     if config.frames == 1 {
-        config = without_part(config, Part::TemporalMemory);
+        config.temporal_memory = None;
     }
     Ok(FusionConfig::new(config))
-}
-
-fn without_part(config: PastatConfig, part: Part) -> PastatConfig {
-    match part {
-        Part::Ce => PastatConfig {
-            ce: false,
-            ..config
-        },
-        Part::Fsa => PastatConfig {
-            fsa: None,
-            ..config
-        },
-        Part::Te => PastatConfig { te: None, ..config },
-        Part::TemporalMemory => PastatConfig {
-            temporal_memory: None,
-            ..config
-        },
-    }
 }

@@ -4,10 +4,12 @@
 //! nothing is padded over agents or time, and their grids are padded to multiples of the attention windows and of the
 //! parts of FSA.
 
+use perception::tensor_values::tensor;
 use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
 
 use super::config::PastatConfig;
+use crate::f64_tensor::picked;
 use crate::full_resolution::FullResolutionMap;
 use crate::maps::{AlignedMaps, MapMetadata, reaching};
 use crate::padding::Padding;
@@ -78,49 +80,32 @@ impl CoarseAlignment {
             None => Vec::new(),
         };
         let first = maps.metadata.len() as i64;
-        let metadata: Vec<MapMetadata> = maps
-            .metadata
-            .iter()
-            .chain(earlier.iter().flat_map(|earlier| &earlier.metadata))
-            .copied()
-            .collect();
-        let places: Vec<i64> = newest
-            .iter()
-            .copied()
-            .chain(earlier_entries.iter().map(|entry| entry + first))
-            .collect();
-        let picked: Vec<MapMetadata> = places
-            .iter()
-            .map(|&place| metadata[place as usize])
-            .collect();
+        let metadata: Vec<MapMetadata> = match earlier {
+            Some(earlier) => [&maps.metadata[..], &earlier.metadata].concat(),
+            None => maps.metadata.clone(),
+        };
+        let of_earlier = earlier_entries.iter().map(|entry| entry + first);
+        let places: Vec<i64> = newest.iter().copied().chain(of_earlier).collect();
+        let picked = places.iter().map(|&place| metadata[place as usize]);
+        let cells = newest.iter();
+        let cells = cells.filter_map(|&entry| received.full_resolution.get(entry as usize));
+        let earlier = earlier.as_ref().filter(|_| !earlier_entries.is_empty());
+        let earlier = earlier.map(|earlier| {
+            let entries = rows_of(&earlier.warped, &earlier_entries)?;
+            padded(&entries, self.earlier_padding_cells)
+        });
         Ok(CoarseMaps {
-            newest: padded(
-                &rows_of(&warped.features, &warped.mask, &newest)?,
-                self.padding_cells,
+            newest: padded(&rows_of(warped, &newest)?, self.padding_cells)?,
+            received: rows_of(
+                &WarpedMaps::new(received.maps.shallow_clone(), sent),
+                &newest,
             )?,
-            received: rows_of(&received.maps, &sent, &newest)?,
-            received_cells: {
-                newest
-                    .iter()
-                    .filter_map(|&entry| received.full_resolution.get(entry as usize))
-                    .map(FullResolutionMap::shallow_clone)
-                    .collect()
-            },
-            earlier: match earlier.as_ref().filter(|_| !earlier_entries.is_empty()) {
-                Some(earlier) => {
-                    let WarpedMaps { features, mask } = &earlier.warped;
-                    Some(padded(
-                        &rows_of(features, mask, &earlier_entries)?,
-                        self.earlier_padding_cells,
-                    )?)
-                }
-                None => None,
-            },
-            earlier_entries: earlier_entries
-                .iter()
+            received_cells: FullResolutionMap::shallow_clones(cells),
+            earlier: earlier.transpose()?,
+            origins: Origins::of(&picked.collect::<Vec<_>>()),
+            earlier_entries: { earlier_entries.iter() }
                 .map(|&entry| entry as usize)
                 .collect(),
-            origins: Origins::of(&picked),
             places,
             all: metadata.len() as i64,
         })
@@ -134,16 +119,10 @@ impl CoarseMaps {
         if self.places.len() as i64 == self.all {
             return Ok(corrections.shallow_clone());
         }
-        let all = Tensor::f_zeros(
-            [self.all - 1, 3],
-            (corrections.kind(), corrections.device()),
-        )?;
+        let options = (corrections.kind(), corrections.device());
         let places: Vec<i64> = self.places[1..].iter().map(|place| place - 1).collect();
-        all.f_index_copy(
-            0,
-            &Tensor::f_from_slice(&places)?.f_to_device(corrections.device())?,
-            corrections,
-        )
+        let places = tensor(&places, &[-1], corrections.device())?;
+        Tensor::f_zeros([self.all - 1, 3], options)?.f_index_copy(0, &places, corrections)
     }
 }
 
@@ -178,21 +157,16 @@ pub(super) fn steps_back(agent: &[usize], age_secs: &[f64]) -> Vec<usize> {
 }
 
 /// Some entries, as floats.
-fn rows_of(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<WarpedMaps, TchError> {
-    let index = Tensor::f_from_slice(entries)?.f_to_device(features.device())?;
+fn rows_of(maps: &WarpedMaps, entries: &[i64]) -> Result<WarpedMaps, TchError> {
     // Selection copies. Entries are distinct, so as many as there are rows are all, in order.
-    let is_all = entries.len() as i64 == features.size()[0];
-    let [features, mask] = [features, mask].map(|tensor| match is_all {
+    let is_all = entries.len() as i64 == maps.features.size()[0];
+    maps.each(|tensor| match is_all {
         true => tensor.f_to_kind(Kind::Float),
-        false => tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float),
-    });
-    Ok(WarpedMaps::new(features?, mask?))
+        false => picked(tensor, entries)?.f_to_kind(Kind::Float),
+    })
 }
 
 /// With rows below and columns to the right that reach nothing, so that both counts are multiples of `cells`.
 fn padded(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
-    Ok(WarpedMaps {
-        features: Padding::to_multiples_of(cells, &maps.features)?,
-        mask: Padding::to_multiples_of(cells, &maps.mask)?,
-    })
+    maps.each(|tensor| Padding::to_multiples_of(cells, tensor))
 }

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use tch::nn;
-use tch::{Device, TchError, Tensor};
+use perception::tensor_values::tensor;
+use tch::{Device, TchError, Tensor, nn};
 
 use super::coarse_alignment::Origins;
 use super::config::PastatConfig;
@@ -55,17 +55,13 @@ impl ConfidenceEmbedding {
         let shares = shares(confidence, &origins.steps_back);
         let of_maps = (shares.iter().zip(confidence))
             .flat_map(|(share, &own)| [*share, own as f32, confidence[0] as f32]);
-        let of_maps = Tensor::f_from_slice(&of_maps.collect::<Vec<f32>>())?
-            .f_view([-1, CONFIDENCES])?
-            .f_to_device(self.device)?;
+        let of_maps = of_maps.collect::<Vec<f32>>();
+        let of_maps = tensor(&of_maps, &[-1, CONFIDENCES], self.device)?;
         Ok(match &self.weight {
-            Some(weight) => {
-                let shares = Tensor::f_from_slice(&shares)?.f_to_device(self.device)?;
-                Confidences {
-                    of_tokens: Some(shares.f_unsqueeze(1)? * weight),
-                    of_maps,
-                }
-            }
+            Some(weight) => Confidences {
+                of_tokens: Some(tensor(&shares, &[-1, 1], self.device)? * weight),
+                of_maps,
+            },
             None => Confidences {
                 of_tokens: None,
                 of_maps: of_maps.f_zeros_like()?,

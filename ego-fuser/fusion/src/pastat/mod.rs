@@ -86,6 +86,7 @@ impl Pastat {
     /// [`ConfigError`] when it cannot be built.
     pub(crate) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Result<Self, ConfigError> {
         config.validate()?;
+        let (memory, hidden) = (config.temporal_memory.as_ref(), config.map_refinement);
         // Random parameters are drawn in this order.
         Ok(Self {
             coarse_alignment: CoarseAlignment::new(config),
@@ -95,33 +96,25 @@ impl Pastat {
             temporal_encoding: TemporalEncoding::new(path, config),
             transformer: Transformer::new(path, config),
             decoder: Decoder::new(path, config),
-            temporal_memory: config
-                .temporal_memory
-                .as_ref()
-                .map(|memory| TemporalMemory::new(path, config, memory)),
-            map_refinement: config
-                .map_refinement
-                .map(|hidden| MapRefinement::new(path, config.channels, hidden)),
+            temporal_memory: memory.map(|memory| TemporalMemory::new(path, config, memory)),
+            map_refinement: hidden.map(|hidden| MapRefinement::new(path, config.channels, hidden)),
         })
     }
-}
 
-impl Pastat {
     /// The fused map before its refinement, `[1, C, H, W]`, and the corrections of the poses.
     fn unrefined(&self, maps: &AlignedMaps) -> Result<(Tensor, Option<Tensor>), TchError> {
         let coarse = self.coarse_alignment.pick(maps)?; // Eq. 2
         let confidences = self.confidence_embedding.embed(&coarse.origins)?; // Eq. 7
         let patches = self.patches.flatten(&coarse)?;
-        let (fine, aligned) = self.spatial_alignment.align(
+        let (fine, aligned, fit) = self.spatial_alignment.align(
             &coarse,
             patches,
             &confidences,
             &maps.grid,
             maps.is_training,
         )?; // FSA
-        let tokens =
-            self.temporal_encoding
-                .encode(aligned, &confidences, &coarse.origins.age_secs)?; // Eq. 10-12
+        let of_maps = [&confidences.of_tokens, &fit];
+        let tokens = (self.temporal_encoding).encode(aligned, of_maps, &coarse.origins.age_secs)?; // Eq. 10-12
         let context = self.transformer.forward(&tokens)?; // Eq. 8, 9
         let mut fused = self.decoder.maximum(&fine, &tokens, &context)?;
         if let Some(memory) = &self.temporal_memory {
@@ -131,13 +124,11 @@ impl Pastat {
             .corrections
             .map(|corrections| coarse.among_all(&corrections))
             .transpose()?;
-        Ok((
-            cropped(
-                &self.decoder.changed(&fused, &context)?,
-                &maps.warped.features,
-            )?,
-            corrections,
-        ))
+        // Without the padding.
+        let (_, _, height, width) = maps.warped.features.size4()?;
+        let fused = self.decoder.changed(&fused, &context)?;
+        let fused = fused.f_narrow(2, 0, height)?.f_narrow(3, 0, width)?;
+        Ok((fused, corrections))
     }
 }
 
@@ -177,19 +168,8 @@ impl Fusion for Pastat {
 /// Likelihood of a vehicle by the detector's class head, `[1, 1, H, W]`; `None` without earlier maps, since the input
 /// contains the head together with these.
 fn likely(fused: &Tensor, maps: &AlignedMaps) -> Result<Option<Tensor>, TchError> {
-    let full_resolution = maps
-        .earlier
-        .as_ref()
-        .and_then(|earlier| earlier.full_resolution.as_ref());
-    full_resolution
-        .map(|(_, classes)| classes.likely(fused))
-        .transpose()
-}
-
-/// `[1, C, H, W]` without the padding, given maps without padding.
-fn cropped(padded: &Tensor, maps: &Tensor) -> Result<Tensor, TchError> {
-    let (_, _, height, width) = maps.size4()?;
-    padded.f_narrow(2, 0, height)?.f_narrow(3, 0, width)
+    let head = maps.earlier_full_resolution();
+    head.map(|(_, classes)| classes.likely(fused)).transpose()
 }
 
 #[cfg(test)]

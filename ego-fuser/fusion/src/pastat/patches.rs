@@ -15,9 +15,9 @@ pub(super) struct Patches {
     earlier_cells: i64,
 }
 
-/// Tokens of maps, before encodings are added.
+/// Tokens of maps, the ego's newest first.
 #[derive(Debug)]
-pub(super) struct PatchTokens {
+pub(super) struct Tokens {
     /// `[N, D, h, w]`.
     pub(super) values: Tensor,
     /// `[N, h, w]`: 1 for tokens of which any cell is valid.
@@ -39,18 +39,16 @@ impl Patches {
         }
     }
 
-    /// Tokens of the newest maps, then of the earlier ones.
-    pub(super) fn flatten(&self, maps: &CoarseMaps) -> Result<PatchTokens, TchError> {
+    /// Tokens of the newest maps, then of the earlier ones; before encodings are added.
+    pub(super) fn flatten(&self, maps: &CoarseMaps) -> Result<Tokens, TchError> {
         let newest = &maps.newest;
-        let (mut values, mut valid) = (
-            self.values(&newest.features, 1)?,
-            self.valid(&newest.mask, 1)?,
-        );
+        let mut values = self.values(&newest.features, 1)?;
+        let mut valid = self.valid(&newest.mask, 1)?;
         if let Some(WarpedMaps { features, mask }) = &maps.earlier {
             values = Tensor::f_cat(&[values, self.values(features, self.earlier_cells)?], 0)?;
             valid = Tensor::f_cat(&[valid, self.valid(mask, self.earlier_cells)?], 0)?;
         }
-        Ok(PatchTokens { values, valid })
+        Ok(Tokens { values, valid })
     }
 
     /// `[N, D, h, w]` of maps `[N, C, H, W]`, each cell of which is one of `cells` by `cells`.
@@ -58,16 +56,10 @@ impl Patches {
         let nn::Conv2D { ws, bs, .. } = &self.convolution;
         let edge = self.patch / cells;
         // Equal to all pooled cells showing their mean.
+        let (edges, none) = ([cells; 2], [0_i64; 2]);
         let weight = match cells {
             1 => ws.shallow_clone(),
-            _ => ws.f_avg_pool2d(
-                [cells, cells],
-                [cells, cells],
-                [0_i64, 0],
-                false,
-                true,
-                None::<i64>,
-            )?,
+            _ => ws.f_avg_pool2d(edges, edges, none, false, true, None::<i64>)?,
         };
         let weight = weight * (cells * cells) as f64;
         maps.f_conv2d(&weight, bs.as_ref(), [edge, edge], [0, 0], [1, 1], 1)

@@ -1,10 +1,10 @@
 //! TE, Temporal Encoding (Eq. 10-12): encodes the true age of a map.
 
+use perception::tensor_values::tensor;
 use tch::{Device, Kind, TchError, Tensor, nn};
 
-use super::confidence_embedding::Confidences;
 use super::config::PastatConfig;
-use super::spatial_alignment::AlignedTokens;
+use super::patches::Tokens;
 
 /// Ages are clamped to this, seconds.
 const MAX_AGE_SECS: f64 = 10.0;
@@ -16,15 +16,6 @@ pub(super) struct TemporalEncoding {
     device: Device,
 }
 
-/// Tokens as the transformer gets them.
-#[derive(Debug)]
-pub(super) struct Tokens {
-    /// `[N, D, h, w]`: `z^(0)`, the ego's newest first.
-    pub(super) values: Tensor,
-    /// `[N, h, w]`, 1 for valid tokens.
-    pub(super) valid: Tensor,
-}
-
 impl TemporalEncoding {
     /// It has no variables; `path` is that of the module.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
@@ -34,25 +25,18 @@ impl TemporalEncoding {
         }
     }
 
-    /// Eq. 10: `z^(0) = Flatten(F) + E_t`, with the terms of the confidence (Eq. 7) and of the match quality from FSA.
+    /// Eq. 10: `z^(0) = Flatten(F) + E_t`, with the terms `of_maps` `[N, D]`: of the confidence (Eq. 7) and of the match
+    /// quality from FSA.
     pub(super) fn encode(
         &self,
-        aligned: AlignedTokens,
-        confidences: &Confidences,
+        Tokens { values, valid }: Tokens,
+        of_maps: [&Option<Tensor>; 2],
         age_secs: &[f64],
     ) -> Result<Tokens, TchError> {
-        let AlignedTokens { values, valid, fit } = aligned;
-        let mut of_map = self.of_ages(age_secs)?;
-        if let Some(of_confidence) = &confidences.of_tokens {
-            of_map = of_map.f_add(of_confidence)?;
-        }
-        if let Some(fit) = fit {
-            of_map = of_map.f_add(&fit)?;
-        }
-        Ok(Tokens {
-            values: values + of_map.f_unsqueeze(2)?.f_unsqueeze(3)?,
-            valid,
-        })
+        let mut terms = of_maps.into_iter().flatten();
+        let of_map = terms.try_fold(self.of_ages(age_secs)?, |sum, term| sum.f_add(term))?;
+        let values = values + of_map.f_unsqueeze(2)?.f_unsqueeze(3)?;
+        Ok(Tokens { values, valid })
     }
 
     /// `[N, D]`: `E_t` of each map; zeros without the encoding, for the ablation.
@@ -61,13 +45,8 @@ impl TemporalEncoding {
         if self.config.te.is_none() {
             return Tensor::f_zeros(size, (Kind::Float, self.device));
         }
-        let values: Vec<f32> = age_secs
-            .iter()
-            .flat_map(|&age| encoding(age, &self.config))
-            .collect();
-        Tensor::f_from_slice(&values)?
-            .f_view(size)?
-            .f_to_device(self.device)
+        let values = age_secs.iter().flat_map(|&age| encoding(age, &self.config));
+        tensor(&values.collect::<Vec<f32>>(), &size, self.device)
     }
 }
 

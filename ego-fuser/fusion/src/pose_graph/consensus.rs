@@ -20,6 +20,22 @@ pub(super) struct Consensus {
     pub(super) score: f64,
 }
 
+/// A point after a motion.
+pub(super) fn moved(motion: &Isometry3<f64>, point: &Vector3<f64>) -> Vector3<f64> {
+    motion.rotation * point + motion.translation.vector
+}
+
+/// Mean distance between the places of some points after two motions.
+pub(super) fn apart<'a>(
+    points: impl ExactSizeIterator<Item = &'a Vector3<f64>>,
+    one: &Isometry3<f64>,
+    other: &Isometry3<f64>,
+) -> f64 {
+    let count = points.len().max(1) as f64;
+    let distances = points.map(|point| (moved(one, point) - moved(other, point)).norm());
+    distances.sum::<f64>() / count
+}
+
 /// Matches boxes with objects; both lie at height zero.
 pub(super) fn consensus(
     objects: &[Vector3<f64>],
@@ -35,14 +51,12 @@ pub(super) fn consensus(
         candidates: candidates(objects, boxes, prior, config),
     };
     let motions = search.motions();
-    let best = motions
-        .iter()
-        .max_by(|one, other| one.score.total_cmp(&other.score))?;
+    let best = { motions.iter() }.max_by(|one, other| one.score.total_cmp(&other.score))?;
     // A different motion that fits almost as well makes the match ambiguous: then none is used.
-    let rival = motions
-        .iter()
-        .filter(|other| search.differ(&best.motion, &other.motion))
-        .map(|other| other.score);
+    let rival = motions.iter().filter(|other| {
+        apart(boxes.iter(), &best.motion, &other.motion) > 2.0 * config.fit_tolerance_m
+    });
+    let rival = rival.map(|other| other.score);
     if rival.fold(f64::NEG_INFINITY, f64::max) + MIN_LEAD > best.score {
         return None;
     }
@@ -65,11 +79,11 @@ fn candidates(
     let mut candidates = Vec::new();
     for (index, center) in boxes.iter().enumerate() {
         let place = moved(prior, center);
-        let near = objects
-            .iter()
-            .enumerate()
-            .filter(|(_, object)| (*object - place).norm() < config.search_m);
-        candidates.extend(near.map(|(object, _)| (object, index)));
+        for (object, at) in objects.iter().enumerate() {
+            if (at - place).norm() < config.search_m {
+                candidates.push((object, index));
+            }
+        }
     }
     candidates
 }
@@ -137,59 +151,38 @@ impl Search<'_> {
     /// Candidates that a motion aligns, each box and each object once, the nearest first.
     fn matches(&self, motion: &Isometry3<f64>) -> Vec<(usize, usize)> {
         let mut near: Vec<(f64, usize, usize)> = (self.candidates.iter())
-            .map(|&(object, index)| (self.apart(motion, object, index), object, index))
-            .filter(|(apart, ..)| *apart < self.config.fit_tolerance_m)
+            .map(|&(object, index)| (self.distance(motion, object, index), object, index))
+            .filter(|(distance, ..)| *distance < self.config.fit_tolerance_m)
             .collect();
         near.sort_by(|one, other| one.0.total_cmp(&other.0));
         let mut matches: Vec<(usize, usize)> = Vec::with_capacity(near.len());
         for (_, object, index) in near {
-            if matches
-                .iter()
-                .all(|&(other, taken)| other != object && taken != index)
-            {
+            let mut taken = matches.iter();
+            if taken.all(|&(other, taken)| other != object && taken != index) {
                 matches.push((object, index));
             }
         }
         matches
     }
 
-    fn apart(&self, motion: &Isometry3<f64>, object: usize, index: usize) -> f64 {
+    fn distance(&self, motion: &Isometry3<f64>, object: usize, index: usize) -> f64 {
         (self.objects[object] - moved(motion, &self.boxes[index])).norm()
     }
 
     fn score(&self, motion: &Isometry3<f64>, matches: &[(usize, usize)]) -> f64 {
         let fits = matches.iter().map(|&(object, index)| {
-            1.0 - (self.apart(motion, object, index) / self.config.fit_tolerance_m).powi(2)
+            1.0 - (self.distance(motion, object, index) / self.config.fit_tolerance_m).powi(2)
         });
         // A weak prior: moving the boxes by the whole search range costs as much as one exact match.
-        let off = self.off(motion, self.prior) / self.config.search_m;
+        let off = apart(self.boxes.iter(), motion, self.prior) / self.config.search_m;
         fits.sum::<f64>() - off * off
-    }
-
-    /// Mean distance between the boxes under two motions.
-    fn off(&self, one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
-        let sum: f64 = self
-            .boxes
-            .iter()
-            .map(|center| (moved(one, center) - moved(other, center)).norm())
-            .sum();
-        sum / self.boxes.len().max(1) as f64
-    }
-
-    fn differ(&self, one: &Isometry3<f64>, other: &Isometry3<f64>) -> bool {
-        self.off(one, other) > 2.0 * self.config.fit_tolerance_m
     }
 
     /// The best fit to the inliers of a motion.
     fn refined(&self, motion: Isometry3<f64>) -> Isometry3<f64> {
         let matches = self.matches(&motion);
-        let pairs = matches
-            .iter()
-            .map(|&(object, index)| (self.boxes[index], self.objects[object]));
+        let pairs =
+            { matches.iter() }.map(|&(object, index)| (self.boxes[index], self.objects[object]));
         planar_fit::fit(&pairs).unwrap_or(motion)
     }
-}
-
-fn moved(motion: &Isometry3<f64>, point: &Vector3<f64>) -> Vector3<f64> {
-    motion.rotation * point + motion.translation.vector
 }

@@ -18,7 +18,7 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use protocol::{Detection, Pose};
 
 pub use config::PoseGraphConfig;
-use consensus::consensus;
+use consensus::{apart, consensus, moved};
 use optimise::{Graph, Node, Observation};
 
 /// An agent with its detections.
@@ -61,15 +61,11 @@ impl ObservedBox {
             center.norm() < 1e4 && heading_rad.is_finite() && found.score >= config.min_score;
         let scale =
             (1.0 + center.norm() / HALF_EXACT_M) / f64::from(found.score.clamp(0.1, 1.0)).sqrt();
-        let (std_m, std_rad) = (
-            config.box_std_m * scale,
-            config.box_std_deg.to_radians() * scale,
-        );
         is_sound.then_some(Self {
             center,
             heading_rad,
-            std_m,
-            std_rad,
+            std_m: config.box_std_m * scale,
+            std_rad: config.box_std_deg.to_radians() * scale,
         })
     }
 }
@@ -79,14 +75,10 @@ impl ObservedBox {
 /// Agents join one after another, those first that share most with the joined ones: an agent that shares nothing with
 /// the ego may still be aligned through a third.
 pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Corrected> {
-    let seen: Vec<Vec<ObservedBox>> = agents
-        .iter()
-        .map(|agent| sound_boxes(agent.boxes, config))
-        .collect();
-    let priors: Vec<Isometry3<f64>> = agents
-        .iter()
-        .map(|agent| flattened(&agent.ego_from_agent))
-        .collect();
+    let seen = agents.iter().map(|agent| sound_boxes(agent.boxes, config));
+    let seen: Vec<Vec<ObservedBox>> = seen.collect();
+    let priors = agents.iter().map(|agent| flattened(&agent.ego_from_agent));
+    let priors: Vec<Isometry3<f64>> = priors.collect();
     let unmoved = agents.iter().map(|agent| Corrected {
         ego_from_agent: agent.ego_from_agent,
         shared: 0,
@@ -106,7 +98,8 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
         return corrected;
     }
     for (agent, solved, shared) in graph.solve(&priors, config) {
-        if moved_by(&seen[agent], &priors[agent], &solved) < config.dead_zone_m {
+        let centers = seen[agent].iter().map(|seen| &seen.center);
+        if apart(centers, &priors[agent], &solved) < config.dead_zone_m {
             continue;
         }
         // The planar correction is applied from the left, so height, roll and pitch of the pose are kept.
@@ -115,16 +108,6 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
         corrected[agent].shared = shared;
     }
     corrected
-}
-
-/// Mean distance between the boxes before and after.
-fn moved_by(seen: &[ObservedBox], before: &Isometry3<f64>, after: &Isometry3<f64>) -> f64 {
-    let moved = seen.iter().map(|seen| {
-        let [old, new] =
-            [before, after].map(|pose| pose.rotation * seen.center + pose.translation.vector);
-        (new - old).norm()
-    });
-    moved.sum::<f64>() / seen.len().max(1) as f64
 }
 
 fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<ObservedBox> {
@@ -140,26 +123,17 @@ fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<ObservedBox
 
 /// Planar position and heading.
 fn flattened(pose: &Pose) -> Isometry3<f64> {
-    let [x, y, _] = pose.translation_m;
-    planar(&Node {
-        x_m: x,
-        y_m: y,
-        heading_rad: pose.yaw_rad(),
-    })
+    planar(&Node::new(&pose.translation_m.into(), pose.yaw_rad()))
 }
 
 fn planar(node: &Node) -> Isometry3<f64> {
     let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), node.heading_rad);
-    Isometry3::from_parts(Vector3::new(node.x_m, node.y_m, 0.0).into(), turn)
+    Isometry3::from_parts(node.place().into(), turn)
 }
 
 /// The inverse of [`planar`].
 fn node_of(motion: &Isometry3<f64>) -> Node {
-    Node {
-        x_m: motion.translation.x,
-        y_m: motion.translation.y,
-        heading_rad: motion.rotation.euler_angles().2,
-    }
+    Node::new(&motion.translation.vector, motion.rotation.euler_angles().2)
 }
 
 /// The graph while agents join it.
@@ -181,17 +155,11 @@ impl Assembly {
         priors: &[Isometry3<f64>],
         config: &PoseGraphConfig,
     ) -> Option<(usize, consensus::Consensus)> {
-        let objects: Vec<Vector3<f64>> = self
-            .objects
-            .iter()
-            .map(|node| Vector3::new(node.x_m, node.y_m, 0.0))
-            .collect();
+        let objects: Vec<Vector3<f64>> = self.objects.iter().map(Node::place).collect();
         let found = waiting.iter().enumerate().filter_map(|(place, &agent)| {
             let centers: Vec<Vector3<f64>> = seen[agent].iter().map(|seen| seen.center).collect();
-            Some((
-                place,
-                consensus(&objects, &centers, &priors[agent], config)?,
-            ))
+            let consensus = consensus(&objects, &centers, &priors[agent], config)?;
+            Some((place, consensus))
         });
         found.max_by(|(_, one), (_, other)| one.score.total_cmp(&other.score))
     }
@@ -207,33 +175,20 @@ impl Assembly {
         let node = self.joined.len();
         let heading = ego_from_agent.rotation.euler_angles().2;
         for (index, seen) in seen.iter().enumerate() {
-            let known = matches
-                .iter()
-                .find(|(_, matched)| *matched == index)
-                .map(|(object, _)| *object);
-            let object = known.unwrap_or_else(|| {
-                let place =
-                    ego_from_agent.rotation * seen.center + ego_from_agent.translation.vector;
-                self.objects.push(Node {
-                    x_m: place.x,
-                    y_m: place.y,
-                    heading_rad: heading + seen.heading_rad,
-                });
-                self.objects.len() - 1
-            });
+            let object = match matches.iter().find(|(_, matched)| *matched == index) {
+                Some((object, _)) => *object,
+                None => {
+                    let place = moved(ego_from_agent, &seen.center);
+                    let heading_rad = heading + seen.heading_rad;
+                    self.objects.push(Node::new(&place, heading_rad));
+                    self.objects.len() - 1
+                }
+            };
             self.observations.push(Observation {
                 agent: node,
                 object,
-                seen: Node {
-                    x_m: seen.center.x,
-                    y_m: seen.center.y,
-                    heading_rad: seen.heading_rad,
-                },
-                information: [
-                    seen.std_m.powi(-2),
-                    seen.std_m.powi(-2),
-                    seen.std_rad.powi(-2),
-                ],
+                seen: Node::new(&seen.center, seen.heading_rad),
+                information: [seen.std_m, seen.std_m, seen.std_rad].map(|std| std.powi(-2)),
             });
         }
         self.joined.push((agent, *ego_from_agent));
@@ -250,37 +205,26 @@ impl Assembly {
             .iter()
             .for_each(|observation| viewers[observation.object] += 1);
         // An object seen by one agent only does not constrain poses.
-        let shared: Vec<Observation> = self
-            .observations
-            .into_iter()
-            .filter(|observation| viewers[observation.object] > 1)
-            .collect();
+        let mut shared = self.observations;
+        shared.retain(|observation| viewers[observation.object] > 1);
         let (std_m, std_rad) = (config.pose_std_m, config.pose_std_deg.to_radians());
+        let joined = self.joined.iter();
+        let nodes = joined.map(|(agent, motion)| (node_of(motion), node_of(&priors[*agent])));
+        let (agents, priors) = nodes.unzip();
         let mut graph = Graph {
-            agents: { self.joined.iter() }
-                .map(|(_, motion)| node_of(motion))
-                .collect(),
-            priors: { self.joined.iter() }
-                .map(|(agent, _)| node_of(&priors[*agent]))
-                .collect(),
-            prior_information: [std_m.powi(-2), std_m.powi(-2), std_rad.powi(-2)],
+            agents,
+            priors,
+            prior_information: [std_m, std_m, std_rad].map(|std| std.powi(-2)),
             objects: self.objects,
             observations: shared,
         };
         graph.optimise();
         let observations = graph.observations;
-        self.joined
-            .into_iter()
-            .zip(graph.agents)
-            .enumerate()
-            .skip(1)
-            .map(move |(place, ((agent, _), solved))| {
-                let shared = observations
-                    .iter()
-                    .filter(|observation| observation.agent == place)
-                    .count();
-                (agent, planar(&solved), shared)
-            })
+        let solved = self.joined.into_iter().zip(graph.agents).enumerate();
+        solved.skip(1).map(move |(place, ((agent, _), solved))| {
+            let of_agent = observations.iter().filter(|of| of.agent == place);
+            (agent, planar(&solved), of_agent.count())
+        })
     }
 }
 

@@ -20,6 +20,20 @@ pub(super) struct Node {
 }
 
 impl Node {
+    /// At a place whose height is left out.
+    pub(super) fn new(place: &Vector3<f64>, heading_rad: f64) -> Self {
+        Self {
+            x_m: place.x,
+            y_m: place.y,
+            heading_rad,
+        }
+    }
+
+    /// The place, at height zero.
+    pub(super) fn place(&self) -> Vector3<f64> {
+        Vector3::new(self.x_m, self.y_m, 0.0)
+    }
+
     fn moved(&self, step: &Vector3<f64>) -> Self {
         Self {
             x_m: self.x_m + step.x,
@@ -233,17 +247,12 @@ impl Equations {
         }
         let agents = -self.agents.cholesky()?.solve(&self.agent_gradient);
         // Step: the objects by back-substitution.
-        let mut pulled: Vec<Vector3<f64>> =
-            self.objects.iter().map(|(_, gradient)| *gradient).collect();
         for (row, object, block) in &self.mixed {
-            pulled[*object] += block.transpose() * agents.fixed_rows::<3>(3 * row);
+            self.objects[*object].1 += block.transpose() * agents.fixed_rows::<3>(3 * row);
         }
-        let objects = pulled
-            .iter()
-            .zip(&inverses)
-            .map(|(pulled, inverse)| -(inverse * pulled))
-            .collect();
-        Some((agents, objects))
+        let objects = self.objects.iter().zip(inverses);
+        let steps = objects.map(|((_, pulled), inverse)| -(inverse * pulled));
+        Some((agents, steps.collect()))
     }
 }
 

@@ -1,7 +1,6 @@
 //! Deformable attention of every token to the points along its trajectory.
 
-use tch::nn;
-use tch::{TchError, Tensor};
+use tch::{TchError, Tensor, nn};
 
 use super::config::TrafAlignConfig;
 use crate::layers::{LayerNorm, Linear, uniform};
@@ -39,11 +38,8 @@ impl TrajectoryAttention {
     pub(super) fn forward(&self, tokens: &Tensor, points: &Tensor) -> Result<Tensor, TchError> {
         let (agents, dim, height, width) = tokens.size4()?;
         let last = tokens.f_permute([0, 2, 3, 1])?.f_contiguous()?;
-        let projected = self
-            .project
-            .forward(&last)?
-            .f_permute([0, 3, 1, 2])?
-            .f_contiguous()?;
+        let projected = self.project.forward(&last)?.f_permute([0, 3, 1, 2])?;
+        let projected = projected.f_contiguous()?;
         let query = projected.f_narrow(1, 0, dim)?;
         let read = projected.f_narrow(1, dim, 2 * dim)?;
         let read = read.f_grid_sampler(points, BILINEAR, PADDING_ZEROS, false)?;
@@ -60,15 +56,12 @@ impl TrajectoryAttention {
             / (per_head as f64).sqrt();
         let weights = scores.f_softmax(3, None)?;
         let attended = (weights * values).f_sum_dim_intlist([3i64].as_slice(), false, None)?;
-        let attended = attended
-            .f_reshape([agents, dim, height, width])?
-            .f_permute([0, 2, 3, 1])?
-            .f_contiguous()?;
+        let attended = attended.f_reshape([agents, dim, height, width])?;
+        let attended = attended.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let tokens = self.norm.forward(&(last + self.out.forward(&attended)?))?;
         let [first, second] = &self.mlp;
-        let tokens = self
-            .mlp_norm
-            .forward(&(&tokens + second.forward(&first.forward(&tokens)?.f_relu()?)?))?;
+        let inner = second.forward(&first.forward(&tokens)?.f_relu()?)?;
+        let tokens = self.mlp_norm.forward(&(&tokens + inner))?;
         tokens.f_permute([0, 3, 1, 2])
     }
 }
@@ -76,12 +69,9 @@ impl TrajectoryAttention {
 /// A linear layer whose bias is random at the start, like its weight.
 fn linear(path: &nn::Path<'_>, [input, output]: [i64; 2]) -> Linear {
     let bound = 1.0 / (input as f64).sqrt();
+    let init = nn::init::DEFAULT_KAIMING_UNIFORM;
     Linear {
-        weight: path.var(
-            "weight",
-            &[output, input],
-            nn::init::DEFAULT_KAIMING_UNIFORM,
-        ),
+        weight: path.var("weight", &[output, input], init),
         bias: Some(path.var("bias", &[output], uniform(bound))),
     }
 }

@@ -51,19 +51,11 @@ impl Trajectories {
         let fine = self.inner.forward(tokens, train);
         let coarse = self.deep.forward(&self.down.forward(&fine, train), train);
         let joined = Tensor::f_cat(&[&fine, &self.up.forward(&coarse, train)], 1)?;
-        let field = self
-            .field
-            .forward(&self.joined.forward(&joined, train), train)
-            .f_sigmoid()?;
+        let joined = self.joined.forward(&joined, train);
+        let field = self.field.forward(&joined, train).f_sigmoid()?;
         let (weight, bias) = &self.offsets;
-        let offsets = self.before_offsets.forward(&field, train).f_conv2d(
-            weight,
-            Some(bias),
-            [1, 1],
-            [1, 1],
-            [1, 1],
-            1,
-        )?;
+        let before = self.before_offsets.forward(&field, train);
+        let offsets = before.f_conv2d(weight, Some(bias), [1, 1], [1, 1], [1, 1], 1)?;
         self.sampling_grid(&offsets)
     }
 

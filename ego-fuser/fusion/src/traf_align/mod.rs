@@ -23,6 +23,7 @@ mod field;
 
 use perception::layers::convolution::ConvLayer;
 use perception::model_config::{ConfigError, DetectorConfig};
+use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
@@ -30,12 +31,14 @@ pub(crate) use config::TrafAlignConfig;
 
 use self::attention::TrajectoryAttention;
 use self::field::Trajectories;
+use super::f64_tensor::picked;
 use super::interface::{Fusion, FusionOutput};
 use super::layers::SMALL;
 use super::maps::{AlignedMaps, MapMetadata, reaching};
 use super::padding::Padding;
 use super::settings::{FusionSettings, HistorySpec, Requirements, of_size};
 use super::spec::MethodSpec;
+use super::warp::WarpedMaps;
 
 /// TraF-Align.
 pub(crate) static METHOD: MethodSpec = MethodSpec::of_features::<TrafAlignConfig>(
@@ -115,63 +118,49 @@ impl TrafAlign {
                 [sin as f32, cos as f32]
             })
         });
-        let waves = Tensor::f_from_slice(&waves.collect::<Vec<f32>>())?.f_view([-1, 2 * WAVES])?;
-        waves.f_to_device(self.age.device())?.f_matmul(&self.age)
+        let waves = waves.collect::<Vec<f32>>();
+        tensor(&waves, &[-1, 2 * WAVES], self.age.device())?.f_matmul(&self.age)
     }
 
     /// One map of tokens per agent: the sum over its frames, `[A, D, h, w]`.
     fn over_time(
         &self,
-        maps: &Tensor,
-        mask: &Tensor,
+        WarpedMaps { features, mask }: &WarpedMaps,
         agents: &Agents,
         train: bool,
     ) -> Result<Tensor, TchError> {
         let patch = [self.config.patch; 2];
         let seen = mask.f_max_pool2d(patch, patch, [0, 0], [1, 1], false)?;
-        let ages = self
-            .ages(&agents.age_secs)?
-            .f_unsqueeze(-1)?
-            .f_unsqueeze(-1)?;
+        let ages = self.ages(&agents.age_secs)?;
+        let ages = ages.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
         // Masked after the addition: tokens out of reach would otherwise consist of the code of their age.
-        let tokens = (self.tokeniser.forward(maps, train) + ages) * seen;
+        let tokens = (self.tokeniser.forward(features, train) + ages) * seen;
         let mut size = tokens.size();
         size[0] = agents.newest.len() as i64;
-        let owner = Tensor::f_from_slice(&agents.owner)?.f_to_device(tokens.device())?;
+        let owner = tensor(&agents.owner, &[-1], tokens.device())?;
         Tensor::f_zeros(size, (tokens.kind(), tokens.device()))?.f_index_add(0, &owner, &tokens)
     }
 
     fn fuse_present(
         &self,
-        maps: &Tensor,
-        mask: &Tensor,
+        present: &WarpedMaps,
         agents: &Agents,
         train: bool,
     ) -> Result<Tensor, TchError> {
-        let (_, _, height, width) = maps.size4()?;
+        let (_, _, height, width) = present.features.size4()?;
         // The U-Net halves the resolution of the tokens once.
-        let maps = Padding::to_multiples_of(2 * self.config.patch, maps)?;
-        let mask = Padding::to_multiples_of(2 * self.config.patch, mask)?;
-        let mut tokens = self.over_time(&maps, &mask, agents, train)?;
+        let padded = present.each(|map| Padding::to_multiples_of(2 * self.config.patch, map))?;
+        let mut tokens = self.over_time(&padded, agents, train)?;
         let points = self.trajectories.points(&tokens, train)?;
         for layer in &self.layers {
             tokens = layer.forward(&tokens, &points)?;
         }
-        let patch = [self.config.patch; 2];
-        let gathered = tokens.f_conv_transpose2d(
-            &self.decoder,
-            None::<Tensor>,
-            patch,
-            [0, 0],
-            [0, 0],
-            1,
-            [1, 1],
-        )?;
-        let newest = Tensor::f_from_slice(&agents.newest)?.f_to_device(maps.device())?;
+        let (patch, none, bias) = ([self.config.patch; 2], [0_i64; 2], None::<Tensor>);
+        let gathered =
+            tokens.f_conv_transpose2d(&self.decoder, bias, patch, none, none, 1, [1, 1])?;
+        let WarpedMaps { features, mask } = padded.each(|map| picked(map, &agents.newest))?;
         // Padding is out of reach of all maps and becomes minus infinity, which is cropped below.
-        let out_of_reach = mask.f_index_select(0, &newest)?.f_eq(0.0)?;
-        let fused = (maps.f_index_select(0, &newest)? + gathered)
-            .f_masked_fill(&out_of_reach, f64::NEG_INFINITY)?;
+        let fused = (features + gathered).f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
         fused
             .f_amax([0i64].as_slice(), false)?
             .f_narrow(1, 0, height)?
@@ -190,10 +179,8 @@ struct Agents {
 
 impl Agents {
     fn new(metadata: &[MapMetadata], entries: &[i64]) -> Self {
-        let facts: Vec<_> = entries
-            .iter()
-            .map(|&entry| metadata[entry as usize])
-            .collect();
+        let facts = entries.iter().map(|&entry| metadata[entry as usize]);
+        let facts: Vec<MapMetadata> = facts.collect();
         let mut names: Vec<usize> = Vec::new();
         let owner: Vec<i64> = (facts.iter())
             .map(|facts| {
@@ -207,9 +194,8 @@ impl Agents {
         let age_secs: Vec<f64> = facts.iter().map(|facts| facts.age_secs).collect();
         let newest = (0..names.len() as i64).map(|agent| {
             let of_agent = (0..owner.len()).filter(|&entry| owner[entry] == agent);
-            of_agent
-                .min_by(|&one, &other| age_secs[one].total_cmp(&age_secs[other]))
-                .unwrap_or(0) as i64
+            let newest = of_agent.min_by(|&a, &b| age_secs[a].total_cmp(&age_secs[b]));
+            newest.unwrap_or(0) as i64
         });
         Self {
             newest: newest.collect(),
@@ -224,10 +210,8 @@ impl Fusion for TrafAlign {
         let warped = &maps.warped;
         let entries = reaching(&warped.mask, true)?;
         let agents = Agents::new(&maps.metadata, &entries);
-        let index = Tensor::f_from_slice(&entries)?.f_to_device(warped.features.device())?;
-        let [features, mask] = [&warped.features, &warped.mask]
-            .map(|tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float));
-        let fused = self.fuse_present(&features?, &mask?, &agents, maps.is_training)?;
+        let present = warped.each(|map| picked(map, &entries)?.f_to_kind(Kind::Float))?;
+        let fused = self.fuse_present(&present, &agents, maps.is_training)?;
         Ok(fused.f_to_kind(warped.features.kind())?.into())
     }
 }

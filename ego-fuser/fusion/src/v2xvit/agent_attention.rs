@@ -1,8 +1,8 @@
 //! HMSA: heterogeneous multi-agent self-attention, across the agents at every cell.
 
-use tch::nn;
-use tch::{TchError, Tensor};
+use tch::{TchError, Tensor, nn};
 
+use crate::f64_tensor::picked;
 use crate::layers::{Linear, SMALL, attend, dropout};
 
 /// Types of agents with separate projections: vehicles and infrastructure.
@@ -94,10 +94,8 @@ impl AgentAttention {
         let mut kinds = types[..queries].to_vec();
         kinds.sort_unstable();
         kinds.dedup();
-        let asked = kinds
-            .into_iter()
-            .map(|kind| Ok((kind, self.asked(kind)?)))
-            .collect::<Result<Vec<_>, TchError>>()?;
+        let asked = kinds.into_iter().map(|kind| Ok((kind, self.asked(kind)?)));
+        let asked = asked.collect::<Result<Vec<_>, TchError>>()?;
         let mut seen = Vec::new();
         for first in (0..cells).step_by(chunk.max(1) as usize) {
             let length = chunk.min(cells - first);
@@ -135,8 +133,8 @@ impl AgentAttention {
             let query = if askers.len() == types.len() {
                 x.shallow_clone()
             } else {
-                let index: Vec<i64> = askers.iter().map(|&agent| agent as i64).collect();
-                x.f_index_select(0, &Tensor::f_from_slice(&index)?.f_to_device(x.device())?)?
+                let rows: Vec<i64> = askers.iter().map(|&agent| agent as i64).collect();
+                picked(x, &rows)?
             };
             let answer = self.answer(&query, x, types, asked, bias.as_ref())?;
             let answer = self.out[*kind].forward(&answer)?.f_transpose(0, 1)?;
@@ -166,10 +164,8 @@ impl AgentAttention {
         if types.len() == 1 {
             // With a single agent all weights are 1.
             let (weight, offset) = &asked.key_value[first];
-            let (weight, offset) = (
-                weight.f_narrow(0, inner, inner)?,
-                offset.f_narrow(0, inner, inner)?,
-            );
+            let weight = weight.f_narrow(0, inner, inner)?;
+            let offset = offset.f_narrow(0, inner, inner)?;
             return x.f_linear(&weight, Some(&offset))?.f_transpose(0, 1);
         }
         let query = query.f_linear(&asked.query.0, Some(&asked.query.1))?;
@@ -200,10 +196,8 @@ impl AgentAttention {
         let mut key_value = Vec::with_capacity(AGENT_TYPES);
         for sender in 0..AGENT_TYPES {
             let relation = (kind * AGENT_TYPES + sender) as i64;
-            let (att, msg) = (
-                self.relation_att.f_get(relation)?,
-                self.relation_msg.f_get(relation)?,
-            );
+            let att = self.relation_att.f_get(relation)?;
+            let msg = self.relation_msg.f_get(relation)?;
             // q W k = q (W k), and (v as a row) W = W^T v.
             let key = folded(&att, &self.key[sender])?;
             let value = folded(&msg.f_transpose(1, 2)?, &self.value[sender])?;

@@ -1,14 +1,13 @@
 //! Encoder of V2X-ViT: layers of agent attention, window attention and a feed-forward network, all pre-norm.
 
-use tch::Tensor;
-use tch::nn;
+use tch::{Tensor, nn};
 
 use super::agent_attention::AgentAttention;
 use super::config::V2xVitConfig;
 use super::temporal_encoding::TemporalEncoding;
 use super::window_attention::WindowAttention;
 use crate::block_order::BlockOrder;
-use crate::layers::{FeedForward, LayerNorm};
+use crate::layers::{FeedForwardBlock, LayerNorm};
 
 /// One pair of attentions, each with a residual.
 #[derive(Debug)]
@@ -56,9 +55,8 @@ impl Block {
         queries: usize,
         train: bool,
     ) -> tch::Result<Tensor> {
-        let seen =
-            self.agents
-                .forward(&self.agent_norm.forward(x)?, unseen, types, queries, train)?;
+        let normed = self.agent_norm.forward(x)?;
+        let seen = (self.agents).forward(&normed, unseen, types, queries, train)?;
         (x.f_narrow(0, 0, queries as i64)? + seen).f_contiguous()
     }
 
@@ -75,8 +73,7 @@ impl Block {
 #[derive(Debug)]
 pub struct Layer {
     blocks: Vec<Block>,
-    norm: LayerNorm,
-    feed_forward: FeedForward,
+    feed_forward: FeedForwardBlock,
 }
 
 impl Layer {
@@ -90,7 +87,7 @@ impl Layer {
     /// # Errors
     /// [`tch::TchError`] when shapes do not fit.
     pub fn feed_forward(&self, x: &Tensor, train: bool) -> tch::Result<Tensor> {
-        Ok(x + self.feed_forward.forward(&self.norm.forward(x)?, train)?)
+        self.feed_forward.forward(x, train)
     }
 }
 
@@ -115,9 +112,8 @@ impl Encoder {
                         blocks: (0..config.blocks)
                             .map(|block| Block::new(&(&path / 0 / "layers" / block), config, order))
                             .collect(),
-                        norm: LayerNorm::new(&(&path / 1 / "norm"), config.channels),
-                        feed_forward: FeedForward::new(
-                            &(&path / 1 / "fn"),
+                        feed_forward: FeedForwardBlock::new(
+                            &(&path / 1),
                             config.channels,
                             config.hidden,
                             config.dropout,
@@ -170,10 +166,9 @@ impl Encoder {
                 let is_last = index + 1 == layer.blocks.len();
                 x = each_agent(&x, |x| {
                     let x = block.across_cells(x, train)?;
-                    if is_last {
-                        layer.feed_forward(&x, train)
-                    } else {
-                        Ok(x)
+                    match is_last {
+                        true => layer.feed_forward(&x, train),
+                        false => Ok(x),
                     }
                 })?;
             }
@@ -184,12 +179,9 @@ impl Encoder {
 
 /// Applies `step` to each of `[N, T, C]`.
 fn each_agent(x: &Tensor, step: impl Fn(&Tensor) -> tch::Result<Tensor>) -> tch::Result<Tensor> {
-    let agents = (0..x.size3()?.0)
-        .map(|agent| step(&x.f_get(agent)?))
-        .collect::<Result<Vec<_>, _>>()?;
-    if let [only] = &agents[..] {
-        only.f_unsqueeze(0)
-    } else {
-        Tensor::f_stack(&agents, 0)
+    let agents = (0..x.size3()?.0).map(|agent| step(&x.f_get(agent)?));
+    match &agents.collect::<Result<Vec<_>, _>>()?[..] {
+        [only] => only.f_unsqueeze(0),
+        agents => Tensor::f_stack(agents, 0),
     }
 }

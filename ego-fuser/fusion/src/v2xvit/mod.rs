@@ -11,8 +11,7 @@ mod temporal_encoding;
 mod window_attention;
 
 use perception::model_config::{ConfigError, DetectorConfig};
-use tch::nn;
-use tch::{TchError, Tensor};
+use tch::{TchError, Tensor, nn};
 
 pub use agent_attention::AgentAttention;
 pub use config::{Merge, V2xVitConfig, WindowConfig};
@@ -76,10 +75,9 @@ impl V2xVit {
         let Some(temporal) = self.encoder.temporal() else {
             return Ok(warped.features.shallow_clone());
         };
-        let rows: Vec<f64> = (maps.metadata.iter())
-            .map(|map| map.age_secs / ROW_SECS)
-            .collect();
-        let code = temporal.encode(&rows)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
+        let rows = maps.metadata.iter().map(|map| map.age_secs / ROW_SECS);
+        let code = temporal.encode(&rows.collect::<Vec<f64>>())?;
+        let code = code.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
         // The reference adds it before the warp, which leaves zeros where a map does not reach.
         warped.features.f_addcmul(&code, &warped.mask)
     }
@@ -89,31 +87,19 @@ impl Fusion for V2xVit {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let mask = &maps.warped.mask;
         let padding = Padding::to_multiples(&maps.warped.features, self.order.largest())?;
-        let tokens = self
-            .order
-            .tokens(&padding.maps(&self.with_age(maps)?, 0)?)?;
+        let order = &self.order;
+        let tokens = order.tokens(&padding.maps(&self.with_age(maps)?, 0)?)?;
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
-        let unseen = if sees_all && padding.is_empty() {
-            None
-        } else {
-            Some(
-                self.order
-                    .tokens(&unseen(&padding.mask(mask, 0)?)?)?
-                    .f_squeeze_dim(2)?,
-            )
+        let unseen = match sees_all && padding.is_empty() {
+            true => None,
+            false => Some(unseen(&padding.mask(mask, 0)?)?),
         };
+        let unseen = unseen.map(|unseen| order.tokens(&unseen)?.f_squeeze_dim(2));
+        let unseen = unseen.transpose()?;
         let types = vec![VEHICLE; maps.metadata.len()];
-        let fused = self
-            .encoder
-            .forward(&tokens, unseen.as_ref(), &types, maps.is_training)?;
+        let fused = (self.encoder).forward(&tokens, unseen.as_ref(), &types, maps.is_training)?;
         let [height, width] = padding.size();
-        Ok(padding
-            .crop(
-                &self
-                    .order
-                    .maps(&fused.f_unsqueeze(0)?, height, width)?
-                    .f_get(0)?,
-            )?
-            .into())
+        let fused = order.maps(&fused.f_unsqueeze(0)?, height, width)?;
+        Ok(padding.crop(&fused.f_get(0)?)?.into())
     }
 }

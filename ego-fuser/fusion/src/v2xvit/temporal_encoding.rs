@@ -1,5 +1,6 @@
 //! Temporal encoding of V2X-ViT: an additive encoding of an agent's delay.
 
+use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
@@ -40,24 +41,17 @@ impl TemporalEncoding {
     /// [`TchError`] of the tensor library.
     pub fn encode(&self, rows: &[f64]) -> Result<Tensor, TchError> {
         let last = (ROWS - 1) as f64;
-        let rows: Vec<f64> = rows
-            .iter()
-            .map(|row| {
-                // `clamp` passes NaN on, which would spread over the whole code.
-                if row.is_nan() {
-                    0.0
-                } else {
-                    row.clamp(0.0, last)
-                }
-            })
-            .collect();
+        // `clamp` passes NaN on, which would spread over the whole code.
+        let rows = rows.iter().map(|row| match row.is_nan() {
+            true => 0.0,
+            false => row.clamp(0.0, last),
+        });
+        let rows: Vec<f64> = rows.collect();
         let lower: Vec<i64> = rows.iter().map(|row| row.floor() as i64).collect();
         let upper: Vec<i64> = rows.iter().map(|row| row.ceil() as i64).collect();
         let share: Vec<f32> = rows.iter().map(|row| row.fract() as f32).collect();
         let (lower, upper) = (picked(&self.table, &lower)?, picked(&self.table, &upper)?);
-        let share = Tensor::f_from_slice(&share)?
-            .f_view([-1, 1])?
-            .f_to_device(self.table.device())?;
+        let share = tensor(&share, &[-1, 1], self.table.device())?;
         let codes = lower.f_lerp_tensor(&upper, &share.f_expand_as(&lower)?)?;
         self.linear.forward(&codes)
     }
@@ -69,12 +63,8 @@ fn waves(channels: i64) -> Tensor {
         .map(|index| {
             let (row, channel) = ((index / channels) as f64, index % channels);
             let rate = 10_000f64.powf(-((channel - channel % 2) as f64) / channels as f64);
-            let phase = row * rate;
-            let wave = if channel % 2 == 0 {
-                phase.sin()
-            } else {
-                phase.cos()
-            };
+            let (sine, cosine) = (row * rate).sin_cos();
+            let wave = if channel % 2 == 0 { sine } else { cosine };
             (wave / (channels as f64).sqrt()) as f32
         })
         .collect();

@@ -1,7 +1,6 @@
 //! MSwin: attention within windows of several sizes, for every agent separately.
 
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor, nn};
 
 use super::config::{Merge, WindowConfig};
 use crate::block_order::BlockOrder;
@@ -140,17 +139,13 @@ impl WindowAttention {
     /// [`TchError`] when the tokens do not fill complete windows.
     pub fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let tokens = x.size2()?.0;
-        let chunk = if train {
-            tokens
-        } else {
+        let chunk = match train {
+            true => tokens,
             // Complete windows of the largest size are complete windows of every size.
-            (CHUNK / self.largest).max(1) * self.largest
+            false => (CHUNK / self.largest).max(1) * self.largest,
         };
-        let biases = self
-            .branches
-            .iter()
-            .map(WindowBranch::bias)
-            .collect::<Result<Vec<_>, _>>()?;
+        let biases = self.branches.iter().map(WindowBranch::bias);
+        let biases = biases.collect::<Result<Vec<_>, _>>()?;
         let chunks = x.f_split(chunk.max(1), 0)?;
         let seen = chunks.iter().map(|x| {
             let branches = self.branches.iter().zip(&biases);
@@ -159,15 +154,11 @@ impl WindowAttention {
         });
         let seen: Vec<Vec<Tensor>> = seen.collect::<Result<_, _>>()?;
         let (weights, bias) = self.merged(&seen, tokens)?;
-        let outputs: Vec<Tensor> = seen
-            .iter()
-            .map(|seen| project(seen, &weights, &bias))
-            .collect::<Result<_, _>>()?;
-        // A single chunk is not copied.
-        let output = if let [only] = &outputs[..] {
-            only.shallow_clone()
-        } else {
-            Tensor::f_cat(&outputs, 0)?
+        let outputs = seen.iter().map(|seen| project(seen, &weights, &bias));
+        let output = match &outputs.collect::<Result<Vec<_>, _>>()?[..] {
+            // A single chunk is not copied.
+            [only] => only.shallow_clone(),
+            outputs => Tensor::f_cat(outputs, 0)?,
         };
         dropout(output, self.dropout, train)
     }
@@ -194,18 +185,11 @@ impl WindowAttention {
                 gate.shares(&mean)?
             }
         };
-        let weights = self
-            .branches
-            .iter()
-            .enumerate()
-            .map(|(index, branch)| {
-                branch
-                    .out
-                    .weight
-                    .f_transpose(0, 1)?
-                    .f_mul(&shares.f_get(index as i64)?)
-            })
-            .collect::<Result<Vec<_>, _>>()?;
+        let weights = (0..).zip(&self.branches).map(|(index, branch)| {
+            let weight = branch.out.weight.f_transpose(0, 1)?;
+            weight.f_mul(&shares.f_get(index)?)
+        });
+        let weights = weights.collect::<Result<Vec<_>, TchError>>()?;
         Ok((weights, sum_over_first(&(&biases * &shares))?))
     }
 }

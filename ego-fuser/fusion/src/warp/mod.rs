@@ -7,6 +7,7 @@
 pub mod coalign;
 mod sampling;
 
+use perception::tensor_values::tensor;
 use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
 
@@ -67,12 +68,17 @@ impl WarpedMaps {
         Ok(self.features.size4()?.0)
     }
 
+    /// Features and mask after the same change.
+    pub(crate) fn each(
+        &self,
+        change: impl Fn(&Tensor) -> Result<Tensor, TchError>,
+    ) -> Result<Self, TchError> {
+        Ok(Self::new(change(&self.features)?, change(&self.mask)?))
+    }
+
     /// The entries from `first` up to `end`.
     pub(crate) fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
-        Ok(Self {
-            features: self.features.f_narrow(0, first, end - first)?,
-            mask: self.mask.f_narrow(0, first, end - first)?,
-        })
+        self.each(|maps| maps.f_narrow(0, first, end - first))
     }
 }
 
@@ -115,21 +121,17 @@ pub fn warp_to_ego(
             mask: sent.f_to_kind(features.kind())?,
         });
     }
-    let mut moved = Vec::with_capacity(ego_from_cav.len());
-    let mut masks = Vec::with_capacity(ego_from_cav.len());
-    for (index, affine) in affine.iter().enumerate() {
-        let map = features.f_narrow(0, index as i64, 1)?;
-        let sent = sent.f_narrow(0, index as i64, 1)?;
-        if *affine == UNMOVED {
-            moved.push(map);
-            masks.push(sent.f_to_kind(features.kind())?);
-            continue;
+    let warped = (0..).zip(affine).map(|(index, affine)| {
+        let map = features.f_narrow(0, index, 1)?;
+        let sent = sent.f_narrow(0, index, 1)?;
+        if affine == UNMOVED {
+            return Ok((map, sent.f_to_kind(features.kind())?));
         }
-        let sampling_grid = sampling_grid(*affine, grid)?.f_to_device(features.device())?;
-        let (map, mask) = read(&map, &sent, &sampling_grid)?;
-        moved.push(map);
-        masks.push(mask);
-    }
+        let shape = [1, height, width, 2];
+        let sampling_grid = tensor(&places(affine, grid), &shape, features.device())?;
+        read(&map, &sent, &sampling_grid)
+    });
+    let (moved, masks): (Vec<_>, Vec<_>) = warped.collect::<Result<_, TchError>>()?;
     Ok(WarpedMaps {
         features: Tensor::f_cat(&moved, 0)?,
         mask: Tensor::f_cat(&masks, 0)?,
@@ -168,33 +170,24 @@ pub(crate) fn warp_cells(
 /// # Errors
 /// [`WarpError`] states both sizes or counts.
 pub(crate) fn check(maps: &Tensor, ego_from_cav: &[Pose], grid: &BevGrid) -> Result<(), WarpError> {
-    let size = maps.size();
-    let &[maps, _, height, width] = size.as_slice() else {
-        return Err(shape_error(size, grid));
-    };
-    if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
-        return Err(shape_error(size, grid));
+    let (found, poses) = (maps.size(), ego_from_cav.len());
+    let &BevGrid { height, width, .. } = grid;
+    match found[..] {
+        [maps, _, rows, columns] if [rows, columns] == [height, width].map(i64::from) => {
+            match maps == poses as i64 {
+                true => Ok(()),
+                false => Err(WarpError::PoseCount { maps, poses }),
+            }
+        }
+        _ => Err(WarpError::Shape {
+            found,
+            height,
+            width,
+        }),
     }
-    if maps != ego_from_cav.len() as i64 {
-        return Err(WarpError::PoseCount {
-            maps,
-            poses: ego_from_cav.len(),
-        });
-    }
-    Ok(())
 }
 
-/// Positions of a grid's cells under an affine map of normalised coordinates, `[1, h, w, 2]` for `grid_sampler`.
-fn sampling_grid(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
-    Tensor::f_from_slice(&places(affine, grid))?.f_view([
-        1,
-        i64::from(grid.height),
-        i64::from(grid.width),
-        2,
-    ])
-}
-
-/// The same in plain floats, two for each cell.
+/// Positions of a grid's cells under an affine map of normalised coordinates, for `grid_sampler`: two floats for each.
 fn places(affine: [f32; 6], grid: &BevGrid) -> Vec<f32> {
     let [rows, columns] = [grid.height, grid.width].map(|count| count as usize);
     let mut places = Vec::with_capacity(2 * rows * columns);
@@ -253,14 +246,6 @@ fn read_by_tensors(
         map.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)? * &mask,
         mask,
     ))
-}
-
-fn shape_error(found: Vec<i64>, grid: &BevGrid) -> WarpError {
-    WarpError::Shape {
-        found,
-        height: grid.height,
-        width: grid.width,
-    }
 }
 
 /// The identity.
@@ -374,7 +359,8 @@ mod tests {
             let map = uniform(seed, &[1, channels, 16, 32]);
             let sent = uniform(seed + 1, &[1, 1, 16, 32]).gt(0.3).to_kind(Kind::Float);
             let affine = cav_from_ego_normalized(&Pose::from_xyz_yaw([x_m, y_m, 0.0], yaw), &GRID);
-            let sampling_grid = sampling_grid(affine, &GRID).unwrap();
+            let places = places(affine, &GRID);
+            let sampling_grid = tensor(&places, &[1, 16, 32, 2], Device::Cpu).unwrap();
             let theta = Tensor::from_slice(&affine).view([1, 2, 3]);
             let apart = &sampling_grid - Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
             prop_assert!(apart.abs().max().double_value(&[]) < 1e-4);

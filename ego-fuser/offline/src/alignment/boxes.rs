@@ -32,9 +32,8 @@ impl FreeAlign {
 
 impl AlignmentMethod for FreeAlign {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
-        Ok(message(
-            &vehicle.boxes[..vehicle.boxes.len().min(self.config.max_boxes)],
-        ))
+        let sent = vehicle.boxes.len().min(self.config.max_boxes);
+        Ok(message(&vehicle.boxes[..sent]))
     }
 
     fn align(
@@ -70,11 +69,8 @@ impl AlignmentMethod for BoxIcp {
         own: &Message,
         received: &Message,
     ) -> Result<Isometry3<f64>, NotAligned> {
-        Ok(box_icp::align(
-            &boxes(own)?,
-            &boxes(received)?,
-            &Isometry3::identity(),
-        )?)
+        let (ego, neighbour) = (boxes(own)?, boxes(received)?);
+        Ok(box_icp::align(&ego, &neighbour, &Isometry3::identity())?)
     }
 }
 
@@ -91,10 +87,7 @@ fn message(boxes: &[Box3d]) -> Message {
 
 fn boxes(message: &Message) -> Result<Vec<Box3d>, NotAligned> {
     match message {
-        Message::Boxes(boxes) => Ok(boxes
-            .detections()
-            .map(|detection| detection.box3d)
-            .collect()),
+        Message::Boxes(boxes) => Ok(boxes.detections().map(|found| found.box3d).collect()),
         _ => Err(NotAligned::Message),
     }
 }

@@ -34,29 +34,23 @@ impl CloudIcp {
             return Ok(Isometry3::identity());
         }
         let own = own.world_from_cav().ok_or(NotAligned::NoPose)?;
-        Ok(own
-            .from_world(received.world_from_cav().ok_or(NotAligned::NoPose)?)
-            .isometry())
+        let received = received.world_from_cav().ok_or(NotAligned::NoPose)?;
+        Ok(own.from_world(received).isometry())
     }
 }
 
 impl AlignmentMethod for CloudIcp {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
         let decimate = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
-        let xyzi = decimate
-            .points_m()
-            .iter()
-            .map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0])
-            .collect();
-        let measured = vehicle
-            .frame
-            .gnss_world_from_lidar()
-            .filter(|_| self.starts_at_gnss);
+        let points = decimate.points_m().iter();
+        let xyzi = points.map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]);
+        let points = PointCloud {
+            xyzi: xyzi.collect(),
+        };
+        let measured = vehicle.frame.gnss_world_from_lidar();
+        let measured = measured.filter(|_| self.starts_at_gnss);
         let pose = measured.map_or(NO_POSE, |pose| PoseEstimate::new(pose, 1.0));
-        Ok(Message::Points(Points {
-            pose,
-            points: PointCloud { xyzi },
-        }))
+        Ok(Message::Points(Points { pose, points }))
     }
 
     fn align(

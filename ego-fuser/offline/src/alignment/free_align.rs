@@ -129,26 +129,18 @@ pub fn align(
     };
     let mut finalists = search.finalists();
     finalists.sort_by(|a, b| {
-        b.matches
-            .len()
-            .cmp(&a.matches.len())
-            .then(a.rms_m.total_cmp(&b.rms_m))
+        let by_matches = b.matches.len().cmp(&a.matches.len());
+        by_matches.then(a.rms_m.total_cmp(&b.rms_m))
     });
     let best = finalists
         .first()
         .filter(|best| best.matches.len() >= required)
         .ok_or(too_few)?;
     // Repetitive scenes have several motions with many inliers: then none can be trusted.
-    let rival = finalists
-        .iter()
-        .find(|other| {
-            !same_motion(
-                &other.ego_from_neighbour,
-                &best.ego_from_neighbour,
-                config.fit_tolerance_m,
-            )
-        })
-        .map_or(0, |rival| rival.matches.len());
+    let (motion, tolerance_m) = (&best.ego_from_neighbour, config.fit_tolerance_m);
+    let mut others = finalists.iter();
+    let rival = others.find(|other| !same_motion(&other.ego_from_neighbour, motion, tolerance_m));
+    let rival = rival.map_or(0, |rival| rival.matches.len());
     if rival + config.min_lead > best.matches.len() {
         return Err(NoAlignment::Ambiguous {
             matches: best.matches.len(),
@@ -181,14 +173,9 @@ struct Graph {
 impl Graph {
     fn new(boxes: &[Box3d], config: &FreeAlignConfig) -> Self {
         // NaN fails the comparison and is left out too.
-        let nodes = boxes
-            .iter()
-            .enumerate()
-            .filter(|(_, node)| node.center_m.iter().all(|c| c.abs() < 1e6));
-        let (given, centres): (Vec<_>, Vec<_>) = nodes
-            .take(config.max_boxes)
-            .map(|(index, node)| (index, Vector3::from(node.center_m)))
-            .unzip();
+        let centres = boxes.iter().map(|node| Vector3::from(node.center_m));
+        let nodes = { centres.enumerate() }.filter(|(_, at)| at.iter().all(|c| c.abs() < 1e6));
+        let (given, centres): (Vec<_>, Vec<_>) = nodes.take(config.max_boxes).unzip();
         let edges = centres
             .iter()
             .flat_map(|a| centres.iter().map(move |b| (a - b).xy().norm()))
@@ -306,11 +293,8 @@ impl Search<'_> {
     }
 
     fn fit(&self, matches: &[Match]) -> Option<Isometry3<f64>> {
-        planar_fit::fit(
-            &matches
-                .iter()
-                .map(|&(a, b)| (self.neighbour.centres[b], self.ego.centres[a])),
-        )
+        let (ego, neighbour) = (&self.ego.centres, &self.neighbour.centres);
+        planar_fit::fit(&matches.iter().map(|&(a, b)| (neighbour[b], ego[a])))
     }
 
     /// The best motions, each with its inliers and fitted to these.
@@ -331,10 +315,8 @@ impl Search<'_> {
             motion = self.fit(&self.together(&motion))?;
         }
         let matches = self.together(&motion);
-        let squares: f64 = matches
-            .iter()
-            .map(|&pair| self.apart(pair, &motion).powi(2))
-            .sum();
+        let apart = matches.iter().map(|&pair| self.apart(pair, &motion));
+        let squares: f64 = apart.map(|apart_m| apart_m.powi(2)).sum();
         let rms_m = (squares / matches.len().max(1) as f64).sqrt();
         Some(BoxAlignment {
             ego_from_neighbour: motion,
@@ -353,10 +335,8 @@ impl Search<'_> {
         near.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut matches: Vec<Match> = Vec::new();
         for (_, pair) in near {
-            if matches
-                .iter()
-                .all(|known| known.0 != pair.0 && known.1 != pair.1)
-            {
+            let mut known = matches.iter();
+            if known.all(|known| known.0 != pair.0 && known.1 != pair.1) {
                 matches.push(pair);
             }
         }

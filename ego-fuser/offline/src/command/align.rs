@@ -93,15 +93,6 @@ enum Boxes {
     Annotated,
 }
 
-impl Boxes {
-    fn adjective(self) -> &'static str {
-        match self {
-            Self::Detected => "detected boxes",
-            Self::Annotated => "annotated boxes",
-        }
-    }
-}
-
 /// `NAME=FILE.yaml`
 #[derive(Debug, Clone)]
 struct NamedSource {
@@ -143,7 +134,10 @@ impl Arguments {
             let found = self.compare(&methods, &mut source, &scenarios, &mut left_out)?;
             for (mut row, method) in found.into_iter().zip(&methods) {
                 if self.boxes.len() > 1 && method.needs_boxes {
-                    row.method += &format!(", {}", boxes.adjective());
+                    row.method += match boxes {
+                        Boxes::Detected => ", detected boxes",
+                        Boxes::Annotated => ", annotated boxes",
+                    };
                 }
                 rows.push(row);
             }
@@ -165,10 +159,9 @@ impl Arguments {
     fn methods(&self, left_out: &mut LeftOut) -> Result<Vec<AlignmentSpec>> {
         use Method::{BoxIcp as BoxIcpMethod, FreeAlign as FreeAlignMethod, Gnss, Icp, IcpGnss};
         let all = [Gnss, Icp, IcpGnss, BoxIcpMethod, FreeAlignMethod];
-        let named = if self.method.is_empty() {
-            &all[..]
-        } else {
-            &self.method
+        let named = match &self.method[..] {
+            [] => &all[..],
+            named => named,
         };
         let built_in = named.iter().map(|method| self.built_in(*method, left_out));
         built_in
@@ -237,11 +230,9 @@ impl Arguments {
             bar.inc(1);
         }
         bar.finish_and_clear();
-        Ok(tallies
-            .iter()
-            .zip(methods)
-            .map(|(tally, method)| tally.row(&method.name))
-            .collect())
+        let rows = tallies.iter().zip(methods);
+        let rows = rows.map(|(tally, method)| tally.row(&method.name));
+        Ok(rows.collect())
     }
 }
 

@@ -3,13 +3,13 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use super::{DataSets, print_left_out};
+use super::{DataSets, print_left_out, rows_with_provenance};
 use anyhow::Result;
 use dataset::average_precision::{Ordering, Scorer, THRESHOLDS};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
-use dataset::{self, LeftOut, LoadOptions, Scenario};
+use dataset::{LeftOut, LoadOptions, Scenario};
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
@@ -18,7 +18,6 @@ use perception::weights::{KIND_KEY, Weights};
 use serde_json::{Value, json};
 use support::cli::{BadInput, Outcome};
 use support::output;
-use support::provenance::Provenance;
 use terminal::progress;
 
 /// A data set with its evaluation protocol.
@@ -81,28 +80,21 @@ impl Arguments {
             left_out.merge(&lost);
             rows.push(row);
         }
-        let area_m = weights.detector_config()?.lidar_range_m;
-        self.print_json(rows, &data, &protocols(&data, area_m))?;
+        self.print_json(rows, &data, weights.detector_config()?.lidar_range_m)?;
         Ok(print_left_out(&left_out))
     }
-}
 
-impl Arguments {
     /// The data sets, each with the agents of its protocol.
     fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
         let mut all = Vec::with_capacity(self.data.data.len());
         for opened in self.data.open(left_out)? {
-            let protocol = self
-                .protocol
-                .resolve(opened.layout)
-                .map_err(BadInput::new)?;
-            let mut scenarios = Vec::with_capacity(opened.scenarios.len());
-            for scenario in &opened.scenarios {
-                if let Some(mut scenario) = protocol.arrange(scenario) {
-                    let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
-                    scenario.ticks.truncate(most);
-                    scenarios.push(scenario);
-                }
+            let protocol = self.protocol.resolve(opened.layout);
+            let protocol = protocol.map_err(BadInput::new)?;
+            let scenarios = opened.scenarios.iter();
+            let mut scenarios: Vec<_> = scenarios.filter_map(|it| protocol.arrange(it)).collect();
+            for scenario in &mut scenarios {
+                let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
+                scenario.ticks.truncate(most);
             }
             all.push(Data {
                 protocol,
@@ -120,9 +112,7 @@ impl Arguments {
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
         let mut tally = Tally::default();
-        let all = data
-            .iter()
-            .flat_map(|data| data.scenarios.iter().map(move |scenario| (data, scenario)));
+        let all = { data.iter() }.flat_map(|data| data.scenarios.iter().map(move |it| (data, it)));
         for (data, scenario) in all {
             let rule = data.protocol.rule_within(detector.config().lidar_range_m);
             for tick in 0..scenario.ticks.len() {
@@ -154,57 +144,34 @@ impl Arguments {
         if !self.json {
             print_row(&row)?;
         }
-        let area_m = detector.config().lidar_range_m;
-        self.print_json(vec![row], data, &protocols(data, area_m))
+        self.print_json(vec![row], data, detector.config().lidar_range_m)
     }
 
-    /// Command, and digests of the program, the weights, the scripts and the evaluated data.
-    fn provenance(&self, data: &[Data]) -> Result<Provenance> {
-        let scripts = self.method.iter().filter_map(|method| method.script_file());
-        let files = scripts.chain([self.weights.as_path()]).map(Path::to_owned);
-        let scenarios = data.iter().flat_map(|data| &data.scenarios);
-        Ok(dataset::provenance(
-            scenarios,
-            files,
-            env!("V2VLOC_COMMIT"),
-        )?)
-    }
-
-    /// Prints rows with the protocol of each data set and the provenance, if JSON is asked for.
-    fn print_json(
-        &self,
-        mut rows: Vec<Value>,
-        data: &[Data],
-        protocols: &[EvaluationProtocol],
-    ) -> Result<()> {
+    /// If JSON is asked for, prints rows with the protocol of each data set, as it applies to the area of the network,
+    /// and with command and digests of the program, the weights, the scripts and the evaluated data.
+    fn print_json(&self, mut rows: Vec<Value>, data: &[Data], area_m: [f64; 6]) -> Result<()> {
         if !self.json {
             return Ok(());
         }
-        let provenance = self.provenance(data)?;
+        let protocols = data.iter().map(|data| data.protocol.within(area_m));
+        let protocols = json!(protocols.collect::<Vec<_>>());
         for row in &mut rows {
-            row["protocols"] = json!(protocols);
-            row["provenance"] = json!(provenance);
+            row["protocols"] = protocols.clone();
         }
-        output::line(serde_json::to_string_pretty(&rows)?)?;
+        let scripts = self.method.iter().filter_map(|method| method.script_file());
+        let files = scripts.chain([self.weights.as_path()]).map(Path::to_owned);
+        let scenarios = data.iter().flat_map(|data| &data.scenarios);
+        output::line(rows_with_provenance(&rows, scenarios, files)?)?;
         Ok(())
     }
-}
-
-/// The protocol of each data set, as it applies to the area of the network.
-fn protocols(data: &[Data], area_m: [f64; 6]) -> Vec<EvaluationProtocol> {
-    let protocols = data.iter().map(|data| data.protocol.within(area_m));
-    protocols.collect()
 }
 
 /// Results of one method over all data, and the data that were left out.
 fn evaluate(setup: &Setup, data: &[Data], json: bool) -> Result<(Value, LeftOut)> {
     let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
     for data in data {
-        let protocol = Some(data.protocol.clone());
-        let setup = Setup {
-            protocol,
-            ..setup.clone()
-        };
+        let mut setup = setup.clone();
+        setup.protocol = Some(data.protocol.clone());
         let mut evaluator = Evaluator::new(setup).map_err(BadInput::of)?;
         name = evaluator.ego().method().name();
         let frames = data.scenarios.iter().map(|scenario| scenario.ticks.len());

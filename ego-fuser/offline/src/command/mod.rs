@@ -84,9 +84,9 @@ impl DataSets {
 }
 
 /// Rows of a result as JSON, each with command and digests of what the result was made from.
-fn rows_with_provenance(
+fn rows_with_provenance<'a>(
     rows: &impl Serialize,
-    scenarios: &[Scenario],
+    scenarios: impl IntoIterator<Item = &'a Scenario>,
     files: impl IntoIterator<Item = PathBuf>,
 ) -> anyhow::Result<String> {
     let provenance = dataset::provenance(scenarios, files, env!("V2VLOC_COMMIT"))?;

@@ -38,23 +38,20 @@ impl Arguments {
         }
         let mut left_out = unused.clone();
         for path in &self.weights {
+            let file = path.display();
             // The same sweeps for every file.
             left_out = unused.clone();
             let scales = search_scales(path, &scenarios, self.frames, &mut left_out)
                 .map_err(BadInput::of)?;
             if scales.is_empty() {
-                output::line(format_args!(
-                    "{}: no layer can be quantised, unchanged",
-                    path.display()
-                ))?;
+                output::line(format_args!("{file}: no layer can be quantised, unchanged"))?;
                 continue;
             }
             let sha256 = annotate(path, SCALES_KEY, &serde_json::to_string(&scales)?)
                 .map_err(BadInput::of)?;
+            let count = scales.len();
             output::line(format_args!(
-                "{}: {} activations, SHA-256 {sha256}",
-                path.display(),
-                scales.len()
+                "{file}: {count} activations, SHA-256 {sha256}"
             ))?;
         }
         Ok(left_out.print())

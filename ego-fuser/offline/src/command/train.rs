@@ -163,10 +163,8 @@ impl Arguments {
         }
         let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
-        self.options.print(
-            &summary.trained,
-            &serde_json::json!({"accuracy": summary.accuracy}),
-        )?;
+        let accuracy = serde_json::json!({"accuracy": summary.accuracy});
+        self.options.print(&summary.trained, &accuracy)?;
         Ok(())
     }
 
@@ -182,9 +180,9 @@ impl Arguments {
     /// Refuses options that change nothing of this training.
     fn check_effects(&self) -> Result<(), BadInput> {
         if self.protocol.ap_order.is_some() {
-            return Err(BadInput::new(
-                "--ap-order: the curve of a training has one order, by score over all frames",
-            ));
+            let reason =
+                "--ap-order: the curve of a training has one order, by score over all frames";
+            return Err(BadInput::new(reason));
         }
         let neighbours = !self.poses.is_empty() || self.lost_share > 0.0 || self.max_delay_ms > 0;
         if neighbours && self.method.exchange() == Exchange::Nothing {
@@ -213,11 +211,8 @@ impl Arguments {
                 .map_err(|error| BadInput::new(format!("{}: {error}", folder.display())))
                 .context("datasets")?;
         }
-        let rule = self
-            .protocol
-            .resolve(Layout::OPV2V)
-            .map_err(BadInput::new)?
-            .ground_truth;
+        let protocol = self.protocol.resolve(Layout::OPV2V);
+        let rule = protocol.map_err(BadInput::new)?.ground_truth;
         let samples = SampleConfig {
             augmentation: Augmentation {
                 turn_rad: self.turn_deg.to_radians(),
@@ -236,15 +231,12 @@ impl Arguments {
             merged_truth: self.ego_only,
             ..SampleConfig::training(SampleKind::Single)
         };
-        let unassigned = if self.ignore_unassigned {
-            Unassigned::Ignored
-        } else {
-            Unassigned::Background
+        let unassigned = match self.ignore_unassigned {
+            true => Unassigned::Ignored,
+            false => Unassigned::Background,
         };
-        let run = self
-            .options
-            .run_config(self.batch, self.lr)
-            .map_err(BadInput::of)?;
+        let run = self.options.run_config(self.batch, self.lr);
+        let run = run.map_err(BadInput::of)?;
         Ok(TrainConfig {
             data: self.data.data.clone(),
             validation: self.validation.clone(),
@@ -316,11 +308,8 @@ impl Arguments {
             }
             None => self.network.clone(),
         };
-        let fusion = ablated(
-            &self.method.default_fusion(&detector),
-            &self.without,
-            self.time_steps,
-        );
+        let whole = self.method.default_fusion(&detector);
+        let fusion = ablated(&whole, &self.without, self.time_steps);
         Ok(Some(fusion.map_err(BadInput::of)?))
     }
 }

@@ -84,27 +84,19 @@ pub fn run(
         let frames: Vec<Frame> = { loaded.frames.into_iter() }
             .map(|(_, frame)| frame)
             .collect();
-        let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick)))
-            .collect::<Result<Vec<_>, _>>()?;
+        let truth = frames.iter().map(|frame| {
+            let pose = frame.world_from_lidar.map(|pose| pose.isometry());
+            pose.ok_or_else(|| AlignError::NoTruth {
+                scenario: scenario.name.clone(),
+                stem: scenario.ticks[tick].stem.clone(),
+                cav: frame.cav.clone(),
+            })
+        });
+        let truth = truth.collect::<Result<Vec<_>, _>>()?;
         let boxes = needs_boxes.then_some(&mut *box_source);
         moment(&mut methods, boxes, &frames, &truth, on_outcome)?;
     }
     Ok(left_out)
-}
-
-fn true_pose(
-    frame: &Frame,
-    scenario: &Scenario,
-    tick: usize,
-) -> Result<Isometry3<f64>, AlignError> {
-    frame
-        .world_from_lidar
-        .map(|pose| pose.isometry())
-        .ok_or_else(|| AlignError::NoTruth {
-            scenario: scenario.name.clone(),
-            stem: scenario.ticks[tick].stem.clone(),
-            cav: frame.cav.clone(),
-        })
 }
 
 /// All pairs of one tick; the ego comes first.
@@ -127,19 +119,14 @@ fn moment(
             None => Ok(Vec::new()),
         })
         .collect::<Result<Vec<_>, _>>()?;
-    let vehicles: Vec<Vehicle<'_>> = near
-        .iter()
-        .zip(&boxes)
-        .map(|(&index, boxes)| Vehicle {
-            frame: &frames[index],
-            boxes,
-        })
-        .collect();
+    let vehicles = near.iter().zip(&boxes).map(|(&index, boxes)| Vehicle {
+        frame: &frames[index],
+        boxes,
+    });
+    let vehicles: Vec<Vehicle<'_>> = vehicles.collect();
     for (number, method) in methods.iter_mut().enumerate() {
-        let prepared = vehicles
-            .iter()
-            .map(|vehicle| prepare(method.as_mut(), vehicle))
-            .collect::<Result<Vec<_>, _>>()?;
+        let prepared = vehicles.iter().map(|it| prepare(method.as_mut(), it));
+        let prepared = prepared.collect::<Result<Vec<_>, _>>()?;
         let Some((own, neighbours)) = prepared.split_first() else {
             continue;
         };
@@ -194,10 +181,8 @@ fn boxes(
         }
         BoxSource::Annotated => {
             let lidar_from_world = world_from_lidar.inverse();
-            let targets = frame
-                .objects
-                .iter()
-                .filter(|object| ClassSet::VEHICLES.contains(object.class));
+            let objects = frame.objects.iter();
+            let targets = objects.filter(|object| ClassSet::VEHICLES.contains(object.class));
             let mut found: Vec<Box3d> = targets
                 .map(|object| ground_truth::upright_box(object, &lidar_from_world))
                 .collect();

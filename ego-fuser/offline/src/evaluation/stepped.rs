@@ -162,22 +162,20 @@ impl<'a> Run<'a> {
     fn compute(&mut self) -> Result<(), EvaluateError> {
         let tick = self.next;
         self.next += 1;
-        let method = self.evaluator.ego.method();
-        let load = LoadOptions {
+        let mut load = LoadOptions {
             points: self.evaluator.needs_points(),
             lidar_variant: self.evaluator.setup.lidar_variant.clone(),
             ..LoadOptions::default()
         };
         let places = &self.places;
         let ego_place = places.first().copied();
-        // Without an exchange, neighbours have nothing to encode; their poses are still needed.
-        let is_needed =
-            |place: usize| Some(place) == ego_place || method.exchange() != Exchange::Nothing;
+        let is_exchanged = self.evaluator.ego.method().exchange() != Exchange::Nothing;
         let is_here = self.evaluator.remote.is_none();
         let sweeps = self
             .evaluator
             .sweeps(self.scenario, tick, places, &load, |place| {
-                is_here && is_needed(place)
+                // Without an exchange, neighbours have nothing to encode; their poses are still needed.
+                is_here && (is_exchanged || Some(place) == ego_place)
             })?;
         if sweeps.first().map(|ego| ego.place) != ego_place {
             self.computed.push_back(None);
@@ -186,10 +184,6 @@ impl<'a> Run<'a> {
         let all = self.perceive(&sweeps)?;
         let mut frames: Vec<Frame> = sweeps.into_iter().map(|sweep| sweep.frame).collect();
         let (mut poses, mut failure) = (Vec::with_capacity(all.len()), None);
-        let own_sweep = SweepTime {
-            capture_nanos: self.scenario.ticks[tick].capture_nanos,
-            arrived_nanos: self.scenario.ticks[tick].capture_nanos,
-        };
         for (place, sent) in all.into_iter().enumerate() {
             poses.push(sent.pose);
             if let Some(reason) = &sent.failure {
@@ -197,19 +191,15 @@ impl<'a> Run<'a> {
                     .count_failure(self.scenario, tick, &sent.cav, reason);
             }
             if place == 0 {
-                failure = self.send_own(tick, sent, own_sweep)?;
-            } else if !sent.messages.is_empty() && method.exchange() != Exchange::Nothing {
+                failure = self.send_own(tick, sent)?;
+            } else if !sent.messages.is_empty() && is_exchanged {
                 let distance_m = distance_m(&frames[0], &frames[place]);
                 self.delivery.enqueue(tick, sent, &self.compute, distance_m);
             }
         }
-        let blind = LoadOptions {
-            points: false,
-            ..load
-        };
-        let observers = self
-            .scenario
-            .load_tick(tick, self.observers.iter().copied(), &blind);
+        load.points = false;
+        let observers = self.observers.iter().copied();
+        let observers = self.scenario.load_tick(tick, observers, &load);
         self.evaluator.left_out.add_tick(&observers);
         frames.extend(observers.frames.into_iter().map(|(_, frame)| frame));
         self.computed.push_back(Some(Computed {
@@ -221,16 +211,13 @@ impl<'a> Run<'a> {
     }
 
     /// Queues the own agent's message; returns the reason where there is none.
-    fn send_own(
-        &mut self,
-        tick: usize,
-        sent: Sent,
-        sweep: SweepTime,
-    ) -> Result<Option<String>, EvaluateError> {
-        self.handle(
-            Input::Sweeps(sent.cav.clone(), vec![sweep]),
-            sweep.arrived_nanos,
-        )?;
+    fn send_own(&mut self, tick: usize, sent: Sent) -> Result<Option<String>, EvaluateError> {
+        let capture_nanos = self.scenario.ticks[tick].capture_nanos;
+        let sweep = SweepTime {
+            capture_nanos,
+            arrived_nanos: capture_nanos,
+        };
+        self.handle(Input::Sweeps(sent.cav.clone(), vec![sweep]), capture_nanos)?;
         let failure = sent.failure.clone();
         let Some(view) = sent.into_views().pop() else {
             return Ok(Some(failure.unwrap_or_default()));
@@ -284,9 +271,7 @@ impl<'a> Run<'a> {
                 self.advance()?;
             },
         };
-        if let Err(reason) = &fused
-            && computed.failure.is_none()
-        {
+        if let (Err(reason), None) = (&fused, &computed.failure) {
             let cav = &computed.frames[0].cav;
             self.evaluator
                 .count_failure(self.scenario, tick, cav, reason);
@@ -304,10 +289,9 @@ impl<'a> Run<'a> {
     /// that are captured until then are computed first.
     fn advance(&mut self) -> Result<(), EvaluateError> {
         loop {
+            let own = self.own.front();
             let moments = [
-                self.own
-                    .front()
-                    .map(|message| message.reception.arrived_nanos),
+                own.map(|message| message.reception.arrived_nanos),
                 self.arriving.front().map(Envelope::arrived_nanos),
                 self.ego_loop.wakes_nanos(),
             ];
@@ -334,25 +318,21 @@ impl<'a> Run<'a> {
     /// Takes everything in that has arrived, and wakes the ego.
     fn act(&mut self, now_nanos: u64) -> Result<(), EvaluateError> {
         loop {
-            let own_nanos = self
-                .own
-                .front()
-                .map(|message| message.reception.arrived_nanos);
+            // Of two at the same time the own agent's comes first.
             let other_nanos = self.arriving.front().map(Envelope::arrived_nanos);
-            let is_own_first = own_nanos.is_some_and(|own| other_nanos.is_none_or(|it| own <= it));
-            let next_nanos = own_nanos.into_iter().chain(other_nanos).min();
-            if next_nanos.is_none_or(|next| next > now_nanos) {
-                break;
-            }
-            if is_own_first {
-                if let Some(message) = self.own.pop_front() {
-                    self.handle(Input::Message(Box::new(message)), now_nanos)?;
-                }
-            } else if let Some(arrived) = self.arriving.pop_front() {
+            let until_nanos = other_nanos.map_or(now_nanos, |other| other.min(now_nanos));
+            let (own, arriving) = (&mut self.own, &mut self.arriving);
+            if let Some(message) = own.pop_front_if(|it| it.reception.arrived_nanos <= until_nanos)
+            {
+                self.handle(Input::Message(Box::new(message)), now_nanos)?;
+            } else if let Some(arrived) =
+                arriving.pop_front_if(|it| it.arrived_nanos() <= now_nanos)
+            {
                 self.take_in(arrived, now_nanos)?;
+            } else {
+                return self.handle(Input::Wake, now_nanos);
             }
         }
-        self.handle(Input::Wake, now_nanos)
     }
 
     /// Hands a neighbour's message to the ego, and before it the arrival of its sweep.
@@ -470,8 +450,8 @@ impl<'a> Run<'a> {
                 self.delivery.close(&source, waiting);
             }
         }
-        self.evaluator.ledger.merge(self.delivery.ledger());
-        self.evaluator.sent_bytes += self.delivery.sent_bytes();
+        self.evaluator.ledger.merge(&self.delivery.ledger);
+        self.evaluator.sent_bytes += self.delivery.sent_bytes;
         Ok(())
     }
 }

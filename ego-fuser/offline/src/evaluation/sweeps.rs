@@ -38,20 +38,17 @@ impl Evaluator {
         self.left_out.add_tick(&loaded);
         let mut sweeps = Vec::with_capacity(loaded.frames.len());
         for (place, frame) in loaded.frames {
-            match self.map_of(scenario, place, tick, with_maps(place)) {
-                Ok(map) => sweeps.push(Sweep { place, frame, map }),
+            let map = match self.map_of(scenario, place, tick, with_maps(place)) {
                 // It fails again where the vehicle perceives it, and is counted there.
-                Err(Error::Detector(error)) if error.is_of_frame() => sweeps.push(Sweep {
-                    place,
-                    frame,
-                    map: None,
-                }),
+                Err(Error::Detector(error)) if error.is_of_frame() => None,
                 Err(Error::Read(error)) => {
                     let rank = rank(place, places);
                     self.left_out.add_unreadable(rank, Problem::from(&error));
+                    continue;
                 }
-                Err(other) => return Err(Box::new(other).into()),
-            }
+                map => map.map_err(Box::new)?,
+            };
+            sweeps.push(Sweep { place, frame, map });
         }
         Ok(sweeps)
     }
@@ -89,13 +86,12 @@ impl Evaluator {
         tick: usize,
         is_needed: bool,
     ) -> Result<Option<Tensor>, Error> {
-        let Some(maps) = self.maps.as_mut().filter(|_| is_needed) else {
-            return Ok(None);
-        };
-        let Some(index) = maps.index_of(&scenario.name) else {
-            return Ok(None);
-        };
-        maps.map(index, scenario, agent, tick).map(Some)
+        if let Some(maps) = self.maps.as_mut().filter(|_| is_needed)
+            && let Some(index) = maps.index_of(&scenario.name)
+        {
+            return maps.map(index, scenario, agent, tick).map(Some);
+        }
+        Ok(None)
     }
 }
 

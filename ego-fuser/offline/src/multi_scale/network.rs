@@ -88,16 +88,13 @@ impl MultiScaleNetwork {
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), detector)?;
         let path = variables.root() / "fusion_net" / "naive_communication";
-        let communication = config
-            .communication
-            .as_ref()
-            .map(|config| Communication::new(&path, config))
-            .transpose()?;
+        let communication = config.communication.as_ref();
+        let communication = communication.map(|config| Communication::new(&path, config));
         Ok(Self {
             variables,
             config: config.clone(),
             network,
-            communication,
+            communication: communication.transpose()?,
         })
     }
 
@@ -108,11 +105,8 @@ impl MultiScaleNetwork {
     pub fn load(path: &Path, device: Device) -> Result<Self, ModelError> {
         let weights = Weights::load(path)?;
         weights.check_kind(MULTI_SCALE_KIND)?;
-        let model = Self::new(
-            &weights.config()?,
-            &weights.metadata_json(FUSION_KEY)?,
-            device,
-        )?;
+        let detector = weights.config()?;
+        let model = Self::new(&detector, &weights.metadata_json(FUSION_KEY)?, device)?;
         weights.copy_into(&model.variables)?;
         Ok(model)
     }
@@ -137,10 +131,8 @@ impl MultiScaleNetwork {
         samples: &[Placement],
     ) -> Result<MultiScaleOutput, TchError> {
         let network = &self.network;
-        let canvas = pillars.scatter(
-            &network.encoder.forward(pillars, false),
-            network.pillar_grid(),
-        );
+        let encoded = network.encoder.forward(pillars, false);
+        let canvas = pillars.scatter(&encoded, network.pillar_grid());
         let (sent, rate) = match &self.communication {
             Some(communication) => {
                 // Which cells an agent sends depends on the scores of its own map.
@@ -187,11 +179,8 @@ impl MultiScaleNetwork {
         };
         // Interpolation spreads a sent cell over its neighbours: all with a part of it are sent.
         let selected = resized(sent, [height as i64, width as i64])?.f_gt(0.0)?;
-        let selected: Vec<i64> = Vec::try_from(&selected.f_sum_dim_intlist(
-            [1i64, 2, 3].as_slice(),
-            false,
-            Kind::Int64,
-        )?)?;
+        let selected = selected.f_sum_dim_intlist([1i64, 2, 3].as_slice(), false, Kind::Int64)?;
+        let selected: Vec<i64> = Vec::try_from(&selected)?;
         let bytes = { selected.into_iter() }.map(|selected| match selected.unsigned_abs() {
             all if all == cells => cells * cell_bytes,
             selected => cells.div_ceil(8) + selected * cell_bytes,

@@ -86,10 +86,9 @@ impl OfflineDetector {
     fn pillars(&mut self, cloud: &PointCloud, ego_from_cav: &Pose) -> Pillars {
         // A vehicle's own body is where its sensor is: removed before its cloud is moved.
         let cloud = self.crop.without_own_body(cloud);
-        let cloud = if self.network.config().one_frame {
-            merge_points([&cloud], &[*ego_from_cav])
-        } else {
-            cloud
+        let cloud = match self.network.config().one_frame {
+            true => merge_points([&cloud], &[*ego_from_cav]),
+            false => cloud,
         };
         // The area is that of the frame in which the network encodes: cropped after the move.
         let mut kept = Vec::new();
@@ -124,12 +123,8 @@ impl OfflineDetector {
         };
         let output = no_grad(|| self.network.forward(&batch, &[placement]))?;
         let heads = Heads::new(&output.heads)?;
-        let mut boxes = decode(
-            &heads.scores,
-            &heads.offsets,
-            &self.anchors,
-            self.limits.score_threshold,
-        )?;
+        let threshold = self.limits.score_threshold;
+        let mut boxes = decode(&heads.scores, &heads.offsets, &self.anchors, threshold)?;
         if self.is_mirrored() {
             for found in &mut boxes {
                 found.box3d = found.box3d.mirrored_y();

@@ -8,7 +8,7 @@ use perception::detector::Detector;
 use perception::weights::Weights;
 use protocol::codec::encode_features;
 use protocol::message::Bev;
-use protocol::{BevFeatures, CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, wire};
+use protocol::{CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, wire};
 use tch::Device;
 
 use crate::Error;
@@ -67,12 +67,12 @@ impl SweepEncoder {
         // The last scenario that begins at or before the sweep: those without ticks are passed over.
         let scenario = self.first.partition_point(|&first| first <= sweep) - 1;
         // The end is one more entry of `first`: threads ask for numbers beyond it.
-        let Some(of) = self.scenarios.get(scenario) else {
-            return Ok(Vec::new());
-        };
-        let within = sweep - self.first[scenario];
-        let (agent, tick) = (within / of.ticks.len(), within % of.ticks.len());
-        let Ok(frame) = of.load(agent, tick, &LoadOptions::default()) else {
+        let frame = self.scenarios.get(scenario).and_then(|of| {
+            let within = sweep - self.first[scenario];
+            let (agent, tick) = (within / of.ticks.len(), within % of.ticks.len());
+            of.load(agent, tick, &LoadOptions::default()).ok()
+        });
+        let Some(frame) = frame else {
             return Ok(Vec::new());
         };
         let detector = self.encoder.detector()?;
@@ -82,20 +82,15 @@ impl SweepEncoder {
             Err(error) if error.is_of_frame() => return Ok(Vec::new()),
             Err(error) => return Err(error.into()),
         };
-        let kept = detector.to_kept(&map)?;
-        self.packed(kept)
-    }
-
-    fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, Error> {
+        let features = detector.to_kept(&map)?;
         let codec = CodecConfig {
             dtype: self.dtype,
             zstd_level: Some(ZSTD_LEVEL),
             ..CodecConfig::default()
         };
         // Sender and time of a map follow from its index.
-        let cav = CavId::new("0").at(&self.path)?;
         let stamp = Stamp {
-            cav,
+            cav: CavId::new("0").at(&self.path)?,
             epoch: 0,
             sequence: 0,
             capture_nanos: 0,

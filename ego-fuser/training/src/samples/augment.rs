@@ -63,11 +63,8 @@ impl ViewAugment {
     /// Changes points of that frame in place.
     pub fn points(&self, points: &mut [[f32; 4]]) {
         let (sin, cos) = self.turn_rad.sin_cos();
-        let (sin, cos, scale) = (
-            (sin * self.scale) as f32,
-            (cos * self.scale) as f32,
-            self.scale as f32,
-        );
+        let [sin, cos, scale] =
+            [sin * self.scale, cos * self.scale, self.scale].map(|of| of as f32);
         let side = if self.mirrored { -1.0f32 } else { 1.0 };
         for [x, y, z, _] in points {
             // Mirrored before it is rotated, as boxes and poses are.
@@ -100,14 +97,11 @@ impl ViewAugment {
             let side = Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, 1.0));
             rotation = side * rotation * side;
         }
-        let rotation =
-            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        let rotation = Rotation3::from_matrix_unchecked(rotation);
         // From right to left: old frame of the other from its new one, the pose, new ego from old.
-        Isometry3::from_parts(
-            translation.into(),
-            self.turn() * rotation * cav.turn().inverse(),
-        )
-        .into()
+        let rotation =
+            self.turn() * UnitQuaternion::from_rotation_matrix(&rotation) * cav.turn().inverse();
+        Isometry3::from_parts(translation.into(), rotation).into()
     }
 
     fn turn(&self) -> UnitQuaternion<f64> {

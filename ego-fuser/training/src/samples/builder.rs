@@ -14,7 +14,7 @@ use tch::Tensor;
 
 use super::augment::{Augmentation, ViewAugment};
 use super::moments::Moments;
-use super::poses::{DrawnError, Offset, SamplePoses, without_pose};
+use super::poses::{DrawnError, Offset, SamplePoses, known, without_pose};
 use super::scenes::{SceneSet, TickRef};
 use crate::feature_store::MapSource;
 use crate::{Error, Result};
@@ -172,10 +172,8 @@ impl SampleBuilder {
         let agents = self.choose_agents(tick, &frames, ego, rng)?;
         let single = self.config.kind == SampleKind::Single;
         let viewers = if single { &agents[..1] } else { &agents[..] };
-        let annotators = match self.config.merged_truth {
-            true => &agents[..],
-            false => viewers,
-        };
+        let merged = self.config.merged_truth;
+        let annotators = if merged { &agents[..] } else { viewers };
         let entries = self.entries(tick, viewers, rng)?;
         let changes = self.config.augmentation.views(entries.len(), rng);
         let truth = self.truth(&frames, annotators, &changes[0]);
@@ -186,14 +184,13 @@ impl SampleBuilder {
         let views = match &mut self.maps {
             Some(maps) => {
                 let scenario = self.scenes.scenario(tick);
-                let map =
-                    |entry: &Entry| maps.map(tick.scenario, scenario, entry.agent, entry.tick);
-                let maps: Vec<Tensor> = entries.iter().map(map).collect::<Result<_, _>>()?;
-                SampleViews::Maps(Tensor::f_cat(&maps, 0)?)
+                let maps = entries
+                    .iter()
+                    .map(|entry| maps.map(tick.scenario, scenario, entry.agent, entry.tick));
+                SampleViews::Maps(Tensor::f_cat(&maps.collect::<Result<Vec<_>>>()?, 0)?)
             }
             None => {
-                let pillars = self.pillars(tick.scenario, &entries, &changes, &mut facts)?;
-                SampleViews::Pillars(pillars)
+                SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?)
             }
         };
         Ok(Sample {
@@ -224,12 +221,7 @@ impl SampleBuilder {
             for (step, tick) in steps.into_iter().enumerate() {
                 let at = TickRef { tick, ..now };
                 let [found, pose] = self.pose_at(at, agent, [index, agents.len()], &error)?;
-                let PoseEstimate::Pose {
-                    world_from_cav,
-                    confidence,
-                    ..
-                } = pose
-                else {
+                let Some((world_from_cav, confidence)) = known(&pose) else {
                     // Without its newest view a vehicle has no part; an older one may be missing.
                     match step {
                         0 => break,
@@ -252,13 +244,12 @@ impl SampleBuilder {
                 }
             }
             if is_ego && newest.is_empty() {
-                let world_from_cav = Pose::IDENTITY;
                 return Ok(vec![Entry {
                     agent,
                     place,
                     tick: now.tick,
-                    world_from_cav,
-                    found: world_from_cav,
+                    world_from_cav: Pose::IDENTITY,
+                    found: Pose::IDENTITY,
                     confidence: 0.0,
                     age_secs: 0.0,
                 }]);
@@ -278,8 +269,7 @@ impl SampleBuilder {
     ) -> Result<[PoseEstimate; 2]> {
         let frames = self.scenes.annotations(tick);
         let Some(frame) = &frames[agent] else {
-            let absent = PoseEstimate::no_pose(NoPoseReason::NoSource, 0);
-            return Ok([absent; 2]);
+            return Ok([PoseEstimate::no_pose(NoPoseReason::NoSource, 0); 2]);
         };
         let scenario = &self.scenes.scenario(tick).name;
         let found = self.config.poses.found(scenario, frame)?;
@@ -362,9 +352,8 @@ impl SampleBuilder {
             min_corners: 8,
             classes: self.config.classes,
         };
-        let views = annotators.iter();
-        let views: Vec<&Frame> = views.filter_map(|&agent| frames[agent].as_ref()).collect();
-        let mut truth = GroundTruth::of_tick(&views, 0, &rule);
+        let views = { annotators.iter() }.filter_map(|&agent| frames[agent].as_ref());
+        let mut truth = GroundTruth::of_tick(&views.collect::<Vec<_>>(), 0, &rule);
         for object in truth.objects.iter_mut().chain(&mut truth.ignored) {
             object.box3d = ego_view.box3d(&object.box3d);
         }

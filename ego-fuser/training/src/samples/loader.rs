@@ -53,25 +53,20 @@ impl Batch {
                 SampleViews::Maps(of_sample) => maps.push(of_sample),
             }
         }
-        let views = if maps.is_empty() {
-            BatchViews::Pillars(PillarBatch::new(&pillars, pillar_grid))
-        } else {
-            BatchViews::Maps(Tensor::f_cat(&maps, 0)?)
+        let views = match maps[..] {
+            [] => BatchViews::Pillars(PillarBatch::new(&pillars, pillar_grid)),
+            _ => BatchViews::Maps(Tensor::f_cat(&maps, 0)?),
         };
-        let mut batch = Self {
+        let samples = samples.into_iter();
+        let parts = samples.map(|of| (of.facts, of.offsets, of.labels, of.truth));
+        let (facts, offsets, labels, truth) = parts.collect();
+        Ok(Self {
             views,
-            facts: Vec::new(),
-            offsets: Vec::new(),
-            labels: Vec::new(),
-            truth: Vec::new(),
-        };
-        for sample in samples {
-            batch.facts.push(sample.facts);
-            batch.offsets.push(sample.offsets);
-            batch.labels.push(sample.labels);
-            batch.truth.push(sample.truth);
-        }
-        Ok(batch)
+            facts,
+            offsets,
+            labels,
+            truth,
+        })
     }
 
     /// The output of a model for all samples.
@@ -89,11 +84,8 @@ impl Batch {
             }
             BatchViews::Maps(maps) => {
                 let maps = maps.f_to_device(model.device())?;
-                model.fuse_and_detect(
-                    &model.network().through_compressor(&maps, train),
-                    &self.facts,
-                    train,
-                )
+                let maps = model.network().through_compressor(&maps, train);
+                model.fuse_and_detect(&maps, &self.facts, train)
             }
         }
     }
@@ -146,10 +138,8 @@ impl Order {
         if self.epoch != Some(epoch) {
             self.shuffled.clone_from(&self.ticks);
             // The factor is 2^64 over the golden ratio: seeds of successive epochs lie far apart.
-            let mut rng = ChaCha8Rng::seed_from_u64(
-                self.seed
-                    .wrapping_add(epoch.wrapping_mul(0x9E37_79B9_7F4A_7C15)),
-            );
+            let offset = epoch.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+            let mut rng = ChaCha8Rng::seed_from_u64(self.seed.wrapping_add(offset));
             self.shuffled.shuffle(&mut rng);
             self.epoch = Some(epoch);
         }

@@ -6,6 +6,7 @@ use std::f64::consts::TAU;
 use fusion::MapMetadata;
 use fusion::box_input::{PlacedBox, placed};
 use fusion::model::CooperativeModel;
+use perception::tensor_values::tensor;
 use protocol::{Box3d, Detection, Pose};
 use rand::Rng;
 use tch::Tensor;
@@ -79,22 +80,16 @@ impl Batch {
             let agents = facts.iter().map(|fact| fact.agent + 1).max().unwrap_or(0);
             let mut found = vec![Vec::new(); agents];
             for (agent, boxes) in found.iter_mut().enumerate() {
-                let Some(index) = newest_of(agent, facts) else {
-                    continue;
-                };
-                let map = of_sample.f_narrow(0, index as i64, 1)?;
-                let (refined, loss) =
-                    refined_boxes(model, &map, &facts[index].ego_from_cav, truth)?;
-                refinement_losses.extend(loss);
-                *boxes = refined;
+                if let Some(index) = newest_of(agent, facts) {
+                    let map = of_sample.f_narrow(0, index as i64, 1)?;
+                    let pose = &facts[index].ego_from_cav;
+                    let (refined, loss) = refined_boxes(model, &map, pose, truth)?;
+                    refinement_losses.extend(loss);
+                    *boxes = refined;
+                }
             }
-            samples.push(sample(
-                model,
-                &of_sample,
-                facts,
-                &found,
-                rng.as_deref_mut(),
-            )?);
+            let rng = rng.as_deref_mut();
+            samples.push(sample(model, &of_sample, facts, &found, rng)?);
         }
         Ok(SamplesWithBoxes {
             samples,
@@ -118,11 +113,10 @@ fn sample(
 ) -> Result<SampleWithBoxes, Error> {
     let agents = found.len();
     // The ego always has its own map.
-    let sends_boxes: Vec<bool> = (0..agents)
-        .map(|agent| {
-            agent > 0 && { rng.as_deref_mut() }.is_none_or(|rng| rng.random_bool(BOXES_ONLY))
-        })
-        .collect();
+    let sends_boxes = (0..agents).map(|agent| {
+        agent > 0 && { rng.as_deref_mut() }.is_none_or(|rng| rng.random_bool(BOXES_ONLY))
+    });
+    let sends_boxes: Vec<bool> = sends_boxes.collect();
     let shifts: Vec<Shift> = match rng.as_deref_mut() {
         Some(rng) => Shift::draw_all(agents, rng),
         None => vec![Shift::default(); agents],
@@ -146,14 +140,10 @@ fn sample(
         boxes.append(&mut of_agent);
     }
     // The others, numbered without gaps.
-    let kept: Vec<usize> = (0..facts.len())
-        .filter(|&index| !sends_boxes[facts[index].agent])
-        .collect();
+    let kept = (0..facts.len()).filter(|&index| !sends_boxes[facts[index].agent]);
+    let kept: Vec<usize> = kept.collect();
     let indices: Vec<i64> = kept.iter().map(|&index| index as i64).collect();
-    let maps = maps.f_index_select(
-        0,
-        &Tensor::f_from_slice(&indices)?.f_to_device(maps.device())?,
-    )?;
+    let maps = maps.f_index_select(0, &tensor(&indices, &[-1], maps.device())?)?;
     let facts = kept.into_iter().map(|index| {
         let before = sends_boxes[..facts[index].agent].iter();
         MapMetadata {
@@ -269,13 +259,8 @@ impl Shift {
             },
             false => Pose::from_xyz_yaw(translation_m, pose.yaw_rad() + self.turn_rad),
         };
-        placed(
-            found.iter(),
-            &moved,
-            sender,
-            fact.age_secs,
-            fact.confidence * self.confidence,
-        )
+        let confidence = fact.confidence * self.confidence;
+        placed(found.iter(), &moved, sender, fact.age_secs, confidence)
     }
 }
 

@@ -47,15 +47,14 @@ impl SamplePoses {
         let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share);
         // Drawn in any case: later draws are the same with and without noise.
         let seed = rng.random();
-        let mut drawn = DrawnError {
+        let noise = self.noise.clone().filter(|_| is_noisy);
+        let spares_ego = noise.as_ref().is_some_and(|noise| noise.mode.spares_ego());
+        let noise = noise.map(|noise| NoisyPose::new(&NoisyPoseConfig { seed, ..noise }));
+        Ok(DrawnError {
+            noise: noise.transpose()?,
+            spares_ego,
             lost,
-            ..DrawnError::default()
-        };
-        if let (Some(noise), true) = (self.noise.clone(), is_noisy) {
-            drawn.spares_ego = noise.mode.spares_ego();
-            drawn.noise = Some(NoisyPose::new(&NoisyPoseConfig { seed, ..noise })?);
-        }
-        Ok(drawn)
+        })
     }
 
     /// Pose of a vehicle without the added error.
@@ -85,7 +84,7 @@ impl Offset {
 }
 
 /// The error of the poses of one sample.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct DrawnError {
     noise: Option<NoisyPose>,
     /// The reference code leaves the ego exact where all others have the same offset.
@@ -166,7 +165,7 @@ impl DrawnError {
 }
 
 /// Pose and confidence of an estimate.
-fn known(estimate: &PoseEstimate) -> Option<(Pose, f32)> {
+pub(super) fn known(estimate: &PoseEstimate) -> Option<(Pose, f32)> {
     match *estimate {
         PoseEstimate::Pose {
             world_from_cav,

@@ -65,10 +65,10 @@ impl Targets {
         ego_from_cav: &Pose,
         truth: &GroundTruth,
     ) -> Self {
-        let cav_from_ego = ego_from_cav.isometry().inverse();
-        let objects: Vec<Box3d> = { truth.objects.iter() }
-            .map(|object| object.box3d.transformed(&cav_from_ego))
-            .collect();
+        let ego_from_cav = ego_from_cav.isometry();
+        let cav_from_ego = ego_from_cav.inverse();
+        let objects = { truth.objects.iter() }.map(|of| of.box3d.transformed(&cav_from_ego));
+        let objects: Vec<Box3d> = objects.collect();
         let footprints = { objects.iter() }.map(|object| Polygon::footprint(&object.corners()));
         let footprints: Vec<Polygon> = footprints.collect();
         let mut targets = Self::default();
@@ -79,26 +79,19 @@ impl Targets {
             // A correction beyond the limits cannot be applied: its detection counts as one of no object.
             let wanted = wanted.filter(is_within_limits);
             let numbers = wanted.unwrap_or_default();
-            targets
-                .corrections
-                .extend({ numbers[..OF_BOX as usize].iter() }.map(|at| *at as f32));
-            targets
-                .is_object
-                .push(f32::from(u8::from(wanted.is_some())));
+            let numbers = numbers[..OF_BOX as usize].iter();
+            targets.corrections.extend(numbers.map(|at| *at as f32));
+            targets.is_object.push(f32::from(wanted.is_some()));
             let [least, most] = SCORED_IOU;
             // The score is that of the box after its correction.
             let iou = overlapped(&refined.box3d, &footprints).map_or(0.0, |(_, iou)| iou);
-            targets
-                .score
-                .push(((iou - least) / (most - least)).clamp(0.0, 1.0) as f32);
-            let [x, y, _] = detection
-                .box3d
-                .transformed(&ego_from_cav.isometry())
-                .center_m;
+            let score = ((iou - least) / (most - least)).clamp(0.0, 1.0);
+            targets.score.push(score as f32);
+            let [x, y, _] = detection.box3d.transformed(&ego_from_cav).center_m;
             // Objects beyond the area are not in the truth: nothing can be said about detections there.
             let [x0, y0, x1, y1] = truth.area_m;
             let is_known = (x0..=x1).contains(&x) && (y0..=y1).contains(&y);
-            targets.is_known.push(f32::from(u8::from(is_known)));
+            targets.is_known.push(f32::from(is_known));
         }
         targets
     }
@@ -112,9 +105,8 @@ impl Targets {
         let is_object = column(&self.is_object, device)?;
         let boxes = boxes.f_mul(&is_object)?.f_sum(Kind::Float)?;
         // Scores of exactly 0 or 1 have no finite logit.
-        let before: Vec<f32> = { found.iter() }
-            .map(|detection| detection.score.clamp(1e-4, 1.0 - 1e-4))
-            .collect();
+        let before = { found.iter() }.map(|detection| detection.score.clamp(1e-4, 1.0 - 1e-4));
+        let before: Vec<f32> = before.collect();
         // A score is corrected by a sum of logits, as in inference.
         let logit = column(&before, device)?.f_logit(None)? + corrections.f_narrow(1, OF_BOX, 1)?;
         let (none, each) = (None::<&Tensor>, Reduction::None);

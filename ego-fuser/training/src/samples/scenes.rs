@@ -66,10 +66,8 @@ impl SceneSet {
             scenarios.extend(found.filter_map(|scenario| protocol.arrange(scenario)));
             problems.extend(dataset.problems.iter().map(ToString::to_string));
         }
-        let set = Self {
-            problems,
-            ..Self::new(scenarios)
-        };
+        let mut set = Self::new(scenarios);
+        set.problems = problems;
         if set.ticks.is_empty() {
             let problem = format!("no tick of any scenario in {folders:?}");
             return Err(Error::Data(problem));
@@ -146,11 +144,10 @@ impl SceneSet {
         let sha256 = self.sha256.get_or_init(|| {
             dataset::content_sha256(&self.scenarios, None, &FileDigests::default())
         });
-        let mut problems = self.problems.clone();
-        problems.extend(lock(&self.unreadable).iter().cloned());
+        let unreadable = lock(&self.unreadable);
         DataListing {
             sha256: sha256.clone(),
-            problems,
+            problems: self.problems.iter().chain(&*unreadable).cloned().collect(),
             without_pose: 0,
         }
     }

@@ -54,10 +54,8 @@ impl DetectorCurve {
     pub(super) fn draw(&self, title: &str) -> Result<(), Error> {
         let path = self.0.path();
         let text = bounded_file::read_text(path, MAX_TEXT_BYTES).at(path)?;
-        Ok(figures::save_png(
-            &charts(title, &text),
-            &path.with_extension("png"),
-        )?)
+        let picture = path.with_extension("png");
+        Ok(figures::save_png(&charts(title, &text), &picture)?)
     }
 }
 

@@ -33,9 +33,8 @@ impl<'a> FrozenEncoder<'a> {
             }
         }
         // In floating point, also where the file has scales for 8-bit inference.
-        let weights = Weights::load(init)
-            .map_err(ModelError::from)?
-            .with_precision(InferencePrecision::Float);
+        let weights = Weights::load(init).map_err(ModelError::from)?;
+        let weights = weights.with_precision(InferencePrecision::Float);
         Ok(Some(Self {
             kept,
             weights: Arc::new(weights),
@@ -49,17 +48,16 @@ impl<'a> FrozenEncoder<'a> {
         builder: &mut SampleBuilder,
         observer: &mut dyn Observer,
     ) -> Result<()> {
-        let on_sweep = &mut |done, all| observer.encoded(done, all);
         let store = FeatureStore::open(
             self.kept,
             &self.weights,
             builder.scenes().scenarios(),
             &FileDigests::default(),
             self.threads,
-            on_sweep,
+            &mut |done, all| observer.encoded(done, all),
         )?;
-        let maps = MapSource::new(Arc::new(store), Arc::clone(&self.weights));
-        builder.maps = Some(maps);
+        let weights = Arc::clone(&self.weights);
+        builder.maps = Some(MapSource::new(Arc::new(store), weights));
         Ok(())
     }
 }

@@ -85,11 +85,8 @@ struct Training<'a> {
 
 impl<'a> Training<'a> {
     fn prepare(config: &'a TrainConfig, observer: &'a mut dyn Observer) -> Result<(Self, Trainer)> {
-        let kind = sample_kind(
-            config.method,
-            config.frozen_encoder.is_some(),
-            config.samples.merged_truth,
-        )?;
+        let (is_frozen, merged) = (config.frozen_encoder.is_some(), config.samples.merged_truth);
+        let kind = sample_kind(config.method, is_frozen, merged)?;
         let run = &config.run;
         // Seeds the tensor library: before the first variable is made.
         run.start()?;

@@ -76,10 +76,8 @@ impl Validator {
             let sample = self.builder.build(tick, &mut rng)?;
             // The ground truth has the same limits as the detections.
             let mut truth = sample.truth.clone();
-            let area_m = truth.area_m;
-            truth
-                .objects
-                .retain(|object| corners_within(&object.box3d.corners(), area_m));
+            let (objects, area_m) = (&mut truth.objects, truth.area_m);
+            objects.retain(|object| corners_within(&object.box3d.corners(), area_m));
             let batch = Batch::collate(vec![sample], model.network().pillar_grid())?;
             let head = no_grad(|| match with_boxes {
                 true => {

@@ -45,11 +45,8 @@ pub(super) fn fleet_exposition(own: &str, others: &[MetricsPeer]) -> String {
             u8::from(text.is_some())
         );
     }
-    merged(
-        [own, &up]
-            .into_iter()
-            .chain(texts.iter().flatten().map(String::as_str)),
-    )
+    let served = texts.iter().flatten().map(String::as_str);
+    merged([own, &up].into_iter().chain(served))
 }
 
 fn series_of(peer: &MetricsPeer) -> Option<String> {
@@ -86,11 +83,8 @@ fn merged<'a>(texts: impl Iterator<Item = &'a str>) -> String {
             }
         }
     }
-    families
-        .into_values()
-        .flatten()
-        .chain(["# EOF\n".to_owned()])
-        .collect()
+    let texts = families.into_values().flatten();
+    texts.chain(["# EOF\n".to_owned()]).collect()
 }
 
 #[cfg(test)]

@@ -23,11 +23,8 @@ pub(super) fn check(local: SocketAddr, uri: &Uri, headers: &HeaderMap) -> Result
         .get_all(HOST)
         .iter()
         .map(|host| String::from_utf8_lossy(host.as_bytes()).into_owned());
-    let mut requested = uri
-        .authority()
-        .map(ToString::to_string)
-        .into_iter()
-        .chain(named);
+    let authority = uri.authority().map(ToString::to_string);
+    let mut requested = authority.into_iter().chain(named);
     requested
         .find(|name| !is_here(name, local.ip()))
         .map_or(Ok(()), Err)

@@ -19,12 +19,8 @@ pub(crate) fn detections(nanos: u64, frame_id: &str, detections: &[Detection]) -
         let source = detection.source.as_ref().map(ToString::to_string);
         // The covariance is not known: zeros, as other detectors write.
         let (score, covariance) = (f64::from(detection.score), [[0.0; 6]; 6]);
-        (
-            detection.box3d,
-            score,
-            covariance,
-            source.unwrap_or_default(),
-        )
+        let id = source.unwrap_or_default();
+        (detection.box3d, score, covariance, id)
     });
     array(nanos, frame_id, found)
 }
@@ -127,14 +123,9 @@ pub(crate) fn markers(
     rgb: [f32; 3],
     boxes: &[Marked],
 ) -> Vec<u8> {
-    let nothing = Box3d {
-        center_m: [0.0; 3],
-        size_m: [0.0; 3],
-        heading_rad: 0.0,
-    };
     let sweep = Marked {
         id: Some(0),
-        box3d: nothing,
+        box3d: Box3d::default(),
         alpha: 0.0,
         text: String::new(),
     };
@@ -142,14 +133,9 @@ pub(crate) fn markers(
         cdr.write_sequence_length(boxes.len() + 1);
         marker(cdr, (frame_id, ns, nanos), (0, DELETE_ALL), rgb, &sweep);
         for (place, marked) in (0..).zip(boxes) {
-            marker(
-                cdr,
-                (frame_id, ns, nanos),
-                // A marker replaces one of the same namespace and id: without an id its place serves.
-                (marked.id.unwrap_or(place), ADD),
-                rgb,
-                marked,
-            );
+            // A marker replaces one of the same namespace and id: without an id its place serves.
+            let id = marked.id.unwrap_or(place);
+            marker(cdr, (frame_id, ns, nanos), (id, ADD), rgb, marked);
         }
     })
 }

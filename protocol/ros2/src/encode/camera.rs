@@ -35,13 +35,9 @@ pub(crate) fn camera_info(
         // A sequence with its length; the matrices after it have fixed sizes, and no length on the wire.
         let distortion = [0.0; 5];
         cdr.write_sequence_length(distortion.len());
-        for number in distortion
-            .iter()
-            .chain(&intrinsic)
-            .chain(&rectification)
-            .chain(&projection)
-        {
-            cdr.write_f64(*number);
+        cdr::f64s(cdr, &distortion);
+        for matrix in [&intrinsic[..], &rectification, &projection] {
+            cdr::f64s(cdr, matrix);
         }
         // No binning, and all of the image is of interest.
         (0..6).for_each(|_| cdr.write_u32(0));

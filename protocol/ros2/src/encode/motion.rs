@@ -69,10 +69,9 @@ fn twist_covariance(motion: EgoMotion) -> [[f64; 6]; 6] {
 fn diagonal(variances: [f64; 6]) -> [[f64; 6]; 6] {
     let mut rows = [[0.0; 6]; 6];
     for (index, (row, variance)) in rows.iter_mut().zip(variances).enumerate() {
-        row.iter_mut()
-            .skip(index)
-            .take(1)
-            .for_each(|place| *place = variance);
+        if let Some(place) = row.get_mut(index) {
+            *place = variance;
+        }
     }
     rows
 }

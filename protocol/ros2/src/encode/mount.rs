@@ -37,10 +37,8 @@ impl FromStr for Mount {
     type Err = MountError;
 
     fn from_str(text: &str) -> Result<Self, MountError> {
-        let numbers: Option<Vec<f64>> = text
-            .split(',')
-            .map(|part| part.trim().parse().ok())
-            .collect();
+        let parts = text.split(',');
+        let numbers: Option<Vec<f64>> = parts.map(|part| part.trim().parse().ok()).collect();
         let (xyz, yaw_deg) = match numbers.as_deref() {
             Some(&[x, y, z]) => ([x, y, z], 0.0),
             Some(&[x, y, z, yaw_deg]) => ([x, y, z], yaw_deg),
@@ -52,9 +50,8 @@ impl FromStr for Mount {
             let text = text.chars().take(100).collect();
             return Err(MountError { text });
         }
-        Ok(Self {
-            base_from_lidar: Pose::from_xyz_yaw(xyz, yaw_deg.to_radians()),
-        })
+        let base_from_lidar = Pose::from_xyz_yaw(xyz, yaw_deg.to_radians());
+        Ok(Self { base_from_lidar })
     }
 }
 

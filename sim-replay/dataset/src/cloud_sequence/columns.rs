@@ -3,7 +3,7 @@
 use super::keys::Unit;
 
 /// Places of the values in a row.
-#[derive(Debug, Default, PartialEq)]
+#[derive(Debug, PartialEq)]
 pub(super) struct Columns {
     /// Number of columns.
     pub(super) width: usize,
@@ -30,12 +30,6 @@ impl PoseColumns {
     /// TUM's order, from a column on.
     fn in_order(first: usize) -> Self {
         Self::Quaternion(std::array::from_fn(|value| first + value))
-    }
-}
-
-impl Default for PoseColumns {
-    fn default() -> Self {
-        Self::Matrix(0)
     }
 }
 
@@ -82,10 +76,8 @@ const NAME_WORDS: &str = "file filename name path filepath cloud pcd pointcloud 
 impl Columns {
     /// True if a value of a row says to which cloud it belongs, or when it was.
     pub(super) fn has_key(&self) -> bool {
-        [self.name, self.number, self.key]
-            .iter()
-            .any(Option::is_some)
-            || self.time.is_some()
+        let keys = [self.name, self.number, self.key];
+        keys.iter().any(Option::is_some) || self.time.is_some()
     }
 
     /// Columns of a row without header: TUM's order, or matrices; before these possibly a key, or seconds and
@@ -109,9 +101,10 @@ impl Columns {
         Ok(Self {
             width,
             pose,
-            key,
+            name: None,
+            number: None,
             time,
-            ..Self::default()
+            key,
         })
     }
 
@@ -166,13 +159,11 @@ fn expected(names: &[&str]) -> String {
 
 /// Values of a quaternion that names give, in their order: 0 to 3 for x, y, z, w.
 pub(super) fn quaternion_order(names: &[&str]) -> Vec<usize> {
-    names
-        .iter()
-        .filter_map(|name| match role(name) {
-            Role::Value(index) => index.checked_sub(3),
-            _ => None,
-        })
-        .collect()
+    let parts = names.iter().filter_map(|name| match role(name) {
+        Role::Value(index) => index.checked_sub(3),
+        _ => None,
+    });
+    parts.collect()
 }
 
 /// Meaning of a name such as `qw`, `p_RS_R_x [m]`, `field.pose.orientation.w` or `timestamp [ns]`.

@@ -89,10 +89,8 @@ fn by_key<K: Eq + Hash>(by: &'static str, clouds: &[K], rows: &[K]) -> Join {
             .and_modify(|known| *known = None)
             .or_insert(Some(row));
     }
-    Join::new(
-        by,
-        clouds.iter().map(|key| index.get(key).copied().flatten()),
-    )
+    let rows = clouds.iter().map(|key| index.get(key).copied().flatten());
+    Join::new(by, rows)
 }
 
 /// The row nearest to each cloud in time, if it is of the same time.
@@ -206,13 +204,8 @@ fn by_line(clouds: &Keys, rows: usize) -> Option<Join> {
     };
     let (first, last) = (*numbers.first()?, *numbers.last()?);
     let is_of_rows = first <= 1 && (last + 1).checked_sub(first) == Some(rows as u64);
-    let places = numbers.iter().map(|number| number - first);
-    is_of_rows.then(|| {
-        Join::new(
-            "number of the row",
-            places.map(|place| usize::try_from(place).ok()),
-        )
-    })
+    let places = (numbers.iter()).map(|number| usize::try_from(number - first).ok());
+    is_of_rows.then(|| Join::new("number of the row", places))
 }
 
 /// True if both lists of times have the same intervals: their clocks differ by a constant only.

@@ -1,5 +1,7 @@
 //! Keys of clouds and poses: names, numbers or times. A list as a whole decides which.
 
+use std::str::FromStr;
+
 use strum::IntoEnumIterator;
 use support::rounding;
 
@@ -45,11 +47,8 @@ impl Unit {
     /// The first unit in which all values are times since an epoch or a start, at most a minute apart.
     fn of(values: &[f64]) -> Option<Self> {
         let most = values.iter().copied().fold(0.0, f64::max);
-        let mut steps: Vec<f64> = values
-            .iter()
-            .zip(values.iter().skip(1))
-            .map(|(value, next)| (next - value).abs())
-            .collect();
+        let steps = values.array_windows();
+        let mut steps: Vec<f64> = steps.map(|[value, next]| (next - value).abs()).collect();
         steps.sort_unstable_by(f64::total_cmp);
         // The median: a pause in the drive does not decide.
         let step = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
@@ -62,10 +61,8 @@ impl Unit {
     pub(super) fn nanos(self, values: &[f64]) -> Vec<u64> {
         // Doubles keep times since 1970 to a quarter of a microsecond.
         let scale = self.seconds() * 1e9;
-        values
-            .iter()
-            .map(|value| rounding::to_u64(value * scale))
-            .collect()
+        let nanos = values.iter().map(|value| rounding::to_u64(value * scale));
+        nanos.collect()
     }
 }
 
@@ -75,9 +72,8 @@ impl Keys {
     pub(super) fn of_stems(stems: &[&str]) -> Self {
         let numbered: Option<Vec<Numbered<'_>>> =
             stems.iter().map(|stem| Numbered::of(stem)).collect();
-        numbered
-            .and_then(|numbered| Self::of_numbered(&numbered))
-            .unwrap_or_else(|| Self::Names(stems.iter().map(|&stem| stem.to_owned()).collect()))
+        let keys = numbered.and_then(|numbered| Self::of_numbered(&numbered));
+        keys.unwrap_or_else(|| Self::Names(stems.iter().map(|&stem| stem.to_owned()).collect()))
     }
 
     /// `None` for names that differ in more than a number.
@@ -109,10 +105,8 @@ impl Keys {
             let names = words.iter().map(|&word| word.to_owned());
             return Some(Self::Names(names.collect()));
         };
-        let are_counts = values
-            .iter()
-            .all(|value| value.fract() == 0.0 && *value < LEAST_WHOLE_TIME);
-        match are_counts {
+        let mut values = values.iter();
+        match values.all(|value| value.fract() == 0.0 && *value < LEAST_WHOLE_TIME) {
             true => None,
             false => Self::of_times(words, None),
         }
@@ -148,10 +142,8 @@ impl Keys {
             Self::Names(names) => ends("names", names),
             Self::Numbers(numbers) => ends("numbers", numbers),
             Self::Times(times) => {
-                let seconds: Vec<String> = times
-                    .iter()
-                    .map(|nanos| format!("{:.3} s", *nanos as f64 * 1e-9))
-                    .collect();
+                let seconds = times.iter().map(|nanos| *nanos as f64 * 1e-9);
+                let seconds: Vec<String> = seconds.map(|time| format!("{time:.3} s")).collect();
                 ends("times", &seconds)
             }
         }
@@ -161,9 +153,10 @@ impl Keys {
     /// the clouds.
     pub(super) fn have_one_form(&self) -> bool {
         match self {
-            Self::Names(names) => names
-                .iter()
-                .all(|name| is_form(name, names.first().unwrap_or(name))),
+            Self::Names(names) => names.iter().all(|name| {
+                let first = names.first().unwrap_or(name);
+                name.contains(is_digit) && around_digits(name).eq(around_digits(first))
+            }),
             Self::Numbers(_) | Self::Times(_) => true,
         }
     }
@@ -183,13 +176,9 @@ fn ends<T: std::fmt::Display>(kind: &str, keys: &[T]) -> String {
     }
 }
 
-/// True if two names with numbers have the same text around these.
-fn is_form(name: &str, other: &str) -> bool {
-    name.contains(is_digit)
-        && name
-            .split(is_digit)
-            .filter(|text| !text.is_empty())
-            .eq(other.split(is_digit).filter(|text| !text.is_empty()))
+/// The text around the numbers of a name.
+fn around_digits(name: &str) -> impl Iterator<Item = &str> {
+    name.split(is_digit).filter(|text| !text.is_empty())
 }
 
 fn is_digit(letter: char) -> bool {
@@ -198,22 +187,17 @@ fn is_digit(letter: char) -> bool {
 
 /// Whole numbers below nine digits; `None` if a word is none.
 pub(super) fn whole_numbers(words: &[&str]) -> Option<Vec<u64>> {
-    let numbers: Option<Vec<u64>> = words.iter().map(|word| word.parse().ok()).collect();
-    numbers.filter(|numbers| {
-        numbers
-            .iter()
-            .all(|number| (*number as f64) < LEAST_WHOLE_TIME)
-    })
+    parsed(words, |number: &u64| (*number as f64) < LEAST_WHOLE_TIME)
 }
 
 /// Numbers from 0 on; `None` if a word is none.
 fn numbers(words: &[&str]) -> Option<Vec<f64>> {
-    let numbers: Option<Vec<f64>> = words.iter().map(|word| word.parse().ok()).collect();
-    numbers.filter(|numbers| {
-        numbers
-            .iter()
-            .all(|number| number.is_finite() && *number >= 0.0)
-    })
+    parsed(words, |number: &f64| number.is_finite() && *number >= 0.0)
+}
+
+fn parsed<T: FromStr>(words: &[&str], is_valid: impl Fn(&T) -> bool) -> Option<Vec<T>> {
+    let numbers = words.iter().map(|word| word.parse().ok().filter(&is_valid));
+    numbers.collect()
 }
 
 /// A name with a number in it.

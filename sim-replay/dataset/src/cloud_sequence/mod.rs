@@ -12,21 +12,14 @@ mod pose_file;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-
-use protocol::{CavId, Handedness, Pose};
 
 use self::join::join;
 use self::keys::Keys;
 use self::pose_file::PoseFile;
 use super::faults::Faults;
 use super::layout::{LayoutRow, Reader};
-use super::points::{SweepStorage, Sweeps, clouds_in};
-use super::{
-    FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
-};
-use crate::frame::Frame;
-use crate::pcd::PcdCloud;
+use super::points::{SweepStorage, clouds_in};
+use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence};
 
 /// A folder of clouds and a file of poses.
 pub(crate) static CLOUDS: LayoutRow = LayoutRow {
@@ -56,15 +49,6 @@ const POSES: [&str; 8] = [
 ];
 /// Folders of the clouds below that of the poses, whatever the case of their letters.
 const FOLDERS: [&str; 4] = ["clouds", "scans", "lidar", "points"];
-
-#[derive(Debug)]
-struct Sequence {
-    /// File of the poses.
-    poses: PathBuf,
-    /// File and pose by stem.
-    clouds: BTreeMap<String, (PathBuf, Pose)>,
-    sweeps: Sweeps,
-}
 
 /// True for a name, or one that ends in it where that begins with `_`.
 fn is_poses(name: &str, known: &str) -> bool {
@@ -124,47 +108,24 @@ fn open(
         };
         let nanos = capture_nanos(&keys, &poses, (index, *row))
             .unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
-        let cloud = ((*stem).to_owned(), (file.clone(), world_from_lidar));
+        let cloud = (
+            Tick::new(*stem, nanos),
+            file.clone(),
+            Some(world_from_lidar),
+        );
         // The index keeps clouds of equal times apart.
         timed.insert((nanos, index), cloud);
     }
     without.report("cloud", problems);
-    Ok(scenario(
-        files::name_below(root, dir),
-        timed,
-        (path, joined.by),
-        options,
-    ))
-}
-
-/// A scenario of clouds by capture time and place, joined with the poses of a file.
-fn scenario(
-    name: String,
-    timed: BTreeMap<(u64, usize), (String, (PathBuf, Pose))>,
-    (poses, by): (PathBuf, &str),
-    options: &OpenOptions,
-) -> Scenario {
-    let ticks = timed.iter();
-    let ticks = ticks
-        .map(|((nanos, _), (stem, _))| Tick::new(stem.clone(), *nanos))
-        .collect();
-    let used = timed.values().map(|(_, (file, _))| file.clone());
-    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, used, options);
-    let clouds: BTreeMap<String, (PathBuf, Pose)> = timed.into_values().collect();
-    let join = format!(
-        "{} poses of {} by {by}",
-        clouds.len(),
-        poses.file_name().unwrap_or_default().display()
-    );
-    let source = Arc::new(Sequence {
-        poses,
-        clouds,
-        sweeps,
-    });
-    Scenario {
+    let of_poses = path.file_name().unwrap_or_default().display();
+    let join = format!("{} poses of {of_poses} by {}", timed.len(), joined.by);
+    let name = files::name_below(root, dir);
+    let clouds = timed.into_values().collect();
+    let storage = (SweepStorage::ByName, options);
+    Ok(Scenario {
         joins: vec![join],
-        ..single_vehicle(name, Layout(&CLOUDS), ticks, source)
-    }
+        ..sequence::scenario(name, Layout(&CLOUDS), clouds, storage, vec![path], false)
+    })
 }
 
 fn stems_of(files: &[PathBuf]) -> Vec<&str> {
@@ -200,32 +161,6 @@ fn capture_nanos(
     match keys {
         Keys::Times(times) => times.get(index).copied(),
         Keys::Numbers(_) | Keys::Names(_) => poses.times.as_ref()?.get(row?).copied(),
-    }
-}
-
-impl FrameSource for Sequence {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
-        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
-        frame.world_from_lidar = self.clouds.get(&tick.stem).map(|(_, pose)| *pose);
-        Ok(frame)
-    }
-
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
-        self.sweeps
-            .read(agent, &self.points_path(agent, tick, variant))
-    }
-
-    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        let mut files = self.sweeps.samples(agent);
-        files.push(self.poses.clone());
-        files
-    }
-
-    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
-        self.clouds
-            .get(&tick.stem)
-            .map(|(path, _)| path.clone())
-            .unwrap_or_default()
     }
 }
 

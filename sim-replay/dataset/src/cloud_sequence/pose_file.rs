@@ -3,14 +3,14 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nalgebra::{Isometry3, Matrix4, Quaternion, Translation3, UnitQuaternion};
+use nalgebra::Matrix4;
 use protocol::Pose;
 
 use super::columns::{Columns, PoseColumns, TimeColumns, quaternion_order};
 use super::keys::{Keys, stamp_nanos, whole_numbers};
 use crate::faults::Faults;
 use crate::kitti_text::{counted_lines, malformed};
-use crate::{ReadError, Result};
+use crate::{ReadError, Result, poses};
 
 /// Signs that begin a comment.
 const COMMENT: [char; 2] = ['#', '%'];
@@ -107,12 +107,10 @@ fn keys(rows: &[Row<'_>], columns: &Columns) -> PoseFile {
         let names = words(rows, column).into_iter().map(str::to_owned).collect();
         keys.push(Keys::Names(names));
     }
-    keys.extend(
-        columns
-            .number
-            .and_then(|column| whole_numbers(&words(rows, column)))
-            .map(Keys::Numbers),
-    );
+    let of_clouds = columns
+        .number
+        .and_then(|column| whole_numbers(&words(rows, column)));
+    keys.extend(of_clouds.map(Keys::Numbers));
     let times = match columns.time {
         Some(TimeColumns::SecondsAndNanos(seconds, nanos)) => (words(rows, seconds).iter())
             .zip(words(rows, nanos))
@@ -128,11 +126,8 @@ fn keys(rows: &[Row<'_>], columns: &Columns) -> PoseFile {
         None => None,
     };
     keys.extend(times);
-    keys.extend(
-        columns
-            .key
-            .and_then(|column| Keys::of_words(&words(rows, column))),
-    );
+    let unknown = columns.key.map(|column| words(rows, column));
+    keys.extend(unknown.and_then(|words| Keys::of_words(&words)));
     let times = keys.iter().find_map(|keys| match keys {
         Keys::Times(times) => Some(times.clone()),
         _ => None,
@@ -188,13 +183,10 @@ impl<'a> Row<'a> {
     /// The columns that a header names.
     fn columns(&self, path: &Path, width: usize) -> Result<Columns> {
         let names = self.names();
-        let columns = match names.len() == width {
+        let (found, listed) = (names.len(), names.join(", "));
+        let columns = match found == width {
             true => Columns::of_names(&names),
-            false => Err(format!(
-                "{} names for {width} columns: {}",
-                names.len(),
-                names.join(", ")
-            )),
+            false => Err(format!("{found} names for {width} columns: {listed}")),
         };
         columns.map_err(|reason| malformed(path, self.line, None, reason))
     }
@@ -207,13 +199,10 @@ impl<'a> Row<'a> {
     }
 
     fn pose(&self, path: &Path, columns: &Columns) -> Result<Pose> {
-        let pose = match self.words.len() == columns.width {
+        let (found, expected) = (self.words.len(), columns.width);
+        let pose = match found == expected {
             true => self.pose_at(columns),
-            false => Err(format!(
-                "{} values, expected {}",
-                self.words.len(),
-                columns.width
-            )),
+            false => Err(format!("{found} values, expected {expected}")),
         };
         pose.map_err(|reason| malformed(path, self.line, None, reason))
     }
@@ -225,39 +214,26 @@ impl<'a> Row<'a> {
                 for (value, column) in values.iter_mut().zip(places) {
                     *value = self.number(*column)?;
                 }
-                of_quaternion(values)
+                // TUM writes w last.
+                let [x, y, z, qx, qy, qz, qw] = values;
+                let pose = Pose {
+                    translation_m: [x, y, z],
+                    rotation_wxyz: [qw, qx, qy, qz],
+                };
+                poses::of_rounded(&pose).map(Pose::from)
             }
             PoseColumns::Matrix(first) => {
-                let values: Result<Vec<f64>, String> = (*first..columns.width)
-                    .map(|column| self.number(column))
-                    .collect();
-                of_matrix(values?)
+                let values = (*first..columns.width).map(|column| self.number(column));
+                let mut values = values.collect::<Result<Vec<f64>, String>>()?;
+                // Three or four rows of four.
+                if values.len() == 12 {
+                    values.extend([0.0, 0.0, 0.0, 1.0]);
+                }
+                let matrix = Matrix4::from_row_slice(&values);
+                Pose::from_matrix(&matrix).map_err(|error| error.to_string())
             }
         }
     }
-}
-
-fn of_quaternion([x, y, z, qx, qy, qz, qw]: [f64; 7]) -> Result<Pose, String> {
-    // TUM writes w last, nalgebra takes it first.
-    let stored = Quaternion::new(qw, qx, qy, qz);
-    if (stored.norm() - 1.0).abs() > 0.01 {
-        return Err(format!(
-            "quaternion of length {:.3}, expected 1",
-            stored.norm()
-        ));
-    }
-    let rotation = UnitQuaternion::new_normalize(stored);
-    let pose: Pose = Isometry3::from_parts(Translation3::new(x, y, z), rotation).into();
-    pose.validate().map_err(|error| error.to_string())?;
-    Ok(pose)
-}
-
-/// Three or four rows of four.
-fn of_matrix(mut values: Vec<f64>) -> Result<Pose, String> {
-    if values.len() == 12 {
-        values.extend([0.0, 0.0, 0.0, 1.0]);
-    }
-    Pose::from_matrix(&Matrix4::from_row_slice(&values)).map_err(|error| error.to_string())
 }
 
 #[cfg(test)]

@@ -108,10 +108,10 @@ impl Index {
             }
         }
         groups.retain(|_, pairs| !pairs.is_empty());
+        let groups = groups.into_iter();
         let groups = groups
-            .into_iter()
-            .map(|(name, group)| (name, in_order(group)));
-        let groups = groups.collect();
+            .map(|(name, group)| (name, in_order(group)))
+            .collect();
         Ok(Self { kind, groups })
     }
 }

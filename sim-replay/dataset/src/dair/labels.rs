@@ -4,7 +4,6 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use protocol::Pose;
-use protocol::text::excerpt;
 
 use crate::frame::{Object, ObjectClass};
 use crate::ground_truth::upright_box;
@@ -108,7 +107,11 @@ fn read(
     for (number, label) in (0..).zip(labels) {
         match object(number, &label) {
             Ok(Some(object)) => {
-                problems.extend(unknown_class(path, &label));
+                let kind = label.required("type").and_then(|kind| kind.text());
+                problems.extend(
+                    kind.ok()
+                        .and_then(|kind| classes::unknown_label(path, kind)),
+                );
                 objects.push(object);
             }
             Ok(None) => {}
@@ -123,15 +126,6 @@ fn read(
 /// An object of unknown type is not a vehicle.
 fn class(label: &Field<'_>) -> Result<ObjectClass> {
     Ok(classes::of_name(label.required("type")?.text()?).unwrap_or(ObjectClass::Other))
-}
-
-fn unknown_class(path: &Path, label: &Field<'_>) -> Option<Problem> {
-    let kind = label.required("type").ok()?.text().ok()?;
-    let shown = format!("{:?}", excerpt(kind, 40));
-    let dir = path.parent().unwrap_or(path);
-    classes::of_name(kind)
-        .is_none()
-        .then(|| classes::unknown(dir, "type", &shown))
 }
 
 /// Length, width, height; nothing if one is 0: such labels have a box in the image alone.

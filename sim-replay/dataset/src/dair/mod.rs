@@ -25,7 +25,6 @@ use self::index::{Index, Kind, Pair};
 use self::labels::{Block, Objects};
 use super::layout::{LayoutRow, Reader, opened};
 use super::points::{SweepStorage, Sweeps};
-use super::presence::AbsentFrames;
 use super::{
     Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Result, Scenario, Tick,
     files, roots,
@@ -137,9 +136,6 @@ fn scenario(
         kept.insert(tick.stem.clone(), pair);
         moments.push(tick);
     }
-    let ticks = (moments.iter())
-        .filter(|tick| !missing.contains(&MissingFrame::new(&agents[0], &tick.stem)));
-    let ticks: Vec<Tick> = ticks.cloned().collect();
     let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
     for agent in &agents {
         let files = (moments.iter())
@@ -153,11 +149,10 @@ fn scenario(
         sweeps,
     });
     Scenario {
-        absent_at: AbsentFrames::new(&agents, &ticks, &missing).among(moments),
         roadside_units: vec![agents[1].clone()],
-        missing,
-        ..Scenario::new(name, layout, agents.to_vec(), ticks, source)
+        ..Scenario::new(name, layout, agents.to_vec(), Vec::new(), source)
     }
+    .among(moments, missing)
 }
 
 /// Side of a pair: vehicle or roadside unit.
@@ -195,13 +190,14 @@ impl Sides {
 
     /// Labels of a side's own sweep.
     fn labels(&self, pair: &Pair, side: Side) -> PathBuf {
-        match side {
-            Side::Vehicle => self.json("vehicle-side/label/lidar", &pair.vehicle),
-            Side::Infrastructure => {
-                let folder = "infrastructure-side/label/virtuallidar";
-                self.json(folder, &pair.infrastructure)
-            }
-        }
+        let (folder, id) = match side {
+            Side::Vehicle => ("vehicle-side/label/lidar", &pair.vehicle),
+            Side::Infrastructure => (
+                "infrastructure-side/label/virtuallidar",
+                &pair.infrastructure,
+            ),
+        };
+        self.json(folder, id)
     }
 
     fn cooperative_labels(&self, pair: &Pair) -> PathBuf {
@@ -217,17 +213,11 @@ impl Sides {
     }
 
     fn calibrations(&self, pair: &Pair, side: Side) -> Vec<PathBuf> {
-        match side {
-            Side::Vehicle => {
-                let folders = calibration::VEHICLE;
-                folders
-                    .map(|folder| self.json(folder, &pair.vehicle))
-                    .to_vec()
-            }
-            Side::Infrastructure => {
-                vec![self.json(calibration::INFRASTRUCTURE, &pair.infrastructure)]
-            }
-        }
+        let (folders, id): (&[&str], _) = match side {
+            Side::Vehicle => (&calibration::VEHICLE, &pair.vehicle),
+            Side::Infrastructure => (&[calibration::INFRASTRUCTURE], &pair.infrastructure),
+        };
+        folders.iter().map(|folder| self.json(folder, id)).collect()
     }
 
     /// The first required file of a side that does not exist.
@@ -324,9 +314,8 @@ impl FrameSource for Source {
     }
 
     fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        let mut files = self.sweeps.samples(agent);
-        files.extend(index::FILES.map(|file| self.sides.root.join(file)));
-        files
+        let index = index::FILES.map(|file| self.sides.root.join(file));
+        self.sweeps.samples(agent, index)
     }
 
     /// Of both sides: the frame of one needs the pose and the ids of the other.

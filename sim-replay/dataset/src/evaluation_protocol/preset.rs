@@ -44,10 +44,9 @@ pub(super) fn preset(name: &str) -> Option<EvaluationProtocol> {
             agents,
             ego,
             max_agents: max_agents(name),
-            ap_order: if name == "v2v4real" {
-                ApOrder::Frame
-            } else {
-                ApOrder::Global
+            ap_order: match name {
+                "v2v4real" => ApOrder::Frame,
+                _ => ApOrder::Global,
             },
         }
     })

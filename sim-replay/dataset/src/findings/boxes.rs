@@ -17,7 +17,7 @@ pub fn without_ground_truth(scenario: &str, targets: usize, merged: usize) -> Op
     let reason = format!(
         "ground truth 0 for every ego and tick, though agents list {targets} objects of its classes: {HINT}"
     );
-    (targets > 0 && merged == 0).then(|| problem(scenario, "ground truth", &reason))
+    (targets > 0 && merged == 0).then(|| Problem::about(scenario, "ground truth", &reason))
 }
 
 /// The finding that most boxes of an agent are empty: `empty` of the `boxes` of frames with points and a pose.
@@ -32,30 +32,19 @@ pub(super) fn mostly_empty(
         "agent {agent}: {empty} of {boxes} boxes ({:.0} %) hold none of its points: {HINT}",
         100.0 * share
     );
-    (boxes >= ENOUGH_BOXES && share > MAX_EMPTY_SHARE).then(|| problem(scenario, "boxes", &reason))
+    (boxes >= ENOUGH_BOXES && share > MAX_EMPTY_SHARE)
+        .then(|| Problem::about(scenario, "boxes", &reason))
 }
 
 /// Number of boxes that hold none of the points.
 pub(super) fn without_points(frame: &Frame, world_from_lidar: &Pose, points: &PointCloud) -> usize {
     let (cells, world_from_lidar) = (Cells::new(points), world_from_lidar.isometry());
     let empty = frame.objects.iter().filter(|object| {
-        let object_from_lidar = object
-            .world_from_object
-            .isometry()
-            .inv_mul(&world_from_lidar);
+        let world_from_object = object.world_from_object.isometry();
+        let object_from_lidar = world_from_object.inv_mul(&world_from_lidar);
         #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
         let half = object.size_m.map(|size| (size / 2.0) as f32);
         !cells.holds_point(&object_from_lidar.cast::<f32>(), half)
     });
     empty.count()
-}
-
-fn problem(scenario: &str, field: &str, reason: &str) -> Problem {
-    let message = format!("{scenario}: {reason}");
-    Problem {
-        path: scenario.to_owned(),
-        line: None,
-        field: Some(field.to_owned()),
-        message,
-    }
 }

@@ -77,25 +77,16 @@ pub fn of_scenario(
         problems.extend(without_pose(scenario, (agent, id), frames));
         let sum =
             |count: fn(&FrameFindings) -> usize| frames.iter().map(|(_, one)| count(one)).sum();
-        let (boxes, empty) = (
-            sum(|one| one.placed_boxes),
-            sum(|one| one.boxes_without_points),
-        );
+        let boxes = sum(|one| one.placed_boxes);
+        let empty = sum(|one| one.boxes_without_points);
         problems.extend(boxes::mostly_empty(&scenario.name, id, boxes, empty));
         let sweeps: Vec<&SweepFindings> = (frames.iter())
             .filter_map(|(_, one)| one.sweep.as_ref())
             .collect();
-        let folder = frames
-            .iter()
-            .find(|(_, one)| one.sweep.is_some())
-            .map(|(tick, _)| sweep_folder(scenario, agent, *tick));
-        let named = format!(" of agent {id}");
-        problems.extend(sweeps::problems(
-            &folder.unwrap_or_default(),
-            &named,
-            &sweeps,
-            scale,
-        ));
+        let first = frames.iter().find(|(_, one)| one.sweep.is_some());
+        let folder = first.map(|(tick, _)| sweep_folder(scenario, agent, *tick));
+        let (folder, named) = (folder.unwrap_or_default(), format!(" of agent {id}"));
+        problems.extend(sweeps::problems(&folder, &named, &sweeps, scale));
     }
     problems.extend(overlap::pose_problems(scenario));
     problems
@@ -124,17 +115,12 @@ fn without_pose(
     let path = (scenario.source.frame_files(id, stem).into_iter().next())
         .or_else(|| scenario.points_path(agent, *tick, None).ok())
         .unwrap_or_default();
-    let path = path.display().to_string();
-    let message = format!(
-        "{path}: lidar_pose: missing in {count} of {} frames of agent {id}, this is the first: boxes cannot be placed",
+    let reason = format!(
+        "lidar_pose: missing in {count} of {} frames of agent {id}, this is the first: boxes cannot be placed",
         frames.len()
     );
-    Some(Problem {
-        path,
-        line: None,
-        field: Some("lidar_pose".to_owned()),
-        message,
-    })
+    let path = path.display().to_string();
+    Some(Problem::about(&path, "lidar_pose", &reason))
 }
 
 /// Findings of some frames, evenly spread over the scenarios. Frames that cannot be read are left out: their reader

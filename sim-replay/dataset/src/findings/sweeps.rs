@@ -109,13 +109,9 @@ pub(super) fn problems(
     let intensity = intensity_fault(&report, sweeps, scale).map(|fault| ("intensity", fault));
     let path = folder.display().to_string();
     let faults = points.into_iter().chain(intensity);
-    let problems = faults.map(|(field, fault)| Problem {
-        message: format!("{path}: sweeps{named}: {fault}"),
-        path: path.clone(),
-        line: None,
-        field: Some(field.to_owned()),
-    });
-    problems.collect()
+    faults
+        .map(|(field, fault)| Problem::about(&path, field, &format!("sweeps{named}: {fault}")))
+        .collect()
 }
 
 /// The first fault of the intensities.

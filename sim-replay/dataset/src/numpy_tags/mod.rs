@@ -35,16 +35,14 @@ impl NumpyArray {
 
 /// True if the node carries a tag of Python's.
 pub(super) fn is_python(node: &Node) -> bool {
-    node.tag
-        .as_deref()
-        .is_some_and(|tag| tag.starts_with("python/"))
+    let tag = node.tag.as_deref();
+    tag.is_some_and(|tag| tag.starts_with("python/"))
 }
 
 /// True if the node is a pickled call, and not a tuple or list of Python's.
 pub(super) fn is_call(node: &Node) -> bool {
-    node.tag
-        .as_deref()
-        .is_some_and(|tag| tag.starts_with(APPLY))
+    let tag = node.tag.as_deref();
+    tag.is_some_and(|tag| tag.starts_with(APPLY))
 }
 
 /// The text of a key that is a NumPy scalar; `None` if it is none.
@@ -54,12 +52,22 @@ pub(super) fn key_text(node: &Node) -> Option<String> {
         .map(|number| number.to_string())
 }
 
-/// Reads `_reconstruct` and `_frombuffer`; a scalar is an array without dimensions.
+/// Reads `_reconstruct`, `_frombuffer` and `scalar(dtype, data)`, an array without dimensions.
 pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray> {
-    match function(field)? {
-        Function::Reconstruct => reconstruct(field),
-        Function::FromBuffer => from_buffer(field),
-        Function::Scalar => Ok(NumpyArray::new(vec![], vec![scalar_value(field)?])),
+    match function(field) {
+        Some("multiarray._reconstruct") => reconstruct(field),
+        Some("numeric._frombuffer") => from_buffer(field),
+        Some("multiarray.scalar") => {
+            let [dtype, data] = items::<2>(&args(field)?)?;
+            let values = numbers(&data, read_dtype(&dtype)?, 1)?;
+            Ok(NumpyArray::new(vec![], values))
+        }
+        _ => {
+            let tag = shown(field.node.tag.as_deref());
+            Err(field.error(format!(
+                "tag {tag} is not supported, expected numbers or NumPy's arrays of them"
+            )))
+        }
     }
 }
 
@@ -73,39 +81,11 @@ pub(super) fn scalar(field: &Field<'_>) -> Result<f64> {
     }
 }
 
-/// The functions of NumPy that occur in pickled numbers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Function {
-    Reconstruct,
-    FromBuffer,
-    Scalar,
-}
-
-fn function(field: &Field<'_>) -> Result<Function> {
-    const KNOWN: [(&str, Function); 3] = [
-        ("multiarray._reconstruct", Function::Reconstruct),
-        ("numeric._frombuffer", Function::FromBuffer),
-        ("multiarray.scalar", Function::Scalar),
-    ];
-    let call = field
-        .node
-        .tag
-        .as_deref()
-        .and_then(|tag| tag.strip_prefix(APPLY));
-    let name = call.and_then(|call| {
-        PACKAGES.iter().find_map(|package| {
-            call.strip_prefix(package)?
-                .strip_prefix('.')
-                .map(str::to_owned)
-        })
-    });
-    let known = name.and_then(|name| KNOWN.iter().find(|(known, _)| *known == name));
-    known.map(|(_, function)| *function).ok_or_else(|| {
-        let tag = shown(field.node.tag.as_deref());
-        field.error(format!(
-            "tag {tag} is not supported, expected numbers or NumPy's arrays of them"
-        ))
-    })
+/// Module and name of the function of NumPy that a node calls.
+fn function<'a>(field: &Field<'a>) -> Option<&'a str> {
+    let call = field.node.tag.as_deref()?.strip_prefix(APPLY)?;
+    let mut packages = PACKAGES.iter();
+    packages.find_map(|package| call.strip_prefix(package)?.strip_prefix('.'))
 }
 
 /// `_reconstruct(ndarray, (0,), b'b')` with its state `(1, shape, dtype, is_fortran, data)`.
@@ -141,16 +121,6 @@ fn from_buffer(field: &Field<'_>) -> Result<NumpyArray> {
         "F" => Ok(ordered(shape, values, true)),
         other => Err(order.error(format!("order {other:?}, expected C or F"))),
     }
-}
-
-/// `scalar(dtype, data)`.
-fn scalar_value(field: &Field<'_>) -> Result<f64> {
-    let [dtype, data] = items::<2>(&args(field)?)?;
-    let values = numbers(&data, read_dtype(&dtype)?, 1)?;
-    values
-        .first()
-        .copied()
-        .ok_or_else(|| data.error("no number"))
 }
 
 /// Arguments of a call without state are its items, or the entry `args`.
@@ -204,13 +174,11 @@ fn check_args(args: &Field<'_>) -> Result<()> {
 
 fn read_shape(field: &Field<'_>) -> Result<Vec<usize>> {
     expect_tag(field, "python/tuple")?;
-    let shape: Vec<usize> = field
-        .items()?
-        .iter()
-        .map(|item| {
-            usize::try_from(item.integer()?).map_err(|_| item.error("a shape is not negative"))
-        })
-        .collect::<Result<_, _>>()?;
+    let items = field.items()?;
+    let sizes = items.iter().map(|item| {
+        usize::try_from(item.integer()?).map_err(|_| item.error("a shape is not negative"))
+    });
+    let shape = sizes.collect::<Result<Vec<usize>>>()?;
     // Checked here: readers multiply the sizes without a check.
     let count = shape
         .iter()
@@ -224,10 +192,9 @@ fn read_shape(field: &Field<'_>) -> Result<Vec<usize>> {
 }
 
 fn ordered(shape: Vec<usize>, values: Vec<f64>, is_fortran: bool) -> NumpyArray {
-    let values = if is_fortran {
-        row_major(&shape, &values)
-    } else {
-        values
+    let values = match is_fortran {
+        true => row_major(&shape, &values),
+        false => values,
     };
     NumpyArray { shape, values }
 }

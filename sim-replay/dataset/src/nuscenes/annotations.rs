@@ -60,7 +60,10 @@ fn read_instances(
     read_all(version, "category.json", problems, |row| {
         let name = row.required("name")?;
         if classes::of_name(name.text()?).is_none() && unknown.len() < MAX_UNKNOWN {
-            unknown.push(unknown_type(&name));
+            let shown: String = name.text()?.chars().take(40).collect();
+            unknown.push(name.error(format!(
+                "{shown:?} is an unknown type of object: it counts as other, not as a vehicle"
+            )));
         }
         names.insert(row.required("token")?.id()?, name.text()?.to_owned());
         Ok(())
@@ -78,13 +81,6 @@ fn read_instances(
         Ok(())
     })?;
     Ok(instances)
-}
-
-fn unknown_type(name: &Field<'_>) -> ReadError {
-    let shown: String = name.text().unwrap_or_default().chars().take(40).collect();
-    name.error(format!(
-        "{shown:?} is an unknown type of object: it counts as other, not as a vehicle"
-    ))
 }
 
 fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object> {

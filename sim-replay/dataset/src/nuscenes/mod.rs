@@ -23,7 +23,6 @@ use self::rig::QuarterTurns;
 use self::tables::{Sample, Scene, Sweep, Tables};
 use super::layout::{LayoutRow, Reader, opened};
 use super::points::{SweepStorage, Sweeps};
-use super::presence::AbsentFrames;
 use super::{
     Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
     files, roots,
@@ -149,8 +148,6 @@ struct Builder<'a> {
 /// Ticks and contents of a scenario.
 #[derive(Default)]
 struct Parts {
-    /// Ticks of the ego.
-    ticks: Vec<Tick>,
     /// Capture times of any agent.
     moments: Vec<Tick>,
     missing: Vec<MissingFrame>,
@@ -168,13 +165,13 @@ impl Builder<'_> {
     ) -> Result<Option<Scenario>> {
         samples.sort_by_key(|(sample, _)| sample.micros);
         let agents = self.agents(&samples)?;
-        let Some((ego, _)) = agents.first() else {
+        if agents.is_empty() {
             let scene = &self.scene.name;
             let reason = format!("scene {scene}: no sweep of a supported LiDAR: left out");
             let path = self.version.join("sample_data.json");
             problems.push(ReadError::malformed(&path, reason));
             return Ok(None);
-        };
+        }
         let capture_nanos = self.capture_times(&samples, options, problems);
         let mut scenario = Parts::default();
         for ((sample, objects), capture_nanos) in samples.into_iter().zip(capture_nanos) {
@@ -199,12 +196,8 @@ impl Builder<'_> {
                 }
                 scenario.missing.push(MissingFrame::new(agent, &tick.stem));
             }
-            if sweeps.contains_key(ego) {
-                scenario.ticks.push(tick.clone());
-            }
-            scenario
-                .contents
-                .insert(tick.stem.clone(), Moment { sweeps, objects });
+            let moment = Moment { sweeps, objects };
+            scenario.contents.insert(tick.stem.clone(), moment);
             scenario.moments.push(tick);
         }
         let agents: Vec<CavId> = agents.into_iter().map(|(agent, _)| agent).collect();
@@ -212,8 +205,11 @@ impl Builder<'_> {
     }
 
     fn scenario(self, agents: Vec<CavId>, parts: Parts, options: &OpenOptions) -> Scenario {
-        let (ticks, moments) = (parts.ticks, parts.moments);
-        let (missing, contents) = (parts.missing, parts.contents);
+        let Parts {
+            moments,
+            missing,
+            contents,
+        } = parts;
         let units = agents.iter();
         let units = units.filter(|agent| rig::is_roadside_unit(self.layout, agent.as_str()));
         let roadside_units = units.cloned().collect();
@@ -233,11 +229,10 @@ impl Builder<'_> {
             sweeps,
         });
         Scenario {
-            absent_at: AbsentFrames::new(&agents, &ticks, &missing).among(moments),
             roadside_units,
-            missing,
-            ..Scenario::new(self.name, self.layout, agents, ticks, source)
+            ..Scenario::new(self.name, self.layout, agents, Vec::new(), source)
         }
+        .among(moments, missing)
     }
 
     /// Agents with the channels of their LiDARs, ego first: vehicles in the order of the data set or of their names, a
@@ -379,9 +374,8 @@ impl FrameSource for Source {
     }
 
     fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
-        let mut files = self.sweeps.samples(agent);
-        files.extend(tables::NAMES.map(|name| self.version.join(name)));
-        files
+        let tables = tables::NAMES.map(|name| self.version.join(name));
+        self.sweeps.samples(agent, tables)
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

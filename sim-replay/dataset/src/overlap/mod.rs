@@ -85,8 +85,8 @@ fn agent_problem(scenario: &Scenario, index: usize, agent: &CavId) -> Option<Pro
             .get(tick)
             .map_or("", |tick| tick.stem.as_str())
     });
-    let message = format!(
-        "{path}: agent {agent}: {} of {count} pairs of sweeps contradict the poses: from {} to {} the poses have {} \
+    let reason = format!(
+        "agent {agent}: {} of {count} pairs of sweeps contradict the poses: from {} to {} the poses have {} \
          ({:.0} % of the structure overlap), the sweeps {} ({:.0} %): poses of other sweeps, other axes or other units",
         wrong.len(),
         stems[0],
@@ -96,12 +96,7 @@ fn agent_problem(scenario: &Scenario, index: usize, agent: &CavId) -> Option<Pro
         shown(&first.best.first_from_second),
         100.0 * first.best.overlap,
     );
-    Some(Problem {
-        path,
-        line: None,
-        field: Some("world_from_lidar".into()),
-        message,
-    })
+    Some(Problem::about(&path, "world_from_lidar", &reason))
 }
 
 fn shown(motion: &Isometry3<f32>) -> String {
@@ -122,12 +117,8 @@ fn pairs(scenario: &Scenario, agent: usize) -> Vec<Pair> {
         .collect();
     // Step: pairs spread evenly over the drive, from the middle of each part.
     let step = candidates.len().div_ceil(SPREAD).max(1);
-    let mut chosen: Vec<Pair> = candidates
-        .iter()
-        .skip(step / 2)
-        .step_by(step)
-        .copied()
-        .collect();
+    let spread = candidates.iter().skip(step / 2).step_by(step);
+    let mut chosen: Vec<Pair> = spread.copied().collect();
     // Step: of the others, those with the largest turn.
     candidates.retain(|pair| chosen.iter().all(|known| known.ticks != pair.ticks));
     candidates.sort_by(|a, b| {
@@ -140,11 +131,8 @@ fn pairs(scenario: &Scenario, agent: usize) -> Vec<Pair> {
 
 /// A sweep and its successor, or a later one where that is close.
 fn pair(scenario: &Scenario, agent: usize, ticks: &[usize], first: usize) -> Option<Pair> {
-    let next = pair_of(
-        scenario,
-        agent,
-        [*ticks.get(first)?, *ticks.get(first + 1)?],
-    )?;
+    let successive = [*ticks.get(first)?, *ticks.get(first + 1)?];
+    let next = pair_of(scenario, agent, successive)?;
     if next.stated.translation.vector.norm() > MOVED_M {
         return Some(next);
     }

@@ -127,12 +127,8 @@ impl<'a> Lines<'a> {
     }
 
     fn token(&mut self) -> &'a [u8] {
-        let end = self
-            .rest
-            .iter()
-            .position(|&byte| is_separator(byte))
-            .unwrap_or(self.rest.len());
-        let (token, rest) = self.rest.split_at(end);
+        let end = self.rest.iter().position(|&byte| is_separator(byte));
+        let (token, rest) = self.rest.split_at(end.unwrap_or(self.rest.len()));
         self.rest = rest;
         token
     }
@@ -182,25 +178,17 @@ impl<'a> Lines<'a> {
 
     fn no_number(&self, field: usize, token: &[u8]) -> PcdError {
         let token: String = String::from_utf8_lossy(token).chars().take(40).collect();
-        let name = self
-            .header
-            .fields
-            .get(field)
-            .map_or("", |field| &field.name);
+        let field = self.header.fields.get(field);
+        let name = field.map_or("", |field| &field.name);
         PcdError::at(self.line, name, format!("{token:?} is no number"))
     }
 
     /// The line has fewer or more values than the header states. They are counted from its start.
     fn wrong_count(&self) -> PcdError {
-        let line = self
-            .begun
-            .split(|&byte| byte == b'\n')
-            .next()
-            .unwrap_or_default();
-        let found = line
-            .split(|&byte| is_separator(byte))
-            .filter(|token| !token.is_empty())
-            .count();
+        let mut lines = self.begun.split(|&byte| byte == b'\n');
+        let line = lines.next().unwrap_or_default();
+        let tokens = line.split(|&byte| is_separator(byte));
+        let found = tokens.filter(|token| !token.is_empty()).count();
         let expected = self.header.columns();
         let mut end = 0;
         let field = self.header.fields.iter().find(|field| {
@@ -209,11 +197,8 @@ impl<'a> Lines<'a> {
             found.min(expected.saturating_sub(1)) < end
         });
         let name = field.map_or("", |field| &field.name);
-        PcdError::at(
-            self.line,
-            name,
-            format!("{found} values in the line, expected {expected}"),
-        )
+        let reason = format!("{found} values in the line, expected {expected}");
+        PcdError::at(self.line, name, reason)
     }
 
     /// A malformed last line without line end means a truncated file.

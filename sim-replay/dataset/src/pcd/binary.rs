@@ -9,41 +9,36 @@ use super::{PcdCloud, PcdError, lzf, unpack_rgb};
 
 /// Position of a field's numbers: that of point `i` at `first + i * step`.
 #[derive(Debug, Clone, Copy)]
-struct Column {
+struct Column<'a> {
+    field: &'a Field,
     first: usize,
     step: usize,
-    kind: Kind,
-    size: usize,
 }
 
 /// Points one after another.
 pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
     let (points, stride) = (header.points, header.stride());
-    if points
-        .checked_mul(stride)
-        .is_none_or(|expected| body.len() < expected)
-    {
+    let expected = points.checked_mul(stride);
+    if expected.is_none_or(|expected| body.len() < expected) {
         let reason = format!(
             "{points} points of {stride} bytes stated, but only {} bytes follow the header: the file is cut off",
             body.len()
         );
         return Err(PcdError::of("POINTS", reason));
     }
-    Ok(gather(header, body, |(field, first)| {
-        column_of(field, first, stride)
+    Ok(gather(header, body, |(field, first)| Column {
+        field,
+        first,
+        step: stride,
     }))
 }
 
 /// Two lengths, then LZF; once unpacked, fields one after another, each for all points.
 pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
     let Some((lengths, packed)) = body.split_first_chunk::<8>() else {
-        return Err(PcdError::of(
-            "DATA",
-            format!(
-                "{} bytes after the header, expected two lengths",
-                body.len()
-            ),
-        ));
+        let found = body.len();
+        let reason = format!("{found} bytes after the header, expected two lengths");
+        return Err(PcdError::of("DATA", reason));
     };
     let [a, b, c, d, e, f, g, h] = *lengths;
     let packed_len = u32::from_le_bytes([a, b, c, d]) as usize;
@@ -62,10 +57,9 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
     let (points, stride) = (header.points, header.stride());
     let expected = points.checked_mul(stride);
     if expected != Some(unpacked_len) {
-        let way = if expected.is_none_or(|expected| unpacked_len < expected) {
-            "fewer"
-        } else {
-            "more"
+        let way = match expected.is_none_or(|expected| unpacked_len < expected) {
+            true => "fewer",
+            false => "more",
         };
         let reason = format!(
             "{points} points of {stride} bytes stated, but unpacked they are {unpacked_len} bytes: {way}"
@@ -74,19 +68,12 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
     }
     let unpacked = lzf::decompress(packed, unpacked_len)
         .map_err(|error| PcdError::of("DATA", error.to_string()))?;
-    Ok(gather(header, &unpacked, |(field, first)| {
+    Ok(gather(header, &unpacked, |(field, first)| Column {
+        field,
         // A field begins behind the numbers of all points of those before it.
-        column_of(field, first * points, field.size * field.count)
+        first: first * points,
+        step: field.size * field.count,
     }))
-}
-
-fn column_of(field: &Field, first: usize, step: usize) -> Column {
-    Column {
-        first,
-        step,
-        kind: field.kind,
-        size: field.size,
-    }
 }
 
 /// A field, and the number of bytes of a point before it.
@@ -102,7 +89,11 @@ fn field_at(header: &Header, index: usize) -> (&Field, usize) {
 
 /// `column` gives the place of a field from the bytes of a point before it. `data` holds every number that it points
 /// at: its length has been checked.
-fn gather(header: &Header, data: &[u8], column: impl Fn((&Field, usize)) -> Column) -> PcdCloud {
+fn gather(
+    header: &Header,
+    data: &[u8],
+    column: impl Fn((&Field, usize)) -> Column<'_>,
+) -> PcdCloud {
     let mut points = vec![[0.0; 4]; header.points];
     for (component, index) in header.xyz.into_iter().enumerate() {
         column(field_at(header, index)).fill(data, &mut points, component);
@@ -124,7 +115,7 @@ fn gather(header: &Header, data: &[u8], column: impl Fn((&Field, usize)) -> Colu
     PcdCloud::of_finite(points, labels)
 }
 
-impl Column {
+impl Column<'_> {
     /// Sets one component of all points. Integers beyond 2^24 and doubles are rounded.
     #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
     #[expect(clippy::indexing_slicing, reason = "a component is 0 to 3")]
@@ -136,7 +127,7 @@ impl Column {
                 })
             };
         }
-        match (self.kind, self.size) {
+        match (self.field.kind, self.field.size) {
             (Kind::Float, 4) => self.each(data, points, |point, bytes| {
                 point[component] = f32::from_le_bytes(bytes)
             }),

@@ -6,6 +6,8 @@
 
 mod points;
 
+use std::ops::RangeInclusive;
+
 use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS};
 
 use super::{IntensityKind, PcdError};
@@ -14,11 +16,12 @@ const MAX_FIELDS: usize = 64;
 /// Longest header line that is read, bytes.
 const MAX_LINE: usize = 8192;
 /// Most numbers in one field of one point.
-const MAX_COUNT: u64 = 65_536;
+const MAX_COUNT: usize = 65_536;
 /// Most bytes of one number.
 const MAX_SIZE: usize = 8;
 /// Storage of the points.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::EnumString)]
+#[strum(serialize_all = "snake_case", ascii_case_insensitive)]
 pub(super) enum Data {
     /// A line of decimal numbers per point.
     Ascii,
@@ -89,28 +92,31 @@ pub(super) struct Header {
 
 /// The values of one header line and their position.
 struct Entry<'a> {
+    key: &'static str,
     line: u64,
     values: Vec<&'a str>,
 }
 
-/// The header lines by key, unchecked.
-#[derive(Default)]
-struct Entries<'a> {
-    found: Vec<(&'static str, Entry<'a>)>,
+impl<'a> Entry<'a> {
+    fn error(&self, reason: String) -> PcdError {
+        PcdError::at(self.line, self.key, reason)
+    }
+
+    /// The only value.
+    fn single(&self) -> Result<&'a str, PcdError> {
+        match self.values[..] {
+            [value] => Ok(value),
+            _ => Err(self.error(format!("{} values, expected 1", self.values.len()))),
+        }
+    }
 }
 
-const KEYS: [&str; 10] = [
-    "VERSION",
-    "FIELDS",
-    "SIZE",
-    "TYPE",
-    "COUNT",
-    "WIDTH",
-    "HEIGHT",
-    "VIEWPOINT",
-    "POINTS",
-    "DATA",
-];
+/// The header lines, unchecked.
+#[derive(Default)]
+struct Entries<'a>(Vec<Entry<'a>>);
+
+/// The keys of header lines.
+const KEYS: &str = "VERSION FIELDS SIZE TYPE COUNT WIDTH HEIGHT VIEWPOINT POINTS DATA";
 const VERSIONS: [&str; 6] = ["0.7", ".7", "0.6", ".6", "0.5", ".5"];
 
 impl Header {
@@ -139,11 +145,13 @@ impl Header {
         let points = entries.points()?;
         entries.check_viewpoint()?;
         let line = entries.get("FIELDS")?.line;
-        let xyz = find_xyz(&fields, line)?;
-        let intensity = find_intensity(&fields);
+        let [x, y, z] = ["x", "y", "z"].map(|name| find_coordinate(&fields, name, line));
+        let value = find_number(&fields, &INTENSITY_FIELDS).map(IntensitySource::Value);
+        let intensity =
+            value.or_else(|| find_number(&fields, &COLOUR_FIELDS).map(IntensitySource::Red));
         let header = Self {
-            xyz,
-            intensity,
+            xyz: [x?, y?, z?],
+            intensity: intensity.unwrap_or(IntensitySource::None),
             points,
             data: entries.data()?,
             fields,
@@ -174,15 +182,11 @@ impl Header {
             }
             IntensitySource::Value(index) => {
                 let field = self.fields.get(index)?;
-                let is_byte = field.kind == Kind::Unsigned && field.size == 1;
-                Some((
-                    &field.name,
-                    if is_byte {
-                        IntensityKind::Byte
-                    } else {
-                        IntensityKind::Number
-                    },
-                ))
+                let kind = match (field.kind, field.size) {
+                    (Kind::Unsigned, 1) => IntensityKind::Byte,
+                    _ => IntensityKind::Number,
+                };
+                Some((&field.name, kind))
             }
             IntensitySource::None => None,
         }
@@ -209,7 +213,7 @@ impl Header {
                         "{:?} of field {name}, expected F, I or U",
                         kinds.values[index]
                     );
-                    return Err(PcdError::at(kinds.line, "TYPE", reason));
+                    return Err(kinds.error(reason));
                 }
                 // Ahead of the types: a packed colour has four bytes, as a float and as an integer.
                 _ if self.intensity == IntensitySource::Red(index) => &[4],
@@ -221,7 +225,7 @@ impl Header {
                     "{size} of field {name}, expected one of {allowed:?} for TYPE {}",
                     kinds.values[index]
                 );
-                return Err(PcdError::at(sizes.line, "SIZE", reason));
+                return Err(sizes.error(reason));
             }
         }
         Ok(())
@@ -241,38 +245,30 @@ fn without_comment(line: &[u8]) -> &[u8] {
 
 impl<'a> Entries<'a> {
     fn has(&self, key: &str) -> bool {
-        self.found.iter().any(|(found, _)| *found == key)
+        self.find(key).is_some()
     }
 
     fn add(&mut self, line: u64, text: &'a [u8]) -> Result<(), PcdError> {
-        let text = std::str::from_utf8(text).map_err(|_| not_text(line))?;
+        let text = std::str::from_utf8(text)
+            .map_err(|_| fault(line, "the header is not text: is this a PCD file?"))?;
         let mut words = text.split_ascii_whitespace();
         let Some(word) = words.next() else {
             return Ok(());
         };
-        let asked = if word.eq_ignore_ascii_case("COLUMNS") {
-            "FIELDS"
-        } else {
-            word
+        let asked = match word.eq_ignore_ascii_case("COLUMNS") {
+            true => "FIELDS",
+            false => word,
         };
-        let Some(key) = KEYS.into_iter().find(|key| key.eq_ignore_ascii_case(asked)) else {
+        let mut keys = KEYS.split(' ');
+        let Some(key) = keys.find(|key| key.eq_ignore_ascii_case(asked)) else {
             let word: String = word.chars().take(40).collect();
-            return Err(PcdError {
-                line: Some(line),
-                field: None,
-                reason: format!("{word:?} is no PCD header key"),
-            });
+            return Err(fault(line, format!("{word:?} is no PCD header key")));
         };
         if self.has(key) {
             return Err(PcdError::at(line, key, "is given a second time"));
         }
-        self.found.push((
-            key,
-            Entry {
-                line,
-                values: words.collect(),
-            },
-        ));
+        let values = words.collect();
+        self.0.push(Entry { key, line, values });
         Ok(())
     }
 
@@ -282,43 +278,27 @@ impl<'a> Entries<'a> {
     }
 
     fn find(&self, key: &str) -> Option<&Entry<'a>> {
-        self.found
-            .iter()
-            .find(|(found, _)| *found == key)
-            .map(|(_, entry)| entry)
-    }
-
-    fn single(&self, key: &str) -> Result<(u64, &'a str), PcdError> {
-        let entry = self.get(key)?;
-        match entry.values[..] {
-            [value] => Ok((entry.line, value)),
-            _ => {
-                let reason = format!("{} values, expected 1", entry.values.len());
-                Err(PcdError::at(entry.line, key, reason))
-            }
-        }
+        self.0.iter().find(|entry| entry.key == key)
     }
 
     fn check_version(&self) -> Result<(), PcdError> {
-        if !self.has("VERSION") {
+        let Some(entry) = self.find("VERSION") else {
             return Ok(());
+        };
+        let version = entry.single()?;
+        match VERSIONS.contains(&version) {
+            true => Ok(()),
+            false => Err(entry.error(format!("{version:?}, expected 0.7, 0.6 or 0.5"))),
         }
-        let (line, version) = self.single("VERSION")?;
-        if VERSIONS.contains(&version) {
-            return Ok(());
-        }
-        let reason = format!("{version:?}, expected 0.7, 0.6 or 0.5");
-        Err(PcdError::at(line, "VERSION", reason))
     }
 
     /// One value for each field, or an error with both counts.
-    fn per_field(&self, key: &'static str, fields: usize) -> Result<&Entry<'a>, PcdError> {
+    fn per_field(&self, key: &str, fields: usize) -> Result<&Entry<'a>, PcdError> {
         let entry = self.get(key)?;
-        if entry.values.len() == fields {
-            return Ok(entry);
+        match entry.values.len() {
+            found if found == fields => Ok(entry),
+            found => Err(entry.error(format!("{found} values for {fields} FIELDS"))),
         }
-        let reason = format!("{} values for {fields} FIELDS", entry.values.len());
-        Err(PcdError::at(entry.line, key, reason))
     }
 
     #[expect(
@@ -327,33 +307,28 @@ impl<'a> Entries<'a> {
     )]
     fn fields(&self) -> Result<Vec<Field>, PcdError> {
         let names = self.get("FIELDS")?;
-        if names.values.is_empty() || names.values.len() > MAX_FIELDS {
-            let reason = format!("{} fields, expected 1 to {MAX_FIELDS}", names.values.len());
-            return Err(PcdError::at(names.line, "FIELDS", reason));
+        let fields = names.values.len();
+        if !(1..=MAX_FIELDS).contains(&fields) {
+            return Err(names.error(format!("{fields} fields, expected 1 to {MAX_FIELDS}")));
         }
-        let sizes = self.per_field("SIZE", names.values.len())?;
-        let kinds = self.per_field("TYPE", names.values.len())?;
-        let counts = if self.has("COUNT") {
-            Some(self.per_field("COUNT", names.values.len())?)
-        } else {
-            None
+        let sizes = self.per_field("SIZE", fields)?;
+        let kinds = self.per_field("TYPE", fields)?;
+        let counts = match self.has("COUNT") {
+            true => Some(self.per_field("COUNT", fields)?),
+            false => None,
         };
-        (0..names.values.len())
-            .map(|index| {
-                let name = names.values[index];
-                let size = number_size(name, sizes.line, sizes.values[index])?;
-                let count = match counts {
-                    Some(counts) => field_count(name, counts.line, counts.values[index])?,
+        let fields = names.values.iter().enumerate().map(|(index, name)| {
+            Ok(Field {
+                name: (*name).to_owned(),
+                kind: number_kind(kinds.values[index]),
+                size: number_of(name, sizes, index, 1..=MAX_SIZE)?,
+                count: match counts {
+                    Some(counts) => number_of(name, counts, index, 0..=MAX_COUNT)?,
                     None => 1,
-                };
-                Ok(Field {
-                    name: name.to_owned(),
-                    kind: number_kind(kinds.values[index]),
-                    size,
-                    count,
-                })
+                },
             })
-            .collect()
+        });
+        fields.collect()
     }
 
     /// The sensor's pose is not applied to the points (PCL does not either), but must be valid.
@@ -362,40 +337,33 @@ impl<'a> Entries<'a> {
             return Ok(());
         };
         if entry.values.len() != 7 {
-            let reason = format!("{} values, expected 7", entry.values.len());
-            return Err(PcdError::at(entry.line, "VIEWPOINT", reason));
+            return Err(entry.error(format!("{} values, expected 7", entry.values.len())));
         }
         for value in &entry.values {
             if !value.parse::<f64>().is_ok_and(f64::is_finite) {
-                let reason = format!("{value:?} is no finite number");
-                return Err(PcdError::at(entry.line, "VIEWPOINT", reason));
+                return Err(entry.error(format!("{value:?} is no finite number")));
             }
         }
         Ok(())
     }
 
     fn data(&self) -> Result<Data, PcdError> {
-        let (line, data) = self.single("DATA")?;
-        let kinds = [
-            ("ascii", Data::Ascii),
-            ("binary", Data::Binary),
-            ("binary_compressed", Data::BinaryCompressed),
-        ];
-        let found = kinds
-            .into_iter()
-            .find(|(name, _)| name.eq_ignore_ascii_case(data));
-        found.map(|(_, kind)| kind).ok_or_else(|| {
-            let reason = format!("{data:?}, expected ascii, binary or binary_compressed");
-            PcdError::at(line, "DATA", reason)
+        let entry = self.get("DATA")?;
+        let data = entry.single()?;
+        data.parse().map_err(|_| {
+            entry.error(format!(
+                "{data:?}, expected ascii, binary or binary_compressed"
+            ))
         })
     }
 }
 
-fn not_text(line: u64) -> PcdError {
+/// The fault of a line without a key.
+fn fault(line: u64, reason: impl Into<String>) -> PcdError {
     PcdError {
         line: Some(line),
         field: None,
-        reason: "the header is not text: is this a PCD file?".into(),
+        reason: reason.into(),
     }
 }
 
@@ -408,23 +376,21 @@ fn number_kind(kind: &str) -> Kind {
     }
 }
 
-fn number_size(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
-    let size = value
-        .parse()
-        .ok()
-        .filter(|size| (1..=MAX_SIZE).contains(size));
-    size.ok_or_else(|| {
-        let reason = format!("{value:?} of field {name}, expected 1 to {MAX_SIZE}");
-        PcdError::at(line, "SIZE", reason)
-    })
-}
-
-fn field_count(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
-    let count = value.parse().ok().filter(|&count: &u64| count <= MAX_COUNT);
-    let count = count.and_then(|count| usize::try_from(count).ok());
-    count.ok_or_else(|| {
-        let reason = format!("{value:?} of field {name}, expected 0 to {MAX_COUNT}");
-        PcdError::at(line, "COUNT", reason)
+/// The number that a header line gives for a field.
+#[expect(clippy::indexing_slicing, reason = "as many sizes and counts as names")]
+fn number_of(
+    name: &str,
+    entry: &Entry<'_>,
+    index: usize,
+    range: RangeInclusive<usize>,
+) -> Result<usize, PcdError> {
+    let value = entry.values[index];
+    let number = value.parse().ok().filter(|number| range.contains(number));
+    number.ok_or_else(|| {
+        let (low, high) = (range.start(), range.end());
+        entry.error(format!(
+            "{value:?} of field {name}, expected {low} to {high}"
+        ))
     })
 }
 
@@ -448,19 +414,7 @@ fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, Pcd
     Ok(index)
 }
 
-fn find_xyz(fields: &[Field], line: u64) -> Result<[usize; 3], PcdError> {
-    let [x, y, z] = ["x", "y", "z"].map(|name| find_coordinate(fields, name, line));
-    Ok([x?, y?, z?])
-}
-
 /// The first field of the most preferred name that holds one number.
-fn find_intensity(fields: &[Field]) -> IntensitySource {
-    if let Some(index) = find_number(fields, &INTENSITY_FIELDS) {
-        return IntensitySource::Value(index);
-    }
-    find_number(fields, &COLOUR_FIELDS).map_or(IntensitySource::None, IntensitySource::Red)
-}
-
 fn find_number(fields: &[Field], names: &[&str]) -> Option<usize> {
     names.iter().find_map(|name| {
         fields

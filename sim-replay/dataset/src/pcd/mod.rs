@@ -27,6 +27,7 @@ use serde::Serialize;
 
 pub use encode::{Encoding, IntensityField, encode};
 
+use crate::error::shown;
 use header::{Data, Header};
 pub use protocol::IntensityKind;
 
@@ -74,7 +75,7 @@ pub enum Place {
 
 /// Reasons why bytes are not a readable PCD file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{}{}{reason}", line.map(|line| format!("line {line}: ")).unwrap_or_default(), field.as_ref().map(|field| format!("{field}: ")).unwrap_or_default())]
+#[error("{}{}{reason}", shown("line ", *line, ": "), shown("", field.as_ref(), ": "))]
 pub struct PcdError {
     /// The line at fault, from 1, if the fault is in text.
     pub line: Option<u64>,
@@ -108,17 +109,13 @@ impl PcdError {
 /// [`PcdError`] with line, field and both values of the fault. No allocation relies on the header alone.
 pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let mut cloud = decode_stored(bytes)?;
-    if let Some(origin) = cloud
-        .intensity
-        .as_mut()
-        .filter(|origin| origin.kind == IntensityKind::RedByte)
+    if let Some(origin) = &mut cloud.intensity
+        && origin.kind == IntensityKind::RedByte
     {
         origin.divisor = RED_SCALE;
-        cloud
-            .points
-            .xyzi
-            .iter_mut()
-            .for_each(|point| point[3] /= RED_SCALE);
+        for point in &mut cloud.points.xyzi {
+            point[3] /= RED_SCALE;
+        }
     }
     Ok(cloud)
 }
@@ -168,10 +165,8 @@ impl PcdCloud {
 
     /// Removes points that are not finite. `labels`: one for each point, or none.
     pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
-        let (all, first) = (
-            points.len(),
-            points.iter().position(|point| !is_finite(point)),
-        );
+        let all = points.len();
+        let first = points.iter().position(|point| !is_finite(point));
         if first.is_some() {
             // Labels first, while the points still show which of them stay.
             let mut kept = points.iter().map(is_finite);

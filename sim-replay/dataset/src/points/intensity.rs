@@ -56,16 +56,12 @@ impl FromStr for IntensityScale {
         if text == "auto" {
             return Ok(Self::AUTO);
         }
-        let divisor = text
-            .parse()
-            .ok()
-            // Neither 0 nor NaN, infinite or subnormal: intensities stay finite.
-            .filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0);
-        divisor
-            .map(|divisor| Self {
-                divisor: Some(divisor),
-            })
-            .ok_or_else(|| IntensityScaleError(text.to_owned()))
+        let divisor = text.parse().ok();
+        // Neither 0 nor NaN, infinite or subnormal: intensities stay finite.
+        match divisor.filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0) {
+            None => Err(IntensityScaleError(text.to_owned())),
+            divisor => Ok(Self { divisor }),
+        }
     }
 }
 
@@ -132,7 +128,7 @@ fn divide(points: &mut PointCloud, divisor: f32) {
 }
 
 /// Scale of the intensities of one live LiDAR: by type or by the range of its first sweeps, as for files.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct LiveIntensities {
     scale: IntensityScale,
     /// Number of sweeps that determined the range.
@@ -146,9 +142,7 @@ impl LiveIntensities {
     pub fn new(scale: IntensityScale) -> Self {
         Self {
             scale,
-            samples: 0,
-            largest: 0.0,
-            has_finding: false,
+            ..Self::default()
         }
     }
 

@@ -21,12 +21,11 @@ pub(super) fn longest_steady(stamps: &[u64]) -> SteadyPart {
     let (mut parts, mut strays) = (vec![Vec::new()], 0);
     for (index, stamp) in stamps.iter().enumerate() {
         let Some(part) = parts.last_mut() else { break };
-        let before: Option<u64> = part
-            .last()
-            .and_then(|&last: &usize| stamps.get(last))
-            .copied();
+        let before = part.last().and_then(|&last: &usize| stamps.get(last));
+        let before = before.copied();
         let two_before = part.len().checked_sub(2).and_then(|place| part.get(place));
         let two_before = two_before.and_then(|&place| stamps.get(place));
+        let next = stamps.get(index + 1).copied();
         if before.is_none_or(|before| *stamp > before) {
             part.push(index);
         } else if two_before.is_some_and(|two_before| stamp > two_before) {
@@ -34,11 +33,7 @@ pub(super) fn longest_steady(stamps: &[u64]) -> SteadyPart {
             strays += 1;
             part.pop();
             part.push(index);
-        } else if stamps
-            .get(index + 1)
-            .copied()
-            .is_some_and(|next| Some(next) <= before)
-        {
+        } else if next.is_some_and(|next| Some(next) <= before) {
             // Two in a row that are not later: the clock was set back, and a part begins.
             parts.push(vec![index]);
         } else {

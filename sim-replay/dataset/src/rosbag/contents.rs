@@ -3,20 +3,17 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
-use protocol::Pose;
+use nalgebra::Isometry3;
 use protocol::text::excerpt;
 use ros2::{PoseType, RosType, Transform, read_header};
 
 use super::scan::{Message, Place, Scan, Topic};
 use super::transforms::is_map;
-use crate::ReadError;
 use crate::faults::Faults;
+use crate::{ReadError, poses};
 
 /// Last part of the topic of fixed transforms.
 const FIXED_TRANSFORMS: &str = "tf_static";
-/// Largest deviation of a quaternion's length from 1: tf2's own.
-const UNIT_TOLERANCE: f64 = 0.01;
 /// Largest number of topics that an error lists.
 const LISTED: usize = 12;
 
@@ -60,19 +57,10 @@ pub(super) struct Contents {
     faults: BTreeMap<String, Faults>,
 }
 
-/// Use of a topic.
-enum Use {
-    Clouds,
-    Poses(PoseType),
-}
-
-impl Use {
-    fn of(topic: &Topic) -> Option<Self> {
-        if topic.type_name == RosType::PointCloud2.name() {
-            return Some(Self::Clouds);
-        }
-        PoseType::of_name(&topic.type_name).map(Self::Poses)
-    }
+/// True for topics of clouds and of poses.
+fn is_used(topic: &Topic) -> bool {
+    let name = &topic.type_name;
+    *name == RosType::PointCloud2.name() || PoseType::of_name(name).is_some()
 }
 
 impl Contents {
@@ -103,11 +91,8 @@ impl Contents {
         let shown = self.topics.iter().take(LISTED);
         let mut names: Vec<String> = shown
             .map(|topic| {
-                format!(
-                    "{} ({})",
-                    excerpt(&topic.name, 60),
-                    excerpt(&topic.type_name, 60)
-                )
+                let [name, kind] = [&topic.name, &topic.type_name].map(|text| excerpt(text, 60));
+                format!("{name} ({kind})")
             })
             .collect();
         let more = self.topics.len().saturating_sub(LISTED);
@@ -132,7 +117,7 @@ impl Contents {
     }
 
     fn take_transform(&mut self, topic: &str, recorded_nanos: u64, read: Transform, is_tf: bool) {
-        let parent_from_child = match isometry(&read.parent_from_child) {
+        let parent_from_child = match poses::of_rounded(&read.parent_from_child) {
             Ok(pose) => pose,
             Err(reason) => {
                 let child = read.child.as_deref().unwrap_or("the pose");
@@ -162,12 +147,12 @@ impl Scan for Contents {
         // MCAP declares a topic with each message: its fault is reported once.
         if !self.topics.contains(topic) {
             self.topics.push(topic.clone());
-            if Use::of(topic).is_some() && !topic.is_cdr() {
+            if is_used(topic) && !topic.is_cdr() {
                 let reason = format!("encoding {:?}, expected cdr", excerpt(&topic.encoding, 40));
                 self.fault(&topic.name, reason);
             }
         }
-        topic.is_cdr() && Use::of(topic).is_some()
+        topic.is_cdr() && is_used(topic)
     }
 
     fn take(&mut self, message: Message<'_>) {
@@ -176,8 +161,9 @@ impl Scan for Contents {
             Ok(data) => data,
             Err(reason) => return self.fault(topic, reason),
         };
-        match Use::of(message.topic) {
-            Some(Use::Clouds) => match read_header(&data) {
+        match PoseType::of_name(&message.topic.type_name) {
+            // A topic that is used and has no poses has clouds.
+            None => match read_header(&data) {
                 Ok((nanos, frame)) => {
                     let cloud = CloudStamp {
                         recorded_nanos,
@@ -190,7 +176,7 @@ impl Scan for Contents {
                 }
                 Err(error) => self.fault(topic, error.to_string()),
             },
-            Some(Use::Poses(pose_type)) => match pose_type.read(&data) {
+            Some(pose_type) => match pose_type.read(&data) {
                 Ok(transforms) => {
                     let is_tf = pose_type == PoseType::TfMessage;
                     for transform in transforms {
@@ -199,7 +185,6 @@ impl Scan for Contents {
                 }
                 Err(error) => self.fault(topic, error.to_string()),
             },
-            None => {}
         }
     }
 
@@ -209,22 +194,4 @@ impl Scan for Contents {
             !clouds.is_empty()
         });
     }
-}
-
-/// A rigid transform of a message, whose quaternion may be rounded.
-fn isometry(pose: &Pose) -> Result<Isometry3<f64>, String> {
-    let [w, x, y, z] = pose.rotation_wxyz;
-    let stored = Quaternion::new(w, x, y, z);
-    let is_unit = (stored.norm() - 1.0).abs() < UNIT_TOLERANCE;
-    if !is_unit {
-        return Err(format!(
-            "quaternion of length {:.3}, expected 1",
-            stored.norm()
-        ));
-    }
-    let [x, y, z] = pose.translation_m;
-    let rotation = UnitQuaternion::new_normalize(stored);
-    let isometry = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
-    let checked = Pose::from(isometry).validate();
-    checked.map(|_| isometry).map_err(|error| error.to_string())
 }

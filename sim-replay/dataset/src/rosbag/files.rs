@@ -51,7 +51,7 @@ impl Kind {
 }
 
 /// True for a file of a bag, and for a folder with one.
-pub(super) fn is_bag(path: &Path) -> bool {
+pub(crate) fn is_bag(path: &Path) -> bool {
     if path.is_file() {
         return Kind::of(path).is_some();
     }
@@ -74,11 +74,8 @@ fn is_described(dir: &Path) -> bool {
 /// The files of bags in a folder.
 fn in_folder(dir: &Path) -> Vec<PathBuf> {
     let names = list(dir).map(|listing| listing.files).unwrap_or_default();
-    names
-        .iter()
-        .map(|name| dir.join(name))
-        .filter(|path| Kind::of(path).is_some())
-        .collect()
+    let paths = names.iter().map(|name| dir.join(name));
+    paths.filter(|path| Kind::of(path).is_some()).collect()
 }
 
 /// The files of the bag at a path, in order. Those that its description lists and that do not exist, and the reverse, are
@@ -145,29 +142,11 @@ fn listed(dir: &Path) -> Result<Vec<PathBuf>> {
     files.collect()
 }
 
-/// The file, or an unpacked copy of it that exists as long as the value.
-pub(super) enum Unpacked {
-    AsIs(PathBuf),
-    Copy(TempPath),
-}
-
-impl Unpacked {
-    pub(super) fn of(path: &Path) -> Result<Self> {
-        let is_compressed = path.to_str().is_some_and(|name| name.ends_with(COMPRESSED));
-        if !is_compressed {
-            return Ok(Self::AsIs(path.to_owned()));
-        }
-        unpacked_copy(path)
-            .map(Self::Copy)
-            .map_err(|error| ReadError::malformed(path, format!("cannot be unpacked: {error}")))
-    }
-
-    pub(super) fn path(&self) -> &Path {
-        match self {
-            Self::AsIs(path) => path,
-            Self::Copy(path) => path,
-        }
-    }
+/// An unpacked copy of a compressed file, which exists as long as the value.
+pub(super) fn unpacked(path: &Path) -> Result<Option<TempPath>> {
+    let is_compressed = path.to_str().is_some_and(|name| name.ends_with(COMPRESSED));
+    let copy = is_compressed.then(|| unpacked_copy(path)).transpose();
+    copy.map_err(|error| ReadError::malformed(path, format!("cannot be unpacked: {error}")))
 }
 
 fn unpacked_copy(path: &Path) -> io::Result<TempPath> {

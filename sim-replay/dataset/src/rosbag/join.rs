@@ -56,26 +56,28 @@ pub(super) fn join(
     contents: &Contents,
     problems: &mut Vec<ReadError>,
 ) -> Result<Joined> {
-    let topics = topics(path, contents)?;
-    let mut attempts: Vec<Attempt> = Vec::new();
-    for sweeps in topics {
-        attempts.push(Attempt::of(path, contents, sweeps));
-        if attempts
-            .last()
-            .is_some_and(|attempt| attempt.chosen.is_some())
-        {
-            break;
+    let mut first = None;
+    for sweeps in topics(path, contents) {
+        let attempt = Attempt::of(path, contents, sweeps);
+        if attempt.chosen.is_some() {
+            return Ok(attempt.finish(path, contents, problems));
         }
+        first.get_or_insert(attempt);
     }
     // The first topic if none has poses.
-    let with_poses = attempts.iter().position(|attempt| attempt.chosen.is_some());
-    let attempt = attempts.swap_remove(with_poses.unwrap_or(0));
+    let attempt = first.ok_or_else(|| {
+        let reason = format!(
+            "no sweep in the bag: expected sensor_msgs/PointCloud2 with stamps, in the frame of a LiDAR; its topics: {}",
+            contents.listing()
+        );
+        ReadError::malformed(path, reason)
+    })?;
     Ok(attempt.finish(path, contents, problems))
 }
 
 /// Topics of sweeps, those with most messages first, of equally many those with most bytes. Clouds in the world's frame
 /// are no sweeps.
-fn topics(path: &Path, contents: &Contents) -> Result<Vec<SweepTopic>> {
+fn topics(path: &Path, contents: &Contents) -> Vec<SweepTopic> {
     let all = contents.clouds.iter();
     let mut topics: Vec<SweepTopic> = all
         .map(|(topic, clouds)| SweepTopic::new(path, topic, clouds))
@@ -88,14 +90,7 @@ fn topics(path: &Path, contents: &Contents) -> Result<Vec<SweepTopic>> {
         let is_most = count as f64 >= SAME_COUNT * most as f64;
         Reverse((if is_most { most } else { count }, topic.bytes()))
     });
-    if topics.is_empty() {
-        let reason = format!(
-            "no sweep in the bag: expected sensor_msgs/PointCloud2 with stamps, in the frame of a LiDAR; its topics: {}",
-            contents.listing()
-        );
-        return Err(ReadError::malformed(path, reason));
-    }
-    Ok(topics)
+    topics
 }
 
 impl Attempt {
@@ -142,22 +137,15 @@ impl Attempt {
                 vec![None; sweeps.sweeps.len()]
             }
         };
-        let has_poses = chosen.is_some();
-        let joined = sweeps
-            .sweeps
-            .iter()
-            .zip(poses)
-            .map(|(sweep, pose)| JoinedSweep {
-                nanos: sweep.nanos,
-                place: sweep.place,
-                world_from_lidar: pose,
-            });
-        Joined {
-            sweeps: joined
-                .filter(|sweep| sweep.world_from_lidar.is_some() || !has_poses)
-                .collect(),
-            text,
-        }
+        let joined = sweeps.sweeps.iter().zip(poses);
+        let joined = joined.filter(|(_, pose)| pose.is_some() || chosen.is_none());
+        let joined = joined.map(|(sweep, world_from_lidar)| JoinedSweep {
+            nanos: sweep.nanos,
+            place: sweep.place,
+            world_from_lidar,
+        });
+        let sweeps = joined.collect();
+        Joined { sweeps, text }
     }
 }
 
@@ -178,9 +166,7 @@ fn text(
             format!("{}, {} poses {span}", source.name, source.poses)
         });
     let unused = others.chain(sources.unusable.iter().cloned());
-    let clouds = contents
-        .clouds
-        .iter()
+    let clouds = (contents.clouds.iter())
         .filter(|(topic, _)| **topic != sweeps.topic)
         .map(|(topic, clouds)| format!("{topic}, {} clouds", clouds.len()));
     let unused: Vec<String> = match chosen {

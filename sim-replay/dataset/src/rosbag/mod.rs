@@ -25,6 +25,8 @@ use std::sync::{Arc, OnceLock};
 use protocol::{CavId, Handedness};
 use ros2::{SweepLimits, read_point_cloud};
 
+pub(super) use self::files::is_bag;
+
 use self::contents::Contents;
 use self::join::{JoinedSweep, join};
 use self::storage::Storage;
@@ -44,7 +46,7 @@ pub(crate) static ROSBAG: LayoutRow = LayoutRow {
             nav_msgs/Odometry, tf2_msgs/TFMessage, geometry_msgs/PoseStamped or PoseWithCovarianceStamped",
     protocol: "opv2v",
     reader: Some(Reader::Sequence {
-        is_one: files::is_bag,
+        is_one: is_bag,
         open,
     }),
 };
@@ -65,11 +67,6 @@ struct Bag {
     sweeps: BTreeMap<u64, JoinedSweep>,
     scale: IntensityScale,
     divisor: OnceLock<f32>,
-}
-
-/// True for a file of a bag, and for a folder with one.
-pub(super) fn is_bag(path: &Path) -> bool {
-    files::is_bag(path)
 }
 
 fn open(

@@ -164,26 +164,18 @@ impl PoseSources {
             self.problems.push(ReadError::malformed(path, reason));
         }
         let is_named = !child.is_empty();
-        let child = if is_named {
-            child
-        } else {
-            self.body_of(&sweeps.frame)
+        let (child, unnamed) = match is_named {
+            true => (child, ""),
+            false => (
+                self.body_of(&sweeps.frame),
+                ", which the messages do not name",
+            ),
         };
-        let route = self
-            .transforms
-            .route_down(&child, &sweeps.frame)
-            .ok_or_else(|| {
-                format!(
-                    "no transform between {child} and {}, the frame of the sweeps",
-                    sweeps.frame
-                )
-            })?;
+        let frame = &sweeps.frame;
+        let route = self.transforms.route_down(&child, frame).ok_or_else(|| {
+            format!("no transform between {child} and {frame}, the frame of the sweeps")
+        })?;
         let trajectory = self.trajectory(path, topic, &of_frames, sweeps);
-        let unnamed = if is_named {
-            ""
-        } else {
-            ", which the messages do not name"
-        };
         Ok(PoseSource {
             name: format!("{topic} ({child} in {world}{unnamed})"),
             world,
@@ -197,13 +189,9 @@ impl PoseSources {
 
     /// The body that carries a LiDAR, or its own frame where no transform names it.
     fn body_of(&self, frame: &str) -> String {
-        let bodies = BODIES
-            .iter()
-            .filter_map(|body| self.transforms.find(body, frame));
-        bodies
-            .map(str::to_owned)
-            .next()
-            .unwrap_or_else(|| frame.to_owned())
+        let mut bodies = BODIES.iter();
+        let body = bodies.find_map(|body| self.transforms.find(body, frame));
+        body.unwrap_or(frame).to_owned()
     }
 
     /// The poses of the sweeps' clock, in order. Those without a stamp or out of order are left out and counted.

@@ -4,8 +4,9 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 
 use recording::McapFile;
+use tempfile::TempPath;
 
-use super::files::{Kind, Unpacked, unpacked_message};
+use super::files::{Kind, unpacked, unpacked_message};
 use super::scan::{At, Message, Place, Scan, Topic};
 use super::sqlite::SqliteFile;
 use crate::recorded::as_read_error;
@@ -18,7 +19,7 @@ struct BagFile {
     path: PathBuf,
     form: Form,
     /// An unpacked copy is deleted with the value.
-    _unpacked: Unpacked,
+    _unpacked: Option<TempPath>,
 }
 
 enum Form {
@@ -95,8 +96,8 @@ impl BagFile {
             let reason = "a bag of ROS 1: `rosbags-convert --src FILE.bag --dst FOLDER` makes one of ROS 2 of it";
             return Err(ReadError::malformed(path, reason));
         }
-        let unpacked = Unpacked::of(path)?;
-        let paths = (path, unpacked.path());
+        let unpacked = unpacked(path)?;
+        let paths = (path, unpacked.as_deref().unwrap_or(path));
         let form = match kind {
             Some(Kind::Sqlite) => Form::Sqlite(SqliteFile::scan(paths, index, scan, problems)?),
             _ => Form::Mcap(scan_mcap(paths, index, scan, problems)?),

@@ -59,25 +59,22 @@ impl<'a> Field<'a> {
 
     /// The entries of a map.
     pub(crate) fn entries(&self) -> Result<Vec<(&'a str, Self)>> {
-        match &self.node.value {
-            Value::Map(entries) => Ok(entries
-                .iter()
-                .map(|(key, node)| (key.as_str(), self.child(key, node)))
-                .collect()),
-            _ => Err(self.expected("a map")),
-        }
+        let Value::Map(entries) = &self.node.value else {
+            return Err(self.expected("a map"));
+        };
+        let entries = entries.iter();
+        let entries = entries.map(|(key, node)| (key.as_str(), self.child(key, node)));
+        Ok(entries.collect())
     }
 
     /// The items of a list.
     pub(crate) fn items(&self) -> Result<Vec<Self>> {
-        match &self.node.value {
-            Value::List(items) => Ok(items
-                .iter()
-                .enumerate()
-                .map(|(index, node)| self.child(&index.to_string(), node))
-                .collect()),
-            _ => Err(self.expected("a list")),
-        }
+        let Value::List(items) = &self.node.value else {
+            return Err(self.expected("a list"));
+        };
+        let items = items.iter().enumerate();
+        let items = items.map(|(index, node)| self.child(&index.to_string(), node));
+        Ok(items.collect())
     }
 
     /// True if a map has the key, with any value.
@@ -107,7 +104,14 @@ impl<'a> Field<'a> {
         if numpy_tags::is_python(self.node) && !matches!(self.node.value, Value::Text(_)) {
             return numpy_tags::scalar(self);
         }
-        plain_number(self.node)
+        let number = match &self.node.value {
+            Value::Integer(value) => Some(*value as f64),
+            Value::Float(value) => Some(*value),
+            // Numbers may be quoted.
+            Value::Text(text) => text.parse().ok(),
+            _ => None,
+        };
+        number
             .filter(|number| number.is_finite())
             .ok_or_else(|| self.expected("a finite number"))
     }
@@ -170,15 +174,10 @@ impl<'a> Field<'a> {
             _ if numpy_tags::is_python(self.node) => return numpy_tags::array(self),
             _ => return Err(self.expected("numbers")),
         };
-        let rows = self
-            .items()?
-            .iter()
-            .map(Self::row)
-            .collect::<Result<Vec<_>, _>>()?;
-        let inner = rows
-            .first()
-            .map(|row| row.shape.clone())
-            .unwrap_or_default();
+        let rows = self.items()?;
+        let rows = rows.iter().map(Self::row).collect::<Result<Vec<_>>>()?;
+        let inner = rows.first().map(|row| row.shape.clone());
+        let inner = inner.unwrap_or_default();
         if rows.iter().any(|row| row.shape != inner) {
             return Err(self.error("rows of different lengths"));
         }
@@ -193,11 +192,8 @@ impl<'a> Field<'a> {
     fn row(&self) -> Result<NumpyArray> {
         match &self.node.value {
             Value::List(items) if !numpy_tags::is_call(self.node) => {
-                let values = self
-                    .items()?
-                    .iter()
-                    .map(Self::number)
-                    .collect::<Result<_, _>>()?;
+                let numbers = self.items()?;
+                let values = numbers.iter().map(Self::number).collect::<Result<_>>()?;
                 Ok(NumpyArray::new(vec![items.len()], values))
             }
             Value::Map(_) | Value::List(_) if numpy_tags::is_python(self.node) => {
@@ -205,15 +201,5 @@ impl<'a> Field<'a> {
             }
             _ => Ok(NumpyArray::new(vec![], vec![self.number()?])),
         }
-    }
-}
-
-fn plain_number(node: &Node) -> Option<f64> {
-    match &node.value {
-        Value::Integer(value) => Some(*value as f64),
-        Value::Float(value) => Some(*value),
-        // Numbers may be quoted.
-        Value::Text(text) => text.parse().ok(),
-        _ => None,
     }
 }

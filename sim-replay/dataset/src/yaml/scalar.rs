@@ -24,11 +24,8 @@ fn number(text: &str) -> Option<Value> {
     let unsigned = text.strip_prefix(['+', '-']).unwrap_or(text);
     if !unsigned.is_empty() && unsigned.bytes().all(|byte| byte.is_ascii_digit()) {
         // Beyond 64 bits it is still a number.
-        return text
-            .parse()
-            .map(Value::Integer)
-            .or_else(|_| text.parse().map(Value::Float))
-            .ok();
+        let integer = text.parse().ok().map(Value::Integer);
+        return integer.or_else(|| text.parse().ok().map(Value::Float));
     }
     match unsigned {
         ".inf" | ".Inf" | ".INF" => {

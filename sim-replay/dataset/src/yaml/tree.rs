@@ -2,7 +2,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-use granit_parser::{Event, Parser, ScalarStyle, Span, StrInput, Tag};
+use granit_parser::{Event, Parser, ScalarStyle, StrInput, Tag};
 
 use super::{Node, Value, scalar};
 use crate::numpy_tags;
@@ -75,7 +75,7 @@ impl<'t> Builder<'t> {
     fn next(&mut self) -> Result<Event<'t>, Unsound> {
         match self.parser.next_event() {
             Some(Ok((event, span))) => {
-                self.line = line(&span);
+                self.line = span.start.line().max(1) as u64;
                 Ok(event)
             }
             Some(Err(error)) => Err(Unsound {
@@ -199,10 +199,6 @@ impl<'t> Builder<'t> {
         }
         Ok(())
     }
-}
-
-fn line(span: &Span) -> u64 {
-    span.start.line().max(1) as u64
 }
 
 /// Without YAML's own prefix.

@@ -62,9 +62,6 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
     }
     let scenarios = read(folder)?;
     let maps: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
-    let cameras = options
-        .cameras
-        .map_or("none".to_owned(), |size| size.to_string());
     for made in &scenarios {
         let settings: [(&str, &dyn ToString, &dyn ToString); 8] = [
             ("subset", &made.subset, &options.subset.name()),
@@ -74,7 +71,7 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
             ("weather", &made.weather, &options.weather.name()),
             ("map_seed", &made.map_seed, &options.map_seed),
             ("layout", &made.layout, &options.layout.name()),
-            ("cameras", &made.cameras, &cameras),
+            ("cameras", &made.cameras, &options.image_size()),
         ];
         for (setting, found, wanted) in settings {
             let (found, wanted) = (found.to_string(), wanted.to_string());

@@ -60,11 +60,8 @@ pub fn convert(
     let (omitted, left_out) = (Omissions::default(), Mutex::new(LeftOut::default()));
     locked(&left_out).add_files(&dataset.problems);
     let mut converted = Converted::default();
-    let ticks = dataset
-        .scenarios
-        .iter()
-        .map(|scenario| scenario.ticks.len());
-    let total = ticks.sum();
+    let scenarios = dataset.scenarios.iter();
+    let total = scenarios.map(|scenario| scenario.ticks.len()).sum();
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
@@ -88,9 +85,8 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
     let capture_nanos = scenario.ticks.iter().map(|tick| tick.capture_nanos);
     let capture_nanos: Vec<u64> = capture_nanos.collect();
     // The coarsest tick that divides all times. File names of OPV2V count ticks.
-    let tick_nanos = TICKS_NANOS
-        .into_iter()
-        .find(|tick| capture_nanos.iter().all(|nanos| nanos % tick == 0));
+    let mut ticks = TICKS_NANOS.into_iter();
+    let tick_nanos = ticks.find(|tick| capture_nanos.iter().all(|nanos| nanos % tick == 0));
     let tick_nanos = tick_nanos.unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
     let mut pairs = capture_nanos.windows(2);
     // Two moments within one tick would share a file name.
@@ -145,10 +141,8 @@ fn write_moments(
         };
         if !holds_images {
             let images = moment.frames.iter().map(|agent| agent.frame.cameras.len());
-            omitted.add(
-                "camera images, which the layout does not have",
-                images.sum(),
-            );
+            let what = "camera images, which the layout does not have";
+            omitted.add(what, images.sum());
         }
         writer.write(&moment, omitted)?;
         Ok(moment.frames.len())

@@ -29,15 +29,10 @@ world:
 
 /// The text of the file. It holds every setting that determines the bytes of the scenario, and the sensors in the terms
 /// of OpenCDA.
-pub(crate) fn protocol_yaml(
-    options: &SynthOptions,
-    spec: &SceneSpec,
-    map_model: &MapModel,
-) -> String {
+pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, model: &MapModel) -> String {
     let (seed, map_seed) = (options.seed, options.map_seed);
     let (frames, period_s) = (options.frames, options.period_s);
-    let (name, map_name, scene_seed, agents) =
-        (&spec.name, &map_model.name, spec.seed, spec.agents);
+    let (name, map_name, scene_seed, agents) = (&spec.name, &model.name, spec.seed, spec.agents);
     let (subset, weather) = (options.subset.name(), options.weather.name());
     let version = env!("CARGO_PKG_VERSION");
     // Without the entry the layout is OPV2V's.
@@ -45,7 +40,7 @@ pub(crate) fn protocol_yaml(
         SceneLayout::Opv2v => String::new(),
         layout => format!("  layout: {}\n", layout.name()),
     };
-    let map = map_yaml(&map_model.findings);
+    let map = map_yaml(&model.findings);
     let cameras = options.cameras.map_or_else(String::new, |size| {
         format!("      camera:\n        fov: 100\n        image_size: {size}\n        num: 4\n")
     });

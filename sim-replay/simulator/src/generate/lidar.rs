@@ -30,22 +30,6 @@ const ATTENUATION_PER_M: f32 = 0.004;
 /// Reflectance of the ground.
 const GROUND_REFLECTIVITY: f32 = 0.25;
 
-/// The rays of one turn. The sensor turns clockwise seen from above and passes the rear when a sweep begins and ends.
-fn lidar_pattern() -> RayPattern {
-    let [low, high] = ELEVATIONS_DEG.map(f32::to_radians);
-    let azimuth_step_rad = -TAU / COLUMNS as f32;
-    RayPattern {
-        first_azimuth_rad: PI + azimuth_step_rad,
-        azimuth_step_rad,
-        columns: COLUMNS,
-        first_elevation_rad: low,
-        elevation_step_rad: (high - low) / (CHANNELS - 1) as f32,
-        channels: CHANNELS,
-        range_m: RANGE_M,
-        rolling: true,
-    }
-}
-
 /// A LiDAR that keeps its buffers from one sweep to the next.
 #[derive(Debug, Clone)]
 pub struct Lidar {
@@ -68,8 +52,21 @@ pub struct LidarSweep<'a> {
 
 impl Default for Lidar {
     fn default() -> Self {
+        let [low, high] = ELEVATIONS_DEG.map(f32::to_radians);
+        // The sensor turns clockwise seen from above and passes the rear when a sweep begins and ends.
+        let azimuth_step_rad = -TAU / COLUMNS as f32;
+        let pattern = RayPattern {
+            first_azimuth_rad: PI + azimuth_step_rad,
+            azimuth_step_rad,
+            columns: COLUMNS,
+            first_elevation_rad: low,
+            elevation_step_rad: (high - low) / (CHANNELS - 1) as f32,
+            channels: CHANNELS,
+            range_m: RANGE_M,
+            rolling: true,
+        };
         Self {
-            caster: Caster::new(lidar_pattern()),
+            caster: Caster::new(pattern),
             points: Vec::new(),
             hits: Vec::new(),
             labels: Vec::new(),
@@ -112,9 +109,6 @@ impl Lidar {
         let rows = depths.zip(image.hits.chunks_exact(CHANNELS));
         for (column, (depths, hits)) in self.caster.columns_at_end(sensor).zip(rows) {
             for ((elevation, &depth), &hit) in self.caster.elevations().zip(depths).zip(hits) {
-                if hit == MISS && weather == Weather::Sunny {
-                    continue;
-                }
                 let measured = measure(depth, hit, bodies, weather, &mut random);
                 let Some((range_m, intensity, hit)) = measured else {
                     continue;
@@ -146,6 +140,7 @@ fn measure(
     random: &mut SplitMix64,
 ) -> Option<(f32, f32, u32)> {
     let (range_m, intensity, hit) = match weather {
+        Weather::Sunny if hit == MISS => return None,
         Weather::Sunny => (depth_m, (-ATTENUATION_PER_M * depth_m).exp(), hit),
         _ => {
             let reflectivity = match hit {

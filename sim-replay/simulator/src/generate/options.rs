@@ -96,6 +96,12 @@ impl SynthOptions {
         if subset == Subset::V2vdet { 60 } else { 2000 }
     }
 
+    /// Size of the images as text.
+    pub(crate) fn image_size(&self) -> String {
+        let size = self.cameras.map(|size| size.to_string());
+        size.unwrap_or_else(|| "none".to_owned())
+    }
+
     /// Steps of the simulation from one stored frame to the next.
     pub(crate) fn steps_per_frame(&self) -> usize {
         (self.period_s / STEP_S).round() as usize
@@ -116,34 +122,22 @@ impl SynthOptions {
         let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
         let copies = copies.join(",");
         let is_opv2v = self.layout == SceneLayout::Opv2v;
-        let have_names = self
-            .copies
-            .iter()
-            .all(|weather| weather.variant().is_some());
+        let mut variants = self.copies.iter().map(|weather| weather.variant());
+        let have_names = variants.all(|name| name.is_some());
         let rule = "must be fog, snow or both";
         require(have_names, "--weather-copies", &copies, rule)?;
         let rule = "must be none, as the layout opv2v alone has copies of sweeps";
-        require(
-            copies.is_empty() || is_opv2v,
-            "--weather-copies",
-            &copies,
-            rule,
-        )?;
-        let images = self
-            .cameras
-            .map_or("none".to_owned(), |size| size.to_string());
+        let are_held = copies.is_empty() || is_opv2v;
+        require(are_held, "--weather-copies", &copies, rule)?;
+        let images = self.image_size();
         let edges = 16..=4096;
         let are_small = { self.cameras }
             .is_none_or(|size| edges.contains(&size.width_px) && edges.contains(&size.height_px));
         let rule = "must be 16 to 4096 pixels along each edge";
         require(are_small, "--cameras", &images, rule)?;
         let rule = "must be none, as images are written in the layout opv2v alone";
-        require(
-            self.cameras.is_none() || is_opv2v,
-            "--cameras",
-            images,
-            rule,
-        )?;
+        let are_held = self.cameras.is_none() || is_opv2v;
+        require(are_held, "--cameras", images, rule)?;
         let (low, high) = (*self.agents.start(), *self.agents.end());
         let agents = format!("{low}-{high}");
         let is_range = low >= 1 && low <= high && high <= 7;

@@ -39,11 +39,8 @@ pub(crate) struct Fix {
 impl Fix {
     /// GNSS latitude and longitude in degrees (the map's origin is at 0, 0; north is +y) and altitude in metres.
     pub(crate) fn geodetic(&self) -> [f64; 3] {
-        [
-            self.gnss_m[1] / METRES_PER_DEG,
-            self.gnss_m[0] / METRES_PER_DEG,
-            self.gnss_m[2],
-        ]
+        let [x, y, altitude_m] = self.gnss_m;
+        [y / METRES_PER_DEG, x / METRES_PER_DEG, altitude_m]
     }
 }
 
@@ -51,16 +48,19 @@ impl Fix {
 #[derive(Debug)]
 pub(crate) struct Positioning {
     random: SplitMix64,
-    gyroscope: Gyroscope,
+    /// Random numbers of the gyroscope, whose samples have white noise and a constant bias.
+    gyroscope: SplitMix64,
+    bias_radps: f64,
     state: Option<([f64; 2], f64)>,
     last_yaw_rad: Option<f64>,
 }
 
 impl Positioning {
     pub(crate) fn new(seed: u64) -> Self {
-        let gyroscope = Gyroscope::new(SplitMix64::derived(seed, &[1]));
+        let mut gyroscope = SplitMix64::derived(seed, &[1]);
         Self {
             random: SplitMix64::new(seed),
+            bias_radps: (GYROSCOPE_BIAS_DEGPS * gyroscope.normal()).to_radians(),
             gyroscope,
             state: None,
             last_yaw_rad: None,
@@ -103,33 +103,14 @@ impl Positioning {
         self.state = Some((position, variance));
         // The filter is planar: the height is that of GNSS.
         let estimate = Placement::level([position[0], position[1], gnss_m[2]], heading_rad);
-        let yaw_rate_radps = self.gyroscope.measured(true_radps);
+        let noise_radps = (GYROSCOPE_NOISE_DEGPS * self.gyroscope.normal()).to_radians();
         Fix {
             gnss_m,
             heading_rad,
             speed_mps,
-            yaw_rate_radps,
+            yaw_rate_radps: true_radps + self.bias_radps + noise_radps,
             estimate,
         }
-    }
-}
-
-/// A gyroscope with white noise and a constant bias, with random numbers of its own.
-#[derive(Debug)]
-struct Gyroscope {
-    random: SplitMix64,
-    bias_radps: f64,
-}
-
-impl Gyroscope {
-    fn new(mut random: SplitMix64) -> Self {
-        let bias_radps = (GYROSCOPE_BIAS_DEGPS * random.normal()).to_radians();
-        Self { random, bias_radps }
-    }
-
-    /// One sample, radians per second.
-    fn measured(&mut self, true_radps: f64) -> f64 {
-        true_radps + self.bias_radps + (GYROSCOPE_NOISE_DEGPS * self.random.normal()).to_radians()
     }
 }
 

@@ -67,10 +67,9 @@ pub(crate) struct Moving {
 impl RecordedFrame {
     /// The motion of a vehicle that is present.
     pub(crate) fn of(&self, vehicle: usize) -> Option<&Moving> {
-        let place = self
-            .moving
-            .binary_search_by_key(&vehicle, |moving| moving.vehicle);
-        Some(&self.moving[place.ok()?])
+        let moving = &self.moving;
+        let place = moving.binary_search_by_key(&vehicle, |moving| moving.vehicle);
+        Some(&moving[place.ok()?])
     }
 }
 
@@ -213,10 +212,8 @@ fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
 fn longest_stand_s(frames: &[RecordedFrame]) -> f64 {
     let mut since: Option<(&Moving, u64)> = None;
     let mut longest = 0;
-    let own = frames
-        .iter()
-        .filter_map(|frame| Some((frame, frame.of(0)?)));
-    for (frame, own) in own {
+    for frame in frames {
+        let Some(own) = frame.of(0) else { continue };
         match since {
             // Compared with the beginning of the stand, so that slow creeping ends it in time.
             Some((before, tick)) if distance_m(&before.motion.end, &own.motion.end) < 0.1 => {

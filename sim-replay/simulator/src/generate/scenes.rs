@@ -164,10 +164,8 @@ impl Scene<'_, '_> {
             let first = recording.frames[0].of(vehicle);
             let id = first.map_or(0, |moving| moving.id);
             let mut positioning = Positioning::new(derive_seed(self.spec.seed, &[4, id as u64]));
-            let moving = recording
-                .frames
-                .iter()
-                .filter_map(|frame| frame.of(vehicle));
+            let frames = recording.frames.iter();
+            let moving = frames.filter_map(|frame| frame.of(vehicle));
             let fixes = moving.map(|moving| {
                 positioning.fix(&moving.motion, moving.speed_mps, self.options.period_s)
             });

@@ -150,7 +150,7 @@ impl Scene<'_, '_> {
         noise: &dyn Fn(u64) -> u64,
     ) -> (PointCloud, Vec<SweepVariant>, Vec<u32>) {
         let sensor = lidar_motion(vehicle);
-        let (ground, weather) = (self.world.ground(), self.options.weather);
+        let (ground, weather) = (&*self.world.ground, self.options.weather);
         let sweep = bench
             .lidar
             .sweep(&sensor, ground, bodies, weather, noise(5));
@@ -192,7 +192,7 @@ impl Scene<'_, '_> {
             .map(|annotation| camera::of_vehicle(annotation.id));
         let paints: Vec<_> = vehicles.chain(standing).collect();
         let surroundings = Surroundings {
-            ground: self.world.ground(),
+            ground: &*self.world.ground,
             bodies,
             paints: &paints,
             weather: self.options.weather,
@@ -209,13 +209,12 @@ impl Scene<'_, '_> {
         bench: &mut Bench<'_>,
         noise: u64,
     ) -> PointCloud {
-        let ground = self.world.ground();
         let returns = bench.radar.returns(
             vehicle,
             half_length_m,
             LIDAR_MOUNT_M,
             STEP_S,
-            ground,
+            &*self.world.ground,
             bodies,
             noise,
         );

@@ -147,10 +147,9 @@ impl TerrainSurface {
             let is_right = u >= v;
             let [start, end] = [from, to].map(|at| {
                 let [u, v] = ray.within(cell, at);
-                let ground = if is_right {
-                    low + u * (right - low) + v * (high - right)
-                } else {
-                    low + v * (left - low) + u * (high - left)
+                let ground = match is_right {
+                    true => low + u * (right - low) + v * (high - right),
+                    false => low + v * (left - low) + u * (high - left),
                 };
                 ray.height(at) - ground
             });

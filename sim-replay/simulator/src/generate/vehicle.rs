@@ -66,12 +66,8 @@ const STOCK: [Stock; 7] = {
     ]
 };
 
-const fn stock(
-    kind: VehicleKind,
-    size_m: [f64; 3],
-    spread: [f64; 3],
-    [driving, parked]: [f64; 2],
-) -> Stock {
+const fn stock(kind: VehicleKind, size_m: [f64; 3], spread: [f64; 3], shares: [f64; 2]) -> Stock {
+    let [driving, parked] = shares;
     Stock {
         kind,
         size_m,
@@ -209,18 +205,13 @@ impl Form {
         let [boot, bonnet] = [profile.boot, profile.bonnet].map(|share| share * length);
         let [rear, front] = profile.cabin.map(|place| place * length);
         let [roof_rear, roof_front] = profile.roof.map(|place| place * length);
+        let shoulder = [boot - half, half - bonnet, side - 0.05];
+        let cabin = [rear, front, side - 0.07];
+        let roof = [roof_rear, roof_front, side - 0.26];
         let mut parts = vec![
             frustum([floor, bumper], below, widest),
-            frustum(
-                [bumper, belt],
-                widest,
-                [boot - half, half - bonnet, side - 0.05],
-            ),
-            frustum(
-                [belt, height],
-                [rear, front, side - 0.07],
-                [roof_rear, roof_front, side - 0.26],
-            ),
+            frustum([bumper, belt], widest, shoulder),
+            frustum([belt, height], cabin, roof),
         ];
         parts.extend(self.wheels(0.33, 0.30 * length, -0.29 * length));
         parts
@@ -246,14 +237,11 @@ impl Form {
 
     fn bus(&self) -> Vec<Part> {
         let Self { half, side, height } = *self;
-        let widest = [-half, half, side];
+        let (below, widest) = ([-half, half, side - 0.03], [-half, half, side]);
+        let roof = [0.1 - half, half - 0.25, side - 0.12];
         let mut parts = vec![
-            frustum([0.30, 1.10], [-half, half, side - 0.03], widest),
-            frustum(
-                [1.10, height],
-                widest,
-                [0.1 - half, half - 0.25, side - 0.12],
-            ),
+            frustum([0.30, 1.10], below, widest),
+            frustum([1.10, height], widest, roof),
         ];
         parts.extend(self.wheels(0.48, 0.30 * 2.0 * self.half, -0.26 * 2.0 * self.half));
         parts

@@ -10,7 +10,7 @@ pub(crate) struct World<'t> {
     pub(crate) map_model: &'t MapModel,
     pub(crate) roads: Roads<'t>,
     pub(crate) lane_index: LaneIndex,
-    ground: Box<dyn Surface + Send + Sync>,
+    pub(crate) ground: Box<dyn Surface + Send + Sync>,
     standing: Vec<Standing>,
 }
 
@@ -26,23 +26,23 @@ impl<'t> World<'t> {
     pub(crate) fn new(map_model: &'t MapModel) -> Self {
         // Decks are bodies, since the ground has only one height at a place.
         let decks = map_model.ground.decks.iter().filter_map(deck_shape);
-        let decks =
-            decks.map(|(shape, center_m)| Standing::new(shape, Placement::level(center_m, 0.0)));
+        let decks = decks.map(|(shape, center_m)| (shape, Placement::level(center_m, 0.0)));
         let solids = map_model.solids.iter().map(|solid| {
             let placement = Placement::level(solid.center_m, solid.yaw_rad);
-            Standing::new(BodyShape::from(solid), placement)
+            (BodyShape::from(solid), placement)
+        });
+        let standing = solids.chain(decks).map(|(shape, placement)| Standing {
+            radius_m: shape.bounds.radius_m(),
+            shape,
+            placement,
         });
         Self {
             map_model,
             roads: Roads::new(&map_model.lanes),
             lane_index: LaneIndex::new(&map_model.lanes),
             ground: ground_surface(map_model),
-            standing: solids.chain(decks).collect(),
+            standing: standing.collect(),
         }
-    }
-
-    pub(crate) fn ground(&self) -> &dyn Surface {
-        &*self.ground
     }
 
     /// Appends static objects within `radius_m` of a position.
@@ -92,15 +92,5 @@ impl From<&Solid> for BodyShape {
             },
         };
         Self::new(vec![part], solid.reflectivity)
-    }
-}
-
-impl Standing {
-    fn new(shape: BodyShape, placement: Placement) -> Self {
-        Self {
-            radius_m: shape.bounds.radius_m(),
-            shape,
-            placement,
-        }
     }
 }

@@ -1,6 +1,6 @@
 //! Clearance check: finds solids that reach into the space of a lane.
 
-use super::convex::{CellIndex, Rectangle, bounds, overlap};
+use super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
 use super::curve::Pose2;
 use super::{LaneId, MapModel, Shape, Solid};
 
@@ -29,18 +29,15 @@ impl MapModel {
     /// Lanes and solids (by index in [`MapModel::solids`]) where the solid reaches into the lane's space up to
     /// `LANE_HEADROOM_M` over it. Empty for a valid map.
     pub fn obstructions(&self) -> Vec<(LaneId, usize)> {
-        let outlines: Vec<_> = self
-            .solids
-            .iter()
-            .map(|solid| outline(solid).corners())
-            .collect();
-        let corners: Vec<[f64; 2]> = outlines.iter().flatten().copied().collect();
+        let solids = self.solids.iter();
+        let outlines: Vec<Quad> = solids.map(|solid| outline(solid).corners()).collect();
         let mut found = Vec::new();
-        if corners.is_empty() {
+        if outlines.is_empty() {
             return found;
         }
-        let mut index = CellIndex::new(bounds(&corners), CELL_M);
-        for (number, outline) in outlines.iter().enumerate() {
+        let corners = outlines.iter().flatten().copied();
+        let mut index = CellIndex::new(bounds(corners), CELL_M);
+        for (number, &outline) in outlines.iter().enumerate() {
             index.insert(number as u32, bounds(outline));
         }
         for lane in &self.lanes.lanes {
@@ -52,7 +49,7 @@ impl MapModel {
                 let half_m = [dx.hypot(dy) / 2.0, (width / 2.0 - 0.02).max(0.01)];
                 let middle = Pose2::new(x, y, dy.atan2(dx));
                 let piece = Rectangle::around(middle, half_m).corners();
-                index.any(bounds(&piece), |number| {
+                index.any(bounds(piece), |number| {
                     let solid = &self.solids[number as usize];
                     let clear = solid.bottom_m() > from[2] + LANE_HEADROOM_M
                         || solid.top_m() < from[2] + SURFACE_M;

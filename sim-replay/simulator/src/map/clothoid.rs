@@ -15,10 +15,7 @@ use super::lane::wrap_angle;
 pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
     let distance = from.distance_m(&to);
     let chord = (to.y - from.y).atan2(to.x - from.x);
-    let (phi0, phi1) = (
-        wrap_angle(from.heading_rad - chord),
-        wrap_angle(to.heading_rad - chord),
-    );
+    let [phi0, phi1] = [from, to].map(|pose| wrap_angle(pose.heading_rad - chord));
     if phi0.abs() < 1e-9 && phi1.abs() < 1e-9 {
         return Curve::new(s_m, from, distance, CurveShape::Line);
     }
@@ -50,12 +47,10 @@ fn integrals(phi0: f64, delta: f64, a: f64) -> (f64, f64, f64) {
     let (mut sine, mut slope, mut cosine) = (0.0, 0.0, 0.0);
     for i in 0..=PIECES {
         let t = f64::from(i) / f64::from(PIECES);
-        let weight = if i == 0 || i == PIECES {
-            1.0
-        } else if i % 2 == 1 {
-            4.0
-        } else {
-            2.0
+        let weight = match i {
+            0 | PIECES => 1.0,
+            _ if i % 2 == 1 => 4.0,
+            _ => 2.0,
         };
         let weight = weight / (3.0 * f64::from(PIECES));
         let (sin, cos) = (phi0 + t * (delta - a + a * t)).sin_cos();

@@ -1,6 +1,8 @@
 //! Conflicts in junctions: pairs of lanes that cross or merge.
 
-use super::lane::{Lane, LaneGraph, LaneId};
+use std::collections::BTreeMap;
+
+use super::lane::{JunctionId, Lane, LaneGraph, LaneId};
 
 /// Lanes that pass each other at a greater height difference do not conflict, metres.
 const LEVEL_M: f64 = 3.0;
@@ -10,19 +12,13 @@ const OVERLAP: f64 = 0.75;
 /// Fills [`Lane::conflicts`]: pairs of lanes of one junction that cross or merge. Lanes with a common predecessor
 /// diverge and do not conflict, nor do neighbours that run side by side.
 pub(crate) fn find(graph: &mut LaneGraph) {
-    let junction_count = graph
-        .lanes
-        .iter()
-        .filter_map(|lane| lane.junction)
-        .map(|j| j.0 as usize + 1)
-        .max();
-    let mut members: Vec<Vec<usize>> = vec![Vec::new(); junction_count.unwrap_or(0)];
+    let mut members: BTreeMap<JunctionId, Vec<usize>> = BTreeMap::new();
     for (index, lane) in graph.lanes.iter().enumerate() {
         if let Some(junction) = lane.junction {
-            members[junction.0 as usize].push(index);
+            members.entry(junction).or_default().push(index);
         }
     }
-    for lanes in members {
+    for lanes in members.values() {
         for (place, &a) in lanes.iter().enumerate() {
             for &b in &lanes[place + 1..] {
                 if in_conflict(&graph.lanes[a], &graph.lanes[b]) {

@@ -51,24 +51,26 @@ impl Rectangle {
 
     pub(crate) fn corners(&self) -> Quad {
         let [x, y] = self.half_m;
-        [
-            self.at(-x, -y),
-            self.at(x, -y),
-            self.at(x, y),
-            self.at(-x, y),
-        ]
+        [[-x, -y], [x, -y], [x, y], [-x, y]].map(|[u, v]| self.at(u, v))
     }
 }
 
+/// Lowest and highest of some values.
+pub(crate) fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
+    values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| {
+        [low.min(value), high.max(value)]
+    })
+}
+
 /// Lowest and highest x and y of some points.
-pub(crate) fn bounds(points: &[[f64; 2]]) -> [[f64; 2]; 2] {
-    let low = points.iter().fold([f64::INFINITY; 2], |low, p| {
-        [low[0].min(p[0]), low[1].min(p[1])]
-    });
-    let high = points.iter().fold([f64::NEG_INFINITY; 2], |high, p| {
-        [high[0].max(p[0]), high[1].max(p[1])]
-    });
-    [low, high]
+pub(crate) fn bounds(points: impl IntoIterator<Item = [f64; 2]>) -> [[f64; 2]; 2] {
+    let none = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
+    points.into_iter().fold(none, |[low, high], p| {
+        [
+            [low[0].min(p[0]), low[1].min(p[1])],
+            [high[0].max(p[0]), high[1].max(p[1])],
+        ]
+    })
 }
 
 /// True if two convex outlines have more than their edges in common (separating axes).
@@ -84,16 +86,9 @@ fn separated_by_edge_of(a: &[[f64; 2]], b: &[[f64; 2]]) -> bool {
         if normal == [0.0, 0.0] {
             return false;
         }
-        let [low_a, high_a] = span(a, normal);
-        let [low_b, high_b] = span(b, normal);
+        let [[low_a, high_a], [low_b, high_b]] = [a, b]
+            .map(|outline| range(outline.iter().map(|p| p[0] * normal[0] + p[1] * normal[1])));
         high_a <= low_b || high_b <= low_a
-    })
-}
-
-fn span(points: &[[f64; 2]], axis: [f64; 2]) -> [f64; 2] {
-    let along = points.iter().map(|p| p[0] * axis[0] + p[1] * axis[1]);
-    along.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| {
-        [low.min(value), high.max(value)]
     })
 }
 
@@ -123,29 +118,23 @@ impl CellIndex {
         }
     }
 
-    pub(crate) fn insert(&mut self, number: u32, [low, high]: [[f64; 2]; 2]) {
-        let ([c0, r0], [c1, r1]) = (self.cell(low), self.cell(high));
-        for row in r0..=r1 {
-            for column in c0..=c1 {
-                self.cells[row * self.columns + column].push(number);
-            }
+    pub(crate) fn insert(&mut self, number: u32, bounds: [[f64; 2]; 2]) {
+        for cell in self.cells_within(bounds) {
+            self.cells[cell].push(number);
         }
     }
 
     /// True if `test` is true for any outline whose cells touch the bounds. One outline may be tested several times.
-    pub(crate) fn any(
-        &self,
-        [low, high]: [[f64; 2]; 2],
-        mut test: impl FnMut(u32) -> bool,
-    ) -> bool {
+    pub(crate) fn any(&self, bounds: [[f64; 2]; 2], mut test: impl FnMut(u32) -> bool) -> bool {
+        let mut cells = self.cells_within(bounds).map(|cell| &self.cells[cell]);
+        cells.any(|numbers| numbers.iter().copied().any(&mut test))
+    }
+
+    /// Places in `cells` of the cells that bounds touch, row by row.
+    fn cells_within(&self, [low, high]: [[f64; 2]; 2]) -> impl Iterator<Item = usize> + use<> {
         let ([c0, r0], [c1, r1]) = (self.cell(low), self.cell(high));
-        (r0..=r1).any(|row| {
-            (c0..=c1).any(|column| {
-                self.cells[row * self.columns + column]
-                    .iter()
-                    .any(|&n| test(n))
-            })
-        })
+        let columns = self.columns;
+        (r0..=r1).flat_map(move |row| (c0..=c1).map(move |column| row * columns + column))
     }
 
     fn cell(&self, point: [f64; 2]) -> [usize; 2] {

@@ -116,11 +116,8 @@ impl Curve {
             CurveShape::Poly3(v) => poly3(v, s_m),
             CurveShape::ParamPoly3 { u, v, normalized } => {
                 let p = if normalized { s_m / self.length_m } else { s_m };
-                (
-                    cubic(u, p),
-                    cubic(v, p),
-                    cubic_slope(v, p).atan2(cubic_slope(u, p)),
-                )
+                let turn = cubic_slope(v, p).atan2(cubic_slope(u, p));
+                (cubic(u, p), cubic(v, p), turn)
             }
         };
         self.start.moved(u, v, turn)

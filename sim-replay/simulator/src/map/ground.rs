@@ -56,14 +56,6 @@ impl Ground {
             Terrain::Grid(grid) => grid.height_m(x, y),
         }
     }
-
-    /// The height of the terrain where it is level everywhere.
-    pub(crate) fn plane_z_m(&self) -> Option<f64> {
-        match self.terrain {
-            Terrain::Plane { z_m } => Some(z_m),
-            Terrain::Grid(_) => None,
-        }
-    }
 }
 
 impl HeightGrid {
@@ -81,17 +73,12 @@ impl HeightGrid {
         let (i, j) = (column as usize, row as usize);
         let (u, v) = (column - i as f64, row - j as f64);
         let (low, high) = (self.node_m(i, j), self.node_m(i + 1, j + 1));
-        let corner = if u >= v {
-            self.node_m(i + 1, j)
-        } else {
-            self.node_m(i, j + 1)
+        let (corner, first, second) = match u >= v {
+            true => (self.node_m(i + 1, j), u, v),
+            false => (self.node_m(i, j + 1), v, u),
         };
         // Barycentric weights on the triangle's two legs.
-        if u >= v {
-            low + u * (corner - low) + v * (high - corner)
-        } else {
-            low + v * (corner - low) + u * (high - corner)
-        }
+        low + first * (corner - low) + second * (high - corner)
     }
 }
 

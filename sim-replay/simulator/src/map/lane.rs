@@ -135,12 +135,7 @@ impl Lane {
 impl LaneGraph {
     /// A graph of `lanes`, whose ids are their places.
     pub fn new(lanes: Vec<Lane>) -> Self {
-        debug_assert!(
-            lanes
-                .iter()
-                .enumerate()
-                .all(|(index, lane)| lane.id.0 as usize == index)
-        );
+        debug_assert!((0..).zip(&lanes).all(|(index, lane)| lane.id.0 == index));
         Self { lanes }
     }
 
@@ -153,11 +148,8 @@ impl LaneGraph {
 /// Normalises an angle to (-pi, pi].
 pub(crate) fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = angle_rad.rem_euclid(2.0 * PI);
-    if wrapped > PI {
-        wrapped - 2.0 * PI
-    } else {
-        wrapped
-    }
+    let turn = if wrapped > PI { 2.0 * PI } else { 0.0 };
+    wrapped - turn
 }
 
 #[cfg(test)]

@@ -18,10 +18,7 @@ const TURN_RAD: f64 = 0.52;
 /// Builds the driving lanes of `network` and their links. `Road::leads_along` gives the direction of each lane:
 /// traffic keeps right or left, road by road.
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
-    let mut table = LaneTable {
-        first_section: Vec::new(),
-        ids: Vec::new(),
-    };
+    let mut table = LaneTable::default();
     let (mut lanes, mut origins) = (Vec::new(), Vec::new());
     for (road_index, road) in network.roads.iter().enumerate() {
         table.first_section.push(table.ids.len());
@@ -40,9 +37,8 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
                     origins.push(origin);
                 }
             }
-            table
-                .ids
-                .push((-(road.sections[section].right.len() as i32), ids));
+            let lowest = -(road.sections[section].right.len() as i32);
+            table.ids.push((lowest, ids));
         }
     }
     let mut graph = LaneGraph::new(lanes);
@@ -65,22 +61,16 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     }
     let from = section.s_m.min(road.length_m);
     let to = road.section_end_m(origin.section);
-    let CenterLine {
-        points,
-        widths_m,
-        banks_rad,
-        length_m,
-    } = center_line(road, origin, from, to)?;
-    let limit = source
-        .speed_limit_mps
-        .or_else(|| road.speed_limit_mps((from + to) / 2.0));
-    let limit = limit.unwrap_or(DEFAULT_LIMIT_MPS);
-    let mut sorted = widths_m.clone();
+    let line = center_line(road, origin, from, to)?;
+    let own_mps = source.speed_limit_mps;
+    let limit_mps = own_mps.or_else(|| road.speed_limit_mps((from + to) / 2.0));
+    let limit = limit_mps.unwrap_or(DEFAULT_LIMIT_MPS);
+    let mut sorted = line.widths_m.clone();
     sorted.sort_unstable_by(f64::total_cmp);
-    let mut lane = Lane::new(id, points, sorted[sorted.len() / 2], limit);
-    (lane.widths_m, lane.length_m) = (widths_m, length_m);
+    let mut lane = Lane::new(id, line.points, sorted[sorted.len() / 2], limit);
+    (lane.widths_m, lane.length_m) = (line.widths_m, line.length_m);
     if !road.lateral.is_level() {
-        lane.banks_rad = banks_rad;
+        lane.banks_rad = line.banks_rad;
     }
     lane.junction = road.junction.map(|junction| JunctionId(junction as u32));
     lane.in_junction = road.junction.is_some();

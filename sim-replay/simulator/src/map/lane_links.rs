@@ -5,7 +5,7 @@ use std::fmt;
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
 use super::lane_table::{LaneTable, Origin};
-use super::road::{Contact, RoadLink, RoadNetwork};
+use super::road::{Connection, Contact, RoadLink, RoadNetwork};
 
 /// A link whose lanes are farther apart than this is refused, metres.
 const LINK_GAP_M: f64 = 0.5;
@@ -82,10 +82,9 @@ impl Linker<'_> {
             if successors.is_empty()
                 && let Some(next) = self.same_lane_on(graph, origin)
             {
-                let found = format!(
-                    "leads from lane {} to no lane, though lane {} continues",
-                    origin.lane, origin.lane
-                );
+                let lane = origin.lane;
+                let found =
+                    format!("leads from lane {lane} to no lane, though lane {lane} continues");
                 log.add(0, "link", &found, "lanes of one id linked");
                 counts.made += 1;
                 successors.push(next);
@@ -130,10 +129,9 @@ impl Linker<'_> {
         if let Some(section) = next_section.filter(|&section| section < road.sections.len()) {
             return self.lanes_of(origin.road, section, next_lane);
         }
-        let end = if forward {
-            Contact::End
-        } else {
-            Contact::Start
+        let end = match forward {
+            true => Contact::End,
+            false => Contact::Start,
         };
         match road.link(end) {
             None => Vec::new(),
@@ -160,16 +158,11 @@ impl Linker<'_> {
         let junction = &self.network.junctions[place];
         let mut lanes = Vec::new();
         let connections = junction.connections.iter();
-        for connection in connections
-            .clone()
-            .filter(|one| one.incoming == origin.road)
-        {
+        let onward = connections.clone();
+        for connection in onward.filter(|one| one.incoming == origin.road) {
             let links = connection.lane_links.iter();
-            let onto = links
-                .filter(|(from, _)| *from == origin.lane)
-                .map(|&(_, to)| to)
-                // Without links, lanes of one id are linked.
-                .chain(connection.lane_links.is_empty().then_some(origin.lane));
+            let onto = links.filter(|(from, _)| *from == origin.lane);
+            let onto = onto.map(|&(_, to)| to).chain(same_id(connection, origin));
             let (road, contact) = (connection.connecting, connection.contact);
             lanes.extend(self.lanes_of(road, self.table.end_section(road, contact), onto));
         }
@@ -182,10 +175,9 @@ impl Linker<'_> {
                 let link = self.network.roads[connection.incoming].link(contact);
                 if link == Some(RoadLink::Junction(place)) {
                     let links = connection.lane_links.iter();
-                    let onto = links
-                        .filter(|(_, to)| *to == origin.lane)
-                        .map(|&(from, _)| from)
-                        .chain(connection.lane_links.is_empty().then_some(origin.lane));
+                    let onto = links.filter(|(_, to)| *to == origin.lane);
+                    let onto = onto.map(|&(from, _)| from);
+                    let onto = onto.chain(same_id(connection, origin));
                     let section = self.table.end_section(connection.incoming, contact);
                     lanes.extend(self.lanes_of(connection.incoming, section, onto));
                 }
@@ -193,6 +185,11 @@ impl Linker<'_> {
         }
         lanes
     }
+}
+
+/// The lane onto which a connection without links leads: that of the same id.
+fn same_id(connection: &Connection, origin: Origin) -> Option<i32> {
+    connection.lane_links.is_empty().then_some(origin.lane)
 }
 
 /// How the end of a lane and the start of the next one lie to each other.
@@ -205,10 +202,8 @@ struct Joint {
 
 impl Joint {
     fn of(lane: &Lane, next: &Lane) -> Self {
-        let (end, start) = (
-            lane.centerline[lane.centerline.len() - 1],
-            next.centerline[0],
-        );
+        let end = lane.centerline[lane.centerline.len() - 1];
+        let start = next.centerline[0];
         Self {
             beside_m: (end[0] - start[0]).hypot(end[1] - start[1]),
             step_m: (end[2] - start[2]).abs(),

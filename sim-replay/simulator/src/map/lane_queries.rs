@@ -1,5 +1,6 @@
 //! Lane queries: the nearest lane to a position.
 
+use super::convex::bounds;
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
 
 /// Edge of a cell of the index, metres.
@@ -31,13 +32,8 @@ pub(crate) struct LaneIndex {
 impl LaneIndex {
     /// Indexes every centre line of `graph`.
     pub(crate) fn new(graph: &LaneGraph) -> Self {
-        let points = graph.lanes.iter().flat_map(|lane| lane.centerline.iter());
-        let low = points.clone().fold([f64::INFINITY; 2], |low, p| {
-            [low[0].min(p[0]), low[1].min(p[1])]
-        });
-        let high = points.fold([f64::NEG_INFINITY; 2], |high, p| {
-            [high[0].max(p[0]), high[1].max(p[1])]
-        });
+        let points = graph.lanes.iter().flat_map(|lane| &lane.centerline);
+        let [low, high] = bounds(points.map(|&[x, y, _]| [x, y]));
         let [columns, rows] =
             [0, 1].map(|axis| ((high[axis] - low[axis]).max(0.0) / CELL_M) as usize + 1);
         let mut index = Self {
@@ -51,11 +47,8 @@ impl LaneIndex {
         for lane in &graph.lanes {
             for (place, point) in lane.centerline.iter().enumerate() {
                 let [column, row] = index.cell(point[0], point[1]);
-                tagged.push((
-                    row as usize * index.columns + column as usize,
-                    lane.id,
-                    place as u32,
-                ));
+                let cell = row as usize * index.columns + column as usize;
+                tagged.push((cell, lane.id, place as u32));
             }
         }
         // By lane and point within a cell, so that ties are decided the same way each time.
@@ -67,10 +60,8 @@ impl LaneIndex {
             }
             index.starts.push(filled as u32);
         }
-        index.entries = tagged
-            .into_iter()
-            .map(|(_, lane, place)| (lane, place))
-            .collect();
+        let entries = tagged.into_iter().map(|(_, lane, place)| (lane, place));
+        index.entries = entries.collect();
         index
     }
 
@@ -109,19 +100,13 @@ impl LaneIndex {
     fn visit(&self, x: f64, y: f64, radius_m: f64, mut found: impl FnMut(LaneId, usize)) {
         let low = self.cell(x - radius_m, y - radius_m);
         let high = self.cell(x + radius_m, y + radius_m);
-        // Wholly outside the grid, where clamping would visit the cells at its edge.
-        if self.entries.is_empty() || high[0] < 0 || high[1] < 0 {
-            return;
-        }
-        if low[0] >= self.columns as i64 || low[1] >= self.rows as i64 {
-            return;
-        }
-        for row in low[1].max(0) as usize..=(high[1] as usize).min(self.rows - 1) {
-            for column in low[0].max(0) as usize..=(high[0] as usize).min(self.columns - 1) {
-                let cell = row * self.columns + column;
-                for &(lane, place) in
-                    &self.entries[self.starts[cell] as usize..self.starts[cell + 1] as usize]
-                {
+        let [last_column, last_row] = [self.columns, self.rows].map(|count| count as i64 - 1);
+        // Wholly outside the grid the ranges are empty.
+        for row in low[1].max(0)..=high[1].min(last_row) {
+            for column in low[0].max(0)..=high[0].min(last_column) {
+                let cell = row as usize * self.columns + column as usize;
+                let [start, end] = [cell, cell + 1].map(|cell| self.starts[cell] as usize);
+                for &(lane, place) in &self.entries[start..end] {
                     found(lane, place as usize);
                 }
             }
@@ -129,10 +114,8 @@ impl LaneIndex {
     }
 
     fn cell(&self, x: f64, y: f64) -> [i64; 2] {
-        [
-            ((x - self.origin_m[0]) / CELL_M).floor() as i64,
-            ((y - self.origin_m[1]) / CELL_M).floor() as i64,
-        ]
+        let [low_x, low_y] = self.origin_m;
+        [x - low_x, y - low_y].map(|metres| (metres / CELL_M).floor() as i64)
     }
 }
 
@@ -147,20 +130,15 @@ fn project_near(lane: &Lane, place: usize, x: f64, y: f64) -> LanePosition {
         let share = (((x - from[0]) * dx + (y - from[1]) * dy) / squared).clamp(0.0, 1.0);
         let distance = (x - from[0] - share * dx).hypot(y - from[1] - share * dy);
         let offset_m = (dx * (y - from[1]) - dy * (x - from[0])) / squared.sqrt();
-        (
-            distance,
-            LanePosition {
-                lane: lane.id,
-                s_m: (index as f64 + share) * step_m,
-                offset_m,
-            },
-        )
+        let position = LanePosition {
+            lane: lane.id,
+            s_m: (index as f64 + share) * step_m,
+            offset_m,
+        };
+        (distance, position)
     });
-    if candidates[0].0 <= candidates[1].0 {
-        candidates[0].1
-    } else {
-        candidates[1].1
-    }
+    let [(before_m, before), (after_m, after)] = candidates;
+    if before_m <= after_m { before } else { after }
 }
 
 #[cfg(test)]

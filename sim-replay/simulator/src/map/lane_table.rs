@@ -4,6 +4,7 @@ use super::LaneId;
 use super::road::Contact;
 
 /// Lane ids by road, section and lane id of the network.
+#[derive(Default)]
 pub(super) struct LaneTable {
     /// First section of each road in `ids`.
     pub(super) first_section: Vec<usize>,
@@ -16,23 +17,18 @@ impl LaneTable {
         let (lowest, ids) = &self.ids[self.first_section[road] + section];
         // Ids run from the lowest upwards and leave out 0.
         let place = lane - lowest - i32::from(lane > 0);
-        if lane == 0 || place < 0 {
-            None
-        } else {
-            ids.get(place as usize).copied().flatten()
-        }
-    }
-
-    fn section_count(&self, road: usize) -> usize {
-        let next = self.first_section.get(road + 1).copied();
-        next.unwrap_or(self.ids.len()) - self.first_section[road]
+        let place = usize::try_from(place).ok().filter(|_| lane != 0)?;
+        ids.get(place).copied().flatten()
     }
 
     /// The section of a road at one of its ends.
     pub(super) fn end_section(&self, road: usize, contact: Contact) -> usize {
         match contact {
             Contact::Start => 0,
-            Contact::End => self.section_count(road) - 1,
+            Contact::End => {
+                let next = self.first_section.get(road + 1).copied();
+                next.unwrap_or(self.ids.len()) - self.first_section[road] - 1
+            }
         }
     }
 }
@@ -48,10 +44,7 @@ pub(super) struct Origin {
 impl Origin {
     /// The section that follows along the road, or against it.
     pub(super) fn next_section(self, forward: bool) -> Option<usize> {
-        if forward {
-            Some(self.section + 1)
-        } else {
-            self.section.checked_sub(1)
-        }
+        let step = if forward { 1 } else { -1 };
+        self.section.checked_add_signed(step)
     }
 }

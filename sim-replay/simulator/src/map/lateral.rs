@@ -38,24 +38,18 @@ impl LateralProfile {
 
     /// True if every cross-section is a straight line, level or not.
     pub fn is_flat(&self) -> bool {
-        self.crossfall_rad
-            .iter()
-            .all(|side| side.records.is_empty())
-            && self.shapes.is_empty()
+        let mut sides = self.crossfall_rad.iter();
+        sides.all(|side| side.records.is_empty()) && self.shapes.is_empty()
     }
 
     /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m`,
     /// metres.
     pub fn at(&self, s_m: f64, t_m: f64) -> [f64; 2] {
-        let fall = self.crossfall_rad[usize::from(t_m < 0.0)]
-            .at(s_m)
-            .clamp(-MAX_SLOPE_RAD, MAX_SLOPE_RAD);
+        let crossfall_rad = &self.crossfall_rad[usize::from(t_m < 0.0)];
+        let [fall, turn] = [crossfall_rad, &self.superelevation_rad]
+            .map(|slope_rad| slope_rad.at(s_m).clamp(-MAX_SLOPE_RAD, MAX_SLOPE_RAD));
         let height = self.shape_m(s_m, t_m) - t_m.abs() * fall.tan();
-        let (sin, cos) = self
-            .superelevation_rad
-            .at(s_m)
-            .clamp(-MAX_SLOPE_RAD, MAX_SLOPE_RAD)
-            .sin_cos();
+        let (sin, cos) = turn.sin_cos();
         [t_m * cos - height * sin, t_m * sin + height * cos]
     }
 
@@ -76,14 +70,10 @@ impl LateralProfile {
 impl CrossShape {
     /// Height at `t_m`; before the first record as at its start.
     fn at(&self, t_m: f64) -> f64 {
-        let first = self
-            .height_m
-            .records
-            .first()
-            .map_or(t_m, |&(start, _)| start);
-        self.height_m
-            .at(t_m.max(first))
-            .clamp(-MAX_SHAPE_M, MAX_SHAPE_M)
+        let first = self.height_m.records.first();
+        let first_m = first.map_or(t_m, |&(start, _)| start);
+        let height_m = self.height_m.at(t_m.max(first_m));
+        height_m.clamp(-MAX_SHAPE_M, MAX_SHAPE_M)
     }
 }
 

@@ -82,10 +82,9 @@ impl RoadMapSource {
         match self {
             Self::Town1 => "town1".into(),
             Self::Town4 => "town4".into(),
-            Self::OpenDrive(path) => match path.file_stem() {
-                Some(stem) => stem.to_string_lossy().to_lowercase(),
-                None => "map".into(),
-            },
+            Self::OpenDrive(path) => path
+                .file_stem()
+                .map_or("map".into(), |stem| stem.to_string_lossy().to_lowercase()),
         }
     }
 }
@@ -110,18 +109,17 @@ pub struct ParkingSpot {
 /// # Errors
 /// [`FileError`] when a map cannot be read or is no usable road network; procedural maps always build.
 pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, FileError> {
-    let name = source.name();
-    match source {
-        RoadMapSource::Town1 => Ok(place_roadside(name, &layout::town1(map_seed), map_seed)),
-        RoadMapSource::Town4 => Ok(place_roadside(name, &layout::town4(map_seed), map_seed)),
+    let layout = match source {
+        RoadMapSource::Town1 => layout::town1(map_seed),
+        RoadMapSource::Town4 => layout::town4(map_seed),
         RoadMapSource::OpenDrive(path) => {
             let Map { network, lanes } = read_map(path)?;
             check_extent(path, &network, &lanes)?;
             let islands = Vec::new();
-            let layout = Layout { network, islands };
-            Ok(place_roadside(name, &layout, map_seed))
+            Layout { network, islands }
         }
-    }
+    };
+    Ok(place_roadside(source.name(), &layout, map_seed))
 }
 
 /// Refuses maps without driving lanes, and maps so large that the ground between their roads would not fit in memory.
@@ -133,8 +131,8 @@ fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result
     }
     let [x_m, y_m] = [0, 1].map(|axis: usize| {
         let points = graph.lanes.iter().flat_map(|lane| &lane.centerline);
-        let values = points.map(|point| point[axis]);
-        values.clone().fold(f64::NEG_INFINITY, f64::max) - values.fold(f64::INFINITY, f64::min)
+        let [low, high] = convex::range(points.map(|point| point[axis]));
+        high - low
     });
     let extent_m = x_m.max(y_m);
     if extent_m > MAX_EXTENT_M {

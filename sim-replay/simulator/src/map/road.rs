@@ -115,10 +115,9 @@ pub struct RoadLane {
 impl RoadLane {
     /// The lane that the map links to the end of this one, or to its start, seen along the road.
     pub(crate) fn linked(&self, at_end: bool) -> Option<i32> {
-        if at_end {
-            self.successor
-        } else {
-            self.predecessor
+        match at_end {
+            true => self.successor,
+            false => self.predecessor,
         }
     }
 
@@ -318,10 +317,8 @@ impl Road {
 
     /// True if traffic on lane `id` of section `section` leads along the road.
     pub(crate) fn leads_along(&self, section: usize, id: i32) -> bool {
-        let lane = self
-            .sections
-            .get(section)
-            .and_then(|section| section.lane(id));
+        let section = self.sections.get(section);
+        let lane = section.and_then(|section| section.lane(id));
         let reversed = lane.is_some_and(|lane| lane.reversed);
         // Right lanes lead along the road in right-hand traffic. Each further condition turns that round.
         ((id < 0) != self.left_hand) != reversed
@@ -329,9 +326,8 @@ impl Road {
 
     /// End of section `index`, metres.
     pub(crate) fn section_end_m(&self, index: usize) -> f64 {
-        self.sections
-            .get(index + 1)
-            .map_or(self.length_m, |next| next.s_m.min(self.length_m))
+        let next = self.sections.get(index + 1);
+        next.map_or(self.length_m, |next| next.s_m.min(self.length_m))
     }
 
     /// Index of the section at `s_m` in [`Road::sections`].
@@ -366,12 +362,10 @@ impl Road {
 
     /// Speed limit at `s_m` where the road has one, metres per second.
     pub(crate) fn speed_limit_mps(&self, s_m: f64) -> Option<f64> {
-        let after = self
-            .speed_limits
-            .partition_point(|&(start, _)| start <= s_m);
+        let limits = &self.speed_limits;
+        let after = limits.partition_point(|&(start, _)| start <= s_m);
         // The first limit also holds before its start.
-        let limit = self.speed_limits.get(after.saturating_sub(1));
-        limit.map(|&(_, limit)| limit)
+        Some(limits.get(after.saturating_sub(1))?.1)
     }
 }
 

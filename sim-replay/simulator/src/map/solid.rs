@@ -60,12 +60,7 @@ impl Shape {
     /// Half of the height, metres.
     pub(crate) fn half_height_m(&self) -> f64 {
         match *self {
-            Self::Box {
-                half_m: [_, _, half],
-            }
-            | Self::Ellipsoid {
-                radii_m: [_, _, half],
-            } => half,
+            Self::Box { half_m: [_, _, z] } | Self::Ellipsoid { radii_m: [_, _, z] } => z,
             Self::Cylinder { half_height_m, .. } => half_height_m,
         }
     }

@@ -171,22 +171,18 @@ impl Surface {
                     }
                 }
                 let own = &mut patches[before..];
-                let top_m = own
-                    .iter()
-                    .map(Patch::high_m)
-                    .fold(f64::NEG_INFINITY, f64::max);
+                let heights = own.iter().map(Patch::high_m);
+                let top_m = heights.fold(f64::NEG_INFINITY, f64::max);
                 own.iter_mut().for_each(|patch| patch.top_m = top_m);
             }
         }
-        let corners: Vec<[f64; 2]> = patches.iter().flat_map(|patch| patch.quad).collect();
-        let bounds_m = if corners.is_empty() {
-            [[0.0; 2]; 2]
-        } else {
-            bounds(&corners)
+        let bounds_m = match patches.is_empty() {
+            true => [[0.0; 2]; 2],
+            false => bounds(patches.iter().flat_map(|patch| patch.quad)),
         };
         let mut index = CellIndex::new(bounds_m, cell_m(&patches, CELL_M));
         for (number, patch) in patches.iter().enumerate() {
-            index.insert(number as u32, bounds(&patch.quad));
+            index.insert(number as u32, bounds(patch.quad));
         }
         Self {
             roads,
@@ -199,7 +195,7 @@ impl Surface {
     /// True if `test` is true for any patch that overlaps `rectangle`.
     pub(crate) fn any(&self, rectangle: &Rectangle, mut test: impl FnMut(&Patch) -> bool) -> bool {
         let corners = rectangle.corners();
-        self.index.any(bounds(&corners), |number| {
+        self.index.any(bounds(corners), |number| {
             let patch = &self.patches[number as usize];
             overlap(&corners, &patch.quad) && test(patch)
         })
@@ -248,10 +244,9 @@ fn strips(
     }
     let is_straight = road.lateral.is_flat() && !road.sections[from.section].has_level_lanes();
     let width_m = (a[1] - a[0]).max(b[1] - b[0]);
-    let count = if is_straight {
-        1
-    } else {
-        (width_m / PIECE_M).ceil().clamp(1.0, most_pieces) as usize
+    let count = match is_straight {
+        true => 1,
+        false => (width_m / PIECE_M).ceil().clamp(1.0, most_pieces) as usize,
     };
     for place in 0..count {
         let ends = [
@@ -281,7 +276,7 @@ pub(super) fn cell_m(patches: &[Patch], least_m: f64) -> f64 {
 
 /// Number of cells of a grid that the bounds of patches touch.
 fn touched(patches: &[Patch], cell_m: f64) -> f64 {
-    let boxes = patches.iter().map(|patch| bounds(&patch.quad));
+    let boxes = patches.iter().map(|patch| bounds(patch.quad));
     let sides = boxes.map(|[low, high]| [0, 1].map(|axis| (high[axis] - low[axis]) / cell_m + 1.0));
     sides.map(|[x, y]| x * y).sum()
 }

@@ -1,7 +1,7 @@
 //! Terrain from roads: level or shaped to meet every road, with hills away from them, and decks where a road passes
 //! above.
 
-use super::convex::{Quad, Rectangle, bounds, overlap};
+use super::convex::{Quad, Rectangle, bounds, overlap, range};
 use super::ground::{Ground, HeightGrid, Terrain, Triangle};
 use super::noise::hills_m;
 use super::surface::{Patch, Surface, cell_m, middle};
@@ -31,9 +31,7 @@ const SMOOTHING: usize = 12;
 /// The ground under and between the roads.
 pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
     let heights = surface.patches.iter().flat_map(|patch| patch.z_m);
-    let [low, high] = heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| {
-        [low.min(z), high.max(z)]
-    });
+    let [low, high] = range(heights);
     if high - low < LEVEL_M {
         return Ground::plane((low + high) / 2.0);
     }
@@ -51,10 +49,8 @@ pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
 fn empty_grid(surface: &Surface) -> HeightGrid {
     let [low, high] = surface.bounds_m;
     let extent = [0, 1].map(|axis| high[axis] - low[axis] + 2.0 * MARGIN_M);
-    let cell_m = cell_m(
-        &surface.patches,
-        CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt()),
-    );
+    let least_m = CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt());
+    let cell_m = cell_m(&surface.patches, least_m);
     let [columns, rows] = extent.map(|extent| (extent / cell_m).ceil() as usize + 1);
     let origin_m = low.map(|low| low - MARGIN_M);
     HeightGrid {
@@ -73,10 +69,8 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
     let (mut nearest_m, mut lowest_m) = (vec![f32::INFINITY; nodes], vec![f32::INFINITY; nodes]);
     for patch in &surface.patches {
         for (place, node) in nodes_within(grid, &patch.quad, grid.cell_m) {
-            let (height, distance) = (
-                patch.height_m(node) as f32,
-                distance_m(node, &patch.quad) as f32,
-            );
+            let height = patch.height_m(node) as f32;
+            let distance = distance_m(node, &patch.quad) as f32;
             lowest_m[place] = lowest_m[place].min(height);
             if distance < nearest_m[place] {
                 (nearest_m[place], grid.heights_m[place]) = (distance, height);
@@ -90,10 +84,8 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
         }
     }
     open_under_bridges(grid, surface);
-    grid.heights_m
-        .iter()
-        .map(|height| !height.is_nan())
-        .collect()
+    let heights = grid.heights_m.iter();
+    heights.map(|height| !height.is_nan()).collect()
 }
 
 /// Clears nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
@@ -110,7 +102,7 @@ fn open_under_bridges(grid: &mut HeightGrid, surface: &Surface) {
 
 /// Nodes whose square of half side `reach_m` overlaps an outline, with their places in the plane.
 fn nodes_within(grid: &HeightGrid, quad: &Quad, reach_m: f64) -> Vec<(usize, [f64; 2])> {
-    let [low, high] = bounds(quad);
+    let [low, high] = bounds(*quad);
     let [columns, rows] = [0, 1].map(|axis: usize| {
         let [first, last] = [low[axis] - reach_m, high[axis] + reach_m]
             .map(|value| ((value - grid.origin_m[axis]) / grid.cell_m).max(0.0));
@@ -153,16 +145,10 @@ fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) 
         return;
     }
     if columns <= 2 && rows <= 2 {
-        let known: Vec<f32> = heights
-            .iter()
-            .copied()
-            .filter(|height| !height.is_nan())
-            .collect();
-        let mean = known.iter().sum::<f32>() / known.len().max(1) as f32;
-        heights
-            .iter_mut()
-            .filter(|height| height.is_nan())
-            .for_each(|height| *height = mean);
+        let known = heights.iter().filter(|height| !height.is_nan());
+        let mean = known.clone().sum::<f32>() / known.count().max(1) as f32;
+        let open = heights.iter_mut().filter(|height| height.is_nan());
+        open.for_each(|height| *height = mean);
         return;
     }
     let (half_columns, half_rows) = (columns.div_ceil(2), rows.div_ceil(2));
@@ -177,16 +163,9 @@ fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) 
             }
         }
     }
-    let mut coarse: Vec<f32> = sums
-        .iter()
-        .map(|&(sum, count)| {
-            if count > 0 {
-                sum / count as f32
-            } else {
-                f32::NAN
-            }
-        })
-        .collect();
+    // The mean of no node is NaN: it stays open.
+    let means = sums.iter().map(|&(sum, count)| sum / count as f32);
+    let mut coarse: Vec<f32> = means.collect();
     let coarse_fixed: Vec<bool> = sums.iter().map(|&(_, count)| count > 0).collect();
     fill_level(&mut coarse, &coarse_fixed, half_columns, half_rows);
     for row in 0..rows {
@@ -213,11 +192,8 @@ fn smooth(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) {
             let left = heights[place - usize::from(column > 0)];
             let right = heights[place + usize::from(column + 1 < columns)];
             let below = heights[if row > 0 { place - columns } else { place }];
-            let above = heights[if row + 1 < rows {
-                place + columns
-            } else {
-                place
-            }];
+            let has_above = row + 1 < rows;
+            let above = heights[if has_above { place + columns } else { place }];
             heights[place] = (left + right + below + above) / 4.0;
         }
     }
@@ -249,17 +225,14 @@ fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
         .iter()
         .map(|&fixed| if fixed { 0.0 } else { f32::MAX / 4.0 })
         .collect();
+    let nodes = (0..rows).flat_map(|row| (0..columns).map(move |column| [column, row]));
     // Step: forward sweep, from the neighbours at lower columns and rows.
-    for row in 0..rows {
-        for column in 0..columns {
-            relax(&mut distances, [columns, rows], [column, row], -1);
-        }
+    for node in nodes.clone() {
+        relax(&mut distances, [columns, rows], node, -1);
     }
     // Step: backward sweep, from the neighbours at higher columns and rows.
-    for row in (0..rows).rev() {
-        for column in (0..columns).rev() {
-            relax(&mut distances, [columns, rows], [column, row], 1);
-        }
+    for node in nodes.rev() {
+        relax(&mut distances, [columns, rows], node, 1);
     }
     distances
 }
@@ -286,21 +259,12 @@ fn relax(distances: &mut [f32], [columns, rows]: [usize; 2], [column, row]: [usi
 /// Triangles of the road surfaces that lie above the terrain.
 fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
     let mut triangles = Vec::new();
-    for patch in surface
-        .patches
-        .iter()
-        .filter(|patch| is_deck(patch, |x, y| grid.height_m(x, y)))
-    {
-        let [a, b, c, d] = patch.quad;
-        let [za, zb, zc, zd] = patch.z_m;
-        let corners = [
-            [a[0], a[1], za],
-            [b[0], b[1], zb],
-            [c[0], c[1], zc],
-            [d[0], d[1], zd],
-        ];
-        for [i, j, k] in [[0, 1, 2], [0, 2, 3]] {
-            let (p, q, r): ([f64; 3], [f64; 3], [f64; 3]) = (corners[i], corners[j], corners[k]);
+    for patch in surface.patches.iter().filter(|patch| is_deck(patch, grid)) {
+        let [a, b, c, d]: [[f64; 3]; 4] = std::array::from_fn(|corner| {
+            let [x, y] = patch.quad[corner];
+            [x, y, patch.z_m[corner]]
+        });
+        for [p, q, r] in [[a, b, c], [a, c, d]] {
             // Strips without width, or turned over in a tight bend, give no triangle.
             let area = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]);
             if area > 1e-6 {
@@ -312,23 +276,12 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
 }
 
 /// True if a patch lies above the terrain anywhere.
-fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
+fn is_deck(patch: &Patch, grid: &HeightGrid) -> bool {
     let [a, b, c, d] = patch.quad;
     // A wide patch spans several cells of the terrain, so its corners alone do not tell.
-    let probes = [
-        a,
-        b,
-        c,
-        d,
-        middle(a, b),
-        middle(c, d),
-        middle(a, d),
-        middle(b, c),
-        middle(a, c),
-    ];
-    probes
-        .iter()
-        .any(|&p| patch.height_m(p) - height_m(p[0], p[1]) > DECK_M)
+    let middles = [(a, b), (c, d), (a, d), (b, c), (a, c)].map(|(p, q)| middle(p, q));
+    let mut probes = patch.quad.into_iter().chain(middles);
+    probes.any(|place| patch.height_m(place) - grid.height_m(place[0], place[1]) > DECK_M)
 }
 
 #[cfg(test)]

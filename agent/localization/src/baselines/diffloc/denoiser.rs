@@ -1,15 +1,15 @@
 //! Denoiser: predicts the velocity of noisy poses of the sweeps of a window from their features.
 
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor, nn};
 
-use super::network::{HEADS, WIDTH as FEATURES};
 use super::transformer::{NORM_EPS, TransformerLayer};
 use crate::baselines::layers::LayerNorm;
 use crate::baselines::place_classes::POSE;
 use crate::pgc::dense::Dense;
 use perception::tensor_values::tensor;
 
+/// Channels of the features of a sweep.
+pub(super) const FEATURES: i64 = 256;
 /// Channels.
 const WIDTH: i64 = 192;
 /// Layers.
@@ -54,7 +54,7 @@ impl PoseDenoiser {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn new(path: &nn::Path<'_>) -> Result<Self, TchError> {
+    pub fn new(path: &nn::Path<'_>) -> tch::Result<Self> {
         let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + FEATURES + 1;
         let half = STEP_CHANNELS / 2;
         let harmonics = (0..HARMONICS).map(|power| (1_u32 << power) as f32);
@@ -64,7 +64,7 @@ impl PoseDenoiser {
             layers: (0..LAYERS)
                 .map(|number| {
                     let path = path / "layers" / number;
-                    TransformerLayer::new(&path, WIDTH, HEADS, EXPANSION, 0.0)
+                    TransformerLayer::new(&path, WIDTH, EXPANSION, 0.0)
                 })
                 .collect(),
             norm: LayerNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
@@ -88,7 +88,7 @@ impl PoseDenoiser {
         steps: &Tensor,
         features: &Tensor,
         windows: Windows<'_>,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let (count, frames, _) = poses.size3()?;
         let on = (Kind::Float, poses.device());
         // 0 between sweeps that see each other, [`UNSEEN`] elsewhere.
@@ -121,7 +121,7 @@ impl PoseDenoiser {
     }
 
     /// A pose with sine and cosine of its multiples.
-    fn embed_poses(&self, poses: &Tensor) -> Result<Tensor, TchError> {
+    fn embed_poses(&self, poses: &Tensor) -> tch::Result<Tensor> {
         let angles = poses
             .f_unsqueeze(3)?
             .f_mul(&self.frequencies)?
@@ -130,7 +130,7 @@ impl PoseDenoiser {
     }
 
     /// Sine and cosine of the step `[W]` at falling frequencies.
-    fn embed_steps(&self, steps: &Tensor) -> Result<Tensor, TchError> {
+    fn embed_steps(&self, steps: &Tensor) -> tch::Result<Tensor> {
         let steps = steps.f_to_kind(Kind::Float)?.f_unsqueeze(1)?;
         let angles = steps.f_mul(&self.step_frequencies)?;
         Tensor::f_cat(&[angles.f_sin()?, angles.f_cos()?], 1)

@@ -6,9 +6,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use tch::nn::{self, Init};
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, Tensor, no_grad};
 
-use super::denoiser::{PoseDenoiser, Windows};
+use super::denoiser::{FEATURES, PoseDenoiser, Windows};
 use super::noise_schedule::NoiseSchedule;
 use super::transformer::{NORM_EPS, TransformerLayer};
 use crate::baselines::layers::LayerNorm;
@@ -21,14 +21,10 @@ use crate::pgc::dense::Dense;
 const TOKEN_WIDTH: i64 = 128;
 /// Layers over tokens.
 const LAYERS: usize = 2;
-/// Attention heads.
-pub(super) const HEADS: i64 = 4;
 /// Channels of the perceptrons, relative to those of a token.
 const EXPANSION: i64 = 4;
 /// Share of samples for which the last layer is skipped in training.
 const DROP_PATH: f64 = 0.1;
-/// Channels of a sweep.
-pub(super) const WIDTH: i64 = 256;
 /// Steps from noise to poses.
 const DENOISING_STEPS: usize = 10;
 /// Seed of the noise that every search starts from.
@@ -57,7 +53,7 @@ pub struct DiffLoc {
 /// Described sweeps, single precision.
 #[derive(Debug)]
 pub struct DescribedTokens {
-    /// `[N, WIDTH]`.
+    /// `[N, FEATURES]`.
     pub features: Tensor,
     /// `[N, K]`: logits of the place classes.
     pub places: Tensor,
@@ -75,7 +71,7 @@ impl DiffLoc {
         tokens: &Tensor,
         kind: Kind,
         train: bool,
-    ) -> Result<DescribedTokens, TchError> {
+    ) -> tch::Result<DescribedTokens> {
         let x = self.inward.forward(&tokens.f_to_kind(kind)?)?;
         let x = x.f_add(&self.positions.f_to_kind(kind)?)?;
         let mut layers = self.layers.iter();
@@ -84,10 +80,8 @@ impl DiffLoc {
         let logits = self.mask.forward(&x)?;
         let weighted = x.f_add(&x.f_mul(&logits.f_sigmoid()?)?)?;
         let features = self.outward.forward(&weighted.f_flatten(1, 2)?)?;
-        let features = self
-            .sweep_norm
-            .forward(&features.f_to_kind(Kind::Float)?, train);
-        let features = features.f_relu()?;
+        let features = features.f_to_kind(Kind::Float)?;
+        let features = self.sweep_norm.forward(&features, train).f_relu()?;
         Ok(DescribedTokens {
             places: self.head.classify(&features)?,
             static_logits: logits.f_squeeze_dim(2)?.f_to_kind(Kind::Float)?,
@@ -95,20 +89,20 @@ impl DiffLoc {
         })
     }
 
-    /// Condition of the denoiser for sweeps with `features` `[N, WIDTH]` in `classes` `[N]`.
+    /// Condition of the denoiser for sweeps with `features` `[N, FEATURES]` in `classes` `[N]`.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn of_class(&self, features: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+    pub fn of_class(&self, features: &Tensor, classes: &Tensor) -> tch::Result<Tensor> {
         self.head.of_class(features, classes)
     }
 
     /// Poses `[W, F, 5]` relative to their classes of sweeps with features [of their classes](Self::of_class)
-    /// `[W, F, WIDTH]`, oldest first; without gradients. The same features give the same poses.
+    /// `[W, F, FEATURES]`, oldest first; without gradients. The same features give the same poses.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn denoised(&self, features: &Tensor, windows: Windows<'_>) -> Result<Tensor, TchError> {
+    pub fn denoised(&self, features: &Tensor, windows: Windows<'_>) -> tch::Result<Tensor> {
         let (count, frames, _) = features.size3()?;
         let device = features.device();
         let mut random = ChaCha8Rng::seed_from_u64(START_SEED);
@@ -127,7 +121,7 @@ impl DiffLoc {
 impl RegressPose for DiffLoc {
     const KIND: &'static str = "DiffLoc";
 
-    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> Result<Self, TchError> {
+    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> tch::Result<Self> {
         let (mean, stdev) = (0.0, 0.02);
         let (size, random) = ([TOKENS, TOKEN_WIDTH], Init::Randn { mean, stdev });
         let all = TOKENS * TOKEN_WIDTH;
@@ -138,26 +132,21 @@ impl RegressPose for DiffLoc {
                 .map(|number| {
                     let drop_path = DROP_PATH * number as f64 / (LAYERS - 1) as f64;
                     let path = path / "layers" / number;
-                    TransformerLayer::new(&path, TOKEN_WIDTH, HEADS, EXPANSION, drop_path)
+                    TransformerLayer::new(&path, TOKEN_WIDTH, EXPANSION, drop_path)
                 })
                 .collect(),
             norm: LayerNorm::new(&(path / "norm"), TOKEN_WIDTH, NORM_EPS),
             mask: Dense::new(&(path / "mask"), TOKEN_WIDTH, 1, 0.1),
-            outward: Dense::new(&(path / "outward"), all, WIDTH, 0.7),
-            sweep_norm: Norm::with_defaults(&(path / "sweep_norm"), WIDTH),
-            head: PlaceHead::new(&(path / "head"), WIDTH, classes),
+            outward: Dense::new(&(path / "outward"), all, FEATURES, 0.7),
+            sweep_norm: Norm::with_defaults(&(path / "sweep_norm"), FEATURES),
+            head: PlaceHead::new(&(path / "head"), FEATURES, classes),
             denoiser: PoseDenoiser::new(&(path / "denoiser"))?,
             schedule: NoiseSchedule::new(path.device())?,
         })
     }
 
     /// Each sweep is alone in its window.
-    fn poses(
-        &self,
-        tokens: &Tensor,
-        places: &PlaceClasses,
-        kind: Kind,
-    ) -> Result<Tensor, TchError> {
+    fn poses(&self, tokens: &Tensor, places: &PlaceClasses, kind: Kind) -> tch::Result<Tensor> {
         let described = self.describe(tokens, kind, false)?;
         let classes = described.places.f_argmax(1, false)?;
         let features = self.of_class(&described.features, &classes)?;

@@ -1,7 +1,7 @@
 //! Noise schedule: how much of a pose remains at each step of the diffusion, and the way back (DDIM, Song et al. 2021).
 
 use perception::tensor_values::tensor;
-use tch::{Device, TchError, Tensor};
+use tch::{Device, Tensor};
 
 /// Steps of the diffusion.
 const STEPS: usize = 100;
@@ -24,7 +24,7 @@ impl NoiseSchedule {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn new(device: Device) -> Result<Self, TchError> {
+    pub fn new(device: Device) -> tch::Result<Self> {
         let kept = (0..STEPS).scan(1.0, |product, step| {
             let beta = BETAS[0] + (BETAS[1] - BETAS[0]) * step as f64 / (STEPS - 1) as f64;
             *product *= 1.0 - beta;
@@ -48,12 +48,7 @@ impl NoiseSchedule {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn add_noise(
-        &self,
-        poses: &Tensor,
-        noise: &Tensor,
-        steps: &Tensor,
-    ) -> Result<Tensor, TchError> {
+    pub fn add_noise(&self, poses: &Tensor, noise: &Tensor, steps: &Tensor) -> tch::Result<Tensor> {
         let [signal, deviation] = (self.factors.each_ref())
             .map(|table| table.f_index_select(0, steps)?.f_view([-1, 1, 1]));
         let noise = noise.f_mul(&deviation?)?;
@@ -65,12 +60,7 @@ impl NoiseSchedule {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn poses(
-        &self,
-        noisy: &Tensor,
-        velocity: &Tensor,
-        steps: &Tensor,
-    ) -> Result<Tensor, TchError> {
+    pub fn poses(&self, noisy: &Tensor, velocity: &Tensor, steps: &Tensor) -> tch::Result<Tensor> {
         // sqrt(kept) noisy - sqrt(1 - kept) velocity: the form of `add_noise` with the sign reversed.
         self.add_noise(noisy, &velocity.f_neg()?, steps)
     }
@@ -84,8 +74,8 @@ impl NoiseSchedule {
         &self,
         noise: &Tensor,
         count: usize,
-        mut predict: impl FnMut(&Tensor, i64) -> Result<Tensor, TchError>,
-    ) -> Result<Tensor, TchError> {
+        mut predict: impl FnMut(&Tensor, i64) -> tch::Result<Tensor>,
+    ) -> tch::Result<Tensor> {
         let last = (self.kept.len() - 1) as f64;
         let shares = (0..count.max(1)).map(|number| number as f64 / (count.max(2) - 1) as f64);
         let steps = shares.map(|share| (last * (1.0 - share)).round() as usize);

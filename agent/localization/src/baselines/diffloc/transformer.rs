@@ -1,7 +1,6 @@
 //! Transformer layer: self-attention and a perceptron, each behind a normalisation and beside a shortcut.
 
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor, nn};
 
 use crate::baselines::layers::LayerNorm;
 use crate::pgc::dense::Dense;
@@ -9,6 +8,8 @@ use crate::pgc::dense::Dense;
 /// Added to variances.
 pub(super) const NORM_EPS: f64 = 1e-6;
 
+/// Attention heads.
+const HEADS: i64 = 4;
 /// Gain of layers at whose end no rectifier follows, relative to He's.
 const LINEAR_GAIN: f64 = 0.7;
 /// Gain of the last layer of each branch: the layer is near the identity at the start.
@@ -23,20 +24,13 @@ pub(super) struct TransformerLayer {
     before_perceptron: LayerNorm,
     up: Dense,
     down: Dense,
-    heads: i64,
     drop_path: f64,
 }
 
 impl TransformerLayer {
     /// Layer with a perceptron of `expansion * width` channels; `drop_path` is the share of samples without each branch
     /// in training.
-    pub(super) fn new(
-        path: &nn::Path<'_>,
-        width: i64,
-        heads: i64,
-        expansion: i64,
-        drop_path: f64,
-    ) -> Self {
+    pub(super) fn new(path: &nn::Path<'_>, width: i64, expansion: i64, drop_path: f64) -> Self {
         let hidden = expansion * width;
         Self {
             before_attention: LayerNorm::new(&(path / "norm1"), width, NORM_EPS),
@@ -45,7 +39,6 @@ impl TransformerLayer {
             before_perceptron: LayerNorm::new(&(path / "norm2"), width, NORM_EPS),
             up: Dense::new(&(path / "up"), width, hidden, LINEAR_GAIN),
             down: Dense::new(&(path / "down"), hidden, width, BRANCH_GAIN),
-            heads,
             drop_path,
         }
     }
@@ -57,7 +50,7 @@ impl TransformerLayer {
         x: &Tensor,
         mask: Option<&Tensor>,
         train: bool,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let attended = self.attend(&self.before_attention.forward(x)?, mask)?;
         let x = x.f_add(&self.keep_some(attended, train)?)?;
         let hidden = self.up.forward(&self.before_perceptron.forward(&x)?)?;
@@ -65,9 +58,9 @@ impl TransformerLayer {
         x.f_add(&self.keep_some(answer, train)?)
     }
 
-    fn attend(&self, x: &Tensor, mask: Option<&Tensor>) -> Result<Tensor, TchError> {
+    fn attend(&self, x: &Tensor, mask: Option<&Tensor>) -> tch::Result<Tensor> {
         let (batch, tokens, width) = x.size3()?;
-        let size = [batch, tokens, 3, self.heads, width / self.heads];
+        let size = [batch, tokens, 3, HEADS, width / HEADS];
         let parts = self
             .qkv
             .forward(x)?
@@ -84,7 +77,7 @@ impl TransformerLayer {
                 )?
             }
             Some(mask) => {
-                let scale = 1.0 / ((width / self.heads) as f64).sqrt();
+                let scale = 1.0 / ((width / HEADS) as f64).sqrt();
                 let logits = query
                     .f_matmul(&key.f_transpose(2, 3)?)?
                     .f_mul_scalar(scale)?;
@@ -97,7 +90,7 @@ impl TransformerLayer {
     }
 
     /// Stochastic depth: zeroes the branch of some samples and scales the others.
-    fn keep_some(&self, branch: Tensor, train: bool) -> Result<Tensor, TchError> {
+    fn keep_some(&self, branch: Tensor, train: bool) -> tch::Result<Tensor> {
         if !train || self.drop_path <= 0.0 {
             return Ok(branch);
         }

@@ -1,9 +1,9 @@
 //! Branch: from tokens to the place class and the pose relative to it.
 
 use perception::layers::convolution::Norm;
-use tch::{Kind, TchError, Tensor, nn};
+use tch::{Kind, Tensor, nn};
 
-use super::network::WIDTH;
+use super::token_layer::WIDTH;
 use crate::baselines::place_classes::PlaceHead;
 use crate::pgc::dense::Dense;
 
@@ -33,7 +33,7 @@ impl Branch {
     }
 
     /// `[S, SWEEP]` features of tokens `[S, T, WIDTH]`, single precision.
-    pub(super) fn features(&self, tokens: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    pub(super) fn features(&self, tokens: &Tensor, train: bool) -> tch::Result<Tensor> {
         let features = self.outward.forward(&tokens.f_flatten(1, 2)?)?;
         self.norm
             .forward(&features.f_to_kind(Kind::Float)?, train)
@@ -44,7 +44,7 @@ impl Branch {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn classify(&self, features: &Tensor) -> Result<Tensor, TchError> {
+    pub fn classify(&self, features: &Tensor) -> tch::Result<Tensor> {
         self.head.classify(features)
     }
 
@@ -52,7 +52,7 @@ impl Branch {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn poses(&self, features: &Tensor, classes: &Tensor) -> Result<Tensor, TchError> {
+    pub fn poses(&self, features: &Tensor, classes: &Tensor) -> tch::Result<Tensor> {
         let features = self.head.of_class(features, classes)?;
         let [position, heading] = [&self.position, &self.heading].map(|[first, second, third]| {
             let hidden = first.forward(&features)?.f_relu()?;

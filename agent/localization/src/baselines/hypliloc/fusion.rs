@@ -1,10 +1,9 @@
 //! Fusion of the tokens of both branches in Euclidean and hyperbolic space.
 
 use tch::nn::{self, Init};
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
 
 use super::graph_attention::{GraphAttention, Space};
-use super::network::WIDTH;
 
 /// Graph attention in both spaces, summed with learnt weights.
 #[derive(Debug)]
@@ -18,15 +17,15 @@ impl Fusion {
     /// Builds the layers below `path`.
     pub(super) fn new(path: &nn::Path<'_>) -> Self {
         Self {
-            euclidean: GraphAttention::with_metric(&(path / "euclidean"), WIDTH, Space::Euclidean),
-            poincare: GraphAttention::with_metric(&(path / "poincare"), WIDTH, Space::Poincare),
+            euclidean: GraphAttention::with_metric(&(path / "euclidean"), Space::Euclidean),
+            poincare: GraphAttention::with_metric(&(path / "poincare"), Space::Poincare),
             weights: path.var("weights", &[2], Init::Const(1.0)),
         }
     }
 
     /// `[S, P + C + 2, WIDTH]` of tokens `[S, P, WIDTH]` of points and `[S, C, WIDTH]` of columns: in this order, then
     /// one pooled token of each.
-    pub(super) fn forward(&self, points: &Tensor, columns: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, points: &Tensor, columns: &Tensor) -> tch::Result<Tensor> {
         let [of_points, of_columns] =
             [points, columns].map(|tokens| tokens.f_mean_dim(1_i64, true, Kind::Float));
         let tokens = Tensor::f_cat(&[points, columns, &of_points?, &of_columns?], 1)?;
@@ -37,7 +36,7 @@ impl Fusion {
 }
 
 /// Tokens of length 1.
-pub(super) fn normalise(tokens: &Tensor) -> Result<Tensor, TchError> {
+pub(super) fn normalise(tokens: &Tensor) -> tch::Result<Tensor> {
     let squares = tokens.f_square()?;
     let squares = squares.f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
     tokens.f_div(&squares.f_add_scalar(1e-12)?.f_sqrt()?)

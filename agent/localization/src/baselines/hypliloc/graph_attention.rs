@@ -1,10 +1,10 @@
 //! Graph attention between all tokens of a sweep, in Euclidean space or in Poincare balls.
 
 use tch::nn::{self, Init};
-use tch::{TchError, Tensor, no_grad};
+use tch::{Tensor, no_grad};
 
 use super::poincare::{expmap0, logmap0};
-use super::token_layer::TokenLayer;
+use super::token_layer::{TokenLayer, WIDTH};
 
 /// Heads of the attention.
 const HEADS: i64 = 8;
@@ -28,30 +28,30 @@ pub(super) struct GraphAttention {
 
 impl GraphAttention {
     /// Attention by the scalar product, between points.
-    pub(super) fn plain(path: &nn::Path<'_>, channels: i64) -> Self {
+    pub(super) fn plain(path: &nn::Path<'_>) -> Self {
         Self {
             metric: None,
-            layer: TokenLayer::new(path, [channels; 2]),
+            layer: TokenLayer::new(path, WIDTH),
             space: Space::Euclidean,
         }
     }
 
     /// Attention by a learnt metric, which all heads share; it begins as the identity.
-    pub(super) fn with_metric(path: &nn::Path<'_>, channels: i64, space: Space) -> Self {
-        let edge = channels / HEADS;
+    pub(super) fn with_metric(path: &nn::Path<'_>, space: Space) -> Self {
+        let edge = WIDTH / HEADS;
         let mut metric = path.var("metric", &[edge, edge], Init::Const(0.0));
         no_grad(|| metric.copy_(&Tensor::eye(edge, (metric.kind(), metric.device()))));
         Self {
             metric: Some(metric),
             space,
-            ..Self::plain(path, channels)
+            ..Self::plain(path)
         }
     }
 
     /// `[S, T, C]` in single precision.
     ///
     /// Weighted means of points of a ball lie in it, since it is convex.
-    pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, tokens: &Tensor) -> tch::Result<Tensor> {
         let (sweeps, count, channels) = tokens.size3()?;
         self.layer.around(tokens, |values| {
             let values = values.f_view([sweeps, count, HEADS, channels / HEADS])?;
@@ -65,7 +65,7 @@ impl GraphAttention {
     }
 
     /// Means of values `[S, HEADS, T, C / HEADS]`, weighted by their similarities.
-    fn attend(&self, values: &Tensor) -> Result<Tensor, TchError> {
+    fn attend(&self, values: &Tensor) -> tch::Result<Tensor> {
         let query = match &self.metric {
             Some(metric) => values.f_matmul(metric)?,
             None => values.shallow_clone(),

@@ -1,19 +1,16 @@
 //! Network: two branches, two fusions with blocks of each modality between them, three poses.
 
 use tch::nn::{self, Init};
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, Tensor, no_grad};
 
 use super::branch::Branch;
 use super::fusion::{Fusion, normalise};
 use super::graph_attention::{GraphAttention, Space};
 use super::panorama::{CircularLayer, panorama};
-use super::token_layer::TokenLayer;
+use super::token_layer::{TokenLayer, WIDTH};
 use crate::baselines::place_classes::PlaceClasses;
 use crate::baselines::regressed_pose::{PoseRegressor, RegressPose};
 use crate::baselines::tokens::{RINGS, SECTORS, TOKENS};
-
-/// Channels of a token.
-pub(super) const WIDTH: i64 = 128;
 
 /// A HypLiLoc network of one scene, output of `agent train hypliloc`.
 pub type HypLiLocLocalizer = PoseRegressor<HypLiLoc>;
@@ -45,12 +42,7 @@ impl HypLiLoc {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn features(
-        &self,
-        tokens: &Tensor,
-        kind: Kind,
-        train: bool,
-    ) -> Result<[Tensor; 3], TchError> {
+    pub fn features(&self, tokens: &Tensor, kind: Kind, train: bool) -> tch::Result<[Tensor; 3]> {
         let tokens = tokens.f_to_kind(kind)?;
         let points = self.inward.forward(&tokens)?.f_to_kind(Kind::Float)?;
         let points = self.attention.forward(&points.f_add(&self.positions)?)?;
@@ -62,9 +54,8 @@ impl HypLiLoc {
         let (inward, attention, outward) = &self.point_block;
         let of_points = inward.forward(&fused.f_narrow(1, 0, TOKENS)?)?;
         let of_points = outward.forward(&attention.forward(&of_points)?)?;
-        let of_columns = self
-            .panorama_block
-            .forward(&fused.f_narrow(1, TOKENS, SECTORS)?)?;
+        let of_columns = fused.f_narrow(1, TOKENS, SECTORS)?;
+        let of_columns = self.panorama_block.forward(&of_columns)?;
         let fused = self.second.forward(&of_points, &of_columns)?;
 
         let [of_points, of_columns, of_both] = &self.branches;
@@ -79,27 +70,27 @@ impl HypLiLoc {
 impl RegressPose for HypLiLoc {
     const KIND: &'static str = "HypLiLoc";
 
-    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> Result<Self, TchError> {
+    fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> tch::Result<Self> {
         let (block, branches) = (path / "point_block", path / "branches");
         let mut log_variances = path.var("log_variances", &[3, 2], Init::Const(0.0));
         let start = Tensor::from_slice(&Self::START);
         no_grad(|| log_variances.f_copy_(&start))?;
         let (mean, stdev) = (0.0, 0.1);
         Ok(Self {
-            inward: TokenLayer::new(&(path / "inward"), [channels, WIDTH]),
+            inward: TokenLayer::new(&(path / "inward"), channels),
             positions: path.var("positions", &[TOKENS, WIDTH], Init::Randn { mean, stdev }),
-            attention: GraphAttention::plain(&(path / "attention"), WIDTH),
+            attention: GraphAttention::plain(&(path / "attention")),
             panorama: [
-                CircularLayer::new(&(path / "panorama0"), [RINGS * channels, WIDTH]),
-                CircularLayer::new(&(path / "panorama1"), [WIDTH; 2]),
+                CircularLayer::new(&(path / "panorama0"), RINGS * channels),
+                CircularLayer::new(&(path / "panorama1"), WIDTH),
             ],
             first: Fusion::new(&(path / "first_fusion")),
             point_block: (
-                TokenLayer::new(&(&block / 0), [WIDTH; 2]),
-                GraphAttention::with_metric(&(&block / 1), WIDTH, Space::Euclidean),
-                TokenLayer::new(&(&block / 2), [WIDTH; 2]),
+                TokenLayer::new(&(&block / 0), WIDTH),
+                GraphAttention::with_metric(&(&block / 1), Space::Euclidean),
+                TokenLayer::new(&(&block / 2), WIDTH),
             ),
-            panorama_block: CircularLayer::new(&(path / "panorama_block"), [WIDTH; 2]),
+            panorama_block: CircularLayer::new(&(path / "panorama_block"), WIDTH),
             second: Fusion::new(&(path / "second_fusion")),
             branches: [
                 Branch::new(&(&branches / "points"), TOKENS, classes),
@@ -111,12 +102,7 @@ impl RegressPose for HypLiLoc {
     }
 
     /// The class and the pose of the fusion.
-    fn poses(
-        &self,
-        tokens: &Tensor,
-        places: &PlaceClasses,
-        kind: Kind,
-    ) -> Result<Tensor, TchError> {
+    fn poses(&self, tokens: &Tensor, places: &PlaceClasses, kind: Kind) -> tch::Result<Tensor> {
         let [.., features] = self.features(tokens, kind, false)?;
         let [.., fusion] = &self.branches;
         let classes = fusion.classify(&features)?.f_argmax(1, false)?;

@@ -1,6 +1,6 @@
 //! Poincare ball: maps between the ball and its tangent space at the origin (Ganea et al. 2018).
 
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
 
 /// Curvature of the ball, negated: its radius is 1 / sqrt(c).
 const CURVATURE: f64 = 0.1;
@@ -10,7 +10,7 @@ const MAX_SHARE: f64 = 0.999;
 const TINY: f64 = 1e-12;
 
 /// Exponential map at the origin: tangent vectors along the last dimension to points of the ball.
-pub(super) fn expmap0(tangent: &Tensor) -> Result<Tensor, TchError> {
+pub(super) fn expmap0(tangent: &Tensor) -> tch::Result<Tensor> {
     let scaled = scaled_norm(tangent)?;
     // In single precision the hyperbolic tangent reaches 1, where the inverse is infinite.
     let share = scaled.f_tanh()?.f_clamp_max(MAX_SHARE)?;
@@ -18,14 +18,14 @@ pub(super) fn expmap0(tangent: &Tensor) -> Result<Tensor, TchError> {
 }
 
 /// Logarithm at the origin, the inverse of [`expmap0`].
-pub(super) fn logmap0(point: &Tensor) -> Result<Tensor, TchError> {
+pub(super) fn logmap0(point: &Tensor) -> tch::Result<Tensor> {
     let scaled = scaled_norm(point)?;
     let length = scaled.f_clamp_max(MAX_SHARE)?.f_atanh()?;
     point.f_mul(&(length / scaled))
 }
 
 /// Norms along the last dimension, in units of the radius.
-fn scaled_norm(x: &Tensor) -> Result<Tensor, TchError> {
+fn scaled_norm(x: &Tensor) -> tch::Result<Tensor> {
     (x.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)? * CURVATURE)
         .f_add_scalar(TINY)?
         .f_sqrt()

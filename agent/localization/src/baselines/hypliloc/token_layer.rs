@@ -1,11 +1,12 @@
 //! Layer of tokens: dense, layer norm and ReLU.
 
-use tch::nn;
-use tch::{TchError, Tensor};
+use tch::{Tensor, nn};
 
 use crate::baselines::layers::LayerNorm;
 use crate::pgc::dense::Dense;
 
+/// Channels of a token.
+pub(super) const WIDTH: i64 = 128;
 /// Added to variances of layer norms, PyTorch's own.
 const NORM_EPS: f64 = 1e-5;
 
@@ -18,15 +19,15 @@ pub(super) struct TokenLayer {
 
 impl TokenLayer {
     /// Builds the layer below `path`.
-    pub(super) fn new(path: &nn::Path<'_>, [inputs, outputs]: [i64; 2]) -> Self {
+    pub(super) fn new(path: &nn::Path<'_>, inputs: i64) -> Self {
         Self {
-            dense: Dense::new(path, inputs, outputs, 1.0),
-            norm: LayerNorm::new(&(path / "norm"), outputs, NORM_EPS),
+            dense: Dense::new(path, inputs, WIDTH, 1.0),
+            norm: LayerNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
         }
     }
 
     /// `[S, T, C]` to `[S, T, C']`, in the precision of the tokens.
-    pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, tokens: &Tensor) -> tch::Result<Tensor> {
         self.around(tokens, Ok)
     }
 
@@ -34,8 +35,8 @@ impl TokenLayer {
     pub(super) fn around(
         &self,
         tokens: &Tensor,
-        step: impl FnOnce(Tensor) -> Result<Tensor, TchError>,
-    ) -> Result<Tensor, TchError> {
+        step: impl FnOnce(Tensor) -> tch::Result<Tensor>,
+    ) -> tch::Result<Tensor> {
         self.norm
             .forward(&step(self.dense.forward(tokens)?)?)?
             .f_relu()

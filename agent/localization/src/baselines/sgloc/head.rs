@@ -1,7 +1,6 @@
 //! Head: attention between scales, residual layers with batch normalisation, and a shift of each cell's own position.
 
-use tch::nn::{self, BatchNormConfig};
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor, nn};
 
 use crate::baselines::layers::DenseNorm;
 use crate::pgc::SceneEncoderConfig;
@@ -40,10 +39,12 @@ impl SgLocHead {
             squeeze: (scales.iter().enumerate())
                 .map(|(scale, &channels)| Dense::new(&(path / "squeeze" / scale), channels, 1, 0.1))
                 .collect(),
-            inward: layer(&(path / "inward"), encoder.cell_channels() + 3),
+            inward: DenseNorm::new(&(path / "inward"), [encoder.cell_channels() + 3, WIDTH]),
             scales,
             blocks: (0..BLOCKS)
-                .map(|number| [0, 1].map(|of| layer(&(path / "blocks" / number / of), WIDTH)))
+                .map(|number| {
+                    [0, 1].map(|of| DenseNorm::new(&(path / "blocks" / number / of), [WIDTH; 2]))
+                })
                 .collect(),
             outward: Dense::new(&(path / "outward"), WIDTH, 3, 0.1),
         }
@@ -57,7 +58,7 @@ impl SgLocHead {
         cells: &Tensor,
         sensor_m: &Tensor,
         train: bool,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         let mut parts = self.weigh(cells)?;
         parts.push((sensor_m / POSITION_SCALE_M).f_to_kind(cells.kind())?);
         let parts = Tensor::f_cat(&parts, 1)?;
@@ -70,7 +71,7 @@ impl SgLocHead {
     }
 
     /// The features scale by scale, each weighted by what it and the fine scale say (tri-scale spatial attention).
-    fn weigh(&self, cells: &Tensor) -> Result<Vec<Tensor>, TchError> {
+    fn weigh(&self, cells: &Tensor) -> tch::Result<Vec<Tensor>> {
         let mut parts = Vec::with_capacity(self.scales.len() + 1);
         let (mut first, mut own) = (0, None);
         for (&channels, squeeze) in self.scales.iter().zip(&self.squeeze) {
@@ -86,8 +87,4 @@ impl SgLocHead {
         }
         Ok(parts)
     }
-}
-
-fn layer(path: &nn::Path<'_>, inputs: i64) -> DenseNorm {
-    DenseNorm::new(path, [inputs, WIDTH], BatchNormConfig::default())
 }

@@ -9,14 +9,12 @@ use tch::{Device, Kind, no_grad};
 
 use super::SgLoc;
 use crate::baselines::regressed_pose::no_pose;
-use crate::pgc::error::LocalizerError;
 use crate::pgc::localization::{ENCODE, REGRESS, SOLVE, VOXELISE};
+use crate::pgc::pose_refinement::SweepCells;
 use crate::pgc::pose_solver::{MIN_CELLS, PoseSolver};
-use crate::pgc::scene_encoder::SceneFeatures;
-use crate::pgc::voxel_batch::VoxelBatch;
-use crate::pgc::voxelise::SweepVoxels;
 use crate::pgc::{
-    Localization, Localize, LocalizerInput, SceneCoordinates, choose_evenly, stopwatch,
+    Localization, Localize, LocalizerError, LocalizerInput, SceneCoordinates, SceneFeatures,
+    SweepVoxels, VoxelBatch, choose_evenly, stopwatch,
 };
 
 /// Largest number of cells of a sweep that are regressed. More than of PGC: their coordinates are less accurate.
@@ -58,14 +56,10 @@ impl SgLocLocalizer {
         features: &SceneFeatures,
     ) -> Result<SceneCoordinates, LocalizerError> {
         let chosen = choose_evenly(sweep.cells(), CELLS);
-        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
-        let rows = tensor(&rows, &[-1], self.device)?;
-        let sensor_m = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m);
-        let sensor_m: Vec<[f32; 3]> = sensor_m.collect();
+        let SweepCells { features, sensor_m } = SweepCells::pick(sweep.cells(), features, &chosen)?;
         let places = tensor(sensor_m.as_flattened(), &[-1, 3], self.device)?;
         let world = no_grad(|| {
-            let cells = features.cells.f_index_select(0, &rows)?;
-            values(&(self.network).coordinates(&cells, &places, Kind::Float, false)?)
+            values(&(self.network).coordinates(&features, &places, Kind::Float, false)?)
         })?;
         Ok(SceneCoordinates {
             // Weight 1 for every cell (Eq. 6), so that the plain confidence is the inlier ratio.

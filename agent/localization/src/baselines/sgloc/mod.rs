@@ -6,11 +6,9 @@
 //! Departures: PGC's encoder, frozen, in place of one of its own of 55 million parameters; a head of 2.7 million in
 //! place of 57; no inter-geometric-consistency term, which the published training code does not use either.
 
-mod config;
 mod head;
 mod localizer;
 mod network;
 
-pub use config::SgLocConfig;
 pub use localizer::SgLocLocalizer;
-pub use network::SgLoc;
+pub use network::{SgLoc, SgLocConfig};

@@ -1,13 +1,23 @@
 //! Network: the encoder of the cells of a sweep, and the head that regresses their scene coordinates.
 
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use serde::{Deserialize, Serialize};
+use tch::{Kind, Tensor, nn};
 
-use super::SgLocConfig;
 use super::head::SgLocHead;
-use crate::pgc::error::LocalizerError;
 use crate::pgc::feature_norm::FeatureNorm;
-use crate::pgc::scene_encoder::SceneEncoder;
+use crate::pgc::{LocalizerError, SceneEncoder, SceneEncoderConfig};
+
+/// Configuration of an SGLoc network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SgLocConfig {
+    /// Name of the scene.
+    pub scene_name: String,
+    /// Centre of the training positions, metres in the world.
+    pub origin_m: [f64; 3],
+    /// The encoder.
+    pub encoder: SceneEncoderConfig,
+}
 
 /// Encoder and head of one scene.
 #[derive(Debug)]
@@ -26,13 +36,11 @@ impl SgLoc {
     pub fn new(path: &nn::Path<'_>, config: &SgLocConfig) -> Result<Self, LocalizerError> {
         let encoder = SceneEncoder::new(&(path / "encoder"), &config.encoder)?;
         let below = path / "regressor";
-        let head = SgLocHead::new(&below, &config.encoder);
-        let norm = FeatureNorm::new(&(&below / "norm"), config.encoder.cell_channels());
         Ok(Self {
             config: config.clone(),
             encoder,
-            norm,
-            head,
+            head: SgLocHead::new(&below, &config.encoder),
+            norm: FeatureNorm::new(&(&below / "norm"), config.encoder.cell_channels()),
         })
     }
 
@@ -57,7 +65,7 @@ impl SgLoc {
         sensor_m: &Tensor,
         kind: Kind,
         train: bool,
-    ) -> Result<Tensor, TchError> {
+    ) -> tch::Result<Tensor> {
         self.head
             .forward(&self.norm.forward(cells)?.f_to_kind(kind)?, sensor_m, train)
     }
@@ -66,7 +74,7 @@ impl SgLoc {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn set_statistics(&mut self, features: &Tensor) -> Result<(), TchError> {
+    pub fn set_statistics(&mut self, features: &Tensor) -> tch::Result<()> {
         self.norm.fit(features)
     }
 }

@@ -5,12 +5,13 @@ use std::sync::{Mutex, PoisonError};
 use perception::detector::{BackboneLevel, Detector};
 use perception::tensor_values::tensor;
 use perception::weights::{KIND_KEY, Weights};
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Device, Kind, Tensor, no_grad};
 
 use super::EncodedCells;
 use super::bev_cells::{BevCells, BevFormat};
-use crate::pgc::error::LocalizerError;
+use crate::pgc::error::{LocalizerError, Result};
 use crate::pgc::scene_encoder::{SceneFeatures, mean_over};
+use crate::pgc::voxel_batch::ranges;
 
 /// Encoder of a detector, in its fastest form.
 #[derive(Debug)]
@@ -32,7 +33,7 @@ impl BackboneEncoder {
     }
 
     /// The encoder of a detector's weights.
-    pub(super) fn of_detector(weights: &Weights, device: Device) -> Result<Self, LocalizerError> {
+    pub(super) fn of_detector(weights: &Weights, device: Device) -> Result<Self> {
         let config = weights.detector_config()?;
         let detector = Detector::from_weights(weights, &config, Device::Cpu)?;
         let (format, is_quantised) = (BevFormat::of_detector(&config), detector.is_quantised());
@@ -46,18 +47,16 @@ impl BackboneEncoder {
 
     /// True for levels in the number format of its own and on the same grids: the same weights may have another area.
     pub(super) fn takes(&self, levels: &[BackboneLevel]) -> bool {
-        levels
-            .iter()
-            .all(|level| level.is_quantised() == self.is_quantised)
-            && levels
-                .iter()
-                .map(BackboneLevel::shape)
-                .eq(self.format.shapes())
+        let shapes = levels.iter().map(BackboneLevel::shape);
+        let mut kinds = levels.iter().map(BackboneLevel::is_quantised);
+        kinds.all(|is_quantised| is_quantised == self.is_quantised)
+            && shapes.eq(self.format.shapes())
     }
 
     /// Features of some sweeps, one after another.
-    pub(super) fn encode(&self, sweeps: &[&BevCells]) -> Result<EncodedCells, LocalizerError> {
-        let (mut cells, mut of_sweeps, mut rows, mut end) = (Vec::new(), Vec::new(), Vec::new(), 0);
+    pub(super) fn encode(&self, sweeps: &[&BevCells]) -> Result<EncodedCells> {
+        let rows = ranges(sweeps.iter().map(|sweep| sweep.cells().len()));
+        let (mut cells, mut of_sweeps) = (Vec::new(), Vec::new());
         for sweep in sweeps {
             let encoded = self
                 .detector
@@ -65,13 +64,11 @@ impl BackboneEncoder {
                 .unwrap_or_else(PoisonError::into_inner)
                 .encode(&sweep.cloud)?;
             let features = self.features(sweep, &encoded.levels)?;
-            let start = end;
-            end += sweep.cells().len() as i64;
-            rows.push(start..end);
             cells.push(features.cells);
             of_sweeps.push(features.sweeps);
         }
-        let features = SceneFeatures::new(Tensor::f_cat(&cells, 0)?, Tensor::f_cat(&of_sweeps, 0)?);
+        let (cells, sweeps) = (Tensor::f_cat(&cells, 0)?, Tensor::f_cat(&of_sweeps, 0)?);
+        let features = SceneFeatures { cells, sweeps };
         Ok(EncodedCells { features, rows })
     }
 
@@ -80,11 +77,11 @@ impl BackboneEncoder {
         &self,
         sweep: &BevCells,
         levels: &[BackboneLevel],
-    ) -> Result<SceneFeatures, LocalizerError> {
+    ) -> Result<SceneFeatures> {
         let Some((coarsest, places)) = levels.last().zip(sweep.places.last()) else {
             return Err(LocalizerError::Config("a backbone without levels".into()));
         };
-        Ok(no_grad(|| {
+        no_grad(|| {
             let map = coarsest.map()?;
             let own = (levels.iter().zip(&sweep.places))
                 .map(|(level, places)| level.of_cells(&tensor(places, &[-1], map.device())?));
@@ -101,8 +98,9 @@ impl BackboneEncoder {
             let mean = map.f_mean_dim([2_i64, 3].as_slice(), false, Kind::Float)?;
             let sweeps = Tensor::f_cat(&[mean, map.f_amax([2_i64, 3].as_slice(), false)?], 1)?;
             let cells = Tensor::f_cat(&parts, 1)?.f_to_device(self.device)?;
-            Ok::<_, TchError>(SceneFeatures::new(cells, sweeps.f_to_device(self.device)?))
-        })?)
+            let sweeps = sweeps.f_to_device(self.device)?;
+            Ok(SceneFeatures { cells, sweeps })
+        })
     }
 }
 

@@ -4,7 +4,7 @@ use perception::crop::Crop;
 use perception::model_config::{DetectorConfig, YAxis};
 use protocol::PointCloud;
 
-use crate::pgc::voxelise::Cell;
+use crate::pgc::voxelise::{Cell, CellPoints};
 
 /// Edges of the surroundings of a cell, whose mean features are added to its own, metres; as those of the scene encoder.
 const CONTEXT_M: [f64; 2] = [20.0, 60.0];
@@ -28,8 +28,8 @@ struct LevelGrid {
     channels: i64,
     /// Edge of a cell, metres.
     cell_m: [f32; 2],
-    width: usize,
-    height: usize,
+    /// Columns and rows.
+    size: [usize; 2],
 }
 
 /// Occupied cells of one sweep.
@@ -45,7 +45,7 @@ pub struct BevCells {
 impl BevFormat {
     /// The grids of a detector.
     pub fn of_detector(config: &DetectorConfig) -> Self {
-        let pillars = config.pillar_grid();
+        let [columns, rows, _] = config.pillar_grid();
         let mut stride = 1;
         let levels = config.num_filters.iter().zip(&config.layer_strides);
         let levels = levels.map(|(&channels, &step)| {
@@ -53,20 +53,17 @@ impl BevFormat {
             LevelGrid {
                 channels,
                 cell_m: [0, 1].map(|axis| (config.voxel_size_m[axis] * stride as f64) as f32),
-                width: pillars[0].div_ceil(stride as usize),
-                height: pillars[1].div_ceil(stride as usize),
+                size: [columns, rows].map(|pillars| pillars.div_ceil(stride as usize)),
             }
         });
+        let is_right = config.y_axis == YAxis::Right;
         let range_m = config.lidar_range_m.map(f64::abs);
         let [x_m, y_m] = [0, 1].map(|axis| range_m[axis].max(range_m[axis + 3]));
         Self {
             crop: Crop::for_detector(config),
             low_m: [0, 1].map(|axis| config.lidar_range_m[axis] as f32),
             range_m: x_m.hypot(y_m),
-            y_sign: match config.y_axis == YAxis::Right {
-                true => -1.0,
-                false => 1.0,
-            },
+            y_sign: if is_right { -1.0 } else { 1.0 },
             levels: levels.collect(),
         }
     }
@@ -86,7 +83,7 @@ impl BevFormat {
     /// Channels, height and width of each level.
     pub(super) fn shapes(&self) -> impl Iterator<Item = [i64; 3]> + '_ {
         let levels = self.levels.iter();
-        levels.map(|level| [level.channels, level.height as i64, level.width as i64])
+        levels.map(|level| [level.channels, level.size[1] as i64, level.size[0] as i64])
     }
 
     /// Height and width of the surroundings of a cell, cells of the coarsest level; odd, so that the cell is in the
@@ -106,14 +103,10 @@ impl BevFormat {
 
 impl LevelGrid {
     /// Column and row of the cell under a place (metres from the grid's corner); the last where rounding leads beyond.
-    fn cell(&self, [x_m, y_m]: [f32; 2]) -> [usize; 2] {
-        let index =
-            // The cast saturates: a place that rounding leaves below the corner is in cell 0.
-            |place_m: f32, edge_m: f32, count: usize| ((place_m / edge_m) as usize).min(count - 1);
-        [
-            index(x_m, self.cell_m[0], self.width),
-            index(y_m, self.cell_m[1], self.height),
-        ]
+    fn cell(&self, place_m: [f32; 2]) -> [usize; 2] {
+        // The cast saturates: a place that rounding leaves below the corner is in cell 0.
+        let cell = [0, 1].map(|axis| (place_m[axis] / self.cell_m[axis]) as usize);
+        [0, 1].map(|axis| cell[axis].min(self.size[axis] - 1))
     }
 }
 
@@ -130,14 +123,15 @@ impl BevCells {
                 cloud,
             };
         };
-        let mut columns = vec![Column::default(); finest.width * finest.height];
+        let [width, height] = finest.size;
+        let mut columns = vec![CellPoints::NONE; width * height];
         for &[x, y, z, _] in &cloud.xyzi {
             let [low_x, low_y] = format.low_m;
             let [column, row] = finest.cell([x - low_x, y * format.y_sign - low_y]);
             // The row follows the network's y axis. The points of the cell stay in the sensor frame.
-            columns[row * finest.width + column].add([x, y, z]);
+            columns[row * width + column].add([x, y, z]);
         }
-        let occupied = (columns.iter().enumerate()).filter(|(_, column)| column.points > 0);
+        let occupied = (columns.iter().enumerate()).filter(|(_, column)| column.count > 0);
         let cells = occupied.map(|(number, column)| (number, column.cell()));
         let (numbers, cells): (Vec<usize>, Vec<Cell>) = cells.unzip();
         let places = format.levels.iter().map(|grid| {
@@ -145,9 +139,9 @@ impl BevCells {
             let steps =
                 [0, 1].map(|axis| (grid.cell_m[axis] / finest.cell_m[axis]).round() as usize);
             let places = numbers.iter().map(|&number| {
-                let column = number % finest.width / steps[0];
-                let row = number / finest.width / steps[1];
-                (row * grid.width + column) as i64
+                let column = number % width / steps[0];
+                let row = number / width / steps[1];
+                (row * grid.size[0] + column) as i64
             });
             places.collect()
         });
@@ -161,44 +155,6 @@ impl BevCells {
     /// The cells, row after row.
     pub fn cells(&self) -> &[Cell] {
         &self.cells
-    }
-}
-
-/// Sums over the points of a cell.
-#[derive(Debug, Clone, Copy)]
-struct Column {
-    sum_m: [f32; 3],
-    low_m: f32,
-    high_m: f32,
-    points: u32,
-}
-
-impl Default for Column {
-    fn default() -> Self {
-        Self {
-            sum_m: [0.0; 3],
-            low_m: f32::MAX,
-            high_m: f32::MIN,
-            points: 0,
-        }
-    }
-}
-
-impl Column {
-    fn add(&mut self, point_m: [f32; 3]) {
-        (0..3).for_each(|axis| self.sum_m[axis] += point_m[axis]);
-        self.low_m = self.low_m.min(point_m[2]);
-        self.high_m = self.high_m.max(point_m[2]);
-        self.points += 1;
-    }
-
-    fn cell(&self) -> Cell {
-        let centroid_m = self.sum_m.map(|sum| sum / self.points as f32);
-        Cell {
-            centroid_m,
-            extent_m: self.high_m - self.low_m,
-            points: self.points,
-        }
     }
 }
 
@@ -229,7 +185,7 @@ mod tests {
                     let [x, y, _] = cell.centroid_m;
                     let [column, row] =
                         grid.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
-                    assert_eq!(place, (row * grid.width + column) as i64);
+                    assert_eq!(place, (row * grid.size[0] + column) as i64);
                 }
             }
         }

@@ -17,11 +17,10 @@ use tch::{Device, Kind};
 pub use bev_cells::{BevCells, BevFormat};
 
 use super::encoder_config::SceneEncoderConfig;
-use super::error::LocalizerError;
+use super::error::{LocalizerError, Result};
 use super::scene_encoder::{SceneEncoder, SceneFeatures};
 use super::voxel_batch::VoxelBatch;
 use super::voxelise::{Cell, SweepVoxels};
-use crate::pgc::Result;
 use backbone::BackboneEncoder;
 
 /// An encoder and the device that it computes on.
@@ -100,10 +99,9 @@ impl CellEncoder {
 
     /// A scene encoder on its device.
     pub fn sparse(encoder: SceneEncoder, device: Device) -> Self {
-        let format = SweepFormat::Voxels(encoder.config().clone());
         Self {
+            format: SweepFormat::Voxels(encoder.config().clone()),
             network: Network::Sparse(Box::new(encoder)),
-            format,
             device,
         }
     }
@@ -122,10 +120,8 @@ impl CellEncoder {
         match &self.network {
             Network::Sparse(encoder) => {
                 let batch = self.batch(encoder, sweeps)?;
-                Ok(EncodedCells {
-                    features: encoder.encode(&batch, kind)?,
-                    rows: batch.cell_rows.clone(),
-                })
+                let (features, rows) = (encoder.encode(&batch, kind)?, batch.cell_rows);
+                Ok(EncodedCells { features, rows })
             }
             Network::Backbone(encoder) => {
                 let cells: Result<Vec<_>, _> = sweeps.iter().map(|sweep| sweep.bev()).collect();
@@ -170,12 +166,10 @@ impl CellEncoder {
     /// # Errors
     /// As [`Self::encode`].
     pub fn observe(&self, sweep: &PreparedSweep, search: &mut ScaleSearch) -> Result<()> {
-        match &self.network {
-            Network::Sparse(encoder) => {
-                Ok(encoder.observe(&self.batch(encoder, &[sweep])?, search)?)
-            }
-            Network::Backbone(_) => Ok(()),
+        if let Network::Sparse(encoder) = &self.network {
+            encoder.observe(&self.batch(encoder, &[sweep])?, search)?;
         }
+        Ok(())
     }
 
     fn batch(&self, encoder: &SceneEncoder, sweeps: &[&PreparedSweep]) -> Result<VoxelBatch> {
@@ -240,21 +234,18 @@ impl PreparedSweep {
     }
 
     fn voxels(&self) -> Result<&SweepVoxels> {
+        let problem = "BEV cells of a detector, must be voxels";
         match self {
             Self::Voxels(voxels) => Ok(voxels),
-            Self::Bev(_) => {
-                let problem = "BEV cells of a detector, must be voxels";
-                Err(LocalizerError::Config(problem.into()))
-            }
+            Self::Bev(_) => Err(LocalizerError::Config(problem.into())),
         }
     }
 
     fn bev(&self) -> Result<&BevCells> {
+        let problem = "voxels, must be BEV cells of a detector";
         match self {
             Self::Bev(cells) => Ok(cells),
-            Self::Voxels(_) => Err(LocalizerError::Config(
-                "voxels, must be BEV cells of a detector".into(),
-            )),
+            Self::Voxels(_) => Err(LocalizerError::Config(problem.into())),
         }
     }
 }

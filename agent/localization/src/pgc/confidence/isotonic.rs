@@ -46,12 +46,8 @@ impl MonotoneMap {
         if pools.is_empty() && !rest.is_empty() {
             pools.push(Pool::of(rest));
         }
-        Self {
-            knots: pools
-                .iter()
-                .map(|pool| (pool.x / pool.count, pool.mean()))
-                .collect(),
-        }
+        let knots = pools.iter().map(|pool| (pool.x / pool.count, pool.mean()));
+        Self::falling(knots.collect())
     }
 
     /// Checks that x increases and values decrease from knot to knot, as in a fit up to rounding.

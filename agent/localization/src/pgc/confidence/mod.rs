@@ -89,21 +89,18 @@ impl ConfidenceModel {
 
     /// Expected natural logarithm of the error in metres.
     fn log_error(&self, evidence: &PoseEvidence) -> f64 {
-        self.bias
-            + features(evidence)
-                .iter()
-                .zip(&self.weights)
-                .map(|(feature, weight)| feature * weight)
-                .sum::<f64>()
+        let features = features(evidence);
+        let weighted = features.iter().zip(&self.weights);
+        let terms = weighted.map(|(feature, weight)| feature * weight);
+        self.bias + terms.sum::<f64>()
     }
 
     /// Model with round numbers, for tests.
     pub fn example() -> Self {
-        let sigma = MonotoneMap::falling(vec![(-3.0, 0.95), (0.0, 0.5), (2.0, 0.05)]);
         Self {
             bias: -1.0,
             weights: [0.3; FEATURES],
-            sigma,
+            sigma: MonotoneMap::falling(vec![(-3.0, 0.95), (0.0, 0.5), (2.0, 0.05)]),
             reject_below: 0.1,
         }
     }

@@ -5,7 +5,6 @@
 
 use nalgebra::{Translation3, Vector3};
 use support::stage_times::StageTimes;
-use tch::TchError;
 
 use crate::pgc::pose_search::{Attempt, PoseSearch};
 use crate::pgc::scene_coordinates::SceneCoordinates;
@@ -19,7 +18,7 @@ pub(crate) fn search(
     mut best: Attempt,
     coordinates: &SceneCoordinates,
     times: &mut StageTimes,
-) -> Result<Attempt, TchError> {
+) -> tch::Result<Attempt> {
     let Ok(found) = &best.solved else {
         return Ok(best);
     };

@@ -4,7 +4,7 @@
 //! (`deploy/results/localization.md`). The refinement network hardly corrects these: it predicts the height of a cell largely from the height that the
 //! pose gives it. Its predictions in the plane depend on them little.
 
-use nalgebra::{Isometry3, Matrix3, Point3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector3};
 
 use crate::pgc::scene_coordinates::SceneCoordinates;
 use crate::registration::refine::forgiveness;
@@ -27,15 +27,12 @@ pub(crate) fn level(
     coordinates: &SceneCoordinates,
     origin_from_sensor: &Isometry3<f64>,
 ) -> Isometry3<f64> {
-    let mut pose = *origin_from_sensor;
-    for scale_m in SCALES_M {
-        match step(coordinates, &pose, scale_m) {
-            Some(next) => pose = next,
-            // Not the pose of an earlier, wider scale, which outliers may have pulled.
-            None => return *origin_from_sensor,
-        }
-    }
-    pose
+    let mut scales_m = SCALES_M.into_iter();
+    let levelled = scales_m.try_fold(*origin_from_sensor, |pose, scale_m| {
+        step(coordinates, &pose, scale_m)
+    });
+    // Not the pose of an earlier, wider scale, which outliers may have pulled.
+    levelled.unwrap_or(*origin_from_sensor)
 }
 
 fn step(
@@ -44,12 +41,7 @@ fn step(
     scale_m: f64,
 ) -> Option<Isometry3<f64>> {
     let (mut information, mut moment, mut count) = (Matrix3::zeros(), Vector3::zeros(), 0);
-    let cells = coordinates
-        .sensor_m
-        .iter()
-        .zip(&coordinates.world_m)
-        .zip(&coordinates.epsilon_m);
-    for ((&sensor_m, &world_m), &epsilon_m) in cells {
+    for (sensor_m, world_m, epsilon_m) in coordinates.cells() {
         let arm = pose.rotation * Point3::from(sensor_m.map(f64::from)).coords;
         let off = Vector3::from(world_m.map(f64::from)) - (pose.translation.vector + arm);
         // Comparisons with NaN are false.
@@ -72,14 +64,13 @@ fn step(
     // About horizontal axes of the world: at small angles the heading stays as predicted.
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(roll, pitch, 0.0)) * pose.rotation;
     let position = pose.translation.vector + Vector3::new(0.0, 0.0, dz);
-    Some(Isometry3::from_parts(
-        Translation3::from(position),
-        rotation,
-    ))
+    Some(Isometry3::from_parts(position.into(), rotation))
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Translation3;
+
     use super::*;
     use crate::pgc::test_scene::SyntheticScene;
 

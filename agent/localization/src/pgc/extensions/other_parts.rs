@@ -5,7 +5,7 @@
 //! right one. Measured gain, poses under 3 m before rejection: town 1 in fog 93.5 to 98.5 %, town 4 in fog 71.0 to
 //! 92.0 %, in snow 92.5 to 98.0 %, in sunshine 99.0 to 99.5 % (`deploy/results/localization.md`).
 
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
 
 /// Factor on the expected error of cells in a part that the classifier does not choose.
 pub(crate) const WIDENING: f64 = 2.0;
@@ -17,7 +17,7 @@ const SUFFICIENT_PROBABILITY: f64 = 0.95;
 const LEAD: f64 = 10.0;
 
 /// Logits `[1, classes]` of at most `most` parts in turn, given those of the classifier.
-pub(crate) fn logits_by_part(logits: &Tensor, most: usize) -> Result<Vec<Tensor>, TchError> {
+pub(crate) fn logits_by_part(logits: &Tensor, most: usize) -> tch::Result<Vec<Tensor>> {
     let (probabilities, order) = logits
         .f_softmax(1, Kind::Float)?
         .f_reshape([-1])?

@@ -3,7 +3,6 @@
 //! Measured gain: none apart; fog and snow need it together with the search of other parts.
 
 use support::stage_times::StageTimes;
-use tch::TchError;
 
 use crate::pgc::pose_search::{Attempt, PoseSearch};
 use crate::pgc::scene_coordinates::SceneCoordinates;
@@ -19,7 +18,7 @@ pub fn search(
     search: &PoseSearch<'_>,
     coordinates: &SceneCoordinates,
     times: &mut StageTimes,
-) -> Result<Attempt, TchError> {
+) -> tch::Result<Attempt> {
     let [first, wider @ ..] = WIDENING;
     let mut best = search.attempt(coordinates, first, times)?;
     for factor in wider {

@@ -185,14 +185,12 @@ pub struct IcpFit {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum NoIcpFit {
     /// Source or target are (nearly) empty.
-    #[error("{found} {what}, at least {required} are needed")]
+    #[error("{found} {what}, at least {MIN_POINTS} are needed")]
     TooFew {
         /// Kind: source points or target planes.
         what: &'static str,
         /// Number found.
         found: usize,
-        /// Number required.
-        required: usize,
     },
     /// The clouds do not overlap at the resulting pose.
     #[error("{overlap:.2} of the points have a partner, at least {required:.2} must")]
@@ -233,11 +231,7 @@ pub fn register(
         ("target planes", target.planes()),
     ] {
         if found < MIN_POINTS {
-            return Err(NoIcpFit::TooFew {
-                what,
-                found,
-                required: MIN_POINTS,
-            });
+            return Err(NoIcpFit::TooFew { what, found });
         }
     }
     let stride = source.points_m.len().div_ceil(config.max_points.max(1));
@@ -353,10 +347,8 @@ impl NormalEquations {
         let damped = self.hessian + Matrix6::identity() * (1e-9 * self.weight);
         let inverse = damped.try_inverse().unwrap_or_else(Matrix6::identity) * mean_square_m2;
         // Rotation is first there, in units of 1 / LEVER_M radians.
-        let (axis, unit) = (
-            [3, 4, 5, 0, 1, 2],
-            [1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M],
-        );
+        let axis = [3, 4, 5, 0, 1, 2];
+        let unit = [1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M];
         Matrix6::from_fn(|row, column| {
             inverse[(axis[row], axis[column])] / (unit[row] * unit[column])
         })

@@ -174,10 +174,7 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
             "a file of kind {kind:?}, needed is one of kind {KIND:?}"
         ));
     }
-    let config = metadata
-        .get(CONFIG_KEY)
-        .map(String::as_str)
-        .unwrap_or_default();
+    let config = metadata.get(CONFIG_KEY).map_or("", String::as_str);
     let config: Config = serde_json::from_str(config)
         .map_err(|error| format!("metadata {CONFIG_KEY:?}: {error}"))?;
     config.check()?;
@@ -205,11 +202,9 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
         (voxel, Surfel { centre_m, normal })
     });
     let scale = metadata.get(COVARIANCE_KEY);
-    let scale: Option<CovarianceScale> =
-        scale
-            .map(|text| serde_json::from_str(text))
-            .transpose()
-            .map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?;
+    let scale = scale.map(|text| serde_json::from_str::<CovarianceScale>(text));
+    let scale = scale.transpose();
+    let scale = scale.map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?;
     let checked = scale.as_ref().map_or(Ok(()), CovarianceScale::check);
     checked.map_err(|error| error.to_string())?;
     Ok(SurfelMap {
@@ -226,20 +221,15 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
 
 impl Config {
     fn check(&self) -> Result<(), String> {
-        let Self {
-            voxel_m,
-            origin_m,
-            range_m,
-            ..
-        } = self;
-        check_voxel(*voxel_m).map_err(|error| error.to_string())?;
-        let is_finite = origin_m
-            .iter()
-            .chain(range_m)
-            .all(|value| value.is_finite());
-        is_finite
-            .then_some(())
-            .ok_or_else(|| format!("origin_m {origin_m:?} and range_m {range_m:?} must be finite"))
+        check_voxel(self.voxel_m).map_err(|error| error.to_string())?;
+        let (origin_m, range_m) = (&self.origin_m, &self.range_m);
+        let mut values = origin_m.iter().chain(range_m);
+        match values.all(|value| value.is_finite()) {
+            true => Ok(()),
+            false => Err(format!(
+                "origin_m {origin_m:?} and range_m {range_m:?} must be finite"
+            )),
+        }
     }
 }
 

@@ -99,9 +99,7 @@ impl Surfels {
             return;
         };
         let row = self.sites.add(voxel) as usize;
-        if row == self.moments.len() {
-            self.moments.push(Moments::default());
-        }
+        self.moments.resize(self.sites.len(), Moments::default());
         self.moments[row].add(point_m);
     }
 
@@ -185,25 +183,18 @@ impl Surfels {
     /// voxel, approximate to one and a half.
     pub(super) fn near(&self, point_m: &Vector3<f64>) -> Option<Surfel> {
         let first = voxel_of(&point_m.add_scalar(-self.voxel_m / 2.0), self.voxel_m)?;
-        let mut nearest = None;
-        let mut least = f64::INFINITY;
-        for offset in 0..8 {
+        let planes = (0..8).filter_map(|offset| {
             let voxel = [
                 first[0] + (offset & 1),
                 first[1] + (offset >> 1 & 1),
                 first[2] + (offset >> 2),
             ];
-            let row = self.sites.row(voxel);
-            let Some(kept) = row.and_then(|row| self.planes.get(row as usize)?.as_ref()) else {
-                continue;
-            };
-            let plane = self.plane(voxel, kept);
-            let distance = (plane.centre_m - point_m).norm_squared();
-            if distance < least {
-                (nearest, least) = (Some(plane), distance);
-            }
-        }
-        nearest
+            let row = self.sites.row(voxel)?;
+            let plane = self.plane(voxel, self.planes.get(row as usize)?.as_ref()?);
+            Some((plane, (plane.centre_m - point_m).norm_squared()))
+        });
+        let nearest = planes.min_by(|(_, a), (_, b)| a.total_cmp(b));
+        nearest.map(|(plane, _)| plane)
     }
 }
 
@@ -219,9 +210,7 @@ pub(super) fn decimate(
             continue;
         };
         let row = sites.add(voxel) as usize;
-        if row == sums.len() {
-            sums.push(Default::default());
-        }
+        sums.resize(sites.len(), Default::default());
         sums[row].0 += point;
         sums[row].1 += 1.0;
     }
@@ -232,9 +221,8 @@ pub(super) fn decimate(
 fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
     let voxel = (point_m / voxel_m).map(f64::floor);
     // One voxel of margin for the neighbours that are looked up. Also rejects values that are not finite.
-    let held = voxel
-        .iter()
-        .all(|axis| axis.abs() < f64::from((1 << 20) - 2));
+    let edge = f64::from((1 << 20) - 2);
+    let held = voxel.iter().all(|axis| axis.abs() < edge);
     held.then(|| [voxel.x as i32, voxel.y as i32, voxel.z as i32])
 }
 

@@ -30,9 +30,8 @@ pub(crate) fn run_config(
     batch: usize,
     learning_rate: f64,
 ) -> anyhow::Result<RunConfig> {
-    Ok(options
-        .run_config(batch, learning_rate)
-        .map_err(BadInput::of)?)
+    let run = options.run_config(batch, learning_rate);
+    Ok(run.map_err(BadInput::of)?)
 }
 
 /// Rejects missing folders and files before anything is computed.

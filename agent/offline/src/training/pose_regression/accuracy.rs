@@ -39,13 +39,10 @@ pub(super) fn accuracy<N: RegressPose>(
             network.network.poses(&tokens, &network.places, kind)
         })?);
     }
-    let off = Tensor::f_cat(&found, 0)?
-        .f_sub(&sweeps.poses)?
-        .f_narrow(1, 0, 3)?;
-    let squares = off
-        .f_square()?
-        .f_sum_dim_intlist(1_i64, false, Kind::Float)?;
-    let error = squares.f_sqrt()?;
+    let off = Tensor::f_cat(&found, 0)?.f_sub(&sweeps.poses)?;
+    let squares = off.f_narrow(1, 0, 3)?.f_square()?;
+    let error = squares.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    let error = error.f_sqrt()?;
     let is_success = error.f_lt(3.0)?.f_to_kind(Kind::Float)?;
     Ok(RegressionAccuracy {
         p50_m: error.f_median()?.f_double_value(&[])?,

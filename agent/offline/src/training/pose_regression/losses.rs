@@ -106,9 +106,8 @@ fn denoising_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Res
     let steps = Tensor::f_randint(schedule.steps(), [2, count], (Kind::Int64, on.1))?;
     let steps = steps.f_amax(0_i64, false)?;
     let noise = Tensor::f_randn(poses.size(), on)?;
-    let joint = Tensor::f_rand([count], on)?
-        .f_ge(SINGLE)?
-        .f_to_kind(Kind::Float)?;
+    let joint = Tensor::f_rand([count], on)?.f_ge(SINGLE)?;
+    let joint = joint.f_to_kind(Kind::Float)?;
     let noisy = schedule.add_noise(&poses, &noise, &steps)?;
     let (denoiser, windows) = (&network.denoiser, Windows::Joint(&joint));
     let velocity = denoiser.forward(&noisy, &steps, &features, windows)?;

@@ -98,9 +98,7 @@ fn train<N: PoseLoss>(
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
     let mut read = |folders: &[PathBuf]| {
         let list = Arc::new(SweepList::open(folders)?);
-        let sweeps = PooledSweeps::encode(&list, &encoder, run, &mut |done, total| {
-            observe(&Progress::Encoding(done, total));
-        })?;
+        let sweeps = PooledSweeps::encode(&list, &encoder, run, observe)?;
         Ok::<_, Error>((sweeps, list.data()))
     };
     let (sweeps, data) = read(&config.scenes)?;
@@ -126,12 +124,10 @@ fn train<N: PoseLoss>(
     adopt_encoder(&variables, &config.encoder, &network_config.encoder)?;
     sweeps.fit(&mut network.projection)?;
     let cache = sweeps.cache(&network.projection, network_config.origin_m)?;
-    network
-        .places
-        .set(&centres(&cache.sweeps.poses, run.seed)?)?;
-    let validation = validation
-        .map(|of| of.cache(&network.projection, network_config.origin_m))
-        .transpose()?;
+    let centres = centres(&cache.sweeps.poses, run.seed)?;
+    network.places.set(&centres)?;
+    let validation = validation.map(|of| of.cache(&network.projection, network_config.origin_m));
+    let validation = validation.transpose()?;
     // Only tokens are needed from here on: the memory of the pooled features is freed.
     drop(sweeps);
     // The time of the training begins here: reading and encoding do not count.

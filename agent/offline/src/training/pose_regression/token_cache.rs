@@ -8,7 +8,7 @@ use localization::baselines::tokens::{RINGS, SECTORS, TOKENS, TokenProjection, p
 use localization::pgc::{Cell, SceneEncoder, SceneEncoderConfig, SweepVoxels, VoxelBatch};
 use nalgebra::{Isometry3, Point3, Vector3};
 use perception::tensor_values::tensor;
-use perception::train::{Prefetch, RunConfig};
+use perception::train::{Observe, Prefetch, Progress, RunConfig};
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::Error;
@@ -62,7 +62,7 @@ struct Prepared {
 }
 
 impl PooledSweeps {
-    /// Encodes every sweep of `list` that has a pose; `progress` gets the number of sweeps done and of all.
+    /// Encodes every sweep of `list` that has a pose; `observe` gets the number of sweeps done and of all.
     ///
     /// # Errors
     /// [`Error`] when no sweep has a pose.
@@ -70,7 +70,7 @@ impl PooledSweeps {
         list: &Arc<SweepList>,
         encoder: &SceneEncoder,
         run: &RunConfig,
-        progress: &mut dyn FnMut(usize, usize),
+        observe: &mut Observe<'_>,
     ) -> Result<Self, Error> {
         let total = list.len();
         let (source, config) = (Arc::clone(list), encoder.config().clone());
@@ -100,7 +100,8 @@ impl PooledSweeps {
                 drives.push(sweep.drive);
                 poses.push(sweep.world_from_sensor);
             }
-            progress((done + BATCH as usize).min(total), total);
+            let done = (done + BATCH as usize).min(total);
+            observe(&Progress::Encoding(done, total));
         }
         if parts.is_empty() {
             return Err(Error::NoSweeps(Vec::new(), String::new()));
@@ -134,12 +135,10 @@ impl PooledSweeps {
             [position.x, position.y, position.z, cos, sin].map(|value| value as f32)
         });
         let poses: Vec<[f32; 5]> = poses.collect();
-        let (mut first, mut first_of_drive) = (0, Vec::new());
-        for (row, drive) in self.drives.iter().enumerate() {
-            if row > 0 && *drive != self.drives[row - 1] {
-                first = row as i64;
-            }
-            first_of_drive.push(first);
+        let mut first_of_drive: Vec<i64> = Vec::new();
+        for drive in self.drives.chunk_by(|one, next| one == next) {
+            let first = first_of_drive.len();
+            first_of_drive.resize(first + drive.len(), first as i64);
         }
         let mut parts = Vec::new();
         for part in self.pooled.f_split(FITTED, 0)? {
@@ -238,10 +237,8 @@ impl TokenSweeps {
         let is_kept = is_kept.f_ge_tensor(&(Tensor::f_rand([count, 1, 1], on)? * most_dropped))?;
         let noise = Tensor::f_randn([count, TOKENS, channels], on)?;
         let noise = noise.f_mul(&(Tensor::f_rand([count, 1, 1], on)? * most_noise))?;
-        let tokens = turned
-            .tokens
-            .f_add(&noise)?
-            .f_mul(&is_kept.f_to_kind(Kind::Float)?)?;
+        let is_kept = is_kept.f_to_kind(Kind::Float)?;
+        let tokens = turned.tokens.f_add(&noise)?.f_mul(&is_kept)?;
         Ok(Self { tokens, ..turned })
     }
 

@@ -42,30 +42,23 @@ pub(super) fn train_classifier(
         if share_done >= 1.0 {
             break;
         }
-        let rows: Vec<i64> = (0..BATCH)
-            .map(|_| rng.random_range(0..cache.sweep_count()) as i64)
-            .collect();
+        let rows = (0..BATCH).map(|_| rng.random_range(0..cache.sweep_count()) as i64);
+        let rows: Vec<i64> = rows.collect();
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(variables.device())?;
         let logits = head.classify(&cache.sweeps.f_index_select(0, &rows)?, true)?;
         let log_shares = logits.f_log_softmax(1, Kind::Float)?;
         let wanted = classes.f_index_select(0, &rows)?;
         // Cross entropy with label smoothing: a share of it is the mean over all classes.
-        let hit = log_shares
-            .f_gather(1, &wanted.f_unsqueeze(1)?, false)?
-            .f_mean(Kind::Float)?;
+        let hit = log_shares.f_gather(1, &wanted.f_unsqueeze(1)?, false)?;
+        let hit = hit.f_mean(Kind::Float)?;
         let even = log_shares.f_mean(Kind::Float)?;
         let loss = -(hit * (1.0 - LABEL_SMOOTHING) + even * LABEL_SMOOTHING);
         optimizer.zero_grad();
         loss.f_backward()?;
         optimizer.step(one_cycle(LEARNING_RATE, share_done))?;
     }
-    let found = no_grad(|| {
-        head.classify(&cache.sweeps, false)?
-            .f_argmax(1, false)?
-            .f_eq_tensor(&classes)
-    })?;
-    found
-        .f_to_kind(Kind::Float)?
-        .f_mean(Kind::Float)?
-        .f_double_value(&[])
+    let logits = no_grad(|| head.classify(&cache.sweeps, false))?;
+    let found = logits.f_argmax(1, false)?.f_eq_tensor(&classes)?;
+    let share = found.f_to_kind(Kind::Float)?.f_mean(Kind::Float)?;
+    share.f_double_value(&[])
 }

@@ -19,10 +19,8 @@ pub(super) struct CoarsePoses {
 
 impl CoarsePoses {
     pub(super) fn new(world_from_sensor: &[Isometry3<f64>], device: Device) -> Result<Self> {
-        let headings: Vec<f32> = world_from_sensor
-            .iter()
-            .map(|pose| heading_rad(pose) as f32)
-            .collect();
+        let poses = world_from_sensor.iter();
+        let headings: Vec<f32> = poses.map(|pose| heading_rad(pose) as f32).collect();
         Ok(Self {
             headings: Tensor::f_from_slice(&headings)?.f_to_device(device)?,
         })
@@ -35,14 +33,11 @@ impl CoarsePoses {
         let count = targets_m.size()[0];
         // Small and large errors both occur: the second round starts from a better pose than the first.
         let scale = Tensor::f_rand([count, 1], like)?.f_square()? * MAX_ERROR_M;
-        let shift = Tensor::f_randn([count, 3], like)?
-            * scale
-            * Tensor::f_from_slice(&[1.0f32, 1.0, 0.3])?.f_to_device(like.1)?;
+        let axes = Tensor::f_from_slice(&[1.0f32, 1.0, 0.3])?.f_to_device(like.1)?;
+        let shift = Tensor::f_randn([count, 3], like)? * scale * axes;
         let turn = Tensor::f_randn([count], like)? * TURN_RAD;
         let yaw = self.headings.f_index_select(0, sweeps)? + turn;
-        Ok((
-            targets_m + shift,
-            Tensor::f_stack(&[yaw.f_cos()?, yaw.f_sin()?], 1)?,
-        ))
+        let heading = Tensor::f_stack(&[yaw.f_cos()?, yaw.f_sin()?], 1)?;
+        Ok((targets_m + shift, heading))
     }
 }

@@ -63,10 +63,8 @@ pub(super) fn classes_of_sweeps(head: &SceneHead, cache: &FeatureCache) -> Resul
             head.config().scene_name
         )));
     }
-    Ok(positions
-        .iter()
-        .map(|position| nearest(&middles, position))
-        .collect())
+    let classes = { positions.iter() }.map(|position| nearest(&middles, position));
+    Ok(classes.collect())
 }
 
 /// Class of each sweep as the head sees it, and the median L1 error of some of its cells under it, metres.
@@ -87,9 +85,8 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
         // Evenly over the cells of the sweep, first and last included.
         let rows = Tensor::f_linspace(first, last, count, on)?.f_to_kind(Kind::Int64)?;
         let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
-        let of_cells = logits
-            .f_narrow(0, sweep as i64, 1)?
-            .f_expand([count, -1], false)?;
+        let of_sweep = logits.f_narrow(0, sweep as i64, 1)?;
+        let of_cells = of_sweep.f_expand([count, -1], false)?;
         let found = head.regress(&cells, &of_cells, Kind::Float)?.coordinates_m;
         let error = (found - cache.targets_m.f_index_select(0, &rows)?).f_abs()?;
         let error = error.f_sum_dim_intlist(1_i64, false, Kind::Float)?;

@@ -35,11 +35,7 @@ impl Features {
     ) -> Result<Self, Error> {
         let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
-            let run = &config.run;
-            let cache =
-                FeatureCache::build(list, &encoder, augmentation, run, &mut |done, total| {
-                    observe(&Progress::Encoding(done, total));
-                })?;
+            let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, observe)?;
             observe(&Progress::Read(list.data()));
             Ok::<_, Error>(cache)
         };

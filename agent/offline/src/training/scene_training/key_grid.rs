@@ -59,10 +59,9 @@ pub(super) fn crop(
         let source = &trained[&name];
         // Only these have a row for each corner of the grid.
         let is_key_grid = matches!(name.as_str(), "refiner.keys" | "refiner.heights");
-        let source = if is_key_grid {
-            source.f_index_select(0, &rows)?
-        } else {
-            source.shallow_clone()
+        let source = match is_key_grid {
+            true => source.f_index_select(0, &rows)?,
+            false => source.shallow_clone(),
         };
         no_grad(|| variable.f_copy_(&source))?;
     }

@@ -13,9 +13,8 @@ pub(super) fn weighted_loss(
     targets_m: &Tensor,
     weights: &Tensor,
 ) -> Result<(Tensor, Tensor), TchError> {
-    let error = (&answer.coordinates_m - targets_m)
-        .f_abs()?
-        .f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    let error = (&answer.coordinates_m - targets_m).f_abs()?;
+    let error = error.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     // The error is the target of its prediction: the second term has a gradient for epsilon alone.
     let surprise = (error.f_detach()? - &answer.epsilon_m).f_abs()?;
     Ok((((&error + surprise) * weights).f_mean(Kind::Float)?, error))
@@ -32,8 +31,6 @@ pub(super) fn centre_loss(
 ) -> Result<Tensor, TchError> {
     let distance = Tensor::f_cdist(targets_m, centres_m, 2.0, 1_i64)? / CENTRE_BLUR_M;
     let wanted = (distance.f_square()? * -0.5).f_softmax(1, Kind::Float)?;
-    let each = (wanted * log_shares)
-        .f_sum_dim_intlist(1_i64, false, Kind::Float)?
-        .f_neg()?;
-    (each * weights).f_mean(Kind::Float)
+    let each = (wanted * log_shares).f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    (each.f_neg()? * weights).f_mean(Kind::Float)
 }

@@ -52,18 +52,16 @@ const MAX_CELLS: usize = 1024;
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
 pub fn train_scene(config: &SceneTrainConfig, observe: &mut Observe<'_>) -> Result<SceneSummary> {
-    let training = Arc::new(SweepList::open(&config.scenes)?);
-    let validation = match config.validation.as_slice() {
-        [] => None,
-        folders => {
-            let mut list = SweepList::open(folders)?;
-            list.thin_out(config.validation_sweeps);
-            Some(Arc::new(list))
-        }
-    };
     let sweeps = SceneSweeps {
-        training,
-        validation,
+        training: Arc::new(SweepList::open(&config.scenes)?),
+        validation: match config.validation.as_slice() {
+            [] => None,
+            folders => {
+                let mut list = SweepList::open(folders)?;
+                list.thin_out(config.validation_sweeps);
+                Some(Arc::new(list))
+            }
+        },
     };
     train_scene_on(config, &sweeps, observe)
 }

@@ -61,10 +61,8 @@ const DIMENSIONS: [Dimension; 7] = [
         value: |run| run.point.pose_noise.map(|noise| noise.position_std_m),
         text: |point| {
             let noise = point.pose_noise?;
-            Some(format!(
-                "{} m {} deg",
-                noise.position_std_m, noise.heading_std_deg
-            ))
+            let (position_m, heading_deg) = (noise.position_std_m, noise.heading_std_deg);
+            Some(format!("{position_m} m {heading_deg} deg"))
         },
     },
     Dimension {
@@ -107,18 +105,15 @@ pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
             texts.collect::<BTreeSet<_>>().len() > 1
         })
         .collect();
-    let mut figures = Vec::new();
-    for &dimension in &varying {
-        let mut charts = Vec::new();
-        for (title, iou) in [("AP@0.5", 1), ("AP@0.7", 2)] {
-            charts.extend(chart(experiment, runs, dimension, &varying, title, iou));
+    let figures = varying.iter().map(|dimension| {
+        let charts = [("AP@0.5", 1), ("AP@0.7", 2)]
+            .map(|(title, iou)| chart(experiment, runs, dimension, &varying, title, iou));
+        Figure {
+            name: dimension.name,
+            charts: charts.into_iter().flatten().collect(),
         }
-        let name = dimension.name;
-        if !charts.is_empty() {
-            figures.push(Figure { name, charts });
-        }
-    }
-    figures
+    });
+    figures.filter(|figure| !figure.charts.is_empty()).collect()
 }
 
 /// A chart of the precisions at one IoU, by its place among them.
@@ -151,9 +146,8 @@ fn chart(
         let key = (dimension.text)(point).map_or(Key::Value(x.to_bits()), Key::Text);
         series[known].1.entry(key).or_default().push((x, y));
     }
-    let series: Vec<Series> = { series.into_iter() }
-        .map(|(name, points)| line(name, points))
-        .collect();
+    let series = series.into_iter().map(|(name, points)| line(name, points));
+    let series: Vec<Series> = series.collect();
     let xs = { series.iter() }.flat_map(|series| series.points.iter().map(|(x, _)| (*x, *x)));
     let (low, high) = xs.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
     let x = if dimension.name == BANDWIDTH {
@@ -184,14 +178,12 @@ enum Key {
 }
 
 fn line(name: String, points: Points) -> Series {
-    let mut points: Vec<(f64, f64)> = points
-        .values()
-        .map(|values| {
-            let (xs, ys) = (values.iter().map(|it| it.0), values.iter().map(|it| it.1));
-            let count = values.len() as f64;
-            (xs.sum::<f64>() / count, ys.sum::<f64>() / count)
-        })
-        .collect();
+    let means = points.values().map(|values| {
+        let (xs, ys) = (values.iter().map(|it| it.0), values.iter().map(|it| it.1));
+        let count = values.len() as f64;
+        (xs.sum::<f64>() / count, ys.sum::<f64>() / count)
+    });
+    let mut points: Vec<(f64, f64)> = means.collect();
     // The keys are in the order of bits or letters, not of values.
     points.sort_by(|a, b| a.0.total_cmp(&b.0));
     Series {

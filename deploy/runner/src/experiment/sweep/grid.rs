@@ -41,25 +41,27 @@ pub struct Point {
 
 /// Number of values of each axis.
 pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
-    let (methods, codecs) = (grid.method.len(), grid.codec.as_ref().map_or(1, Vec::len));
+    let (methods, codecs) = (grid.method.len(), size(&grid.codec));
     let mut sizes = match grid.reference.len() {
         0 => vec![("method", methods), ("codec", codecs)],
         // References come with the first encoding only, so they add up and do not multiply.
         others => vec![("method with codec", methods * codecs + others)],
     };
     sizes.extend([
-        ("latency_ms", grid.latency_ms.as_ref().map_or(1, Vec::len)),
-        ("jitter_ms", grid.jitter_ms.as_ref().map_or(1, Vec::len)),
-        (
-            "bandwidth_mbps",
-            grid.bandwidth_mbps.as_ref().map_or(1, Vec::len),
-        ),
-        ("loss", grid.loss.as_ref().map_or(1, Vec::len)),
-        ("pose_noise", grid.pose_noise.as_ref().map_or(1, Vec::len)),
-        ("vehicles", grid.vehicles.as_ref().map_or(1, Vec::len)),
-        ("seed", grid.seed.as_ref().map_or(1, Vec::len)),
+        ("latency_ms", size(&grid.latency_ms)),
+        ("jitter_ms", size(&grid.jitter_ms)),
+        ("bandwidth_mbps", size(&grid.bandwidth_mbps)),
+        ("loss", size(&grid.loss)),
+        ("pose_noise", size(&grid.pose_noise)),
+        ("vehicles", size(&grid.vehicles)),
+        ("seed", size(&grid.seed)),
     ]);
     sizes
+}
+
+/// Number of values of an axis; an absent one has that of the link.
+fn size<T>(axis: &Option<Vec<T>>) -> usize {
+    axis.as_ref().map_or(1, Vec::len)
 }
 
 /// Number of points of the grid.

@@ -69,10 +69,9 @@ pub(super) fn page(
 /// The runs: what varies in a table, the best precisions in bold, and the rest in a line.
 fn runs_table(table: &VaryingTable) -> String {
     let mut text = "<h2>Runs</h2>\n<div class=\"wide\"><table><thead><tr>".to_owned();
-    table
-        .columns
-        .iter()
-        .for_each(|column| text += &format!("<th>{}</th>", escaped(column)));
+    for column in &table.columns {
+        text += &format!("<th>{}</th>", escaped(column));
+    }
     text += "</tr></thead><tbody>\n";
     for (line, fields) in table.lines.iter().enumerate() {
         text += "<tr>";

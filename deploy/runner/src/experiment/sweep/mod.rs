@@ -20,7 +20,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, anyhow};
 use dataset::Scenario;
 use figures;
 use fusion::Exchange;
@@ -122,8 +122,7 @@ impl Sweep {
     }
 
     fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self> {
-        let trial = experiment.trial().context("link")?;
-        let data = OpenedData::open(&trial)?;
+        let data = OpenedData::open(&experiment.trial().context("link")?)?;
         let scenarios: Vec<Scenario> = data.chosen(experiment.scenarios).cloned().collect();
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) {
             let dataset = experiment.dataset.display();
@@ -143,11 +142,9 @@ impl Sweep {
 
     /// Identity of the run of each point.
     fn keys(&self) -> Result<Vec<CellKey>> {
-        let mut keys = Vec::with_capacity(self.points.len());
-        for point in &self.points {
-            keys.push(self.trial(point)?.key(&self.data, point.method)?);
-        }
-        Ok(keys)
+        let points = self.points.iter();
+        let keys = points.map(|point| self.trial(point)?.key(&self.data, point.method));
+        keys.collect()
     }
 
     fn trial(&self, point: &Point) -> Result<Trial> {
@@ -155,9 +152,8 @@ impl Sweep {
     }
 
     fn known(&self, keys: &[CellKey]) -> Result<Vec<Option<Cell>>> {
-        { keys.iter() }
-            .map(|key| Cell::read(key, &self.cells()))
-            .collect()
+        let known = keys.iter().map(|key| Cell::read(key, &self.cells()));
+        known.collect()
     }
 
     fn cells(&self) -> PathBuf {
@@ -191,9 +187,8 @@ impl Sweep {
         // Read back from the cache, as other processes may have computed them.
         let cells: Option<Vec<Cell>> = self.known(&keys)?.into_iter().collect();
         let cells = cells.ok_or_else(|| WorkerError("a run that was done is not there".into()))?;
-        let runs: Vec<Run> = (self.points.iter().cloned().zip(cells))
-            .map(|(point, cell)| Run { point, cell })
-            .collect();
+        let runs = self.points.iter().cloned().zip(cells);
+        let runs: Vec<Run> = runs.map(|(point, cell)| Run { point, cell }).collect();
         let table = self.write(&runs)?;
         // After the results are written: a failed write must not cost the maps too.
         if !keep_maps {
@@ -211,11 +206,8 @@ impl Sweep {
         self.print_estimate(&known, &missing, jobs)?;
         // Maps before runs, so that every worker finds them in the cache.
         self.encode(&missing, jobs)?;
-        let missing: Vec<(usize, &CellKey)> = missing
-            .into_iter()
-            .map(|index| (index, &keys[index]))
-            .collect();
-        self.compute(&missing, jobs)
+        let missing = missing.into_iter().map(|index| (index, &keys[index]));
+        self.compute(&Vec::from_iter(missing), jobs)
     }
 
     /// Prints the number of runs and the estimated time of the missing ones.
@@ -344,8 +336,7 @@ impl Sweep {
 
     /// Computes the run of a point and caches it.
     fn compute_one(&self, index: usize, key: CellKey, on_frame: &mut dyn FnMut()) -> Result<()> {
-        let point = &self.points[index];
-        compute(&self.trial(point)?, &self.data, key, on_frame)?.write(&self.cells())
+        compute(&self.trial(&self.points[index])?, &self.data, key, on_frame)?.write(&self.cells())
     }
 
     /// Runs as a worker: computes the points that the parent process requests.
@@ -357,16 +348,14 @@ impl Sweep {
         for line in io::stdin().lock().lines() {
             let request: Option<(usize, CellKey)> =
                 serde_json::from_str(&line.context(PARENT)?).ok();
-            // A line that is no request is answered too, or the parent would wait for ever.
-            let Some((index, key)) = request.filter(|(index, _)| *index < self.points.len()) else {
-                let answer = format!("{} that is no point of the grid", workers::FAILED);
-                reply(&answer).context(PARENT)?;
-                continue;
+            let computed = match request.filter(|(index, _)| *index < self.points.len()) {
+                // The parent may have ended; then the answer to the run fails too.
+                Some((index, key)) => self.compute_one(index, key, &mut || {
+                    reply(workers::FRAME).unwrap_or_default()
+                }),
+                // A line that is no request is answered too, or the parent would wait for ever.
+                None => Err(anyhow!("that is no point of the grid")),
             };
-            // The parent may have ended; then the answer to the run fails too.
-            let computed = self.compute_one(index, key, &mut || {
-                reply(workers::FRAME).unwrap_or_default()
-            });
             let answer = match computed {
                 Ok(()) => workers::DONE.to_owned(),
                 Err(error) => format!("{} {error:#}", workers::FAILED),

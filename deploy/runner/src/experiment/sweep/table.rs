@@ -85,8 +85,7 @@ fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
     fields.extend(sizes.map(|bytes| fixed(bytes.filter(|bytes| *bytes > 0.0).map(f64::log2), 4)));
     fields.push(fixed(Some(comm.nominal_fp32_log2), 4));
     let (latency, age) = (&metrics.latency_ms.capture_to_detection, &metrics.age_ms);
-    let times = [latency.p50, latency.p95, latency.p99, age.p50, age.p95];
-    fields.extend(times.map(|ms| fixed(ms, 3)));
+    fields.extend([latency.p50, latency.p95, latency.p99, age.p50, age.p95].map(|ms| fixed(ms, 3)));
     let dropped = REASONS.map(|reason| messages.dropped.get(&reason).copied().unwrap_or(0));
     let stale = messages.dropped.get(&DropReason::Stale).copied();
     let mut counts = vec![

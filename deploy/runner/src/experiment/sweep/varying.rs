@@ -114,9 +114,7 @@ impl VaryingTable {
     }
 
     fn settings_of(&self, line: usize) -> String {
-        let pairs = self
-            .columns
-            .iter()
+        let pairs = { self.columns.iter() }
             .zip(&self.lines[line])
             .take(self.settings);
         let given = pairs.filter(|(_, value)| !value.is_empty());

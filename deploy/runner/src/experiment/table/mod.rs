@@ -65,7 +65,7 @@ pub fn run(
     fs::create_dir_all(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
-    check_scenes(experiment, data.chosen(experiment.scenarios)).map_err(BadInput::new)?;
+    check_scenes(experiment, data.chosen(experiment.scenarios)).map_err(BadInput::of)?;
     let run = Run {
         experiment,
         cells,
@@ -73,10 +73,8 @@ pub fn run(
     };
     let places = run.places()?;
     let part = slice.map_or(0..places.len(), |slice| slice.part(places.len()));
-    let mut cells = Vec::with_capacity(part.len());
-    for place in &places[part] {
-        cells.push(run.cell(place, observer)?);
-    }
+    let cells = places[part].iter().map(|place| run.cell(place, observer));
+    let cells = cells.collect::<Result<Vec<_>>>()?;
     // Cells of other slices may still be missing, so no table can be filled.
     if slice.is_some() {
         return Ok(Vec::new());
@@ -116,17 +114,13 @@ impl Run<'_> {
         for table in &self.experiment.tables {
             for row in &table.rows {
                 for column in &table.columns {
-                    places.extend(
-                        self.experiment
-                            .trainings_of(row)?
-                            .into_iter()
-                            .map(|weights| Place {
-                                table,
-                                row,
-                                column,
-                                weights,
-                            }),
-                    );
+                    let trainings = self.experiment.trainings_of(row)?.into_iter();
+                    places.extend(trainings.map(|weights| Place {
+                        table,
+                        row,
+                        column,
+                        weights,
+                    }));
                 }
             }
         }

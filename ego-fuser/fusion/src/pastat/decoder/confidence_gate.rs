@@ -16,14 +16,10 @@ pub(super) struct ConfidenceGate {
 
 impl ConfidenceGate {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let dim = config.dim;
         Self {
-            hidden: nn::linear(
-                path / "hidden",
-                2 * config.dim,
-                config.dim,
-                nn::LinearConfig::default(),
-            ),
-            out: nn::linear(path / "out", config.dim, 1, ZERO),
+            hidden: nn::linear(path / "hidden", 2 * dim, dim, nn::LinearConfig::default()),
+            out: nn::linear(path / "out", dim, 1, ZERO),
             patch: config.patch,
         }
     }

@@ -8,9 +8,8 @@ use tch::{Kind, TchError, Tensor};
 
 use self::confidence_gate::ConfidenceGate;
 use super::config::PastatConfig;
-use super::patches::channels_last;
+use super::patches::{Tokens, channels_last};
 use super::spatial_alignment::FineMaps;
-use super::temporal_encoding::Tokens;
 use crate::f64_tensor::{self, are_numbers};
 use crate::layers::ZERO;
 
@@ -56,10 +55,8 @@ impl Decoder {
         if count == 0 {
             return f64_tensor::by_cell(own);
         }
-        let weight = self.gate.forward(
-            &channels_last(&tokens.values.f_narrow(0, 1, count)?)?,
-            context,
-        )?;
+        let others = channels_last(&tokens.values.f_narrow(0, 1, count)?)?;
+        let weight = self.gate.forward(&others, context)?;
         neighbours.maximum_with(own, &weight)
     }
 

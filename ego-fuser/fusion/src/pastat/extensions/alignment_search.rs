@@ -85,11 +85,8 @@ fn compare_there(
     }
     let rows: Vec<i64> = moved.iter().map(|&row| searched[row as usize]).collect();
     let there = network.displacements(&pairs.only(&rows)?, &picked(far, &moved)?, area)?;
-    let better = rows_where(
-        &there
-            .similarity
-            .f_gt_tensor(&picked(&near.similarity, &rows)?.f_add_scalar(MARGIN)?)?,
-    )?;
+    let least = picked(&near.similarity, &rows)?.f_add_scalar(MARGIN)?;
+    let better = rows_where(&there.similarity.f_gt_tensor(&least)?)?;
     let rows: Vec<i64> = better.iter().map(|&row| rows[row as usize]).collect();
     near.with(&rows, &there.only(&better)?)
 }
@@ -144,18 +141,18 @@ fn offsets(pairs: &Pairs, area: &Area, config: SearchConfig, train: bool) -> Res
     let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
     if train {
         // The middle column is no shift: a map stays unless it fits better elsewhere by the margin.
-        let _ = fit
-            .f_select(1, fit.size2()?.1 / 2)?
-            .f_add_scalar_(config.margin)?;
+        let mut stays = fit.f_select(1, fit.size2()?.1 / 2)?;
+        let _ = stays.f_add_scalar_(config.margin)?;
     }
     let mut tries = vec![(fit, (shifts(radius)? * cell_m).f_constant_pad_nd([0, 1])?)];
     if !train {
+        let radius = radius.min(TURNED_RADIUS);
         tries.extend(turned_tries(
             maps,
             &pairs.ego_from_cav,
             area,
             cell_m,
-            radius.min(TURNED_RADIUS),
+            radius,
         )?);
     }
     let (fits, offsets): (Vec<_>, Vec<_>) = tries.into_iter().unzip();
@@ -175,10 +172,8 @@ fn turned_tries(
 ) -> Result<Vec<(Tensor, Tensor)>> {
     let turned = turned(others, &TURNS_RAD, ego_from_cav, area)?;
     // All at once, as the ego's map at each shift is the same for all.
-    let fit = Shifted::new(ego, radius, 1)?
-        .correlate(&turned)?
-        .whole
-        .f_sub_scalar(TURN_MARGIN)?;
+    let fit = Shifted::new(ego, radius, 1)?.correlate(&turned)?.whole;
+    let fit = fit.f_sub_scalar(TURN_MARGIN)?;
     let shifts_m = shifts(radius)? * cell_m;
     fit.f_split(others.size4()?.0, 0)?
         .into_iter()
@@ -190,17 +185,11 @@ fn turned_tries(
 /// All maps rotated about their senders by the first of some angles, then by the second, and so on.
 fn turned(maps: &Tensor, turns_rad: &[f64], ego_from_cav: &[Pose], area: &Area) -> Result<Tensor> {
     let (count, _, rows, columns) = maps.size4()?;
-    let deltas: Vec<f32> = turns_rad
-        .iter()
-        .flat_map(|&turn_rad| [0.0, 0.0, turn_rad as f32].repeat(count as usize))
-        .collect();
-    let deltas = Tensor::f_from_slice(&deltas)?.f_view([-1, 3])?;
-    let places = sampling_grid(
-        &deltas,
-        &ego_from_cav.repeat(turns_rad.len()),
-        area,
-        [rows, columns],
-    )?;
+    let deltas = { turns_rad.iter() }
+        .flat_map(|&turn_rad| [0.0, 0.0, turn_rad as f32].repeat(count as usize));
+    let deltas = Tensor::f_from_slice(&deltas.collect::<Vec<f32>>())?.f_view([-1, 3])?;
+    let poses = ego_from_cav.repeat(turns_rad.len());
+    let places = sampling_grid(&deltas, &poses, area, [rows, columns])?;
     let maps = maps.f_repeat([turns_rad.len() as i64, 1, 1, 1])?;
     let places = places.f_to_device(maps.device())?;
     maps.f_grid_sampler(&places, BILINEAR, PADDING_ZEROS, false)

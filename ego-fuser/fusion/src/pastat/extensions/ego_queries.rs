@@ -100,11 +100,9 @@ impl Strip<'_> {
     fn normal(&self, entry: &[f32]) -> Normal {
         let channels = self.of.dim as f32;
         let (mut mean, mut scale) = ([0.0; STRIP], [0.0; STRIP]);
-        self.rows(entry).for_each(|row| {
-            mean.iter_mut()
-                .zip(row)
-                .for_each(|(sum, value)| *sum += value)
-        });
+        for row in self.rows(entry) {
+            (mean.iter_mut().zip(row)).for_each(|(sum, value)| *sum += value);
+        }
         mean.iter_mut().for_each(|sum| *sum /= channels);
         // Squares of deviations in a second pass: a difference of large sums would lose digits in f32.
         self.rows(entry).for_each(|row| {
@@ -112,9 +110,9 @@ impl Strip<'_> {
                 *sum += (value - mean) * (value - mean);
             }
         });
-        scale
-            .iter_mut()
-            .for_each(|sum| *sum = (*sum / channels + EPSILON).sqrt().recip());
+        for sum in &mut scale {
+            *sum = (*sum / channels + EPSILON).sqrt().recip();
+        }
         Normal { mean, scale }
     }
 
@@ -126,10 +124,7 @@ impl Strip<'_> {
             }
         }
         // The scale is the same for all channels, so the sum is scaled and not each term.
-        score
-            .iter_mut()
-            .zip(scale)
-            .for_each(|(score, scale)| *score *= scale);
+        (score.iter_mut().zip(scale)).for_each(|(score, scale)| *score *= scale);
         score
     }
 
@@ -151,11 +146,9 @@ impl Strip<'_> {
             }
         }
         let mut most = [f32::NEG_INFINITY; STRIP];
-        scores.iter().for_each(|scores| {
-            most.iter_mut()
-                .zip(scores)
-                .for_each(|(most, score)| *most = most.max(*score))
-        });
+        for scores in scores.iter() {
+            (most.iter_mut().zip(scores)).for_each(|(most, score)| *most = most.max(*score));
+        }
         let mut total = [0.0; STRIP];
         for scores in scores.iter_mut() {
             for ((score, most), total) in scores.iter_mut().zip(&most).zip(&mut total) {
@@ -163,12 +156,9 @@ impl Strip<'_> {
                 *total += *score;
             }
         }
-        scores.iter_mut().for_each(|scores| {
-            scores
-                .iter_mut()
-                .zip(&total)
-                .for_each(|(score, total)| *score /= total)
-        });
+        for scores in scores.iter_mut() {
+            (scores.iter_mut().zip(&total)).for_each(|(score, total)| *score /= total);
+        }
     }
 
     fn mean(&self, entries: &[&[f32]], normal: &[Normal], weights: &[Row], gathered: &mut [f32]) {
@@ -176,10 +166,7 @@ impl Strip<'_> {
         for ((entry, Normal { mean, scale }), weight) in entries.iter().zip(normal).zip(weights) {
             // A normalised token is (value - mean) * scale, so the scale goes into the weight.
             let mut share = *weight;
-            share
-                .iter_mut()
-                .zip(scale)
-                .for_each(|(share, scale)| *share *= scale);
+            (share.iter_mut().zip(scale)).for_each(|(share, scale)| *share *= scale);
             for (sums, row) in gathered
                 .chunks_exact_mut(self.of.cells)
                 .zip(self.rows(entry))

@@ -41,17 +41,12 @@ impl Area {
 
     /// The same with cells of `cells` by `cells`, compared up to about as many metres away.
     pub(crate) fn with_cells_of(self, cells: i64) -> Self {
-        let (cell_m, radius) = (
-            self.cell_m * cells as f64,
-            // Rounded up: larger cells do not shorten the range.
-            (self.radius + cells - 1) / cells,
-        );
-        let size = self.size.map(|count| count / cells);
         Self {
-            size,
-            cell_m,
+            size: self.size.map(|count| count / cells),
+            cell_m: self.cell_m * cells as f64,
             cells: self.cells * cells,
-            radius,
+            // Rounded up: larger cells do not shorten the range.
+            radius: (self.radius + cells - 1) / cells,
             ..self
         }
     }
@@ -104,12 +99,8 @@ pub(crate) fn own_sampling_grid(
 ) -> Result<Tensor, TchError> {
     let moved = planar_poses(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
     // p_cav = R^T (p_ego - v - d).
-    places(
-        &moved,
-        &moved.f_narrow(1, 0, 2)?.f_zeros_like()?,
-        [area, own],
-        area.size,
-    )
+    let origin = moved.f_narrow(1, 0, 2)?.f_zeros_like()?;
+    places(&moved, &origin, [area, own], area.size)
 }
 
 /// `[N, 3]`: x and y, metres, and yaw, radians.
@@ -148,10 +139,8 @@ fn places(
 /// A sender's pose corrected by a `delta`, see [`sampling_grid`].
 pub(crate) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
     let [x, y, z] = ego_from_cav.translation_m;
-    Pose::from_xyz_yaw(
-        [x + delta[0], y + delta[1], z],
-        ego_from_cav.yaw_rad() + delta[2],
-    )
+    let yaw_rad = ego_from_cav.yaw_rad() + delta[2];
+    Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], yaw_rad)
 }
 
 /// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `sampling_grid`. Cells beyond their edges are
@@ -165,10 +154,8 @@ pub(crate) fn resample(
     let valid = valid
         .f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?
         .f_to_kind(Kind::Float)?;
-    Ok((
-        maps.f_grid_sampler(sampling_grid, BILINEAR, PADDING_ZEROS, false)?,
-        valid,
-    ))
+    let maps = maps.f_grid_sampler(sampling_grid, BILINEAR, PADDING_ZEROS, false)?;
+    Ok((maps, valid))
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::cell::OnceCell;
 use multiversion::multiversion;
 use tch::{Kind, Result, Tensor};
 
-use crate::f64_tensor::{are_numbers, numbers, sum_over_first};
+use crate::f64_tensor::{are_numbers, numbers, offsets_around, sum_over_first};
 use crate::vector_loops::{LANES, add_products};
 
 /// Parts of the grid along each edge: enough to distinguish a rotation from a shift.
@@ -29,15 +29,9 @@ pub(crate) struct Correlation {
 /// The shifts in the order of [`Correlation`], `[K, 2]`: cells along x and y from a cell of a neighbour's map to the
 /// cell of the ego's that it is compared with.
 pub(crate) fn shifts(radius: i64) -> Result<Tensor> {
-    let steps = -radius..=radius;
-    let all: Vec<f32> = (steps.clone())
-        .flat_map(|row| {
-            steps
-                .clone()
-                .flat_map(move |column| [column as f32, row as f32])
-        })
-        .collect();
-    Tensor::f_from_slice(&all)?.f_view([-1, 2])
+    Tensor::f_from_slice(&offsets_around(radius))?
+        .f_view([-1, 2])?
+        .f_to_kind(Kind::Float)
 }
 
 /// The ego's map, prepared for comparisons at every shift, part by part.
@@ -61,15 +55,11 @@ impl Shifted {
     pub(crate) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self> {
         let ego = ego.f_detach()?;
         let around = ego.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
-        let numbers = if are_numbers(&around) {
-            Some(numbers(&around)?)
-        } else {
-            None
-        };
+        let numbers = are_numbers(&around).then(|| numbers(&around));
         let squares = sum_by_part(&ego.f_square()?, parts)?.f_squeeze_dim(1)?;
         Ok(Self {
+            numbers: numbers.transpose()?,
             around,
-            numbers,
             maps: OnceCell::new(),
             squares,
             radius,

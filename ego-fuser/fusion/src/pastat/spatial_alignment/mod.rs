@@ -21,7 +21,7 @@ use super::confidence_embedding::Confidences;
 use super::config::PastatConfig;
 use super::extensions::alignment_search::displacements;
 use super::extensions::pooled_history::pooled;
-use super::patches::PatchTokens;
+use super::patches::Tokens;
 use crate::f64_tensor::picked;
 use crate::full_resolution::FullResolutionMap;
 
@@ -44,16 +44,6 @@ pub(super) struct FineMaps {
     pub(super) corrections: Option<Tensor>,
 }
 
-/// Tokens of all entries after the alignment.
-pub(super) struct AlignedTokens {
-    /// `[N, D, h, w]`.
-    pub(super) values: Tensor,
-    /// `[N, h, w]`.
-    pub(super) valid: Tensor,
-    /// `[N, D]`: quality of each map's match; absent: not known.
-    pub(super) fit: Option<Tensor>,
-}
-
 impl SpatialAlignment {
     /// Its variables are `fsa.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
@@ -65,48 +55,37 @@ impl SpatialAlignment {
         }
     }
 
-    /// Moves all entries but the ego's newest to their best match with that; `is_training`: by the network only.
+    /// Moves all entries but the ego's newest to their best match with that; `is_training`: by the network only. Also
+    /// the quality of each map's match, `[N, D]`; absent: not known.
     pub(super) fn align(
         &self,
         coarse: &CoarseMaps,
-        tokens: PatchTokens,
+        tokens: Tokens,
         confidences: &Confidences,
         grid: &BevGrid,
         is_training: bool,
-    ) -> Result<(FineMaps, AlignedTokens), TchError> {
+    ) -> Result<(FineMaps, Tokens, Option<Tensor>), TchError> {
         let (own, count) = (coarse.newest.features.f_get(0)?, coarse.newest.count()?);
-        let PatchTokens { values, valid } = tokens;
         let Some(network) = self.network.as_ref().filter(|_| coarse.origins.count() > 1) else {
-            let neighbours = NeighbourMaps::still(coarse.newest.only(1, count)?);
-            return Ok((
-                FineMaps {
-                    own,
-                    neighbours,
-                    corrections: None,
-                },
-                AlignedTokens {
-                    values,
-                    valid,
-                    fit: None,
-                },
-            ));
+            let fine = FineMaps {
+                own,
+                neighbours: NeighbourMaps::still(coarse.newest.only(1, count)?),
+                corrections: None,
+            };
+            return Ok((fine, tokens, None));
         };
         let (_, height, width) = own.size3()?;
         let area = Area::new(grid, [height, width], network.radius());
         let Displacements { deltas, fit, .. } =
             self.compare(network, coarse, &confidences.of_maps, &area, is_training)?;
-        let (values, valid) = moved_tokens(&values, &valid, &deltas, &coarse.origins, &area)?;
-        let neighbours = moved_maps(coarse, &deltas, &area, grid)?;
+        let tokens = moved_tokens(&tokens, &deltas, &coarse.origins, &area)?;
+        let fine = FineMaps {
+            own,
+            neighbours: moved_maps(coarse, &deltas, &area, grid)?,
+            corrections: Some(deltas),
+        };
         // The ego's newest, which matches itself, gets nothing.
-        let fit = Some(fit.f_constant_pad_nd([0, 0, 1, 0])?);
-        Ok((
-            FineMaps {
-                own,
-                neighbours,
-                corrections: Some(deltas),
-            },
-            AlignedTokens { values, valid, fit },
-        ))
+        Ok((fine, tokens, Some(fit.f_constant_pad_nd([0, 0, 1, 0])?)))
     }
 
     /// Displacements of all entries from the ego's newest.
@@ -147,13 +126,8 @@ impl SpatialAlignment {
                 .first()
                 .map(|newest| of_newest(&newest.deltas, &origins.agent, agents as usize))
                 .transpose()?;
-            found.push(displacements(
-                network,
-                &pairs,
-                &area,
-                known.as_ref(),
-                is_training,
-            )?);
+            let known = known.as_ref();
+            found.push(displacements(network, &pairs, &area, known, is_training)?);
         }
         Displacements::all(&found)
     }
@@ -170,14 +144,13 @@ fn of_newest(deltas: &Tensor, agent: &[usize], newest: usize) -> Result<Tensor, 
     picked(&with_ego, &entries.collect::<Vec<_>>())
 }
 
-/// Tokens `[N, D, h, w]` and their validity `[N, h, w]`, all but the first entry's moved by `deltas` `[N - 1, 3]`.
+/// Tokens, all but the first entry's moved by `deltas` `[N - 1, 3]`.
 fn moved_tokens(
-    values: &Tensor,
-    valid: &Tensor,
+    Tokens { values, valid }: &Tokens,
     deltas: &Tensor,
     origins: &Origins,
     area: &Area,
-) -> Result<(Tensor, Tensor), TchError> {
+) -> Result<Tokens, TchError> {
     let (entries, _, rows, columns) = values.size4()?;
     let places = sampling_grid(deltas, &origins.ego_from_cav[1..], area, [rows, columns])?;
     let (after, after_valid) = resample(
@@ -186,10 +159,10 @@ fn moved_tokens(
         &places,
     )?;
     let after_valid = after_valid.f_squeeze_dim(1)?;
-    Ok((
-        Tensor::f_cat(&[values.f_narrow(0, 0, 1)?, after], 0)?,
-        Tensor::f_cat(&[valid.f_narrow(0, 0, 1)?, after_valid], 0)?,
-    ))
+    Ok(Tokens {
+        values: Tensor::f_cat(&[values.f_narrow(0, 0, 1)?, after], 0)?,
+        valid: Tensor::f_cat(&[valid.f_narrow(0, 0, 1)?, after_valid], 0)?,
+    })
 }
 
 /// The newest maps of neighbours, resampled from the maps as received by the poses that `deltas` correct.
@@ -204,22 +177,10 @@ fn moved_maps(
         return Ok(NeighbourMaps::still(coarse.newest.only(1, 1)?));
     }
     // Maps as received are not padded, unlike the grid onto which they are sampled.
-    let own = Area::new(
-        grid,
-        [i64::from(grid.height), i64::from(grid.width)],
-        area.radius,
-    );
-    let (deltas, poses) = (
-        deltas.f_narrow(0, 0, count)?,
-        &coarse.origins.ego_from_cav[1..=count as usize],
-    );
-    let places = own_sampling_grid(&deltas, poses, [area, &own])?;
-    let cells = coarse
-        .received_cells
-        .iter()
-        .skip(1)
-        .map(FullResolutionMap::shallow_clone)
-        .collect();
+    let own = Area::new(grid, [grid.height, grid.width].map(i64::from), area.radius);
+    let poses = &coarse.origins.ego_from_cav[1..=count as usize];
+    let places = own_sampling_grid(&deltas.f_narrow(0, 0, count)?, poses, [area, &own])?;
+    let cells = FullResolutionMap::shallow_clones(coarse.received_cells.iter().skip(1));
     NeighbourMaps::at(coarse.received.only(1, count + 1)?, cells, places)
 }
 

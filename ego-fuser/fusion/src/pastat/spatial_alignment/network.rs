@@ -42,17 +42,12 @@ impl AlignmentNetwork {
     /// Before training it moves nothing and adds nothing to tokens of `dim` channels.
     pub(crate) fn new(path: &nn::Path<'_>, [channels, dim]: [i64; 2], config: &FsaConfig) -> Self {
         let (matching, hidden) = (config.matching, config.hidden);
+        let by_cell = nn::ConvConfig::default();
         // For each part the shift along x and y and its quality; the same for the whole; the motion; the confidences.
         let inputs = 3 * (PARTS * PARTS + 1) + 3 + CONFIDENCES;
         Self {
             matching: [
-                nn::conv2d(
-                    path / "matching0",
-                    channels,
-                    matching,
-                    1,
-                    nn::ConvConfig::default(),
-                ),
+                nn::conv2d(path / "matching0", channels, matching, 1, by_cell),
                 nn::conv2d(path / "matching1", matching, matching, 3, around()),
             ],
             sharpness: path.var("sharpness", &[], Init::Const(SHARPNESS.ln())),
@@ -196,34 +191,22 @@ fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) 
         .middles_of_parts()?
         .f_to_device(parts.device())?
         .f_unsqueeze(1)?;
-    let (mean, middle) = (
-        sum_over_first(&(parts * &share))?,
-        sum_over_first(&(&middles * &share))?,
-    );
-    let (shift, arm) = (
-        parts - mean.f_unsqueeze(0)?,
-        &middles - middle.f_unsqueeze(0)?,
-    );
+    let mean = sum_over_first(&(parts * &share))?;
+    let middle = sum_over_first(&(&middles * &share))?;
+    let shift = parts - mean.f_unsqueeze(0)?;
+    let arm = &middles - middle.f_unsqueeze(0)?;
     // Least squares for a small angle: the sum of arm x shift over the sum of |arm|^2.
     let turning = arm.f_narrow(2, 0, 1)? * shift.f_narrow(2, 1, 1)?
         - arm.f_narrow(2, 1, 1)? * shift.f_narrow(2, 0, 1)?;
-    let inertia = sum_over_first(
-        &(arm
-            .f_square()?
-            .f_sum_dim_intlist([2_i64].as_slice(), true, None)?
-            * &share),
-    )?;
+    let squared = arm.f_square()?;
+    let squared = squared.f_sum_dim_intlist([2_i64].as_slice(), true, None)?;
+    let inertia = sum_over_first(&(squared * &share))?;
     // A single part does not determine a rotation: a few metres of lever arm prevent division by zero.
     let turn = sum_over_first(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
     let to_sender = senders - middle;
     // The weighted centre of the observed parts moves by `mean`; a rotation moves the sender relative to it.
-    let across = Tensor::f_cat(
-        &[
-            -(to_sender.f_narrow(1, 1, 1)?),
-            to_sender.f_narrow(1, 0, 1)?,
-        ],
-        1,
-    )?;
+    let [x, y] = [0, 1].map(|axis| to_sender.f_narrow(1, axis, 1));
+    let across = Tensor::f_cat(&[-y?, x?], 1)?;
     Tensor::f_cat(&[mean + across * &turn, turn], 1)
 }
 

@@ -28,16 +28,14 @@ pub(crate) struct Pairs {
 impl Pairs {
     /// Some of the others.
     pub(crate) fn only(&self, rows: &[i64]) -> Result<Self, TchError> {
+        let poses = rows.iter().map(|&row| self.ego_from_cav[row as usize]);
         Ok(Self {
             ego: self.ego.shallow_clone(),
             own: Rc::clone(&self.own),
             shown: picked(&self.shown, rows)?,
             mask: picked(&self.mask, rows)?,
             confidences: picked(&self.confidences, rows)?,
-            ego_from_cav: rows
-                .iter()
-                .map(|&row| self.ego_from_cav[row as usize])
-                .collect(),
+            ego_from_cav: poses.collect(),
         })
     }
 }

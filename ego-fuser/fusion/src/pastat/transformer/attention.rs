@@ -26,16 +26,13 @@ pub(super) struct AgentAttention {
 
 impl AgentAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64) -> Self {
+        let identity = Tensor::eye(heads, (Kind::Float, path.device()));
         Self {
             query: nn::linear(path / "query", dim, dim, BARE),
             key: nn::linear(path / "key", dim, dim, BARE),
             value: nn::linear(path / "value", dim, dim, BARE),
             out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
-            members: Tensor::eye(heads, (Kind::Float, path.device())).repeat_interleave_self_int(
-                dim / heads,
-                0,
-                None,
-            ),
+            members: identity.repeat_interleave_self_int(dim / heads, 0, None),
             heads,
         }
     }
@@ -84,10 +81,8 @@ impl AgentAttention {
         let [key, value] =
             [&self.key, &self.value].map(|linear| linear.ws.f_view([self.heads, each, dim]));
         let (one, none) = (Tensor::from(1f32), Tensor::from(0f32));
-        let (gain, shift) = (
-            norm.ws.as_ref().unwrap_or(&one),
-            norm.bs.as_ref().unwrap_or(&none),
-        );
+        let gain = norm.ws.as_ref().unwrap_or(&one);
+        let shift = norm.bs.as_ref().unwrap_or(&none);
         // Query of each head led back through the weights of the key and the gain of the norm.
         let asked = (key? * gain).f_transpose(1, 2)?.f_matmul(&query)?;
         let gathered = others.gather(&numbers(&asked)?, &numbers(&ego?)?);
@@ -96,12 +91,8 @@ impl AgentAttention {
         // The weights of a head add up to 1, so the shift of the norm passes through the values once.
         let mixed = (&values * gain).f_matmul(&gathered)?
             + values.f_matmul(&shift.f_expand([dim], false)?.f_unsqueeze(1)?)?;
-        Ok(self.out.forward(
-            &mixed
-                .f_view([dim, cells])?
-                .f_transpose(0, 1)?
-                .f_reshape([1, height, width, dim])?,
-        ))
+        let mixed = mixed.f_view([dim, cells])?.f_transpose(0, 1)?;
+        Ok(self.out.forward(&mixed.f_reshape([1, height, width, dim])?))
     }
 }
 

@@ -54,9 +54,8 @@ impl Block {
     fn across(&self, kept: &Tensor, valid: &Tensor) -> Result<Tensor> {
         let [_, norm_windows, norm_mlp] = &self.norms;
         let kept = self.windows.forward(&norm_windows.forward(kept), valid)? + kept;
-        let inner = self.mlp[0]
-            .forward(&norm_mlp.forward(&kept))
-            .f_gelu("none")?;
+        let inner = self.mlp[0].forward(&norm_mlp.forward(&kept));
+        let inner = inner.f_gelu("none")?;
         Ok(self.mlp[1].forward(&inner) + kept)
     }
 }

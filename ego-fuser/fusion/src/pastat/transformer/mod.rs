@@ -13,8 +13,7 @@ use tch::{Device, TchError, Tensor, nn};
 use self::block::Block;
 use super::config::PastatConfig;
 use super::extensions::ego_queries::Others;
-use super::patches::channels_last;
-use super::temporal_encoding::Tokens;
+use super::patches::{Tokens, channels_last};
 
 /// The blocks of the transformer.
 #[derive(Debug)]

@@ -71,10 +71,8 @@ impl ComputeTimes {
     /// In simulation time every sweep is processed: a process that is slower than the scene is rejected.
     pub(super) fn check(&self, scenario: &Scenario) -> Result<(), EvaluateError> {
         // Time that goes backwards gives a period of 0 rather than an overflow.
-        let steps = scenario
-            .ticks
-            .windows(2)
-            .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        let steps = scenario.ticks.windows(2);
+        let steps = steps.map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
         let Some(period_nanos) = steps.min() else {
             return Ok(());
         };

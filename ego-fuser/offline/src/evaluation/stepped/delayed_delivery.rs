@@ -51,8 +51,10 @@ pub(super) struct DelayedDelivery {
     /// Messages that were handed over and neither arrived nor were lost yet.
     kept: BTreeMap<u64, Kept>,
     next_id: u64,
-    ledger: Ledger,
-    sent_bytes: u64,
+    /// The message accounting.
+    pub(super) ledger: Ledger,
+    /// Bytes of all that was sent so far, poses included.
+    pub(super) sent_bytes: u64,
 }
 
 impl DelayedDelivery {
@@ -127,15 +129,12 @@ impl DelayedDelivery {
         packet.id = self.next_id;
         packet.submitted_nanos = packet.submitted_nanos.saturating_sub(self.began_nanos);
         self.next_id += 1;
-        let topic = topic(&packet.from, packet.stream);
-        self.kept.insert(
-            packet.id,
-            Kept {
-                topic,
-                adapted,
-                envelope,
-            },
-        );
+        let kept = Kept {
+            topic: Topic::stream(&packet.from, packet.stream),
+            adapted,
+            envelope,
+        };
+        self.kept.insert(packet.id, kept);
         // By time, then by number: messages of one time keep their order.
         self.pending
             .insert((packet.submitted_nanos, packet.id), packet);
@@ -144,13 +143,11 @@ impl DelayedDelivery {
     /// Arrivals by `nanos`, in order of time. All messages that are sent until then have been handed over.
     pub(super) fn until(&mut self, nanos: u64) -> Vec<Envelope> {
         let nanos = nanos.saturating_sub(self.began_nanos);
-        while let Some(entry) = self
-            .pending
-            .first_entry()
-            .filter(|entry| entry.key().0 <= nanos)
+        while let Some(entry) = self.pending.first_entry()
+            && entry.key().0 <= nanos
         {
             let packet = entry.remove();
-            let account = Account::published(topic(&packet.from, packet.stream));
+            let account = Account::published(Topic::stream(&packet.from, packet.stream));
             self.ledger.sent(&account);
             if let Some(reason) = self.kept.get(&packet.id).and_then(|kept| kept.adapted) {
                 self.ledger.adapted(&account, reason);
@@ -158,16 +155,16 @@ impl DelayedDelivery {
             self.sent_bytes += packet.bytes;
             self.link.submit(packet);
         }
-        self.link
-            .advance(nanos)
-            .into_iter()
+        let outcomes = self.link.advance(nanos).into_iter();
+        outcomes
             .filter_map(|outcome| self.settle(outcome))
             .collect()
     }
 
     fn settle(&mut self, outcome: Outcome) -> Option<Envelope> {
         let packet = outcome.packet;
-        let account = Account::towards(topic(&packet.from, packet.stream), &self.receiver);
+        let topic = Topic::stream(&packet.from, packet.stream);
+        let account = Account::towards(topic, &self.receiver);
         let envelope = match outcome.delivery {
             Delivery::Dropped(reason) => {
                 self.kept.remove(&packet.id);
@@ -179,9 +176,8 @@ impl DelayedDelivery {
             } => {
                 // The copy counts as one more message.
                 self.ledger.sent(&account);
-                self.kept
-                    .get(&packet.id)
-                    .and_then(|kept| kept.envelope.clone())
+                let kept = self.kept.get(&packet.id);
+                kept.and_then(|kept| kept.envelope.clone())
             }
             Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.envelope),
         };
@@ -199,7 +195,7 @@ impl DelayedDelivery {
     /// The ego has used a message. That of its own agent takes no link.
     pub(super) fn received(&mut self, (cav, stream): &Source) {
         if *cav != self.ego {
-            let account = Account::towards(topic(cav, *stream), &self.receiver);
+            let account = Account::towards(Topic::stream(cav, *stream), &self.receiver);
             self.ledger.received(&account);
         }
     }
@@ -207,7 +203,7 @@ impl DelayedDelivery {
     /// The ego has not used a message. That of its own agent takes no link.
     pub(super) fn dropped(&mut self, (cav, stream): &Source, reason: DropReason) {
         if *cav != self.ego {
-            let account = Account::towards(topic(cav, *stream), &self.receiver);
+            let account = Account::towards(Topic::stream(cav, *stream), &self.receiver);
             self.ledger.dropped(&account, reason);
         }
     }
@@ -217,29 +213,11 @@ impl DelayedDelivery {
     pub(super) fn close(&mut self, (cav, stream): &Source, waiting: u64) {
         // Handed over ahead but not submitted by the end: these count as not sent.
         let not_sent: BTreeSet<u64> = self.pending.values().map(|packet| packet.id).collect();
-        let topic = topic(cav, *stream);
-        let is_under_way =
-            |(id, kept): &(&u64, &Kept)| kept.topic == topic && !not_sent.contains(id);
-        let under_way = self.kept.iter().filter(is_under_way).count() as u64;
+        let topic = Topic::stream(cav, *stream);
+        let of_stream = self.kept.iter().filter(|(_, kept)| kept.topic == topic);
+        let under_way = of_stream.filter(|(id, _)| !not_sent.contains(*id)).count() as u64;
         let account = Account::towards(topic, &self.receiver);
         self.ledger.set_in_flight(&account, under_way + waiting);
-    }
-
-    /// Bytes of all that was sent so far, poses included.
-    pub(super) fn sent_bytes(&self) -> u64 {
-        self.sent_bytes
-    }
-
-    /// The message accounting.
-    pub(super) fn ledger(&self) -> &Ledger {
-        &self.ledger
-    }
-}
-
-fn topic(cav: &CavId, stream: Stream) -> Topic {
-    Topic::Stream {
-        cav: cav.clone(),
-        stream,
     }
 }
 
@@ -277,10 +255,10 @@ mod tests {
             failure: None,
         };
         delivery.enqueue(0, sent, &ComputeTimes::default(), 1.0);
-        let account = Account::published(topic(&cav, Stream::Boxes));
-        assert_eq!(delivery.ledger().get(&account), None);
+        let account = Account::published(Topic::stream(&cav, Stream::Boxes));
+        assert_eq!(delivery.ledger.get(&account), None);
         delivery.until(1);
-        let counts = delivery.ledger().get(&account).unwrap();
+        let counts = delivery.ledger.get(&account).unwrap();
         assert_eq!((counts.sent, counts.adapted[&RateReason::Fits]), (1, 1));
     }
 }

@@ -96,21 +96,16 @@ impl RemotePool {
         let here = bus.identity().process.clone();
         for (cav, streams) in vehicles {
             let options = PublisherOptions::SENSOR.lossless(1);
-            sensors.insert(
-                cav.clone(),
-                Sensors {
-                    gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), options)?,
-                    imu: bus.publisher(Topic::stream(cav, Stream::Imu), options)?,
-                    lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), options)?,
-                },
-            );
+            let publishers = Sensors {
+                gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), options)?,
+                imu: bus.publisher(Topic::stream(cav, Stream::Imu), options)?,
+                lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), options)?,
+            };
+            sensors.insert(cav.clone(), publishers);
             let there = process_id(Role::Agent, cav);
-            routes.extend(
-                [Stream::Gnss, Stream::Imu, Stream::Lidar].map(|stream| Route {
-                    topic: Topic::stream(cav, stream),
-                    receiver: there.clone(),
-                }),
-            );
+            for stream in [Stream::Gnss, Stream::Imu, Stream::Lidar] {
+                routes.push(Route::new(Topic::stream(cav, stream), there.clone()));
+            }
             for stream in [Stream::Pose].into_iter().chain(streams.iter().copied()) {
                 let (topic, receiver) = (Topic::stream(cav, stream), here.clone());
                 subscriptions.push(bus.subscribe(topic.clone(), &inbox)?);
@@ -152,18 +147,12 @@ impl RemotePool {
                 gnss.submit(frame.capture_nanos, measured);
             }
             imu.submit(frame.capture_nanos, frame.motion());
-            lidar.submit(
-                frame.capture_nanos,
-                Lidar {
-                    points: frame.points.clone(),
-                },
-            );
+            let points = frame.points.clone();
+            lidar.submit(frame.capture_nanos, Lidar { points });
         }
         let deadline = Instant::now() + TIMEOUT;
-        let mut answers: BTreeMap<&CavId, Answer> = frames
-            .iter()
-            .map(|frame| (&frame.cav, Answer::default()))
-            .collect();
+        let answers = frames.iter().map(|frame| (&frame.cav, Answer::default()));
+        let mut answers: BTreeMap<&CavId, Answer> = answers.collect();
         while answers.iter().any(|(cav, answer)| self.awaits(cav, answer)) {
             match self.inbox.take(Some(deadline)) {
                 Pop::Item(topic, Event::Message(arrival)) => {
@@ -187,13 +176,10 @@ impl RemotePool {
                 }
                 Pop::Item(..) => {}
                 Pop::TimedOut | Pop::Closed => {
-                    let silent = answers
-                        .iter()
-                        .filter(|(cav, answer)| self.awaits(cav, answer))
-                        .map(|(cav, _)| cav.to_string());
-                    let cavs = silent.collect::<Vec<_>>().join(", ");
+                    answers.retain(|cav, answer| self.awaits(cav, answer));
+                    let silent: Vec<String> = answers.keys().map(ToString::to_string).collect();
                     return Err(RemoteError::Silent {
-                        cavs,
+                        cavs: silent.join(", "),
                         capture_nanos: frames.first().map_or(0, |f| f.capture_nanos),
                     });
                 }

@@ -10,27 +10,21 @@ impl Entries<'_> {
     /// `POINTS`, or `WIDTH` times `HEIGHT`: the values present must be consistent, and one of `POINTS` and `WIDTH` is
     /// required.
     pub(super) fn points(&self) -> Result<usize, PcdError> {
-        let (width, height, points) = (
-            self.count("WIDTH")?,
-            self.count("HEIGHT")?,
-            self.count("POINTS")?,
-        );
-        let (key, line, count) = match (width, points) {
-            (Some((_, width)), Some((line, points))) => {
-                check_product(width, height.map(|(_, height)| height), line, points)?;
+        let width = self.count("WIDTH")?;
+        let height = self.count("HEIGHT")?.map(|(_, height)| height);
+        let (key, line, count) = match (width, self.count("POINTS")?) {
+            (width, Some((line, points))) => {
+                if let Some((_, width)) = width {
+                    check_product(width, height, line, points)?;
+                }
                 ("POINTS", line, points)
             }
-            (None, Some((line, points))) => ("POINTS", line, points),
-            (Some((line, width)), None) => (
-                "WIDTH",
-                line,
-                width.saturating_mul(height.map_or(1, |(_, height)| height)),
-            ),
+            (Some((line, width)), None) => {
+                ("WIDTH", line, width.saturating_mul(height.unwrap_or(1)))
+            }
             (None, None) => {
-                return Err(PcdError::of(
-                    "POINTS",
-                    "missing in the header, and WIDTH too",
-                ));
+                let reason = "missing in the header, and WIDTH too";
+                return Err(PcdError::of("POINTS", reason));
             }
         };
         if count > MAX_POINTS {
@@ -42,14 +36,13 @@ impl Entries<'_> {
     }
 
     fn count(&self, key: &str) -> Result<Option<(u64, u64)>, PcdError> {
-        if !self.has(key) {
+        let Some(entry) = self.find(key) else {
             return Ok(None);
-        }
-        let (line, value) = self.single(key)?;
-        let number = value
-            .parse()
-            .map_err(|_| PcdError::at(line, key, format!("{value:?} is no count")))?;
-        Ok(Some((line, number)))
+        };
+        let value = entry.single()?;
+        let number = value.parse();
+        let number = number.map_err(|_| entry.error(format!("{value:?} is no count")))?;
+        Ok(Some((entry.line, number)))
     }
 }
 

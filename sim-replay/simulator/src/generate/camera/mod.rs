@@ -48,15 +48,13 @@ impl FromStr for ImageSize {
 
     /// Reads `WIDTHxHEIGHT`.
     fn from_str(text: &str) -> Result<Self, String> {
-        let edges = text
-            .split_once('x')
-            .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
-        let (width_px, height_px) =
-            edges.ok_or_else(|| format!("{text:?} is not WIDTHxHEIGHT, for example 480x300"))?;
-        Ok(Self {
-            width_px,
-            height_px,
-        })
+        let edges = text.split_once('x').and_then(|(width, height)| {
+            Some(Self {
+                width_px: width.parse().ok()?,
+                height_px: height.parse().ok()?,
+            })
+        });
+        edges.ok_or_else(|| format!("{text:?} is not WIDTHxHEIGHT, for example 480x300"))
     }
 }
 

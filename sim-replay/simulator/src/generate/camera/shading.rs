@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::Surroundings;
 use super::ground_paint::GroundPaint;
 use super::paint::{Colour, Paint, SNOW, mix};
-use crate::generate::raycast::{Caster, GROUND, MISS, RangeImage, SkewedColumn, Sweep};
+use crate::generate::raycast::{Caster, ColumnPose, GROUND, MISS, RangeImage, Sweep};
 use crate::generate::weather::Weather;
 use support::random::SplitMix64;
 
@@ -27,7 +27,7 @@ const FLAKES: f64 = 0.01;
 pub(super) struct Shader<'a> {
     image: &'a RangeImage,
     channels: usize,
-    columns: Vec<SkewedColumn>,
+    columns: Vec<ColumnPose>,
     elevations: Vec<(f32, f32)>,
     world_from_sensor: Matrix3<f32>,
     origin_m: Vector3<f64>,
@@ -88,15 +88,10 @@ impl<'a> Shader<'a> {
             GROUND => ground.colour(&place, self.weather),
             body => self.paint(body as usize, place.z as f32),
         };
-        let facing = self
-            .normal(column, channel)
-            .dot(&Vector3::from(SUN).normalize())
-            .max(0.0);
-        let sun = if self.weather == Weather::Sunny {
-            1.0 - AMBIENT
-        } else {
-            0.3
-        };
+        let normal = self.normal(column, channel);
+        let facing = normal.dot(&Vector3::from(SUN).normalize()).max(0.0);
+        let is_sunny = self.weather == Weather::Sunny;
+        let sun = if is_sunny { 1.0 - AMBIENT } else { 0.3 };
         let lit = material
             .map(|part| part * (AMBIENT + (1.0 - AMBIENT - sun) * 0.5 + sun * facing * 1.3));
         mix(lit, sky, 1.0 - (-depth_m / self.haze_m()).exp())
@@ -166,11 +161,8 @@ impl<'a> Shader<'a> {
         };
         let normal = across.cross(&up);
         // The cross product may point either way. The visible side faces the sensor.
-        let towards_sensor = if normal.dot(&here) > 0.0 {
-            -normal
-        } else {
-            normal
-        };
+        let faces_away = normal.dot(&here) > 0.0;
+        let towards_sensor = if faces_away { -normal } else { normal };
         let length = towards_sensor.norm();
         if length > 0.0 {
             self.world_from_sensor * towards_sensor / length

@@ -19,35 +19,6 @@ pub(super) struct AgentFolders {
     mark: Unfinished,
 }
 
-impl AgentFolders {
-    /// Creates the folders, removing old ones.
-    fn make(root: &Path, scene: &SceneHeader) -> Result<Self, SynthError> {
-        let folder = scene_path(root, &scene.name);
-        make_fresh_folder(&folder)?;
-        let mark = Unfinished::mark(&folder)?;
-        write_file(&folder.join(FILE_NAME), &scene.origin)?;
-        let names = agent_folders(scene);
-        let agents: Vec<PathBuf> = names.iter().map(|name| folder.join(name)).collect();
-        agents.iter().try_for_each(|folder| make_folder(folder))?;
-        let ticks = scene
-            .capture_nanos
-            .iter()
-            .map(|nanos| nanos / scene.tick_nanos);
-        let is_roadside = scene.agents.iter().map(|agent| agent.is_roadside).collect();
-        Ok(Self {
-            agents,
-            is_roadside,
-            ticks: ticks.collect(),
-            mark,
-        })
-    }
-
-    /// Finishes the folders: all files are written.
-    fn close(self) -> Result<(), SynthError> {
-        self.mark.clear()
-    }
-}
-
 /// Writes the files of one frame of one agent.
 type WriteFrame = fn(&FrameFiles<'_>, &AgentFrame) -> Result<(), SynthError>;
 
@@ -95,8 +66,22 @@ impl AgentFolderWriter {
 }
 
 impl SceneWriter for AgentFolderWriter {
+    /// Creates the folders, removing old ones.
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        self.folders = Some(AgentFolders::make(&self.root, scene)?);
+        let folder = scene_path(&self.root, &scene.name);
+        make_fresh_folder(&folder)?;
+        let mark = Unfinished::mark(&folder)?;
+        write_file(&folder.join(FILE_NAME), &scene.origin)?;
+        let names = agent_folders(scene);
+        let agents: Vec<PathBuf> = names.iter().map(|name| folder.join(name)).collect();
+        agents.iter().try_for_each(|folder| make_folder(folder))?;
+        let nanos = scene.capture_nanos.iter();
+        self.folders = Some(AgentFolders {
+            agents,
+            is_roadside: scene.agents.iter().map(|agent| agent.is_roadside).collect(),
+            ticks: nanos.map(|nanos| nanos / scene.tick_nanos).collect(),
+            mark,
+        });
         Ok(())
     }
 
@@ -115,6 +100,7 @@ impl SceneWriter for AgentFolderWriter {
     }
 
     fn end(&mut self) -> Result<(), SynthError> {
-        self.folders.take().map_or(Ok(()), AgentFolders::close)
+        let folders = self.folders.take();
+        folders.map_or(Ok(()), |folders| folders.mark.clear())
     }
 }

@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 use super::boxes::{upright_in, with_byte_intensities};
 use super::dair_json::{cooperative_type, side_type, transform, upright_label, world_label};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
-use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, locked};
+use super::{AgentFrame, DAY_MICROS, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::generate::error::SynthError;
 use dataset::frame::Object;
 use dataset::ground_truth::upright_box;
@@ -23,12 +23,12 @@ use dataset::pcd::{self, Encoding, IntensityField};
 
 /// First number of the unit's frames; also the upper limit of the number of vehicle frames.
 const FIRST_UNIT_FRAME: usize = 500_000;
-/// Time stamps of a scene start here, microseconds, with a day between two scenes.
+/// Time stamps of the first scene start here, microseconds.
 const EPOCH_MICROS: u64 = 1_626_155_000_000_000;
-const DAY_MICROS: u64 = 86_400_000_000;
 
-/// Variant of the layout.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Variant of the layout, which has its name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::IntoStaticStr)]
+#[strum(serialize_all = "lowercase")]
 pub(super) enum Edition {
     /// Pairs by paths, cooperative labels in the world.
     Dair,
@@ -41,16 +41,25 @@ pub(super) enum Edition {
 struct Side {
     folder: &'static str,
     labels: &'static str,
+    calibrations: &'static [&'static str],
+    /// First number of its frames.
+    first_number: usize,
 }
 
 const VEHICLE: Side = Side {
     folder: "vehicle-side",
     labels: "lidar",
+    calibrations: &["lidar_to_novatel", "novatel_to_world"],
+    first_number: 0,
 };
 const UNIT: Side = Side {
     folder: "infrastructure-side",
     labels: "virtuallidar",
+    calibrations: &["virtuallidar_to_world"],
+    first_number: FIRST_UNIT_FRAME,
 };
+/// Folder of what concerns both agents.
+const COOPERATIVE: &str = "cooperative";
 
 /// The writer.
 #[derive(Debug)]
@@ -61,27 +70,19 @@ pub(super) struct Dair {
     scenes: usize,
     /// Number of the next scene's first frame.
     next_frame: usize,
-    scene: Option<Batch>,
-    /// Rows of the three lists, by number of the vehicle's frame.
-    rows: Mutex<Vec<(usize, Rows)>>,
+    scene: Batch,
+    /// Rows of the lists of vehicle, unit and pairs, by number of the vehicle's frame.
+    rows: Mutex<Vec<(usize, [Value; 3])>>,
 }
 
 /// A scene.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Batch {
     number: usize,
     first_frame: usize,
     /// Index of the agent that is the roadside unit.
     unit: usize,
     capture_nanos: Vec<u64>,
-}
-
-/// Rows of the lists for one capture time.
-#[derive(Debug)]
-struct Rows {
-    vehicle: Value,
-    unit: Value,
-    pair: Value,
 }
 
 impl Dair {
@@ -91,42 +92,30 @@ impl Dair {
             edition,
             scenes: 0,
             next_frame: 0,
-            scene: None,
+            scene: Batch::default(),
             rows: Mutex::default(),
         }
     }
 
     fn make_folders(&self) -> Result<(), SynthError> {
-        for name in [VEHICLE.folder, UNIT.folder, "cooperative"] {
-            make_fresh_folder(&self.root.join(name))?;
+        for side in [VEHICLE, UNIT] {
+            let folder = self.root.join(side.folder);
+            make_fresh_folder(&folder)?;
+            make_folder(&folder.join("velodyne"))?;
+            for name in side.calibrations {
+                make_folder(&folder.join("calib").join(name))?;
+            }
+            make_folder(&folder.join("label").join(side.labels))?;
         }
-        let cooperative = format!("cooperative/{}", self.cooperative_labels());
-        let folders = [
-            "vehicle-side/velodyne",
-            "vehicle-side/calib/lidar_to_novatel",
-            "vehicle-side/calib/novatel_to_world",
-            "vehicle-side/label/lidar",
-            "infrastructure-side/velodyne",
-            "infrastructure-side/calib/virtuallidar_to_world",
-            "infrastructure-side/label/virtuallidar",
-            &cooperative,
-        ];
-        folders
-            .iter()
-            .try_for_each(|folder| make_folder(&self.root.join(folder)))
+        let cooperative = self.root.join(COOPERATIVE);
+        make_fresh_folder(&cooperative)?;
+        make_folder(&cooperative.join(self.cooperative_labels()))
     }
 
     fn cooperative_labels(&self) -> &'static str {
         match self.edition {
             Edition::Dair => "label_world",
             Edition::V2xSeq => "label",
-        }
-    }
-
-    fn layout(&self) -> &'static str {
-        match self.edition {
-            Edition::Dair => "dair",
-            Edition::V2xSeq => "v2xseq",
         }
     }
 
@@ -194,7 +183,7 @@ impl Dair {
 
 impl SceneWriter for Dair {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        let layout = self.layout();
+        let layout: &'static str = self.edition.into();
         if scene.agents.len() < 2 {
             let reason = format!(
                 "scene {} has one agent; a vehicle and a roadside unit are needed",
@@ -214,22 +203,19 @@ impl SceneWriter for Dair {
         write_origin(&self.root, scene)?;
         // A roadside unit if there is one, else the second agent.
         let unit = (1..scene.agents.len()).find(|&agent| scene.agents[agent].is_roadside);
-        self.scene = Some(Batch {
+        self.scene = Batch {
             number: self.scenes,
             first_frame: self.next_frame,
             unit: unit.unwrap_or(1),
             capture_nanos: scene.capture_nanos.clone(),
-        });
+        };
         self.scenes += 1;
         self.next_frame += frames;
         Ok(())
     }
 
     fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
-        let Some(batch) = &self.scene else {
-            return Ok(());
-        };
-        let frames = moment.frames.len();
+        let (batch, frames) = (&self.scene, moment.frames.len());
         let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(batch.unit)) else {
             omitted.add("frames of moments without vehicle or roadside unit", frames);
             return Ok(());
@@ -239,7 +225,7 @@ impl SceneWriter for Dair {
         omitted.add(what, frames - 2);
         let number = batch.first_frame + moment.index;
         let [id, unit_id] =
-            [number, FIRST_UNIT_FRAME + number].map(|number| format!("{number:06}"));
+            [VEHICLE, UNIT].map(|side| format!("{:06}", side.first_number + number));
         self.write_side(&VEHICLE, &id, vehicle, omitted)?;
         self.write_side(&UNIT, &unit_id, unit, omitted)?;
         self.write_vehicle_pose(&id, vehicle)?;
@@ -260,35 +246,25 @@ impl SceneWriter for Dair {
         Ok(())
     }
 
-    fn end(&mut self) -> Result<(), SynthError> {
-        self.scene = None;
-        Ok(())
-    }
-
     fn finish(&mut self) -> Result<(), SynthError> {
         let mut rows = std::mem::take(&mut *locked(&self.rows));
         // Moments are written by several threads, in any order.
         rows.sort_by_key(|(number, _)| *number);
-        let vehicles = list_of(&rows, |rows| &rows.vehicle);
-        self.write_json("vehicle-side/data_info.json", &vehicles)?;
-        let units = list_of(&rows, |rows| &rows.unit);
-        self.write_json("infrastructure-side/data_info.json", &units)?;
-        let pairs = list_of(&rows, |rows| &rows.pair);
-        self.write_json("cooperative/data_info.json", &pairs)
+        let folders = [VEHICLE.folder, UNIT.folder, COOPERATIVE];
+        folders.iter().enumerate().try_for_each(|(list, folder)| {
+            let rows = rows.iter().map(|(_, rows)| rows[list].clone());
+            self.write_json(&format!("{folder}/data_info.json"), &rows.collect())
+        })
     }
 }
 
-fn list_of(rows: &[(usize, Rows)], row: fn(&Rows) -> &Value) -> Value {
-    Value::Array(rows.iter().map(|(_, rows)| row(rows).clone()).collect())
-}
-
 impl Dair {
-    /// The rows of a capture time in the lists.
-    fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> Rows {
+    /// The rows of a capture time in the lists of vehicle, unit and pairs.
+    fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> [Value; 3] {
         let begin_micros = EPOCH_MICROS + batch.number as u64 * DAY_MICROS;
         let micros = begin_micros + batch.capture_nanos[moment.index] / 1000;
-        let vehicle = self.side_row(&VEHICLE, id, micros, batch, 0);
-        let unit = self.side_row(&UNIT, unit_id, micros, batch, FIRST_UNIT_FRAME);
+        let vehicle = self.side_row(&VEHICLE, id, micros, batch);
+        let unit = self.side_row(&UNIT, unit_id, micros, batch);
         let offset = json!({ "delta_x": 0.0, "delta_y": 0.0 });
         let pair = match self.edition {
             Edition::Dair => json!({
@@ -307,24 +283,13 @@ impl Dair {
                 "system_error_offset": offset,
             }),
         };
-        Rows {
-            vehicle,
-            unit,
-            pair,
-        }
+        [vehicle, unit, pair]
     }
 
-    /// The row of one side, whose frames have numbers from `first_number` on over all scenes.
-    fn side_row(
-        &self,
-        side: &Side,
-        id: &str,
-        micros: u64,
-        batch: &Batch,
-        first_number: usize,
-    ) -> Value {
+    /// The row of one side.
+    fn side_row(&self, side: &Side, id: &str, micros: u64, batch: &Batch) -> Value {
         let [first, last] = [0, batch.capture_nanos.len() - 1]
-            .map(|frame| format!("{:06}", first_number + batch.first_frame + frame));
+            .map(|frame| format!("{:06}", side.first_number + batch.first_frame + frame));
         let mut row = json!({
             "image_path": format!("image/{id}.jpg"),
             "image_timestamp": micros.to_string(),
@@ -333,11 +298,7 @@ impl Dair {
             "intersection_loc": "generated",
         });
         let labels = format!("label/{}/{id}.json", side.labels);
-        let calibrations: &[&str] = match side.folder {
-            "vehicle-side" => &["lidar_to_novatel", "novatel_to_world"],
-            _ => &["virtuallidar_to_world"],
-        };
-        for name in calibrations {
+        for name in side.calibrations {
             row[format!("calib_{name}_path")] = json!(format!("calib/{name}/{id}.json"));
         }
         match self.edition {

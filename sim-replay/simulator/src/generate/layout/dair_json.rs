@@ -17,9 +17,8 @@ pub(super) fn side_type(class: ObjectClass) -> Option<&'static str> {
 
 /// The type of an object as both sides together label it: vehicles alone.
 pub(super) fn cooperative_type(class: ObjectClass) -> Option<&'static str> {
-    ObjectClass::VEHICLES
-        .contains(&class)
-        .then(|| real_type(class))
+    let is_vehicle = ObjectClass::VEHICLES.contains(&class);
+    is_vehicle.then(|| real_type(class))
 }
 
 /// Rotation as 3 rows and translation as 3 rows of one number.

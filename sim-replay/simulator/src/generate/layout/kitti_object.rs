@@ -28,7 +28,7 @@ Tr_imu_to_velo: 1 0 0 0 0 1 0 0 0 0 1 0
 ";
 
 /// The writer.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct KittiObject {
     root: PathBuf,
     /// Number of the next scene's first frame; `None` before the first scene.
@@ -41,9 +41,7 @@ impl KittiObject {
     pub(super) fn new(root: &Path) -> Self {
         Self {
             root: root.to_owned(),
-            next_frame: None,
-            first_frame: 0,
-            moments: 0,
+            ..Self::default()
         }
     }
 

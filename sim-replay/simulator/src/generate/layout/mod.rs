@@ -42,6 +42,9 @@ pub(crate) use disk::{Unfinished, make_folder, remove_folder};
 use sequences::Sequences;
 pub(crate) use support::sync::lock as locked;
 
+/// Offset between the clocks of two scenes, microseconds: a day.
+const DAY_MICROS: u64 = 86_400_000_000;
+
 /// The layouts that scenes are written in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
@@ -122,7 +125,7 @@ pub(crate) trait SceneWriter: Send + Sync {
 }
 
 /// A scene before its first moment.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct SceneHeader {
     /// Its name; parts separated by `/` are folders.
     pub(crate) name: String,

@@ -10,12 +10,11 @@ use serde_json::{Map, Value};
 use super::boxes::{float_bytes, points_in, ring};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
 use super::nuscenes_tables::{AnnotationRecord, Sample, SceneTables, SweepRecord, Tables};
-use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, locked};
+use super::{AgentFrame, DAY_MICROS, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::generate::error::SynthError;
 
-/// Time stamps of a scene start here, microseconds, with a day between two scenes.
+/// Time stamps of the first scene start here, microseconds.
 const EPOCH_MICROS: u64 = 1_696_454_400_000_000;
-const DAY_MICROS: u64 = 86_400_000_000;
 /// The folder of the sweeps.
 const SWEEPS: &str = "sweeps";
 
@@ -40,13 +39,13 @@ pub(super) struct NuScenes {
     root: PathBuf,
     style: &'static Style,
     scenes: usize,
-    scene: Option<Current>,
+    scene: Current,
     samples: Mutex<Vec<Sample>>,
     tables: Tables,
 }
 
 /// The scene that is being written.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Current {
     number: usize,
     header: SceneHeader,
@@ -59,7 +58,7 @@ impl NuScenes {
             root: root.to_owned(),
             style,
             scenes: 0,
-            scene: None,
+            scene: Current::default(),
             samples: Mutex::default(),
             tables: Tables::default(),
         }
@@ -85,19 +84,17 @@ impl SceneWriter for NuScenes {
         channels
             .iter()
             .try_for_each(|channel| make_folder(&self.root.join(SWEEPS).join(channel)))?;
-        self.scene = Some(Current {
+        self.scene = Current {
             number: self.scenes,
             header: scene.clone(),
             channels,
-        });
+        };
         self.scenes += 1;
         Ok(())
     }
 
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let Some(scene) = &self.scene else {
-            return Ok(());
-        };
+        let scene = &self.scene;
         let offset = EPOCH_MICROS + scene.number as u64 * DAY_MICROS;
         let micros = offset + scene.header.capture_nanos[moment.index] / 1000;
         let name = (self.style.file_name)(scene.number, moment.index, micros);
@@ -132,15 +129,14 @@ impl SceneWriter for NuScenes {
     fn end(&mut self) -> Result<(), SynthError> {
         let mut samples = std::mem::take(&mut *locked(&self.samples));
         samples.sort_by_key(|sample| sample.moment);
-        if let Some(scene) = self.scene.take() {
-            self.tables.add(SceneTables {
-                number: scene.number,
-                name: &scene.header.name,
-                channels: &scene.channels,
-                fields: (self.style.scene_fields)(&scene.header),
-                samples: &samples,
-            });
-        }
+        let scene = std::mem::take(&mut self.scene);
+        self.tables.add(SceneTables {
+            number: scene.number,
+            name: &scene.header.name,
+            channels: &scene.channels,
+            fields: (self.style.scene_fields)(&scene.header),
+            samples: &samples,
+        });
         Ok(())
     }
 

@@ -68,12 +68,6 @@ pub(super) struct SceneTables<'a> {
 #[derive(Debug, Default)]
 pub(super) struct Tables(BTreeMap<&'static str, Vec<Value>>);
 
-/// Pose of a sensor on its vehicle, and the token of its row.
-struct Mount {
-    token: String,
-    vehicle_from_lidar: Isometry3<f64>,
-}
-
 impl Tables {
     fn push(&mut self, table: &'static str, row: Value) {
         self.0.entry(table).or_default().push(row);
@@ -140,7 +134,7 @@ impl Tables {
             let Some((_, first, _)) = chain.first() else {
                 continue;
             };
-            let mount = self.add_mount(scene, channel, first);
+            let (mount, vehicle_from_lidar) = self.add_mount(scene, channel, first);
             let moments = chain.iter().map(|(sample, ..)| sample.moment.to_string());
             let tokens =
                 moments.map(|moment| scene_token(scene, "sample_data", &[channel, &moment]));
@@ -150,7 +144,7 @@ impl Tables {
             {
                 // The mount is that of the first sweep, so that one row serves the whole scene.
                 let world_from_vehicle: Pose =
-                    (sweep.world_from_lidar * mount.vehicle_from_lidar.inverse()).into();
+                    (sweep.world_from_lidar * vehicle_from_lidar.inverse()).into();
                 // One pose for each sweep, so both rows share a token.
                 let row = json!({
                     "token": token, "timestamp": sample.micros,
@@ -159,7 +153,7 @@ impl Tables {
                 self.push("ego_pose", row);
                 let row = json!({
                     "token": token, "sample_token": sample_token, "ego_pose_token": token,
-                    "calibrated_sensor_token": mount.token, "timestamp": sample.micros, "fileformat": "bin",
+                    "calibrated_sensor_token": mount, "timestamp": sample.micros, "fileformat": "bin",
                     "is_key_frame": true, "height": 0, "width": 0, "filename": sweep.file, "prev": prev, "next": next,
                 });
                 self.push("sample_data", row);
@@ -167,7 +161,13 @@ impl Tables {
         }
     }
 
-    fn add_mount(&mut self, scene: &SceneTables<'_>, channel: &str, first: &SweepRecord) -> Mount {
+    /// Adds the row of a sensor on its vehicle; returns the row's token and the pose.
+    fn add_mount(
+        &mut self,
+        scene: &SceneTables<'_>,
+        channel: &str,
+        first: &SweepRecord,
+    ) -> (String, Isometry3<f64>) {
         // A sensor is one row, also if several scenes use it.
         let sensor = token(&["sensor", channel]);
         let sensors = self.0.entry("sensor").or_default();
@@ -185,10 +185,7 @@ impl Tables {
             "rotation": pose.rotation_wxyz, "camera_intrinsic": [],
         });
         self.push("calibrated_sensor", row);
-        Mount {
-            token,
-            vehicle_from_lidar,
-        }
+        (token, vehicle_from_lidar)
     }
 
     /// Objects by id, and their boxes at each sample: a chain of boxes per object.

@@ -2,7 +2,7 @@
 //!
 //! The world of the files is CARLA's: left-handed, degrees, half extents. This is the only writer that mirrors.
 
-use std::fmt::Write as _;
+use std::fmt::{Debug, Write as _};
 
 use dataset::camera_files::body_from_optical;
 use protocol::{Camera, EgoMotion, PointCloud, Pose};
@@ -95,22 +95,17 @@ fn write_camera(
     writeln!(yaml, "camera{number}:")?;
     let cords: [f64; 6] = world_from_body.into();
     write_list(yaml, "  ", "cords", &cords)?;
-    let rows = extrinsic
-        .row_iter()
-        .map(|row| row.iter().copied().collect());
-    write_rows(yaml, "extrinsic", rows)?;
-    let first = vec![pinhole.fx_px, 0.0, pinhole.cx_px];
-    let second = vec![0.0, pinhole.fy_px, pinhole.cy_px];
-    let rows = [first, second, vec![0.0, 0.0, 1.0]];
-    write_rows(yaml, "intrinsic", rows.into_iter())
+    // nalgebra's arrays are columns.
+    let rows: [[f64; 4]; 4] = extrinsic.transpose().into();
+    write_rows(yaml, "extrinsic", &rows)?;
+    let first = [pinhole.fx_px, 0.0, pinhole.cx_px];
+    let second = [0.0, pinhole.fy_px, pinhole.cy_px];
+    write_rows(yaml, "intrinsic", &[first, second, [0.0, 0.0, 1.0]])
 }
 
-fn write_rows(
-    yaml: &mut String,
-    key: &str,
-    mut rows: impl Iterator<Item = Vec<f64>>,
-) -> std::fmt::Result {
+fn write_rows(yaml: &mut String, key: &str, rows: &[impl Debug]) -> std::fmt::Result {
     writeln!(yaml, "  {key}:")?;
+    let mut rows = rows.iter();
     rows.try_for_each(|row| writeln!(yaml, "  - {row:?}"))
 }
 
@@ -132,14 +127,10 @@ fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {
 
 /// The motion of a recorded frame, if its yaw rate is recorded: `ego_speed` alone holds the speed.
 fn write_motion(yaml: &mut String, motion: &EgoMotion) -> std::fmt::Result {
-    let Some(yaw_rate_rad_s) = motion.yaw_rate_rad_s else {
-        return Ok(());
-    };
-    writeln!(
-        yaml,
-        "imu:\n  yaw_rate_degps: {}",
-        -yaw_rate_rad_s.to_degrees()
-    )
+    match motion.yaw_rate_rad_s {
+        Some(rate) => writeln!(yaml, "imu:\n  yaw_rate_degps: {}", -rate.to_degrees()),
+        None => Ok(()),
+    }
 }
 
 fn write_object(yaml: &mut String, object: &Object, anchor: &BoxAnchor) -> std::fmt::Result {

@@ -6,11 +6,8 @@ use std::sync::Mutex;
 use protocol::Pose;
 
 use super::disk::{Unfinished, make_folder, make_fresh_folder, write_file, write_origin};
-use super::{Moment, Omissions, SceneHeader, SceneWriter, locked};
+use super::{DAY_MICROS, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::generate::error::SynthError;
-
-/// Offset between the clocks of two scenes, microseconds: a day.
-const DAY_MICROS: u64 = 86_400_000_000;
 
 /// Differences between these layouts.
 #[derive(Debug)]
@@ -57,13 +54,13 @@ pub(super) struct Sequences {
     scenes: usize,
     /// Number of the first sequence of the next scene.
     next_sequence: usize,
-    scene: Option<Current>,
+    scene: Current,
     /// Sweeps that were written, with their agents.
     sweeps: Mutex<Vec<(usize, SweepPose)>>,
 }
 
 /// The scene that is being written.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Current {
     first_sequence: usize,
     offset_micros: u64,
@@ -78,7 +75,7 @@ impl Sequences {
             style,
             scenes: 0,
             next_sequence: 0,
-            scene: None,
+            scene: Current::default(),
             sweeps: Mutex::default(),
         }
     }
@@ -98,21 +95,19 @@ impl SceneWriter for Sequences {
             write_origin(&folder, scene)?;
             make_folder(&folder.join(self.style.sweeps_folder))?;
         }
-        self.scene = Some(Current {
+        self.scene = Current {
             first_sequence: self.next_sequence,
             offset_micros: self.style.epoch_micros + self.scenes as u64 * DAY_MICROS,
             capture_nanos: scene.capture_nanos.clone(),
             marks,
-        });
+        };
         self.scenes += 1;
         self.next_sequence += scene.agents.len();
         Ok(())
     }
 
     fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
-        let Some(scene) = &self.scene else {
-            return Ok(());
-        };
+        let scene = &self.scene;
         let micros = scene.offset_micros + scene.capture_nanos[moment.index] / 1000;
         for frame in &moment.frames {
             let folder = self.folder(scene.first_sequence + frame.agent);
@@ -135,9 +130,7 @@ impl SceneWriter for Sequences {
     fn end(&mut self) -> Result<(), SynthError> {
         let mut sweeps = std::mem::take(&mut *locked(&self.sweeps));
         sweeps.sort_by_key(|(agent, sweep)| (*agent, sweep.moment));
-        let Some(scene) = self.scene.take() else {
-            return Ok(());
-        };
+        let scene = std::mem::take(&mut self.scene);
         for (agent, mark) in scene.marks.into_iter().enumerate() {
             let number = scene.first_sequence + agent;
             let own = sweeps.iter().filter(|(of, _)| *of == agent);

@@ -10,7 +10,7 @@ use protocol::Pose;
 use super::AgentFrame;
 use super::agent_folders::FrameFiles;
 use super::boxes::real_type;
-use super::yaml_text::{ObjectEntry, write_speed, write_vehicles};
+use super::yaml_text::{ObjectEntry, keyed_poses, write_speed, write_vehicles};
 use crate::generate::error::SynthError;
 use dataset::carla_pose::CarlaPose;
 
@@ -59,13 +59,8 @@ pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<
 fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     let frame = &agent.frame;
     write_speed(yaml, frame)?;
-    for (key, pose) in [
-        ("lidar_pose", frame.world_from_lidar),
-        ("true_ego_pos", frame.world_from_vehicle),
-    ] {
-        if let Some(pose) = pose {
-            writeln!(yaml, "{key}: {}", pickled_matrix(&pose))?;
-        }
+    for (key, pose) in keyed_poses(frame) {
+        writeln!(yaml, "{key}: {}", pickled_matrix(&pose))?;
     }
     let lidar_from_world = agent.world_from_lidar().inverse();
     write_vehicles(yaml, agent, |yaml, object, _| {

@@ -5,7 +5,7 @@ use protocol::Pose;
 use super::AgentFrame;
 use super::agent_folders::FrameFiles;
 use super::boxes::{float_bytes, real_type};
-use super::yaml_text::{ObjectEntry, write_list, write_speed, write_vehicles};
+use super::yaml_text::{ObjectEntry, keyed_poses, write_list, write_speed, write_vehicles};
 use crate::generate::error::SynthError;
 use dataset::carla_pose::CarlaPose;
 
@@ -18,13 +18,8 @@ pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<
 fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     let frame = &agent.frame;
     write_speed(yaml, frame)?;
-    for (key, pose) in [
-        ("lidar_pose", frame.world_from_lidar),
-        ("true_ego_pos", frame.world_from_vehicle),
-    ] {
-        if let Some(pose) = pose {
-            write_list(yaml, "", key, &six(&pose))?;
-        }
+    for (key, pose) in keyed_poses(frame) {
+        write_list(yaml, "", key, &six(&pose))?;
     }
     write_vehicles(yaml, agent, |yaml, object, anchor| {
         let [.., roll, yaw, pitch] = six(&object.world_from_object);

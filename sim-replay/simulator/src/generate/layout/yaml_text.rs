@@ -3,6 +3,7 @@
 use std::fmt::{self, Write as _};
 
 use nalgebra::Vector3;
+use protocol::Pose;
 
 use super::{AgentFrame, BoxAnchor, SceneHeader};
 use dataset::frame::{Frame, Object};
@@ -13,17 +14,11 @@ const KMH_PER_MPS: f64 = 3.6;
 const FIRST_VEHICLE: usize = 1001;
 
 /// A list of numbers below a key.
-pub(super) fn write_list(
-    yaml: &mut String,
-    indent: &str,
-    key: &str,
-    values: &[f64],
-) -> fmt::Result {
+pub(super) fn write_list(yaml: &mut String, indent: &str, key: &str, list: &[f64]) -> fmt::Result {
     writeln!(yaml, "{indent}{key}:")?;
     // Minus zero would be another text for the same number; `{:?}` keeps a point in whole numbers.
-    values
-        .iter()
-        .try_for_each(|value| writeln!(yaml, "{indent}- {:?}", value + 0.0))
+    let mut values = list.iter();
+    values.try_for_each(|value| writeln!(yaml, "{indent}- {:?}", value + 0.0))
 }
 
 /// An object of the map of vehicles, in the numbers of the file.
@@ -42,29 +37,22 @@ impl ObjectEntry<'_> {
     /// Writes the entry, with keys in alphabetical order.
     pub(super) fn write(&self, yaml: &mut String) -> fmt::Result {
         writeln!(yaml, "  {}:", self.object.id)?;
-        write_list(yaml, "    ", "angle", &self.angle_deg)?;
-        self.write_more(yaml, "angle", "center")?;
-        write_list(yaml, "    ", "center", &self.center_m)?;
-        self.write_more(yaml, "center", "extent")?;
-        write_list(
-            yaml,
-            "    ",
-            "extent",
-            &self.object.size_m.map(|size| size / 2.0),
-        )?;
-        self.write_more(yaml, "extent", "location")?;
-        write_list(yaml, "    ", "location", &self.location_m)?;
-        self.write_more(yaml, "location", "speed")?;
+        let half_m = self.object.size_m.map(|size| size / 2.0);
+        for (key, list, next) in [
+            ("angle", self.angle_deg, "center"),
+            ("center", self.center_m, "extent"),
+            ("extent", half_m, "location"),
+            ("location", self.location_m, "speed"),
+        ] {
+            write_list(yaml, "    ", key, &list)?;
+            let more = self.more.iter();
+            let mut between = more.filter(|(more, _)| key < *more && *more < next);
+            between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))?;
+        }
         match self.object.speed_mps {
             Some(speed_mps) => writeln!(yaml, "    speed: {}", KMH_PER_MPS * speed_mps),
             None => Ok(()),
         }
-    }
-
-    fn write_more(&self, yaml: &mut String, after: &str, until: &str) -> fmt::Result {
-        let more = self.more.iter();
-        let mut between = more.filter(|(key, _)| after < *key && *key < until);
-        between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))
     }
 }
 
@@ -74,6 +62,13 @@ pub(super) fn write_speed(yaml: &mut String, frame: &Frame) -> fmt::Result {
         Some(speed_mps) => writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps),
         None => Ok(()),
     }
+}
+
+/// The poses of a frame that the right-handed layouts hold, with their keys.
+pub(super) fn keyed_poses(frame: &Frame) -> impl Iterator<Item = (&'static str, Pose)> {
+    let lidar = frame.world_from_lidar.map(|pose| ("lidar_pose", pose));
+    let vehicle = frame.world_from_vehicle.map(|pose| ("true_ego_pos", pose));
+    lidar.into_iter().chain(vehicle)
 }
 
 /// Writes the objects of a frame, each with the anchor of its box.

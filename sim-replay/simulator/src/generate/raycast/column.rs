@@ -89,10 +89,10 @@ impl ColumnRays<'_> {
     }
 }
 
-/// Position and direction of the sensor at one column, relative to a point near the sensor (so that `f32` is exact
-/// enough).
+/// Position and direction of the sensor when one column was measured, relative to a point near the sensor (so that
+/// `f32` is exact enough) or to the sensor at the sweep's end.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct ColumnPose {
+pub(crate) struct ColumnPose {
     pub(super) time: f32,
     pub(super) origin: Vector3<f32>,
     pub(super) forward: Vector3<f32>,
@@ -117,6 +117,12 @@ impl ColumnPose {
             forward: (rotation * Vector3::new(cos, sin, 0.0)).cast(),
             up: (rotation * Vector3::z()).cast(),
         }
+    }
+
+    /// The point at `range_m` along the ray of an elevation given by its cosine and sine.
+    #[inline]
+    pub(crate) fn point_m(&self, (cos, sin): (f32, f32), range_m: f32) -> [f32; 3] {
+        (self.origin + (self.forward * cos + self.up * sin) * range_m).into()
     }
 
     /// The column in the frame of a body at `body_position` (relative to the anchor) turned by `body_from_world`.

@@ -13,13 +13,13 @@ mod placement;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use column::RayPattern;
+pub(crate) use column::{ColumnPose, RayPattern};
 pub use part::{Bounds, Part};
 pub use placement::{Placement, Sweep, wrapped};
 
 use nalgebra::{Matrix3, Vector3};
 
-use column::{ColumnPose, ColumnRays};
+use column::ColumnRays;
 use footprint::{Footprint, SensorFrames};
 use part::greater;
 
@@ -113,25 +113,6 @@ impl Surface for Plane {
     }
 }
 
-/// Pose of one column when it was measured, relative to the sensor at the sweep's end.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct SkewedColumn {
-    /// Origin of the column, metres.
-    pub origin_m: Vector3<f32>,
-    /// Direction of the column at elevation 0.
-    pub forward: Vector3<f32>,
-    /// Direction at elevation 90 degrees.
-    pub up: Vector3<f32>,
-}
-
-impl SkewedColumn {
-    /// The point at `range_m` along the ray of an elevation given by its cosine and sine.
-    #[inline]
-    pub(crate) fn point_m(&self, (cos, sin): (f32, f32), range_m: f32) -> [f32; 3] {
-        (self.origin_m + (self.forward * cos + self.up * sin) * range_m).into()
-    }
-}
-
 /// Hits of one sweep: `[columns, channels]`, the channels of a column side by side.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct RangeImage {
@@ -211,21 +192,19 @@ impl Caster {
             .sort_unstable_by(|(a, i), (b, j)| a.nearest_m.total_cmp(&b.nearest_m).then(i.cmp(j)));
         for index in 0..self.order.len() {
             let (footprint, body) = self.order[index].clone();
-            self.cast_body(&bodies[body], &footprint, body as u32, &anchor);
+            self.cast_body(&bodies[body], &footprint, body as u32, anchor);
         }
         &self.image
     }
 
     /// The columns of the last sweep in the frame of the sensor at the sweep's end, where de-skewed points lie.
-    pub(crate) fn columns_at_end<'a>(
-        &'a self,
-        sensor: &Sweep,
-    ) -> impl Iterator<Item = SkewedColumn> + 'a {
+    pub(crate) fn columns_at_end(&self, sensor: &Sweep) -> impl Iterator<Item = ColumnPose> {
         let end_from_world: Matrix3<f32> = sensor.end.rotation().transpose().cast();
-        self.columns.iter().map(move |pose| SkewedColumn {
-            origin_m: end_from_world * pose.origin,
+        self.columns.iter().map(move |pose| ColumnPose {
+            origin: end_from_world * pose.origin,
             forward: end_from_world * pose.forward,
             up: end_from_world * pose.up,
+            ..*pose
         })
     }
 
@@ -234,18 +213,12 @@ impl Caster {
         self.cos.iter().copied().zip(self.sin.iter().copied())
     }
 
-    fn cast_body(
-        &mut self,
-        body: &Body<'_>,
-        footprint: &Footprint,
-        id: u32,
-        anchor: &Vector3<f64>,
-    ) {
+    fn cast_body(&mut self, body: &Body<'_>, footprint: &Footprint, id: u32, anchor: Vector3<f64>) {
         let count = self.pattern.columns as i64;
         let channels = footprint.channels.clone();
         let (cos, sin) = (&self.cos[channels.clone()], &self.sin[channels.clone()]);
         // Most bodies stand still: one frame serves all columns.
-        let still = body.motion.is_still().then(|| body.frame(1.0, anchor));
+        let still = body.motion.is_still().then(|| body.frame(1.0, &anchor));
         for column in footprint.first_column..footprint.first_column + footprint.columns as i64 {
             // A footprint may reach over the seam of a full turn.
             let column = column.rem_euclid(count) as usize;
@@ -259,7 +232,7 @@ impl Caster {
             let hits = &mut self.image.hits[range];
             let pose = &self.columns[column];
             let (body_from_world, position) =
-                still.unwrap_or_else(|| body.frame(pose.time, anchor));
+                still.unwrap_or_else(|| body.frame(pose.time, &anchor));
             let rays: ColumnRays<'_> = pose.in_body(&body_from_world, &position, cos, sin);
             for part in &body.shape.parts {
                 part.cast(&rays, depths, hits, id);

@@ -43,9 +43,8 @@ impl Placement {
 
     /// `world_from_self`.
     pub fn isometry(&self) -> Isometry3<f64> {
-        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(
-            self.rotation(),
-        ));
+        let rotation = Rotation3::from_matrix_unchecked(self.rotation());
+        let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
         Isometry3::from_parts(Translation3::from(self.position_m), rotation)
     }
 

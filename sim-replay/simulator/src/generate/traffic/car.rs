@@ -7,7 +7,6 @@ use super::roads::Roads;
 use crate::generate::raycast::{Placement, Sweep};
 use crate::generate::vehicle::Vehicle;
 use crate::map::{Lane, LaneId};
-use support::random::SplitMix64;
 
 /// One vehicle in traffic.
 #[derive(Debug, Clone)]
@@ -92,14 +91,4 @@ pub(crate) struct LaneChangeState {
     pub(super) random_change: Option<Side>,
     /// Time until the random change expires, or until the next one may start, seconds.
     pub(super) random_change_timer_s: f64,
-}
-
-impl LaneChangeState {
-    pub(crate) fn random(random: &mut SplitMix64) -> Self {
-        Self {
-            held_up_s: 0.0,
-            random_change: None,
-            random_change_timer_s: random.between(0.0, 50.0),
-        }
-    }
 }

@@ -95,12 +95,10 @@ pub(crate) fn bend_speeds_mps(lane: &Lane) -> Vec<f32> {
                 ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
             let product = ab * bc * ac;
             // Curvature of the circle through the three points.
-            let is_triangle = product > 1e-6;
-            let curvature = if is_triangle {
+            let curvature = match product > 1e-6 {
                 // k = 4 A / (a b c), with A half of the doubled area.
-                2.0 * doubled_area / product
-            } else {
-                0.0
+                true => 2.0 * doubled_area / product,
+                false => 0.0,
             };
             let bend = (SIDEWAYS_MPS2 / curvature.max(1e-6)).sqrt().max(CRAWL_MPS);
             lane.speed_limit_mps.min(bend) as f32

@@ -3,7 +3,6 @@
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-use super::car::Side;
 use super::roads::Roads;
 use crate::map::LaneId;
 
@@ -36,10 +35,7 @@ impl Explorer {
             for next in roads.onward(lane.id) {
                 onto[next.0 as usize].push((lane.id, length_m));
             }
-            for beside in [Side::Left, Side::Right]
-                .iter()
-                .filter_map(|side| side.of(lane))
-            {
+            for beside in [lane.left, lane.right].into_iter().flatten() {
                 onto[beside.0 as usize].push((lane.id, CHANGE_M));
             }
         }
@@ -72,13 +68,12 @@ impl Explorer {
     /// Keeps the lanes with the shortest distance to a least visited one.
     pub(super) fn keep_best(&mut self, lanes: &mut Vec<LaneId>) {
         let distances: Vec<Option<u64>> = lanes.iter().map(|&lane| self.unknown_m(lane)).collect();
+        let least = distances.iter().flatten().min().copied();
         // No least visited lane can be reached: all lanes stay.
-        let Some(least) = distances.iter().flatten().min() else {
+        if least.is_none() {
             return;
-        };
-        let mut are_best = distances
-            .iter()
-            .map(|distance| distance.as_ref() == Some(least));
+        }
+        let mut are_best = distances.iter().map(|distance| *distance == least);
         lanes.retain(|_| are_best.next().unwrap_or(false));
     }
 
@@ -121,6 +116,7 @@ impl Explorer {
 
 #[cfg(test)]
 mod tests {
+    use super::super::car::Side;
     use super::*;
     use crate::map::{RoadMapSource, build};
 

@@ -225,12 +225,10 @@ impl Traffic<'_> {
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             // Lanes that were decided but will not be driven do not count.
             let graph = self.roads.graph;
-            car.path
-                .ahead(graph)
-                .skip(1)
-                .for_each(|(lane, _)| explorer.give_up(lane));
-            path.ahead(graph)
-                .for_each(|(lane, _)| explorer.choose(lane));
+            let undone = car.path.ahead(graph).skip(1);
+            undone.for_each(|(lane, _)| explorer.give_up(lane));
+            let chosen = path.ahead(graph);
+            chosen.for_each(|(lane, _)| explorer.choose(lane));
         }
         let entry = (path.s_m, index as u32);
         let occupants = &mut self.occupants[path.lane().0 as usize];

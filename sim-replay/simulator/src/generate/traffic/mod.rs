@@ -117,11 +117,10 @@ impl<'t> Traffic<'t> {
             car.motion = Sweep::still(start);
             car.speed_mps = 0.0;
         }
-        car.standing_s = if car.speed_mps < 0.1 {
-            car.standing_s + STEP_S
-        } else {
-            0.0
-        };
+        car.standing_s += STEP_S;
+        if car.speed_mps >= 0.1 {
+            car.standing_s = 0.0;
+        }
         let to = car.point_m();
         self.index.relocate(index as u32, from, to);
     }
@@ -131,11 +130,9 @@ impl<'t> Traffic<'t> {
         // Entries are centres: 9 m exceeds the radius of the longest vehicle.
         let radius_m = footprint.radius_m() + 9.0;
         self.index.near(footprint.center_m, radius_m, near);
-        let mut others = near
-            .iter()
-            .map(|&other| other as usize)
-            .filter(|&other| other != index);
-        if others.any(|other| self.cars[other].rectangle().overlaps(footprint)) {
+        if near.iter().any(|&other| {
+            other as usize != index && self.cars[other as usize].rectangle().overlaps(footprint)
+        }) {
             return false;
         }
         self.parked_index.near(footprint.center_m, radius_m, near);

@@ -124,10 +124,7 @@ impl Path {
 
     /// The lane under the vehicle and those ahead, each with the distance to its start (negative for the first),
     /// metres.
-    pub(crate) fn ahead<'a>(
-        &'a self,
-        graph: &'a LaneGraph,
-    ) -> impl Iterator<Item = (LaneId, f64)> + 'a {
+    pub(crate) fn ahead(&self, graph: &LaneGraph) -> impl Iterator<Item = (LaneId, f64)> {
         let mut start_m = -self.s_m;
         self.lanes.iter().skip(self.current).map(move |&lane| {
             let entry = (lane, start_m);
@@ -181,26 +178,22 @@ impl Path {
 
     /// The point `offset_m` ahead of (or behind) the vehicle's centre, extrapolated straight beyond the known path.
     pub(crate) fn point_m(&self, graph: &LaneGraph, offset_m: f64) -> [f64; 3] {
-        self.mixed(graph, offset_m, point_on, |from, to, share| {
-            std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]))
-        })
+        self.mixed(graph, offset_m, point_on)
     }
 
     /// Slope across the path there, radians; positive where the left side is higher.
     fn bank_rad(&self, graph: &LaneGraph, offset_m: f64) -> f64 {
-        self.mixed(graph, offset_m, Lane::bank_rad, |from, to, share| {
-            from + share * (to - from)
-        })
+        let [bank_rad] = self.mixed(graph, offset_m, |lane, s_m| [lane.bank_rad(s_m)]);
+        bank_rad
     }
 
-    /// Value of a lane property `offset_m` ahead of the vehicle's centre; during a change, mixed from both lanes.
-    fn mixed<T>(
+    /// Values of a lane property `offset_m` ahead of the vehicle's centre; during a change, mixed from both lanes.
+    fn mixed<const N: usize>(
         &self,
         graph: &LaneGraph,
         offset_m: f64,
-        on: impl Fn(&Lane, f64) -> T,
-        mix: impl Fn(T, T, f64) -> T,
-    ) -> T {
+        on: impl Fn(&Lane, f64) -> [f64; N],
+    ) -> [f64; N] {
         let (mut index, mut s_m) = (self.current, self.s_m + offset_m);
         while s_m < 0.0 && index > 0 {
             index -= 1;
@@ -219,7 +212,8 @@ impl Path {
         match change.left_beside(lane.id) {
             Some(left) if share < 1.0 => {
                 let left = graph.lane(left);
-                mix(on(left, s_m / lane.length_m * left.length_m), own, share)
+                let from = on(left, s_m / lane.length_m * left.length_m);
+                std::array::from_fn(|axis| from[axis] + share * (own[axis] - from[axis]))
             }
             // Lanes behind the change are those that the vehicle came from.
             _ => own,

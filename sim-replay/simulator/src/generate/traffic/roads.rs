@@ -62,10 +62,9 @@ impl<'t> Roads<'t> {
         let successors = &self.graph.lane(lane).successors;
         let mut onward = successors.clone();
         onward.retain(|next| self.endless[next.0 as usize]);
-        if onward.is_empty() {
-            successors.clone()
-        } else {
-            onward
+        match onward.is_empty() {
+            true => successors.clone(),
+            false => onward,
         }
     }
 }

@@ -103,7 +103,11 @@ impl<'t> Traffic<'t> {
         let driver = Driver::random(&mut self.random);
         let path = Path::new(spawn.lane, spawn.s_m);
         let aside_m = self.random.between(-0.2, 0.2);
-        let lane_change = LaneChangeState::random(&mut self.random);
+        let lane_change = LaneChangeState {
+            held_up_s: 0.0,
+            random_change: None,
+            random_change_timer_s: self.random.between(0.0, 50.0),
+        };
         let placement = path.placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], aside_m);
         let speed_mps = 0.6 * driver.pace * self.roads.speed_mps(spawn.lane, spawn.s_m);
         let index = self.cars.len() as u32;

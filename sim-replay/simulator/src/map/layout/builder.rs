@@ -1,7 +1,7 @@
 //! Road network builder: adds roads and junctions and links them.
 
 use super::super::clothoid;
-use super::super::curve::{Curve, CurveShape, Pose2};
+use super::super::curve::{Curve, Pose2};
 use super::super::profile::Profile;
 use super::super::road::{
     Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork,
@@ -58,23 +58,14 @@ pub(super) struct Builder {
     pub network: RoadNetwork,
 }
 
-/// Left edge of a lane seen in driving direction: place, height, slope in driving direction, lane width.
+/// Left edge of a lane seen in driving direction: place, height and slope in driving direction, lane width.
 struct LaneEdge {
     pose: Pose2,
-    height_m: f64,
-    slope: f64,
+    height_and_slope: [f64; 2],
     width_m: f64,
 }
 
 impl CrossProfile {
-    /// The same lanes on both sides.
-    pub(super) fn both(side: Vec<(LaneKind, f64)>) -> Self {
-        Self {
-            left: side.clone(),
-            right: side,
-        }
-    }
-
     /// Width of the wider side, metres.
     pub(super) fn half_width_m(&self) -> f64 {
         let [left, right] =
@@ -150,8 +141,7 @@ impl Builder {
         let (exit, entry) = (self.lane_edge(from, true), self.lane_edge(to, false));
         let curve = clothoid::between(exit.pose, entry.pose, 0.0);
         let length_m = curve.length_m;
-        let heights = [&exit, &entry].map(|edge| [edge.height_m, edge.slope]);
-        let elevation = Profile::between(length_m, heights[0], heights[1]);
+        let elevation = Profile::between(length_m, exit.height_and_slope, entry.height_and_slope);
         // No slope at either end: the edges of the lanes join without a kink.
         let width = Profile::between(length_m, [exit.width_m, 0.0], [entry.width_m, 0.0]);
         let mut only = RoadLane::new(LaneKind::Driving, width);
@@ -230,8 +220,7 @@ impl Builder {
         };
         LaneEdge {
             pose,
-            height_m: road.elevation.at(s),
-            slope: sign * road.elevation.slope_at(s),
+            height_and_slope: [road.elevation.at(s), sign * road.elevation.slope_at(s)],
             width_m: high - low,
         }
     }
@@ -255,14 +244,4 @@ impl Builder {
         });
         place
     }
-}
-
-/// An arc of a circle as a road's whole reference line.
-pub(super) fn arc(start: Pose2, curvature: f64, length_m: f64) -> Vec<Curve> {
-    vec![Curve {
-        s_m: 0.0,
-        start,
-        length_m,
-        shape: CurveShape::Arc { curvature },
-    }]
 }

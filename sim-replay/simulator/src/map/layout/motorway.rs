@@ -33,6 +33,9 @@ pub(super) struct Motorway {
 /// One direction: 1 along the ring, -1 against it.
 pub(super) type Direction = f64;
 
+/// Pose of an end of a ramp, with height and slope there.
+pub(super) type RampEnd = (Pose2, [f64; 2]);
+
 impl Motorway {
     /// A carriageway from one length of the ring to another, in driving direction (to rising lengths along the ring, to
     /// falling ones against it).
@@ -87,8 +90,7 @@ impl Motorway {
 
     /// Lets `ramp` leave between two carriageways: all lanes continue, the outermost one also into the ramp.
     pub(super) fn diverge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
-        let junction = builder.junction();
-        self.extend(builder, junction, before, after);
+        let junction = self.extend(builder, before, after);
         let outer = RoadEnd::end(before).lane(-(self.lanes as i32));
         let ramp = RoadEnd::start(ramp).lane(-1);
         builder.connect(junction, outer, ramp, LIMIT_MPS);
@@ -96,37 +98,30 @@ impl Motorway {
 
     /// Lets `ramp` join between two carriageways.
     pub(super) fn merge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
-        let junction = builder.junction();
-        self.extend(builder, junction, before, after);
+        let junction = self.extend(builder, before, after);
         let ramp = RoadEnd::end(ramp).lane(-1);
         let outer = RoadEnd::start(after).lane(-(self.lanes as i32));
         builder.connect(junction, ramp, outer, LIMIT_MPS);
     }
 
-    /// A ramp that left at `s_m` down to `port` (which looks away from its roundabout).
-    pub(super) fn off_ramp(
-        &self,
-        builder: &mut Builder,
-        s_m: f64,
-        direction: Direction,
-        port: Pose2,
-    ) -> usize {
-        let start = self.ramp_pose(s_m, direction, -RAMP_ANGLE_RAD);
-        let height = [self.ring.height_m(s_m), direction * self.ring.slope(s_m)];
-        self.ramp(builder, [start, port.reversed()], [height, [0.0; 2]])
+    /// The end of a ramp at `s_m`, where it leaves (`turn` -1) or joins (1).
+    pub(super) fn ramp_end(&self, s_m: f64, direction: Direction, turn: f64) -> RampEnd {
+        let outer = (self.lanes as f64 - 1.0) * LANE_M;
+        let edge = self.left_edge(s_m, direction);
+        let pose = edge.moved(0.0, -outer - RAMP_OFFSET_M, turn * RAMP_ANGLE_RAD);
+        let slope = direction * self.ring.slope(s_m);
+        (pose, [self.ring.height_m(s_m), slope])
     }
 
-    /// A ramp from `port` up to `s_m`, where it joins.
-    pub(super) fn on_ramp(
-        &self,
-        builder: &mut Builder,
-        s_m: f64,
-        direction: Direction,
-        port: Pose2,
-    ) -> usize {
-        let end = self.ramp_pose(s_m, direction, RAMP_ANGLE_RAD);
-        let height = [self.ring.height_m(s_m), direction * self.ring.slope(s_m)];
-        self.ramp(builder, [port, end], [[0.0; 2], height])
+    /// A ramp from one end to the other.
+    pub(super) fn ramp(builder: &mut Builder, from: RampEnd, to: RampEnd) -> usize {
+        let curves = path(&[from.0, to.0]);
+        let elevation = Profile::between(curves[0].length_m, from.1, to.1);
+        let profile = CrossProfile {
+            left: vec![(LaneKind::Shoulder, 0.4)],
+            right: vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)],
+        };
+        builder.road(curves, elevation, &profile, RAMP_LIMIT_MPS)
     }
 
     /// Puts a tunnel over a whole carriageway.
@@ -139,17 +134,6 @@ impl Motorway {
         });
     }
 
-    fn ramp(&self, builder: &mut Builder, poses: [Pose2; 2], heights: [[f64; 2]; 2]) -> usize {
-        let curves = path(&poses);
-        let [from, to] = heights;
-        let elevation = Profile::between(curves[0].length_m, from, to);
-        let profile = CrossProfile {
-            left: vec![(LaneKind::Shoulder, 0.4)],
-            right: vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)],
-        };
-        builder.road(curves, elevation, &profile, RAMP_LIMIT_MPS)
-    }
-
     /// Left edge of the first lane, in driving direction.
     fn left_edge(&self, s_m: f64, direction: Direction) -> Pose2 {
         let middle = self.ring.pose(s_m);
@@ -160,16 +144,13 @@ impl Motorway {
         }
     }
 
-    fn ramp_pose(&self, s_m: f64, direction: Direction, turn_rad: f64) -> Pose2 {
-        let outer = (self.lanes as f64 - 1.0) * LANE_M;
-        self.left_edge(s_m, direction)
-            .moved(0.0, -outer - RAMP_OFFSET_M, turn_rad)
-    }
-
-    fn extend(&self, builder: &mut Builder, junction: usize, before: usize, after: usize) {
+    /// Lets all lanes of a carriageway continue through a junction, which is returned.
+    fn extend(&self, builder: &mut Builder, before: usize, after: usize) -> usize {
+        let junction = builder.junction();
         for lane in 1..=self.lanes as i32 {
             let (from, to) = (RoadEnd::end(before), RoadEnd::start(after));
             builder.connect(junction, from.lane(-lane), to.lane(-lane), LIMIT_MPS);
         }
+        junction
     }
 }

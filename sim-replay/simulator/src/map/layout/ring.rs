@@ -5,6 +5,7 @@ use std::f64::consts::PI;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
+use super::super::convex::range;
 use super::super::curve::Pose2;
 
 /// Samples of the length along the line.
@@ -53,20 +54,17 @@ impl Ring {
             ring.lengths_m.push(length);
         }
         let upper = ring.crossing()[usize::from(rng.random_bool(0.5))];
-        let height_m = rng.random_range(RISE_M[0]..RISE_M[1]);
-        ring.bumps.push(Bump {
-            middle_m: upper,
-            height_m,
-            plateau_m: 45.0,
-            reach_m: rng.random_range(240.0..300.0),
+        let bumps = [
+            (upper, 45.0, 240.0..300.0),
+            (ring.apex_m(), 25.0, 290.0..340.0),
+        ];
+        let bumps = bumps.map(|(middle_m, plateau_m, reach_m)| Bump {
+            middle_m,
+            height_m: rng.random_range(RISE_M[0]..RISE_M[1]),
+            plateau_m,
+            reach_m: rng.random_range(reach_m),
         });
-        let height_m = rng.random_range(RISE_M[0]..RISE_M[1]);
-        ring.bumps.push(Bump {
-            middle_m: ring.apex_m(),
-            height_m,
-            plateau_m: 25.0,
-            reach_m: rng.random_range(290.0..340.0),
-        });
+        ring.bumps = bumps.into();
         ring
     }
 
@@ -119,9 +117,7 @@ impl Ring {
         let samples =
             (1..SAMPLES / 2).map(|sample| self.point(2.0 * PI * sample as f64 / SAMPLES as f64));
         let near = samples.filter(|point| (point[0] - x).abs() < 4.0);
-        near.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], p| {
-            [low.min(p[1]), high.max(p[1])]
-        })
+        range(near.map(|point| point[1]))
     }
 
     /// The two lengths at which the line crosses itself.

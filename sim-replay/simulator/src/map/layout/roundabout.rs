@@ -2,10 +2,10 @@
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use super::super::curve::Pose2;
+use super::super::curve::{Curve, CurveShape, Pose2};
 use super::super::profile::Profile;
 use super::super::road::LaneKind;
-use super::builder::{Builder, CrossProfile, RoadEnd, arc};
+use super::builder::{Builder, CrossProfile, RoadEnd};
 
 /// Width of the ring's lane, metres.
 const LANE_M: f64 = 5.0;
@@ -71,7 +71,8 @@ impl Roundabout {
             left: vec![(LaneKind::Shoulder, 1.0)],
             right: vec![(LaneKind::Driving, LANE_M), (LaneKind::Shoulder, 0.6)],
         };
-        let curve = arc(start, 1.0 / inner, inner * turn);
-        builder.road(curve, Profile::default(), &profile, LIMIT_MPS)
+        let curvature = 1.0 / inner;
+        let arc = Curve::new(0.0, start, inner * turn, CurveShape::Arc { curvature });
+        builder.road(vec![arc], Profile::default(), &profile, LIMIT_MPS)
     }
 }

@@ -47,6 +47,14 @@ struct Chain {
     wiggle_rad: [f64; 2],
 }
 
+impl Chain {
+    /// Its first and its last node, each with the node beside it.
+    fn ends(&self) -> [[usize; 2]; 2] {
+        let last = self.nodes.len() - 1;
+        [[0, 1], [last, last - 1]].map(|places| places.map(|place| self.nodes[place]))
+    }
+}
+
 impl StreetGraph {
     pub(super) fn degree(&self, node: usize) -> usize {
         let ends = self.edges.iter().flatten();
@@ -101,8 +109,9 @@ pub(super) fn lay_out(
     for chain in &chains {
         let curves = path(&poses(graph, chain, &radii));
         let road = builder.road(curves, Profile::default(), &chain.profile, limit_mps);
-        ends[chain.nodes[0]].push(RoadEnd::start(road));
-        ends[chain.nodes[chain.nodes.len() - 1]].push(RoadEnd::end(road));
+        let [[first, _], [last, _]] = chain.ends();
+        ends[first].push(RoadEnd::start(road));
+        ends[last].push(RoadEnd::end(road));
     }
     let mut ports = Vec::new();
     for (node, ends) in ends.iter().enumerate() {
@@ -127,12 +136,8 @@ fn join(builder: &mut Builder, junction: usize, ends: &[RoadEnd], limit_mps: f64
             // Both poses face into the junction, so the way out is the opposite heading of `to`.
             let turn = wrap_angle(to_rad + std::f64::consts::PI - from_rad);
             // Turning traffic slows down.
-            let is_turn = turn.abs() > 0.5;
-            let limit = if is_turn {
-                limit_mps.min(7.0)
-            } else {
-                limit_mps
-            };
+            let most_mps = if turn.abs() > 0.5 { 7.0 } else { f64::INFINITY };
+            let limit = limit_mps.min(most_mps);
             let (incoming, outgoing) = (builder.incoming(from), builder.outgoing(to));
             for (&lane_in, &lane_out) in incoming.iter().zip(&outgoing) {
                 builder.connect(junction, lane_in, lane_out, limit);
@@ -201,10 +206,10 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
 fn junction_radii(graph: &StreetGraph, chains: &[Chain]) -> Vec<f64> {
     let mut arms: Vec<Vec<(f64, f64)>> = vec![Vec::new(); graph.nodes.len()];
     for chain in chains {
-        let last = chain.nodes.len() - 1;
         let half = chain.profile.half_width_m();
-        arms[chain.nodes[0]].push((graph.angle(chain.nodes[0], chain.nodes[1]), half));
-        arms[chain.nodes[last]].push((graph.angle(chain.nodes[last], chain.nodes[last - 1]), half));
+        for [node, next] in chain.ends() {
+            arms[node].push((graph.angle(node, next), half));
+        }
     }
     arms.iter().map(|arms| junction_radius_m(arms)).collect()
 }
@@ -246,22 +251,14 @@ fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
 
 /// Pose at which a street begins at its first (0) or last (1) node, facing into the street.
 fn end_pose(graph: &StreetGraph, chain: &Chain, radii: &[f64], which: usize) -> Pose2 {
-    let last = chain.nodes.len() - 1;
-    let (node, next) = if which == 0 {
-        (chain.nodes[0], chain.nodes[1])
-    } else {
-        (chain.nodes[last], chain.nodes[last - 1])
-    };
+    let [node, next] = chain.ends()[which];
     if let Some(port) = graph.nodes[node].port {
         return port;
     }
-    let is_long = graph.distance_m(node, next) > WIGGLE_MIN_M;
-    let wiggle = if is_long {
-        chain.wiggle_rad[which]
-    } else {
-        0.0
-    };
-    let heading_rad = graph.angle(node, next) + wiggle;
+    let mut heading_rad = graph.angle(node, next);
+    if graph.distance_m(node, next) > WIGGLE_MIN_M {
+        heading_rad += chain.wiggle_rad[which];
+    }
     let middle = Pose2::new(graph.nodes[node].x, graph.nodes[node].y, heading_rad);
     middle.moved(radii[node], 0.0, 0.0)
 }

@@ -42,7 +42,7 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
     let ramps = interchange(&mut builder, &motorway, &inside, &outside, &mut rng);
     let map_model = map_model(&mut builder, &motorway, &inside, &mut rng);
     let works = works(&mut builder, &outside, &mut rng);
-    let [off_inside, on_inside, off_outside, on_outside] = ramps;
+    let [[off_inside, on_inside], [off_outside, on_outside]] = ramps;
     let arms = [
         (0.0, RoadEnd::start(link)),
         (FRAC_PI_2, RoadEnd::end(off_inside)),
@@ -83,7 +83,8 @@ fn link_road(builder: &mut Builder, inside: &Roundabout, outside: &Roundabout) -
         (LaneKind::Sidewalk, 2.2),
     ];
     let curves = path(&[inside.port(0.0), outside.port(PI).reversed()]);
-    let profile = CrossProfile::both(lanes);
+    let (left, right) = (lanes.clone(), lanes);
+    let profile = CrossProfile { left, right };
     builder.road(curves, Profile::default(), &profile, LINK_LIMIT_MPS)
 }
 
@@ -94,13 +95,12 @@ fn interchange(
     inside: &Roundabout,
     outside: &Roundabout,
     rng: &mut ChaCha8Rng,
-) -> [usize; 4] {
+) -> [[usize; 2]; 2] {
     let (apex, around) = (motorway.ring.apex_m(), motorway.ring.length_m());
     // The tunnel lies in the other lobe, where nothing crosses.
     let tunnel = motorway.ring.far_apex_m() + rng.random_range(-160.0..100.0);
     let tunnel_end = tunnel + rng.random_range(45.0..75.0);
-    let mut ramps = Vec::new();
-    for (direction, roundabout) in [(1.0, inside), (-1.0, outside)] {
+    [(1.0, inside), (-1.0, outside)].map(|(direction, roundabout): (f64, &Roundabout)| {
         let before = apex - direction * RAMP_FROM_MIDDLE_M;
         let after = apex + direction * RAMP_FROM_MIDDLE_M;
         let zone = direction * RAMP_ZONE_M;
@@ -121,13 +121,17 @@ fn interchange(
         // Inside, the ring leads down: traffic comes from above. Outside it comes from below.
         let from = roundabout.port(direction * FRAC_PI_2);
         let to = roundabout.port(-direction * FRAC_PI_2);
-        let off = motorway.off_ramp(builder, before, direction, from);
-        let on = motorway.on_ramp(builder, after, direction, to);
+        let (start, end) = (
+            motorway.ramp_end(before, direction, -1.0),
+            motorway.ramp_end(after, direction, 1.0),
+        );
+        // Ports look away from their roundabouts, which lie level on the ground.
+        let off = Motorway::ramp(builder, start, (from.reversed(), [0.0; 2]));
+        let on = Motorway::ramp(builder, (to, [0.0; 2]), end);
         motorway.diverge(builder, arriving, inner, off);
         motorway.merge(builder, inner, leaving, on);
-        ramps.extend([off, on]);
-    }
-    [ramps[0], ramps[1], ramps[2], ramps[3]]
+        [off, on]
+    })
 }
 
 /// The small town inside the ring; returns the street's end at the roundabout.

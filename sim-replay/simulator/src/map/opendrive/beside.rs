@@ -2,10 +2,10 @@
 
 use super::super::finding::FindingLog;
 use super::super::road::{RoadObject, RoadSignal, RoadStructure};
-use super::element::{Element, MAX_LENGTH_M, Result, children};
+use super::element::{Element, MAX_LENGTH_M, Result, children, noted};
 
 /// Every element named `name` in the list `list` of a road; elements that cannot be read are left out.
-fn read_all<T>(
+pub(super) fn read_all<T>(
     road: Element,
     list: &'static str,
     name: &'static str,
@@ -15,19 +15,12 @@ fn read_all<T>(
     let Some(list) = road.child(list) else {
         return Vec::new();
     };
-    let read = children(list, name).filter_map(|element| {
-        read(element)
-            .map_err(|error| error.note(log, "left out"))
-            .ok()
-    });
-    read.collect()
+    children(list, name)
+        .filter_map(|element| noted(read(element), log, "left out"))
+        .collect()
 }
 
-pub(super) fn read_objects(road: Element, log: &mut FindingLog) -> Vec<RoadObject> {
-    read_all(road, "objects", "object", read_object, log)
-}
-
-fn read_object(element: Element) -> Result<RoadObject> {
+pub(super) fn read_object(element: Element) -> Result<RoadObject> {
     let label = [element.optional_text("type"), element.optional_text("name")]
         .map(Option::unwrap_or_default)
         .join(" ");
@@ -45,11 +38,7 @@ fn read_object(element: Element) -> Result<RoadObject> {
     })
 }
 
-pub(super) fn read_signals(road: Element, log: &mut FindingLog) -> Vec<RoadSignal> {
-    read_all(road, "signals", "signal", read_signal, log)
-}
-
-fn read_signal(element: Element) -> Result<RoadSignal> {
+pub(super) fn read_signal(element: Element) -> Result<RoadSignal> {
     // The signal faces against the direction it is for; `+` is for traffic along the road.
     let flip = match element.optional_text("orientation") {
         Some("-") => std::f64::consts::PI,

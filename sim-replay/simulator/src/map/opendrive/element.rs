@@ -76,6 +76,11 @@ impl OpenDriveError {
     }
 }
 
+/// The value, or nothing where it cannot be read: then the error is a finding, handled by `action`.
+pub(super) fn noted<T>(read: Result<T>, log: &mut FindingLog, action: &str) -> Option<T> {
+    read.map_err(|error| error.note(log, action)).ok()
+}
+
 /// Line numbers of positions in a text, with one count for each block: the XML document itself would count from its
 /// start for each position, and a list of all lines could be larger than the text.
 pub(super) struct LineIndex<'input> {

@@ -3,39 +3,30 @@
 use super::super::finding::FindingLog;
 use super::super::road::{Connection, Junction};
 use super::Ids;
-use super::element::{Element, Result, children};
+use super::element::{Element, Result, children, noted};
 use super::links::read_contact;
 
 /// Reads a junction; connections that cannot be read are left out.
 pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junction {
     let kind = element.optional_text("type").unwrap_or("default");
     let direct = kind == "direct";
-    match kind {
-        "default" | "direct" | "" => {}
-        "virtual" => {
-            let action = "built only where its roads begin or end at other roads' ends";
-            element.note_value(log, "type", action);
-        }
-        "crossing" => {
-            let action = "left out: pedestrian crossings are not simulated";
-            element.note_value(log, "type", action);
-        }
-        _ => element.note_value(log, "type", "treated as a common junction"),
+    let action = match kind {
+        "default" | "direct" | "" => None,
+        "virtual" => Some("built only where its roads begin or end at other roads' ends"),
+        "crossing" => Some("left out: pedestrian crossings are not simulated"),
+        _ => Some("treated as a common junction"),
+    };
+    if let Some(action) = action {
+        element.note_value(log, "type", action);
     }
-    let mut connections = Vec::new();
-    for connection in children(element, "connection") {
-        match read_connection(connection, ids, direct, log) {
-            Ok(Some(found)) => connections.push(found),
-            Ok(None) => {
-                connection.note(log, "names no road that it leads to", "connection left out")
-            }
-            Err(error) => error.note(log, "connection left out"),
-        }
-    }
+    let connections = children(element, "connection").filter_map(|connection| {
+        let read = read_connection(connection, ids, direct, log);
+        noted(read, log, "connection left out")?
+    });
     Junction {
         id: element.optional_text("id").unwrap_or_default().to_owned(),
         direct,
-        connections,
+        connections: connections.collect(),
     }
 }
 
@@ -50,6 +41,7 @@ fn read_connection(
         false => "connectingRoad",
     };
     if element.optional_text(onto).is_none() {
+        element.note(log, "names no road that it leads to", "connection left out");
         return Ok(None);
     }
     let mut lane_links = Vec::new();

@@ -5,7 +5,7 @@ use super::super::profile::Profile;
 use super::super::road::{LaneKind, LaneSection, MAX_WIDTH_M, RoadLane};
 
 use super::border::{Stretch, widths_from_borders};
-use super::element::{Element, MAX_LANES, Result, children};
+use super::element::{Element, MAX_LANES, Result, children, noted};
 use super::profile::read_profile;
 use super::speed::read_speed;
 
@@ -113,9 +113,7 @@ fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane> {
     let link = element.child("link");
     let [predecessor, successor] = ["predecessor", "successor"].map(|name| {
         let end = link.and_then(|link| link.child(name))?;
-        end.lane_id("id")
-            .map_err(|error| error.note(log, "lane link treated as absent"))
-            .ok()
+        noted(end.lane_id("id"), log, "lane link treated as absent")
     });
     let mut speeds = children(element, "speed");
     let speed_limit_mps = speeds.next().and_then(|speed| read_speed(speed, log));
@@ -123,21 +121,17 @@ fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane> {
         let action = "left out: the first limit holds for the whole lane";
         further.note_value(log, "sOffset", action);
     }
-    let reversed = match element.optional_text("direction") {
-        Some("reversed") => true,
-        Some("both") => {
-            element.note_value(log, "direction", "driven in the direction of its side only");
-            false
-        }
-        _ => false,
-    };
+    let direction = element.optional_text("direction");
+    if direction == Some("both") {
+        element.note_value(log, "direction", "driven in the direction of its side only");
+    }
     note_heights(element, log);
     Ok(RoadLane {
         predecessor,
         successor,
         speed_limit_mps,
         level: matches!(element.optional_text("level"), Some("true" | "1")),
-        reversed,
+        reversed: direction == Some("reversed"),
         ..RoadLane::new(read_kind(element, log), width)
     })
 }

@@ -3,16 +3,14 @@
 use super::super::finding::FindingLog;
 use super::super::road::{Contact, Road, RoadLink};
 use super::Ids;
-use super::element::{Element, Result};
+use super::element::{Element, Result, noted};
 
 /// Fills the links of a road; links to elements that are not in this map are treated as absent.
 pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut FindingLog) {
     let link = element.child("link");
     [road.predecessor, road.successor] = ["predecessor", "successor"].map(|name| {
         let end = link.and_then(|link| link.child(name))?;
-        read_link(end, ids)
-            .map_err(|error| error.note(log, "link treated as absent"))
-            .ok()
+        noted(read_link(end, ids), log, "link treated as absent")
     });
     road.junction = match element.optional_text("junction").map(str::trim) {
         // -1 stands for a road outside junctions.

@@ -94,22 +94,17 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork> {
     children(root, "include").for_each(|element| element.note_value(&mut log, "file", "left out"));
     let (mut roads, elements) = read_roads(root, &mut log)?;
     let (junctions, junction_elements) = collect_ids(root, "junction", &mut log);
-    let places = roads
-        .iter()
-        .zip(0..)
-        .map(|(road, place)| (road.id.clone(), place));
+    let names = roads.iter().map(|road| road.id.clone());
     let ids = Ids {
-        roads: places.collect(),
+        roads: names.zip(0..).collect(),
         junctions,
     };
     let mut junctions_m = vec![0.0; ids.junctions.len()];
     for (road, element) in roads.iter_mut().zip(elements) {
         log.enter("road", &road.id);
         links::read(element, road, &ids, &mut log);
-        let total_m = road
-            .junction
-            .and_then(|junction| junctions_m.get_mut(junction));
-        if let Some(total_m) = total_m {
+        let junction = road.junction;
+        if let Some(total_m) = junction.and_then(|junction| junctions_m.get_mut(junction)) {
             *total_m += lanes_length_m(road);
             let what = "the lanes of its junction";
             check_total(element, what, *total_m, MAX_JUNCTION_M)?;

@@ -105,11 +105,8 @@ fn curvatures<const N: usize>(
     for (value, name) in values.iter_mut().zip(names) {
         *value = element.number(name, -ANY_CURVATURE, ANY_CURVATURE)?;
     }
-    let odd = values
-        .iter()
-        .zip(names)
-        .find(|(value, _)| value.abs() > bound);
-    let Some((value, name)) = odd else {
+    let mut named = values.iter().zip(names);
+    let Some((value, name)) = named.find(|(value, _)| value.abs() > bound) else {
         return Ok(Some(values));
     };
     let error = element.error_range(name, value, -bound, bound);

@@ -4,10 +4,12 @@ use super::super::finding::FindingLog;
 use super::super::lateral::{CrossShape, LateralProfile, MAX_SHAPE_M, MAX_SLOPE_RAD};
 use super::super::profile::Profile;
 use super::super::road::MAX_OFFSET_M;
-use super::element::{Element, MAX_LENGTH_M, Result, children};
+use super::element::{Element, MAX_LENGTH_M, Result, children, noted};
 
 /// Samples along a road at which slopes are checked.
 const LOOKS: u32 = 50;
+/// Action for parts that are not read or not built.
+const LEFT_OUT: &str = "left out: the road is built without it";
 
 /// Cubics a, b, c, d from the elements `name` of `parent`, by rising `start`.
 pub(super) fn read_profile(
@@ -37,17 +39,13 @@ pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -
     lateral.superelevation_rad = slope(element, "superelevation", None, length_m, log);
     lateral.crossfall_rad =
         ["left", "right"].map(|side| slope(element, "crossfall", Some(side), length_m, log));
-    match read_shapes(element) {
-        Ok(shapes) if shapes.iter().any(|shape| !is_zero(&shape.height_m)) => {
-            lateral.shapes = shapes
-        }
-        Ok(_) => {}
-        Err(error) => error.note(log, "shape of the road left out"),
-    }
+    let shapes = noted(read_shapes(element), log, "shape of the road left out");
+    let shapes = shapes.filter(|shapes| shapes.iter().any(|shape| !is_zero(&shape.height_m)));
+    lateral.shapes = shapes.unwrap_or_default();
     for other in element.elements() {
         if !["superelevation", "crossfall", "shape", "userData"].contains(&other.name()) {
             let found = format!("up to {:.2} m high", other.largest("constant", "a"));
-            other.note(log, &found, "left out: the road is built without it");
+            other.note(log, &found, LEFT_OUT);
         }
     }
     lateral
@@ -61,13 +59,8 @@ fn slope(
     length_m: f64,
     log: &mut FindingLog,
 ) -> Profile {
-    let mut profile = match read_profile(parent, name, "s", MAX_OFFSET_M) {
-        Ok(profile) => profile,
-        Err(error) => {
-            error.note(log, "left out: the road is built without it");
-            return Profile::default();
-        }
-    };
+    let read = read_profile(parent, name, "s", MAX_OFFSET_M);
+    let mut profile = noted(read, log, LEFT_OUT).unwrap_or_default();
     let sides = children(parent, name).map(|record| record.optional_text("side"));
     let mut wanted =
         sides.map(|of| side.is_none() || of == side || matches!(of, None | Some("both")));
@@ -82,7 +75,7 @@ fn slope(
     if steepest > MAX_SLOPE_RAD {
         let found =
             format!("holds <{name}> up to {steepest:.2} rad, expected at most {MAX_SLOPE_RAD}");
-        parent.note(log, &found, "left out: the road is built without it");
+        parent.note(log, &found, LEFT_OUT);
         return Profile::default();
     }
     profile
@@ -119,9 +112,6 @@ fn read_shapes(parent: Element) -> Result<Vec<CrossShape>> {
 }
 
 fn is_zero(profile: &Profile) -> bool {
-    let mut coefficients = profile
-        .records
-        .iter()
-        .flat_map(|(_, coefficients)| coefficients);
-    coefficients.all(|&coefficient| coefficient == 0.0)
+    let mut records = profile.records.iter();
+    records.all(|(_, coefficients)| *coefficients == [0.0; 4])
 }

@@ -3,10 +3,11 @@
 use super::super::finding::FindingLog;
 use super::super::profile::Profile;
 use super::super::road::{MAX_OFFSET_M, Road};
-use super::element::{Element, MAX_LENGTH_M, Result, children};
+use super::beside::{read_all, read_object, read_signal, read_structures};
+use super::element::{Element, MAX_LENGTH_M, Result, children, noted};
 use super::profile::{read_lateral, read_profile};
 use super::speed::read_speed;
-use super::{beside, lanes, plan_view};
+use super::{lanes, plan_view};
 
 /// Highest road over the map's zero, metres.
 const MAX_HEIGHT_M: f64 = 10_000.0;
@@ -33,9 +34,9 @@ pub(super) fn read(element: Element, log: &mut FindingLog) -> Result<Road> {
         sections: lanes::read_sections(lanes, &lane_offset, length_m, log)?,
         lane_offset,
         speed_limits: read_speed_limits(element, log),
-        objects: beside::read_objects(element, log),
-        signals: beside::read_signals(element, log),
-        structures: beside::read_structures(element, length_m, log),
+        objects: read_all(element, "objects", "object", read_object, log),
+        signals: read_all(element, "signals", "signal", read_signal, log),
+        structures: read_structures(element, length_m, log),
         ..Road::default()
     })
 }
@@ -58,10 +59,9 @@ fn read_speed_limits(road: Element, log: &mut FindingLog) -> Vec<(f64, f64)> {
         let Some(limit) = speed.and_then(|speed| read_speed(speed, log)) else {
             continue;
         };
-        match element.number("s", 0.0, MAX_LENGTH_M) {
-            Ok(s_m) => limits.push((s_m, limit)),
-            Err(error) => error.note(log, "speed limit treated as absent"),
-        }
+        let s_m = element.number("s", 0.0, MAX_LENGTH_M);
+        let s_m = noted(s_m, log, "speed limit treated as absent");
+        limits.extend(s_m.map(|s_m| (s_m, limit)));
     }
     limits.sort_by(|a, b| a.0.total_cmp(&b.0));
     limits

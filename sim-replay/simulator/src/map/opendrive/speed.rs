@@ -1,7 +1,7 @@
 //! `<speed>`: limits of roads and lanes.
 
 use super::super::finding::FindingLog;
-use super::element::Element;
+use super::element::{Element, noted};
 
 /// Speed limit where the map has none: 130 km/h, metres per second.
 const UNLIMITED_MPS: f64 = 130.0 / 3.6;
@@ -24,15 +24,11 @@ pub(super) fn read_speed(element: Element, log: &mut FindingLog) -> Option<f64> 
             return None;
         }
     };
-    match element.number("max", 0.0, MAX_LIMIT) {
-        Ok(limit) if limit > 0.0 => Some(limit * metres),
-        Ok(_) => {
-            element.note_value(log, "max", "speed limit treated as absent");
-            None
-        }
-        Err(error) => {
-            error.note(log, "speed limit treated as absent");
-            None
-        }
+    let limit = element.number("max", 0.0, MAX_LIMIT);
+    let limit = noted(limit, log, "speed limit treated as absent")?;
+    if limit == 0.0 {
+        element.note_value(log, "max", "speed limit treated as absent");
+        return None;
     }
+    Some(limit * metres)
 }

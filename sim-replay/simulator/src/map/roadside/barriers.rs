@@ -103,10 +103,8 @@ fn strip_middle(road: &Road, cut: &CrossSection) -> Option<[f64; 3]> {
         lanes.find(|(_, lane)| lane.kind == LaneKind::Driving)
     });
     let ((left, _), (right, _)) = (left?, right?);
-    let s = cut
-        .s_m
-        .min(road.section_end_m(cut.section) - 1e-6)
-        .max(section.s_m);
+    let before_end_m = road.section_end_m(cut.section) - 1e-6;
+    let s = cut.s_m.min(before_end_m).max(section.s_m);
     let low = road.lane_span_m(cut.section, -right, s)[1];
     let high = road.lane_span_m(cut.section, left, s)[0];
     (high - low > 1.0).then(|| {

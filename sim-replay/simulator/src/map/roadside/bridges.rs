@@ -5,7 +5,7 @@ use super::super::curve::Pose2;
 
 use super::super::road::RoadStructure;
 use super::super::surface::CrossSection;
-use super::super::{Solid, SolidKind};
+use super::super::{Solid, SolidKind, Terrain};
 
 use super::parts::wall;
 use super::site::{HEADROOM_M, Site, outline};
@@ -26,7 +26,7 @@ const TUNNEL_M: f64 = 5.2;
 
 /// Places the structures of all roads.
 pub(super) fn place(site: &mut Site) {
-    let flat = site.ground.plane_z_m().is_some();
+    let flat = matches!(site.ground.terrain, Terrain::Plane { .. });
     for road in 0..site.surface.roads.len() {
         let structures = site.network.roads[road].structures.iter();
         for RoadStructure { s_m, length_m, .. } in structures.filter(|one| one.tunnel) {

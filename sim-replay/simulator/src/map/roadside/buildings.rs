@@ -91,9 +91,9 @@ impl Draft {
 
     /// A box whose lower side is at `at[2]`.
     fn block_at(&mut self, at: [f64; 3], size: [f64; 3]) {
-        let (foot, kind) = (self.foot, SolidKind::Building);
-        self.parts
-            .push(foot.cuboid(kind, at, size, self.reflectivity));
+        let (kind, reflectivity) = (SolidKind::Building, self.reflectivity);
+        let part = self.foot.cuboid(kind, at, size, reflectivity);
+        self.parts.push(part);
     }
 
     fn cylinder(&mut self, at: [f64; 3], size: [f64; 2]) {
@@ -274,12 +274,8 @@ fn shop(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let sign = [rng.random_range(2.0..5.0), 0.4, rng.random_range(0.8..1.8)];
     draft.block_at([u, front + awning + 0.3, height], sign);
     if rng.random_bool(0.5) {
-        let upper_width = width * rng.random_range(0.35..0.7);
-        let upper = [
-            upper_width,
-            (depth - awning) * 0.8,
-            rng.random_range(2.8..6.0),
-        ];
+        let area = [width * rng.random_range(0.35..0.7), (depth - awning) * 0.8];
+        let upper = [area[0], area[1], rng.random_range(2.8..6.0)];
         let u = rng.random_range(-0.5..0.5) * (width - upper[0]);
         draft.block_at([u, awning / 2.0, height], upper);
     }
@@ -331,13 +327,8 @@ fn church(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let nave = depth - tower;
     let height = rng.random_range(6.0..9.0);
     draft.body(0.0, tower / 2.0, [width * 0.75, nave, height]);
-    let rise = rng.random_range(4.0..6.0);
-    draft.gable(
-        [0.0, tower / 2.0, height],
-        [width * 0.75, nave],
-        rise,
-        false,
-    );
+    let (at, rise) = ([0.0, tower / 2.0, height], rng.random_range(4.0..6.0));
+    draft.gable(at, [width * 0.75, nave], rise, false);
     draft.body(0.0, depth * 0.15, [width, tower, height * 0.9]);
     let top = rng.random_range(14.0..22.0);
     let front = -depth / 2.0 + tower / 2.0;

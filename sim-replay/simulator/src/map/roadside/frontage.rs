@@ -94,11 +94,8 @@ impl Side {
     /// Width of pavement and verge on this side, metres.
     pub(super) fn pavement_m(&self, site: &Site, s_m: f64) -> f64 {
         let cut = site.cut_at(self.road, s_m);
-        if self.sign > 0.0 {
-            cut.paved_m[1] - cut.carriageway_m[1]
-        } else {
-            cut.carriageway_m[0] - cut.paved_m[0]
-        }
+        let edge = usize::from(self.sign > 0.0);
+        self.sign * (cut.paved_m[edge] - cut.carriageway_m[edge])
     }
 
     /// A pose beside the road turned to face it.
@@ -108,11 +105,8 @@ impl Side {
 
     /// The pose turned so that the road lies to its right.
     pub(super) fn with_road_right(&self, pose: Pose2) -> Pose2 {
-        if self.sign > 0.0 {
-            pose
-        } else {
-            pose.reversed()
-        }
+        let is_left = self.sign > 0.0;
+        if is_left { pose } else { pose.reversed() }
     }
 
     fn beyond(
@@ -124,12 +118,8 @@ impl Side {
     ) -> Pose2 {
         let inside = s_m.clamp(0.0, self.length_m);
         let cut = site.cut_at(self.road, inside);
-        let [low, high] = range(cut).map(|t_m| cut.aside_m(t_m));
-        let t = if self.sign > 0.0 {
-            high + out_m
-        } else {
-            low - out_m
-        };
+        let edge_m = range(cut)[usize::from(self.sign > 0.0)];
+        let t = cut.aside_m(edge_m) + self.sign * out_m;
         let pose = site.network.roads[self.road].pose_at(inside);
         pose.moved(s_m - inside, t, 0.0)
     }
@@ -151,14 +141,12 @@ fn zone(road: &Road) -> Zone {
         let widths = driving.map(|lane| lane.width.at(middle - section.s_m));
         widths.sum::<f64>()
     });
+    let limit_mps = road.speed_limit_mps(middle);
     if lanes.any(|lane| lane.kind == LaneKind::Sidewalk) {
         Zone::Street
     } else if left_m.max(right_m) > MOTORWAY_WIDTH_M {
         Zone::Motorway
-    } else if road
-        .speed_limit_mps(middle)
-        .is_some_and(|limit| limit > FAST_MPS)
-    {
+    } else if limit_mps.is_some_and(|limit| limit > FAST_MPS) {
         Zone::Rural
     } else {
         Zone::Street

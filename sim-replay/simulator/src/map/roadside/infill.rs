@@ -61,9 +61,7 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
         }
         match choice {
             0 => second_row(site, pose, rng),
-            1..=6 => {
-                plant(site, pose, species, size, rng);
-            }
+            1..=6 => plant(site, pose, species, size, rng),
             _ => {}
         }
     }

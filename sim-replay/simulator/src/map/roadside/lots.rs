@@ -1,5 +1,7 @@
 //! Parking lots: bays in rows beside the street.
 
+use std::f64::consts::FRAC_PI_2;
+
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -25,16 +27,11 @@ pub(super) const DEPTH_M: f64 = 2.0 * BAY_M[0] + AISLE_M + 1.4;
 pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
     let count = ((lot.width_m - 1.0) / BAY_M[1]).floor() as u32;
     let island = rng.random_range(2..=4.max(count / 2));
-    for (v, turn) in [
-        (-(AISLE_M + BAY_M[0]) / 2.0, -1.0),
-        ((AISLE_M + BAY_M[0]) / 2.0, 1.0),
-    ] {
+    for turn in [-1.0, 1.0] {
+        let v = turn * (AISLE_M + BAY_M[0]) / 2.0;
         for bay in 0..count {
             let u = (f64::from(bay) + 0.5 - f64::from(count) / 2.0) * BAY_M[1];
-            let pose = lot
-                .foot
-                .pose
-                .moved(u, v, turn * std::f64::consts::FRAC_PI_2);
+            let pose = lot.foot.pose.moved(u, v, turn * FRAC_PI_2);
             if bay % island == island - 1 && rng.random_bool(0.6) {
                 let foot = site.foot(pose);
                 let parts = if rng.random_bool(0.6) {
@@ -46,11 +43,8 @@ pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
                 continue;
             }
             // Some drivers park backwards.
-            let parked = if rng.random_bool(0.3) {
-                pose.reversed()
-            } else {
-                pose
-            };
+            let is_backwards = rng.random_bool(0.3);
+            let parked = if is_backwards { pose.reversed() } else { pose };
             site.parking.push(ParkingSpot {
                 center_m: [pose.x, pose.y, site.ground_m([pose.x, pose.y])],
                 yaw_rad: parked.heading_rad,

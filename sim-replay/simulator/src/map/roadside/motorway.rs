@@ -98,13 +98,10 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             let [a, b] = [s, s + step].map(|s| site.foot(side.beyond_paved(site, s, out)));
             let (low, high) = (a.z_m.min(b.z_m), a.z_m.max(b.z_m));
             // Panels of slightly different height between posts; some are missing or glazed (lower).
-            let is_low = rng.random_bool(0.08);
-            let own = height
-                * if is_low {
-                    0.45
-                } else {
-                    rng.random_range(0.94..1.06)
-                };
+            let own = match rng.random_bool(0.08) {
+                true => height * 0.45,
+                false => height * rng.random_range(0.94..1.06),
+            };
             if (low - side.road_m(site, s)).abs() < 3.0 {
                 let (kind, z) = (SolidKind::NoiseWall, [low - 0.3, high + own]);
                 let [p, q] = [a, b].map(|foot| [foot.pose.x, foot.pose.y]);

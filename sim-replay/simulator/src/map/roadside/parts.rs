@@ -77,18 +77,13 @@ impl PartFootprint {
         self.solid(kind, Shape::Ellipsoid { radii_m }, center_m, reflectivity)
     }
 
-    fn solid(
-        &self,
-        kind: SolidKind,
-        shape: Shape,
-        [u, v, w]: [f64; 3],
-        reflectivity: f32,
-    ) -> Solid {
-        let at = self.pose.moved(u, v, 0.0);
+    fn solid(&self, kind: SolidKind, shape: Shape, at: [f64; 3], reflectivity: f32) -> Solid {
+        let [u, v, w] = at;
+        let Pose2 { x, y, .. } = self.pose.moved(u, v, 0.0);
         Solid {
             kind,
             shape,
-            center_m: [at.x, at.y, self.z_m + w],
+            center_m: [x, y, self.z_m + w],
             yaw_rad: self.pose.heading_rad,
             reflectivity,
         }

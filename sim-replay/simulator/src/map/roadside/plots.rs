@@ -30,14 +30,8 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     }
 }
 
-/// Character of a street, common to its houses.
-struct Character {
-    styles: Vec<Style>,
-    set_back_m: f64,
-    gap_m: f64,
-}
-
-fn character(rng: &mut ChaCha8Rng) -> Character {
+/// Character of a street, common to its houses: their styles, least set-back and gap, metres.
+fn character(rng: &mut ChaCha8Rng) -> (Vec<Style>, f64, f64) {
     use Style::*;
     let (styles, set_back_m, gap_m) = match rng.random_range(0..5) {
         0 => (vec![House, House, House, Row, Shop], 2.5..6.0, 3.5),
@@ -50,15 +44,11 @@ fn character(rng: &mut ChaCha8Rng) -> Character {
         ),
         _ => (vec![Hall, Hall, Tanks, Shop, Block], 3.0..8.0, 5.0),
     };
-    Character {
-        styles,
-        set_back_m: rng.random_range(set_back_m),
-        gap_m,
-    }
+    (styles, rng.random_range(set_back_m), gap_m)
 }
 
 fn along_street(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
-    let character = character(rng);
+    let (styles, least_set_back, gap) = character(rng);
     let mut s = -CORNER_M;
     while s < side.length_m + CORNER_M {
         let kind = rng.random_range(0..100);
@@ -66,16 +56,16 @@ fn along_street(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             0..13 => parking_lot(site, side, s, rng),
             13..18 => green(site, side, s, rng),
             _ => {
-                let style = character.styles[rng.random_range(0..character.styles.len())];
+                let style = styles[rng.random_range(0..styles.len())];
                 let size = style.lot_m(rng);
-                let set_back = character.set_back_m + rng.random_range(0.0..1.8);
+                let set_back = least_set_back + rng.random_range(0.0..1.8);
                 let mut end = building(site, side, s, size, set_back, style, rng);
                 if end.is_none() {
                     // A small house where nothing else fits.
                     let (style, set_back) = (Style::House, 0.8 + set_back * 0.5);
                     end = building(site, side, s, [8.2, 8.0], set_back, style, rng);
                 }
-                end.map(|end| end + character.gap_m * rng.random_range(0.4..2.2))
+                end.map(|end| end + gap * rng.random_range(0.4..2.2))
             }
         };
         s = advanced.unwrap_or(s + 2.5);

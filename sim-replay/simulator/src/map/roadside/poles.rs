@@ -6,7 +6,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
-use super::super::road::{Road, RoadLink};
+use super::super::road::RoadLink;
 use super::super::{Solid, SolidKind};
 use super::frontage::{Side, Zone, sides};
 use super::parts::PartFootprint;
@@ -43,39 +43,22 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
     let mut lights = false;
     for index in 0..site.network.roads.len() {
         let road = &site.network.roads[index];
-        for signal in &road.signals {
-            lights |= signal.dynamic;
-            let foot = site.foot(beside_line(
-                road,
-                signal.s_m,
-                signal.t_m,
-                signal.heading_rad,
-            ));
-            let parts = if signal.dynamic {
-                light(foot)
-            } else {
-                sign(foot, rng)
+        let signals = road.signals.iter();
+        let signals = signals.map(|one| (one.s_m, one.t_m, one.heading_rad, one.dynamic));
+        let signs = road.objects.iter().filter(|one| is_sign(&one.label));
+        let signs = signs.map(|one| (one.s_m, one.t_m, one.heading_rad, false));
+        for (s_m, t_m, heading_rad, is_light) in signals.chain(signs) {
+            lights |= is_light;
+            let [aside_m, _] = road.aside_m(road.section_at(s_m), s_m, t_m);
+            let foot = site.foot(road.pose_at(s_m).moved(0.0, aside_m, heading_rad));
+            let parts = match is_light {
+                true => light(foot),
+                false => sign(foot, rng),
             };
-            beside_carriageway(site, &parts, signal.t_m);
-        }
-        for object in road.objects.iter().filter(|object| is_sign(&object.label)) {
-            let foot = site.foot(beside_line(
-                road,
-                object.s_m,
-                object.t_m,
-                object.heading_rad,
-            ));
-            let parts = sign(foot, rng);
-            beside_carriageway(site, &parts, object.t_m);
+            beside_carriageway(site, &parts, t_m);
         }
     }
     lights
-}
-
-/// A pose that a map gives by `s` and `t`, turned by `heading_rad`.
-fn beside_line(road: &Road, s_m: f64, t_m: f64, heading_rad: f64) -> Pose2 {
-    let [aside_m, _] = road.aside_m(road.section_at(s_m), s_m, t_m);
-    road.pose_at(s_m).moved(0.0, aside_m, heading_rad)
 }
 
 /// Places parts, or the same a little farther out where the map has them on the carriageway.
@@ -188,11 +171,8 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 fn signs(site: &mut Site, side: &Side, distance_m: Range<f64>, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..distance_m.end);
     while s < side.length_m - 2.0 {
-        let out = if side.zone == Zone::Street {
-            0.5..0.9
-        } else {
-            0.8..1.6
-        };
+        let is_street = side.zone == Zone::Street;
+        let out = if is_street { 0.5..0.9 } else { 0.8..1.6 };
         let pose = side.beyond_kerb(site, s, rng.random_range(out));
         let foot = site.foot(if side.along { pose } else { pose.reversed() });
         site.try_place(&sign(foot, rng), 0.05, false);
@@ -205,12 +185,8 @@ fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..20.0);
     while s < side.length_m - 3.0 {
         let pavement = side.pavement_m(site, s);
-        let is_at_kerb = rng.random_bool(0.5);
-        let out = if is_at_kerb {
-            0.6
-        } else {
-            (pavement - 0.4).max(0.6)
-        };
+        let (at_back, is_at_kerb) = ((pavement - 0.4).max(0.6), rng.random_bool(0.5));
+        let out = if is_at_kerb { 0.6 } else { at_back };
         let foot = site.foot(side.facing(side.beyond_kerb(site, s, out)));
         let kind = SolidKind::StreetFurniture;
         let parts = match rng.random_range(0..12) {

@@ -1,7 +1,7 @@
 //! Ground plan of a scene: outlines that are occupied, and solids that have been placed.
 
 pub(super) use super::super::clearance::outline;
-use super::super::convex::{CellIndex, Rectangle, bounds, overlap};
+use super::super::convex::{CellIndex, Rectangle, bounds, overlap, range};
 use super::super::curve::Pose2;
 use super::super::ground::Ground;
 use super::super::road::RoadNetwork;
@@ -47,8 +47,12 @@ impl<'a> Site<'a> {
 
     /// True if a rectangle is free of roads and of everything placed, between two heights.
     pub(super) fn is_free(&self, rectangle: &Rectangle, z_m: [f64; 2], pavements: bool) -> bool {
+        let (outline, [bottom_m, top_m]) = (rectangle.corners(), z_m);
         self.surface.is_clear(rectangle, z_m, HEADROOM_M, pavements)
-            && !self.is_taken(&rectangle.corners(), z_m)
+            && !self.index.any(bounds(outline), |number| {
+                let (other, [low, high]) = &self.taken[number as usize];
+                bottom_m < *high && top_m > *low && overlap(&outline, other)
+            })
     }
 
     /// Takes a rectangle between two heights.
@@ -84,12 +88,8 @@ impl<'a> Site<'a> {
     /// Lowest and highest terrain under the corners and the middle of a rectangle, metres.
     pub(super) fn ground_range_m(&self, rectangle: &Rectangle) -> [f64; 2] {
         let corners = rectangle.corners().into_iter();
-        let heights = corners
-            .chain([rectangle.center_m])
-            .map(|place| self.ground_m(place));
-        heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| {
-            [low.min(z), high.max(z)]
-        })
+        let places = corners.chain([rectangle.center_m]);
+        range(places.map(|place| self.ground_m(place)))
     }
 
     /// The foot of parts that stand on the terrain.
@@ -104,15 +104,9 @@ impl<'a> Site<'a> {
         &cuts[after.saturating_sub(1)]
     }
 
-    fn is_taken(&self, outline: &[[f64; 2]], [bottom_m, top_m]: [f64; 2]) -> bool {
-        self.index.any(bounds(outline), |number| {
-            let (other, [low, high]) = &self.taken[number as usize];
-            bottom_m < *high && top_m > *low && overlap(outline, other)
-        })
-    }
-
     fn take_outline(&mut self, outline: Vec<[f64; 2]>, z_m: [f64; 2]) {
-        self.index.insert(self.taken.len() as u32, bounds(&outline));
+        let bounds = bounds(outline.iter().copied());
+        self.index.insert(self.taken.len() as u32, bounds);
         self.taken.push((outline, z_m));
     }
 
@@ -130,7 +124,7 @@ impl<'a> Site<'a> {
                 z_m[1].max(patch.z_m[1]).max(patch.z_m[2]),
             ];
         }
-        let [low, high] = bounds(&points);
+        let [low, high] = bounds(points.iter().copied());
         if points.len() > 2 && (high[0] - low[0]).max(high[1] - low[1]) < MAX_JUNCTION_M {
             self.take_outline(hull(points), [z_m[0] - 0.5, z_m[1] + HEADROOM_M]);
         }

@@ -95,16 +95,10 @@ fn crown(foot: PartFootprint, at: [f64; 3], radii: [f64; 3], leaves: f32) -> Sol
 }
 
 /// Plants a tree at a pose on the ground, if all of it finds room.
-pub(super) fn plant(
-    site: &mut Site,
-    pose: Pose2,
-    species: Species,
-    size: f64,
-    rng: &mut ChaCha8Rng,
-) -> bool {
-    let parts = tree(site.foot(pose), species, size, rng);
+pub(super) fn plant(site: &mut Site, pose: Pose2, kind: Species, size: f64, rng: &mut ChaCha8Rng) {
+    let parts = tree(site.foot(pose), kind, size, rng);
     // Crowns may touch; the trunk keeps its distance from walls and poles by the crown around it.
-    site.try_place(&parts, 0.0, false)
+    site.try_place(&parts, 0.0, false);
 }
 
 /// Rows of street trees on broad pavements and verges, one species and rhythm a street.

@@ -87,13 +87,13 @@ impl MapRefinement {
             padding: 0,
             upsampling: 1,
         };
-        let formats = [
-            LayerFormat::hidden(input, hidden),
-            LayerFormat::last(hidden),
-        ];
-        let [first, second] = [0, 1].map(|layer| {
-            let nn::Conv2D { ws, bs, .. } = &self.convolutions[layer];
-            Int8Convolution::new(ws, bs.as_ref(), geometry, formats[layer])
+        let [first, second] = &self.convolutions;
+        let [first, second] = [
+            (first, LayerFormat::hidden(input, hidden)),
+            (second, LayerFormat::last(hidden)),
+        ]
+        .map(|(nn::Conv2D { ws, bs, .. }, format)| {
+            Int8Convolution::new(ws, bs.as_ref(), geometry, format)
         });
         self.int8 = Some(Int8Refinement {
             input,
@@ -105,14 +105,8 @@ impl MapRefinement {
 
 /// A size-preserving 3x3 convolution.
 fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
-    maps.f_conv2d(
-        &convolution.ws,
-        convolution.bs.as_ref(),
-        [1, 1],
-        [1, 1],
-        [1, 1],
-        1,
-    )
+    let nn::Conv2D { ws, bs, .. } = convolution;
+    maps.f_conv2d(ws, bs.as_ref(), [1, 1], [1, 1], [1, 1], 1)
 }
 
 impl Int8Refinement {

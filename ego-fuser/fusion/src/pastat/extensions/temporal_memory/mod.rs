@@ -71,11 +71,7 @@ impl TemporalMemory {
         fine: &FineMaps,
         context: &Tensor,
     ) -> Result<Tensor> {
-        let earlier = aligned
-            .earlier
-            .as_ref()
-            .and_then(|earlier| earlier.full_resolution.as_ref());
-        let Some((maps, classes)) = earlier else {
+        let Some((maps, classes)) = aligned.earlier_full_resolution() else {
             return Ok(fused);
         };
         let maps = self.placed(maps, coarse, fine.corrections.as_ref())?;
@@ -83,12 +79,10 @@ impl TemporalMemory {
             return Ok(fused);
         }
         let likely = classes.likely(&fused)?;
+        let grid = &aligned.grid;
         self.forward(
             [&fused, &fine.own],
-            &Earlier {
-                maps,
-                grid: &aligned.grid,
-            },
+            &Earlier { maps, grid },
             context,
             &likely,
         )
@@ -233,19 +227,9 @@ impl TemporalMemory {
 /// given those of all but the very first, `corrections` `[N - 1, 3]`. A correction close to that of its agent's newest
 /// map is replaced by it.
 fn settled(origins: &Origins, corrections: &Tensor, first: usize) -> Result<Vec<[f64; 3]>> {
-    let corrections = Vec::<f64>::try_from(
-        corrections
-            .f_detach()?
-            .f_to_kind(Kind::Double)?
-            .f_reshape(-1)?,
-    )?;
-    let all: Vec<[f64; 3]> = std::iter::once([0.0; 3])
-        .chain(
-            corrections
-                .chunks_exact(3)
-                .map(|found| [found[0], found[1], found[2]]),
-        )
-        .collect();
+    let corrections = corrections.f_detach()?.f_to_kind(Kind::Double)?;
+    let corrections = Vec::<f64>::try_from(corrections.f_reshape(-1)?)?;
+    let all = [&[[0.0; 3]][..], corrections.as_chunks::<3>().0].concat();
     Ok((first..all.len())
         .map(|entry| {
             // For earlier maps of the ego this is the first entry, whose correction is zero.
@@ -276,9 +260,8 @@ struct Places {
 
 impl Places {
     fn of(selection: &Selection, width: i64, device: Device) -> Result<Self> {
-        let near: Vec<i64> = selection
-            .near
-            .iter()
+        let near = selection.near.iter();
+        let near: Vec<i64> = near
             .map(|&[row, column]| row as i64 * width + column as i64)
             .collect();
         let around = tensor(&selection.around, &[-1, AROUND], device)?;
@@ -327,16 +310,13 @@ fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<T
     let results = shown
         .f_linear(&weight, None::<&Tensor>)?
         .f_view([-1, hidden])?;
-    let (sums, ..) = Tensor::f_embedding_bag(
-        &results,
-        &around.results,
-        &around.first,
-        false,
-        SUM,
-        false,
-        None::<&Tensor>,
-        false,
-    )?;
+    let Around {
+        results: rows,
+        first,
+    } = around;
+    let unweighted = None::<&Tensor>;
+    let (sums, ..) =
+        Tensor::f_embedding_bag(&results, rows, first, false, SUM, false, unweighted, false)?;
     match &convolution.bs {
         Some(bias) => sums.f_add(bias),
         None => Ok(sums),

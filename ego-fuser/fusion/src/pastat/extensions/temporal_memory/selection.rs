@@ -10,19 +10,6 @@ pub(super) const AROUND: i64 = 9;
 /// others its outline.
 const MARGIN_CELLS: i64 = 2;
 
-/// Offsets of the nine cells, rows and columns from the first, row by row.
-const BESIDE: [[usize; 2]; AROUND as usize] = [
-    [0, 0],
-    [0, 1],
-    [0, 2],
-    [1, 0],
-    [1, 1],
-    [1, 2],
-    [2, 0],
-    [2, 1],
-    [2, 2],
-];
-
 /// The cells of a few patches, patch by patch and row by row, and their neighbours.
 #[derive(Debug)]
 pub(super) struct Selection {
@@ -56,10 +43,8 @@ impl Selection {
     fn of(patches: &[usize], patch: usize, size: [usize; 2]) -> Self {
         let [height, width] = size;
         let cells = patches.iter().flat_map(|index| {
-            let (row, column) = (
-                index / (width / patch) * patch,
-                index % (width / patch) * patch,
-            );
+            let across = width / patch;
+            let (row, column) = (index / across * patch, index % across * patch);
             (row..row + patch)
                 .flat_map(move |row| (column..column + patch).map(move |column| [row, column]))
         });
@@ -70,13 +55,11 @@ impl Selection {
             place[cell] = Some(0);
         }
         let mut near = Vec::new();
-        for (cell, place) in place
-            .iter_mut()
-            .enumerate()
-            .filter(|(_, place)| place.is_some())
-        {
-            *place = Some(near.len() as i64);
-            near.push([cell / width, cell % width]);
+        for (cell, place) in place.iter_mut().enumerate() {
+            if let Some(place) = place {
+                *place = near.len() as i64;
+                near.push([cell / width, cell % width]);
+            }
         }
         let around = cells.iter().flat_map(|&cell| beside(cell, size));
         let around = around.map(|cell| cell.and_then(|cell| place[cell]));
@@ -96,10 +79,10 @@ impl Selection {
 
 /// The nine cells in and around one of a map of a size, counted row by row; `None` beyond the edge.
 fn beside([row, column]: [usize; 2], [height, width]: [usize; 2]) -> [Option<usize>; 9] {
-    BESIDE.map(|[down, right]| {
-        // Offsets count from the cell above and to the left, hence one less.
-        let row = (row + down).checked_sub(1)?;
-        let column = (column + right).checked_sub(1)?;
+    std::array::from_fn(|place| {
+        // Row by row from the cell above and to the left, hence one less.
+        let row = (row + place / 3).checked_sub(1)?;
+        let column = (column + place % 3).checked_sub(1)?;
         (row < height && column < width).then_some(row * width + column)
     })
 }

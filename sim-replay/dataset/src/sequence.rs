@@ -1,0 +1,77 @@
+//! Sequences of a single vehicle: a file per sweep, and the pose of its LiDAR where that is known.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use protocol::{CavId, Handedness, Pose};
+
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, Result, Scenario, Tick, single_vehicle};
+use crate::frame::Frame;
+use crate::pcd::PcdCloud;
+
+/// Sweeps and poses of a sequence.
+#[derive(Debug)]
+struct Sequence {
+    /// File and `world_from_lidar` by the stem of the tick.
+    clouds: HashMap<String, (PathBuf, Option<Pose>)>,
+    sweeps: Sweeps,
+    /// Files of poses, times and calibration, whether or not they exist.
+    shared_files: Vec<PathBuf>,
+    is_z_down: bool,
+}
+
+/// The scenario of `clouds` in order of time, each with its file and `world_from_lidar`. All its poses and times come
+/// from `shared_files`. Points that are stored with z down are turned by half a turn about x.
+pub(super) fn scenario(
+    name: String,
+    layout: Layout,
+    clouds: Vec<(Tick, PathBuf, Option<Pose>)>,
+    (storage, options): (SweepStorage, &OpenOptions),
+    shared_files: Vec<PathBuf>,
+    is_z_down: bool,
+) -> Scenario {
+    let files = clouds.iter().map(|(_, file, _)| file.clone());
+    let sweeps = Sweeps::of_single_vehicle(storage, files, options);
+    let ticks = clouds.iter().map(|(tick, ..)| tick.clone()).collect();
+    let clouds = clouds
+        .into_iter()
+        .map(|(tick, file, pose)| (tick.stem, (file, pose)));
+    let source = Sequence {
+        clouds: clouds.collect(),
+        sweeps,
+        shared_files,
+        is_z_down,
+    };
+    single_vehicle(name, layout, ticks, Arc::new(source))
+}
+
+impl FrameSource for Sequence {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        frame.world_from_lidar = self.clouds.get(&tick.stem).and_then(|(_, pose)| *pose);
+        Ok(frame)
+    }
+
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
+        let path = self.points_path(agent, tick, variant);
+        let mut cloud = self.sweeps.read(agent, &path)?;
+        if self.is_z_down {
+            for [_, y, z, _] in &mut cloud.points.xyzi {
+                // The half turn, `diag(1, -1, -1)`.
+                (*y, *z) = (-*y, -*z);
+            }
+        }
+        Ok(cloud)
+    }
+
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        self.sweeps.samples(agent, self.shared_files.clone())
+    }
+
+    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
+        let cloud = self.clouds.get(&tick.stem);
+        cloud.map(|(file, _)| file.clone()).unwrap_or_default()
+    }
+}
