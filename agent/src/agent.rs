@@ -170,7 +170,7 @@ impl Agent {
         let levels = self.levels(&sweep);
         let input = pose_input(&self.cav, input, levels);
         let pose = self.pose_source.estimate(&input);
-        let pose = self.published(pose);
+        let pose = { self.attack.as_ref() }.map_or(pose, |attack| attack.pose(pose));
         (pose, self.pose_stages("pose", began), sweep)
     }
 
@@ -221,10 +221,6 @@ impl Agent {
     fn pose_stages(&self, step: &str, began: Instant) -> Vec<StageTiming> {
         let whole = StageTiming::new(step, began.elapsed());
         [&[whole][..], self.pose_source.stages()].concat()
-    }
-
-    fn published(&self, pose: PoseEstimate) -> PoseEstimate {
-        { self.attack.as_ref() }.map_or(pose, |attack| attack.pose(pose))
     }
 
     /// Starts the pose source anew at a pose that a person states, with its standard deviations. False if the source
@@ -290,19 +286,16 @@ impl Agent {
         let sent = detector.compressed(map)?;
         let features = detector.to_message(&sent)?;
         times.lap("message");
-        let mut perception = Perception {
-            features,
-            confidence: Vec::new(),
-            detections: Vec::new(),
-            times: Vec::new(),
+        let (confidence, detections) = match self.has_head {
+            true => self.detect(detector, &detector.decompressed(&sent)?, &mut times)?,
+            false => Default::default(),
         };
-        if self.has_head {
-            let map = detector.decompressed(&sent)?;
-            (perception.confidence, perception.detections) =
-                self.detect(detector, &map, &mut times)?;
-        }
-        perception.times = times.into_timings();
-        Ok(perception)
+        Ok(Perception {
+            features,
+            confidence,
+            detections,
+            times: times.into_timings(),
+        })
     }
 
     /// Confidence and detections of the map that receivers have.

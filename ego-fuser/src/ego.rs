@@ -421,17 +421,8 @@ impl Ego {
             box_correction::correct_by_boxes(&mut metadata, &maps, &self.detector, pose_graph)?;
             stages.lap("correct");
         }
-        let mut earlier = Vec::new();
-        for (agent, kept, ego_from_cav) in self.earlier(&aligned) {
-            earlier.push(&kept.map);
-            let age_nanos = aligned[0].view.capture_nanos as i64 - kept.capture_nanos as i64;
-            metadata.push(MapMetadata {
-                agent,
-                ego_from_cav,
-                confidence: kept.confidence,
-                age_secs: age_nanos as f64 * 1e-9,
-            });
-        }
+        let (earlier, of_earlier): (Vec<_>, Vec<_>) = self.earlier(&aligned).into_iter().unzip();
+        metadata.extend(of_earlier);
         let newest = ReceivedMaps::new(one_after_another(&maps)?, Some(one_after_another(&sent)?));
         let earlier = (!earlier.is_empty())
             .then(|| ReceivedMaps::together(&earlier))
@@ -486,15 +477,22 @@ impl Ego {
 
     /// The kept maps of the vehicles that take part, with their poses in the ego's current frame. An ego without a pose
     /// has none.
-    fn earlier(&self, aligned: &[Aligned<'_>]) -> Vec<(usize, &KeptMap, Pose)> {
-        let Some(world_from_ego) = aligned[0].view.pose.world_from_cav() else {
+    fn earlier(&self, aligned: &[Aligned<'_>]) -> Vec<(&ReceivedMaps, MapMetadata)> {
+        let ego = aligned[0].view;
+        let Some(world_from_ego) = ego.pose.world_from_cav() else {
             return Vec::new();
         };
         let mut earlier = Vec::new();
         for (agent, Aligned { view, .. }) in aligned.iter().enumerate() {
             for kept in self.history.before(&view.cav, view.capture_nanos) {
-                let ego_from_cav = world_from_ego.from_world(&kept.world_from_cav);
-                earlier.push((agent, kept, ego_from_cav));
+                let age_nanos = ego.capture_nanos as i64 - kept.capture_nanos as i64;
+                let metadata = MapMetadata {
+                    agent,
+                    ego_from_cav: world_from_ego.from_world(&kept.world_from_cav),
+                    confidence: kept.confidence,
+                    age_secs: age_nanos as f64 * 1e-9,
+                };
+                earlier.push((&kept.map, metadata));
             }
         }
         earlier

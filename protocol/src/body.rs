@@ -203,7 +203,7 @@ impl<'a> PayloadReader<'a> {
                 self.piece = rest;
                 self.crc.update(run);
                 run.as_chunks().0.as_chunks().0
-            } else if self.fill(across.as_flattened_mut().as_flattened_mut()) {
+            } else if (self.fill(across.as_flattened_mut().as_flattened_mut())).is_some() {
                 &across
             } else {
                 break;
@@ -221,21 +221,17 @@ impl<'a> PayloadReader<'a> {
         (values, excess >= 0)
     }
 
-    /// Fills `bytes`; `false` when the pieces end before.
-    fn fill(&mut self, bytes: &mut [u8]) -> bool {
+    /// Fills `bytes`; `None` when the pieces end before.
+    fn fill(&mut self, bytes: &mut [u8]) -> Option<()> {
         let mut left = bytes;
         while !left.is_empty() {
-            let Some(run) = self.next_run(left.len()) else {
-                return false;
-            };
+            let run = self.next_run(left.len())?;
             self.crc.update(run);
-            let Some((filled, rest)) = left.split_at_mut_checked(run.len()) else {
-                return false;
-            };
+            let (filled, rest) = left.split_at_mut_checked(run.len())?;
             filled.copy_from_slice(run);
             left = rest;
         }
-        true
+        Some(())
     }
 
     /// The checksum over all bytes of the payload, including those not yet read.

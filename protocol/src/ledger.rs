@@ -72,9 +72,7 @@ pub struct Counts {
 impl Counts {
     /// Messages lost for any reason.
     pub fn dropped_total(&self) -> u64 {
-        self.dropped
-            .values()
-            .fold(0, |sum, count| sum.saturating_add(*count))
+        self.dropped.values().copied().fold(0, u64::saturating_add)
     }
 
     /// Adds another's counters. Numbers from a hostile peer saturate.

@@ -155,10 +155,8 @@ impl<'a> Node<'a> {
         // One topic more per vehicle than streams: its GNSS.
         let topics = MAX_VEHICLES * (options.streams.len() + 1);
         let inbox = bus.limited_inbox(PLACES, topics, options.inbox);
-        stop.on_request({
-            let inbox = Arc::clone(&inbox);
-            move || inbox.close()
-        });
+        let closed = Arc::clone(&inbox);
+        stop.on_request(move || closed.close());
         let membership = Membership::begin(bus, Role::Agent, 2 * MAX_VEHICLES)?;
         Ok(Self {
             bus,
@@ -247,7 +245,9 @@ impl<'a> Node<'a> {
                 senders.contains(cav)
             });
             let Some(gone) = gone.cloned() else {
-                self.reject(cav);
+                if self.rejected.len() < MAX_REJECTED && self.rejected.insert(cav.clone()) {
+                    tracing::warn!(%cav, "its messages are not forwarded: the link carries at most {MAX_VEHICLES} vehicles");
+                }
                 return Ok(());
             };
             self.vehicles.remove(&gone);
@@ -256,13 +256,6 @@ impl<'a> Node<'a> {
         tracing::info!(%cav, "its messages are forwarded");
         self.vehicles.insert(cav, vehicle);
         Ok(())
-    }
-
-    fn reject(&mut self, cav: CavId) {
-        if self.rejected.len() < MAX_REJECTED && !self.rejected.contains(&cav) {
-            tracing::warn!(%cav, "its messages are not forwarded: the link carries at most {MAX_VEHICLES} vehicles");
-            self.rejected.insert(cav);
-        }
     }
 
     fn attach(&self, cav: &CavId) -> Result<Vehicle, BusError> {

@@ -70,36 +70,26 @@ impl RecordReport {
 
     /// Description of the missing messages; `None` if there are none.
     pub fn loss_in_words(&self) -> Option<String> {
-        let Self {
-            file,
-            messages,
-            seconds,
-            overwritten,
-            undelivered,
-            router_gone_s,
-            not_written,
-            failure,
-            ..
-        } = self;
-        let missing = overwritten + undelivered + not_written;
-        match failure {
+        let missing = self.overwritten + self.undelivered + self.not_written;
+        let (gone_s, seconds) = (self.router_gone_s, self.seconds);
+        match &self.failure {
             None if missing == 0 => None,
-            None if *undelivered == missing && *router_gone_s > 0.0 => Some(format!(
-                "recording with gaps: router gone for {router_gone_s:.1} s, {missing} messages missing"
+            None if self.undelivered == missing && gone_s > 0.0 => Some(format!(
+                "recording with gaps: router gone for {gone_s:.1} s, {missing} messages missing"
             )),
-            None if *undelivered == missing => Some(format!(
+            None if self.undelivered == missing => Some(format!(
                 "recording with gaps: the recorder was too slow for the router, {missing} messages missing"
             )),
             None => Some(format!(
                 "recording with gaps: the disk is too slow, {missing} messages missing"
             )),
-            Some(why) if *messages == 0 => Some(format!(
+            Some(why) if self.messages == 0 => Some(format!(
                 "nothing is recorded: {why}, {missing} messages missing"
             )),
             Some(why) => Some(format!(
                 "recording cut at {seconds:.1} s: {why}, {missing} messages missing; sim-replay recover {} --out {}",
-                file.display(),
-                file.with_extension("whole.mcap").display()
+                self.file.display(),
+                self.file.with_extension("whole.mcap").display()
             )),
         }
     }

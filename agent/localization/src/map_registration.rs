@@ -75,7 +75,7 @@ impl MapRegistration {
         let moved = fit.target_from_source.translation.vector - start.translation.vector;
         let is_near = moved.norm() <= MOST_MOVED_M;
         (is_near && fit.overlap_above_ground >= CONFIRMED)
-            .then(|| registered(&fit, self.map.covariance_scale()))
+            .then(|| registered(&fit, self.map.covariance_scale))
     }
 }
 
@@ -87,7 +87,7 @@ impl Localize for MapRegistration {
         let near = (sweep.predicted).and_then(|start| self.registered(&source, &start));
         let registering = times.lap(REGISTER);
         if let Some(found) = near {
-            return Ok(Localization::of_found(found, times));
+            return Ok(Localization::new(&Ok(found), times));
         }
         let mut localization = self.localizer.localize(sweep)?;
         // The localizer has a stopwatch of its own, which began after the failed registration.
@@ -127,12 +127,7 @@ fn judged(
             ..*found
         },
     };
-    let (inlier_count, inlier_ratio) = (localization.inlier_count, localization.inlier_ratio);
-    Localization {
-        inlier_count,
-        inlier_ratio,
-        ..Localization::of_found(judged, localization.times)
-    }
+    Localization::new(&Ok(judged), localization.times)
 }
 
 /// The pose of a registration. Its confidence is that of the expected squared error (Eq. 6).
@@ -170,7 +165,7 @@ mod tests {
 
     impl Localize for Fixed {
         fn localize(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
-            Ok(Localization::of_found(self.found, stopwatch()))
+            Ok(Localization::new(&Ok(self.found), stopwatch()))
         }
 
         fn place(&self) -> Option<&str> {

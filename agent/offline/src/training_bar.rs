@@ -23,7 +23,7 @@ pub struct TrainingBar {
     last_line: Cell<Option<Instant>>,
     encoding: Cell<Option<Encoding>>,
     /// Length of the training.
-    length: Option<Length>,
+    length: Length,
     /// True if the length includes the encoding.
     includes_encoding: bool,
 }
@@ -39,26 +39,17 @@ struct Encoding {
     is_estimated: bool,
 }
 
-impl Default for TrainingBar {
-    fn default() -> Self {
+impl TrainingBar {
+    /// Bar for a training of this length, which is part of the estimate if sweeps have to be encoded first.
+    pub fn of(length: Length) -> Self {
         let bar = progress::percent_bar(PARTS);
         Self {
             is_watched: !bar.is_hidden(),
             bar,
             last_line: Cell::new(None),
             encoding: Cell::new(None),
-            length: None,
+            length,
             includes_encoding: false,
-        }
-    }
-}
-
-impl TrainingBar {
-    /// Bar for a training of this length, which is part of the estimate if sweeps have to be encoded first.
-    pub fn of(length: Length) -> Self {
-        Self {
-            length: Some(length),
-            ..Self::default()
         }
     }
 
@@ -90,7 +81,7 @@ impl TrainingBar {
     pub fn report(&self, share_done: f64, seconds: f64, text: &str) {
         let remaining_s = match self.length {
             // The clock ends it, whatever part of the time the encoding took.
-            Some(Length::Time(limit)) => Some((limit.as_secs_f64() - seconds).max(0.0)),
+            Length::Time(limit) => Some((limit.as_secs_f64() - seconds).max(0.0)),
             _ => remaining_s(share_done, 1.0 - share_done, seconds),
         };
         self.show(share_done, remaining_s, text);
@@ -154,14 +145,9 @@ impl TrainingBar {
 }
 
 /// Estimate of the duration of the encoding of all sweeps, and the training after it.
-fn estimate(
-    sweeps: usize,
-    seconds: f64,
-    length: Option<Length>,
-    includes_encoding: bool,
-) -> String {
+fn estimate(sweeps: usize, seconds: f64, length: Length, includes_encoding: bool) -> String {
     let then = match length {
-        Some(Length::Time(time)) => {
+        Length::Time(time) => {
             let (time_s, all) = (time.as_secs_f64(), minutes(time.as_secs_f64()));
             if !includes_encoding {
                 format!(", then {all} of training")
@@ -172,9 +158,8 @@ fn estimate(
                 format!(" of the {all} in all, which leaves {left} for the training")
             }
         }
-        Some(Length::Steps(steps)) => format!(", then {steps} steps of training"),
-        Some(Length::Epochs(epochs)) => format!(", then {epochs} passes of training"),
-        None => String::new(),
+        Length::Steps(steps) => format!(", then {steps} steps of training"),
+        Length::Epochs(epochs) => format!(", then {epochs} passes of training"),
     };
     format!("encoding {sweeps} sweeps takes {}{then}", minutes(seconds))
 }
@@ -206,27 +191,20 @@ mod tests {
     #[test]
     fn the_durations_of_encoding_and_training_are_estimated() {
         let training = |length| estimate(600, 540.0, length, false);
-        let time = Some(Length::Time(Duration::from_secs(1200)));
+        let time = Length::Time(Duration::from_secs(1200));
         assert_eq!(
             training(time),
             "encoding 600 sweeps takes 9 min, then 20 min of training"
         );
         assert_eq!(
-            training(Some(Length::Steps(50))),
+            training(Length::Steps(50)),
             "encoding 600 sweeps takes 9 min, then 50 steps of training"
         );
         assert_eq!(
-            estimate(20, 42.4, None, false),
-            "encoding 20 sweeps takes 42 s"
+            estimate(20, 42.4, Length::Epochs(3.0), false),
+            "encoding 20 sweeps takes 42 s, then 3 passes of training"
         );
-        let within = |time| {
-            estimate(
-                600,
-                540.0,
-                Some(Length::Time(Duration::from_secs(time))),
-                true,
-            )
-        };
+        let within = |time| estimate(600, 540.0, Length::Time(Duration::from_secs(time)), true);
         assert_eq!(
             within(1200),
             "encoding 600 sweeps takes 9 min of the 20 min in all, which leaves 11 min for the training"
@@ -239,7 +217,7 @@ mod tests {
 
     #[test]
     fn each_data_set_is_timed_from_its_own_beginning() {
-        let bar = TrainingBar::default();
+        let bar = TrainingBar::of(Length::Steps(1));
         let first = |done| {
             bar.encoded(done, 200);
             bar.encoding.get().map(|encoding| encoding.first)

@@ -22,7 +22,7 @@ use crate::agent::{Agent, AgentInput, EncodedSweep};
 use crate::agent_output::Perception;
 use crate::attack::{Attack, CapturedMessages, Falsification};
 use crate::rate::RateConfig;
-use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
+use crate::sweep_pairing::{PairedSweep, SweepPairing};
 use crate::sweep_selection::{MAX_EGOS, SweepSelection};
 use sweep_reports::SweepReports;
 pub use sweep_reports::descriptor;
@@ -142,13 +142,11 @@ pub struct AgentLoop {
 
 impl AgentLoop {
     /// Loop of a vehicle before its first input.
-    pub fn new(agent: Agent, options: LoopOptions) -> Self {
-        let attack = { options.falsification }
-            .map(|falsification| Attack::new(falsification, agent.cav(), 0));
-        let mut agent = match attack {
-            Some(_) => agent.with_attack(attack),
-            None => agent,
-        };
+    pub fn new(mut agent: Agent, options: LoopOptions) -> Self {
+        if let Some(falsification) = options.falsification {
+            let attack = Attack::new(falsification, agent.cav(), 0);
+            agent = agent.with_attack(Some(attack));
+        }
         if !options.needs_head() && !agent.falsifies() {
             agent = agent.without_head();
         }
@@ -197,11 +195,11 @@ impl AgentLoop {
             }
             Input::Gnss(capture_nanos, gnss) => {
                 let poses = self.pairing.add_pose(capture_nanos, gnss.world_from_lidar);
-                self.drop_unused(Unused { poses, motions: 0 });
+                self.drop_messages(Stream::Gnss, poses, DropReason::Superseded);
             }
             Input::Motion(capture_nanos, motion) => {
                 let motions = self.pairing.add_motion(capture_nanos, motion);
-                self.drop_unused(Unused { poses: 0, motions });
+                self.drop_messages(Stream::Imu, motions, DropReason::Superseded);
             }
             Input::Pace(ego, pace) => self.follow(&ego, pace, now_nanos),
             Input::PaceEnded(ego) => self.selection.forget(&ego),
@@ -277,12 +275,6 @@ impl AgentLoop {
         }
     }
 
-    /// Counts measurements whose sweeps were superseded, and they with them.
-    fn drop_unused(&mut self, unused: Unused) {
-        self.drop_messages(Stream::Gnss, unused.poses, DropReason::Superseded);
-        self.drop_messages(Stream::Imu, unused.motions, DropReason::Superseded);
-    }
-
     fn drop_messages(&mut self, stream: Stream, count: usize, reason: DropReason) {
         let dropped = (0..count).map(|_| Output::Dropped(stream, reason));
         self.outputs.extend(dropped);
@@ -329,7 +321,10 @@ impl AgentLoop {
 
     /// First step of a sweep: its pose.
     fn localize(&mut self, paired: PairedSweep<Sweep>, now_nanos: u64) {
-        self.drop_unused(paired.unused);
+        // Measurements whose sweeps were superseded, and they with them.
+        let unused = paired.unused;
+        self.drop_messages(Stream::Gnss, unused.poses, DropReason::Superseded);
+        self.drop_messages(Stream::Imu, unused.motions, DropReason::Superseded);
         let used = [
             paired.pose.map(|_| Stream::Gnss),
             paired.motion.map(|_| Stream::Imu),

@@ -234,10 +234,8 @@ impl Tracker {
     /// are worth together.
     fn assign(&mut self, measurements: &[Measurement]) -> Vec<Option<usize>> {
         let innovations = self.tracks.iter().map(|track| {
-            let of_track = measurements
-                .iter()
-                .map(|measured| track.innovation(measured));
-            of_track.collect()
+            let all = measurements.iter();
+            all.map(|measured| track.innovation(measured)).collect()
         });
         let innovations: Vec<Vec<Option<Innovation>>> = innovations.collect();
         let found = self.config.detection_probability;

@@ -220,19 +220,14 @@ impl Fleet {
     /// # Errors
     /// The first file that cannot be read, by name.
     pub(crate) fn provenance(&self, programs: &Path) -> io::Result<Provenance> {
-        let Scenario {
-            scene,
-            models,
-            method,
-            link,
-            ..
-        } = &self.scenario;
+        let (scenario, scene) = (&self.scenario, &self.scenario.scene);
         let vehicles = self.agents.iter().map(|cav| self.settings_of(cav));
         let vehicles: Vec<_> = vehicles.collect();
         // Opened before, when the run was planned.
-        let link = { link.as_ref() }.and_then(|link| LinkConfig::open(&link.model).ok());
+        let link = { scenario.link.as_ref() }.and_then(|link| LinkConfig::open(&link.model).ok());
         let link = link.as_ref().map(|(link, folder)| (link, folder.as_path()));
-        let files = files_of(*method, models.weights.clone(), &vehicles, link);
+        let weights = scenario.models.weights.clone();
+        let files = files_of(scenario.method, weights, &vehicles, link);
         // Only the frames and vehicles of the run are hashed: no others are read.
         let mut data = self.recorded.clone();
         data.agents.clone_from(&self.agents);

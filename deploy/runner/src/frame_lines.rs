@@ -3,6 +3,7 @@
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use deploy::score::{TRACKS, TruthLine};
@@ -44,12 +45,19 @@ impl FrameLines {
         })
     }
 
-    /// Adds a frame, with the name of its scenario where there are several; false after an error.
-    pub(crate) fn add(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> bool {
+    /// Adds a frame, with the name of its scenario where there are several; a break after an error.
+    pub(crate) fn add(
+        &mut self,
+        scenario: Option<&str>,
+        frame: &EvaluatedFrame,
+    ) -> ControlFlow<()> {
         if self.written.is_ok() {
             self.written = self.write(scenario, frame);
         }
-        self.written.is_ok()
+        match self.written {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(_) => ControlFlow::Break(()),
+        }
     }
 
     fn write(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> io::Result<()> {

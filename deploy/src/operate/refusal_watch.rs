@@ -57,12 +57,8 @@ impl RefusalWatch {
         let read = self.thread.take().and_then(|thread| thread.join().ok());
         let counts = read.map_or_else(BTreeMap::new, |all| all.counts());
         for (refused, count) in &counts {
-            let Rejection {
-                peer,
-                reason,
-                message,
-            } = refused;
-            tracing::warn!(%peer, %reason, what = %message, count, "refused by the router");
+            let (peer, reason, what) = (&refused.peer, &refused.reason, &refused.message);
+            tracing::warn!(%peer, %reason, %what, count, "refused by the router");
         }
         counts
     }

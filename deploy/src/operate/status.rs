@@ -216,11 +216,8 @@ impl RunStatus {
 
     fn processes_table(&self) -> TextTable {
         let numbers = ["pid", "up s", "restarts", "silent s", "MiB", "fds"];
-        let mut table = table_with_note(
-            &["process", "state"],
-            &numbers,
-            "problem, last crash or failure",
-        );
+        let note = "problem, last crash or failure";
+        let mut table = table_with_note(&["process", "state"], &numbers, note);
         for process in &self.processes {
             table.row([
                 process.name.clone(),

@@ -64,16 +64,12 @@ impl StatusReporter {
         // A process that still loads its models gets no less time than one that computes.
         let [hang, start] =
             [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
+        let (run, endpoint) = (run.as_str(), endpoint.as_str());
         Self {
             health: Health::new(hang, start),
             failures: Failures::default(),
             router: RouterWatch::new(probe, is_here),
-            status: StatusWriter::new(
-                folder.path(),
-                run.as_str(),
-                endpoint.as_str(),
-                Some(protocol),
-            ),
+            status: StatusWriter::new(folder.path(), run, endpoint, Some(protocol)),
         }
     }
 

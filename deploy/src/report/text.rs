@@ -42,9 +42,7 @@ impl fmt::Display for RunReport {
 
 impl fmt::Display for Pace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            ticks, answered, ..
-        } = self;
+        let (ticks, answered) = (self.ticks, self.answered);
         let share = self.answered_share().map_or("-".into(), percent);
         let rate = { self.rate_hz }.map(|rate| format!(", {rate:.1} detections a second"));
         let (rate, interval) = (rate.unwrap_or_default(), milliseconds(&self.interval_ms));

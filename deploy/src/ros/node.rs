@@ -172,10 +172,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let clock = publishes_clock.then_some(RosTopic::Clock);
         let initial_pose = node.initial_pose.is_some().then_some(RosTopic::InitialPose);
         let topics = [RosTopic::Tf, RosTopic::TfStatic, RosTopic::Diagnostics].into_iter();
-        topics
-            .chain(clock)
-            .chain(initial_pose)
-            .try_for_each(|topic| node.declare(topic))?;
+        let mut topics = topics.chain(clock).chain(initial_pose);
+        topics.try_for_each(|topic| node.declare(topic))?;
         Ok(node)
     }
 

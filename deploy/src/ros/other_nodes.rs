@@ -68,12 +68,8 @@ pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<b
 /// Nodes that publish a topic, without this one.
 fn publishers(session: &RosSession, topic: &RosName) -> Result<BTreeSet<String>, BusError> {
     let (own, selector) = (session.node(), session.node().publishers_of(topic));
-    let tokens = session
-        .zenoh
-        .liveliness()
-        .get(&selector)
-        .timeout(QUERY_TIMEOUT)
-        .wait();
+    let liveliness = session.zenoh.liveliness();
+    let tokens = liveliness.get(&selector).timeout(QUERY_TIMEOUT).wait();
     let tokens =
         tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
     let nodes = std::iter::from_fn(|| tokens.recv().ok())

@@ -85,11 +85,8 @@ impl RosSession {
     ) -> Result<RosSubscription, BusError> {
         // Publishers of every distribution are heard, whatever hash they write; but not our own.
         let keys = self.node.any_hash(topic, ros_type);
-        let builder = self
-            .zenoh
-            .declare_subscriber(&keys)
-            .allowed_origin(Locality::Remote)
-            .callback(receive);
+        let builder = self.zenoh.declare_subscriber(&keys);
+        let builder = builder.allowed_origin(Locality::Remote).callback(receive);
         let refused = |cause| BusError::zenoh(format!("subscribing to {keys}"), &cause);
         let subscriber: Box<dyn Any + Send + Sync> = if qos.is_latched {
             let history = HistoryConfig::default().detect_late_publishers();

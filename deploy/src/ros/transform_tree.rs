@@ -58,17 +58,11 @@ pub(super) enum NoTransform {
 impl TransformTree {
     /// Adds a transform; false if it is none, or there is no place for another frame.
     pub(super) fn add(&mut self, transform: &Transform, origin: Origin) -> bool {
-        let Transform {
-            nanos,
-            parent,
-            child: Some(child),
-            parent_from_child,
-        } = transform
-        else {
+        let (parent, Some(child)) = (&transform.parent, &transform.child) else {
             return false;
         };
         let is_known = self.0.contains_key(child);
-        if parent_from_child.validate().is_err()
+        if transform.parent_from_child.validate().is_err()
             || parent == child
             || !is_known && self.0.len() >= MOST_FRAMES
         {
@@ -84,8 +78,8 @@ impl TransformTree {
         if frame.origin != origin || frame.parent != *parent {
             *frame = Frame::below(parent, origin);
         }
-        let pose = parent_from_child.isometry();
-        frame.parent_from_frame.add(*nanos, pose);
+        let pose = transform.parent_from_child.isometry();
+        frame.parent_from_frame.add(transform.nanos, pose);
         true
     }
 

@@ -6,10 +6,10 @@ use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use protocol::{CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
-use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
+use super::frame_record::{FrameRecord, JudgedFrame};
 use super::live_precision::{Answer, LivePrecision, TickTruth};
 use super::neighbours::{self, NeighbourRecord};
-use super::open_ticks::{OpenTicks, Part, Tick};
+use super::open_ticks::{OpenTicks, Tick};
 use super::precision::{FrameCounts, by_iou, by_part, precision_recall_csv};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::ground_truth;
@@ -78,17 +78,26 @@ impl FrameScores {
 
     /// Adds the ground truth of a tick.
     pub fn truth(&mut self, stamp: &Stamp, truth: Truth) {
-        self.add(stamp, Part::Truth(truth));
+        self.add(stamp, |tick| {
+            tick.truth.get_or_insert((stamp.publish_nanos, truth));
+        });
     }
 
     /// Adds the ego's result of a tick. A second result of the same tick (of a restarted ego) does not count.
     pub fn result(&mut self, stamp: &Stamp, result: Detections) {
-        self.add(stamp, Part::Result(result));
+        self.add(stamp, |tick| {
+            tick.result.get_or_insert((stamp.publish_nanos, result));
+        });
     }
 
     /// Adds the pose estimate of a vehicle at a tick.
     pub fn pose(&mut self, stamp: &Stamp, estimate: PoseEstimate) {
-        self.add(stamp, Part::Pose(estimate));
+        self.add(stamp, |tick| {
+            if tick.poses.iter().all(|(known, _)| *known != stamp.cav) {
+                tick.poses.push((stamp.cav.clone(), estimate));
+                tick.posed_nanos.push(stamp.publish_nanos);
+            }
+        });
     }
 
     /// Scores the ticks that are still open: no further message will arrive.
@@ -147,8 +156,8 @@ impl FrameScores {
         steps.map(|nanos| nanos as f64 * 1e-9).sum()
     }
 
-    fn add(&mut self, stamp: &Stamp, part: Part) {
-        if let Some((capture_nanos, tick)) = self.open.add(stamp, part) {
+    fn add(&mut self, stamp: &Stamp, fill: impl FnOnce(&mut Tick)) {
+        if let Some((capture_nanos, tick)) = self.open.add(stamp, fill) {
             self.judge(capture_nanos, tick);
         }
     }
@@ -168,15 +177,14 @@ impl FrameScores {
             return;
         }
         let objects = ground_truth(&truth, &self.ego, &self.rule);
-        let at = (truth.tick, capture_nanos, began_nanos);
-        let Some((done_nanos, result)) = tick.result else {
-            return self.judge_unanswered(at, &objects, &world_from_lidar);
-        };
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
         let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
-        let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
-        let timed = (stamps, Some(done_nanos));
-        self.judge_answered(at, timed, result, &objects, world_from_lidar);
+        let answer = tick.result.map(|(done_nanos, result)| {
+            let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
+            (stamps, Some(done_nanos), result)
+        });
+        let at = (truth.tick, capture_nanos, began_nanos);
+        self.judge_tick(at, answer, &objects, world_from_lidar);
     }
 
     /// Scores a frame whose truth is known already, at once; `result` is `None` if the ego has none, `poses` are the
@@ -192,90 +200,64 @@ impl FrameScores {
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         self.judge_poses(poses, &world_from_lidar);
+        let answer = result.map(|result| {
+            let stamps = StageStamps {
+                detected_ms: latency_ms,
+                ..StageStamps::default()
+            };
+            let latency_nanos = latency_ms.map(|latency_ms| (latency_ms * 1e6) as u64);
+            let published_nanos = latency_nanos.map(|nanos| capture_nanos.saturating_add(nanos));
+            (stamps, published_nanos, result)
+        });
         // Without a network a tick is published at its capture time.
         let at = (tick, capture_nanos, capture_nanos);
-        let Some(result) = result else {
-            return self.judge_unanswered(at, objects, &world_from_lidar);
-        };
-        let stamps = StageStamps {
-            detected_ms: latency_ms,
-            ..StageStamps::default()
-        };
-        let published_nanos =
-            latency_ms.map(|latency_ms| capture_nanos.saturating_add((latency_ms * 1e6) as u64));
-        let timed = (stamps, published_nanos);
-        self.judge_answered(at, timed, result, objects, world_from_lidar);
+        self.judge_tick(at, answer, objects, world_from_lidar);
     }
 
-    /// Scores a tick, of a number, capture time and time of publication, without a result.
-    fn judge_unanswered(
+    /// Scores a tick, of a number, capture time and time of publication; the answer is the result with its stamps and
+    /// its time of publication.
+    fn judge_tick(
         &mut self,
         (tick, capture_nanos, began_nanos): (u64, u64, u64),
-        objects: &GroundTruth,
-        world_from_lidar: &[(CavId, Pose)],
-    ) {
-        let streamed = self.judge_live((tick, began_nanos), world_from_lidar, objects, None);
-        self.records.push(FrameRecord {
-            tick,
-            capture_nanos,
-            stamps: StageStamps {
-                began_nanos: Some(began_nanos),
-                ..StageStamps::default()
-            },
-            truth: objects.objects.len(),
-            streamed,
-            ..FrameRecord::default()
-        });
-    }
-
-    /// Scores a tick with or without a result; returns the result that was the newest at its publication.
-    fn judge_live(
-        &mut self,
-        (tick, began_nanos): (u64, u64),
-        world_from_lidar: &[(CavId, Pose)],
-        truth: &GroundTruth,
-        answer: Option<Answer<'_>>,
-    ) -> Option<StreamedResult> {
-        let truth = TickTruth {
-            tick,
-            began_nanos,
-            world_from_ego: true_pose(world_from_lidar, &self.ego).copied(),
-            truth,
-        };
-        self.live.add(&truth, answer)
-    }
-
-    fn judge_answered(
-        &mut self,
-        (tick, capture_nanos, began_nanos): (u64, u64, u64),
-        (stamps, published_nanos): (StageStamps, Option<u64>),
-        result: Detections,
+        answer: Option<(StageStamps, Option<u64>, Detections)>,
         objects: &GroundTruth,
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
-        let answer = Answer {
-            published_nanos,
-            detections: &result.detections,
+        let world_from_ego = true_pose(&world_from_lidar, &self.ego).copied();
+        let truth = TickTruth {
+            tick,
+            began_nanos,
+            world_from_ego,
+            truth: objects,
         };
-        let at = (tick, began_nanos);
-        let streamed = self.judge_live(at, &world_from_lidar, objects, Some(answer));
+        let published = answer.as_ref().map(|(_, published_nanos, result)| Answer {
+            published_nanos: *published_nanos,
+            detections: &result.detections,
+        });
+        let mut record = FrameRecord {
+            tick,
+            capture_nanos,
+            truth: objects.objects.len(),
+            streamed: self.live.add(&truth, published),
+            ..FrameRecord::default()
+        };
+        let Some((stamps, _, result)) = answer else {
+            record.stamps.began_nanos = Some(began_nanos);
+            return self.records.push(record);
+        };
         let verdicts = self.scorer.add(&result.detections, objects);
         let counts = FrameCounts::of(&self.scorer, &verdicts);
         let fused = result.fused.iter();
         let bytes = fused.clone().map(|of| (of.payload_bytes, of.wire_bytes));
         let ages_ms = fused.map(|of| of.age_nanos as f64 * 1e-6);
-        let found = result.pose.world_from_cav();
-        let ego_error = { found.zip(true_pose(&world_from_lidar, &self.ego)) }
-            .map(|(found, truth)| PoseError::between(found, truth));
+        let poses = result.pose.world_from_cav().zip(world_from_ego.as_ref());
+        let ego_error = poses.map(|(found, truth)| PoseError::between(found, truth));
         let stale = { result.skipped.iter() }.filter(|one| one.reason == Some(DropReason::Stale));
         self.records.push(FrameRecord {
-            tick,
             agent_frame: Some(result.agent_frame),
-            capture_nanos,
             latency_ms: stamps.detected_ms,
             stamps,
             detected: counts.detected,
-            truth: objects.objects.len(),
             found: counts.found,
             fused: result.fused.len(),
             skipped: result.skipped.len(),
@@ -285,7 +267,7 @@ impl FrameScores {
             wire_bytes: bytes.clone().map(|(_, wire)| wire).sum(),
             ego_error_m: ego_error.map(|error| error.distance_m),
             ego_error_deg: ego_error.map(|error| error.angle_deg),
-            streamed,
+            ..record
         });
         neighbours::add(&mut self.neighbours, &result);
         self.bytes.extend(bytes);

@@ -437,24 +437,17 @@ impl Worker {
     }
 
     fn stats(&mut self, sender: &ProcessId, arrival: &Arrival) {
-        let Some(Stats {
-            process,
-            mut ledger,
-            stages,
-            usage,
-            traffic,
-            problems,
-        }) = self.inbox.decode(arrival, &Limits::DEFAULT)
-        else {
+        let Some(mut report): Option<Stats> = self.inbox.decode(arrival, &Limits::DEFAULT) else {
             return;
         };
+        let process = report.process;
         // A restarted process has another epoch: both instances count.
         let instance = (process.clone(), arrival.header.stamp.epoch);
         let has_room = self.stats.len() < MAX_INSTANCES || self.stats.contains_key(&instance);
         if process != *sender || !has_room {
             return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
         }
-        let foreign = ledger.remove_foreign(&process);
+        let foreign = report.ledger.remove_foreign(&process);
         if let Some(first) = foreign.first()
             && self.reported_foreign.insert(process.clone())
         {
@@ -465,23 +458,23 @@ impl Worker {
         // Until the first tick: the loading of models belongs to no frame.
         let known = self.stats.get(&instance);
         let cpu_before_s = match self.published.is_empty() {
-            true => usage.cpu_s,
+            true => report.usage.cpu_s,
             false => known.map_or(0.0, |known| known.cpu_before_s),
         };
         let stats = ProcessStats {
             process,
-            ledger,
-            stages,
-            usage,
+            ledger: report.ledger,
+            stages: report.stages,
+            usage: report.usage,
             cpu_before_s,
-            traffic,
+            traffic: report.traffic,
         };
         self.stats.insert(instance, stats);
         let ledgers = self.stats.values().map(|stats| &stats.ledger);
         let dropped = ledgers.map(|ledger| ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;
-            progress.problems.insert(name.clone(), problems);
+            progress.problems.insert(name.clone(), report.problems);
             progress.last_reports.insert(name, at);
         });
     }

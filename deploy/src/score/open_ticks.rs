@@ -20,13 +20,6 @@ pub(super) struct Tick {
     pub(super) posed_nanos: Vec<u64>,
 }
 
-/// Message of a tick.
-pub(super) enum Part {
-    Truth(Truth),
-    Result(Detections),
-    Pose(PoseEstimate),
-}
-
 /// Incomplete ticks, by capture time.
 #[derive(Default)]
 pub(super) struct OpenTicks {
@@ -35,28 +28,18 @@ pub(super) struct OpenTicks {
 }
 
 impl OpenTicks {
-    /// Adds a message to its tick: the first of its kind counts, and a closed tick stays closed. If too many are open,
-    /// the oldest tick is removed and returned with its capture time.
-    pub(super) fn add(&mut self, stamp: &Stamp, part: Part) -> Option<(u64, Tick)> {
+    /// Lets `fill` add a message to its tick: the first of its kind counts, and a closed tick stays closed. If too many
+    /// are open, the oldest tick is removed and returned with its capture time.
+    pub(super) fn add(
+        &mut self,
+        stamp: &Stamp,
+        fill: impl FnOnce(&mut Tick),
+    ) -> Option<(u64, Tick)> {
         let capture_nanos = stamp.capture_nanos;
         if { self.closed_until }.is_some_and(|closed| capture_nanos <= closed) {
             return None;
         }
-        let tick = self.open.entry(capture_nanos).or_default();
-        match part {
-            Part::Truth(truth) => {
-                tick.truth.get_or_insert((stamp.publish_nanos, truth));
-            }
-            Part::Result(result) => {
-                tick.result.get_or_insert((stamp.publish_nanos, result));
-            }
-            Part::Pose(estimate) => {
-                if tick.poses.iter().all(|(known, _)| *known != stamp.cav) {
-                    tick.poses.push((stamp.cav.clone(), estimate));
-                    tick.posed_nanos.push(stamp.publish_nanos);
-                }
-            }
-        }
+        fill(self.open.entry(capture_nanos).or_default());
         // The oldest may be this one: closed ticks stay in order.
         let is_full = self.open.len() > MOST_OPEN;
         is_full.then(|| self.close_oldest()).flatten()

@@ -100,14 +100,12 @@ impl FrameAssembler {
 
     /// An assembler of the scene frames of another ego, which knows what this one knows of the run.
     pub(crate) fn for_ego(&self, ego: Option<CavId>) -> Self {
-        let (areas, ledgers, egos) = (self.areas.clone(), self.ledgers.clone(), self.egos.clone());
+        let (ledgers, egos) = (self.ledgers.clone(), self.egos.clone());
         Self {
-            areas,
             ledgers,
             egos,
             ego,
-            judge: self.judge.renewed(),
-            ..Self::default()
+            ..Self::new(self.judge.protocol.clone(), self.areas.clone())
         }
     }
 
@@ -303,15 +301,6 @@ impl FrameAssembler {
     }
 }
 
-/// True for a true positive, false for a false one; `None` if the detection counts neither way.
-fn is_hit(verdict: Verdict) -> Option<bool> {
-    match verdict {
-        Verdict::Match(_) => Some(true),
-        Verdict::FalsePositive => Some(false),
-        Verdict::Ignored => None,
-    }
-}
-
 fn decode<M: Payload>(seen: &ReceivedMessage<'_>) -> Option<M> {
     decoded(seen.payload?)
 }
@@ -462,7 +451,11 @@ impl OpenFrame {
         };
         let mut shown = self.placed(&result.ego, &result.pose, result.detections.iter(), None);
         for (shown, verdict) in shown.iter_mut().zip(&judgement.verdicts) {
-            shown.is_hit = is_hit(*verdict);
+            shown.is_hit = match verdict {
+                Verdict::Match(_) => Some(true),
+                Verdict::FalsePositive => Some(false),
+                Verdict::Ignored => None,
+            };
         }
         shown
     }

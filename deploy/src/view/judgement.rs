@@ -55,7 +55,7 @@ impl Judgement {
 /// Judge of the frames of a run: objects of its protocol within the area count.
 pub(super) struct Judge {
     scorer: Scorer,
-    protocol: Option<EvaluationProtocol>,
+    pub(super) protocol: Option<EvaluationProtocol>,
 }
 
 impl Default for Judge {
@@ -71,11 +71,6 @@ impl Judge {
             scorer: Scorer::new(&[IOU]),
             protocol,
         }
-    }
-
-    /// Another judge by the same protocol.
-    pub(super) fn renewed(&self) -> Self {
-        Self::new(self.protocol.clone())
     }
 
     /// Name of the protocol.

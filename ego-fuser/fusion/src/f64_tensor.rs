@@ -21,20 +21,17 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     Vec::try_from(tensor.f_reshape(-1)?)
 }
 
-/// Count of the numbers that are not below `least`, rounded up to a multiple of `step`.
-pub(crate) fn above(numbers: &[f32], least: f32, step: usize) -> usize {
+/// Indices of the highest numbers in ascending order: as many as are not below `least`, rounded up to a multiple of
+/// `step`, but at most a `share` of all, and at least one.
+pub(crate) fn largest(numbers: &[f32], share: f64, least: f32, step: usize) -> Vec<usize> {
     // NaN is not below anything, so it counts.
-    numbers
-        .iter()
+    let above = { numbers.iter() }
         .filter(|number| number.partial_cmp(&&least) != Some(Ordering::Less))
-        .count()
-        .next_multiple_of(step)
-}
-
-/// Indices of the highest numbers, `wanted` but at most a `share` of all, and at least one, in ascending order.
-pub(crate) fn largest(numbers: &[f32], share: f64, wanted: usize) -> Vec<usize> {
+        .count();
     let most = (numbers.len() as f64 * share).ceil() as usize;
-    let wanted = most.min(wanted).clamp(1, numbers.len());
+    let wanted = most
+        .min(above.next_multiple_of(step))
+        .clamp(1, numbers.len());
     let mut order: Vec<usize> = (0..numbers.len()).collect();
     order.sort_by(|a, b| numbers[*b].total_cmp(&numbers[*a]));
     order.truncate(wanted);

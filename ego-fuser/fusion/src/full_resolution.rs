@@ -96,16 +96,16 @@ impl FullResolutionMap {
         cells: &[[usize; 2]],
         grid: &BevGrid,
     ) -> Result<BTreeMap<usize, CellSamples>> {
-        maps.iter()
-            .try_fold(BTreeMap::new(), |mut by_step, (step, pose, map)| {
-                let seen = map.at(&places_of(cells, pose, grid), None)?;
-                let most = match by_step.get(step) {
-                    Some(before) => seen.or(before)?,
-                    None => seen,
-                };
-                by_step.insert(*step, most);
-                Ok(by_step)
-            })
+        let mut by_step: BTreeMap<usize, CellSamples> = BTreeMap::new();
+        for (step, pose, map) in maps {
+            let mut seen = map.at(&places_of(cells, pose, grid), None)?;
+            if let Some(before) = by_step.get(step) {
+                seen.features = seen.features.f_maximum(&before.features)?;
+                seen.mask = seen.mask.f_maximum(&before.mask)?;
+            }
+            by_step.insert(*step, seen);
+        }
+        Ok(by_step)
     }
 
     /// Features at positions in `grid_sampler`'s coordinates, two for each: `[R, C]`, and their validity, `[R, 1]`; those
@@ -133,16 +133,6 @@ impl FullResolutionMap {
                 })
             }
         }
-    }
-}
-
-impl CellSamples {
-    /// Element-wise maximum of both.
-    fn or(&self, other: &Self) -> Result<Self> {
-        Ok(Self {
-            features: self.features.f_maximum(&other.features)?,
-            mask: self.mask.f_maximum(&other.mask)?,
-        })
     }
 }
 

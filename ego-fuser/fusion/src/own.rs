@@ -5,36 +5,29 @@ use tch::TchError;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
 use super::settings::without_settings;
-use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::spec::{Exchange, MethodSpec};
 
 /// Ego-only, no collaboration: the baseline of every method.
 pub static NONE: MethodSpec = MethodSpec {
     name: "none",
-    summary: "ego-only, no collaboration",
     exchange: Exchange::Nothing,
-    gate: None,
-    runs_with_weights_of: &[],
-    fusion: FusionSpec::of::<OwnConfig>(),
+    ..MethodSpec::of_features::<OwnConfig>("ego-only, no collaboration")
 };
 
 /// Late fusion: boxes are exchanged and merged by NMS.
 pub static LATE: MethodSpec = MethodSpec {
     name: "late",
-    summary: "boxes, merged by rotated NMS",
     exchange: Exchange::Boxes,
-    gate: None,
     runs_with_weights_of: &["none"],
-    fusion: FusionSpec::of::<OwnConfig>(),
+    ..MethodSpec::of_features::<OwnConfig>("boxes, merged by rotated NMS")
 };
 
 /// Early fusion: points are exchanged and encoded together in the ego frame.
 pub static EARLY: MethodSpec = MethodSpec {
     name: "early",
-    summary: "points, encoded together in the ego frame",
     exchange: Exchange::Points,
-    gate: None,
     runs_with_weights_of: &["early", "none"],
-    fusion: FusionSpec::of::<OwnConfig>(),
+    ..MethodSpec::of_features::<OwnConfig>("points, encoded together in the ego frame")
 };
 
 without_settings!(OwnConfig, "own", NoFusion);

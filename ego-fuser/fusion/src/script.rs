@@ -15,7 +15,7 @@ use zip::ZipArchive;
 use crate::interface::{Fusion, FusionOutput};
 use crate::maps::{AlignedMaps, MapMetadata};
 use crate::settings::{FusionConfig, FusionSettings};
-use crate::spec::{Exchange, FusionSpec, MethodSpec};
+use crate::spec::{FusionSpec, MethodSpec};
 
 /// Most bytes that the files of a module may have beyond their compressed size: its source is compressed, its tensors are
 /// not.
@@ -46,12 +46,10 @@ pub(crate) fn spec(name: &str) -> Option<&'static MethodSpec> {
         let weights: [&'static str; 3] = [name, stem.leak(), "max"];
         Box::leak(Box::new(MethodSpec {
             name,
-            summary: "feature maps, fused by a TorchScript module",
-            exchange: Exchange::Features,
-            gate: None,
             // Its own training, else that of a method of the file's name, else one whose fusion has no parameters.
             runs_with_weights_of: Box::leak(Box::new(weights)),
             fusion: FUSION,
+            ..MethodSpec::of_features::<ScriptConfig>("feature maps, fused by a TorchScript module")
         }))
     }))
 }

@@ -62,12 +62,6 @@ pub struct AlignmentMeter {
     fusion: FusionStage,
 }
 
-/// Two maps, and the true pose of the second.
-struct Pair {
-    maps: Tensor,
-    ego_from_cav: Pose,
-}
-
 impl AlignmentMeter {
     /// Reads the weights.
     ///
@@ -112,13 +106,13 @@ impl AlignmentMeter {
         Ok(summaries.collect())
     }
 
-    /// The ego with each of its neighbours in range.
+    /// The ego with each of its neighbours in range: two maps, and the true pose of the second.
     fn pairs(
         &mut self,
         scenario: &Scenario,
         tick: usize,
         left_out: &mut LeftOut,
-    ) -> Result<Vec<Pair>, AlignmentMeterError> {
+    ) -> Result<Vec<(Tensor, Pose)>, AlignmentMeterError> {
         let agents = scenario.present_agents(tick);
         let loaded = scenario.load_tick(tick, agents, &LoadOptions::default());
         left_out.add_tick(&loaded);
@@ -140,7 +134,7 @@ impl AlignmentMeter {
             if x.hypot(y) <= Ego::COMM_RANGE_M {
                 let maps =
                     Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0).map_err(EgoError::from)?;
-                pairs.push(Pair { maps, ego_from_cav });
+                pairs.push((maps, ego_from_cav));
             }
         }
         Ok(pairs)
@@ -155,17 +149,17 @@ impl AlignmentMeter {
     /// Errors of a pair with an offset, before and after: metres and degrees.
     fn around(
         &self,
-        pair: &Pair,
+        (maps, ego_from_cav): &(Tensor, Pose),
         offset: &Offset,
         rng: &mut impl Rng,
     ) -> Result<[[f64; 2]; 2], AlignmentMeterError> {
         let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
         let turn_rad = offset.turn_deg.to_radians() * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
         let shift = [offset.shift_m * cos, offset.shift_m * sin, turn_rad];
-        let off = moved(&pair.ego_from_cav, shift);
-        let correction = self.correction(&pair.maps, off)?;
+        let off = moved(ego_from_cav, shift);
+        let correction = self.correction(maps, off)?;
         let corrected = moved(&off, correction.ok_or(AlignmentMeterError::NoAlignment)?);
-        Ok([off, corrected].map(|found| error(&pair.ego_from_cav, &found)))
+        Ok([off, corrected].map(|found| error(ego_from_cav, &found)))
     }
 
     /// The method's correction of the pose of the second of two maps: x and y, metres, and heading, radians.

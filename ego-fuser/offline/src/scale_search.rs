@@ -24,10 +24,22 @@ pub fn search_scales(
     left_out: &mut LeftOut,
 ) -> Result<ActivationScales, EvaluateError> {
     let mut search = ScaleSearch::default();
-    observe_detector(weights, scenarios, frames, &mut search, left_out)?;
-    let mut setup = Setup::default();
     // Scales that the file has already must not change what is observed.
-    setup.models.precision = InferencePrecision::Float;
+    let precision = InferencePrecision::Float;
+    let network = Weights::load(weights)?.with_precision(precision);
+    let mut detector = Detector::from_weights(&network, &network.detector_config()?, Device::Cpu)?;
+    for scenario in scenarios {
+        for tick in 0..scenario.ticks.len().min(frames) {
+            let loaded =
+                scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
+            left_out.add_tick(&loaded);
+            for (_, frame) in loaded.frames {
+                detector.observe(&frame.points, &mut search)?;
+            }
+        }
+    }
+    let mut setup = Setup::default();
+    setup.models.precision = precision;
     setup.models.weights = weights.to_owned();
     let mut evaluator = Evaluator::new(setup)?;
     evaluator.ego_mut().fusion_mut().start_scale_search();
@@ -41,26 +53,4 @@ pub fn search_scales(
         search.merge(fusion);
     }
     Ok(search.scales())
-}
-
-fn observe_detector(
-    weights: &Path,
-    scenarios: &[Scenario],
-    frames: usize,
-    search: &mut ScaleSearch,
-    left_out: &mut LeftOut,
-) -> Result<(), EvaluateError> {
-    let weights = Weights::load(weights)?.with_precision(InferencePrecision::Float);
-    let mut detector = Detector::from_weights(&weights, &weights.detector_config()?, Device::Cpu)?;
-    for scenario in scenarios {
-        for tick in 0..scenario.ticks.len().min(frames) {
-            let loaded =
-                scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
-            left_out.add_tick(&loaded);
-            for (_, frame) in loaded.frames {
-                detector.observe(&frame.points, search)?;
-            }
-        }
-    }
-    Ok(())
 }

@@ -591,7 +591,7 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
     let earlier = ego
         .earlier(&aligned(&second, &other))
         .into_iter()
-        .map(|(agent, _, pose)| (agent, pose));
+        .map(|(_, metadata)| (metadata.agent, metadata.ego_from_cav));
     let earlier: Vec<_> = earlier.collect();
     assert_eq!(earlier.len(), 1);
     let (agent, place) = earlier[0];
@@ -609,7 +609,7 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
     let agents: Vec<usize> = ego
         .earlier(&aligned(&third, &later))
         .into_iter()
-        .map(|found| found.0)
+        .map(|(_, metadata)| metadata.agent)
         .collect();
     assert_eq!(agents, [0, 0, 1]);
     let lost = View {

@@ -123,13 +123,14 @@ impl Observation {
         let step = (empty.len() / FINGERPRINT_VALUES).max(1);
         let compared = values.iter().zip(empty).step_by(step);
         let fingerprint = compared.map(|(value, nothing)| value - nothing).collect();
+        let seen = Self {
+            fingerprint,
+            map: values,
+            ..Self::of_boxes(found)
+        };
+        // The cells of a mirrored network lie elsewhere; its boxes do not.
         if detector.config().y_axis == YAxis::Right {
-            // The cells of a mirrored network lie elsewhere; its boxes do not.
-            return Ok(Self {
-                fingerprint,
-                map: values,
-                ..Self::of_boxes(found)
-            });
+            return Ok(seen);
         }
         let mut cells = heads.confidence;
         for (cell, sure) in cells.iter_mut().enumerate() {
@@ -137,13 +138,9 @@ impl Observation {
                 *sure = 0.0;
             }
         }
-        let vehicles = found.into_iter().map(|(at_m, _)| at_m).collect();
         Ok(Self {
-            vehicles,
             sure: Sure::Cells(grid, cells),
-            fingerprint,
-            is_blind: false,
-            map: values,
+            ..seen
         })
     }
 

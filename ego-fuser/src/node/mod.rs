@@ -208,10 +208,8 @@ impl<'a> Node<'a> {
             .and_then(|file| InputLog::create(file, KIND, Some(ego.detector())));
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         // Ends the wait for the next message at once.
-        stop.on_request({
-            let inbox = Arc::clone(&inbox);
-            move || inbox.close()
-        });
+        let closed = Arc::clone(&inbox);
+        stop.on_request(move || closed.close());
         let own = [Stream::Descriptor, ego_loop.stream()]
             .into_iter()
             .map(|stream| bus.subscribe(Topic::stream(cav, stream), &inbox))

@@ -9,7 +9,9 @@ use protocol::{KeyExpr, Operation, Permission, Principal, RunScope, access};
 use serde_json::{Value, json};
 
 use super::credentials::ROUTER;
-use super::router_probe::PROBE_KEY;
+
+/// Key of the probes of a router's own process, below no run.
+pub(super) const PROBE_KEY: &str = "v2v-probe";
 
 /// Principals that a router admits, and their runs.
 #[derive(Debug, Clone, PartialEq, Eq)]

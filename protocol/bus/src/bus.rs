@@ -14,7 +14,7 @@ use super::flush_barrier::FlushBarrier;
 use super::heartbeat::Heartbeat;
 use super::inbox_limits::InboxLimits;
 use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
-use super::metrics::{MetricsPeer, MetricsServer};
+use super::metrics::{self, MetricsPeer};
 use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
 use super::router_contact::RouterContact;
@@ -24,6 +24,7 @@ use super::status_publisher::{StatusPublisher, StatusSender};
 use super::subscriber::{Inbox, Subscription};
 use super::{BusError, BusOptions, MessageStats, open, open_unless};
 use crate::Result;
+use crate::web::WebServer;
 
 /// Longest wait for the end of another process of a name: longer than a router takes to notice that one was killed.
 const NAME_LIMIT: Duration = Duration::from_secs(11);
@@ -58,7 +59,7 @@ pub struct Bus {
     contact: RouterContact,
     status: StatusPublisher,
     status_thread: JoinHandle<()>,
-    metrics: Option<MetricsServer>,
+    metrics: Option<WebServer>,
 }
 
 impl Bus {
@@ -80,7 +81,7 @@ impl Bus {
 
     fn with_pool(session: Session, options: &BusOptions, identity: Identity) -> Result<Self> {
         let mut bus = Self::over(session, identity)?;
-        bus.pool = SharedPool::open(&bus.session, options.shared_memory.pool_bytes(), &bus.stats)?;
+        bus.pool = SharedPool::open(&bus.session, options.shared_memory, &bus.stats)?;
         Ok(bus)
     }
 
@@ -147,7 +148,7 @@ impl Bus {
         address: SocketAddr,
         others: Vec<MetricsPeer>,
     ) -> Result<SocketAddr> {
-        let server = MetricsServer::start(address, &self.stats, others);
+        let server = metrics::serve(address, &self.stats, others);
         let server = server.map_err(|cause| BusError::Metrics { address, cause })?;
         Ok(self.metrics.insert(server).address())
     }

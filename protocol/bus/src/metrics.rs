@@ -20,42 +20,31 @@ pub use fleet::MetricsPeer;
 use super::{FrameStats, MessageStats, PeerSummary, process_usage};
 use crate::web::{Answer, WebServer};
 
-/// Serves the counters of a process at `http://<address>/metrics` until dropped.
-pub(crate) struct MetricsServer(WebServer);
-
-impl MetricsServer {
-    /// Starts to serve `stats`, and the series of `others`; port 0: any free port.
-    ///
-    /// # Errors
-    /// When the address cannot be bound.
-    pub(crate) fn start(
-        address: SocketAddr,
-        stats: &MessageStats,
-        others: Vec<MetricsPeer>,
-    ) -> std::io::Result<Self> {
-        let stats = stats.clone();
-        let server = WebServer::start(address, move |request| match request.path.as_str() {
-            "/metrics" => {
-                let own = exposition(&stats);
-                let body = if others.is_empty() {
-                    own
-                } else {
-                    fleet::fleet_exposition(&own, &others)
-                };
-                Answer::Page {
-                    content_type: CONTENT_TYPE,
-                    body: body.into(),
-                }
+/// Serves `stats`, and the series of `others`, at `http://<address>/metrics` until dropped; port 0: any free port.
+///
+/// # Errors
+/// When the address cannot be bound.
+pub(crate) fn serve(
+    address: SocketAddr,
+    stats: &MessageStats,
+    others: Vec<MetricsPeer>,
+) -> std::io::Result<WebServer> {
+    let stats = stats.clone();
+    WebServer::start(address, move |request| match request.path.as_str() {
+        "/metrics" => {
+            let own = exposition(&stats);
+            let body = if others.is_empty() {
+                own
+            } else {
+                fleet::fleet_exposition(&own, &others)
+            };
+            Answer::Page {
+                content_type: CONTENT_TYPE,
+                body: body.into(),
             }
-            other => Answer::NotFound(format!("{other} not found; see /metrics")),
-        })?;
-        Ok(Self(server))
-    }
-
-    /// Address of the server.
-    pub(crate) fn address(&self) -> SocketAddr {
-        self.0.address()
-    }
+        }
+        other => Answer::NotFound(format!("{other} not found; see /metrics")),
+    })
 }
 
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -345,8 +334,7 @@ mod tests {
 
     #[test]
     fn metrics_can_be_fetched() {
-        let server =
-            MetricsServer::start("127.0.0.1:0".parse().unwrap(), &sample(), Vec::new()).unwrap();
+        let server = serve("127.0.0.1:0".parse().unwrap(), &sample(), Vec::new()).unwrap();
         let (status, body) = crate::web::fetch(server.address(), "/metrics").unwrap();
         assert_eq!(status, "HTTP/1.0 200 OK");
         let text = String::from_utf8(body).unwrap();

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::{self, JoinHandle};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use protocol::wire::{self, Encoded};
@@ -21,6 +21,7 @@ use super::shared_pool::SharedPool;
 use super::{Arrival, BusError, MessageStats};
 use crate::batch_scheduling;
 use support::nanos;
+use support::sync::spawn;
 
 /// Interval between two probes of a publisher that has sent nothing yet.
 const PROBE_PERIOD: Duration = Duration::from_millis(50);
@@ -188,10 +189,8 @@ impl Publisher {
             is_one_at_a_time: matches!(options.overflow, Overflow::KeepLast(_))
                 && !options.is_for_onlookers,
         };
-        let thread = thread::Builder::new()
-            .name(format!("send {topic}"))
-            .spawn(move || sender.run())
-            .map_err(BusError::thread(format!("sending {key}")))?;
+        let thread = spawn(format!("send {topic}"), move || sender.run());
+        let thread = thread.map_err(BusError::thread(format!("sending {key}")))?;
         Ok(Self {
             topic,
             overflow: options.overflow,
@@ -234,7 +233,7 @@ impl Publisher {
 
     /// Forwards a message unchanged, under the stamp of its sender; nothing is copied.
     pub fn relay(&self, arrival: &Arrival) {
-        let bytes = arrival.payload().clone();
+        let bytes = arrival.payload.clone();
         self.push(arrival.header.stamp.capture_nanos, |_, _| Ok(bytes));
     }
 
@@ -245,7 +244,7 @@ impl Publisher {
         }
         let mut header = arrival.header.clone();
         header.stamp.capture_nanos = capture_nanos;
-        let whole = arrival.payload().to_bytes();
+        let whole = arrival.payload.to_bytes();
         let rest = whole.get(HEADER_LEN..).unwrap_or_default();
         let mut writer = ZBytes::writer();
         // The checksum of the payload does not cover the header, which has a new one of its own.

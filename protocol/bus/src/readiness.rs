@@ -9,13 +9,12 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
 use std::sync::{Arc, Condvar, Mutex};
-use std::thread;
 use std::time::{Duration, Instant};
 
 use protocol::{CavId, Control, KeyExpr, Limits, Principal, ProcessId, Role, Topic};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use support::sync::{lock, wait_at_most};
+use support::sync::{lock, spawn, wait_at_most};
 
 use super::bounded_queue::Pop;
 use super::{Bus, BusError, Event, Inbox, Subscription};
@@ -125,10 +124,8 @@ impl Barrier {
         let (barrier, inbox) = (Arc::new(self), bus.inbox(PLACES, MAX_PROCESSES));
         let subscription = bus.subscribe_all(&KeyExpr::ready(&bus.identity().run), &inbox)?;
         let attending = (Arc::clone(&barrier), Arc::clone(&inbox));
-        thread::Builder::new()
-            .name("readiness".into())
-            .spawn(move || attending.0.listen(&attending.1))
-            .map_err(BusError::thread("readiness"))?;
+        let listening = spawn("readiness", move || attending.0.listen(&attending.1));
+        listening.map_err(BusError::thread("readiness"))?;
         Ok(RoutesReady {
             barrier,
             inbox,

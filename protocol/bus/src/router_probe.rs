@@ -8,15 +8,14 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use protocol::KeyExpr;
-use support::sync::lock;
+use support::sync::{lock, spawn};
 use zenoh::{Session, Wait};
 
+use super::access_control::PROBE_KEY;
 use super::session::declare_subscriber;
 use super::shutdown;
 use super::{BusError, BusOptions, open};
 
-/// Key of the probes of a router's own process, below no run.
-pub(super) const PROBE_KEY: &str = "v2v-probe";
 /// Interval of these probes.
 const PERIOD: Duration = Duration::from_millis(500);
 /// The most that one look adds to the silence: a longer time since the look before is one in which this program itself
@@ -51,9 +50,8 @@ impl RouterProbe {
         let probe = Self::begin(client, PROBE_KEY)?;
         // A weak reference: the thread ends with the probe instead of keeping it alive.
         let (router, alive) = (router.clone(), Arc::downgrade(&probe.arrived));
-        let thread = thread::Builder::new().name("router-probe".into());
         // On a thread: at a router that fails it waits for ever.
-        let thread = thread.spawn(move || {
+        let thread = spawn("router-probe", move || {
             while alive.strong_count() > 0 && router.put(PROBE_KEY, [0_u8; 1]).wait().is_ok() {
                 thread::sleep(PERIOD);
             }

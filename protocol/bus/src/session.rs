@@ -2,11 +2,11 @@
 
 use std::net::{TcpListener, UdpSocket};
 use std::sync::mpsc;
-use std::thread;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use support::cli::Interrupted;
+use support::sync::spawn;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::Sample;
 use zenoh::{Config, Session, Wait};
@@ -59,16 +59,6 @@ pub enum SharedMemory {
     Attached,
     /// As [`Self::Attached`], with a pool of so many bytes for own messages: at least three times those in flight.
     Pool(usize),
-}
-
-impl SharedMemory {
-    /// Bytes of the pool; 0: none.
-    pub fn pool_bytes(self) -> usize {
-        match self {
-            Self::Pool(bytes) => bytes,
-            Self::Off | Self::Attached => 0,
-        }
-    }
 }
 
 /// Options of a session.
@@ -293,10 +283,8 @@ pub fn open_unless(stop: &Stop, options: &BusOptions) -> Result<Session, BusErro
     });
     // zenoh cannot be interrupted: its thread is left behind, and ends with the process.
     let wanted = options.clone();
-    thread::Builder::new()
-        .name("open".into())
-        .spawn(move || drop(result.send(Some(open(&wanted)))))
-        .map_err(BusError::thread("opening a session"))?;
+    let opening = spawn("open", move || drop(result.send(Some(open(&wanted)))));
+    opening.map_err(BusError::thread("opening a session"))?;
     let (endpoint, source) = (options.endpoint.clone(), Interrupted);
     let stopped = BusError::Stopped { endpoint, source };
     first.recv().ok().flatten().unwrap_or(Err(stopped))
@@ -365,6 +353,8 @@ fn same(found: &Value, wanted: &Value) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::thread;
+
     use super::*;
 
     #[test]

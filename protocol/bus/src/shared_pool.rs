@@ -15,7 +15,7 @@ use zenoh::shm::{
 use zenoh::{Session, Wait};
 
 use super::message_stats::SharedMemoryUse;
-use super::{BusError, MessageStats};
+use super::{BusError, MessageStats, SharedMemory};
 use crate::Result;
 
 /// Bodies of fewer bytes take the socket.
@@ -39,14 +39,18 @@ impl SharedPool {
         Self(None)
     }
 
-    /// A pool of `bytes` for the messages of `session`; 0: none.
+    /// The pool for the messages of `session`; none without bytes.
     ///
     /// # Errors
     /// [`BusError::SharedMemory`] when the system has too little; [`BusError::Zenoh`] when it gives none.
-    pub(super) fn open(session: &Session, bytes: usize, stats: &MessageStats) -> Result<Self> {
-        if bytes == 0 {
+    pub(super) fn open(
+        session: &Session,
+        memory: SharedMemory,
+        stats: &MessageStats,
+    ) -> Result<Self> {
+        let SharedMemory::Pool(bytes @ 1..) = memory else {
             return Ok(Self::none());
-        }
+        };
         check_room(bytes)?;
         let provider = ShmProviderBuilder::default_backend(bytes).wait();
         let provider =

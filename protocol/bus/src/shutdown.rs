@@ -5,7 +5,7 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use support::sync::{lock, wait_at_most};
+use support::sync::{lock, spawn, wait_at_most};
 
 type Reaction = Box<dyn FnOnce() + Send>;
 
@@ -89,22 +89,20 @@ impl Stop {
             )
         };
         let stop = self.clone();
-        thread::Builder::new()
-            .name("signals".into())
-            .spawn(move || {
-                runtime.block_on(async {
-                    loop {
-                        tokio::select! {
-                            _ = interrupt.recv() => {}
-                            _ = terminate.recv() => {}
-                        }
-                        if stop.requested() {
-                            std::process::exit(130);
-                        }
-                        stop.request();
+        spawn("signals", move || {
+            runtime.block_on(async {
+                loop {
+                    tokio::select! {
+                        _ = interrupt.recv() => {}
+                        _ = terminate.recv() => {}
                     }
-                });
-            })?;
+                    if stop.requested() {
+                        std::process::exit(130);
+                    }
+                    stop.request();
+                }
+            });
+        })?;
         Ok(())
     }
 
@@ -115,13 +113,11 @@ impl Stop {
     /// When the thread that waits for it cannot be started.
     pub fn on_end_of_input(&self) -> std::io::Result<()> {
         let stop = self.clone();
-        thread::Builder::new()
-            .name("parent-death".into())
-            .spawn(move || {
-                // A broken pipe is an end of input too.
-                let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
-                stop.request();
-            })?;
+        spawn("parent-death", move || {
+            // A broken pipe is an end of input too.
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+            stop.request();
+        })?;
         Ok(())
     }
 
@@ -130,13 +126,11 @@ impl Stop {
     pub fn enforce(&self, limit: Duration) {
         self.on_request(move || {
             // Without a thread for it, the operator can still press Ctrl-C a second time.
-            let _ = thread::Builder::new()
-                .name("enforcer".into())
-                .spawn(move || {
-                    thread::sleep(limit);
-                    tracing::error!("not ended {limit:?} after the request: exit without cleanup");
-                    std::process::exit(1);
-                });
+            let _ = spawn("enforcer", move || {
+                thread::sleep(limit);
+                tracing::error!("not ended {limit:?} after the request: exit without cleanup");
+                std::process::exit(1);
+            });
         });
     }
 }
@@ -164,12 +158,10 @@ pub fn within<T: Send + 'static>(
     teardown: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, Overdue> {
     let (done, wait) = mpsc::sync_channel(1);
-    let helper = thread::Builder::new()
-        .name(format!("end-{what}"))
-        .spawn(move || {
-            // The receiver is gone only after the timeout.
-            let _ = done.send(teardown());
-        });
+    let helper = spawn(format!("end-{what}"), move || {
+        // The receiver is gone only after the timeout.
+        let _ = done.send(teardown());
+    });
     let overdue = Overdue { what, limit };
     helper.map_err(|_| overdue)?;
     wait.recv_timeout(limit).map_err(|_| overdue)

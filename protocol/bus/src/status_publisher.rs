@@ -6,14 +6,14 @@ use std::collections::BTreeSet;
 use std::mem;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::thread::{self, JoinHandle};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use protocol::{CavId, Control, Key, Payload, RunId, Stamp, Stats, Topic, wire};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
-use support::sync::lock;
+use support::sync::{lock, spawn};
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::process_usage::process_usage;
@@ -98,10 +98,8 @@ impl StatusPublisher {
 
     pub(super) fn start(&self, sender: StatusSender) -> Result<JoinHandle<()>, BusError> {
         let shared = Arc::clone(&self.0);
-        thread::Builder::new()
-            .name("status".into())
-            .spawn(move || sender.run(&shared))
-            .map_err(BusError::thread("status"))
+        let thread = spawn("status", move || sender.run(&shared));
+        thread.map_err(BusError::thread("status"))
     }
 }
 

@@ -64,7 +64,7 @@ pub struct Arrival {
     pub header: Header,
     /// Arrival time.
     pub at: Instant,
-    payload: ZBytes,
+    pub(super) payload: ZBytes,
 }
 
 impl Arrival {
@@ -82,10 +82,6 @@ impl Arrival {
     /// Bytes on the wire, without the overhead of the transport.
     pub fn wire_bytes(&self) -> u64 {
         self.payload.len() as u64
-    }
-
-    pub(super) fn payload(&self) -> &ZBytes {
-        &self.payload
     }
 
     /// The message on the wire, header included, in the pieces in which it was received.

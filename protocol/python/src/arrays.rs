@@ -7,6 +7,14 @@ use pyo3::{Py, PyResult, Python};
 /// A matrix of `float64`.
 pub(crate) type Matrix = Py<PyArray2<f64>>;
 
+/// What `make` makes of a value that is there.
+pub(crate) fn optional<T, U>(
+    value: Option<T>,
+    make: impl FnOnce(T) -> PyResult<U>,
+) -> PyResult<Option<U>> {
+    value.map(make).transpose()
+}
+
 /// `[rows, COLUMNS]` from its rows.
 pub(crate) fn rows<T: numpy::Element, const COLUMNS: usize>(
     py: Python<'_>,

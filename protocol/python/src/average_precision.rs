@@ -89,10 +89,10 @@ fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detectio
     let py = found.py();
     let (boxes, scores) = match found.cast::<Detections>() {
         Ok(found) => {
-            let (boxes, scores) = found.get().scored();
+            let found = found.get();
             (
-                boxes.bind(py).clone().into_any(),
-                scores.bind(py).clone().into_any(),
+                found.boxes.bind(py).clone().into_any(),
+                found.scores.bind(py).clone().into_any(),
             )
         }
         Err(_) => found.extract().map_err(|_| {

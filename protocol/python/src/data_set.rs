@@ -34,7 +34,7 @@ impl DataSet {
                 .iter()
                 .map(|scenario| scenario.ticks.len())
                 .sum(),
-            Source::Recording(recording) => recording.len(),
+            Source::Recording(recording) => recording.frames.len(),
         }
     }
 

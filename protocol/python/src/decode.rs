@@ -108,8 +108,8 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
             .into_any(),
         WireMessage::Truth(truth) => {
             let agents = PyDict::new(py);
-            for parts in AgentParts::of_truth(&truth) {
-                let (agent, recorded) = Agent::new(py, parts)?;
+            for agent in &truth.agents {
+                let (agent, recorded) = Agent::new(py, AgentParts::of_truth(agent))?;
                 agents.set_item(recorded.cav.as_str(), agent)?;
             }
             let made = PyDict::new(py);

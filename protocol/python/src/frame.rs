@@ -8,7 +8,7 @@ use protocol::Box3d;
 use pyo3::types::{PyDict, PyDictMethods};
 use pyo3::{Py, PyResult, Python, pyclass, pymethods};
 
-use crate::arrays::{self, Matrix};
+use crate::arrays::{self, Matrix, optional};
 use crate::error::error;
 use crate::frame_parts::{AgentParts, FrameParts};
 use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate, Tracks};
@@ -40,31 +40,22 @@ impl Agent {
         }
         let cav = recorded.cav.to_string();
         let points = std::mem::take(&mut recorded.points).xyzi;
+        let points = Some(points).filter(|_| parts.has_points);
         let radar = recorded.radar.take();
         let made = Self {
-            points: (parts.has_points)
-                .then(|| arrays::rows(py, points))
-                .transpose()?,
-            radar: radar
-                .map(|sweep| arrays::rows(py, sweep.xyzi))
-                .transpose()?,
+            points: optional(points, |points| arrays::rows(py, points))?,
+            radar: optional(radar, |sweep| arrays::rows(py, sweep.xyzi))?,
             cameras: cameras.unbind(),
-            world_from_lidar: (recorded.world_from_lidar)
-                .map(|pose| arrays::pose(py, &pose))
-                .transpose()?,
-            gnss_world_from_lidar: (parts.gnss_world_from_lidar)
-                .map(|pose| arrays::pose(py, &pose))
-                .transpose()?,
+            world_from_lidar: optional(recorded.world_from_lidar, |pose| arrays::pose(py, &pose))?,
+            gnss_world_from_lidar: optional(parts.gnss_world_from_lidar, |pose| {
+                arrays::pose(py, &pose)
+            })?,
             speed_mps: recorded.speed_mps,
             yaw_rate_rad_s: recorded.yaw_rate_rad_s,
             objects: Objects::annotated(py, &recorded)?,
-            pose: (parts.pose)
-                .map(|pose| PoseEstimate::new(py, &pose))
-                .transpose()?,
-            bev: (parts.bev).map(|bev| Bev::new(py, bev)).transpose()?,
-            boxes: (parts.boxes)
-                .map(|boxes| Detections::of_agent(py, &cav, &boxes))
-                .transpose()?,
+            pose: optional(parts.pose, |pose| PoseEstimate::new(py, &pose))?,
+            bev: optional(parts.bev, |bev| Bev::new(py, bev))?,
+            boxes: optional(parts.boxes, |boxes| Detections::of_agent(py, &cav, &boxes))?,
             cav,
         };
         Ok((Py::new(py, made)?, recorded))

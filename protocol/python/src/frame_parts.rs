@@ -3,8 +3,8 @@
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use protocol::{
-    Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream, Topic,
-    Tracks, Truth, WireError, wire,
+    AgentTruth, Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream,
+    Topic, Tracks, Truth, WireError, wire,
 };
 
 use crate::payload::DecodedBev;
@@ -134,13 +134,9 @@ impl AgentParts {
         }
     }
 
-    /// The agents of a message of the ground truth.
-    pub(crate) fn of_truth(truth: &Truth) -> Vec<Self> {
-        truth
-            .agents
-            .iter()
-            .map(|agent| Self::recorded(Frame::of_truth(agent), false))
-            .collect()
+    /// An agent of a message of the ground truth.
+    pub(crate) fn of_truth(agent: &AgentTruth) -> Self {
+        Self::recorded(Frame::of_truth(agent), false)
     }
 
     /// An agent with points that it shares.

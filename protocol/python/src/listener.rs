@@ -32,7 +32,7 @@ const MOST_NAMED: usize = 100;
 /// Frames of a live run as they arrive.
 #[pyclass(module = "v2vloc")]
 pub(crate) struct Listener {
-    connection: Option<Connection>,
+    connection: Option<(Bus, PassiveSubscriber)>,
     run: RunId,
     endpoint: Endpoint,
     timeout: Option<Duration>,
@@ -48,11 +48,6 @@ pub(crate) struct Listener {
     is_over: bool,
 }
 
-struct Connection {
-    bus: Bus,
-    subscriber: PassiveSubscriber,
-}
-
 /// Result of one step of a listener.
 enum Step {
     Message(RawMessage),
@@ -66,7 +61,7 @@ impl Listener {
     /// The next message, waiting for one so long: without Python's lock, and such that Ctrl-C interrupts.
     fn step(&mut self, py: Python<'_>, wait: Duration) -> PyResult<Step> {
         py.check_signals()?;
-        let Some(Connection { bus, subscriber }) = &self.connection else {
+        let Some((bus, subscriber)) = &self.connection else {
             return Ok(Step::End);
         };
         let has_ended = self.is_over && self.last_data.elapsed() >= self.settle;
@@ -137,7 +132,7 @@ impl Listener {
     }
 
     fn disconnect(&mut self) {
-        if let Some(Connection { bus, subscriber }) = self.connection.take() {
+        if let Some((bus, subscriber)) = self.connection.take() {
             // Subscriptions have to end before the bus is left.
             drop(subscriber);
             // A connection that does not close in time closes with the process.
@@ -215,7 +210,7 @@ impl Listener {
     #[getter]
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let connection = self.connection.as_ref();
-        let subscriber = connection.map(|connection| &connection.subscriber);
+        let subscriber = connection.map(|(_, subscriber)| subscriber);
         let overwritten = subscriber.map_or(0, PassiveSubscriber::overwritten);
         let undelivered = subscriber.map_or(0, PassiveSubscriber::undelivered);
         let counts = PyDict::new(py);
@@ -295,7 +290,7 @@ pub(crate) fn listen(
     let connection: Result<_, bus::BusError> = py.detach(|| {
         let bus = Bus::join(&options, identity)?;
         let subscriber = bus.tap(&selectors, PLACES)?;
-        Ok(Connection { bus, subscriber })
+        Ok((bus, subscriber))
     });
     let connection = connection.map_err(error)?;
     let protocol = EvaluationProtocol::preset("opv2v").ok_or_else(|| error("no protocol opv2v"))?;

@@ -3,11 +3,11 @@
 use dataset::frame::{Frame, Object};
 use dataset::ground_truth::{GroundTruth, upright_box};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
-use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose, Track};
+use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose};
 use pyo3::types::{PyBytes, PyDict, PyDictMethods, PyList};
 use pyo3::{Py, PyAny, PyResult, Python, pyclass, pymethods};
 
-use crate::arrays::{self, Matrix};
+use crate::arrays::{self, Matrix, optional};
 use crate::json;
 
 /// Pose estimate of an agent, or the reason why it has none.
@@ -31,10 +31,7 @@ impl PoseEstimate {
             } => Self {
                 world_from_cav: Some(arrays::pose(py, world_from_cav)?),
                 confidence: Some(*confidence),
-                covariance: covariance
-                    .as_ref()
-                    .map(|one| arrays::covariance(py, one))
-                    .transpose()?,
+                covariance: optional(covariance.as_ref(), |one| arrays::covariance(py, one))?,
                 ..Self::default()
             },
             protocol::PoseEstimate::NoPose {
@@ -149,8 +146,8 @@ impl Bev {
 #[pyclass(frozen, get_all, module = "v2vloc")]
 pub(crate) struct Detections {
     cav: String,
-    boxes: Matrix,
-    scores: Py<PyArray1<f32>>,
+    pub(crate) boxes: Matrix,
+    pub(crate) scores: Py<PyArray1<f32>>,
     sources: Py<PyList>,
     tracks: Py<PyAny>,
     pose: Py<PoseEstimate>,
@@ -210,7 +207,7 @@ impl Detections {
         Ok(Self {
             cav: cav.to_owned(),
             boxes: arrays::boxes(py, found.iter().map(|one| &one.box3d))?,
-            scores: PyArray1::from_vec(py, found.iter().map(|one| one.score).collect()).unbind(),
+            scores: column(py, found, |one| one.score),
             sources: PyList::new(py, sources.collect::<Vec<_>>())?.unbind(),
             tracks,
             pose: PoseEstimate::new(py, pose)?,
@@ -221,11 +218,6 @@ impl Detections {
             neighbours,
             stages_ms: PyDict::new(py).unbind(),
         })
-    }
-
-    /// The arrays from which average precision is computed.
-    pub(crate) fn scored(&self) -> (&Matrix, &Py<PyArray1<f32>>) {
-        (&self.boxes, &self.scores)
     }
 }
 
@@ -269,14 +261,14 @@ impl Tracks {
         let made = Self {
             cav: found.ego.to_string(),
             agent_frame: found.agent_frame,
-            ids: by_track(py, tracks, |track| track.id),
+            ids: column(py, tracks, |track| track.id),
             boxes: arrays::boxes(py, tracks.iter().map(|track| &track.box3d))?,
             velocities_mps: arrays::rows(py, velocities_mps)?,
             covariances: covariances.reshape([tracks.len(), 4, 4])?.unbind(),
-            scores: by_track(py, tracks, |track| track.score),
-            hits: by_track(py, tracks, |track| track.hits),
-            ages_s: by_track(py, tracks, |track| track.age_s),
-            unseen_s: by_track(py, tracks, |track| track.unseen_s),
+            scores: column(py, tracks, |track| track.score),
+            hits: column(py, tracks, |track| track.hits),
+            ages_s: column(py, tracks, |track| track.age_s),
+            unseen_s: column(py, tracks, |track| track.unseen_s),
             pose: PoseEstimate::new(py, &found.pose)?,
             left_out: found.left_out,
         };
@@ -284,12 +276,9 @@ impl Tracks {
     }
 }
 
-fn by_track<T: numpy::Element>(
-    py: Python<'_>,
-    tracks: &[Track],
-    value: fn(&Track) -> T,
-) -> Py<PyArray1<T>> {
-    PyArray1::from_vec(py, tracks.iter().map(value).collect()).unbind()
+/// One value for each row.
+fn column<R, T: numpy::Element>(py: Python<'_>, rows: &[R], value: fn(&R) -> T) -> Py<PyArray1<T>> {
+    PyArray1::from_vec(py, rows.iter().map(value).collect()).unbind()
 }
 
 #[pymethods]
@@ -347,18 +336,14 @@ impl Objects {
         let boxes = boxes.map(|boxes| arrays::boxes(py, boxes.iter()));
         let poses = objects.iter().map(|object| object.world_from_object);
         let poses: Vec<Pose> = poses.collect();
-        let speeds = objects
-            .iter()
-            // NaN where unknown: an array of numbers has no `None`.
-            .map(|object| object.speed_mps.unwrap_or(f64::NAN))
-            .collect();
         let made = Self {
-            ids: PyArray1::from_vec(py, objects.iter().map(|object| object.id).collect()).unbind(),
+            ids: column(py, objects, |object| object.id),
             classes: PyList::new(py, objects.iter().map(|object| object.class.name()))?.unbind(),
             boxes: boxes.transpose()?,
             world_from_object: arrays::poses(py, &poses)?,
             sizes_m: arrays::rows(py, objects.iter().map(|object| object.size_m).collect())?,
-            speeds_mps: PyArray1::from_vec(py, speeds).unbind(),
+            // NaN where unknown: an array of numbers has no `None`.
+            speeds_mps: column(py, objects, |object| object.speed_mps.unwrap_or(f64::NAN)),
             truth,
         };
         Py::new(py, made)
@@ -402,10 +387,9 @@ impl Camera {
             width_px: metadata.width_px,
             height_px: metadata.height_px,
             intrinsics: intrinsics.transpose()?,
-            lidar_from_camera: metadata
-                .lidar_from_camera
-                .map(|pose| arrays::pose(py, &pose))
-                .transpose()?,
+            lidar_from_camera: optional(metadata.lidar_from_camera, |pose| {
+                arrays::pose(py, &pose)
+            })?,
         };
         Py::new(py, made)
     }

@@ -17,7 +17,7 @@ pub(crate) struct RecordingFrames {
     pub(crate) run: String,
     protocol: EvaluationProtocol,
     /// Capture times and indices of their messages, in order.
-    frames: Vec<(u64, Vec<usize>)>,
+    pub(crate) frames: Vec<(u64, Vec<usize>)>,
 }
 
 impl RecordingFrames {
@@ -43,10 +43,6 @@ impl RecordingFrames {
             protocol,
             frames: frames.into_iter().collect(),
         })
-    }
-
-    pub(crate) fn len(&self) -> usize {
-        self.frames.len()
     }
 
     /// Parts of the file that cannot be read.

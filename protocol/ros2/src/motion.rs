@@ -5,10 +5,9 @@
 //! is the body).
 
 use protocol::EgoMotion;
-use re_cdr::{ByteOrder, CdrReader};
 
 use crate::RosType;
-use crate::read::{Body, Header, ReadError, Reader};
+use crate::read::{ReadError, Reader};
 
 /// Variance from which a value counts as not measured: drivers write it, as we do, where they measure nothing.
 const UNMEASURED: f64 = 1e6;
@@ -74,20 +73,11 @@ impl MotionType {
     /// # Errors
     /// [`MotionError`] names the field and its value.
     pub fn read(self, bytes: &[u8]) -> Result<TimedMotion, MotionError> {
-        match Body::of(bytes)? {
-            Body::BigEndian(message) => self.read_body(message),
-            Body::LittleEndian(message) => self.read_body(message),
-        }
-    }
-
-    fn read_body<BO: ByteOrder>(
-        self,
-        mut message: Reader<'_, BO>,
-    ) -> Result<TimedMotion, MotionError> {
-        let Header { nanos, .. } = message.header()?;
+        let mut message = Reader::of(bytes)?;
+        let (capture_nanos, _) = message.header()?;
         let motion = match self {
             Self::Odometry => {
-                message.read("child_frame_id", CdrReader::read_str)?;
+                message.str("child_frame_id")?;
                 message.f64s::<7>("pose.pose")?;
                 message.f64s::<36>("pose.covariance")?;
                 let fields = ["twist.twist.linear.x", "twist.twist.angular.z"];
@@ -113,15 +103,15 @@ impl MotionType {
             }
         };
         Ok(TimedMotion {
-            capture_nanos: nanos,
+            capture_nanos,
             motion,
         })
     }
 }
 
 /// `geometry_msgs/Twist`; errors name the fields of speed and yaw rate.
-fn read_twist<BO: ByteOrder>(
-    message: &mut Reader<'_, BO>,
+fn read_twist(
+    message: &mut Reader<'_>,
     [speed_field, yaw_rate_field]: [&'static str; 2],
 ) -> Result<EgoMotion, MotionError> {
     let [speed_mps, _, _] = message.f64s(speed_field)?;
@@ -168,7 +158,7 @@ fn within(field: &'static str, found: f64, limit: f64) -> Result<f64, MotionErro
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use re_cdr::{BigEndian, CdrWriter, LittleEndian};
+    use re_cdr::{BigEndian, ByteOrder, CdrWriter, LittleEndian};
 
     use super::*;
 

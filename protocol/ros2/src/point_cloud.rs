@@ -6,9 +6,9 @@
 //! have them for rays without a return, are left out.
 
 use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS, IntensityKind, PointCloud};
-use re_cdr::{BigEndian, ByteOrder, CdrReader, LittleEndian};
+use re_cdr::{BigEndian, ByteOrder, LittleEndian};
 
-use crate::read::{Body, Header, ReadError, Reader};
+use crate::read::{ReadError, Reader};
 
 /// More fields than any driver publishes.
 const MAX_FIELDS: u32 = 256;
@@ -95,10 +95,36 @@ pub struct SweepLimits {
 /// # Errors
 /// [`PointCloudError`] names the field and both values.
 pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<Sweep, PointCloudError> {
-    match Body::of(bytes)? {
-        Body::BigEndian(message) => read_sweep(message, limits),
-        Body::LittleEndian(message) => read_sweep(message, limits),
+    let mut message = Reader::of(bytes)?;
+    let (capture_nanos, frame_id) = message.header()?;
+    let (height, width) = (message.u32("height")?, message.u32("width")?);
+    let fields = read_fields(&mut message)?;
+    // Values are in the order that the flag states, whatever the order of the message.
+    let is_big_endian = message.u8("is_bigendian")? != 0;
+    let (point_step, row_step) = (message.u32("point_step")?, message.u32("row_step")?);
+    let data = message.bytes("data")?;
+    let columns = Columns::find(&fields)?;
+    let layout = Layout {
+        height,
+        width,
+        point_step,
+        row_step,
+    };
+    layout.check(&columns, data.len(), limits)?;
+    let mut sweep = Sweep {
+        capture_nanos,
+        frame_id: frame_id.into(),
+        points: PointCloud::default(),
+        intensity: (columns.intensity).map(|(name, _, kind)| (name.to_owned(), kind)),
+        without_return: 0,
+        too_far: 0,
+    };
+    if is_big_endian {
+        sweep.fill::<BigEndian>(data, &layout, &columns, limits.max_abs_value);
+    } else {
+        sweep.fill::<LittleEndian>(data, &layout, &columns, limits.max_abs_value);
     }
+    Ok(sweep)
 }
 
 /// Datatypes of `sensor_msgs/PointField`.
@@ -327,51 +353,14 @@ fn at_most(what: &'static str, found: u64, max: u64) -> Result<(), PointCloudErr
     Err(PointCloudError::TooMany { what, found, max })
 }
 
-fn read_sweep<BO: ByteOrder>(
-    mut message: Reader<'_, BO>,
-    limits: SweepLimits,
-) -> Result<Sweep, PointCloudError> {
-    let Header { nanos, frame_id } = message.header()?;
-    let (height, width) = (message.u32("height")?, message.u32("width")?);
-    let fields = read_fields(&mut message)?;
-    // Values are in the order that the flag states, whatever the order of the message.
-    let is_big_endian = message.read("is_bigendian", CdrReader::read_u8)? != 0;
-    let (point_step, row_step) = (message.u32("point_step")?, message.u32("row_step")?);
-    let data = message.read("data", CdrReader::read_byte_sequence)?;
-    let columns = Columns::find(&fields)?;
-    let layout = Layout {
-        height,
-        width,
-        point_step,
-        row_step,
-    };
-    layout.check(&columns, data.len(), limits)?;
-    let mut sweep = Sweep {
-        capture_nanos: nanos,
-        frame_id: frame_id.into(),
-        points: PointCloud::default(),
-        intensity: (columns.intensity).map(|(name, _, kind)| (name.to_owned(), kind)),
-        without_return: 0,
-        too_far: 0,
-    };
-    if is_big_endian {
-        sweep.fill::<BigEndian>(data, &layout, &columns, limits.max_abs_value);
-    } else {
-        sweep.fill::<LittleEndian>(data, &layout, &columns, limits.max_abs_value);
-    }
-    Ok(sweep)
-}
-
-fn read_fields<'a, BO: ByteOrder>(
-    message: &mut Reader<'a, BO>,
-) -> Result<Vec<Field<'a>>, PointCloudError> {
+fn read_fields<'a>(message: &mut Reader<'a>) -> Result<Vec<Field<'a>>, PointCloudError> {
     let count = message.u32("length of fields")?;
     at_most("fields", count.into(), MAX_FIELDS.into())?;
     let fields = (0..count).map(|_| {
         Ok(Field {
-            name: message.read("fields.name", CdrReader::read_str)?,
+            name: message.str("fields.name")?,
             offset: message.u32("fields.offset")?,
-            datatype: message.read("fields.datatype", CdrReader::read_u8)?,
+            datatype: message.u8("fields.datatype")?,
             count: message.u32("fields.count")?,
         })
     });

@@ -1,7 +1,7 @@
 //! Reading of ROS 2 messages in CDR: encapsulation header, byte order, header of the message, errors by field.
 
 use protocol::Pose;
-use re_cdr::{BigEndian, ByteOrder, CdrReader, LittleEndian};
+use re_cdr::{BigEndian, CdrReader, LittleEndian};
 
 /// Error of a message that cannot be read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -34,66 +34,67 @@ pub enum ReadError {
     },
 }
 
-/// A message after its encapsulation header, in either byte order.
-pub(crate) enum Body<'a> {
-    BigEndian(Reader<'a, BigEndian>),
-    LittleEndian(Reader<'a, LittleEndian>),
-}
-
-impl<'a> Body<'a> {
-    /// The body of a message with its encapsulation header.
-    pub(crate) fn of(bytes: &'a [u8]) -> Result<Self, ReadError> {
-        // Values are aligned from the end of this header on, so the reader begins there.
-        match bytes.split_first_chunk() {
-            Some(([0, 0, _, _], body)) => Ok(Self::BigEndian(Reader::new(body))),
-            Some(([0, 1, _, _], body)) => Ok(Self::LittleEndian(Reader::new(body))),
-            _ => Err(ReadError::Encoding {
-                found: bytes.iter().take(4).copied().collect(),
-            }),
-        }
-    }
-}
-
-/// `std_msgs/Header`.
-pub(crate) struct Header<'a> {
-    /// Stamp, nanoseconds.
-    pub(crate) nanos: u64,
-    /// Frame of the message.
-    pub(crate) frame_id: &'a str,
-}
-
-/// Reader of one message in byte order `BO`.
-pub(crate) struct Reader<'a, BO> {
-    cdr: CdrReader<'a, BO>,
+/// Reader of one message after its encapsulation header, in the byte order that the header states.
+pub(crate) struct Reader<'a> {
+    cdr: Cdr<'a>,
     len: usize,
 }
 
-impl<'a, BO: ByteOrder> Reader<'a, BO> {
-    fn new(body: &'a [u8]) -> Self {
-        Self {
-            cdr: CdrReader::new(body),
-            len: body.len(),
-        }
+enum Cdr<'a> {
+    BigEndian(CdrReader<'a, BigEndian>),
+    LittleEndian(CdrReader<'a, LittleEndian>),
+}
+
+impl<'a> Reader<'a> {
+    /// Reader of a message with its encapsulation header.
+    pub(crate) fn of(bytes: &'a [u8]) -> Result<Self, ReadError> {
+        // Values are aligned from the end of this header on, so the reader begins there.
+        let (cdr, len) = match bytes.split_first_chunk() {
+            Some(([0, 0, _, _], body)) => (Cdr::BigEndian(CdrReader::new(body)), body.len()),
+            Some(([0, 1, _, _], body)) => (Cdr::LittleEndian(CdrReader::new(body)), body.len()),
+            _ => {
+                let found = bytes.iter().take(4).copied().collect();
+                return Err(ReadError::Encoding { found });
+            }
+        };
+        Ok(Self { cdr, len })
     }
 
-    /// Reads a value; an error names `field`.
-    pub(crate) fn read<T>(
+    /// Reads a value in either byte order; an error names `field`.
+    fn read<T>(
         &mut self,
         field: &'static str,
-        read: impl FnOnce(&mut CdrReader<'a, BO>) -> re_cdr::Result<T>,
+        big: impl FnOnce(&mut CdrReader<'a, BigEndian>) -> re_cdr::Result<T>,
+        little: impl FnOnce(&mut CdrReader<'a, LittleEndian>) -> re_cdr::Result<T>,
     ) -> Result<T, ReadError> {
-        let at = self.cdr.position();
-        let len = self.len;
-        read(&mut self.cdr).map_err(|cause| ReadError::Cdr {
+        let (at, read) = match &mut self.cdr {
+            Cdr::BigEndian(cdr) => (cdr.position(), big(cdr)),
+            Cdr::LittleEndian(cdr) => (cdr.position(), little(cdr)),
+        };
+        read.map_err(|cause| ReadError::Cdr {
             field,
             at,
-            len,
+            len: self.len,
             cause: cause.to_string(),
         })
     }
 
+    pub(crate) fn u8(&mut self, field: &'static str) -> Result<u8, ReadError> {
+        self.read(field, CdrReader::read_u8, CdrReader::read_u8)
+    }
+
     pub(crate) fn u32(&mut self, field: &'static str) -> Result<u32, ReadError> {
-        self.read(field, CdrReader::read_u32)
+        self.read(field, CdrReader::read_u32, CdrReader::read_u32)
+    }
+
+    pub(crate) fn str(&mut self, field: &'static str) -> Result<&'a str, ReadError> {
+        self.read(field, CdrReader::read_str, CdrReader::read_str)
+    }
+
+    /// `uint8[]`.
+    pub(crate) fn bytes(&mut self, field: &'static str) -> Result<&'a [u8], ReadError> {
+        let (big, little) = (CdrReader::read_byte_sequence, CdrReader::read_byte_sequence);
+        self.read(field, big, little)
     }
 
     /// `float64[N]`, or a structure of as many.
@@ -103,7 +104,7 @@ impl<'a, BO: ByteOrder> Reader<'a, BO> {
     ) -> Result<[f64; N], ReadError> {
         let mut values = [0.0; N];
         for value in &mut values {
-            *value = self.read(field, CdrReader::read_f64)?;
+            *value = self.read(field, CdrReader::read_f64, CdrReader::read_f64)?;
         }
         Ok(values)
     }
@@ -118,14 +119,14 @@ impl<'a, BO: ByteOrder> Reader<'a, BO> {
         })
     }
 
-    /// `std_msgs/Header`.
-    pub(crate) fn header(&mut self) -> Result<Header<'a>, ReadError> {
-        let sec = self.read("header.stamp.sec", CdrReader::read_i32)?;
+    /// `std_msgs/Header`: stamp (nanoseconds) and frame of the message.
+    pub(crate) fn header(&mut self) -> Result<(u64, &'a str), ReadError> {
+        let field = "header.stamp.sec";
+        let sec = self.read(field, CdrReader::read_i32, CdrReader::read_i32)?;
         let nanosec = self.u32("header.stamp.nanosec")?;
         let seconds = u64::try_from(sec).ok().filter(|_| nanosec < 1_000_000_000);
         let seconds = seconds.ok_or(ReadError::Stamp { sec, nanosec })?;
-        let frame_id = self.read("header.frame_id", CdrReader::read_str)?;
-        let nanos = seconds * 1_000_000_000 + u64::from(nanosec);
-        Ok(Header { nanos, frame_id })
+        let frame_id = self.str("header.frame_id")?;
+        Ok((seconds * 1_000_000_000 + u64::from(nanosec), frame_id))
     }
 }

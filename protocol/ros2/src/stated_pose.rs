@@ -1,10 +1,9 @@
 //! Stated pose: reader of the pose that a person draws in RViz or a program sends, with its covariance.
 
 use protocol::{InvalidPose, Pose};
-use re_cdr::ByteOrder;
 
 use crate::names::MAP_FRAME;
-use crate::read::{Body, ReadError, Reader};
+use crate::read::{ReadError, Reader};
 
 /// Standard deviations are kept within these bounds, metres and radians: a stated pose is neither exact nor unknown.
 const STD: [f64; 2] = [0.01, 10.0];
@@ -51,30 +50,24 @@ impl StatedPose {
     /// # Errors
     /// [`StatedPoseError`] names the field and its value.
     pub fn read(bytes: &[u8]) -> Result<Self, StatedPoseError> {
-        match Body::of(bytes)? {
-            Body::BigEndian(message) => read(message),
-            Body::LittleEndian(message) => read(message),
+        let mut message = Reader::of(bytes)?;
+        let (_, frame_id) = message.header()?;
+        if frame_id.trim_start_matches('/') != MAP_FRAME {
+            let found = frame_id.to_owned();
+            return Err(StatedPoseError::Frame { found });
         }
+        let world_from_base = message.pose("pose")?;
+        world_from_base.validate()?;
+        let covariance: [f64; 36] = message.f64s("covariance")?;
+        // Row-major 6 x 6: variances of x, y and yaw are at 0, 7 and 35.
+        let [xx, .., yaw] = covariance;
+        let [_, _, _, _, _, _, _, yy, ..] = covariance;
+        Ok(Self {
+            world_from_base,
+            position_std_m: std(0, xx)?.max(std(7, yy)?),
+            yaw_std_rad: std(35, yaw)?,
+        })
     }
-}
-
-fn read<BO: ByteOrder>(mut message: Reader<'_, BO>) -> Result<StatedPose, StatedPoseError> {
-    let header = message.header()?;
-    if header.frame_id.trim_start_matches('/') != MAP_FRAME {
-        let found = header.frame_id.to_owned();
-        return Err(StatedPoseError::Frame { found });
-    }
-    let world_from_base = message.pose("pose")?;
-    world_from_base.validate()?;
-    let covariance: [f64; 36] = message.f64s("covariance")?;
-    // Row-major 6 x 6: variances of x, y and yaw are at 0, 7 and 35.
-    let [xx, .., yaw] = covariance;
-    let [_, _, _, _, _, _, _, yy, ..] = covariance;
-    Ok(StatedPose {
-        world_from_base,
-        position_std_m: std(0, xx)?.max(std(7, yy)?),
-        yaw_std_rad: std(35, yaw)?,
-    })
 }
 
 fn std(index: usize, variance: f64) -> Result<f64, StatedPoseError> {

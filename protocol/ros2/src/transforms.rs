@@ -1,9 +1,8 @@
 //! Reader of poses: where one frame is in another, from the messages of odometry, localization and transforms.
 
 use protocol::Pose;
-use re_cdr::{ByteOrder, CdrReader};
 
-use crate::read::{Body, ReadError, Reader};
+use crate::read::{ReadError, Reader};
 
 /// More transforms than any robot publishes in one message.
 const MAX_TRANSFORMS: u32 = 10_000;
@@ -51,16 +50,7 @@ impl PoseType {
     /// # Errors
     /// [`ReadError`] names the field.
     pub fn read(self, bytes: &[u8]) -> Result<Vec<Transform>, ReadError> {
-        match Body::of(bytes)? {
-            Body::BigEndian(message) => self.read_body(message),
-            Body::LittleEndian(message) => self.read_body(message),
-        }
-    }
-
-    fn read_body<BO: ByteOrder>(
-        self,
-        mut message: Reader<'_, BO>,
-    ) -> Result<Vec<Transform>, ReadError> {
+        let mut message = Reader::of(bytes)?;
         let count = match self {
             Self::TfMessage => message.u32("length of transforms")?.min(MAX_TRANSFORMS),
             _ => 1,
@@ -69,11 +59,11 @@ impl PoseType {
         (0..count).map(|_| self.read_one(&mut message)).collect()
     }
 
-    fn read_one<BO: ByteOrder>(self, message: &mut Reader<'_, BO>) -> Result<Transform, ReadError> {
-        let header = message.header()?;
+    fn read_one(self, message: &mut Reader<'_>) -> Result<Transform, ReadError> {
+        let (nanos, parent) = message.header()?;
         let child = match self {
             Self::Odometry | Self::TfMessage => {
-                let child = frame(message.read("child_frame_id", CdrReader::read_str)?);
+                let child = frame(message.str("child_frame_id")?);
                 Some(child).filter(|child| !child.is_empty())
             }
             Self::PoseStamped | Self::PoseWithCovarianceStamped => None,
@@ -83,8 +73,8 @@ impl PoseType {
             _ => "pose",
         })?;
         Ok(Transform {
-            nanos: header.nanos,
-            parent: frame(header.frame_id),
+            nanos,
+            parent: frame(parent),
             child,
             parent_from_child,
         })
@@ -96,11 +86,8 @@ impl PoseType {
 /// # Errors
 /// [`ReadError`] names the field.
 pub fn read_header(bytes: &[u8]) -> Result<(u64, String), ReadError> {
-    let header = match Body::of(bytes)? {
-        Body::BigEndian(mut message) => message.header()?,
-        Body::LittleEndian(mut message) => message.header()?,
-    };
-    Ok((header.nanos, frame(header.frame_id)))
+    let (nanos, frame_id) = Reader::of(bytes)?.header()?;
+    Ok((nanos, frame(frame_id)))
 }
 
 fn frame(name: &str) -> String {

@@ -123,10 +123,8 @@ impl ConfidenceGate {
     /// # Errors
     /// [`WireError::Value`] when the window has an even width, is too wide, or its sigma is not positive.
     pub(super) fn cells(&self, confidence: &[f32], grid: &BevGrid) -> Result<Vec<u32>, WireError> {
-        let smoothed = match self.smoothing {
-            Some(smoothing) => Some(smoothing.smooth(confidence, grid)?),
-            None => None,
-        };
+        let smoothed = (self.smoothing).map(|window| window.smooth(confidence, grid));
+        let smoothed = smoothed.transpose()?;
         let values = smoothed.as_deref().unwrap_or(confidence);
         let passing = (0u32..)
             .zip(values)

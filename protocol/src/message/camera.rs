@@ -107,12 +107,9 @@ impl Payload for Camera {
     fn check(metadata: &CameraMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
         check_within("width_px", metadata.width_px.into(), 1.0, MAX_EDGE_PX)?;
         check_within("height_px", metadata.height_px.into(), 1.0, MAX_EDGE_PX)?;
-        if let Some(pinhole) = &metadata.pinhole {
-            pinhole.check_values()?;
-        }
-        if let Some(pose) = &metadata.lidar_from_camera {
-            check_pose("lidar_from_camera", pose)?;
-        }
+        let (pinhole, pose) = (&metadata.pinhole, &metadata.lidar_from_camera);
+        pinhole.iter().try_for_each(Pinhole::check_values)?;
+        (pose.iter()).try_for_each(|pose| check_pose("lidar_from_camera", pose))?;
         let max = limits.max_body_bytes;
         Ok(BodyShape::Bytes { min: 1, max })
     }

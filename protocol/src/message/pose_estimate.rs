@@ -138,9 +138,8 @@ impl PoseEstimate {
             } => {
                 check_pose("world_from_cav", world_from_cav)?;
                 check_within("confidence", f64::from(*confidence), 0.0, 1.0)?;
-                covariance
-                    .as_ref()
-                    .map_or(Ok(()), PlanarCovariance::check_values)
+                let mut covariance = covariance.iter();
+                covariance.try_for_each(PlanarCovariance::check_values)
             }
             Self::NoPose { .. } => Ok(()),
         }

@@ -49,9 +49,8 @@ impl Truth {
         check_count("objects", objects, limits.max_boxes)?;
         for agent in &self.agents {
             check_pose("world_from_lidar", &agent.world_from_lidar)?;
-            for object in &agent.objects {
-                object.check_values()?;
-            }
+            let mut objects = agent.objects.iter();
+            objects.try_for_each(TrueObject::check_values)?;
         }
         Ok(())
     }
@@ -68,8 +67,7 @@ impl TrueObject {
         };
         // Data sets have objects without length, width or height: one of them must not reject the whole message.
         box3d.check_from(0.0)?;
-        self.speed_mps
-            .map_or(Ok(()), |speed| check_within("speed_mps", speed, -1e3, 1e3))
+        check_within("speed_mps", self.speed_mps.unwrap_or(0.0), -1e3, 1e3)
     }
 }
 

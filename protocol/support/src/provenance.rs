@@ -73,10 +73,8 @@ impl Provenance {
     /// Digest of the settings, written as text, and of all that they were applied to; the command does not count.
     pub fn key(&self, settings: &str) -> String {
         let mut hash = Sha256::new();
-        for part in [&self.program_sha256, &self.data_sha256] {
-            hash.update(part);
-        }
-        for sha256 in self.files_sha256.values() {
+        let digests = [&self.program_sha256, &self.data_sha256].into_iter();
+        for sha256 in digests.chain(self.files_sha256.values()) {
             hash.update(sha256);
         }
         hash.update(settings);

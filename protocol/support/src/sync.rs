@@ -1,7 +1,20 @@
-//! Locks whose holder cannot leave a value that is half changed.
+//! Named threads, and locks whose holder cannot leave a value that is half changed.
 
+use std::io;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::{Builder, JoinHandle};
 use std::time::Duration;
+
+/// Runs `work` on a thread with this name.
+///
+/// # Errors
+/// When the system cannot start a thread.
+pub fn spawn<T: Send + 'static>(
+    name: impl Into<String>,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> io::Result<JoinHandle<T>> {
+    Builder::new().name(name.into()).spawn(work)
+}
 
 /// Locks a mutex, also after a panic of a thread that held it.
 pub fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

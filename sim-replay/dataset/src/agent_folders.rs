@@ -26,15 +26,10 @@ pub(super) struct ScenarioFolder {
     pub(super) stems: Vec<String>,
     /// Stems of frames of some agents, by the agent that lacks them.
     pub(super) missing: Vec<MissingFrame>,
-    /// Suffixes of point files other than the plain one and the radar's.
-    pub(super) variants: Vec<String>,
-    pub(super) has_radar: bool,
-    /// Numbers of the cameras of each agent.
-    pub(super) cameras: BTreeMap<CavId, BTreeSet<u8>>,
+    /// Contents of the agents' folders.
+    pub(super) by_agent: BTreeMap<CavId, AgentFolder>,
     /// Suffix of the sweeps.
     pub(super) suffix: &'static str,
-    /// Agents that have sweeps and nothing else.
-    pub(super) without_yaml: BTreeSet<CavId>,
 }
 
 /// Folders of scenarios at or below `dir`. Folders below that cannot be listed are left out.
@@ -167,41 +162,31 @@ impl ScenarioFolder {
                     .get(id)
                     .is_some_and(|agent| !agent.stems.contains(*stem))
             });
-            missing.extend(without.map(|id| MissingFrame {
-                agent: id.clone(),
-                stem: (*stem).clone(),
-            }));
+            missing.extend(without.map(|id| MissingFrame::new(id, stem)));
         }
         let mut stems: Vec<String> = all.into_iter().cloned().collect();
         problems.extend(without_common_frame(dir, &agents, &by_agent));
         // The set is in text order, where 10 comes before 9.
         stems.sort_by(|first, second| files::natural_order(first, second));
-        let variants = by_agent.values().flat_map(|agent| &agent.variants);
-        let variants: BTreeSet<String> = variants.cloned().collect();
-        let has_radar = by_agent.values().any(|agent| agent.has_radar);
-        let cameras = by_agent
-            .iter()
-            .map(|(id, agent)| (id.clone(), agent.cameras.clone()))
-            .collect();
-        let variants = variants.into_iter().collect();
-        let bare = by_agent.iter().filter(|(_, agent)| agent.is_without_yaml);
-        let without_yaml = bare.map(|(id, _)| id.clone()).collect();
         Ok(Self {
             dir: dir.to_owned(),
             agents,
             stems,
             missing,
-            variants,
-            has_radar,
-            cameras,
+            by_agent,
             suffix,
-            without_yaml,
         })
     }
 
     /// The folder of an agent.
     pub(super) fn agent_dir(&self, agent: &CavId) -> PathBuf {
         self.dir.join(agent.as_str())
+    }
+
+    /// True for an agent that has sweeps and nothing else.
+    pub(super) fn is_without_yaml(&self, agent: &CavId) -> bool {
+        let contents = self.by_agent.get(agent);
+        contents.is_some_and(|contents| contents.is_without_yaml)
     }
 
     /// The metadata file of a frame.
@@ -495,8 +480,10 @@ mod tests {
             ],
         );
         let (folder, problems) = scan(dir.path());
-        assert_eq!(folder.variants, ["fog_0.060", "snow_2.5_2.0"]);
-        assert!(folder.has_radar && problems.is_empty(), "{problems:?}");
+        let agent = &folder.by_agent[&folder.agents[0]];
+        let variants: Vec<&String> = agent.variants.iter().collect();
+        assert_eq!(variants, ["fog_0.060", "snow_2.5_2.0"]);
+        assert!(agent.has_radar && problems.is_empty(), "{problems:?}");
     }
 
     #[test]

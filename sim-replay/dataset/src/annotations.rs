@@ -26,7 +26,8 @@ const CLASS_KEYS: [&str; 4] = ["obj_type", "object_type", "class", "type"];
 #[derive(Debug)]
 pub(super) struct Annotations<'a> {
     root: Field<'a>,
-    problems: Vec<Problem>,
+    /// Parts that were left out.
+    pub(super) problems: Vec<Problem>,
 }
 
 impl<'a> Annotations<'a> {
@@ -35,11 +36,6 @@ impl<'a> Annotations<'a> {
             root,
             problems: Vec::new(),
         }
-    }
-
-    /// Parts that were left out.
-    pub(super) fn into_problems(self) -> Vec<Problem> {
-        self.problems
     }
 
     /// The field of the first of `keys` that is present; one that cannot be read is left out.
@@ -175,19 +171,14 @@ impl<'a> Annotations<'a> {
         };
         let class = kind.text().ok().and_then(classes::of_name);
         class.unwrap_or_else(|| {
-            self.unknown_class(key, &kind.found());
+            // The scenario's folder: the same finding in several agents' frames is one then.
+            let scenario = self.root.path.ancestors().nth(2).unwrap_or(Path::new(""));
+            let problem = classes::unknown(scenario, key, &kind.found());
+            if !self.problems.contains(&problem) {
+                self.problems.push(problem);
+            }
             ObjectClass::Other
         })
-    }
-
-    fn unknown_class(&mut self, key: &str, found: &str) {
-        // The scenario's folder: the same finding in several agents' frames is one then.
-        let mut folders = self.root.path().ancestors().skip(2);
-        let scenario = folders.next().unwrap_or(Path::new(""));
-        let problem = classes::unknown(scenario, key, found);
-        if !self.problems.contains(&problem) {
-            self.problems.push(problem);
-        }
     }
 
     fn left_out(&mut self, what: &str, error: ReadError) {

@@ -80,11 +80,6 @@ pub enum ApOrder {
 }
 
 impl EvaluationProtocol {
-    /// The preset of that name.
-    pub fn preset(name: &str) -> Option<Self> {
-        preset::preset(name)
-    }
-
     /// The rule for a network that covers `area_m`: x, y, z low, then x, y, z high, metres in the ego's LiDAR frame. No
     /// network finds objects outside its area, so the ground-truth range ends there, unless `exact_range` is set.
     pub fn rule_within(&self, area_m: [f64; 6]) -> GroundTruthRule {

@@ -100,14 +100,22 @@ impl AgentFolder {
         };
         let mut without_yaml = BTreeSet::new();
         for name in files::stems(&listing.files, suffix) {
-            match Sweep::of(name, &yamls) {
-                Sweep::Plain => drop(agent.stems.insert(name.to_owned())),
-                Sweep::Radar => agent.has_radar = true,
-                Sweep::Variant(variant) => drop(agent.variants.insert(variant.to_owned())),
-                Sweep::WithoutYaml(stem) if are_numbers && !is_number(stem) => {
-                    strays.push(format!("{name}{suffix}"))
+            // At the first underscore: variants contain more of them, `fog_0.060` for example.
+            match name.split_once('_') {
+                // First the whole name: a stem may contain an underscore itself.
+                _ if yamls.contains(name) => drop(agent.stems.insert(name.to_owned())),
+                Some((stem, RADAR)) if yamls.contains(stem) => agent.has_radar = true,
+                Some((stem, variant)) if yamls.contains(stem) => {
+                    agent.variants.insert(variant.to_owned());
                 }
-                Sweep::WithoutYaml(stem) => drop(without_yaml.insert(stem)),
+                parts => {
+                    let stem = parts.map_or(name, |(stem, _)| stem);
+                    if are_numbers && !is_number(stem) {
+                        strays.push(format!("{name}{suffix}"));
+                    } else {
+                        without_yaml.insert(stem);
+                    }
+                }
             }
         }
         problems.extend(named_once(dir, &strays));
@@ -120,31 +128,6 @@ impl AgentFolder {
             ReadError::malformed(&dir.join(format!("{stem}{missing}")), reason)
         }));
         agent
-    }
-}
-
-/// Role of a point file.
-enum Sweep<'a> {
-    Plain,
-    Radar,
-    Variant(&'a str),
-    /// Its frame's stem.
-    WithoutYaml(&'a str),
-}
-
-impl<'a> Sweep<'a> {
-    fn of(name: &'a str, yamls: &BTreeSet<&str>) -> Self {
-        // First the whole name: a stem may contain an underscore itself.
-        if yamls.contains(name) {
-            return Self::Plain;
-        }
-        // At the first underscore: variants contain more of them, `fog_0.060` for example.
-        match name.split_once('_') {
-            Some((stem, RADAR)) if yamls.contains(stem) => Self::Radar,
-            Some((stem, variant)) if yamls.contains(stem) => Self::Variant(variant),
-            Some((stem, _)) => Self::WithoutYaml(stem),
-            None => Self::WithoutYaml(name),
-        }
     }
 }
 

@@ -9,6 +9,8 @@ use super::{ReadError, Result, files};
 
 /// Largest file of one frame, bytes: calibrations have some 500, labels of a hundred objects 100 kB.
 const MAX_FRAME_BYTES: u64 = 16 << 20;
+/// Largest edge of a box, metres.
+const MAX_SIZE_M: f64 = 200.0;
 
 /// Reads and parses the file of one frame.
 pub(super) fn read(path: &Path) -> Result<Value> {
@@ -56,55 +58,27 @@ fn is_of_word(byte: u8) -> bool {
     byte.is_ascii_alphanumeric() || b"+-._".contains(&byte)
 }
 
-/// A value with its position in the document; readers take numbers and texts from it.
-#[derive(Debug, Clone)]
-pub(super) struct Field<'a> {
-    path: &'a Path,
-    /// Dotted names from the root, for example `3.3d_location.x`.
-    name: String,
-    value: &'a Value,
-}
+/// A value with its position in the document.
+pub(super) type Field<'a> = super::field::Field<'a, Value>;
 
 impl<'a> Field<'a> {
-    /// The whole document.
-    pub(super) fn root(path: &'a Path, value: &'a Value) -> Self {
-        Self {
-            path,
-            name: String::new(),
-            value,
-        }
-    }
-
     /// Entry `index` of a list.
     pub(super) fn entry(path: &'a Path, index: usize, value: &'a Value) -> Self {
-        Self {
-            path,
-            name: index.to_string(),
-            value,
-        }
+        Self::root(path, value).child(&index.to_string(), value)
     }
 
     /// An error about this field.
     pub(super) fn error(&self, reason: impl Into<String>) -> ReadError {
-        let field = Some(self.name.as_str()).filter(|name| !name.is_empty());
-        ReadError::malformed_at(self.path, None, field, reason)
+        ReadError::malformed_at(self.path, None, self.place(), reason)
     }
 
     fn expected(&self, what: &str) -> ReadError {
-        self.error(format!("{}, expected {what}", kind(self.value)))
-    }
-
-    fn child(&self, key: &str, value: &'a Value) -> Self {
-        Self {
-            path: self.path,
-            name: child_name(&self.name, key),
-            value,
-        }
+        self.error(format!("{}, expected {what}", kind(self.node)))
     }
 
     /// The items of a list.
     pub(super) fn items(&self) -> Result<impl ExactSizeIterator<Item = Self>> {
-        let Some(items) = self.value.as_array() else {
+        let Some(items) = self.node.as_array() else {
             return Err(self.expected("a list"));
         };
         let items = items.iter().enumerate();
@@ -113,7 +87,7 @@ impl<'a> Field<'a> {
 
     /// An entry that may be missing, null or an empty text.
     pub(super) fn optional(&self, key: &str) -> Result<Option<Self>> {
-        let Some(map) = self.value.as_object() else {
+        let Some(map) = self.node.as_object() else {
             return Err(self.expected("a map"));
         };
         let found = map.get(key);
@@ -124,7 +98,7 @@ impl<'a> Field<'a> {
     /// A required entry.
     pub(super) fn required(&self, key: &str) -> Result<Self> {
         self.optional(key)?
-            .ok_or_else(|| self.child(key, self.value).error("missing"))
+            .ok_or_else(|| self.child(key, self.node).error("missing"))
     }
 
     /// A finite number, as such or as text.
@@ -137,7 +111,7 @@ impl<'a> Field<'a> {
 
     /// A number as such, or as a text.
     fn stated<T: FromStr>(&self, number: impl Fn(&serde_json::Number) -> Option<T>) -> Option<T> {
-        match self.value {
+        match self.node {
             Value::Number(found) => number(found),
             Value::String(text) => text.trim().parse().ok(),
             _ => None,
@@ -160,12 +134,12 @@ impl<'a> Field<'a> {
     }
 
     pub(super) fn text(&self) -> Result<&'a str> {
-        self.value.as_str().ok_or_else(|| self.expected("a text"))
+        self.node.as_str().ok_or_else(|| self.expected("a text"))
     }
 
     /// A text, or a whole number as text: ids are written either way.
     pub(super) fn id(&self) -> Result<String> {
-        match self.value {
+        match self.node {
             Value::String(text) => Ok(text.clone()),
             Value::Number(number) if number.is_u64() => Ok(number.to_string()),
             _ => Err(self.expected("an id")),
@@ -181,8 +155,18 @@ impl<'a> Field<'a> {
             .map_err(|found: Vec<f64>| self.error(format!("{} numbers, expected {N}", found.len())))
     }
 
+    /// The edges of a box that this field states, metres: above 0, and not larger than those of any object.
+    pub(super) fn checked_size(&self, size_m: [f64; 3]) -> Result<[f64; 3]> {
+        if size_m.iter().all(|size| *size > 0.0 && *size <= MAX_SIZE_M) {
+            return Ok(size_m);
+        }
+        Err(self.error(format!(
+            "{size_m:?} are no sizes in metres, expected up to {MAX_SIZE_M}"
+        )))
+    }
+
     fn flatten(&self, most: usize, numbers: &mut Vec<f64>) -> Result<()> {
-        if self.value.is_array() {
+        if self.node.is_array() {
             let mut items = self.items()?;
             return items.try_for_each(|item| item.flatten(most, numbers));
         }
@@ -192,14 +176,6 @@ impl<'a> Field<'a> {
         }
         numbers.push(self.number()?);
         Ok(())
-    }
-}
-
-/// Name of a field of a map or list: `vehicles.4335.extent`.
-pub(super) fn child_name(parent: &str, key: &str) -> String {
-    match parent {
-        "" => key.to_owned(),
-        parent => format!("{parent}.{key}"),
     }
 }
 

@@ -141,7 +141,7 @@ impl RowSplitter {
             match byte {
                 _ if self.depth == 0 => self.outside(byte)?,
                 // Only commas of the list itself end an entry, not those in a row or in a text.
-                b',' | b']' if self.depth == 1 && !self.is_string => self.end(byte, entry)?,
+                b',' | b']' if self.depth == 1 && !self.is_string => self.end(byte, entry),
                 _ => self.inside(byte)?,
             }
         }
@@ -182,7 +182,7 @@ impl RowSplitter {
     }
 
     /// The end of an entry, or of the list.
-    fn end(&mut self, byte: u8, entry: &mut impl FnMut(usize, &[u8])) -> Result<(), String> {
+    fn end(&mut self, byte: u8, entry: &mut impl FnMut(usize, &[u8])) {
         let is_last = byte == b']';
         let is_blank = self.entry.iter().all(u8::is_ascii_whitespace);
         // `[]` has no entry. A blank entry elsewhere is passed on, and its reader reports it.
@@ -194,7 +194,6 @@ impl RowSplitter {
         if is_last {
             (self.depth, self.is_over) = (0, true);
         }
-        Ok(())
     }
 
     fn finish(&self) -> Result<(), String> {

@@ -41,8 +41,8 @@ pub(super) fn open(
 ) -> Result<Scenario> {
     let velodyne = dir.join("velodyne");
     let mut scans = scans(&velodyne, problems)?;
-    let times = or_without("times", times(dir, &scans, problems), problems);
-    let poses = or_without("poses", poses(dir, &scans, problems), problems);
+    let times = sequence::or_without("times", times(dir, &scans, problems), problems);
+    let poses = sequence::or_without("poses", poses(dir, &scans, problems), problems);
     let (of_times, of_poses) = (dir.join("times.txt"), poses_path(dir).unwrap_or_default());
     keep_those_with(&mut scans, &of_times, times.as_deref(), problems);
     keep_those_with(&mut scans, &of_poses, poses.as_deref(), problems);
@@ -90,14 +90,6 @@ fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, S
     let scans = scans.collect();
     strays.report("file", problems);
     Ok(scans)
-}
-
-/// Values that a file gives for all scans; if it cannot be read, a problem and nothing.
-fn or_without<T>(what: &str, read: Result<Option<T>>, problems: &mut Vec<ReadError>) -> Option<T> {
-    read.unwrap_or_else(|error| {
-        problems.push(error.with_consequence(&format!("the sequence is read without {what}")));
-        None
-    })
 }
 
 /// One value for each line of a file, whose number from 0 is that of the scan. Lines that cannot be read are reported.

@@ -31,6 +31,7 @@ mod dair;
 mod error;
 pub mod evaluation_protocol;
 mod faults;
+mod field;
 mod files;
 pub mod findings;
 pub mod frame;

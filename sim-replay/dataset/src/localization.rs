@@ -78,10 +78,12 @@ pub(super) fn open(
     problems: &mut Vec<ReadError>,
 ) -> Result<Scenario> {
     let storage = storage(dir);
-    let points_dir = dir.join(match storage {
-        SweepStorage::NcltRaw => RAW,
-        _ => CONVERTED,
-    });
+    let (points, layout) = match storage {
+        SweepStorage::NcltRaw => (RAW, Layout::NCLT),
+        SweepStorage::ByName => (CONVERTED, Layout::NCLT),
+        SweepStorage::Planar => (CONVERTED, Layout::OXFORD),
+    };
+    let points_dir = dir.join(points);
     let mut stamps = BTreeMap::new();
     for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
         match stem.parse::<u64>() {
@@ -93,10 +95,8 @@ pub(super) fn open(
             }
         }
     }
-    let poses = poses(dir, storage, &stamps, problems).unwrap_or_else(|error| {
-        problems.push(error.with_consequence("the sequence is read without poses"));
-        None
-    });
+    let poses = poses(dir, storage, &stamps, problems);
+    let poses = sequence::or_without("poses", poses, problems);
     if let Some(poses) = &poses {
         for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
             let path = points_dir.join(format!("{micros}.bin"));
@@ -110,10 +110,6 @@ pub(super) fn open(
             problems.push(ReadError::malformed(dir, reason));
         }
     }
-    let layout = match storage {
-        SweepStorage::Planar => Layout::OXFORD,
-        _ => Layout::NCLT,
-    };
     let join = (poses.as_ref()).map(|_| format!("{} poses by time", stamps.len()));
     let poses = poses.unwrap_or_default();
     let clouds = stamps.into_iter().map(|(micros, stem)| {

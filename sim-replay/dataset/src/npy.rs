@@ -6,7 +6,7 @@
 use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
-use crate::scalar::{Scalar, ScalarKind};
+use crate::scalar::{self, Scalar, ScalarKind, size_of};
 
 /// Numbers of a point that are accepted.
 const COLUMNS: std::ops::RangeInclusive<usize> = 3..=32;
@@ -166,11 +166,6 @@ fn fields_of(text: &str) -> Result<Vec<(String, Scalar)>, String> {
     tuples.collect()
 }
 
-/// Bytes of one element of the array.
-fn size_of(fields: &[(String, Scalar)]) -> usize {
-    fields.iter().map(|(_, scalar)| scalar.size).sum()
-}
-
 fn product(one: usize, sizes: &[usize]) -> Option<usize> {
     sizes
         .iter()
@@ -197,11 +192,7 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
 
 /// Name and place of the first field of numbers with one of the names, the first preferred.
 fn find(fields: &[(String, Scalar)], names: &[&str]) -> Option<(String, (usize, Scalar))> {
-    let index = names.iter().find_map(|wanted| {
-        fields.iter().position(|(name, scalar)| {
-            scalar.kind != ScalarKind::Padding && name.eq_ignore_ascii_case(wanted)
-        })
-    })?;
+    let index = scalar::find(fields, names)?;
     let (name, scalar) = fields.get(index)?;
     Some((name.clone(), (size_of(fields.get(..index)?), *scalar)))
 }

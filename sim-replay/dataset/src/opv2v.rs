@@ -28,7 +28,7 @@ pub(super) struct Opv2v {
 impl FrameSource for Opv2v {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, self.handedness);
-        if self.folder.without_yaml.contains(agent) {
+        if self.folder.is_without_yaml(agent) {
             return Ok(frame);
         }
         let path = self.folder.yaml(agent, &tick.stem);
@@ -41,7 +41,7 @@ impl FrameSource for Opv2v {
         let mut annotations = Annotations::new(root);
         annotations.add_vehicle(&mut frame, |field| self.six_numbers(field));
         frame.objects = annotations.objects(|id, _| Ok(id), |place| self.world_from(place));
-        frame.problems = annotations.into_problems();
+        frame.problems = annotations.problems;
         Ok(frame)
     }
 
@@ -57,7 +57,7 @@ impl FrameSource for Opv2v {
     }
 
     fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8], frame: &mut Frame) {
-        if self.folder.without_yaml.contains(agent) {
+        if self.folder.is_without_yaml(agent) {
             return;
         }
         let path = self.folder.yaml(agent, &tick.stem);
@@ -67,10 +67,10 @@ impl FrameSource for Opv2v {
         };
         let (root, dir) = (Field::root(&path, &node), self.folder.agent_dir(agent));
         // An agent may have fewer cameras than others.
-        let own = self.folder.cameras.get(agent);
+        let own = self.folder.by_agent.get(agent);
         for &number in numbers
             .iter()
-            .filter(|number| own.is_some_and(|own| own.contains(number)))
+            .filter(|number| own.is_some_and(|own| own.cameras.contains(number)))
         {
             let camera = camera_files::find(&dir, &tick.stem, number).and_then(|file| {
                 camera_files::read(&file, number, &root, &|field| self.six_numbers(field))
@@ -84,7 +84,7 @@ impl FrameSource for Opv2v {
     }
 
     fn frame_files(&self, agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
-        if self.folder.without_yaml.contains(agent) {
+        if self.folder.is_without_yaml(agent) {
             return Vec::new();
         }
         vec![self.folder.yaml(agent, &tick.stem)]

@@ -90,11 +90,14 @@ fn agent_folder_scenario(
     let moments = folder.ticks(options.period_nanos, problems);
     let (agents, missing) = (folder.agents.clone(), folder.missing.clone());
     let name = files::name_below(root, &folder.dir);
-    let (lidar_variants, has_radar) = (folder.variants.clone(), folder.has_radar);
+    let variants = (folder.by_agent.values()).flat_map(|agent| &agent.variants);
+    let variants: BTreeSet<String> = variants.cloned().collect();
+    let has_radar = folder.by_agent.values().any(|agent| agent.has_radar);
     let (cameras, source): (_, Arc<dyn FrameSource>) = match layout == Layout::V2V4REAL {
         true => (BTreeSet::new(), Arc::new(V2v4Real { folder, sweeps })),
         false => {
-            let cameras = folder.cameras.values().flatten().copied().collect();
+            let cameras = (folder.by_agent.values()).flat_map(|agent| &agent.cameras);
+            let cameras = cameras.copied().collect();
             let source = Opv2v {
                 folder,
                 sweeps,
@@ -104,7 +107,7 @@ fn agent_folder_scenario(
         }
     };
     Scenario {
-        lidar_variants,
+        lidar_variants: variants.into_iter().collect(),
         has_radar,
         cameras: cameras.into_iter().collect(),
         source_handedness: handedness,

@@ -6,7 +6,7 @@
 use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
-use crate::scalar::{Scalar, ScalarKind};
+use crate::scalar::{Scalar, ScalarKind, find, size_of};
 
 /// Longest header that is read, bytes.
 const MAX_HEADER: usize = 64 << 10;
@@ -14,11 +14,12 @@ const MAX_HEADER: usize = 64 << 10;
 const MAX_PROPERTIES: usize = 256;
 
 /// Storage of the numbers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::EnumString)]
+#[strum(serialize_all = "snake_case")]
 enum Storage {
     Ascii,
-    LittleEndian,
-    BigEndian,
+    BinaryLittleEndian,
+    BinaryBigEndian,
 }
 
 /// Elements of one kind.
@@ -29,21 +30,6 @@ struct Element {
     properties: Vec<(String, Scalar)>,
     /// Name of the first list: elements with lists have no fixed size.
     list: Option<String>,
-}
-
-impl Element {
-    fn stride(&self) -> usize {
-        self.properties.iter().map(|(_, scalar)| scalar.size).sum()
-    }
-
-    /// Index of a property, by any of the names, the first preferred.
-    fn find(&self, names: &[&str]) -> Option<usize> {
-        names.iter().find_map(|name| {
-            self.properties
-                .iter()
-                .position(|(found, _)| found.eq_ignore_ascii_case(name))
-        })
-    }
 }
 
 /// Reads a PLY file in memory; intensities are as stored.
@@ -66,10 +52,10 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         ));
     }
     let [x, y, z] = ["x", "y", "z"].map(|name| {
-        let found = vertex.find(&[name]);
+        let found = find(&vertex.properties, &[name]);
         found.ok_or_else(|| format!("element vertex has no property {name}"))
     });
-    let intensity = vertex.find(&INTENSITY_FIELDS);
+    let intensity = find(&vertex.properties, &INTENSITY_FIELDS);
     let columns = [Some(x?), Some(y?), Some(z?), intensity];
     let (points, form) = match storage {
         Storage::Ascii => (ascii(vertex, before, body, &columns)?, "PLY, ascii"),
@@ -100,11 +86,11 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     }
     let (text, body) = bytes.split_at_checked(len).unwrap_or_default();
     let text = String::from_utf8_lossy(text);
-    let (mut storage, mut elements) = (None, Vec::<Element>::new());
+    let (mut format, mut elements) = (None, Vec::<Element>::new());
     for (number, line) in (1..).zip(text.lines()) {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match *words {
-            ["format", name, _] => storage = Some(name),
+            ["format", name, _] => format = Some(name),
             ["element", name, count] => {
                 let count = count
                     .parse()
@@ -136,23 +122,16 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
             _ => {}
         }
     }
-    let storage = match storage {
-        Some("ascii") => Storage::Ascii,
-        Some("binary_little_endian") => Storage::LittleEndian,
-        Some("binary_big_endian") => Storage::BigEndian,
-        Some(other) => {
-            return Err(format!(
-                "format {other:?}, expected ascii, binary_little_endian or binary_big_endian"
-            ));
-        }
-        None => return Err("no line format".to_owned()),
-    };
+    let format = format.ok_or("no line format")?;
+    let storage: Storage = format.parse().map_err(|_| {
+        format!("format {format:?}, expected ascii, binary_little_endian or binary_big_endian")
+    })?;
     // After all lines: `format` may come behind the elements.
     for (_, scalar) in elements
         .iter_mut()
         .flat_map(|element| &mut element.properties)
     {
-        scalar.is_big_endian = storage == Storage::BigEndian;
+        scalar.is_big_endian = storage == Storage::BinaryBigEndian;
     }
     Ok((storage, elements, body))
 }
@@ -226,9 +205,10 @@ fn binary(
                 "element {name} before the vertices has the list {list:?}: their place is unknown"
             ));
         }
-        skipped = skipped.saturating_add(element.count.saturating_mul(element.stride()));
+        let bytes = element.count.saturating_mul(size_of(&element.properties));
+        skipped = skipped.saturating_add(bytes);
     }
-    let stride = vertex.stride();
+    let stride = size_of(&vertex.properties);
     let body = body.get(skipped..).unwrap_or_default();
     let length = vertex.count.checked_mul(stride);
     let Some(body) = length.and_then(|length| body.get(..length)) else {
@@ -240,9 +220,8 @@ fn binary(
     let places = columns.map(|index| {
         let index = index?;
         let (_, scalar) = vertex.properties.get(index)?;
-        let before = vertex.properties.iter().take(index);
-        let first: usize = before.map(|(_, scalar)| scalar.size).sum();
-        Some((first, *scalar))
+        let before = vertex.properties.get(..index)?;
+        Some((size_of(before), *scalar))
     });
     let points = body.chunks_exact(stride.max(1)).map(|bytes| {
         places.map(|place| {

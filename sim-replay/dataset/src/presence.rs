@@ -33,16 +33,6 @@ impl AbsentFrames {
     }
 }
 
-/// The moments at which the first of `agents`, the ego, has a frame.
-fn ticks_of_ego(moments: &[Tick], agents: &[CavId], missing: &[MissingFrame]) -> Vec<Tick> {
-    let lacking: HashSet<&str> = (missing.iter())
-        .filter(|frame| Some(&frame.agent) == agents.first())
-        .map(|frame| frame.stem.as_str())
-        .collect();
-    let ticks = (moments.iter()).filter(|tick| !lacking.contains(tick.stem.as_str()));
-    ticks.cloned().collect()
-}
-
 /// The frames of one tick that could be read.
 #[derive(Debug, Default)]
 pub struct LoadedTick {
@@ -59,9 +49,20 @@ impl Scenario {
     /// The scenario with the capture times at which any agent has a frame, and the frames that some of them lack: its
     /// ticks are those of the ego.
     pub(super) fn among(self, moments: Vec<Tick>, missing: Vec<MissingFrame>) -> Self {
-        let ticks = ticks_of_ego(&moments, &self.agents, &missing);
+        self.with_ticks(Some(Arc::new(moments)), missing)
+    }
+
+    /// The same among `moments`, or among its ticks where these are all.
+    fn with_ticks(self, moments: Option<Arc<Vec<Tick>>>, missing: Vec<MissingFrame>) -> Self {
+        let lacking: HashSet<&str> = (missing.iter())
+            .filter(|frame| Some(&frame.agent) == self.agents.first())
+            .map(|frame| frame.stem.as_str())
+            .collect();
+        let all = moments.as_deref().unwrap_or(&self.ticks).iter();
+        let ticks = all.filter(|tick| !lacking.contains(tick.stem.as_str()));
+        let ticks: Vec<Tick> = ticks.cloned().collect();
         let absent_at = AbsentFrames {
-            moments: Some(Arc::new(moments)),
+            moments,
             ..AbsentFrames::new(&self.agents, &ticks, &missing)
         };
         Self {
@@ -91,23 +92,16 @@ impl Scenario {
             .collect();
         let missing = (self.missing.iter()).filter(|frame| agents.contains(&frame.agent));
         let missing: Vec<MissingFrame> = missing.cloned().collect();
-        // Not only the present ticks: the new ego may have frames where the old one has none.
-        let moments = self.absent_at.moments.as_deref().unwrap_or(&self.ticks);
-        let ticks = ticks_of_ego(moments, &agents, &missing);
-        let absent_at = AbsentFrames {
-            moments: self.absent_at.moments.clone(),
-            ..AbsentFrames::new(&agents, &ticks, &missing)
-        };
         let units = (self.roadside_units.iter()).filter(|unit| agents.contains(unit));
         let roadside_units = units.cloned().collect();
+        // Not only the present ticks: the new ego may have frames where the old one has none.
+        let moments = self.absent_at.moments.clone();
         Self {
             agents,
-            ticks,
-            missing,
-            absent_at,
             roadside_units,
             ..self.clone()
         }
+        .with_ticks(moments, missing)
     }
 
     /// Number of missing frames of agents other than the ego at its ticks.

@@ -70,6 +70,20 @@ impl Scalar {
     }
 }
 
+/// Bytes of fields one after another.
+pub(super) fn size_of(fields: &[(String, Scalar)]) -> usize {
+    fields.iter().map(|(_, scalar)| scalar.size).sum()
+}
+
+/// Index of the first field of numbers with one of the names, the first preferred.
+pub(super) fn find(fields: &[(String, Scalar)], names: &[&str]) -> Option<usize> {
+    names.iter().find_map(|wanted| {
+        fields.iter().position(|(name, scalar)| {
+            scalar.kind != ScalarKind::Padding && name.eq_ignore_ascii_case(wanted)
+        })
+    })
+}
+
 /// IEEE 754 binary16.
 fn half(bits: u16) -> f64 {
     let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };

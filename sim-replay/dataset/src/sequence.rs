@@ -7,7 +7,7 @@ use std::sync::Arc;
 use protocol::{CavId, Handedness, Pose};
 
 use super::points::{SweepStorage, Sweeps};
-use super::{FrameSource, Layout, OpenOptions, Result, Scenario, Tick, single_vehicle};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -45,6 +45,18 @@ pub(super) fn scenario(
         is_z_down,
     };
     single_vehicle(name, layout, ticks, Arc::new(source))
+}
+
+/// Values that a file gives for all scans; if it cannot be read, a problem and nothing.
+pub(super) fn or_without<T>(
+    what: &str,
+    read: Result<Option<T>>,
+    problems: &mut Vec<ReadError>,
+) -> Option<T> {
+    read.unwrap_or_else(|error| {
+        problems.push(error.with_consequence(&format!("the sequence is read without {what}")));
+        None
+    })
 }
 
 impl FrameSource for Sequence {

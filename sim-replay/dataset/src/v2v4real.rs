@@ -45,7 +45,7 @@ impl FrameSource for V2v4Real {
             },
         );
         annotations.add_vehicle(&mut frame, pose);
-        frame.problems = annotations.into_problems();
+        frame.problems = annotations.problems;
         Ok(frame)
     }
 

@@ -44,7 +44,7 @@ pub struct Outcome {
 #[derive(Debug)]
 pub struct LinkEmulator {
     config: LinkConfig,
-    capacity: Capacity,
+    rules: Rules,
     trace: Option<Trace>,
     seed: u64,
     lines: BTreeMap<Option<(CavId, CavId)>, QueueServer>,
@@ -83,10 +83,17 @@ impl LinkEmulator {
     pub fn new(config: LinkConfig, folder: &Path, seed: u64) -> Result<Self, LinkError> {
         config.validate()?;
         let trace = config.read_trace(folder)?;
-        let capacity = Capacity::new(&config.capacity, trace.as_ref());
+        let rules = Rules {
+            capacity: Capacity::new(&config.capacity, trace.as_ref()),
+            burst_bytes: match config.capacity {
+                CapacityConfig::TokenBucket { burst_bytes, .. } => burst_bytes,
+                _ => 0,
+            },
+            queue: config.queue,
+        };
         Ok(Self {
             config,
-            capacity,
+            rules,
             trace,
             seed,
             lines: BTreeMap::new(),
@@ -113,9 +120,8 @@ impl LinkEmulator {
             Medium::PerPair => Some((packet.from.clone(), packet.to.clone())),
         };
         let mut left = Vec::new();
-        let rules = rules(&self.config, &self.capacity);
         let line = self.lines.entry(key).or_default();
-        line.submit(packet, &rules, &mut left);
+        line.submit(packet, &self.rules, &mut left);
         left.into_iter().for_each(|left| self.settle(left));
         // An unlimited link without delay delivers at once, and a full queue drops at once.
         self.collect(self.now_nanos);
@@ -129,9 +135,8 @@ impl LinkEmulator {
 
     /// Time of the next outcome; `None` if nothing is in flight.
     pub fn next_nanos(&self) -> Option<u64> {
-        let rules = rules(&self.config, &self.capacity);
         let lines = self.lines.values();
-        let sent = lines.filter_map(|line| line.next_nanos(&rules));
+        let sent = lines.filter_map(|line| line.next_nanos(&self.rules));
         // Outcomes that were collected but not fetched yet come before everything in flight.
         let known = self.outcomes.first().map(|outcome| outcome.nanos);
         let ahead = self.under_way.keys().next().map(|(nanos, _)| *nanos);
@@ -141,15 +146,14 @@ impl LinkEmulator {
     /// Queues first, in order of time over all of them, then arrivals.
     fn run(&mut self, until_nanos: u64) {
         loop {
-            let rules = rules(&self.config, &self.capacity);
             let lines = self.lines.values_mut();
-            let next = lines.filter_map(|line| Some((line.next_nanos(&rules)?, line)));
+            let next = lines.filter_map(|line| Some((line.next_nanos(&self.rules)?, line)));
             let next = next.min_by_key(|(nanos, _)| *nanos);
             let Some((nanos, line)) = next.filter(|(nanos, _)| *nanos <= until_nanos) else {
                 break;
             };
             let mut left = Vec::new();
-            line.advance(nanos, &rules, &mut left);
+            line.advance(nanos, &self.rules, &mut left);
             left.into_iter().for_each(|left| self.settle(left));
         }
         self.now_nanos = until_nanos;
@@ -280,18 +284,6 @@ impl LinkConfig {
             0 => arrival_nanos,
             step_nanos => submitted_nanos + took_nanos / step_nanos * step_nanos,
         }
-    }
-}
-
-fn rules<'a>(config: &'a LinkConfig, capacity: &'a Capacity) -> Rules<'a> {
-    let burst_bytes = match config.capacity {
-        CapacityConfig::TokenBucket { burst_bytes, .. } => burst_bytes,
-        _ => 0,
-    };
-    Rules {
-        capacity,
-        burst_bytes,
-        queue: &config.queue,
     }
 }
 

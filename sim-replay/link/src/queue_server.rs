@@ -47,18 +47,18 @@ pub(super) enum Departure {
 }
 
 /// Parameters of a queue.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Rules<'a> {
-    pub(super) capacity: &'a Capacity,
+#[derive(Debug)]
+pub(super) struct Rules {
+    pub(super) capacity: Capacity,
     pub(super) burst_bytes: u64,
-    pub(super) queue: &'a QueueConfig,
+    pub(super) queue: QueueConfig,
 }
 
 impl QueueServer {
     /// Submits a packet now. The queue has been advanced to now.
-    pub(super) fn submit(&mut self, packet: Packet, rules: &Rules<'_>, left: &mut Vec<Departure>) {
+    pub(super) fn submit(&mut self, packet: Packet, rules: &Rules, left: &mut Vec<Departure>) {
         let nanos = packet.submitted_nanos;
-        if *rules.capacity == Capacity::Unlimited {
+        if rules.capacity == Capacity::Unlimited {
             left.push(Departure::Sent {
                 packet,
                 start_nanos: nanos,
@@ -95,12 +95,12 @@ impl QueueServer {
         self.waiting.push_back(packet);
     }
 
-    fn is_full_for(&self, packet: &Packet, rules: &Rules<'_>) -> bool {
+    fn is_full_for(&self, packet: &Packet, rules: &Rules) -> bool {
         self.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes
     }
 
     /// Advances to `nanos`; the packets sent by then are added to `left`, in that order.
-    pub(super) fn advance(&mut self, nanos: u64, rules: &Rules<'_>, left: &mut Vec<Departure>) {
+    pub(super) fn advance(&mut self, nanos: u64, rules: &Rules, left: &mut Vec<Departure>) {
         while let Some((end_nanos, is_urgent)) = self.next(rules)
             && end_nanos <= nanos
         {
@@ -123,12 +123,12 @@ impl QueueServer {
     }
 
     /// Time at which the next last bit is sent.
-    pub(super) fn next_nanos(&self, rules: &Rules<'_>) -> Option<u64> {
+    pub(super) fn next_nanos(&self, rules: &Rules) -> Option<u64> {
         self.next(rules).map(|(nanos, _)| nanos)
     }
 
     /// The same, with true for an urgent packet.
-    fn next(&self, rules: &Rules<'_>) -> Option<(u64, bool)> {
+    fn next(&self, rules: &Rules) -> Option<(u64, bool)> {
         let [urgent, usual] = [self.urgent.front(), self.sending.as_ref()].map(|sending| {
             let sending = sending?;
             // With a burst the work may have been available before the packet was submitted.
@@ -142,7 +142,7 @@ impl QueueServer {
         }
     }
 
-    fn send(&mut self, packet: Packet, nanos: u64, rules: &Rules<'_>) {
+    fn send(&mut self, packet: Packet, nanos: u64, rules: &Rules) {
         // Capacity unused before now is lost, except for the burst.
         let done = rules.capacity.done_by(nanos);
         let idle = done.saturating_sub(work(rules.burst_bytes));
@@ -155,7 +155,7 @@ impl QueueServer {
     }
 
     /// Inserts an urgent packet: the end of the packet being sent is delayed by its duration.
-    fn cut_in(&mut self, packet: Packet, rules: &Rules<'_>) {
+    fn cut_in(&mut self, packet: Packet, rules: &Rules) {
         let nanos = packet.submitted_nanos;
         let added = work(packet.bytes);
         self.urgent_used = self.urgent_used.max(rules.capacity.done_by(nanos)) + added;

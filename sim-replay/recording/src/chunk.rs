@@ -2,7 +2,6 @@
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read};
-use std::ops::ControlFlow;
 use std::os::unix::fs::FileExt;
 use std::sync::Arc;
 
@@ -42,7 +41,7 @@ impl Channels {
             // Records after one that cannot be in a summary are not used.
             let _ = for_each_record(&summary[..], options, |opcode, data| {
                 has_chunks |= opcode == op::CHUNK_INDEX;
-                add(&mut channels.repeated, opcode, data).map(|()| ControlFlow::Continue(()))
+                add(&mut channels.repeated, opcode, data)
             });
             channels.has_chunks = Some(has_chunks);
         }
@@ -156,7 +155,7 @@ pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<Unpacke
             },
             _ => channels.add(opcode, data)?,
         }
-        Ok(ControlFlow::Continue(()))
+        Ok(())
     })?;
     Ok(chunk)
 }
@@ -169,11 +168,11 @@ pub(super) fn in_words(error: McapError) -> String {
     }
 }
 
-/// Passes the records of `source` to `visit`, one after the other, until it stops or there are no more.
+/// Passes the records of `source` to `visit`, one after the other, until it fails or there are no more.
 fn for_each_record(
     mut source: impl Read,
     options: LinearReaderOptions,
-    mut visit: impl FnMut(u8, &[u8]) -> McapResult<ControlFlow<()>>,
+    mut visit: impl FnMut(u8, &[u8]) -> McapResult<()>,
 ) -> McapResult<()> {
     let options = options
         .with_record_length_limit(MAX_RECORD_BYTES)
@@ -188,11 +187,7 @@ fn for_each_record(
                     Err(error) => return Err(error.into()),
                 }
             }
-            LinearReadEvent::Record { opcode, data } => {
-                if visit(opcode, data)?.is_break() {
-                    return Ok(());
-                }
-            }
+            LinearReadEvent::Record { opcode, data } => visit(opcode, data)?,
         }
     }
     Ok(())

@@ -5,7 +5,7 @@ use std::path::Path;
 use protocol::{Header, Key, wire};
 
 use super::damage::Damage;
-use super::mcap_file::{McapFile, Messages, Place, is_foreign};
+use super::mcap_file::{McapFile, Place, is_foreign};
 use super::{RecordingError, is_own};
 
 /// A message of a recording: its position and its header.
@@ -23,7 +23,7 @@ pub struct Entry {
 /// A recording whose messages can be read in any order.
 #[derive(Debug)]
 pub struct Recording {
-    file: McapFile,
+    pub(super) file: McapFile,
     entries: Vec<Entry>,
 }
 
@@ -94,10 +94,5 @@ impl Recording {
     /// As [`McapFile::read`].
     pub fn read(&self, entry: &Entry) -> Result<Vec<u8>, RecordingError> {
         self.file.read(entry.place)
-    }
-
-    /// The messages of all channels, in the order of the file. For [`super::recover`].
-    pub(super) fn all(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
-        self.file.all()
     }
 }

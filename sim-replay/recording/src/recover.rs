@@ -24,7 +24,7 @@ pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<Reco
     let recording = Recording::open(from)?;
     let mut writer = RecordingWriter::create(to, options)?;
     let mut messages = 0;
-    for held in recording.all() {
+    for held in recording.file.all() {
         for message in held?.iter() {
             let encoding = message.channel.message_encoding.as_str();
             // The channels for ROS 2 are derived from these.

@@ -61,10 +61,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     });
     bar.finish_and_clear();
     print(&report, args.json)?;
-    Ok(if report.problems.is_empty() {
-        Outcome::Done
-    } else {
-        Outcome::BadInput
+    Ok(match report.problems.is_empty() {
+        true => Outcome::Done,
+        false => Outcome::BadInput,
     })
 }
 

@@ -11,15 +11,10 @@ const SLOWEST: f64 = 1e-6;
 pub(crate) struct ReplayClock {
     /// Seconds of the scene per second of the wall clock; 0: every tick is due at once.
     rate: f64,
-    state: State,
+    /// Ticks that may still be published while it is halted; `None`: it runs.
+    steps: Option<u64>,
     // Wall-clock time at which a capture time was due; all others follow from it. `None`: the next tick is due at once.
     anchor: Option<(Instant, u64)>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum State {
-    Running,
-    Halted { steps: u64 },
 }
 
 impl ReplayClock {
@@ -27,7 +22,7 @@ impl ReplayClock {
     pub(crate) fn new(rate: f64) -> Self {
         Self {
             rate,
-            state: State::Running,
+            steps: None,
             anchor: None,
         }
     }
@@ -35,30 +30,24 @@ impl ReplayClock {
     /// Runs on from here, at another rate if one is given.
     pub(crate) fn resume(&mut self, rate: Option<f64>) {
         self.rate = rate.unwrap_or(self.rate);
-        self.state = State::Running;
+        self.steps = None;
         self.anchor = None;
     }
 
     /// Halts after the current tick.
     pub(crate) fn pause(&mut self) {
-        self.state = State::Halted { steps: 0 };
+        self.steps = Some(0);
     }
 
     /// True if it is halted, with no further ticks to be published.
     pub(super) fn is_halted(&self) -> bool {
-        self.state == State::Halted { steps: 0 }
+        self.steps == Some(0)
     }
 
     /// Halts, but allows `ticks` more, each at once.
     pub(crate) fn step(&mut self, ticks: u64) {
         // Steps that are asked for in quick succession add up.
-        let steps = match self.state {
-            State::Halted { steps } => steps,
-            State::Running => 0,
-        };
-        self.state = State::Halted {
-            steps: steps.saturating_add(ticks),
-        };
+        self.steps = Some(self.steps.unwrap_or(0).saturating_add(ticks));
     }
 
     /// After a jump of the scene's time, or a wait: the next tick is due at once.
@@ -68,9 +57,9 @@ impl ReplayClock {
 
     /// Time at which the tick captured at `capture_nanos` is due; `None` while the clock is halted.
     pub(crate) fn due(&self, capture_nanos: u64, now: Instant) -> Option<Instant> {
-        match (self.state, self.anchor) {
-            (State::Halted { steps: 0 }, _) => None,
-            (State::Running, Some((at, anchored))) if self.rate > 0.0 => {
+        match (self.steps, self.anchor) {
+            (Some(0), _) => None,
+            (None, Some((at, anchored))) if self.rate > 0.0 => {
                 let scene = Duration::from_nanos(capture_nanos.saturating_sub(anchored));
                 Some(at + scene.div_f64(self.rate.max(SLOWEST)))
             }
@@ -81,9 +70,9 @@ impl ReplayClock {
     /// Records that the tick captured at `capture_nanos`, which was due at `due`, was published. Counting from the due
     /// time and not from now keeps the pace: a late tick does not delay those after it.
     pub(crate) fn published(&mut self, capture_nanos: u64, due: Instant) {
-        match &mut self.state {
-            State::Running => self.anchor = Some((due, capture_nanos)),
-            State::Halted { steps } => *steps = steps.saturating_sub(1),
+        match &mut self.steps {
+            None => self.anchor = Some((due, capture_nanos)),
+            Some(steps) => *steps = steps.saturating_sub(1),
         }
     }
 }

@@ -198,10 +198,8 @@ impl<'a> Replay<'a> {
 
         let inbox = bus.inbox(COMMANDS, 16);
         // A halted clock waits without a deadline: only the closed inbox lets it notice a stop.
-        stop.on_request({
-            let inbox = Arc::clone(&inbox);
-            move || inbox.close()
-        });
+        let closed = Arc::clone(&inbox);
+        stop.on_request(move || closed.close());
         let verbs = [Start, Pause, Resume, Step, Seek].map(Topic::Control);
         let answers = options.lockstep.iter();
         let answers = answers.map(|ego| Topic::stream(ego, Stream::Detections));

@@ -81,14 +81,11 @@ impl RefinerConfig {
     /// its rows are.
     pub fn cropped(&self, low_m: [f64; 2], high_m: [f64; 2]) -> (Self, Vec<i64>) {
         let whole = self.corners();
-        let first: [i64; 2] = std::array::from_fn(|axis| {
-            let steps = (low_m[axis] - self.low_m[axis]) / self.spacing_m;
-            (steps.floor() as i64).clamp(0, whole[axis] - 1)
-        });
-        let last: [i64; 2] = std::array::from_fn(|axis| {
-            let steps = (high_m[axis] - self.low_m[axis]) / self.spacing_m;
-            (steps.ceil() as i64).clamp(first[axis], whole[axis] - 1)
-        });
+        let [low, high] = [low_m, high_m]
+            .map(|place_m| [0, 1].map(|axis| (place_m[axis] - self.low_m[axis]) / self.spacing_m));
+        let first = [0, 1].map(|axis| (low[axis].floor() as i64).clamp(0, whole[axis] - 1));
+        let last =
+            [0, 1].map(|axis| (high[axis].ceil() as i64).clamp(first[axis], whole[axis] - 1));
         let [low_m, high_m] = [first, last]
             .map(|steps| [0, 1].map(|axis| self.low_m[axis] + steps[axis] as f64 * self.spacing_m));
         let cropped = Self {

@@ -52,11 +52,6 @@ impl Localization {
         }
     }
 
-    /// A pose, rejected or not.
-    pub(crate) fn of_found(found: FoundPose, times: StageTimes) -> Self {
-        Self::new(&Ok(found), times)
-    }
-
     /// Result of a method without cells: its estimate is the only evidence.
     pub fn from_estimate(estimate: PoseEstimate, times: StageTimes) -> Self {
         let found = estimate.world_from_cav().map(|world_from_cav| FoundPose {

@@ -47,7 +47,8 @@ pub struct Localizer {
     pub(super) encoder: CellEncoder,
     pub(super) head: SceneHead,
     pub(super) solver: PoseSolver,
-    pub(super) most_parts: usize,
+    /// Largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
+    pub(crate) most_parts: usize,
     pub(super) sha256: [String; 2],
 }
 
@@ -219,11 +220,6 @@ impl Localizer {
             epsilon_m,
             origin_m: self.head.config().origin_m,
         })
-    }
-
-    /// Sets the largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
-    pub fn set_most_parts(&mut self, most: usize) {
-        self.most_parts = most;
     }
 
     /// Sets the confidence below which poses are rejected, beside the threshold of the head.

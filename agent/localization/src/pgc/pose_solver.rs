@@ -82,19 +82,15 @@ impl PoseSolver {
     /// # Errors
     /// [`NoRegistration`] when there are too few cells or too few inliers.
     pub fn solve(&self, coordinates: &SceneCoordinates) -> Solved {
-        self.search(coordinates)
+        self.search_wider(coordinates, 1.0)
             .map(|registration| self.judge(coordinates, &registration, None))
     }
 
-    /// First step: the pose relative to the origin of `coordinates`.
+    /// First step: the pose relative to the origin of `coordinates`, for cells with `factor` times the error. Inliers are
+    /// counted as without the factor.
     ///
     /// # Errors
     /// As [`Self::solve`].
-    pub fn search(&self, coordinates: &SceneCoordinates) -> Result<Registration, NoRegistration> {
-        self.search_wider(coordinates, 1.0)
-    }
-
-    /// The same for cells with `factor` times the error. Inliers are counted as in [`Self::search`].
     pub(super) fn search_wider(
         &self,
         coordinates: &SceneCoordinates,
@@ -121,7 +117,7 @@ impl PoseSolver {
         })
     }
 
-    /// A given pose relative to the origin of `coordinates`, with its inliers as in [`Self::search`].
+    /// A given pose relative to the origin of `coordinates`, with its inliers as in [`Self::search_wider`].
     pub(super) fn registration_at(
         &self,
         coordinates: &SceneCoordinates,

@@ -91,15 +91,6 @@ impl LocalizedPose {
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 
-    /// Reads a baseline, which is computed in floating point.
-    ///
-    /// # Errors
-    /// [`crate::pgc::LocalizerError`] names the file and what is wrong with it.
-    pub fn baseline(config: &BaselinePoseConfig, inference: Inference) -> Result<Self> {
-        let localizer = load_baseline(&config.weights, inference.device, PoseSolver::default())?;
-        Ok(Self::new(localizer, config.motion_gate.clone()))
-    }
-
     /// The pose of another localizer, behind a motion gate.
     pub fn new(localizer: Box<dyn Localize>, motion_gate: MotionGateConfig) -> Self {
         Self {
@@ -120,18 +111,18 @@ impl PoseSettings for PgcConfig {
         within("pgc.min_confidence", self.min_confidence, 0.0, 1.0)
     }
 
-    fn min_confidence(&mut self) -> Option<&mut f64> {
-        Some(&mut self.min_confidence)
-    }
-
-    fn networks(&mut self) -> Option<[&mut PathBuf; 3]> {
-        Some([&mut self.encoder, &mut self.head, &mut self.surfel_map])
+    fn networks(&mut self) -> Option<([&mut PathBuf; 3], &mut f64)> {
+        let files = [&mut self.encoder, &mut self.head, &mut self.surfel_map];
+        Some((files, &mut self.min_confidence))
     }
 }
 
 impl PoseSettings for BaselinePoseConfig {
+    /// A baseline is computed in floating point.
     fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
-        Ok(Box::new(LocalizedPose::baseline(self, inference)?))
+        let localizer = load_baseline(&self.weights, inference.device, PoseSolver::default())?;
+        let source = LocalizedPose::new(localizer, self.motion_gate.clone());
+        Ok(Box::new(source))
     }
 
     fn validate(&self) -> Result<(), FieldError> {

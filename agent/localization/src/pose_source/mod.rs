@@ -178,8 +178,8 @@ impl PoseSourceConfig {
     pub fn with_networks(mut self) -> Result<Self, FileError> {
         let networks = self.settings_mut().and_then(|settings| settings.networks());
         // A head that is not given is refused by the check of the values.
-        let given = networks.filter(|[_, head, _]| !head.as_os_str().is_empty());
-        if let Some([encoder, head, map]) = given {
+        let given = networks.filter(|([_, head, _], _)| !head.as_os_str().is_empty());
+        if let Some(([encoder, head, map], _)) = given {
             *head = head_file(head)?;
             if !map.as_os_str().is_empty() {
                 *map = surfel_map_file(map)?;
@@ -193,7 +193,7 @@ impl PoseSourceConfig {
     /// The scene-specific head of PGC, if the source has one.
     pub fn head(&self) -> Option<PathBuf> {
         let mut source = self.clone();
-        let [_, head, _] = source.settings_mut()?.networks()?;
+        let ([_, head, _], _) = source.settings_mut()?.networks()?;
         Some(std::mem::take(head))
     }
 

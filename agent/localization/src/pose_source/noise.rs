@@ -84,11 +84,8 @@ impl PoseNoise {
     /// decayed: so it depends on no earlier call, and frames may be lost, repeated or started anywhere.
     pub(crate) fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
         let random = self.random(cav);
-        let depth = if rho > 0.0 {
-            (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64
-        } else {
-            0
-        };
+        // 0 without correlation, whose logarithm is minus infinity.
+        let depth = (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64;
         let mut sum = [0.0; 4];
         // With this first weight the variance of the sum is 1 for any rho.
         let mut weight = (1.0 - rho * rho).sqrt();

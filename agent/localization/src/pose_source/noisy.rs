@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::error_table::{ErrorTable, TableRow};
-use super::noise::{self, PlanarError, PoseNoise};
+use super::noise::{self, PoseNoise};
 use super::settings::{PoseBasis, PoseSettings};
 use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError, no_pose};
 
@@ -201,7 +201,9 @@ impl NoisyPose {
             Kind::Autoregressive(noise, rho) => noise.autoregressive(cav, step, *rho),
             Kind::Replayed(table) => return replayed(table.row(self.first_row(cav), step), pose),
         };
-        PoseEstimate::new(error.added_in_world(pose), confidence(&error))
+        // Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
+        let confidence = 1.0 / (1.0 + error.distance_m().powi(2));
+        PoseEstimate::new(error.added_in_world(pose), confidence as f32)
     }
 
     /// Vehicles start at different rows of the table, so that their errors differ.
@@ -236,11 +238,6 @@ fn correlation(config: &NoisyPoseConfig) -> f64 {
     } else {
         0.0
     }
-}
-
-/// Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
-fn confidence(error: &PlanarError) -> f32 {
-    (1.0 / (1.0 + error.distance_m().powi(2))) as f32
 }
 
 #[cfg(test)]

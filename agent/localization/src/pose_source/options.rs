@@ -47,14 +47,13 @@ pub(super) fn update<S: PoseSettings + Args>(
 ) -> Result<Vec<Arg>, clap::Error> {
     settings.update_from_arg_matches(matches)?;
     let mut own = of::<S>();
-    let files = settings.networks().into_iter().flatten();
-    for (file, option) in files.zip(NETWORKS) {
-        own.push(Arg::new(option));
-        if let Some(given) = matches.get_one::<PathBuf>(option) {
-            file.clone_from(given);
+    if let Some((files, least)) = settings.networks() {
+        for (file, option) in files.into_iter().zip(NETWORKS) {
+            own.push(Arg::new(option));
+            if let Some(given) = matches.get_one::<PathBuf>(option) {
+                file.clone_from(given);
+            }
         }
-    }
-    if let Some(least) = settings.min_confidence() {
         own.push(Arg::new(MIN_CONFIDENCE));
         if let Some(given) = matches.get_one::<f64>(MIN_CONFIDENCE) {
             *least = *given;

@@ -145,25 +145,14 @@ pub(crate) struct CachedPose {
     poses: HashMap<SweepKey, PoseEstimate>,
 }
 
-impl CachedPose {
-    /// Reads the table.
-    ///
-    /// # Errors
-    /// [`FileError`] names the file and what is wrong with it.
-    pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self> {
-        Ok(Self {
-            poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())?,
-        })
-    }
-}
-
 impl PoseSettings for CachedPoseConfig {
     fn basis(&self) -> PoseBasis {
         PoseBasis::Files
     }
 
     fn build(&self, _: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
-        Ok(Box::new(CachedPose::new(self)?))
+        let poses = PoseTable::read(&self.file)?.of_scenario(self.scenario.as_deref())?;
+        Ok(Box::new(CachedPose { poses }))
     }
 
     fn validate(&self) -> Result<(), FieldError> {

@@ -35,19 +35,14 @@ pub(crate) trait PoseSettings {
     }
 
     /// Encoder, scene-specific head and surfel map of PGC: they may be given by name, and by the options `--encoder`,
-    /// `--head` and `--surfel-map`.
-    fn networks(&mut self) -> Option<[&mut PathBuf; 3]> {
-        None
-    }
-
-    /// Least confidence of a pose of PGC, by the option `--min-confidence`.
-    fn min_confidence(&mut self) -> Option<&mut f64> {
+    /// `--head` and `--surfel-map`. Beside them the least confidence of a pose, by the option `--min-confidence`.
+    fn networks(&mut self) -> Option<([&mut PathBuf; 3], &mut f64)> {
         None
     }
 
     /// Files that the source reads.
     fn files(&mut self) -> Vec<&mut PathBuf> {
-        let networks = self.networks().into_iter().flatten();
+        let networks = self.networks().into_iter().flat_map(|(files, _)| files);
         // A surfel map is optional.
         networks
             .filter(|file| !file.as_os_str().is_empty())

@@ -84,7 +84,8 @@ impl TrackedPoseConfig {
 
 impl PoseSettings for TrackedPoseConfig {
     fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
-        Ok(Box::new(TrackedPose::load(self, inference)?))
+        let localizer = TrackedPose::localizer(self, inference)?;
+        Ok(Box::new(TrackedPose::new(localizer, self.clone())))
     }
 
     fn validate(&self) -> Result<(), FieldError> {
@@ -92,12 +93,9 @@ impl PoseSettings for TrackedPoseConfig {
         Self::validate(self)
     }
 
-    fn networks(&mut self) -> Option<[&mut PathBuf; 3]> {
-        Some([&mut self.encoder, &mut self.head, &mut self.surfel_map])
-    }
-
-    fn min_confidence(&mut self) -> Option<&mut f64> {
-        Some(&mut self.min_confidence)
+    fn networks(&mut self) -> Option<([&mut PathBuf; 3], &mut f64)> {
+        let files = [&mut self.encoder, &mut self.head, &mut self.surfel_map];
+        Some((files, &mut self.min_confidence))
     }
 
     fn option_prefix() -> &'static str {
@@ -144,25 +142,16 @@ pub struct TrackedPose {
 }
 
 impl TrackedPose {
-    /// Reads the networks.
+    /// Reads the networks: the localizer of a tracked vehicle.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn load(config: &TrackedPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
-        let localizer = Self::localizer(config, inference)?;
-        Ok(Self::new(localizer, config.clone()))
-    }
-
-    /// The localizer of a tracked vehicle.
-    ///
-    /// # Errors
-    /// As [`Self::load`].
     pub fn localizer(
         config: &TrackedPoseConfig,
         inference: Inference,
     ) -> Result<Box<dyn Localize>, LocalizerError> {
         let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
-        localizer.set_most_parts(MOST_PARTS);
+        localizer.most_parts = MOST_PARTS;
         localizer.set_min_confidence(config.min_confidence);
         // Outermost: near a prediction the registration alone may suffice, without the networks.
         let localizer = MapRegistration::of(Box::new(localizer), &config.surfel_map);

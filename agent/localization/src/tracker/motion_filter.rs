@@ -143,11 +143,9 @@ impl MotionFilter {
         step[(YAW, YAW_RATE)] = time_s;
         let half_square = time_s * time_s / 2.0;
         // Step: process noise. An acceleration is constant within a step: its effects are fully correlated.
-        let mut pushed = State::zeros();
-        pushed[X] = half_square * cos;
-        pushed[Y] = half_square * sin;
-        pushed[SPEED] = time_s;
-        pushed *= ACCELERATION_STD;
+        let (push_x, push_y) = (half_square * cos, half_square * sin);
+        let pushed =
+            State::from([push_x, push_y, 0.0, time_s, 0.0, 0.0, 0.0, 0.0]) * ACCELERATION_STD;
         let turned =
             State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0, 0.0]) * yaw_acceleration_std;
         // A random walk: its variance, not its deviation, grows with time.

@@ -17,7 +17,7 @@ pub use report::{HeldOutAccuracy, MapReport};
 
 use self::check::Check;
 use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
-use crate::evaluation::{EvaluatedSweep, LocalizationSummary};
+use crate::evaluation::LocalizationSummary;
 use crate::training::{
     CELLS, FeatureCache, SceneSummary, SceneSweeps, SceneTrainConfig, SweepAugmentation, SweepList,
     train_scene_on,
@@ -408,32 +408,29 @@ impl Map<'_> {
         weights: &Path,
         checked: &mut Check,
     ) -> Result<(Option<FitReport>, Option<String>)> {
-        match ConfidenceModel::fit(&checked.labelled, self.config.rejection) {
-            Ok((model, report)) => {
-                let text = serde_json::to_string(&model).expect("a model is numbers");
-                let mut sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
-                let confidence = Confidence::Calibrated(model);
-                // Judged by the new model first: rejected poses are no samples for the covariances.
-                for sweep in checked.sweeps.iter_mut().chain(&mut checked.copies) {
-                    sweep.judge_again(&confidence);
-                }
-                let all = checked.sweeps.iter().chain(&checked.copies);
-                let samples: Vec<_> = all.filter_map(EvaluatedSweep::pose_sample).collect();
-                match CovarianceScale::fit(&samples) {
-                    Ok(scale) => {
-                        let text = serde_json::to_string(&scale).expect("a scale is numbers");
-                        sha256 = annotate(weights, COVARIANCE_KEY, &text)?;
-                    }
-                    Err(reason) => {
-                        self.note(format!("the covariances are not fitted: {reason}"));
-                    }
-                }
-                Ok((Some(report), Some(sha256)))
-            }
+        let (model, report) = match ConfidenceModel::fit(&checked.labelled, self.config.rejection) {
+            Ok(fitted) => fitted,
             Err(error) => {
                 self.note(format!("the confidence is not fitted: {error}"));
-                Ok((None, None))
+                return Ok((None, None));
             }
+        };
+        let text = serde_json::to_string(&model).expect("a model is numbers");
+        let mut sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
+        let confidence = Confidence::Calibrated(model);
+        // Judged by the new model first: rejected poses are no samples for the covariances.
+        let all = checked.sweeps.iter_mut().chain(&mut checked.copies);
+        let samples = all.filter_map(|sweep| {
+            sweep.judge_again(&confidence);
+            sweep.pose_sample()
+        });
+        match CovarianceScale::fit(&samples.collect::<Vec<_>>()) {
+            Ok(scale) => {
+                let text = serde_json::to_string(&scale).expect("a scale is numbers");
+                sha256 = annotate(weights, COVARIANCE_KEY, &text)?;
+            }
+            Err(reason) => self.note(format!("the covariances are not fitted: {reason}")),
         }
+        Ok((Some(report), Some(sha256)))
     }
 }

@@ -8,7 +8,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use super::sweep_store::{SweepList, yaw};
+use super::sweep_store::{SweepList, mean_position_m, yaw};
 use super::turned_sweep::{CELLS, TurnedSweep};
 use crate::Error;
 use localization::pgc::{Cell, CellEncoder, PreparedSweep};
@@ -141,6 +141,14 @@ impl FeatureCache {
     pub(crate) fn cell_count(&self) -> i64 {
         self.sweep_of_cell.size()[0]
     }
+
+    /// `[wanted]` random rows of cells, the same for the same seed and `stream`.
+    pub(crate) fn drawn_rows(&self, seed: u64, stream: u64, wanted: usize) -> tch::Result<Tensor> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(stream);
+        let rows = (0..wanted).map(|_| rng.random_range(0..self.cell_count()));
+        tensor(&rows.collect::<Vec<i64>>(), &[-1], self.cells.device())
+    }
 }
 
 #[derive(Default)]
@@ -189,11 +197,7 @@ impl Builder {
         if self.poses.is_empty() || self.places.is_empty() {
             return Err(Error::NoSweeps(Vec::new(), String::new()));
         }
-        let count = self.poses.len() as f64;
-        let origin_m: [f64; 3] = std::array::from_fn(|axis| {
-            let positions = self.poses.iter().map(|pose| pose.translation.vector[axis]);
-            positions.sum::<f64>() / count
-        });
+        let origin_m = mean_position_m(&self.poses);
         let mut targets = Vec::with_capacity(3 * self.places.len());
         for (cell, &sweep) in self.places.iter().zip(&self.sweep_of_cell) {
             let [x, y, z] = cell.centroid_m.map(f64::from);

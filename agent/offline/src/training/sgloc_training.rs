@@ -4,8 +4,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use tch::nn::VarStore;
 use tch::{Kind, Tensor, no_grad};
 
@@ -13,7 +11,6 @@ use super::{CELLS, FeatureCache, SweepAugmentation, SweepList};
 use crate::Error;
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{CellEncoder, LocalizerError, SceneEncoder, SceneEncoderConfig};
-use perception::tensor_values::tensor;
 use perception::train::{Means, Observe, Progress, RunConfig, SaveEvery, Task, Trained, Trainer};
 use perception::weights::Weights;
 
@@ -56,7 +53,7 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     };
     let variables = VarStore::new(run.device);
     let mut network = SgLoc::new(&variables.root(), &network_config)?;
-    let sample = drawn_rows(&cache, run.seed, 0, STATISTICS_CELLS)?;
+    let sample = cache.drawn_rows(run.seed, 0, STATISTICS_CELLS)?;
     network.set_statistics(&cache.cells.f_index_select(0, &sample)?)?;
     adopt_encoder(&variables, &config.encoder, &network_config.encoder)?;
     let mut trainer = Trainer::begin(run, &variables, None, started)?;
@@ -99,12 +96,13 @@ impl Task for Training<'_> {
     /// Mean L1 error of the scene coordinates of some cells, metres, the sum of its axes as in SGLoc.
     fn loss(&mut self, trainer: &Trainer) -> Result<Tensor, Error> {
         let wanted = self.run.batch * CELLS;
-        let rows = drawn_rows(&self.cache, self.run.seed, trainer.steps(), wanted)?;
-        let cells = self.cache.cells.f_index_select(0, &rows)?;
-        let sensor_m = self.cache.sensor_m.f_index_select(0, &rows)?;
+        let cache = &self.cache;
+        let rows = cache.drawn_rows(self.run.seed, trainer.steps(), wanted)?;
+        let cells = cache.cells.f_index_select(0, &rows)?;
+        let sensor_m = cache.sensor_m.f_index_select(0, &rows)?;
         let kind = self.run.precision.kind();
         let found_m = self.network.coordinates(&cells, &sensor_m, kind, true)?;
-        let error_m = (found_m - self.cache.targets_m.f_index_select(0, &rows)?).f_abs()?;
+        let error_m = (found_m - cache.targets_m.f_index_select(0, &rows)?).f_abs()?;
         let error_m = error_m.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
         let loss = error_m.f_mean(Kind::Float)?;
         self.means.add([loss.f_double_value(&[])?]);
@@ -117,14 +115,6 @@ impl Task for Training<'_> {
         (self.observe)(&trainer.step_report(share_done, vec![error_m], &text));
         Ok(())
     }
-}
-
-/// `[wanted]` random rows of a cache, the same for the same step.
-fn drawn_rows(cache: &FeatureCache, seed: u64, step: u64, wanted: usize) -> tch::Result<Tensor> {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(step);
-    let rows = (0..wanted).map(|_| rng.random_range(0..cache.cell_count()));
-    tensor(&rows.collect::<Vec<i64>>(), &[-1], cache.cells.device())
 }
 
 /// Gives the encoder below `variables` the weights of a file and freezes it.

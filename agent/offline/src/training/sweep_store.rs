@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use dataset::frame::Frame;
-use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario, findings, reasons};
+use dataset::{self, IntensityScale, LoadOptions, Scenario, findings, reasons};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
 
@@ -53,12 +53,8 @@ impl StoredSweep {
     }
 }
 
-/// A sweep with its true pose.
-pub(super) struct PosedSweep {
-    /// `[N]` of x, y, z (metres, sensor frame) and intensity.
-    pub(super) points: Vec<[f32; 4]>,
-    pub(super) world_from_sensor: Isometry3<f64>,
-}
+/// Points of a sweep, `[N]` of x, y, z (metres, sensor frame) and intensity, and its true pose.
+pub(super) type PosedSweep = (Vec<[f32; 4]>, Isometry3<f64>);
 
 /// A rotation about the vertical.
 pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
@@ -70,6 +66,15 @@ pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
 pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
     let ahead = world_from_sensor.rotation * Vector3::x();
     ahead.y.atan2(ahead.x)
+}
+
+/// Mean position of sensors, metres, world frame.
+pub(super) fn mean_position_m(world_from_sensor: &[Isometry3<f64>]) -> [f64; 3] {
+    std::array::from_fn(|axis| {
+        let poses = world_from_sensor.iter();
+        let positions = poses.map(|pose| pose.translation.vector[axis]);
+        positions.sum::<f64>() / world_from_sensor.len() as f64
+    })
 }
 
 /// Paths of sweeps with true poses on disk. Each folder is one world: poses in different folders are unrelated.
@@ -159,28 +164,29 @@ impl SweepList {
             points: false,
             ..LoadOptions::default()
         };
-        let mut poses = Vec::with_capacity(self.places.len());
-        for (index, place) in self.places.iter().enumerate() {
-            let loaded = place.scenario.load(place.agent, place.tick, &options);
-            let loaded = loaded.inspect_err(|error| self.leave_out(index, error));
-            let pose = loaded.ok().and_then(|frame| frame.world_from_lidar);
-            poses.push((place.drive, pose.map(|pose| pose.isometry())));
-        }
-        poses
+        let poses = self.places.iter().enumerate().map(|(index, place)| {
+            let frame = self.load(index, place, &options);
+            let pose = frame.and_then(|frame| frame.world_from_lidar);
+            (place.drive, pose.map(|pose| pose.isometry()))
+        });
+        poses.collect()
     }
 
     /// Reads the whole frame of a sweep, with the names of its scenario and its files; `None` if it cannot be read.
     pub(crate) fn frame(&self, index: usize) -> Option<(Frame, String, String)> {
         let place = self.places.get(index)?;
         let stem = place.scenario.ticks.get(place.tick)?.stem.clone();
-        let options = LoadOptions::default();
-        let loaded = place.scenario.load(place.agent, place.tick, &options);
-        let loaded = loaded.inspect_err(|error| self.leave_out(index, error));
-        Some((loaded.ok()?, place.scenario.name.clone(), stem))
+        let frame = self.load(index, place, &LoadOptions::default())?;
+        Some((frame, place.scenario.name.clone(), stem))
     }
 
-    fn leave_out(&self, index: usize, error: &ReadError) {
-        lock(&self.unreadable).insert(index, error.to_string());
+    /// The frame of a sweep; one that cannot be read is noted.
+    fn load(&self, index: usize, place: &Place, options: &LoadOptions) -> Option<Frame> {
+        let loaded = place.scenario.load(place.agent, place.tick, options);
+        let noted = loaded.inspect_err(|error| {
+            lock(&self.unreadable).insert(index, error.to_string());
+        });
+        noted.ok()
     }
 
     /// Keeps at most `count` sweeps, evenly spread.
@@ -204,15 +210,15 @@ impl SweepList {
     /// Reads one sweep, points within `range_m` of the sensor; `None` if its pose is unknown or it cannot be read, which
     /// is counted.
     pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
-        let sweep = self.posed_sweep(index, range_m)?;
-        let points = sweep.points.iter().map(|point| {
+        let (points, world_from_sensor) = self.posed_sweep(index, range_m)?;
+        let points = points.iter().map(|point| {
             // The cast saturates: coordinates beyond 327 m stay at the end of the range of i16.
             std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16)
         });
         Some(StoredSweep {
             world: self.places[index].world,
             drive: self.places[index].drive,
-            world_from_sensor: sweep.world_from_sensor,
+            world_from_sensor,
             points: points.collect(),
         })
     }
@@ -223,10 +229,7 @@ impl SweepList {
         let (mut points, range) = (frame.points.xyzi, range_m as f32);
         // A NaN in x or y fails the comparison and is left out too.
         points.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
-        Some(PosedSweep {
-            points,
-            world_from_sensor,
-        })
+        Some((points, world_from_sensor))
     }
 
     /// Reads the whole frame of a sweep with the pose of its sensor; `None` if that is unknown or the frame cannot be

@@ -25,13 +25,12 @@ impl TurnedSweep {
     /// A sweep within the range of the encoder, for a sensor in the orientation `turned_from_sensor`, each point kept with
     /// a probability.
     pub(super) fn new(
-        sweep: PosedSweep,
+        (mut points, world_from_sensor): PosedSweep,
         turned_from_sensor: &Isometry3<f64>,
         keep: f64,
         rng: &mut impl Rng,
         format: &SweepFormat,
     ) -> Self {
-        let mut points = sweep.points;
         let in_range = points.len();
         points.retain(|_| keep >= 1.0 || rng.random_bool(keep));
         let turn: Isometry3<f32> = turned_from_sensor.cast();
@@ -46,7 +45,7 @@ impl TurnedSweep {
             rows: choose(prepared.cells(), CELLS, rng),
             sweep: prepared,
             points: in_range,
-            world_from_sensor: sweep.world_from_sensor * turned_from_sensor.inverse(),
+            world_from_sensor: world_from_sensor * turned_from_sensor.inverse(),
         }
     }
 }

@@ -35,10 +35,6 @@ enum Layers {
     },
 }
 
-/// Canvas with the features of pillars: `[1, C_pillar, H, W]`, channels innermost in memory.
-#[derive(Debug)]
-pub(super) struct Canvas(Tensor);
-
 impl BevEncoder {
     /// An encoder of folded layers in floating point.
     pub(super) fn new(
@@ -86,8 +82,8 @@ impl BevEncoder {
         matches!(self.layers, Layers::Int8 { .. })
     }
 
-    /// Writes pillars to the canvas.
-    pub(super) fn scatter(&mut self, pillars: &Pillars) -> tch::Result<Canvas> {
+    /// Writes pillars to the canvas: `[1, C_pillar, H, W]`, channels innermost in memory.
+    pub(super) fn scatter(&mut self, pillars: &Pillars) -> tch::Result<Tensor> {
         let (pillar_grid, projection) = (&self.pillar_grid, &self.projection);
         let flat = match &mut self.layers {
             Layers::Float { canvas, .. } => {
@@ -109,17 +105,16 @@ impl BevEncoder {
         let [height, width] = [pillar_grid.height, pillar_grid.width].map(|size| size as i64);
         let canvas = flat?.f_view([1, height, width, -1])?;
         let canvas = canvas.f_to_device(self.device)?;
-        Ok(Canvas(canvas.f_permute([0, 3, 1, 2])?))
+        canvas.f_permute([0, 3, 1, 2])
     }
 
     /// Levels of the backbone for a canvas.
-    pub(super) fn levels(&self, canvas: &Canvas) -> tch::Result<Vec<BackboneLevel>> {
+    pub(super) fn levels(&self, canvas: &Tensor) -> tch::Result<Vec<BackboneLevel>> {
         match &self.layers {
             Layers::Float { backbone, .. } => {
-                let levels = backbone.levels_of(&canvas.0, false);
-                Ok(BackboneLevel::in_float(levels))
+                Ok(BackboneLevel::in_float(backbone.levels_of(canvas, false)))
             }
-            Layers::Int8 { backbone, .. } => backbone.levels(&canvas.0),
+            Layers::Int8 { backbone, .. } => backbone.levels(canvas),
         }
     }
 
@@ -142,11 +137,11 @@ impl BevEncoder {
     }
 
     /// Adds the activations of a canvas to a search for their scales; nothing if the layers are in integers already.
-    pub(super) fn observe(&self, canvas: &Canvas, search: &mut ScaleSearch) -> tch::Result<()> {
+    pub(super) fn observe(&self, canvas: &Tensor, search: &mut ScaleSearch) -> tch::Result<()> {
         match &self.layers {
             Layers::Float {
                 backbone, shrink, ..
-            } => observe_backbone(backbone, shrink.as_ref(), &canvas.0, search),
+            } => observe_backbone(backbone, shrink.as_ref(), canvas, search),
             Layers::Int8 { .. } => Ok(()),
         }
     }

@@ -102,8 +102,7 @@ impl Voxeliser {
     /// Sorts the points of one sweep into pillars; points outside the area and points that are not finite are dropped.
     pub fn voxelise(&mut self, points: &[[f32; 4]]) -> Pillars {
         let mut pillars = self.assign(points);
-        let starts = self.gather(points, &mut pillars);
-        debug_assert_eq!(starts, pillars.points.len());
+        self.gather(points, &mut pillars);
         // Only cells with a pillar are reset, not the whole grid.
         for coord in &pillars.coords {
             let [z, y, x] = coord.map(|index| index as usize);
@@ -165,8 +164,8 @@ impl Voxeliser {
         pillar
     }
 
-    /// Second pass: copies the points of a pillar together. Returns the number of points copied.
-    fn gather(&self, points: &[[f32; 4]], pillars: &mut Pillars) -> usize {
+    /// Second pass: copies the points of a pillar together.
+    fn gather(&self, points: &[[f32; 4]], pillars: &mut Pillars) {
         let mut next = Vec::with_capacity(pillars.len());
         let mut total = 0;
         for &count in &pillars.counts {
@@ -181,7 +180,6 @@ impl Voxeliser {
                 *slot += 1;
             }
         }
-        total
     }
 }
 

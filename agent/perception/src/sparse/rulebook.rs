@@ -87,13 +87,10 @@ impl Rulebook {
         let mut index = Vec::with_capacity(rulebooks.iter().map(|book| book.rows.len()).sum());
         let mut first = 0;
         for book in rulebooks {
-            index.extend(book.rows.iter().map(|&row| {
-                if row == NONE {
-                    // One beyond the last input: the row of zeros that `gather` appends.
-                    inputs as i64
-                } else {
-                    first + i64::from(row)
-                }
+            index.extend(book.rows.iter().map(|&row| match row {
+                // One beyond the last input: the row of zeros that `gather` appends.
+                NONE => inputs as i64,
+                _ => first + i64::from(row),
             }));
             first += book.inputs as i64;
         }

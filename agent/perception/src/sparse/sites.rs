@@ -72,10 +72,10 @@ impl Sites {
 }
 
 fn key(coord: [i32; 3]) -> u64 {
-    let axis_bits =
-        |axis: i32| u64::from(axis.wrapping_add(HALF_RANGE) as u32 & ((1 << AXIS_BITS) - 1));
-    let axes = coord.into_iter();
-    axes.fold(0, |key, axis| key << AXIS_BITS | axis_bits(axis))
+    coord.into_iter().fold(0, |key, axis| {
+        let axis_bits = axis.wrapping_add(HALF_RANGE) as u32 & ((1 << AXIS_BITS) - 1);
+        key << AXIS_BITS | u64::from(axis_bits)
+    })
 }
 
 /// Hash by one multiplication: the keys are coordinates, and the table is used for one sweep.

@@ -76,9 +76,8 @@ impl Arguments {
         }
         note_maps(&out.join("maps"));
         output::note(format_args!("all columns and the report: {folder}"));
-        Ok(left_out(
-            computed.runs.iter().map(|run| &run.cell.metrics.left_out),
-        ))
+        let runs = computed.runs.iter();
+        Ok(left_out(runs.map(|run| &run.cell.metrics.left_out)))
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
@@ -158,12 +157,11 @@ impl Trial {
             out: None,
             ..self.clone()
         };
-        settings.setup.models.weights = PathBuf::new();
-        let Setup {
-            agents, vehicles, ..
-        } = &mut settings.setup;
+        let setup = &mut settings.setup;
+        setup.models.weights = PathBuf::new();
+        let vehicles = setup.vehicles.values_mut();
         // Only whether a vehicle has weights of its own counts here: their contents are in the provenance.
-        for settings in std::iter::once(agents).chain(vehicles.values_mut()) {
+        for settings in std::iter::once(&mut setup.agents).chain(vehicles) {
             settings.weights = settings.weights.take().map(|_| PathBuf::new());
         }
         Ok(CellKey {
@@ -296,13 +294,10 @@ fn judged(
         scores.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
             let mut files = files.iter_mut();
-            let is_written = files.all(|files| files.add(&scenario.name, &frame));
+            let written = files.try_for_each(|files| files.add(&scenario.name, &frame));
             judge(scores, frame, is_timed);
             on_frame();
-            match is_written {
-                true => ControlFlow::Continue(()),
-                false => ControlFlow::Break(()),
-            }
+            written
         })?;
         // A file could not be written. finish returns the error.
         if judged.is_break() {

@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io;
+use std::io::ErrorKind;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -37,7 +38,13 @@ impl FrameFiles {
         let lines = fs::create_dir_all(out)
             .and_then(|()| fs::create_dir(&folder))
             .and_then(|()| FrameLines::create(&folder))
-            .map_err(|error| writing(error, &folder))?;
+            .map_err(|error| match error.kind() {
+                // One that exists is the user's choice, any other is not.
+                ErrorKind::AlreadyExists => {
+                    anyhow::Error::from(error).context(folder.display().to_string())
+                }
+                _ => anyhow::Error::from(error).context(NotWritten(folder.clone())),
+            })?;
         Ok(Self {
             folder,
             lines,
@@ -45,8 +52,8 @@ impl FrameFiles {
         })
     }
 
-    /// Adds a frame of a scenario; false after an error, which [`Self::finish`] returns.
-    pub(crate) fn add(&mut self, scenario: &str, frame: &EvaluatedFrame) -> bool {
+    /// Adds a frame of a scenario; a break after an error, which [`Self::finish`] returns.
+    pub(crate) fn add(&mut self, scenario: &str, frame: &EvaluatedFrame) -> ControlFlow<()> {
         self.scenarios.push(scenario.to_owned());
         self.lines.add(Some(scenario), frame)
     }
@@ -63,16 +70,6 @@ impl FrameFiles {
             .and_then(|()| atomic_file::write(&folder.join("frames.csv"), frames))
             .and_then(|()| atomic_file::write(&folder.join("precision_recall.csv"), curve))
             .with_context(|| folder.display().to_string())
-    }
-}
-
-/// The error of creating a folder: one that exists is the user's choice, any other is not.
-fn writing(error: io::Error, folder: &Path) -> anyhow::Error {
-    match error.kind() {
-        io::ErrorKind::AlreadyExists => {
-            anyhow::Error::from(error).context(folder.display().to_string())
-        }
-        _ => anyhow::Error::from(error).context(NotWritten(folder.into())),
     }
 }
 

@@ -56,12 +56,10 @@ impl Fleet {
                 self.link_config(context, bus)
             })?;
         }
-        planner.plan(
-            REPLAY.into(),
-            "sim-replay stream",
-            RestartPolicy::Task,
-            |bus| self.replay_config(context, bus),
-        )?;
+        let replay = REPLAY.to_owned();
+        planner.plan(replay, "sim-replay stream", RestartPolicy::Task, |bus| {
+            self.replay_config(context, bus)
+        })?;
         if let Some(record) = &self.scenario.record {
             let (run, out) = (context.run.clone(), context.folder.file(RECORDING));
             // A recording cannot be resumed after an interruption.

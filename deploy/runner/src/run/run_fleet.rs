@@ -114,17 +114,10 @@ fn go(
     let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let [detections, truth, tracks] = LINES.map(|name| folder.file(name));
     let tracks = fleet.scenario.ego.tracks.then_some(tracks);
+    let lines = [detections, truth];
     let session = place.session.clone();
     // The scorer subscribes before any process starts, so that it misses none of their messages.
-    let mut scorer = ScorerNode::start(
-        session,
-        run,
-        agents,
-        ego,
-        board,
-        [detections, truth],
-        tracks,
-    )?;
+    let mut scorer = ScorerNode::start(session, run, agents, ego, board, lines, tracks)?;
     if let Some(address) = fleet.scenario.network.metrics {
         let peers = specs.iter().filter_map(|spec| {
             Some(MetricsPeer {
@@ -204,9 +197,7 @@ fn watch(
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched, RunError> {
-    let SessionContext {
-        run, folder, keys, ..
-    } = *context;
+    let (run, folder, keys) = (context.run, context.folder, context.keys);
     let endpoint = &place.endpoint;
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
@@ -343,21 +334,18 @@ fn write(
         }
     }
     let mut sum = Ledger::default();
-    for process in &stats {
-        sum.merge(&process.ledger);
-    }
+    let ledgers = stats.iter().map(|process| &process.ledger);
+    ledgers.for_each(|ledger| sum.merge(ledger));
     // Before the balance, which accounts of offline processes cannot meet.
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
     let balance = sum.balance();
     let missed = missed(fleet, &board, &watched.ending);
-    let provenance = match fingerprint.join() {
-        Ok(Ok(provenance)) => Some(provenance),
-        Ok(Err(error)) => {
-            tracing::warn!("no hashes of what the run read: {error}");
-            None
-        }
-        Err(_) => None,
-    };
+    let collected = fingerprint.join().ok();
+    let provenance = collected.and_then(|collected| {
+        collected
+            .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))
+            .ok()
+    });
     let mut metrics = metrics(fleet, &board, &progress, &sum);
     metrics.left_out.add_findings(fleet.findings.clone());
     let metrics = Metrics {

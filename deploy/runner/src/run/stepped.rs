@@ -4,7 +4,6 @@
 //! number of processes.
 
 use std::collections::BTreeSet;
-use std::ops::ControlFlow;
 
 use dataset::findings;
 use deploy::operate::run_folder::{RunFolder, RunFolderError};
@@ -84,12 +83,9 @@ fn play(
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let _ = evaluator.run(&fleet.recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
-        let is_written = lines.add(None, &frame);
+        let written = lines.add(None, &frame);
         judge(&mut board, frame, true);
-        match is_written {
-            true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(()),
-        }
+        written
     })?;
     bar.finish_and_clear();
     lines.finish().map_err(unwritable)?;

@@ -124,22 +124,15 @@ impl Scenario {
             return given.map_or(Ok(()), Err);
         }
         let (scene, remote) = (&self.scene, self.remote_agents.first());
+        let off = "must be false with clock stepped";
         let refused = [
             (
                 "scene.rate",
                 (scene.rate != 1.0).then(|| scene.rate.to_string()),
                 "must be 1 with clock stepped, which has no pace",
             ),
-            (
-                "scene.loop",
-                scene.repeat.then(|| "true".into()),
-                "must be false with clock stepped",
-            ),
-            (
-                "scene.lockstep",
-                scene.lockstep.then(|| "true".into()),
-                "must be false with clock stepped",
-            ),
+            ("scene.loop", scene.repeat.then(|| "true".into()), off),
+            ("scene.lockstep", scene.lockstep.then(|| "true".into()), off),
             (
                 "models.device",
                 (self.models.device != ComputeDevice::Cpu).then(|| "cuda".into()),

@@ -47,29 +47,21 @@ impl Scenario {
         }
         let file = std::path::absolute(path).at(path)?;
         let folder = file.parent().unwrap_or(Path::new("/"));
-        let Scenario {
-            scene,
-            models,
-            agents,
-            vehicles,
-            link,
-            security,
-            ..
-        } = &mut scenario;
-        let keys = security.iter_mut().flat_map(|security| &mut security.keys);
+        let security = scenario.security.iter_mut();
+        let keys = security.flat_map(|security| &mut security.keys);
         // An empty path is one that is left out. Joined, it would name the folder of the file.
-        for place in [&mut scene.dir, &mut models.weights]
+        for place in [&mut scenario.scene.dir, &mut scenario.models.weights]
             .into_iter()
             .chain(keys)
             .filter(|place| !place.as_os_str().is_empty())
         {
             *place = without_dots(&folder.join(&place));
         }
-        *agents = with_files(std::mem::take(agents), path, folder)?;
-        for own in vehicles.values_mut() {
+        scenario.agents = with_files(scenario.agents, path, folder)?;
+        for own in scenario.vehicles.values_mut() {
             own.change(|settings| with_files(settings, path, folder))?;
         }
-        if let Some(link) = link.as_mut().filter(|link| !link.is_preset()) {
+        if let Some(link) = scenario.link.as_mut().filter(|link| !link.is_preset()) {
             let model = without_dots(&folder.join(&link.model));
             link.model = model.to_string_lossy().into_owned();
         }

@@ -111,11 +111,9 @@ fn covered(box3d: &Box3d, grid: &BevGrid) -> Vec<(usize, f64)> {
     let mut found = Vec::new();
     for row in rows {
         for column in columns.clone() {
-            let low = [column, row];
-            let low: [f64; 2] =
-                std::array::from_fn(|axis| low_m[axis] + low[axis] as f64 * grid.cell_m);
-            let [x0, y0] = low;
-            let [x1, y1] = low.map(|edge| edge + grid.cell_m);
+            let [x0, y0] = [(low_m[0], column), (low_m[1], row)]
+                .map(|(low_m, cell)| low_m + cell as f64 * grid.cell_m);
+            let [x1, y1] = [x0, y0].map(|edge| edge + grid.cell_m);
             let cell = Polygon::new([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]);
             let share = footprint.intersection(&cell) / cell.area();
             if share > 0.0 {

@@ -114,16 +114,6 @@ struct Layer {
     global: GlobalHalf,
 }
 
-impl Layer {
-    fn new(path: &nn::Path<'_>, sizes: &SwapFusionConfig) -> Self {
-        let (attention, feed) = (path / "window_attention", path / "window_ffd");
-        Self {
-            local: HalfBlock::new(Partition::Window, &attention, &feed, sizes),
-            global: GlobalHalf::new(path, sizes),
-        }
-    }
-}
-
 /// The method behind the common interface.
 #[derive(Debug)]
 pub struct Ermvp {
@@ -151,7 +141,14 @@ impl Ermvp {
                 config.search,
             ),
             layers: (0..sizes.depth)
-                .map(|index| Layer::new(&(path / "layers" / index), sizes))
+                .map(|index| {
+                    let path = path / "layers" / index;
+                    let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
+                    Layer {
+                        local: HalfBlock::new(Partition::Window, &attention, &feed, sizes),
+                        global: GlobalHalf::new(&path, sizes),
+                    }
+                })
                 .collect(),
             head: MeanHead::new(&(path / "mlp_head"), sizes.channels),
             window: sizes.window,

@@ -80,10 +80,8 @@ impl CoarseAlignment {
             None => Vec::new(),
         };
         let first = maps.metadata.len() as i64;
-        let metadata: Vec<MapMetadata> = match earlier {
-            Some(earlier) => [&maps.metadata[..], &earlier.metadata].concat(),
-            None => maps.metadata.clone(),
-        };
+        let mut metadata = maps.metadata.clone();
+        metadata.extend(earlier.iter().flat_map(|earlier| &earlier.metadata));
         let of_earlier = earlier_entries.iter().map(|entry| entry + first);
         let places: Vec<i64> = newest.iter().copied().chain(of_earlier).collect();
         let picked = places.iter().map(|&place| metadata[place as usize]);

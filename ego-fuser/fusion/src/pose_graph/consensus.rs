@@ -43,49 +43,36 @@ pub(super) fn consensus(
     prior: &Isometry3<f64>,
     config: &PoseGraphConfig,
 ) -> Option<Consensus> {
+    // Pairs of object and box that may match at the uncorrected pose.
+    let mut candidates = Vec::new();
+    for (index, center) in boxes.iter().enumerate() {
+        let place = moved(prior, center);
+        let near = (0..objects.len()).filter(|&at| (objects[at] - place).norm() < config.search_m);
+        candidates.extend(near.map(|object| (object, index)));
+    }
     let search = Search {
         objects,
         boxes,
         prior,
         config,
-        candidates: candidates(objects, boxes, prior, config),
+        candidates,
     };
     let motions = search.motions();
-    let best = { motions.iter() }.max_by(|one, other| one.score.total_cmp(&other.score))?;
+    let (best, score) = { motions.iter() }.max_by(|one, other| one.1.total_cmp(&other.1))?;
     // A different motion that fits almost as well makes the match ambiguous: then none is used.
-    let rival = motions.iter().filter(|other| {
-        apart(boxes.iter(), &best.motion, &other.motion) > 2.0 * config.fit_tolerance_m
-    });
-    let rival = rival.map(|other| other.score);
-    if rival.fold(f64::NEG_INFINITY, f64::max) + MIN_LEAD > best.score {
+    let far_m = 2.0 * config.fit_tolerance_m;
+    let rival = { motions.iter() }.filter(|(other, _)| apart(boxes.iter(), best, other) > far_m);
+    let rival = rival.map(|(_, score)| *score);
+    if rival.fold(f64::NEG_INFINITY, f64::max) + MIN_LEAD > *score {
         return None;
     }
-    let refined = search.refined(best.motion);
+    let refined = search.refined(*best);
     let matches = search.matches(&refined);
     (matches.len() >= config.min_shared.max(2)).then(|| Consensus {
         score: search.score(&refined, &matches),
         matches,
         motion: refined,
     })
-}
-
-/// Pairs of object and box that may match at the uncorrected pose.
-fn candidates(
-    objects: &[Vector3<f64>],
-    boxes: &[Vector3<f64>],
-    prior: &Isometry3<f64>,
-    config: &PoseGraphConfig,
-) -> Vec<(usize, usize)> {
-    let mut candidates = Vec::new();
-    for (index, center) in boxes.iter().enumerate() {
-        let place = moved(prior, center);
-        for (object, at) in objects.iter().enumerate() {
-            if (at - place).norm() < config.search_m {
-                candidates.push((object, index));
-            }
-        }
-    }
-    candidates
 }
 
 struct Search<'a> {
@@ -96,30 +83,24 @@ struct Search<'a> {
     candidates: Vec<(usize, usize)>,
 }
 
-struct Scored {
-    motion: Isometry3<f64>,
-    score: f64,
-}
-
 impl Search<'_> {
-    /// Motion by each pair of candidates, where it is within bounds and has enough inliers.
-    fn motions(&self) -> Vec<Scored> {
-        let mut motions = Vec::new();
-        for (index, &first) in self.candidates.iter().enumerate() {
-            for &second in &self.candidates[index + 1..] {
-                let Some(motion) = self.motion(first, second) else {
-                    continue;
-                };
-                let matches = self.matches(&motion);
-                if matches.len() >= self.config.min_shared.max(2) {
-                    motions.push(Scored {
-                        score: self.score(&motion, &matches),
-                        motion,
-                    });
-                }
-            }
-        }
-        motions
+    /// Motion and score by each pair of candidates, where it is within bounds and has enough inliers.
+    fn motions(&self) -> Vec<(Isometry3<f64>, f64)> {
+        let pairs = self
+            .candidates
+            .iter()
+            .enumerate()
+            .flat_map(|(index, &first)| {
+                let later = self.candidates[index + 1..].iter();
+                later.map(move |&second| (first, second))
+            });
+        let motions = pairs.filter_map(|(first, second)| {
+            let motion = self.motion(first, second)?;
+            let matches = self.matches(&motion);
+            let are_enough = matches.len() >= self.config.min_shared.max(2);
+            are_enough.then(|| (motion, self.score(&motion, &matches)))
+        });
+        motions.collect()
     }
 
     fn motion(&self, first: (usize, usize), second: (usize, usize)) -> Option<Isometry3<f64>> {

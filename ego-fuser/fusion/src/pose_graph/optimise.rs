@@ -136,12 +136,13 @@ impl Graph {
         );
         let (sin, cos) = agent.heading_rad.sin_cos();
         let (dx, dy) = (object.x_m - agent.x_m, object.y_m - agent.y_m);
+        let turn = object.heading_rad - agent.heading_rad - observation.seen.heading_rad;
         // R^T (object - agent) - seen, in the frame of the agent.
         let residual = Vector3::new(
             cos * dx + sin * dy - observation.seen.x_m,
             -sin * dx + cos * dy - observation.seen.y_m,
             // Front and back of a box are easily confused.
-            half_turn(object.heading_rad - agent.heading_rad - observation.seen.heading_rad),
+            turn - PI * (turn / PI).round(),
         );
         (residual, squared(&residual, &observation.information))
     }
@@ -271,9 +272,4 @@ fn difference(one: &Node, other: &Node) -> Vector3<f64> {
         one.y_m - other.y_m,
         turn.sin().atan2(turn.cos()),
     )
-}
-
-/// An angle within a quarter turn of zero that differs by half turns.
-fn half_turn(angle: f64) -> f64 {
-    angle - PI * (angle / PI).round()
 }

@@ -31,15 +31,14 @@ pub(crate) struct TrafAlignConfig {
 impl TrafAlignConfig {
     /// Sized for one core and live traffic.
     pub(crate) fn lean(channels: i64) -> Self {
-        let (patch, dim, heads, kernel, layers, field) = (2, 32, 2, 3, 1, 3);
         Self {
             channels,
-            patch,
-            dim,
-            heads,
-            kernel,
-            layers,
-            field,
+            patch: 2,
+            dim: 32,
+            heads: 2,
+            kernel: 3,
+            layers: 1,
+            field: 3,
             frames: 3,
             frame_secs: 0.1,
         }

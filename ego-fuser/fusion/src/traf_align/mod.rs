@@ -140,32 +140,6 @@ impl TrafAlign {
         let owner = tensor(&agents.owner, &[-1], tokens.device())?;
         Tensor::f_zeros(size, (tokens.kind(), tokens.device()))?.f_index_add(0, &owner, &tokens)
     }
-
-    fn fuse_present(
-        &self,
-        present: &WarpedMaps,
-        agents: &Agents,
-        train: bool,
-    ) -> Result<Tensor, TchError> {
-        let (_, _, height, width) = present.features.size4()?;
-        // The U-Net halves the resolution of the tokens once.
-        let padded = present.each(|map| Padding::to_multiples_of(2 * self.config.patch, map))?;
-        let mut tokens = self.over_time(&padded, agents, train)?;
-        let points = self.trajectories.points(&tokens, train)?;
-        for layer in &self.layers {
-            tokens = layer.forward(&tokens, &points)?;
-        }
-        let (patch, none, bias) = ([self.config.patch; 2], [0_i64; 2], None::<Tensor>);
-        let gathered =
-            tokens.f_conv_transpose2d(&self.decoder, bias, patch, none, none, 1, [1, 1])?;
-        let WarpedMaps { features, mask } = padded.each(|map| picked(map, &agents.newest))?;
-        // Padding is out of reach of all maps and becomes minus infinity, which is cropped below.
-        let fused = (features + gathered).f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
-        fused
-            .f_amax([0i64].as_slice(), false)?
-            .f_narrow(1, 0, height)?
-            .f_narrow(2, 0, width)
-    }
 }
 
 /// Assignment of maps to agents.
@@ -211,7 +185,24 @@ impl Fusion for TrafAlign {
         let entries = reaching(&warped.mask, true)?;
         let agents = Agents::new(&maps.metadata, &entries);
         let present = warped.each(|map| picked(map, &entries)?.f_to_kind(Kind::Float))?;
-        let fused = self.fuse_present(&present, &agents, maps.is_training)?;
+        let (_, _, height, width) = present.features.size4()?;
+        // The U-Net halves the resolution of the tokens once.
+        let padded = present.each(|map| Padding::to_multiples_of(2 * self.config.patch, map))?;
+        let mut tokens = self.over_time(&padded, &agents, maps.is_training)?;
+        let points = self.trajectories.points(&tokens, maps.is_training)?;
+        for layer in &self.layers {
+            tokens = layer.forward(&tokens, &points)?;
+        }
+        let (patch, none, bias) = ([self.config.patch; 2], [0_i64; 2], None::<Tensor>);
+        let gathered =
+            tokens.f_conv_transpose2d(&self.decoder, bias, patch, none, none, 1, [1, 1])?;
+        let WarpedMaps { features, mask } = padded.each(|map| picked(map, &agents.newest))?;
+        // Padding is out of reach of all maps and becomes minus infinity, which is cropped below.
+        let fused = (features + gathered).f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
+        let fused = fused
+            .f_amax([0i64].as_slice(), false)?
+            .f_narrow(1, 0, height)?
+            .f_narrow(2, 0, width)?;
         Ok(fused.f_to_kind(warped.features.kind())?.into())
     }
 }

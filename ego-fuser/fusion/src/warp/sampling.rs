@@ -82,15 +82,10 @@ impl Cells {
     fn read_at(&self, at: [f32; 2], valid: &[f32], values: &mut [f32]) -> f32 {
         let place = place(at, [self.height, self.width]);
         let valid = place.nearest.map_or(0.0, |nearest| valid[nearest]);
-        match valid == 0.0 {
-            true => values.fill(0.0),
-            false => self.read_cell(&place, valid, values),
+        if valid == 0.0 {
+            values.fill(0.0);
+            return valid;
         }
-        valid
-    }
-
-    #[inline]
-    fn read_cell(&self, place: &Place, valid: f32, values: &mut [f32]) {
         let [a, b, c, d] = place
             .cells
             .map(|cell| &self.values[cell * self.channels..][..self.channels]);
@@ -98,6 +93,7 @@ impl Cells {
         for ((((value, a), b), c), d) in values.iter_mut().zip(a).zip(b).zip(c).zip(d) {
             *value = of_a * a + of_b * b + of_c * c + of_d * d;
         }
+        valid
     }
 }
 

@@ -1,7 +1,5 @@
 //! Alignment method: a message from each vehicle, and from two messages the pose of one in the frame of the other.
 
-use std::fmt;
-
 use dataset::frame::Frame;
 use localization::pose_source::PoseSourceError;
 use nalgebra::Isometry3;
@@ -64,14 +62,6 @@ impl AlignmentSpec {
     /// The method at the beginning of a scene.
     pub fn for_scene(&self) -> Box<dyn AlignmentMethod> {
         (self.construct)()
-    }
-}
-
-impl fmt::Debug for AlignmentSpec {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("AlignmentSpec")
-            .field("name", &self.name)
-            .finish_non_exhaustive()
     }
 }
 

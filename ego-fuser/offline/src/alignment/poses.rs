@@ -1,7 +1,6 @@
 //! Alignment by poses, the method of the paper: every vehicle localises itself, and only poses are exchanged.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::rc::Rc;
 
 use agent_offline::evaluation::estimate_pose;
@@ -44,14 +43,6 @@ impl Poses {
             measured,
             sources: BTreeMap::new(),
         })
-    }
-}
-
-impl fmt::Debug for Poses {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Poses")
-            .field("measured", &self.measured)
-            .finish_non_exhaustive()
     }
 }
 

@@ -1,7 +1,6 @@
 //! `ego-fuser align`: alignment methods without GNSS, side by side.
 
 use std::path::PathBuf;
-use std::str::FromStr;
 use std::sync::Arc;
 
 use agent::agent::Agent;
@@ -39,8 +38,8 @@ pub(crate) struct Arguments {
     #[arg(long, num_args = 1.., value_delimiter = ',', value_enum)]
     method: Vec<Method>,
     /// One more method: the poses of a source, described as in a scenario file. May be repeated.
-    #[arg(long, value_name = "NAME=FILE.yaml")]
-    pose_source: Vec<NamedSource>,
+    #[arg(long, value_name = "NAME=FILE.yaml", value_parser = parse_source)]
+    pose_source: Vec<(String, PathBuf)>,
     /// Sources of boxes; with several, methods that match boxes have a row for each.
     #[arg(long, value_enum, num_args = 1.., value_delimiter = ',', default_value = "detected")]
     boxes: Vec<Boxes>,
@@ -93,24 +92,12 @@ enum Boxes {
     Annotated,
 }
 
-/// `NAME=FILE.yaml`
-#[derive(Debug, Clone)]
-struct NamedSource {
-    name: String,
-    file: PathBuf,
-}
-
-impl FromStr for NamedSource {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text.split_once('=') {
-            Some((name, file)) if !name.is_empty() && !file.is_empty() => Ok(Self {
-                name: name.to_owned(),
-                file: file.into(),
-            }),
-            _ => Err(format!("{text:?} is not NAME=FILE.yaml")),
+fn parse_source(text: &str) -> Result<(String, PathBuf), String> {
+    match text.split_once('=') {
+        Some((name, file)) if !name.is_empty() && !file.is_empty() => {
+            Ok((name.to_owned(), file.into()))
         }
+        _ => Err(format!("{text:?} is not NAME=FILE.yaml")),
     }
 }
 
@@ -147,7 +134,7 @@ impl Arguments {
             let maps: Vec<Dataset> = maps.collect::<Result<_, _>>()?;
             let all = { maps.into_iter() }.flat_map(|data| data.scenarios);
             let all: Vec<Scenario> = scenarios.into_iter().chain(all).collect();
-            let sources = self.pose_source.iter().map(|source| source.file.clone());
+            let sources = self.pose_source.iter().map(|(_, file)| file.clone());
             let files = self.weights.iter().cloned().chain(sources);
             output::line(rows_with_provenance(&rows, &all, files)?)?;
         } else {
@@ -236,8 +223,7 @@ impl Arguments {
     }
 }
 
-fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
-    let NamedSource { name, file } = source;
+fn from_source((name, file): &(String, PathBuf)) -> Result<AlignmentSpec> {
     let config: PoseSourceConfig = config_file::read(file).map_err(BadInput::of)?;
     let config = config.with_networks().at(file).map_err(BadInput::of)?;
     // Built once already here: a source that cannot be built is an error before the comparison.

@@ -47,9 +47,9 @@ impl Arguments {
         }
         let shifts = self.shifts_m.iter().map(|&shift_m| (shift_m, 0.0));
         let turns = self.turns_deg.iter().map(|&turn_deg| (0.0, turn_deg));
-        let both = shifts.chain(turns);
-        let offsets = both.map(|(shift_m, turn_deg)| Offset { shift_m, turn_deg });
-        let offsets: Vec<Offset> = offsets.collect();
+        let offsets: Vec<Offset> = { shifts.chain(turns) }
+            .map(|(shift_m, turn_deg)| Offset { shift_m, turn_deg })
+            .collect();
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
         let mut meter = AlignmentMeter::load(&weights).map_err(BadInput::of)?;
         let mut left_out = LeftOut::default();

@@ -90,7 +90,9 @@ impl Participant {
                     answer.note(message, encoded.wire_bytes() as u64)?;
                 }
                 Output::Timed(stages) => self.steps.push(stages),
-                Output::Failed(error) if error.is_of_frame() => answer.fail(&error),
+                Output::Failed(error) if error.is_of_frame() => {
+                    answer.failure = Some(error.to_string());
+                }
                 Output::Failed(error) => return Err(error.into()),
                 Output::Computed { .. } | Output::Dropped(Stream::Lidar, _) => is_over = true,
                 _ => {}

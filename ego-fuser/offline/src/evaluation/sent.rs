@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use agent::attack::CapturedMessages;
 use dataset::frame::Frame;
 use localization::pose_source::NO_SOURCE;
-use perception::detector::DetectorError;
 use protocol::{CavId, Limits, Message, PoseEstimate, RateChoice, Stream, WireError};
 
 use ego_fuser::ego::{Content, View};
@@ -39,7 +38,8 @@ pub(super) struct SentMessage {
 pub(super) struct Answer {
     pose: Option<(PoseEstimate, u64)>,
     messages: BTreeMap<Stream, SentMessage>,
-    failure: Option<String>,
+    /// Reason why the sweep cannot be computed.
+    pub(super) failure: Option<String>,
 }
 
 impl Answer {
@@ -67,11 +67,6 @@ impl Answer {
         };
         self.messages.insert(stream, message);
         Ok(())
-    }
-
-    /// Notes that the sweep cannot be computed.
-    pub(super) fn fail(&mut self, error: &DetectorError) {
-        self.failure = Some(error.to_string());
     }
 
     /// True with a pose and a message of each of these streams.

@@ -27,6 +27,7 @@ use delayed_delivery::{DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
 use ego_fuser::ego_loop::{EgoLoop, Input, Message, Output, Reception};
 use fusion::method::Exchange;
+use support::nanos;
 
 /// Runs a scenario; `on_frame` may end it. Each frame's stamp has the time at which the ego published it.
 pub(super) fn run(
@@ -362,7 +363,7 @@ impl<'a> Run<'a> {
                 // The sweeps of simulation time are all computed.
                 Output::Pace(_) => continue,
             };
-            self.ego_free_nanos = now_nanos.saturating_add(self.compute.fuse_nanos());
+            self.ego_free_nanos = now_nanos.saturating_add(nanos::of_ms(self.compute.fuse_ms));
             self.decided.push_back((now_nanos, fused));
         }
         Ok(())
@@ -380,7 +381,7 @@ impl<'a> Run<'a> {
         let compute = self.compute;
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
         let ready_nanos = self.ready_nanos(tick);
-        let done_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
+        let done_nanos = decided_nanos.saturating_add(nanos::of_ms(compute.fuse_ms));
         let ego = &frames[0].cav;
         let (mut result, tracks, failure) = match fused {
             Ok((result, tracks)) => (result, tracks, None),
@@ -389,8 +390,8 @@ impl<'a> Run<'a> {
         if self.evaluator.setup.link.is_some() {
             // Measured times would differ in every run.
             result.stages = [
-                ("pose", compute.pose_nanos()),
-                ("map", compute.map_nanos()),
+                ("pose", nanos::of_ms(compute.pose_ms)),
+                ("map", nanos::of_ms(compute.map_ms)),
                 ("wait", decided_nanos - ready_nanos),
                 ("fuse", done_nanos - decided_nanos),
             ]

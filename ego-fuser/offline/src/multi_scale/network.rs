@@ -169,9 +169,9 @@ impl MultiScaleNetwork {
     ) -> Result<Vec<u64>, TchError> {
         let (pillar_grid, config) = (self.network.pillar_grid(), &self.network.config);
         let stride = config.layer_strides[0];
-        let [height, width] = [pillar_grid.height, pillar_grid.width].map(|extent| extent as u64);
         // A strided convolution with padding rounds up.
-        let [height, width] = [height, width].map(|extent| extent.div_ceil(stride.unsigned_abs()));
+        let [height, width] = [pillar_grid.height, pillar_grid.width]
+            .map(|extent| (extent as u64).div_ceil(stride.unsigned_abs()));
         let (cells, cell_bytes) = (height * width, 4 * config.num_filters[0].unsigned_abs());
         let agents = samples.iter().map(|sample| sample.agents).sum::<i64>();
         let Some(sent) = sent else {

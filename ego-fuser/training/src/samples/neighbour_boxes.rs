@@ -52,20 +52,13 @@ pub(crate) fn augmentation_summary() -> String {
 /// A sample's maps, their metadata, and the boxes of neighbours without a map.
 pub(crate) type SampleWithBoxes = (Tensor, Vec<MapMetadata>, Vec<PlacedBox>);
 
-/// Samples with boxes.
-pub(crate) struct SamplesWithBoxes {
-    pub(crate) samples: Vec<SampleWithBoxes>,
-    /// Loss of the refinement of each vehicle's boxes.
-    pub(crate) refinement_losses: Vec<Tensor>,
-}
-
 impl Batch {
-    /// The samples with boxes. With `rng`, some neighbours send boxes, with all errors; without, all do, as detected.
+    /// The samples with boxes, and the loss of the refinement of each vehicle's boxes. With `rng`, some neighbours send boxes, with all errors; without, all do, as detected.
     pub(crate) fn with_boxes(
         &self,
         model: &CooperativeModel,
         mut rng: Option<&mut impl Rng>,
-    ) -> Result<SamplesWithBoxes, Error> {
+    ) -> Result<(Vec<SampleWithBoxes>, Vec<Tensor>), Error> {
         let BatchViews::Maps(maps) = &self.views else {
             return Err(Error::NothingToFreeze);
         };
@@ -91,10 +84,7 @@ impl Batch {
             let rng = rng.as_deref_mut();
             samples.push(sample(model, &of_sample, facts, &found, rng)?);
         }
-        Ok(SamplesWithBoxes {
-            samples,
-            refinement_losses,
-        })
+        Ok((samples, refinement_losses))
     }
 }
 

@@ -197,11 +197,11 @@ impl Task for Training<'_> {
             // Of the step, so that a resumed training repeats none.
             let mut rng = ChaCha8Rng::seed_from_u64(self.config.run.seed);
             rng.set_stream(trainer.steps());
-            let with_boxes = batch.with_boxes(&self.model, Some(&mut rng))?;
-            let head = self.model.detect_with_boxes(&with_boxes.samples)?;
+            let (samples, refinement) = batch.with_boxes(&self.model, Some(&mut rng))?;
+            let head = self.model.detect_with_boxes(&samples)?;
             let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
-            let refinement: Tensor = with_boxes.refinement_losses.iter().sum();
-            let vehicles = with_boxes.refinement_losses.len().max(1) as f64;
+            let vehicles = refinement.len().max(1) as f64;
+            let refinement: Tensor = refinement.iter().sum();
             let total = terms.total() + refinement / vehicles;
             self.terms = Some(terms);
             return Ok(total);

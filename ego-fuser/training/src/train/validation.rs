@@ -81,8 +81,8 @@ impl Validator {
             let batch = Batch::collate(vec![sample], model.network().pillar_grid())?;
             let head = no_grad(|| match with_boxes {
                 true => {
-                    let samples = batch.with_boxes(model, None::<&mut ChaCha8Rng>)?;
-                    Ok::<_, Error>(model.detect_with_boxes(&samples.samples)?)
+                    let (samples, _) = batch.with_boxes(model, None::<&mut ChaCha8Rng>)?;
+                    Ok::<_, Error>(model.detect_with_boxes(&samples)?)
                 }
                 false => Ok(batch.output(model, false)?.head),
             })?;

@@ -62,6 +62,7 @@ fn array(nanos: u64, frame_id: &str, found: impl ExactSizeIterator<Item = Found>
 }
 
 /// A box with its marker's properties.
+#[derive(Default)]
 pub(crate) struct Marked {
     /// Id; `None`: its index in the list.
     pub(crate) id: Option<i32>,
@@ -123,12 +124,7 @@ pub(crate) fn markers(
     rgb: [f32; 3],
     boxes: &[Marked],
 ) -> Vec<u8> {
-    let sweep = Marked {
-        id: Some(0),
-        box3d: Box3d::default(),
-        alpha: 0.0,
-        text: String::new(),
-    };
+    let sweep = Marked::default();
     cdr::message(|cdr| {
         cdr.write_sequence_length(boxes.len() + 1);
         marker(cdr, (frame_id, ns, nanos), (0, DELETE_ALL), rgb, &sweep);

@@ -26,13 +26,10 @@ impl Join {
         }
     }
 
-    fn found(&self) -> usize {
-        self.rows.iter().flatten().count()
-    }
-
     /// True if at least half of the clouds have a row.
     fn is_join(&self) -> bool {
-        2 * self.found() >= self.rows.len() && self.found() > 0
+        let found = self.rows.iter().flatten().count();
+        2 * found >= self.rows.len() && found > 0
     }
 }
 

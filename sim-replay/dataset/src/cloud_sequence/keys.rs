@@ -82,7 +82,9 @@ impl Keys {
         if numbered.iter().any(|name| name.around != around) {
             return None;
         }
-        if let Some(times) = numbered.iter().map(Numbered::stamp_nanos).collect() {
+        let stamps = numbered.iter();
+        let stamps = stamps.map(|name| stamp_nanos(name.seconds?, name.number));
+        if let Some(times) = stamps.collect() {
             return Some(Self::Times(times));
         }
         let words: Vec<&str> = numbered.iter().map(|name| name.number).collect();
@@ -234,11 +236,6 @@ impl<'a> Numbered<'a> {
             number,
             seconds: stamp.map(|(_, seconds)| seconds),
         })
-    }
-
-    /// Nanoseconds of a name with seconds and nanoseconds.
-    fn stamp_nanos(&self) -> Option<u64> {
-        stamp_nanos(self.seconds?, self.number)
     }
 }
 

@@ -13,8 +13,6 @@ use protocol::rotated_iou::Polygon;
 
 /// Most boxes of a file.
 const MAX_BOXES: usize = 10_000;
-/// Largest edge of a box, metres.
-const MAX_SIZE_M: f64 = 200.0;
 /// Largest deviation of the angles of a box's corners from 90 degrees, as a cosine.
 const MAX_SKEW: f64 = 0.1;
 /// Ids of a list are `block + number`. Blocks are farther apart than any number.
@@ -25,6 +23,9 @@ const SAME_OBJECT_IOU: f64 = 0.05;
 
 /// Valid objects, and the faults of the others.
 pub(super) type Objects = (Vec<Object>, Vec<Problem>);
+
+/// Id, pose in the world and size of a labelled box.
+type LabelledBox = (i64, Pose, [f64; 3]);
 
 /// Source of a list. The lists number their objects independently, so each has its own range of ids.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,17 +45,8 @@ impl Block {
 /// and does not identify the object at another tick.
 pub(super) fn in_world(path: &Path) -> Result<Objects> {
     read(path, |number, label| {
-        let Some((world_from_object, size_m)) = from_corners(&label.required("world_8_points")?)?
-        else {
-            return Ok(None);
-        };
-        Ok(Some(Object {
-            id: Block::Cooperative.id(number),
-            class: class(label)?,
-            world_from_object,
-            size_m,
-            speed_mps: None,
-        }))
+        let found = from_corners(&label.required("world_8_points")?)?;
+        Ok(found.map(|(pose, size_m)| (Block::Cooperative.id(number), pose, size_m)))
     })
 }
 
@@ -82,19 +74,13 @@ pub(super) fn in_frame(
         let track = track.and_then(|track| i64::try_from(track.count().ok()?).ok());
         // A larger track id would reach into the ids of another list.
         let number = track.filter(|track| *track < BLOCK).unwrap_or(number);
-        Ok(Some(Object {
-            id: block.id(number),
-            class: class(label)?,
-            world_from_object,
-            size_m,
-            speed_mps: None,
-        }))
+        Ok(Some((block.id(number), world_from_object, size_m)))
     })
 }
 
 fn read(
     path: &Path,
-    object: impl Fn(i64, &Field<'_>) -> Result<Option<Object>>,
+    labelled: impl Fn(i64, &Field<'_>) -> Result<Option<LabelledBox>>,
 ) -> Result<Objects> {
     let value = json::read(path)?;
     let labels = Field::root(path, &value);
@@ -105,16 +91,21 @@ fn read(
     }
     let (mut objects, mut problems) = (Vec::with_capacity(labels.len()), Vec::new());
     for (number, label) in (0..).zip(labels) {
-        match object(number, &label) {
-            Ok(Some(object)) => {
-                let kind = label.required("type").and_then(|kind| kind.text());
-                problems.extend(
-                    kind.ok()
-                        .and_then(|kind| classes::unknown_label(path, kind)),
-                );
-                objects.push(object);
+        let Some(found) = labelled(number, &label).transpose() else {
+            continue;
+        };
+        match found.and_then(|found| Ok((found, label.required("type")?.text()?))) {
+            Ok(((id, world_from_object, size_m), kind)) => {
+                problems.extend(classes::unknown_label(path, kind));
+                objects.push(Object {
+                    id,
+                    // An object of unknown type is not a vehicle.
+                    class: classes::of_name(kind).unwrap_or(ObjectClass::Other),
+                    world_from_object,
+                    size_m,
+                    speed_mps: None,
+                });
             }
-            Ok(None) => {}
             Err(error) => problems.push(Problem::from(
                 &error.with_consequence("the object is left out"),
             )),
@@ -123,32 +114,18 @@ fn read(
     Ok((objects, problems))
 }
 
-/// An object of unknown type is not a vehicle.
-fn class(label: &Field<'_>) -> Result<ObjectClass> {
-    Ok(classes::of_name(label.required("type")?.text()?).unwrap_or(ObjectClass::Other))
-}
-
 /// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
 fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>> {
     let size_m = numbers_of(dimensions, ["l", "w", "h"])?;
     if size_m.contains(&0.0) {
         return Ok(None);
     }
-    check_size(dimensions, size_m).map(Some)
+    dimensions.checked_size(size_m).map(Some)
 }
 
 fn numbers_of(field: &Field<'_>, keys: [&str; 3]) -> Result<[f64; 3]> {
     let [first, second, third] = keys.map(|key| field.required(key)?.number());
     Ok([first?, second?, third?])
-}
-
-fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3]> {
-    if size_m.iter().all(|size| *size > 0.0 && *size <= MAX_SIZE_M) {
-        return Ok(size_m);
-    }
-    Err(field.error(format!(
-        "{size_m:?} are no sizes in metres, expected up to {MAX_SIZE_M}"
-    )))
 }
 
 /// Pose and size of a box from its corners: four of the bottom, in order around it from the front, then those above
@@ -172,7 +149,7 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>> {
     if size_m.contains(&0.0) {
         return Ok(None);
     }
-    let size_m = check_size(field, size_m)?;
+    let size_m = field.checked_size(size_m)?;
     let skew = [(ahead, aside), (aside, above), (above, ahead)]
         .map(|(a, b)| (a.normalize().dot(&b.normalize())).abs());
     if !skew.iter().all(|cosine| *cosine <= MAX_SKEW) {

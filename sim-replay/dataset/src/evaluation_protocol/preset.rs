@@ -28,28 +28,30 @@ pub const PRESETS: [(&str, &str); 14] = [
     ("mars", "Open MARS, multi-agent subset"),
 ];
 
-/// The preset of that name.
-pub(super) fn preset(name: &str) -> Option<EvaluationProtocol> {
-    let known = PRESETS.iter().any(|(known, _)| *known == name);
-    known.then(|| {
-        let (agents, ego) = match name {
-            "v2xreal-v2v" | "v2xsim" => (AgentKinds::Vehicles, EgoKind::Vehicle),
-            "v2xreal-i2i" | "rcooper" => (AgentKinds::Units, EgoKind::Unit),
-            _ => (AgentKinds::All, EgoKind::Vehicle),
-        };
-        EvaluationProtocol {
-            name: name.to_owned(),
-            ground_truth: rule(name),
-            exact_range: false,
-            agents,
-            ego,
-            max_agents: max_agents(name),
-            ap_order: match name {
-                "v2v4real" => ApOrder::Frame,
-                _ => ApOrder::Global,
-            },
-        }
-    })
+impl EvaluationProtocol {
+    /// The preset of that name.
+    pub fn preset(name: &str) -> Option<Self> {
+        let known = PRESETS.iter().any(|(known, _)| *known == name);
+        known.then(|| {
+            let (agents, ego) = match name {
+                "v2xreal-v2v" | "v2xsim" => (AgentKinds::Vehicles, EgoKind::Vehicle),
+                "v2xreal-i2i" | "rcooper" => (AgentKinds::Units, EgoKind::Unit),
+                _ => (AgentKinds::All, EgoKind::Vehicle),
+            };
+            Self {
+                name: name.to_owned(),
+                ground_truth: rule(name),
+                exact_range: false,
+                agents,
+                ego,
+                max_agents: max_agents(name),
+                ap_order: match name {
+                    "v2v4real" => ApOrder::Frame,
+                    _ => ApOrder::Global,
+                },
+            }
+        })
+    }
 }
 
 fn rule(name: &str) -> GroundTruthRule {

@@ -6,7 +6,7 @@ mod boxes;
 mod cells;
 mod sweeps;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use protocol::{CavId, Pose};
 use rayon::prelude::*;
@@ -84,9 +84,10 @@ pub fn of_scenario(
             .filter_map(|(_, one)| one.sweep.as_ref())
             .collect();
         let first = frames.iter().find(|(_, one)| one.sweep.is_some());
-        let folder = first.map(|(tick, _)| sweep_folder(scenario, agent, *tick));
-        let (folder, named) = (folder.unwrap_or_default(), format!(" of agent {id}"));
-        problems.extend(sweeps::problems(&folder, &named, &sweeps, scale));
+        let path = first.and_then(|(tick, _)| scenario.points_path(agent, *tick, None).ok());
+        let (path, named) = (path.unwrap_or_default(), format!(" of agent {id}"));
+        let folder = path.parent().unwrap_or(&path);
+        problems.extend(sweeps::problems(folder, &named, &sweeps, scale));
     }
     problems.extend(overlap::pose_problems(scenario));
     problems
@@ -95,11 +96,6 @@ pub fn of_scenario(
 /// Findings of single clouds of a folder together.
 pub fn of_clouds(folder: &Path, sweeps: &[&SweepFindings], scale: IntensityScale) -> Vec<Problem> {
     sweeps::problems(folder, "", sweeps, scale)
-}
-
-fn sweep_folder(scenario: &Scenario, agent: usize, tick: usize) -> PathBuf {
-    let path = scenario.points_path(agent, tick, None).unwrap_or_default();
-    path.parent().map(PathBuf::from).unwrap_or(path)
 }
 
 /// The finding that frames with objects have no pose.

@@ -11,8 +11,6 @@ use crate::frame::{Object, ObjectClass};
 use crate::json::Field;
 use crate::{ReadError, Result, classes};
 
-/// Largest edge of a box, metres.
-const MAX_SIZE_M: f64 = 200.0;
 /// Largest distance of a point outside a box that counts as a hit, metres: the margin of the public converter of
 /// V2X-Sim.
 const HIT_MARGIN_M: f64 = 0.2;
@@ -89,14 +87,8 @@ fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Obje
         .get(&token.id()?)
         .ok_or_else(|| token.error("no row of instance.json has this token"))?;
     let size = row.required("size")?;
-    let edges = size.numbers::<3>()?;
-    if !edges.iter().all(|edge| *edge > 0.0 && *edge <= MAX_SIZE_M) {
-        return Err(size.error(format!(
-            "{edges:?} are no sizes in metres, expected up to {MAX_SIZE_M}"
-        )));
-    }
     // nuScenes has the width first. Sizes here begin with the length.
-    let [width, length, height] = edges;
+    let [width, length, height] = size.checked_size(size.numbers()?)?;
     let world_from_object: Pose = transform(row)?.into();
     Ok(Object {
         id: *id,

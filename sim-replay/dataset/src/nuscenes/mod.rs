@@ -145,16 +145,6 @@ struct Builder<'a> {
     name: String,
 }
 
-/// Ticks and contents of a scenario.
-#[derive(Default)]
-struct Parts {
-    /// Capture times of any agent.
-    moments: Vec<Tick>,
-    missing: Vec<MissingFrame>,
-    /// Contents by stem.
-    contents: HashMap<String, Moment>,
-}
-
 impl Builder<'_> {
     /// The scenario of a scene; nothing if no vehicle has a sweep.
     fn build(
@@ -173,7 +163,7 @@ impl Builder<'_> {
             return Ok(None);
         }
         let capture_nanos = self.capture_times(&samples, options, problems);
-        let mut scenario = Parts::default();
+        let (mut moments, mut missing, mut contents) = (Vec::new(), Vec::new(), HashMap::new());
         for ((sample, objects), capture_nanos) in samples.into_iter().zip(capture_nanos) {
             let mut channels = agents.iter().map(|(_, channel)| channel);
             // The first sweep in the order of the agents gives the name: the ego may lack one.
@@ -194,22 +184,24 @@ impl Builder<'_> {
                     }
                     None => {}
                 }
-                scenario.missing.push(MissingFrame::new(agent, &tick.stem));
+                missing.push(MissingFrame::new(agent, &tick.stem));
             }
-            let moment = Moment { sweeps, objects };
-            scenario.contents.insert(tick.stem.clone(), moment);
-            scenario.moments.push(tick);
+            contents.insert(tick.stem.clone(), Moment { sweeps, objects });
+            moments.push(tick);
         }
-        let agents: Vec<CavId> = agents.into_iter().map(|(agent, _)| agent).collect();
-        Ok(Some(self.scenario(agents, scenario, options)))
+        let agents = agents.into_iter().map(|(agent, _)| agent).collect();
+        let scenario = self.scenario(agents, &moments, contents, options);
+        Ok(Some(scenario.among(moments, missing)))
     }
 
-    fn scenario(self, agents: Vec<CavId>, parts: Parts, options: &OpenOptions) -> Scenario {
-        let Parts {
-            moments,
-            missing,
-            contents,
-        } = parts;
+    /// The scenario without its ticks, from the contents of `moments` by their stems.
+    fn scenario(
+        self,
+        agents: Vec<CavId>,
+        moments: &[Tick],
+        contents: HashMap<String, Moment>,
+        options: &OpenOptions,
+    ) -> Scenario {
         let units = agents.iter();
         let units = units.filter(|agent| rig::is_roadside_unit(self.layout, agent.as_str()));
         let roadside_units = units.cloned().collect();
@@ -232,7 +224,6 @@ impl Builder<'_> {
             roadside_units,
             ..Scenario::new(self.name, self.layout, agents, Vec::new(), source)
         }
-        .among(moments, missing)
     }
 
     /// Agents with the channels of their LiDARs, ego first: vehicles in the order of the data set or of their names, a

@@ -1,8 +1,9 @@
 //! Points as lines of decimal numbers.
 
-use super::header::{Header, IntensitySource, Kind};
+use super::header::{Header, IntensitySource};
 use super::number::{is_separator, ordinary, unusual};
 use super::{PcdCloud, PcdError, Place, unpack_rgb};
+use crate::scalar::ScalarKind;
 
 /// Use of the numbers of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -218,7 +219,7 @@ fn columns(header: &Header) -> Vec<Column> {
     let fields = header.fields.iter().enumerate();
     let columns = fields.map(|(index, field)| match header.intensity {
         IntensitySource::Value(intensity) if intensity == index => Column::Component(3),
-        IntensitySource::Red(colour) if colour == index && field.kind == Kind::Float => {
+        IntensitySource::Red(colour) if colour == index && field.kind == ScalarKind::Float => {
             Column::FloatColour
         }
         IntensitySource::Red(colour) if colour == index => Column::IntegerColour,

@@ -4,8 +4,9 @@
 //! least", except for the unpacked one, which determines the positions of fields.
 
 use super::MAX_BYTES;
-use super::header::{Field, Header, IntensitySource, Kind};
+use super::header::{Field, Header, IntensitySource};
 use super::{PcdCloud, PcdError, lzf, unpack_rgb};
+use crate::scalar::ScalarKind;
 
 /// Position of a field's numbers: that of point `i` at `first + i * step`.
 #[derive(Debug, Clone, Copy)]
@@ -128,19 +129,19 @@ impl Column<'_> {
             };
         }
         match (self.field.kind, self.field.size) {
-            (Kind::Float, 4) => self.each(data, points, |point, bytes| {
+            (ScalarKind::Float, 4) => self.each(data, points, |point, bytes| {
                 point[component] = f32::from_le_bytes(bytes)
             }),
-            (Kind::Float, _) => numbers!(f64),
-            (Kind::Unsigned, 1) => numbers!(u8),
-            (Kind::Unsigned, 2) => numbers!(u16),
-            (Kind::Unsigned, 4) => numbers!(u32),
-            (Kind::Signed, 1) => numbers!(i8),
-            (Kind::Signed, 2) => numbers!(i16),
-            (Kind::Signed, 4) => numbers!(i32),
-            (Kind::Signed, _) => numbers!(i64),
+            (ScalarKind::Float, _) => numbers!(f64),
+            (ScalarKind::Unsigned, 1) => numbers!(u8),
+            (ScalarKind::Unsigned, 2) => numbers!(u16),
+            (ScalarKind::Unsigned, 4) => numbers!(u32),
+            (ScalarKind::Signed, 1) => numbers!(i8),
+            (ScalarKind::Signed, 2) => numbers!(i16),
+            (ScalarKind::Signed, 4) => numbers!(i32),
+            (ScalarKind::Signed, _) => numbers!(i64),
             // The header accepts no other type.
-            (Kind::Unsigned | Kind::Other, _) => numbers!(u64),
+            (ScalarKind::Unsigned | ScalarKind::Padding, _) => numbers!(u64),
         }
     }
 

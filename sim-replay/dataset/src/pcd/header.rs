@@ -11,6 +11,7 @@ use std::ops::RangeInclusive;
 use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS};
 
 use super::{IntensityKind, PcdError};
+use crate::scalar::{Scalar, ScalarKind};
 
 const MAX_FIELDS: usize = 64;
 /// Longest header line that is read, bytes.
@@ -42,24 +43,12 @@ impl Data {
     }
 }
 
-/// Type of one number of a field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
-    /// `TYPE F`, 4 or 8 bytes.
-    Float,
-    /// `TYPE I`, 1, 2, 4 or 8 bytes.
-    Signed,
-    /// `TYPE U`, 1, 2, 4 or 8 bytes.
-    Unsigned,
-    /// Any other type: accepted only for fields that are not read.
-    Other,
-}
-
 /// One field of a point.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Field {
     pub(super) name: String,
-    pub(super) kind: Kind,
+    /// `TYPE` F, I or U; any other is padding, accepted only for fields that are not read.
+    pub(super) kind: ScalarKind,
     /// Bytes of one number.
     pub(super) size: usize,
     /// Numbers per point; PCL's padding may have none.
@@ -182,11 +171,8 @@ impl Header {
             }
             IntensitySource::Value(index) => {
                 let field = self.fields.get(index)?;
-                let kind = match (field.kind, field.size) {
-                    (Kind::Unsigned, 1) => IntensityKind::Byte,
-                    _ => IntensityKind::Number,
-                };
-                Some((&field.name, kind))
+                let stored = Scalar::new(field.kind, field.size, false);
+                Some((&field.name, stored.intensity_kind()))
             }
             IntensitySource::None => None,
         }
@@ -208,7 +194,7 @@ impl Header {
             } = &self.fields[index];
             let (kinds, sizes) = (entries.get("TYPE")?, entries.get("SIZE")?);
             let allowed: &[usize] = match kind {
-                Kind::Other => {
+                ScalarKind::Padding => {
                     let reason = format!(
                         "{:?} of field {name}, expected F, I or U",
                         kinds.values[index]
@@ -217,8 +203,8 @@ impl Header {
                 }
                 // Ahead of the types: a packed colour has four bytes, as a float and as an integer.
                 _ if self.intensity == IntensitySource::Red(index) => &[4],
-                Kind::Float => &[4, 8],
-                Kind::Signed | Kind::Unsigned => &[1, 2, 4, 8],
+                ScalarKind::Float => &[4, 8],
+                ScalarKind::Signed | ScalarKind::Unsigned => &[1, 2, 4, 8],
             };
             if !allowed.contains(size) {
                 let reason = format!(
@@ -367,12 +353,12 @@ fn fault(line: u64, reason: impl Into<String>) -> PcdError {
     }
 }
 
-fn number_kind(kind: &str) -> Kind {
+fn number_kind(kind: &str) -> ScalarKind {
     match kind {
-        "F" | "f" => Kind::Float,
-        "I" | "i" => Kind::Signed,
-        "U" | "u" => Kind::Unsigned,
-        _ => Kind::Other,
+        "F" | "f" => ScalarKind::Float,
+        "I" | "i" => ScalarKind::Signed,
+        "U" | "u" => ScalarKind::Unsigned,
+        _ => ScalarKind::Padding,
     }
 }
 

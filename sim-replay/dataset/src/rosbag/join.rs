@@ -1,6 +1,7 @@
 //! Join of sweeps and poses of a bag by the stamps of their headers.
 
 use std::cmp::Reverse;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use nalgebra::Isometry3;
@@ -19,8 +20,8 @@ const SAME_COUNT: f64 = 0.95;
 /// The sweeps of a bag with their poses.
 #[derive(Debug)]
 pub(super) struct Joined {
-    /// In order of their stamps.
-    pub(super) sweeps: Vec<JoinedSweep>,
+    /// By the stamps of their headers.
+    pub(super) sweeps: BTreeMap<u64, JoinedSweep>,
     /// Topics that were chosen, and those that were not.
     pub(super) text: String,
 }
@@ -139,10 +140,14 @@ impl Attempt {
         };
         let joined = sweeps.sweeps.iter().zip(poses);
         let joined = joined.filter(|(_, pose)| pose.is_some() || chosen.is_none());
-        let joined = joined.map(|(sweep, world_from_lidar)| JoinedSweep {
-            nanos: sweep.nanos,
-            place: sweep.place,
-            world_from_lidar,
+        let joined = joined.map(|(sweep, world_from_lidar)| {
+            let (nanos, place) = (sweep.nanos, sweep.place);
+            let sweep = JoinedSweep {
+                nanos,
+                place,
+                world_from_lidar,
+            };
+            (nanos, sweep)
         });
         let sweeps = joined.collect();
         Joined { sweeps, text }

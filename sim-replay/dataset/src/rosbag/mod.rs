@@ -80,19 +80,13 @@ fn open(
     let storage = Storage::open(&files, &mut contents, problems)?;
     contents.finish(problems);
     let joined = join(path, &contents, problems)?;
-    let sweeps: BTreeMap<u64, JoinedSweep> = joined
-        .sweeps
-        .into_iter()
-        .map(|sweep| (sweep.nanos, sweep))
-        .collect();
-    let ticks = sweeps
-        .keys()
-        .map(|nanos| Tick::new(nanos.to_string(), *nanos));
+    let stamps = joined.sweeps.keys();
+    let ticks = stamps.map(|nanos| Tick::new(nanos.to_string(), *nanos));
     let ticks = ticks.collect();
     let source = Bag {
         storage,
         description: files::description(path),
-        sweeps,
+        sweeps: joined.sweeps,
         scale: options.intensity_scale,
         divisor: OnceLock::new(),
     };

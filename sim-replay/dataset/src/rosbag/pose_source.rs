@@ -8,7 +8,7 @@ use nalgebra::Isometry3;
 
 use super::contents::{Contents, PoseStamp};
 use super::sweeps::{SweepTopic, most_frequent};
-use super::transforms::{Route, Transforms, is_map};
+use super::transforms::{Motion, Route, Transforms, is_map};
 use crate::ReadError;
 use crate::trajectory::{NoPose, Trajectory};
 
@@ -122,7 +122,7 @@ impl PoseSources {
             }
         }
         for ((parent, child), pose) in last {
-            self.transforms.add_fixed(parent, child, pose);
+            self.transforms.add(parent, child, Motion::Fixed(pose));
         }
     }
 
@@ -138,8 +138,8 @@ impl PoseSources {
         }
         for ((parent, child), poses) in by_frames {
             let name = format!("transforms of {child} in {parent}");
-            let trajectory = self.trajectory(path, &name, &poses, sweeps);
-            self.transforms.add_moving(parent, child, trajectory);
+            let motion = Motion::Moving(self.trajectory(path, &name, &poses, sweeps));
+            self.transforms.add(parent, child, motion);
         }
     }
 

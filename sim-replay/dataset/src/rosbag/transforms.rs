@@ -22,8 +22,9 @@ struct Edge {
     motion: Motion,
 }
 
+/// A transform over time.
 #[derive(Debug)]
-enum Motion {
+pub(super) enum Motion {
     /// `parent_from_child`.
     Fixed(Isometry3<f64>),
     Moving(Trajectory),
@@ -41,15 +42,7 @@ struct Step {
 }
 
 impl Transforms {
-    pub(super) fn add_fixed(&mut self, parent: &str, child: &str, pose: Isometry3<f64>) {
-        self.add(parent, child, Motion::Fixed(pose));
-    }
-
-    pub(super) fn add_moving(&mut self, parent: &str, child: &str, poses: Trajectory) {
-        self.add(parent, child, Motion::Moving(poses));
-    }
-
-    fn add(&mut self, parent: &str, child: &str, motion: Motion) {
+    pub(super) fn add(&mut self, parent: &str, child: &str, motion: Motion) {
         self.edges.push(Edge {
             parent: parent.to_owned(),
             child: child.to_owned(),
@@ -182,11 +175,11 @@ mod tests {
 
     fn robot() -> Transforms {
         let mut transforms = Transforms::default();
-        transforms.add_fixed("base_link", "mast", moved(1.0));
-        transforms.add_fixed("mast", "lidar", moved(0.5));
-        transforms.add_moving("odom", "base_link", moving(20.0));
-        transforms.add_moving("map", "odom", moving(2.0));
-        transforms.add_moving("base_link", "wheel", moving(9.0));
+        transforms.add("base_link", "mast", Motion::Fixed(moved(1.0)));
+        transforms.add("mast", "lidar", Motion::Fixed(moved(0.5)));
+        transforms.add("odom", "base_link", Motion::Moving(moving(20.0)));
+        transforms.add("map", "odom", Motion::Moving(moving(2.0)));
+        transforms.add("base_link", "wheel", Motion::Moving(moving(9.0)));
         transforms
     }
 
@@ -218,21 +211,21 @@ mod tests {
         };
         assert_eq!(names(&robot(), "lidar"), ["map", "odom"]);
         let mut fixed = Transforms::default();
-        fixed.add_fixed("map", "odom", moved(5.0));
-        fixed.add_moving("odom", "base_link", moving(1.0));
+        fixed.add("map", "odom", Motion::Fixed(moved(5.0)));
+        fixed.add("odom", "base_link", Motion::Moving(moving(1.0)));
         assert_eq!(
             names(&fixed, "base_link"),
             ["odom"],
             "the map is odometry by another name"
         );
         let mut head = Transforms::default();
-        head.add_moving("base_link", "head", moving(1.0));
+        head.add("base_link", "head", Motion::Moving(moving(1.0)));
         assert!(
             names(&head, "head").is_empty(),
             "a robot does not move in its own body"
         );
         let mut other = Transforms::default();
-        other.add_moving("camera_init", "body", moving(1.0));
+        other.add("camera_init", "body", Motion::Moving(moving(1.0)));
         assert_eq!(names(&other, "body"), ["camera_init"]);
         assert!(is_map("robot1/map") && !is_map("odom"));
     }

@@ -1,38 +1,14 @@
 //! A YAML node with its position: typed access for readers, with errors that give file, line and field.
 
-use std::path::Path;
-
 use super::{Node, Value};
-use crate::json::child_name;
 use crate::numpy_tags::{self, NumpyArray};
 use crate::{ReadError, Result};
 
-/// A node with its position in the document; readers take values from it.
-///
-/// NumPy's pickled arrays and scalars are read in place of any number ([`numpy_tags`]).
-#[derive(Debug, Clone)]
-pub(crate) struct Field<'a> {
-    path: &'a Path,
-    /// Dotted names from the root, for example `vehicles.4335.extent`.
-    name: String,
-    pub(crate) node: &'a Node,
-}
+/// A node with its position in the document. NumPy's pickled arrays and scalars are read in place of any number
+/// ([`numpy_tags`]).
+pub(crate) type Field<'a> = crate::field::Field<'a, Node>;
 
 impl<'a> Field<'a> {
-    /// The whole document.
-    pub(crate) fn root(path: &'a Path, node: &'a Node) -> Self {
-        Self {
-            path,
-            name: String::new(),
-            node,
-        }
-    }
-
-    /// The file of the node.
-    pub(crate) fn path(&self) -> &'a Path {
-        self.path
-    }
-
     /// Kind and content in few words, for messages.
     pub(crate) fn found(&self) -> String {
         self.node.value.kind()
@@ -40,21 +16,12 @@ impl<'a> Field<'a> {
 
     /// An error about this field.
     pub(crate) fn error(&self, reason: impl Into<String>) -> ReadError {
-        let field = Some(self.name.as_str()).filter(|name| !name.is_empty());
-        ReadError::malformed_at(self.path, Some(self.node.line), field, reason)
+        ReadError::malformed_at(self.path, Some(self.node.line), self.place(), reason)
     }
 
     /// An error with the found and the expected value.
     pub(crate) fn expected(&self, what: &str) -> ReadError {
         self.error(format!("{}, expected {what}", self.found()))
-    }
-
-    fn child(&self, key: &str, node: &'a Node) -> Self {
-        Self {
-            path: self.path,
-            name: child_name(&self.name, key),
-            node,
-        }
     }
 
     /// The entries of a map.

@@ -10,7 +10,7 @@ use super::*;
 fn rewritten(recording: &Recording, options: WriteOptions) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     let mut writer = options.create(&mut bytes).unwrap();
-    for messages in recording.all() {
+    for messages in recording.file.all() {
         messages
             .unwrap()
             .iter()

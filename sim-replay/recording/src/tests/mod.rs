@@ -154,7 +154,7 @@ fn recorded(ticks: u64, points: usize, options: RecordingOptions) -> Vec<u8> {
 /// Every message of every channel: topic, encoding, data.
 fn messages_of(recording: &Recording) -> Vec<(String, String, Vec<u8>)> {
     let mut messages = Vec::new();
-    for held in recording.all() {
+    for held in recording.file.all() {
         for message in held.unwrap().iter() {
             let channel = &message.channel;
             messages.push((

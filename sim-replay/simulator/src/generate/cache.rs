@@ -5,8 +5,8 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::data_protocol::FILE_NAME;
 use super::error::SynthError;
+use super::layout::PROTOCOL_FILE;
 use super::layout::{SceneLayout, remove_folder};
 use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
@@ -18,7 +18,7 @@ use support::{atomic_file, bounded_file};
 /// Longer files were not written by this program, bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// Settings recorded in [`FILE_NAME`].
+/// Settings recorded in [`PROTOCOL_FILE`].
 #[derive(Debug, Deserialize)]
 struct MadeWith {
     generator: Generator,
@@ -147,7 +147,7 @@ fn read(folder: &Path) -> Result<Vec<Generator>> {
         if !scenario.is_dir() {
             continue;
         }
-        let file = scenario.join(FILE_NAME);
+        let file = scenario.join(PROTOCOL_FILE);
         let text = bounded_file::read_text(&file, MAX_FILE_BYTES).map_err(|error| {
             let problem = format!("{error}; generated scenes record their settings in this file");
             FileError::new(&file, problem)

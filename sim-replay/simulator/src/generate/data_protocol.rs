@@ -6,9 +6,6 @@ use super::recording::SceneSpec;
 use super::traffic::STEP_S;
 use crate::map::{Finding, MapModel};
 
-/// Name of the file, in the folder of its scenario.
-pub(super) const FILE_NAME: &str = "data_protocol.yaml";
-
 /// The text of the file for a converted scene: source layout and name of the scenario there.
 pub(crate) fn converted_yaml(from: &str, scenario: &str, tick_nanos: u64) -> String {
     let (version, tick_s) = (env!("CARGO_PKG_VERSION"), tick_nanos as f64 / 1e9);

@@ -139,20 +139,15 @@ fn measure(
     weather: Weather,
     random: &mut SplitMix64,
 ) -> Option<(f32, f32, u32)> {
-    let (range_m, intensity, hit) = match weather {
-        Weather::Sunny if hit == MISS => return None,
-        Weather::Sunny => (depth_m, (-ATTENUATION_PER_M * depth_m).exp(), hit),
-        _ => {
-            let reflectivity = match hit {
-                MISS | GROUND => GROUND_REFLECTIVITY,
-                body => bodies[body as usize].shape.reflectivity,
-            };
-            match weather.echo((hit != MISS).then_some(depth_m), reflectivity, random) {
-                Echo::Target(kept) => (depth_m, kept * (-ATTENUATION_PER_M * depth_m).exp(), hit),
-                Echo::Backscatter(range_m, intensity) => (range_m, intensity, MISS),
-                Echo::Lost => return None,
-            }
-        }
+    let reflectivity = match hit {
+        MISS | GROUND => GROUND_REFLECTIVITY,
+        body => bodies[body as usize].shape.reflectivity,
+    };
+    let target_m = (hit != MISS).then_some(depth_m);
+    let (range_m, intensity, hit) = match weather.echo(target_m, reflectivity, random) {
+        Echo::Target(kept) => (depth_m, kept * (-ATTENUATION_PER_M * depth_m).exp(), hit),
+        Echo::Backscatter(range_m, intensity) => (range_m, intensity, MISS),
+        Echo::Lost => return None,
     };
     // One draw decides both losses: they are independent, so their survival shares multiply.
     let faint = (1.0 - intensity / DROP_BELOW_INTENSITY).max(0.0) * DROP_AT_ZERO;

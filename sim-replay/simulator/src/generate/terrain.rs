@@ -105,7 +105,6 @@ impl TerrainSurface {
     /// Distance at which a ray meets the ground between two distances.
     fn meet(&self, ray: &GridRay, from_m: f64, limit_m: f64) -> Option<f64> {
         let mut cell = ray.place(from_m).map(|place| place.floor() as i64);
-        let forward = ray.slope.map(|slope| slope > 0.0);
         let inverse = ray.slope.map(|slope| 1.0 / slope);
         // The ray visits cell after cell; the nearer border gives the next one.
         let mut leaves = [0, 1].map(|axis| ray.leave(axis, cell[axis], inverse[axis]));
@@ -123,7 +122,7 @@ impl TerrainSurface {
             if exit >= limit_m {
                 return None;
             }
-            cell[axis] += if forward[axis] { 1 } else { -1 };
+            cell[axis] += if ray.slope[axis] > 0.0 { 1 } else { -1 };
             leaves[axis] = ray.leave(axis, cell[axis], inverse[axis]);
             at = exit;
         }
@@ -131,8 +130,11 @@ impl TerrainSurface {
 
     /// Between two distances inside one cell; on each of its two triangles the height above ground is linear.
     fn meet_in_cell(&self, ray: &GridRay, cell: [i64; 2], from: f64, to: f64) -> Option<f64> {
-        let [low, right, left, high] =
-            [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(u, v)| self.node_m(cell[0] + u, cell[1] + v));
+        let [low, right, left, high] = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(u, v)| {
+            // Beyond the edge the height of the edge holds. The grid clamps the upper end itself.
+            let [column, row] = [cell[0] + u, cell[1] + v].map(|place: i64| place.max(0) as usize);
+            self.grid.node_m(column, row)
+        });
         let [u, v] = ray.within(cell, from);
         // The diagonal of a cell separates its two triangles.
         let diagonal = from + (v - u) / off_zero(ray.slope[0] - ray.slope[1]);
@@ -163,12 +165,6 @@ impl TerrainSurface {
                 }
             })
         })
-    }
-
-    fn node_m(&self, column: i64, row: i64) -> f64 {
-        self.grid
-            // Beyond the edge the height of the edge holds. The grid clamps the upper end itself.
-            .node_m(column.max(0) as usize, row.max(0) as usize)
     }
 }
 

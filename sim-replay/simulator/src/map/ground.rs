@@ -66,6 +66,15 @@ impl HeightGrid {
         )
     }
 
+    /// World x and y of the node in `column` and `row`, metres.
+    pub(crate) fn place_m(&self, column: usize, row: usize) -> [f64; 2] {
+        let [x, y] = self.origin_m;
+        [
+            x + column as f64 * self.cell_m,
+            y + row as f64 * self.cell_m,
+        ]
+    }
+
     /// Height of the surface at `x`, `y`, metres.
     pub fn height_m(&self, x: f64, y: f64) -> f64 {
         let column = ((x - self.origin_m[0]) / self.cell_m).clamp(0.0, (self.columns - 1) as f64);

@@ -61,16 +61,16 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     }
     let from = section.s_m.min(road.length_m);
     let to = road.section_end_m(origin.section);
-    let line = center_line(road, origin, from, to)?;
+    let mut lane = center_line(road, origin, from, to)?;
+    lane.id = id;
     let own_mps = source.speed_limit_mps;
     let limit_mps = own_mps.or_else(|| road.speed_limit_mps((from + to) / 2.0));
-    let limit = limit_mps.unwrap_or(DEFAULT_LIMIT_MPS);
-    let mut sorted = line.widths_m.clone();
+    lane.speed_limit_mps = limit_mps.unwrap_or(DEFAULT_LIMIT_MPS);
+    let mut sorted = lane.widths_m.clone();
     sorted.sort_unstable_by(f64::total_cmp);
-    let mut lane = Lane::new(id, line.points, sorted[sorted.len() / 2], limit);
-    (lane.widths_m, lane.length_m) = (line.widths_m, line.length_m);
-    if !road.lateral.is_level() {
-        lane.banks_rad = line.banks_rad;
+    lane.width_m = sorted[sorted.len() / 2];
+    if road.lateral.is_level() {
+        lane.banks_rad = Vec::new();
     }
     lane.junction = road.junction.map(|junction| JunctionId(junction as u32));
     lane.in_junction = road.junction.is_some();
@@ -85,20 +85,9 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     Some(lane)
 }
 
-/// A lane's middle in driving direction.
-#[derive(Default)]
-struct CenterLine {
-    /// Even points, metres.
-    points: Vec<[f64; 3]>,
-    /// Width at each.
-    widths_m: Vec<f64>,
-    /// Slope across at each.
-    banks_rad: Vec<f64>,
-    length_m: f64,
-}
-
-/// The middle of a lane; `None` for a lane of no or of absurd length.
-fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<CenterLine> {
+/// The middle of a lane in driving direction, with widths, slopes across and length; `None` for a lane of no or of
+/// absurd length.
+fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<Lane> {
     let along = road.leads_along(origin.section, origin.lane);
     let fine = ((to - from) / FINE_STEP_M).ceil().max(1.0) as usize;
     let mut samples: Vec<([f64; 3], [f64; 2])> = (0..=fine)
@@ -126,9 +115,9 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<Center
         return None;
     }
     let steps = (total / STEP_M).round().max(1.0) as usize;
-    let mut line = CenterLine {
+    let mut line = Lane {
         length_m: total,
-        ..CenterLine::default()
+        ..Lane::default()
     };
     let mut place = 0;
     for i in 0..=steps {
@@ -139,7 +128,7 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<Center
         let share = ((wanted - lengths[place]) / (lengths[place + 1] - lengths[place]).max(1e-12))
             .clamp(0.0, 1.0);
         let ((a, [width_a, bank_a]), (b, [width_b, bank_b])) = (samples[place], samples[place + 1]);
-        line.points.push(std::array::from_fn(|axis| {
+        line.centerline.push(std::array::from_fn(|axis| {
             a[axis] + share * (b[axis] - a[axis])
         }));
         line.widths_m.push(width_a + share * (width_b - width_a));

@@ -1,6 +1,6 @@
 //! Lane queries: the nearest lane to a position.
 
-use super::convex::bounds;
+use super::convex::{CellIndex, bounds};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
 
 /// Edge of a cell of the index, metres.
@@ -20,48 +20,27 @@ pub(crate) struct LanePosition {
 /// A grid over the points of all centre lines, for the nearest lane in constant time.
 #[derive(Debug, Clone)]
 pub(crate) struct LaneIndex {
-    origin_m: [f64; 2],
-    columns: usize,
-    rows: usize,
-    /// First entry of each cell in `entries`, and the end of the last.
-    starts: Vec<u32>,
-    /// Lane and index of a point on its centre line, by cell.
-    entries: Vec<(LaneId, u32)>,
+    /// Lane of each point, and index of the point on its centre line.
+    points: Vec<(LaneId, usize)>,
+    cells: CellIndex,
 }
 
 impl LaneIndex {
     /// Indexes every centre line of `graph`.
     pub(crate) fn new(graph: &LaneGraph) -> Self {
         let points = graph.lanes.iter().flat_map(|lane| &lane.centerline);
-        let [low, high] = bounds(points.map(|&[x, y, _]| [x, y]));
-        let [columns, rows] =
-            [0, 1].map(|axis| ((high[axis] - low[axis]).max(0.0) / CELL_M) as usize + 1);
+        let extent_m = bounds(points.map(|&[x, y, _]| [x, y]));
         let mut index = Self {
-            origin_m: low,
-            columns,
-            rows,
-            starts: Vec::new(),
-            entries: Vec::new(),
+            points: Vec::new(),
+            cells: CellIndex::new(extent_m, CELL_M),
         };
-        let mut tagged: Vec<(usize, LaneId, u32)> = Vec::new();
-        for lane in &graph.lanes {
-            for (place, point) in lane.centerline.iter().enumerate() {
-                let [column, row] = index.cell(point[0], point[1]);
-                let cell = row as usize * index.columns + column as usize;
-                tagged.push((cell, lane.id, place as u32));
-            }
-        }
         // By lane and point within a cell, so that ties are decided the same way each time.
-        tagged.sort_unstable();
-        let mut filled = 0;
-        for cell in 0..=index.columns * index.rows {
-            while filled < tagged.len() && tagged[filled].0 < cell {
-                filled += 1;
+        for lane in &graph.lanes {
+            for (place, &[x, y, _]) in lane.centerline.iter().enumerate() {
+                index.cells.insert(index.points.len() as u32, [[x, y]; 2]);
+                index.points.push((lane.id, place));
             }
-            index.starts.push(filled as u32);
         }
-        let entries = tagged.into_iter().map(|(_, lane, place)| (lane, place));
-        index.entries = entries.collect();
         index
     }
 
@@ -76,46 +55,28 @@ impl LaneIndex {
         z_m: Option<f64>,
     ) -> Option<LanePosition> {
         let mut best: Option<(f64, LanePosition)> = None;
-        self.visit(x, y, radius_m, |id, place| {
+        let [low, high] = [-radius_m, radius_m].map(|reach_m| [x + reach_m, y + reach_m]);
+        self.cells.any([low, high], |number| {
+            let (id, place) = self.points[number as usize];
             let lane = graph.lane(id);
             if z_m.is_some_and(|z| (lane.centerline[place][2] - z).abs() > 3.0) {
-                return;
+                return false;
             }
             let position = project_near(lane, place, x, y);
             let (point, heading) = lane.at(position.s_m);
             if heading_rad
                 .is_some_and(|wanted| wrap_angle(wanted - heading).abs() > 60f64.to_radians())
             {
-                return;
+                return false;
             }
             let distance = (x - point[0]).hypot(y - point[1]);
             if distance <= radius_m && best.is_none_or(|(least, _)| distance < least) {
                 best = Some((distance, position));
             }
+            // False goes on to the next point: all of them are visited.
+            false
         });
         best.map(|(_, position)| position)
-    }
-
-    /// Calls `found` with each lane point in the cells within `radius_m` of `x`, `y`.
-    fn visit(&self, x: f64, y: f64, radius_m: f64, mut found: impl FnMut(LaneId, usize)) {
-        let low = self.cell(x - radius_m, y - radius_m);
-        let high = self.cell(x + radius_m, y + radius_m);
-        let [last_column, last_row] = [self.columns, self.rows].map(|count| count as i64 - 1);
-        // Wholly outside the grid the ranges are empty.
-        for row in low[1].max(0)..=high[1].min(last_row) {
-            for column in low[0].max(0)..=high[0].min(last_column) {
-                let cell = row as usize * self.columns + column as usize;
-                let [start, end] = [cell, cell + 1].map(|cell| self.starts[cell] as usize);
-                for &(lane, place) in &self.entries[start..end] {
-                    found(lane, place as usize);
-                }
-            }
-        }
-    }
-
-    fn cell(&self, x: f64, y: f64) -> [i64; 2] {
-        let [low_x, low_y] = self.origin_m;
-        [x - low_x, y - low_y].map(|metres| (metres / CELL_M).floor() as i64)
     }
 }
 

@@ -50,6 +50,11 @@ impl Profile {
         })
     }
 
+    /// Values at `count` + 1 even places from 0 to `length_m`.
+    pub(crate) fn samples(&self, length_m: f64, count: u32) -> impl Iterator<Item = f64> {
+        (0..=count).map(move |place| self.at(length_m * f64::from(place) / f64::from(count)))
+    }
+
     pub(crate) fn record_at(&self, s: f64) -> Option<(f64, [f64; 4])> {
         let after = self.records.partition_point(|&(start, _)| start <= s);
         self.records.get(after.saturating_sub(1)).copied()

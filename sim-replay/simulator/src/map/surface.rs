@@ -303,17 +303,12 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
         |kind| kind != LaneKind::Other && kind != LaneKind::Median,
     ];
     let [driving, carriageway, paved] = kinds.map(|wanted| {
-        let mut range: Option<[f64; 2]> = None;
-        for id in road.sections[section].lane_ids() {
-            let Some(lane) = road.sections[section].lane(id) else {
-                continue;
-            };
-            let [low, high] = road.lane_span_m(section, id, inside_m);
-            if wanted(lane.kind) && high > low {
-                range = Some(range.map_or([low, high], |[a, b]| [a.min(low), b.max(high)]));
-            }
-        }
-        range
+        let lanes = &road.sections[section];
+        let ids = lanes.lane_ids();
+        let ids = ids.filter(|&id| lanes.lane(id).is_some_and(|lane| wanted(lane.kind)));
+        let spans = ids.map(|id| road.lane_span_m(section, id, inside_m));
+        let wide = spans.filter(|[low, high]| high > low);
+        wide.reduce(|[a, b], [low, high]| [a.min(low), b.max(high)])
     });
     let carriageway_m = carriageway.or(driving).unwrap_or([origin; 2]);
     let paved_m = paved.unwrap_or(carriageway_m);

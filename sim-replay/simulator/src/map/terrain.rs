@@ -111,10 +111,7 @@ fn nodes_within(grid: &HeightGrid, quad: &Quad, reach_m: f64) -> Vec<(usize, [f6
     let mut nodes = Vec::new();
     for row in rows {
         for column in columns.clone() {
-            let node = [
-                grid.origin_m[0] + column as f64 * grid.cell_m,
-                grid.origin_m[1] + row as f64 * grid.cell_m,
-            ];
+            let node = grid.place_m(column, row);
             if overlap(&Rectangle::square(node, reach_m).corners(), quad) {
                 nodes.push((row * grid.columns + column, node));
             }
@@ -153,28 +150,19 @@ fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) 
     }
     let (half_columns, half_rows) = (columns.div_ceil(2), rows.div_ceil(2));
     let mut sums = vec![(0.0f32, 0u32); half_columns * half_rows];
-    for row in 0..rows {
-        for column in 0..columns {
-            let place = row * columns + column;
-            // Open nodes are still NaN here.
-            if fixed[place] {
-                let (sum, count) = &mut sums[row / 2 * half_columns + column / 2];
-                (*sum, *count) = (*sum + heights[place], *count + 1);
-            }
-        }
+    let half = |place: usize| place / columns / 2 * half_columns + place % columns / 2;
+    // Open nodes are still NaN here.
+    for place in (0..heights.len()).filter(|&place| fixed[place]) {
+        let (sum, count) = &mut sums[half(place)];
+        (*sum, *count) = (*sum + heights[place], *count + 1);
     }
     // The mean of no node is NaN: it stays open.
     let means = sums.iter().map(|&(sum, count)| sum / count as f32);
     let mut coarse: Vec<f32> = means.collect();
     let coarse_fixed: Vec<bool> = sums.iter().map(|&(_, count)| count > 0).collect();
     fill_level(&mut coarse, &coarse_fixed, half_columns, half_rows);
-    for row in 0..rows {
-        for column in 0..columns {
-            let place = row * columns + column;
-            if !fixed[place] {
-                heights[place] = coarse[row / 2 * half_columns + column / 2];
-            }
-        }
+    for place in (0..heights.len()).filter(|&place| !fixed[place]) {
+        heights[place] = coarse[half(place)];
     }
     for _ in 0..SMOOTHING {
         smooth(heights, fixed, columns, rows);
@@ -202,20 +190,14 @@ fn smooth(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) {
 /// Adds hills, the higher the farther from the roads.
 fn raise_hills(grid: &mut HeightGrid, fixed: &[bool], seed: u64) {
     let distances = distances(fixed, grid.columns, grid.rows);
-    for row in 0..grid.rows {
-        for column in 0..grid.columns {
-            let place = row * grid.columns + column;
-            let distance_m = f64::from(distances[place]) * grid.cell_m;
-            let share = ((distance_m - HILLS_FROM_M[0]) / (HILLS_FROM_M[1] - HILLS_FROM_M[0]))
-                .clamp(0.0, 1.0);
-            let (x, y) = (
-                grid.origin_m[0] + column as f64 * grid.cell_m,
-                grid.origin_m[1] + row as f64 * grid.cell_m,
-            );
-            // Smoothstep: hills begin and end without a kink.
-            grid.heights_m[place] +=
-                (share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed)) as f32;
-        }
+    for (place, &distance) in distances.iter().enumerate() {
+        let distance_m = f64::from(distance) * grid.cell_m;
+        let share =
+            ((distance_m - HILLS_FROM_M[0]) / (HILLS_FROM_M[1] - HILLS_FROM_M[0])).clamp(0.0, 1.0);
+        let [x, y] = grid.place_m(place % grid.columns, place / grid.columns);
+        // Smoothstep: hills begin and end without a kink.
+        let rise_m = share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed);
+        grid.heights_m[place] += rise_m as f32;
     }
 }
 

@@ -48,7 +48,8 @@ struct Config {
 pub struct SurfelMap {
     target: IcpTarget,
     place: String,
-    covariance_scale: Option<CovarianceScale>,
+    /// Scale of the covariance of registered poses, if it was fitted.
+    pub(crate) covariance_scale: Option<CovarianceScale>,
     sha256: String,
 }
 
@@ -81,11 +82,6 @@ impl SurfelMap {
     /// Name of the place, as of its head; empty if it is not known.
     pub fn place(&self) -> &str {
         &self.place
-    }
-
-    /// Scale of the covariance of registered poses, if it was fitted.
-    pub fn covariance_scale(&self) -> Option<CovarianceScale> {
-        self.covariance_scale
     }
 
     /// SHA-256 of the file.

@@ -25,6 +25,7 @@ use losses::PoseLoss;
 use token_cache::{PooledSweeps, TokenCache, TokenSweeps};
 
 use super::sgloc_training::adopt_encoder;
+use super::sweep_store::mean_position_m;
 use super::{SweepList, kmeans};
 use crate::Error;
 
@@ -108,14 +109,9 @@ fn train<N: PoseLoss>(
     };
     observe(&Progress::Read(data.clone()));
     let count = sweeps.world_from_sensor.len();
-    let origin_m = [0, 1, 2].map(|axis: usize| {
-        let positions = sweeps.world_from_sensor.iter();
-        let positions = positions.map(|pose| pose.translation.vector[axis]);
-        positions.sum::<f64>() / count as f64
-    });
     let network_config = PoseRegressorConfig {
         scene_name: config.scene_name.clone(),
-        origin_m,
+        origin_m: mean_position_m(&sweeps.world_from_sensor),
         classes: CLASSES.min(count) as i64,
         encoder: encoder.config().clone(),
     };

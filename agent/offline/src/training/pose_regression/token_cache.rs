@@ -251,9 +251,8 @@ impl TokenSweeps {
         let angle = turns.f_to_kind(Kind::Float)?.f_unsqueeze(1)? * (TAU / SECTORS as f64);
         let (cos, sin) = (angle.f_cos()?, angle.f_sin()?);
         let [x, y] = [3, 4].map(|of| self.poses.narrow(1, of, 1));
-        let heading = [&x * &cos + &y * &sin, &y * &cos - &x * &sin];
+        let (x, y) = (&x * &cos + &y * &sin, &y * &cos - &x * &sin);
         let position = self.poses.f_narrow(1, 0, 3)?;
-        let [x, y] = heading;
         Ok(Self {
             tokens: rolled(&self.tokens, &source)?,
             statics: rolled(&self.statics, &source)?,

@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use tch::nn::VarStore;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::training::FeatureCache;
@@ -15,30 +14,17 @@ const CELLS: i64 = 32;
 /// Largest median L1 error of these cells under which a classification is trusted, metres.
 const TRUSTED_M: f64 = 5.0;
 
-/// The head of a file and its configuration.
-pub(super) struct StoredHead {
-    weights: Weights,
-    pub(super) config: SceneHeadConfig,
-}
-
-impl StoredHead {
-    /// Reads a head that was trained on the features of the encoder with this SHA-256.
-    pub(super) fn load(
-        path: &Path,
-        encoder: &Path,
-        encoder_sha256: &str,
-    ) -> Result<Self, LocalizerError> {
-        let weights = Weights::load(path)?;
-        weights.check_kind(SceneHead::KIND)?;
-        let config: SceneHeadConfig = weights.config()?;
-        config.check_encoder(path, encoder, encoder_sha256)?;
-        Ok(Self { weights, config })
-    }
-
-    /// Gives a network of the same configuration the weights of the file.
-    pub(super) fn copy_into(&self, variables: &VarStore) -> Result<(), LocalizerError> {
-        Ok(self.weights.copy_into(variables)?)
-    }
+/// Reads a head that was trained on the features of the encoder with this SHA-256, and its configuration.
+pub(super) fn load(
+    path: &Path,
+    encoder: &Path,
+    encoder_sha256: &str,
+) -> Result<(Weights, SceneHeadConfig), LocalizerError> {
+    let weights = Weights::load(path)?;
+    weights.check_kind(SceneHead::KIND)?;
+    let config: SceneHeadConfig = weights.config()?;
+    config.check_encoder(path, encoder, encoder_sha256)?;
+    Ok((weights, config))
 }
 
 /// Class of each sweep of `cache`, which a trained head does not store: the one whose trusted sweeps lie nearest. A

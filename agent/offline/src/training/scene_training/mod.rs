@@ -21,8 +21,6 @@ pub use self::config::{SceneSummary, SceneTrainConfig};
 
 use self::cell_order::CellOrder;
 use self::classifier::train_classifier;
-use self::coarse_pose::CoarsePoses;
-use self::continued::StoredHead;
 use self::features::Features;
 pub(crate) use self::features::SceneSweeps;
 use self::losses::{centre_loss, weighted_loss};
@@ -32,7 +30,7 @@ use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
 use crate::{Error, Result};
-use localization::pgc::{SceneHead, SceneHeadConfig};
+use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
 use perception::train::{
     Curve, DataListing, Length, Means, Observe, Progress, SaveEvery, Task, Trainer,
 };
@@ -86,7 +84,8 @@ struct Training<'a> {
     variables: VarStore,
     head: SceneHead,
     order: CellOrder,
-    coarse_poses: CoarsePoses,
+    /// `[S]`: true heading of each sweep's sensor, radians.
+    headings: Tensor,
     /// Current logits of the classifier for each sweep.
     logits: Option<Tensor>,
     /// Sweeps of the last step's cells, and their errors.
@@ -113,10 +112,10 @@ impl<'a> Training<'a> {
         run.start()?;
         let features = Features::compute(config, sweeps, observe)?;
         let load =
-            |init: &PathBuf| StoredHead::load(init, &config.encoder, &features.encoder_sha256);
+            |init: &PathBuf| continued::load(init, &config.encoder, &features.encoder_sha256);
         let stored = config.init.as_ref().map(load).transpose()?;
         let head_config = match &stored {
-            Some(StoredHead { config, .. }) => SceneHeadConfig {
+            Some((_, config)) => SceneHeadConfig {
                 sweep_points: (config.sweep_points)
                     .or_else(|| median_points(&features.training.points)),
                 ..config.clone()
@@ -129,8 +128,9 @@ impl<'a> Training<'a> {
         let variables = VarStore::new(run.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
         let class_of_sweep = match &stored {
-            Some(stored) => {
-                stored.copy_into(&variables)?;
+            Some((weights, _)) => {
+                let copied = weights.copy_into(&variables);
+                copied.map_err(LocalizerError::from)?;
                 continued::classes_of_sweeps(&head, &cache)?
             }
             None => {
@@ -159,7 +159,7 @@ impl<'a> Training<'a> {
             variables,
             head,
             order: CellOrder::new(&cache, redundancy, run.batch, run.seed, trainer.steps())?,
-            coarse_poses: CoarsePoses::new(&cache.world_from_sensor, run.device)?,
+            headings: coarse_pose::headings(&cache.world_from_sensor, run.device)?,
             cache,
             validation: features.validation,
             logits: None,
@@ -243,7 +243,7 @@ impl Task for Training<'_> {
         let mut refined_m = 0.0;
         // The refiner learns on coarse poses as wrong as those it will be given.
         if let Some(refiner) = head.refiner() {
-            let (assumed, heading) = self.coarse_poses.draw(&targets, &sweeps)?;
+            let (assumed, heading) = coarse_pose::draw(&self.headings, &targets, &sweeps)?;
             let answer = refiner.look(&cells, &assumed, &heading, kind)?;
             let (refiner_loss, refined) = weighted_loss(&answer, &targets, &weights)?;
             loss += refiner_loss;

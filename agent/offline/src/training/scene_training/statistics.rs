@@ -1,8 +1,6 @@
 //! Statistics of a scene that a head has before its training: mean and deviation of features, centres of coordinates.
 
 use perception::tensor_values::{tensor, values};
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use tch::{Device, Result};
 
 use crate::training::{FeatureCache, kmeans};
@@ -14,9 +12,7 @@ const SAMPLE: usize = 20_000;
 /// Sets both, reproducibly by `seed`.
 pub(super) fn set_statistics(head: &mut SceneHead, cache: &FeatureCache, seed: u64) -> Result<()> {
     let centre_count = head.config().centres as usize;
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let sample = (0..SAMPLE).map(|_| rng.random_range(0..cache.cell_count()));
-    let sample = tensor(&sample.collect::<Vec<i64>>(), &[-1], cache.cells.device())?;
+    let sample = cache.drawn_rows(seed, 0, SAMPLE)?;
     let places = values(&cache.targets_m.f_index_select(0, &sample)?)?;
     let places = places.as_chunks::<3>().0.iter();
     let places: Vec<[f64; 3]> = places.map(|place| place.map(f64::from)).collect();

@@ -179,19 +179,14 @@ impl Point {
 
     /// Pose source of this point.
     fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
-        let Some(NoiseSpec {
-            position_std_m,
-            heading_std_deg,
-        }) = self.pose_noise
-        else {
+        let Some(noise) = self.pose_noise else {
             return experiment.poses.clone();
         };
-        let (mode, seed) = (experiment.noise_mode, self.seed);
         PoseSourceConfig::Noisy(NoisyPoseConfig {
-            mode,
-            position_std_m,
-            heading_std_deg,
-            seed,
+            mode: experiment.noise_mode,
+            position_std_m: noise.position_std_m,
+            heading_std_deg: noise.heading_std_deg,
+            seed: self.seed,
             ..NoisyPoseConfig::default()
         })
     }

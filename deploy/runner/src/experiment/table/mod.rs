@@ -147,13 +147,11 @@ impl Run<'_> {
     }
 
     fn cell(&self, place: &Place<'_>, observer: &mut dyn TableObserver) -> Result<Cell> {
-        let Place {
-            table, row, column, ..
-        } = place;
         let trial = self.trial(place)?;
-        let key = trial.key(&self.data, row.method)?;
+        let key = trial.key(&self.data, place.row.method)?;
         let known = Cell::read(&key, &self.cells)?;
-        observer.cell(&table.name, &row.label(), &column.name, known.is_some());
+        let (table, column) = (&place.table.name, &place.column.name);
+        observer.cell(table, &place.row.label(), column, known.is_some());
         if let Some(cell) = known {
             return Ok(cell);
         }
@@ -163,16 +161,11 @@ impl Run<'_> {
     }
 
     fn trial(&self, place: &Place<'_>) -> Result<Trial> {
-        let Place {
-            table,
-            row,
-            column,
-            weights,
-        } = place;
+        let (row, column) = (place.row, place.column);
         let mut trial = self.experiment.trial()?;
-        trial.scenarios = table.scenarios.or(trial.scenarios);
+        trial.scenarios = place.table.scenarios.or(trial.scenarios);
         let setup = &mut trial.setup;
-        setup.models.weights.clone_from(weights);
+        setup.models.weights.clone_from(&place.weights);
         if let Some(poses) = row.poses.as_ref().or(column.poses.as_ref()) {
             setup.agents.pose.clone_from(poses);
         }

@@ -67,7 +67,8 @@ fn provenance(table: &FilledTable) -> String {
         data.insert(format!("`{}`", of.data_sha256));
         files.extend(&of.files_sha256);
     }
-    let [frames, programs, data] = [frames, programs, data].map(joined);
+    let [frames, programs, data] =
+        [frames, programs, data].map(|values| Vec::from_iter(values).join(", "));
     let mut text = format!(
         "\nFrames: {frames}. Program: {programs}. Data: contents SHA-256 {data}. Weights and other files:\n\n"
     );
@@ -75,10 +76,6 @@ fn provenance(table: &FilledTable) -> String {
         let _ = writeln!(text, "- `{}`, SHA-256 `{sha256}`", file.display());
     }
     text
-}
-
-fn joined(values: BTreeSet<String>) -> String {
-    values.into_iter().collect::<Vec<_>>().join(", ")
 }
 
 /// CSV: a line per cell and training.
@@ -141,10 +138,8 @@ fn mean(cells: &[Cell], value: &dyn Fn(&Cell) -> Option<f64>) -> Option<(f64, Op
     let mean = values.iter().sum::<f64>() / count;
     let square: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
     // Sample standard deviation, divided by the number of trainings less one.
-    Some((
-        mean,
-        (values.len() > 1).then(|| (square / (count - 1.0)).sqrt()),
-    ))
+    let deviation = (values.len() > 1).then(|| (square / (count - 1.0)).sqrt());
+    Some((mean, deviation))
 }
 
 fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {

@@ -66,7 +66,13 @@ pub(crate) fn displacements(
         }
         None => near,
     };
-    compare_again(network, pairs, found, area)
+    // Compared again at the new position for maps that were moved by more than `AGAIN_M`.
+    let rows = rows_where(&is_large(&found.deltas)?.f_squeeze_dim(1)?)?;
+    if rows.is_empty() {
+        return Ok(found);
+    }
+    let again = network.displacements(&pairs.only(&rows)?, &picked(&found.deltas, &rows)?, area)?;
+    found.with(&rows, &again)
 }
 
 /// Displacements of the comparison at the poses, `near`, or for some rows at `far` `[rows, 3]`, metres and radians in the
@@ -89,21 +95,6 @@ fn compare_there(
     let better = rows_where(&there.similarity.f_gt_tensor(&least)?)?;
     let rows: Vec<i64> = better.iter().map(|&row| rows[row as usize]).collect();
     near.with(&rows, &there.only(&better)?)
-}
-
-/// The same, compared again at the new position for maps that were moved by more than [`AGAIN_M`].
-fn compare_again(
-    network: &AlignmentNetwork,
-    pairs: &Pairs,
-    found: Displacements,
-    area: &Area,
-) -> Result<Displacements> {
-    let rows = rows_where(&is_large(&found.deltas)?.f_squeeze_dim(1)?)?;
-    if rows.is_empty() {
-        return Ok(found);
-    }
-    let again = network.displacements(&pairs.only(&rows)?, &picked(&found.deltas, &rows)?, area)?;
-    found.with(&rows, &again)
 }
 
 /// `[K, 1]`: true for displacements `[K, 3]` by more than [`AGAIN_M`].
@@ -147,39 +138,22 @@ fn offsets(pairs: &Pairs, area: &Area, config: SearchConfig, train: bool) -> Res
     let mut tries = vec![(fit, (shifts(radius)? * cell_m).f_constant_pad_nd([0, 1])?)];
     if !train {
         let radius = radius.min(TURNED_RADIUS);
-        tries.extend(turned_tries(
-            maps,
-            &pairs.ego_from_cav,
-            area,
-            cell_m,
-            radius,
-        )?);
+        let turned = turned(maps[1], &TURNS_RAD, &pairs.ego_from_cav, area)?;
+        // All at once, as the ego's map at each shift is the same for all.
+        let fit = Shifted::new(maps[0], radius, 1)?.correlate(&turned)?.whole;
+        let fits = fit
+            .f_sub_scalar(TURN_MARGIN)?
+            .f_split(maps[1].size4()?.0, 0)?;
+        let shifts_m = shifts(radius)? * cell_m;
+        for (fit, turn_rad) in fits.into_iter().zip(TURNS_RAD) {
+            tries.push((fit, shifts_m.f_pad([0, 1], "constant", turn_rad)?));
+        }
     }
     let (fits, offsets): (Vec<_>, Vec<_>) = tries.into_iter().unzip();
     let best = Tensor::f_cat(&fits, 1)?.f_argmax(-1, false)?;
     Tensor::f_cat(&offsets, 0)?
         .f_to_device(best.device())?
         .f_index_select(0, &best)
-}
-
-/// Correlations of each rotation, `[K, P]`, less the margin, and the offsets `[P, 3]` of the columns.
-fn turned_tries(
-    [ego, others]: [&Tensor; 2],
-    ego_from_cav: &[Pose],
-    area: &Area,
-    cell_m: f64,
-    radius: i64,
-) -> Result<Vec<(Tensor, Tensor)>> {
-    let turned = turned(others, &TURNS_RAD, ego_from_cav, area)?;
-    // All at once, as the ego's map at each shift is the same for all.
-    let fit = Shifted::new(ego, radius, 1)?.correlate(&turned)?.whole;
-    let fit = fit.f_sub_scalar(TURN_MARGIN)?;
-    let shifts_m = shifts(radius)? * cell_m;
-    fit.f_split(others.size4()?.0, 0)?
-        .into_iter()
-        .zip(TURNS_RAD)
-        .map(|(fit, turn_rad)| Ok((fit, shifts_m.f_pad([0, 1], "constant", turn_rad)?)))
-        .collect()
 }
 
 /// All maps rotated about their senders by the first of some angles, then by the second, and so on.

@@ -51,21 +51,9 @@ impl ComputeTimes {
             .try_for_each(|(stage, ms)| within(&format!("{field}.{stage}"), ms, 0.0, 60_000.0))
     }
 
-    pub(super) fn pose_nanos(&self) -> u64 {
-        nanos::of_ms(self.pose_ms)
-    }
-
-    pub(super) fn map_nanos(&self) -> u64 {
-        nanos::of_ms(self.map_ms)
-    }
-
-    pub(super) fn fuse_nanos(&self) -> u64 {
-        nanos::of_ms(self.fuse_ms)
-    }
-
     /// Time until an agent has published all messages of a sweep.
     pub(super) fn agent_nanos(&self) -> u64 {
-        self.pose_nanos().saturating_add(self.map_nanos())
+        nanos::of_ms(self.pose_ms).saturating_add(nanos::of_ms(self.map_ms))
     }
 
     /// In simulation time every sweep is processed: a process that is slower than the scene is rejected.
@@ -78,7 +66,7 @@ impl ComputeTimes {
         };
         let steps = [
             ("an agent (pose_ms + map_ms)", self.agent_nanos()),
-            ("the ego (fuse_ms)", self.fuse_nanos()),
+            ("the ego (fuse_ms)", nanos::of_ms(self.fuse_ms)),
         ];
         for (what, takes_nanos) in steps {
             if takes_nanos > period_nanos {

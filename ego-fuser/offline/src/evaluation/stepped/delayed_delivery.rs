@@ -11,6 +11,7 @@ use protocol::{
 
 use ego_fuser::capture_clock::SweepTime;
 use ego_fuser::ego_loop::{Message, Source};
+use support::nanos;
 
 use super::super::sent::Sent;
 use super::{ComputeTimes, exact_reception};
@@ -88,7 +89,7 @@ impl DelayedDelivery {
             stream: Stream::Pose,
             sequence: tick as u64,
             bytes: sent.pose_bytes,
-            submitted_nanos: sent.capture_nanos.saturating_add(compute.pose_nanos()),
+            submitted_nanos: nanos::of_ms(compute.pose_ms).saturating_add(sent.capture_nanos),
             distance_m,
         };
         self.hand_over(pose.clone(), None, None);

@@ -87,10 +87,8 @@ impl RemotePool {
         stop: &Stop,
     ) -> Result<Self, RemoteError> {
         let inbox = bus.inbox(2, 3 * vehicles.len());
-        stop.on_request({
-            let inbox = Arc::clone(&inbox);
-            move || inbox.close()
-        });
+        let closed = Arc::clone(&inbox);
+        stop.on_request(move || closed.close());
         let (mut sensors, mut subscriptions, mut routes) =
             (BTreeMap::new(), Vec::new(), Vec::new());
         let here = bus.identity().process.clone();

@@ -80,7 +80,6 @@ struct MountedCamera {
 #[derive(Debug, Clone)]
 pub(super) struct CameraRig {
     cameras: Vec<MountedCamera>,
-    size: ImageSize,
 }
 
 /// Surroundings of a vehicle as its cameras see them.
@@ -96,7 +95,6 @@ impl CameraRig {
     pub(super) fn new(size: ImageSize) -> Self {
         Self {
             cameras: MOUNTS.map(|mount| MountedCamera::new(mount, size)).into(),
-            size,
         }
     }
 
@@ -108,12 +106,11 @@ impl CameraRig {
         ground_paint: &mut GroundPaint<'_>,
         seed: u64,
     ) -> Vec<(u8, Camera)> {
-        let size = self.size;
         let images = self.cameras.iter_mut().zip(0u8..).map(|(camera, number)| {
             let seed = seed.wrapping_add(number.into());
             let rgb = camera.render(vehicle, surroundings, ground_paint, seed);
-            let image = png_image::encode(&rgb, size);
             let metadata = camera.metadata;
+            let image = png_image::encode(&rgb, &metadata);
             (number, Camera { metadata, image })
         });
         images.collect()

@@ -1,14 +1,14 @@
 //! PNG encoding of rendered images.
 
-use super::ImageSize;
+use protocol::CameraMetadata;
 
 /// The bytes of a PNG of `rgb`, three bytes a pixel, row by row.
 ///
 /// # Panics
 /// Never: writing to memory does not fail, and the buffer has the size of the image.
-pub(super) fn encode(rgb: &[u8], size: ImageSize) -> Vec<u8> {
+pub(super) fn encode(rgb: &[u8], metadata: &CameraMetadata) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(rgb.len() / 4);
-    let mut encoder = png::Encoder::new(&mut bytes, size.width_px, size.height_px);
+    let mut encoder = png::Encoder::new(&mut bytes, metadata.width_px, metadata.height_px);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_compression(png::Compression::Fast);

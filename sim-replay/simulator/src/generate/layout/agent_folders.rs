@@ -6,18 +6,7 @@ use std::path::{Path, PathBuf};
 use super::disk::{Unfinished, make_folder, make_fresh_folder, scene_path, write_file};
 use super::yaml_text::agent_folders;
 use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
-use crate::generate::data_protocol::FILE_NAME;
 use crate::generate::error::SynthError;
-
-/// The folders of a scene in the layouts of the OPV2V family.
-#[derive(Debug)]
-pub(super) struct AgentFolders {
-    agents: Vec<PathBuf>,
-    is_roadside: Vec<bool>,
-    /// Number of the moment's tick, by index.
-    ticks: Vec<u64>,
-    mark: Unfinished,
-}
 
 /// Writes the files of one frame of one agent.
 type WriteFrame = fn(&FrameFiles<'_>, &AgentFrame) -> Result<(), SynthError>;
@@ -51,7 +40,11 @@ impl FrameFiles<'_> {
 #[derive(Debug)]
 pub(super) struct AgentFolderWriter {
     root: PathBuf,
-    folders: Option<AgentFolders>,
+    /// Folder of each agent of the scene, and true for a roadside unit.
+    agents: Vec<(PathBuf, bool)>,
+    /// Number of the moment's tick, by index.
+    ticks: Vec<u64>,
+    mark: Option<Unfinished>,
     write_frame: WriteFrame,
 }
 
@@ -59,7 +52,9 @@ impl AgentFolderWriter {
     pub(super) fn new(root: &Path, write_frame: WriteFrame) -> Self {
         Self {
             root: root.to_owned(),
-            folders: None,
+            agents: Vec::new(),
+            ticks: Vec::new(),
+            mark: None,
             write_frame,
         }
     }
@@ -70,37 +65,30 @@ impl SceneWriter for AgentFolderWriter {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
         let folder = scene_path(&self.root, &scene.name);
         make_fresh_folder(&folder)?;
-        let mark = Unfinished::mark(&folder)?;
-        write_file(&folder.join(FILE_NAME), &scene.origin)?;
-        let names = agent_folders(scene);
-        let agents: Vec<PathBuf> = names.iter().map(|name| folder.join(name)).collect();
-        agents.iter().try_for_each(|folder| make_folder(folder))?;
+        self.mark = Some(Unfinished::mark(&folder)?);
+        write_file(&folder.join(super::PROTOCOL_FILE), &scene.origin)?;
+        let names = agent_folders(scene).into_iter().zip(&scene.agents);
+        let agents = names.map(|(name, agent)| (folder.join(name), agent.is_roadside));
+        self.agents = agents.collect();
         let nanos = scene.capture_nanos.iter();
-        self.folders = Some(AgentFolders {
-            agents,
-            is_roadside: scene.agents.iter().map(|agent| agent.is_roadside).collect(),
-            ticks: nanos.map(|nanos| nanos / scene.tick_nanos).collect(),
-            mark,
-        });
-        Ok(())
+        self.ticks = nanos.map(|nanos| nanos / scene.tick_nanos).collect();
+        let mut folders = self.agents.iter();
+        folders.try_for_each(|(folder, _)| make_folder(folder))
     }
 
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let Some(folders) = &self.folders else {
-            return Ok(());
-        };
         moment.frames.iter().try_for_each(|frame| {
+            let (folder, is_roadside) = &self.agents[frame.agent];
             let files = FrameFiles {
-                folder: &folders.agents[frame.agent],
-                tick: folders.ticks[moment.index],
-                is_roadside: folders.is_roadside[frame.agent],
+                folder,
+                tick: self.ticks[moment.index],
+                is_roadside: *is_roadside,
             };
             (self.write_frame)(&files, frame)
         })
     }
 
     fn end(&mut self) -> Result<(), SynthError> {
-        let folders = self.folders.take();
-        folders.map_or(Ok(()), |folders| folders.mark.clear())
+        self.mark.take().map_or(Ok(()), Unfinished::clear)
     }
 }

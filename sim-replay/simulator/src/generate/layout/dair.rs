@@ -66,23 +66,14 @@ const COOPERATIVE: &str = "cooperative";
 pub(super) struct Dair {
     root: PathBuf,
     edition: Edition,
-    /// Number of scenes begun.
-    scenes: usize,
-    /// Number of the next scene's first frame.
-    next_frame: usize,
-    scene: Batch,
-    /// Rows of the lists of vehicle, unit and pairs, by number of the vehicle's frame.
-    rows: Mutex<Vec<(usize, [Value; 3])>>,
-}
-
-/// A scene.
-#[derive(Debug, Default)]
-struct Batch {
-    number: usize,
+    /// Number of the scene that is being written, and of its first frame.
+    scene: usize,
     first_frame: usize,
     /// Index of the agent that is the roadside unit.
     unit: usize,
     capture_nanos: Vec<u64>,
+    /// Rows of the lists of vehicle, unit and pairs, by number of the vehicle's frame.
+    rows: Mutex<Vec<(usize, [Value; 3])>>,
 }
 
 impl Dair {
@@ -90,9 +81,10 @@ impl Dair {
         Self {
             root: root.to_owned(),
             edition,
-            scenes: 0,
-            next_frame: 0,
-            scene: Batch::default(),
+            scene: 0,
+            first_frame: 0,
+            unit: 0,
+            capture_nanos: Vec::new(),
             rows: Mutex::default(),
         }
     }
@@ -191,39 +183,32 @@ impl SceneWriter for Dair {
             );
             return Err(SynthError::Layout { layout, reason });
         }
-        let frames = scene.capture_nanos.len();
-        if self.next_frame + frames > FIRST_UNIT_FRAME {
+        if self.first_frame + scene.capture_nanos.len() > FIRST_UNIT_FRAME {
             let reason =
                 format!("more than {FIRST_UNIT_FRAME} frames have no numbers of six digits");
             return Err(SynthError::Layout { layout, reason });
         }
-        if self.scenes == 0 {
+        if self.scene == 0 {
             self.make_folders()?;
         }
         write_origin(&self.root, scene)?;
         // A roadside unit if there is one, else the second agent.
         let unit = (1..scene.agents.len()).find(|&agent| scene.agents[agent].is_roadside);
-        self.scene = Batch {
-            number: self.scenes,
-            first_frame: self.next_frame,
-            unit: unit.unwrap_or(1),
-            capture_nanos: scene.capture_nanos.clone(),
-        };
-        self.scenes += 1;
-        self.next_frame += frames;
+        self.unit = unit.unwrap_or(1);
+        self.capture_nanos.clone_from(&scene.capture_nanos);
         Ok(())
     }
 
     fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
-        let (batch, frames) = (&self.scene, moment.frames.len());
-        let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(batch.unit)) else {
+        let frames = moment.frames.len();
+        let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(self.unit)) else {
             omitted.add("frames of moments without vehicle or roadside unit", frames);
             return Ok(());
         };
         let what = "frames of agents beyond one vehicle and one roadside unit";
         // Both were found above, so there are at least two.
         omitted.add(what, frames - 2);
-        let number = batch.first_frame + moment.index;
+        let number = self.first_frame + moment.index;
         let [id, unit_id] =
             [VEHICLE, UNIT].map(|side| format!("{:06}", side.first_number + number));
         self.write_side(&VEHICLE, &id, vehicle, omitted)?;
@@ -242,7 +227,13 @@ impl SceneWriter for Dair {
         }
         let path = format!("cooperative/{}/{id}.json", self.cooperative_labels());
         self.write_json(&path, &Value::Array(labels))?;
-        locked(&self.rows).push((number, self.rows_of(batch, moment, &id, &unit_id)));
+        locked(&self.rows).push((number, self.rows_of(moment, &id, &unit_id)));
+        Ok(())
+    }
+
+    fn end(&mut self) -> Result<(), SynthError> {
+        self.first_frame += self.capture_nanos.len();
+        self.scene += 1;
         Ok(())
     }
 
@@ -260,11 +251,11 @@ impl SceneWriter for Dair {
 
 impl Dair {
     /// The rows of a capture time in the lists of vehicle, unit and pairs.
-    fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> [Value; 3] {
-        let begin_micros = EPOCH_MICROS + batch.number as u64 * DAY_MICROS;
-        let micros = begin_micros + batch.capture_nanos[moment.index] / 1000;
-        let vehicle = self.side_row(&VEHICLE, id, micros, batch);
-        let unit = self.side_row(&UNIT, unit_id, micros, batch);
+    fn rows_of(&self, moment: &Moment, id: &str, unit_id: &str) -> [Value; 3] {
+        let begin_micros = EPOCH_MICROS + self.scene as u64 * DAY_MICROS;
+        let micros = begin_micros + self.capture_nanos[moment.index] / 1000;
+        let vehicle = self.side_row(&VEHICLE, id, micros);
+        let unit = self.side_row(&UNIT, unit_id, micros);
         let offset = json!({ "delta_x": 0.0, "delta_y": 0.0 });
         let pair = match self.edition {
             Edition::Dair => json!({
@@ -278,8 +269,8 @@ impl Dair {
             Edition::V2xSeq => json!({
                 "vehicle_frame": id,
                 "infrastructure_frame": unit_id,
-                "vehicle_sequence": format!("{:04}", batch.number),
-                "infrastructure_sequence": format!("{:04}", batch.number),
+                "vehicle_sequence": format!("{:04}", self.scene),
+                "infrastructure_sequence": format!("{:04}", self.scene),
                 "system_error_offset": offset,
             }),
         };
@@ -287,9 +278,9 @@ impl Dair {
     }
 
     /// The row of one side.
-    fn side_row(&self, side: &Side, id: &str, micros: u64, batch: &Batch) -> Value {
-        let [first, last] = [0, batch.capture_nanos.len() - 1]
-            .map(|frame| format!("{:06}", side.first_number + batch.first_frame + frame));
+    fn side_row(&self, side: &Side, id: &str, micros: u64) -> Value {
+        let [first, last] = [0, self.capture_nanos.len() - 1]
+            .map(|frame| format!("{:06}", side.first_number + self.first_frame + frame));
         let mut row = json!({
             "image_path": format!("image/{id}.jpg"),
             "image_timestamp": micros.to_string(),
@@ -304,15 +295,15 @@ impl Dair {
         match self.edition {
             Edition::Dair => {
                 row["label_lidar_path"] = json!(labels);
-                row["batch_id"] = json!(batch.number.to_string());
+                row["batch_id"] = json!(self.scene.to_string());
                 row["batch_start_id"] = json!(first);
                 row["batch_end_id"] = json!(last);
             }
             Edition::V2xSeq => {
                 row["label_lidar_std_path"] = json!(labels);
                 row["frame_id"] = json!(id);
-                row["sequence_id"] = json!(format!("{:04}", batch.number));
-                row["num_frames"] = json!(batch.capture_nanos.len().to_string());
+                row["sequence_id"] = json!(format!("{:04}", self.scene));
+                row["num_frames"] = json!(self.capture_nanos.len().to_string());
                 row["start_frame_id"] = json!(first);
                 row["end_frame_id"] = json!(last);
             }

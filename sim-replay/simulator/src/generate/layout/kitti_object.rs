@@ -2,7 +2,6 @@
 //!
 //! Boxes are upright in the frame of the LiDAR. There is no image: regions of images are zero.
 
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use nalgebra::Point3;
@@ -82,8 +81,7 @@ impl SceneWriter for KittiObject {
 
 /// The label of each object: type, truncation, occlusion, alpha, image box, sizes, bottom centre, rotation.
 fn labels(frame: &AgentFrame) -> String {
-    let mut text = String::with_capacity(200 * frame.frame.objects.len());
-    for object in &frame.frame.objects {
+    let lines = frame.frame.objects.iter().map(|object| {
         let upright = upright_in(frame, object);
         let ([length, width, height], [x, y, z]) = (upright.size_m, upright.center_m);
         // KITTI gives the middle of the bottom face.
@@ -92,13 +90,11 @@ fn labels(frame: &AgentFrame) -> String {
         let rotation_y_rad = -upright.heading_rad - std::f64::consts::FRAC_PI_2;
         let alpha_rad = rotation_y_rad - bottom.x.atan2(bottom.z);
         let ([x, y, z], kind): ([f64; 3], &str) = (bottom.into(), kind(object.class));
-        // Writing to a String does not fail.
-        let _ = writeln!(
-            text,
-            "{kind} 0 0 {alpha_rad} 0 0 0 0 {height} {width} {length} {x} {y} {z} {rotation_y_rad}"
-        );
-    }
-    text
+        format!(
+            "{kind} 0 0 {alpha_rad} 0 0 0 0 {height} {width} {length} {x} {y} {z} {rotation_y_rad}\n"
+        )
+    });
+    lines.collect()
 }
 
 fn kind(class: ObjectClass) -> &'static str {

@@ -3,7 +3,6 @@
 //! Poses are of the left camera, in the frame of the first scan's camera: the position of the sequence in the world is
 //! lost.
 
-use std::fmt::Write as _;
 use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
@@ -52,12 +51,10 @@ fn write_poses(root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
 /// Seconds from the first moment, one a line.
 fn times(capture_nanos: &[u64]) -> String {
     let first = capture_nanos.first().copied().unwrap_or(0);
-    let mut text = String::with_capacity(16 * capture_nanos.len());
-    for nanos in capture_nanos {
-        // Writing to a String does not fail.
-        let _ = writeln!(text, "{:e}", (nanos - first) as f64 / 1e9);
-    }
-    text
+    let seconds = capture_nanos
+        .iter()
+        .map(|nanos| (nanos - first) as f64 / 1e9);
+    seconds.map(|seconds| format!("{seconds:e}\n")).collect()
 }
 
 /// One line per capture time, since the line number is the scan number; where there is no pose, the previous one is

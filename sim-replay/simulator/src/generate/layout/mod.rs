@@ -42,6 +42,9 @@ pub(crate) use disk::{Unfinished, make_folder, remove_folder};
 use sequences::Sequences;
 pub(crate) use support::sync::lock as locked;
 
+/// Name of the file of a scenario's settings, in its folder.
+pub(crate) const PROTOCOL_FILE: &str = "data_protocol.yaml";
+
 /// Offset between the clocks of two scenes, microseconds: a day.
 const DAY_MICROS: u64 = 86_400_000_000;
 

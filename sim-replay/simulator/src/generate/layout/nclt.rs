@@ -2,7 +2,6 @@
 //!
 //! A point is three `u16` in steps of 5 mm from -100 m on, a byte of intensity and one of the laser; axes have z down.
 
-use std::fmt::Write as _;
 use std::path::Path;
 
 use super::Omissions;
@@ -51,17 +50,15 @@ fn points(points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8> {
 fn write_poses(root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
     let folder = root.join("ground_truth");
     make_folder(&folder)?;
-    let mut rows = String::with_capacity(160 * sequence.sweeps.len());
-    for sweep in sequence.sweeps {
+    let rows = sequence.sweeps.iter().map(|sweep| {
         let pose = pose_z_down(&sweep.world_from_lidar);
         let [x, y, z] = pose.translation_m;
         let (roll, pitch, heading) = pose.isometry().rotation.euler_angles();
-        // Writing to a String does not fail.
         let micros = sweep.micros;
-        let _ = writeln!(rows, "{micros},{x},{y},{z},{roll},{pitch},{heading}");
-    }
+        format!("{micros},{x},{y},{z},{roll},{pitch},{heading}\n")
+    });
     let name = format!("groundtruth_{}.csv", day(sequence.number));
-    write_file(&folder.join(name), rows)
+    write_file(&folder.join(name), rows.collect::<String>())
 }
 
 /// A coordinate as a number of steps, if it is in range.

@@ -38,18 +38,12 @@ pub(super) struct Style {
 pub(super) struct NuScenes {
     root: PathBuf,
     style: &'static Style,
-    scenes: usize,
-    scene: Current,
+    /// Number of the scene that is being written.
+    number: usize,
+    scene: SceneHeader,
+    channels: Vec<String>,
     samples: Mutex<Vec<Sample>>,
     tables: Tables,
-}
-
-/// The scene that is being written.
-#[derive(Debug, Default)]
-struct Current {
-    number: usize,
-    header: SceneHeader,
-    channels: Vec<String>,
 }
 
 impl NuScenes {
@@ -57,8 +51,9 @@ impl NuScenes {
         Self {
             root: root.to_owned(),
             style,
-            scenes: 0,
-            scene: Current::default(),
+            number: 0,
+            scene: SceneHeader::default(),
+            channels: Vec::new(),
             samples: Mutex::default(),
             tables: Tables::default(),
         }
@@ -75,7 +70,7 @@ impl NuScenes {
 
 impl SceneWriter for NuScenes {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        if self.scenes == 0 {
+        if self.number == 0 {
             make_fresh_folder(&self.root.join(SWEEPS))?;
             make_fresh_folder(&self.root.join(self.style.version))?;
         }
@@ -84,23 +79,17 @@ impl SceneWriter for NuScenes {
         channels
             .iter()
             .try_for_each(|channel| make_folder(&self.root.join(SWEEPS).join(channel)))?;
-        self.scene = Current {
-            number: self.scenes,
-            header: scene.clone(),
-            channels,
-        };
-        self.scenes += 1;
+        (self.scene, self.channels) = (scene.clone(), channels);
         Ok(())
     }
 
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let scene = &self.scene;
-        let offset = EPOCH_MICROS + scene.number as u64 * DAY_MICROS;
-        let micros = offset + scene.header.capture_nanos[moment.index] / 1000;
-        let name = (self.style.file_name)(scene.number, moment.index, micros);
+        let offset = EPOCH_MICROS + self.number as u64 * DAY_MICROS;
+        let micros = offset + self.scene.capture_nanos[moment.index] / 1000;
+        let name = (self.style.file_name)(self.number, moment.index, micros);
         let mut sweeps = Vec::with_capacity(moment.frames.len());
         for frame in &moment.frames {
-            let file = format!("{SWEEPS}/{}/{name}", scene.channels[frame.agent]);
+            let file = format!("{SWEEPS}/{}/{name}", self.channels[frame.agent]);
             write_file(&self.root.join(&file), self.sweep_bytes(frame))?;
             sweeps.push(SweepRecord {
                 agent: frame.agent,
@@ -129,14 +118,14 @@ impl SceneWriter for NuScenes {
     fn end(&mut self) -> Result<(), SynthError> {
         let mut samples = std::mem::take(&mut *locked(&self.samples));
         samples.sort_by_key(|sample| sample.moment);
-        let scene = std::mem::take(&mut self.scene);
         self.tables.add(SceneTables {
-            number: scene.number,
-            name: &scene.header.name,
-            channels: &scene.channels,
-            fields: (self.style.scene_fields)(&scene.header),
+            number: self.number,
+            name: &self.scene.name,
+            channels: &self.channels,
+            fields: (self.style.scene_fields)(&self.scene),
             samples: &samples,
         });
+        self.number += 1;
         Ok(())
     }
 

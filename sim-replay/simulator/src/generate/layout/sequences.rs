@@ -51,21 +51,13 @@ pub(super) struct SweepPose {
 pub(super) struct Sequences {
     root: PathBuf,
     style: &'static Style,
-    scenes: usize,
-    /// Number of the first sequence of the next scene.
-    next_sequence: usize,
-    scene: Current,
-    /// Sweeps that were written, with their agents.
-    sweeps: Mutex<Vec<(usize, SweepPose)>>,
-}
-
-/// The scene that is being written.
-#[derive(Debug, Default)]
-struct Current {
+    /// Number of the scene that is being written, and of its first sequence.
+    scene: usize,
     first_sequence: usize,
-    offset_micros: u64,
     capture_nanos: Vec<u64>,
     marks: Vec<Unfinished>,
+    /// Sweeps that were written, with their agents.
+    sweeps: Mutex<Vec<(usize, SweepPose)>>,
 }
 
 impl Sequences {
@@ -73,9 +65,10 @@ impl Sequences {
         Self {
             root: root.to_owned(),
             style,
-            scenes: 0,
-            next_sequence: 0,
-            scene: Current::default(),
+            scene: 0,
+            first_sequence: 0,
+            capture_nanos: Vec::new(),
+            marks: Vec::new(),
             sweeps: Mutex::default(),
         }
     }
@@ -87,30 +80,22 @@ impl Sequences {
 
 impl SceneWriter for Sequences {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        let mut marks = Vec::with_capacity(scene.agents.len());
         for agent in 0..scene.agents.len() {
-            let folder = self.folder(self.next_sequence + agent);
+            let folder = self.folder(self.first_sequence + agent);
             make_fresh_folder(&folder)?;
-            marks.push(Unfinished::mark(&folder)?);
+            self.marks.push(Unfinished::mark(&folder)?);
             write_origin(&folder, scene)?;
             make_folder(&folder.join(self.style.sweeps_folder))?;
         }
-        self.scene = Current {
-            first_sequence: self.next_sequence,
-            offset_micros: self.style.epoch_micros + self.scenes as u64 * DAY_MICROS,
-            capture_nanos: scene.capture_nanos.clone(),
-            marks,
-        };
-        self.scenes += 1;
-        self.next_sequence += scene.agents.len();
+        self.capture_nanos.clone_from(&scene.capture_nanos);
         Ok(())
     }
 
     fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
-        let scene = &self.scene;
-        let micros = scene.offset_micros + scene.capture_nanos[moment.index] / 1000;
+        let offset = self.style.epoch_micros + self.scene as u64 * DAY_MICROS;
+        let micros = offset + self.capture_nanos[moment.index] / 1000;
         for frame in &moment.frames {
-            let folder = self.folder(scene.first_sequence + frame.agent);
+            let folder = self.folder(self.first_sequence + frame.agent);
             let folder = folder.join(self.style.sweeps_folder);
             let file = folder.join((self.style.file_name)(moment.index, micros));
             let points = (self.style.points)(&frame.frame.points.xyzi, omitted);
@@ -130,21 +115,22 @@ impl SceneWriter for Sequences {
     fn end(&mut self) -> Result<(), SynthError> {
         let mut sweeps = std::mem::take(&mut *locked(&self.sweeps));
         sweeps.sort_by_key(|(agent, sweep)| (*agent, sweep.moment));
-        let scene = std::mem::take(&mut self.scene);
-        for (agent, mark) in scene.marks.into_iter().enumerate() {
-            let number = scene.first_sequence + agent;
+        for (agent, mark) in std::mem::take(&mut self.marks).into_iter().enumerate() {
+            let number = self.first_sequence;
             let own = sweeps.iter().filter(|(of, _)| *of == agent);
             let own: Vec<SweepPose> = own.map(|(_, sweep)| *sweep).collect();
             let sequence = Sequence {
                 folder: (self.style.folder)(number),
                 number,
-                capture_nanos: &scene.capture_nanos,
+                capture_nanos: &self.capture_nanos,
                 sweeps: &own,
             };
             (self.style.write_poses)(&self.root, &sequence)?;
             // Cleared after the poses, without which the sequence is incomplete.
             mark.clear()?;
+            self.first_sequence += 1;
         }
+        self.scene += 1;
         Ok(())
     }
 }

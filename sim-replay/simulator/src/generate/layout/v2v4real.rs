@@ -88,14 +88,8 @@ fn pickled_matrix(pose: &Pose) -> String {
     // nalgebra keeps columns together, NumPy rows.
     let rows = matrix.transpose();
     let bytes: Vec<u8> = rows.iter().flat_map(|value| value.to_le_bytes()).collect();
-    let mut text = MATRIX_HEAD.to_owned();
     let digits = STANDARD.encode(bytes);
-    let mut rest = digits.as_str();
-    while !rest.is_empty() {
-        let (line, after) = rest.split_at(rest.len().min(BASE64_LINE));
-        let end = if after.is_empty() { "" } else { "\n" };
-        let _ = write!(text, "    {line}{end}");
-        rest = after;
-    }
-    text
+    let lines = digits.as_bytes().chunks(BASE64_LINE);
+    let lines = lines.map(|line| format!("    {}", String::from_utf8_lossy(line)));
+    MATRIX_HEAD.to_owned() + &lines.collect::<Vec<_>>().join("\n")
 }

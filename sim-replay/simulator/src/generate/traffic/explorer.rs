@@ -67,14 +67,12 @@ impl Explorer {
 
     /// Keeps the lanes with the shortest distance to a least visited one.
     pub(super) fn keep_best(&mut self, lanes: &mut Vec<LaneId>) {
-        let distances: Vec<Option<u64>> = lanes.iter().map(|&lane| self.unknown_m(lane)).collect();
-        let least = distances.iter().flatten().min().copied();
-        // No least visited lane can be reached: all lanes stay.
-        if least.is_none() {
-            return;
+        let distances = lanes.iter().filter_map(|&lane| self.unknown_m(lane));
+        let least = distances.min();
+        // If no least visited lane can be reached, all lanes stay.
+        if least.is_some() {
+            lanes.retain(|&lane| self.unknown_m(lane) == least);
         }
-        let mut are_best = distances.iter().map(|distance| *distance == least);
-        lanes.retain(|_| are_best.next().unwrap_or(false));
     }
 
     /// True if the lane `beside` justifies the change from `own`.

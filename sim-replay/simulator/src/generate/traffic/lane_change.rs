@@ -86,14 +86,10 @@ impl Traffic<'_> {
     }
 
     fn time_to_random_change_s(&mut self, index: usize) -> f64 {
-        match self.explores(index) {
+        match index == 0 && self.options.focus_explores {
             true => self.random.between(4.0, 16.0),
             false => self.random.between(20.0, 80.0),
         }
-    }
-
-    fn explores(&self, index: usize) -> bool {
-        index == 0 && self.options.focus_explores
     }
 
     /// Side of a random change; for an exploring focus, one that leads to less visited roads.

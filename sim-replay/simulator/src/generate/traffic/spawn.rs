@@ -181,10 +181,8 @@ impl<'t> Traffic<'t> {
                 let car = &self.cars[index];
                 car.is_present && car.standing_s > NEXT_LEAVES_S
             });
-            let distances =
-                standing.map(|index| (index, distance_m(self.cars[index].point_m(), center_m)));
-            let nearest = distances.min_by(|a, b| a.1.total_cmp(&b.1));
-            return nearest.map(|(index, _)| index);
+            let away_m = |index: usize| distance_m(self.cars[index].point_m(), center_m);
+            return standing.min_by(|&a, &b| away_m(a).total_cmp(&away_m(b)));
         }
         let stuck = (1..self.cars.len()).filter(|&index| {
             let car = &self.cars[index];

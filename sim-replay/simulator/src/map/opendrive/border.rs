@@ -65,8 +65,7 @@ fn read_border(
     log: &mut FindingLog,
 ) -> Result<Profile> {
     let border = read_profile(element, "border", "sOffset", MAX_OFFSET_M)?;
-    let looks =
-        (0..=LOOKS).map(|look| border.at(stretch.length_m * f64::from(look) / f64::from(LOOKS)));
+    let looks = border.samples(stretch.length_m, LOOKS);
     let farthest = looks.fold(0.0, |far: f64, t| if t.abs() > far.abs() { t } else { far });
     if farthest * side < 0.0 {
         let found = format!("has <border> at t={farthest:.3} on its other side");
@@ -77,8 +76,8 @@ fn read_border(
 }
 
 fn note_overlaps(element: Element, width: &Profile, length_m: f64, log: &mut FindingLog) {
-    let narrowest = (0..=LOOKS).map(|look| width.at(length_m * f64::from(look) / f64::from(LOOKS)));
-    let narrowest = narrowest.fold(f64::INFINITY, f64::min);
+    let looks = width.samples(length_m, LOOKS);
+    let narrowest = looks.fold(f64::INFINITY, f64::min);
     if narrowest < -ROUNDING_M {
         let found = format!("has <border> {:.3} m inside the inner border", -narrowest);
         element.note(log, &found, "width 0 there");

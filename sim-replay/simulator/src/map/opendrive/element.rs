@@ -154,15 +154,11 @@ impl<'a, 'input> Element<'a, 'input> {
 
     /// The largest magnitude of a number among the descendants with a name; 0 where there is none.
     pub(super) fn largest(&self, name: &'static str, attribute: &'static str) -> f64 {
-        let nodes = self
-            .node
-            .descendants()
-            .filter(|node| node.has_tag_name(name));
-        let values = nodes.filter_map(|node| node.attribute(attribute)?.trim().parse::<f64>().ok());
-        values
-            .map(f64::abs)
-            .filter(|value| value.is_finite())
-            .fold(0.0, f64::max)
+        let nodes = self.node.descendants();
+        let named = nodes.filter(|node| node.has_tag_name(name));
+        let values = named.filter_map(|node| node.attribute(attribute)?.trim().parse::<f64>().ok());
+        let sizes = values.map(f64::abs).filter(|size| size.is_finite());
+        sizes.fold(0.0, f64::max)
     }
 
     /// The first child with a name.

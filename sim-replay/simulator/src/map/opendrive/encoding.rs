@@ -55,17 +55,11 @@ fn unmarked(bytes: &[u8], log: &mut FindingLog) -> &'static Encoding {
 /// The label in `<?xml ... encoding="label"?>`.
 fn declared(head: &[u8]) -> Option<String> {
     let head = String::from_utf8_lossy(head);
-    let declaration = head
-        .trim_start()
-        .strip_prefix("<?xml")?
-        .split("?>")
-        .next()?;
-    let (_, value) = declaration.split_once("encoding")?;
+    let declaration = head.trim_start().strip_prefix("<?xml")?;
+    let (_, value) = declaration.split("?>").next()?.split_once("encoding")?;
     let value = value.trim_start().strip_prefix('=')?.trim_start();
-    let quote = value
-        .chars()
-        .next()
-        .filter(|quote| matches!(quote, '"' | '\''))?;
+    let first = value.chars().next();
+    let quote = first.filter(|first| matches!(first, '"' | '\''))?;
     let (label, _) = value[1..].split_once(quote)?;
     Some(label.trim().to_owned())
 }

@@ -31,9 +31,8 @@ pub(super) fn read_sections(
     }
     let mut sections = Vec::with_capacity(starts.len());
     for (place, &(s_m, element)) in starts.iter().enumerate() {
-        let end_m = starts
-            .get(place + 1)
-            .map_or(road_length_m, |(next, _)| *next);
+        let next = starts.get(place + 1);
+        let end_m = next.map_or(road_length_m, |(next_m, _)| *next_m);
         if matches!(element.optional_text("singleSide"), Some("true" | "1")) {
             element.note_value(log, "singleSide", "the other side has no lanes here");
         }
@@ -57,8 +56,7 @@ pub(super) fn read_sections(
 fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Result<()> {
     for lane in section.left.iter().chain(&section.right) {
         // A peak between the samples is clamped by `Road::lane_span_m`.
-        let widths = (0..=20).map(|i| lane.width.at(length_m * f64::from(i) / 20.0));
-        let widest = widths.fold(0.0, f64::max);
+        let widest = lane.width.samples(length_m, 20).fold(0.0, f64::max);
         if widest > MAX_WIDTH_M {
             return Err(element.error_element(&format!(
                 "holds a lane that is {widest:.1} m wide; expected at most {MAX_WIDTH_M}"

@@ -69,9 +69,8 @@ fn slope(
     if is_zero(&profile) {
         return Profile::default();
     }
-    let steepest =
-        (0..=LOOKS).map(|look| profile.at(length_m * f64::from(look) / f64::from(LOOKS)));
-    let steepest = steepest.map(f64::abs).fold(0.0, f64::max);
+    let slopes = profile.samples(length_m, LOOKS);
+    let steepest = slopes.map(f64::abs).fold(0.0, f64::max);
     if steepest > MAX_SLOPE_RAD {
         let found =
             format!("holds <{name}> up to {steepest:.2} rad, expected at most {MAX_SLOPE_RAD}");

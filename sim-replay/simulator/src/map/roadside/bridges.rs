@@ -56,14 +56,16 @@ fn bridge(site: &mut Site, road: usize) {
     for i in 1..cuts.len() {
         let (from, to) = (&cuts[i - 1], &cuts[i]);
         let length = to.s_m - from.s_m;
-        if drops[i - 1].min(drops[i]) < BRIDGE_M || length < 0.1 {
+        let drop = drops[i - 1].min(drops[i]);
+        if drop < BRIDGE_M || length < 0.1 {
             since_pillars = PILLARS_M / 2.0;
             continue;
         }
-        let drop = drops[i - 1].min(drops[i]);
         let thickness = (drop - HEADROOM_M - 0.05).clamp(SLAB_M[0], SLAB_M[1]);
         let thickness = thickness.min(drop * 0.4);
-        site.place(&[slab(from, to, thickness)]);
+        // Below the lowest edge, so that the slab does not stick out of the road.
+        let top = from.range_m()[0].min(to.range_m()[0]) - 0.06;
+        site.place(&[slab(from, to, [top - thickness, top], 0.3)]);
         parapet(site, road, from, to);
         since_pillars += length;
         if since_pillars >= PILLARS_M && drop > 3.0 {
@@ -73,19 +75,16 @@ fn bridge(site: &mut Site, road: usize) {
     }
 }
 
-fn slab(from: &CrossSection, to: &CrossSection, thickness_m: f64) -> Solid {
+/// A slab over the paved width of both cuts and `beyond_m` more.
+fn slab(from: &CrossSection, to: &CrossSection, z_m: [f64; 2], beyond_m: f64) -> Solid {
     let [a, b] = [from, to].map(|cut| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0));
     let width = (from.paved_m[1] - from.paved_m[0]).max(to.paved_m[1] - to.paved_m[0]);
-    // Below the lowest edge, so that the slab does not stick out of the road.
-    let top = from.range_m()[0].min(to.range_m()[0]) - 0.06;
-    let z = [top - thickness_m, top];
-    wall(SolidKind::BridgeDeck, a, b, z, width + 0.3, 0.35)
+    wall(SolidKind::BridgeDeck, a, b, z_m, width + beyond_m, 0.35)
 }
 
 /// Low walls at both edges, where no other lane of the same height joins.
 fn parapet(site: &mut Site, road: usize, from: &CrossSection, to: &CrossSection) {
-    for side in [0, 1] {
-        let out = if side == 0 { -0.2 } else { 0.2 };
+    for (side, out) in [(0, -0.2), (1, 0.2)] {
         let [a, b] = [from, to].map(|cut| cut.at(cut.paved_m[side] + out));
         let edges = [from, to].map(|cut| cut.height_m(cut.paved_m[side]));
         let z = [edges[0].min(edges[1]) - 0.3, edges[0].max(edges[1]) + 1.0];
@@ -129,8 +128,7 @@ fn retaining_walls(site: &mut Site, road: usize) {
         if to.s_m - from.s_m < 0.1 {
             continue;
         }
-        for side in [0, 1] {
-            let sign = if side == 0 { -1.0 } else { 1.0 };
+        for (side, sign) in [(0, -1.0), (1, 1.0)] {
             let beside =
                 [from, to].map(|cut| site.ground_m(cut.at(cut.paved_m[side] + sign * BESIDE_M)));
             let high = beside[0].max(beside[1]);
@@ -173,8 +171,7 @@ fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
         let [a, b] = [s, next].map(|s| site.cut_at(road, s));
         let ([low_a, high_a], [low_b, high_b]) = (a.range_m(), b.range_m());
         let z = [low_a.min(low_b), high_a.max(high_b)];
-        for side in [0, 1] {
-            let out = if side == 0 { -0.45 } else { 0.45 };
+        for (side, out) in [(0, -0.45), (1, 0.45)] {
             let [p, q] = [a, b].map(|cut| cut.at(cut.paved_m[side] + out));
             let height = [z[0] - 0.3, z[1] + TUNNEL_M];
             let part = wall(SolidKind::TunnelWall, p, q, height, 0.4, 0.4);
@@ -183,10 +180,8 @@ fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
                 site.place(&[part]);
             }
         }
-        let [p, q] = [a, b].map(|cut| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0));
-        let width = (a.paved_m[1] - a.paved_m[0]).max(b.paved_m[1] - b.paved_m[0]) + 1.3;
         let height = [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8];
-        let roof = wall(SolidKind::BridgeDeck, p, q, height, width, 0.35);
+        let roof = slab(a, b, height, 1.3);
         let z = [roof.bottom_m(), roof.top_m()];
         if site.surface.is_clear(&outline(&roof), z, HEADROOM_M, true) {
             site.place(&[roof]);

@@ -3,6 +3,8 @@
 //! A building has its [`PartFootprint`] in the centre of its lot, facing along the street, with the street on its
 //! right: `u` runs along the street, `v` away from it. No part reaches beyond the lot.
 
+use std::ops::Range;
+
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -36,20 +38,28 @@ pub(super) struct Lot {
     pub depth_m: f64,
 }
 
+/// Adds the parts of a building on a lot of this width and depth, metres.
+type AddParts = fn(&mut Draft, [f64; 2], &mut ChaCha8Rng);
+
 impl Style {
-    /// Ranges of width and depth of a lot for this style, metres.
+    /// Ranges of width and depth of a lot for this style, metres, and its parts.
+    fn plan(self) -> (Range<f64>, Range<f64>, AddParts) {
+        match self {
+            Self::House => (8.0..14.0, 8.0..12.0, house),
+            Self::Row => (18.0..36.0, 9.0..12.0, row),
+            Self::Block => (18.0..32.0, 14.0..22.0, block),
+            Self::Tower => (16.0..24.0, 16.0..24.0, tower),
+            Self::Shop => (12.0..26.0, 10.0..18.0, shop),
+            Self::Hall => (22.0..38.0, 16.0..28.0, hall),
+            Self::Church => (14.0..18.0, 24.0..32.0, church),
+            Self::Tanks => (14.0..22.0, 10.0..14.0, tanks),
+            Self::PetrolStation => (24.0..30.0, 18.0..22.0, petrol_station),
+        }
+    }
+
+    /// Width and depth of a lot for this style, metres.
     pub(super) fn lot_m(self, rng: &mut ChaCha8Rng) -> [f64; 2] {
-        let (width, depth) = match self {
-            Self::House => (8.0..14.0, 8.0..12.0),
-            Self::Row => (18.0..36.0, 9.0..12.0),
-            Self::Block => (18.0..32.0, 14.0..22.0),
-            Self::Tower => (16.0..24.0, 16.0..24.0),
-            Self::Shop => (12.0..26.0, 10.0..18.0),
-            Self::Hall => (22.0..38.0, 16.0..28.0),
-            Self::Church => (14.0..18.0, 24.0..32.0),
-            Self::Tanks => (14.0..22.0, 10.0..14.0),
-            Self::PetrolStation => (24.0..30.0, 18.0..22.0),
-        };
+        let (width, depth, _) = self.plan();
         [rng.random_range(width), rng.random_range(depth)]
     }
 }
@@ -61,17 +71,7 @@ pub(super) fn build(style: Style, lot: &Lot, rng: &mut ChaCha8Rng) -> Vec<Solid>
         reflectivity: rng.random_range(0.15..0.75),
         parts: Vec::new(),
     };
-    let add_parts = match style {
-        Style::House => house,
-        Style::Row => row,
-        Style::Block => block,
-        Style::Tower => tower,
-        Style::Shop => shop,
-        Style::Hall => hall,
-        Style::Church => church,
-        Style::Tanks => tanks,
-        Style::PetrolStation => petrol_station,
-    };
+    let (.., add_parts) = style.plan();
     add_parts(&mut draft, [lot.width_m, lot.depth_m], rng);
     draft.parts
 }

@@ -2,7 +2,7 @@
 
 use tch::{Kind, TchError, Tensor};
 
-use crate::f64_tensor::{above, largest};
+use crate::f64_tensor::{largest, numbers};
 use crate::pastat::extensions::LEAST_LIKELY;
 use crate::warp::Samples;
 
@@ -33,10 +33,9 @@ impl Tiles {
         // Windows overlap by the margin. The padding of a maximum is minus infinity and never wins.
         let window = EDGE + 2 * NEAR;
         let by_tile = likely.f_max_pool2d([window; 2], [EDGE; 2], [NEAR; 2], [1, 1], false)?;
-        let by_tile: Vec<f32> = Vec::try_from(by_tile.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
+        let by_tile = numbers(&by_tile.f_to_kind(Kind::Float)?)?;
         let all = Self::all([height, width]).first_cells;
-        let wanted = above(&by_tile, LEAST_LIKELY, STEP);
-        let chosen = largest(&by_tile, share, wanted);
+        let chosen = largest(&by_tile, share, LEAST_LIKELY, STEP);
         Ok(Self {
             first_cells: chosen.into_iter().map(|tile| all[tile]).collect(),
             size: [height, width],

@@ -101,25 +101,16 @@ impl TemporalMemory {
         let corrections = corrections
             .map(|corrections| settled(origins, corrections, first))
             .transpose()?;
-        Ok(coarse
-            .earlier_entries
-            .iter()
-            .enumerate()
-            .filter_map(|(index, &entry)| {
-                // Step 0 is an earlier map whose agent has no newest map in reach. It takes no part.
-                let step = origins.steps_back[first + index]
-                    .checked_sub(1)
-                    .filter(|step| *step < steps)?;
-                let (pose, map) = (&origins.ego_from_cav[first + index], maps.get(entry)?);
-                Some((
-                    step,
-                    corrections
-                        .as_ref()
-                        .map_or(*pose, |corrections| moved(pose, &corrections[index])),
-                    map,
-                ))
-            })
-            .collect())
+        let entries = coarse.earlier_entries.iter().enumerate();
+        let placed = entries.filter_map(|(index, &entry)| {
+            // Step 0 is an earlier map whose agent has no newest map in reach. It takes no part.
+            let step = origins.steps_back[first + index].checked_sub(1)?;
+            let (pose, map) = (&origins.ego_from_cav[first + index], maps.get(entry)?);
+            let correction = corrections.as_ref().map(|all| &all[index]);
+            let pose = correction.map_or(*pose, |delta| moved(pose, delta));
+            (step < steps).then_some((step, pose, map))
+        });
+        Ok(placed.collect())
     }
 
     /// Its variables lie below `path`. For maps of `channels`, tokens of `dim` with `patch` cells along each edge, and

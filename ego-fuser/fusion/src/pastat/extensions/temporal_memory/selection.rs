@@ -2,7 +2,7 @@
 
 use tch::{Kind, Result, Tensor};
 
-use crate::f64_tensor::{above, largest};
+use crate::f64_tensor::{largest, numbers};
 
 /// A cell and its eight neighbours.
 pub(super) const AROUND: i64 = 9;
@@ -32,9 +32,9 @@ impl Selection {
         let margin = [MARGIN_CELLS; 2];
         let by_patch =
             likely.f_max_pool2d([window, window], [patch, patch], margin, [1, 1], false)?;
-        let by_patch: Vec<f32> = Vec::try_from(by_patch.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
+        let by_patch = numbers(&by_patch.f_to_kind(Kind::Float)?)?;
         Ok(Self::of(
-            &largest(&by_patch, share, above(&by_patch, least, 1)),
+            &largest(&by_patch, share, least, 1),
             patch as usize,
             [height as usize, width as usize],
         ))
