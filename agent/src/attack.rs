@@ -304,13 +304,9 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
         for (down, right) in (-PATCH_CELLS..=PATCH_CELLS)
             .flat_map(|down| (-PATCH_CELLS..=PATCH_CELLS).map(move |right| (down, right)))
         {
-            let [Some(source), Some(target)] =
-                [[from_row, from_column], [row, column]].map(|[row, column]| {
-                    let (row, column) = (row + down, column + right);
-                    let is_inside = (0..height).contains(&row) && (0..width).contains(&column);
-                    is_inside.then(|| (row * width + column) as usize)
-                })
-            else {
+            let source = cell([from_row + down, from_column + right], [height, width]);
+            let target = cell([row + down, column + right], [height, width]);
+            let (Some(source), Some(target)) = (source, target) else {
                 continue;
             };
             confidence[target] = original_confidence[source];
@@ -320,6 +316,13 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
             }
         }
     }
+}
+
+/// Index of a cell of a map of `size` rows and columns; `None` outside.
+fn cell(place: [i64; 2], size: [i64; 2]) -> Option<usize> {
+    let ([row, column], [height, width]) = (place, size);
+    let is_inside = (0..height).contains(&row) && (0..width).contains(&column);
+    is_inside.then(|| (row * width + column) as usize)
 }
 
 #[cfg(test)]

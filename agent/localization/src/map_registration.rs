@@ -75,7 +75,7 @@ impl MapRegistration {
         let moved = fit.target_from_source.translation.vector - start.translation.vector;
         let is_near = moved.norm() <= MOST_MOVED_M;
         (is_near && fit.overlap_above_ground >= CONFIRMED)
-            .then(|| registered(&fit, self.map.covariance_scale))
+            .then(|| found_pose(&fit, self.map.covariance_scale))
     }
 }
 
@@ -131,7 +131,7 @@ fn judged(
 }
 
 /// The pose of a registration. Its confidence is that of the expected squared error (Eq. 6).
-fn registered(fit: &IcpFit, covariance_scale: Option<CovarianceScale>) -> FoundPose {
+fn found_pose(fit: &IcpFit, covariance_scale: Option<CovarianceScale>) -> FoundPose {
     let [position, rotation] = LEAST_STD.map(|std: f64| std * std);
     let least = [position, position, position, rotation, rotation, rotation];
     let least = Matrix6::from_diagonal(&least.into());

@@ -362,8 +362,12 @@ impl AgentLoop {
     }
 
     /// Second step: the perception.
-    fn perceive(&mut self, paired: PairedSweep<Sweep>, pose: PoseEstimate, sweep: EncodedSweep) {
-        let mut sweep = sweep;
+    fn perceive(
+        &mut self,
+        paired: PairedSweep<Sweep>,
+        pose: PoseEstimate,
+        mut sweep: EncodedSweep,
+    ) {
         let capture_nanos = paired.capture_nanos;
         let (cloud, arrived_nanos) = (&paired.sweep.cloud, paired.sweep.arrived_nanos);
         // Without a network the sweep itself is all there is to send.

@@ -91,7 +91,8 @@ impl RouterWatch {
         lost_since: Option<Instant>,
         now: Instant,
     ) -> Option<Finding> {
-        let pause = now.saturating_duration_since(self.looked.replace(now).unwrap_or(now));
+        let looked = self.looked.replace(now).unwrap_or(now);
+        let pause = now.saturating_duration_since(looked);
         // A gap in the own loop says nothing about the router.
         if pause > LIMIT {
             self.pauses.add(pause);

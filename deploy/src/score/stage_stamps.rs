@@ -59,7 +59,8 @@ impl StageStamps {
 
 /// Time at which a stage began that ended at `end_ms`; `None` without one.
 fn before_stage(stages: &[StageTiming], name: &str, end_ms: Option<f64>) -> Option<f64> {
-    Some(end_ms? - stages.iter().find(|timing| timing.stage == name)?.nanos as f64 / 1e6)
+    let stage = stages.iter().find(|timing| timing.stage == name)?;
+    Some(end_ms? - stage.nanos as f64 / 1e6)
 }
 
 fn ms_between(began_nanos: u64, nanos: u64) -> f64 {

@@ -38,6 +38,7 @@ pub fn search_scales(
             }
         }
     }
+    drop((network, detector));
     let mut setup = Setup::default();
     setup.models.precision = precision;
     setup.models.weights = weights.to_owned();

@@ -15,7 +15,8 @@ pub struct Boxes {
     objects: Vec<PerceivedObject>,
 }
 
-/// A detection, and the track of the same object where its vehicle has one.
+/// A detection, and the track of the same object where its vehicle has one. Serialised as on the wire: rounded, and without
+/// the source of the detection.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(from = "CompactBox", into = "CompactBox")]
 pub struct PerceivedObject {

@@ -22,8 +22,8 @@ struct Sequence {
     is_z_down: bool,
 }
 
-/// The scenario of `clouds` in order of time, each with its file and `world_from_lidar`. All its poses and times come
-/// from `shared_files`. Points that are stored with z down are turned by half a turn about x.
+/// The scenario of `clouds` in order of time, each with its file and `world_from_lidar`. What neither names nor sweeps
+/// hold comes from `shared_files`. Points that are stored with z down are turned by half a turn about x.
 pub(super) fn scenario(
     name: String,
     layout: Layout,

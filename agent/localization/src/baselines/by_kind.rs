@@ -15,7 +15,7 @@ use crate::pgc::{Localize, Result};
 /// Reads the weights of a baseline; `solver` is for those that regress coordinates.
 ///
 /// # Errors
-/// [`LocalizerError`] when the file is missing, truncated or of no baseline, or its tensors are not those of its
+/// [`LocalizerError`](crate::pgc::LocalizerError) when the file is missing, truncated or of no baseline, or its tensors are not those of its
 /// configuration.
 pub fn load_baseline(path: &Path, device: Device, solver: PoseSolver) -> Result<Box<dyn Localize>> {
     match Weights::load(path)?.metadata(KIND_KEY) {

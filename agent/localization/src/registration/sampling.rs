@@ -95,8 +95,8 @@ fn axes(points: &[Vector3<f64>; 3]) -> Option<Matrix3<f64>> {
         return None;
     }
     let normal = normal.try_normalize(1e-9)?;
-    let third = normal.cross(&first);
-    Some(Matrix3::from_columns(&[first, third, normal]))
+    let second = normal.cross(&first);
+    Some(Matrix3::from_columns(&[first, second, normal]))
 }
 
 /// `N` distinct indices below `count`; the caller ensures that there are at least `N`.

@@ -419,12 +419,12 @@ impl Map<'_> {
         let mut sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
         let confidence = Confidence::Calibrated(model);
         // Judged by the new model first: rejected poses are no samples for the covariances.
-        let all = checked.sweeps.iter_mut().chain(&mut checked.copies);
-        let samples = all.filter_map(|sweep| {
+        let mut samples = Vec::new();
+        for sweep in checked.sweeps.iter_mut().chain(&mut checked.copies) {
             sweep.judge_again(&confidence);
-            sweep.pose_sample()
-        });
-        match CovarianceScale::fit(&samples.collect::<Vec<_>>()) {
+            samples.extend(sweep.pose_sample());
+        }
+        match CovarianceScale::fit(&samples) {
             Ok(scale) => {
                 let text = serde_json::to_string(&scale).expect("a scale is numbers");
                 sha256 = annotate(weights, COVARIANCE_KEY, &text)?;

@@ -44,12 +44,12 @@ impl ScaleSearch {
             let scale = Scale::of_exponent(exponent);
             // Infinite where all values are 0: any scale has the error 0 then.
             let reach = scale.step() * f64::from(MAX_ACTIVATION) / largest;
-            // Measured where the best scale can be. Finer steps clamp nearly all; coarser ones err evenly.
             // Both are summed up: the first negative value may come with a later sweep.
             let sums = [(0, &mut observed.unsigned), (MIDDLE, &mut observed.centred)];
             for (zero_point, errors) in sums {
                 *errors.entry(exponent).or_default() += match reach {
                     ..0.03 => power,
+                    // Measured where the best scale can be. Finer steps clamp nearly all; coarser ones err evenly.
                     0.03..4.0 => squared_error(values, Quantisation { scale, zero_point })?,
                     // Rounding to steps of width s errs evenly by up to s / 2: s^2 / 12 in the mean square.
                     _ => power.min(count * scale.step().powi(2) / 12.0),

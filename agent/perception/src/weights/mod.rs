@@ -72,9 +72,10 @@ impl Weights {
             return Err(FileError::new(path, "a folder, must be one weights file"));
         }
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-        let incomplete = |error| incomplete(path, bytes.len(), error);
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(incomplete)?;
-        let file = SafeTensors::deserialize(&bytes).map_err(incomplete)?;
+        let (_, header) = SafeTensors::read_metadata(&bytes)
+            .map_err(|error| incomplete(path, bytes.len(), error))?;
+        let file = SafeTensors::deserialize(&bytes)
+            .map_err(|error| incomplete(path, bytes.len(), error))?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.iter() {
             if let Some(values) = read_values(path, name, &view)? {

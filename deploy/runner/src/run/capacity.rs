@@ -144,7 +144,8 @@ fn period_ms(fleet: &Fleet) -> Option<f64> {
     let pairs = times.clone().zip(times.skip(1));
     let steps = pairs.map(|(from, to)| to.saturating_sub(from));
     // The shortest step is the hardest to keep up with.
-    Some(steps.min().filter(|_| has_pace)? as f64 * 1e-6 / scene.rate)
+    let shortest_nanos = steps.min().filter(|_| has_pace)?;
+    Some(shortest_nanos as f64 * 1e-6 / scene.rate)
 }
 
 /// Megabytes of a frame: of each vehicle its sweep, and its map if it sends maps.
@@ -236,7 +237,7 @@ pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
     listed(&Vec::from_iter(all), "or")
 }
 
-/// `a, b and c`.
+/// `a, b and c`, with `word` for "and".
 pub(super) fn listed(parts: &[String], word: &str) -> String {
     match parts {
         [] => String::new(),

@@ -57,8 +57,9 @@ fn one_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
     let (mut name, mut found) = (method.name(), Vec::new());
     for &candidate in &candidates {
         // Several files of a better name are an error, which a worse name must not hide.
-        if found.is_empty() {
-            (name, found) = (candidate, files_of(path, candidate)?);
+        (name, found) = (candidate, files_of(path, candidate)?);
+        if !found.is_empty() {
+            break;
         }
     }
     if let [file] = &found[..] {

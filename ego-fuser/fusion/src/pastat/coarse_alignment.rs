@@ -84,9 +84,10 @@ impl CoarseAlignment {
         metadata.extend(earlier.iter().flat_map(|earlier| &earlier.metadata));
         let of_earlier = earlier_entries.iter().map(|entry| entry + first);
         let places: Vec<i64> = newest.iter().copied().chain(of_earlier).collect();
-        let picked = places.iter().map(|&place| metadata[place as usize]);
-        let cells = newest.iter();
-        let cells = cells.filter_map(|&entry| received.full_resolution.get(entry as usize));
+        let chosen = places.iter().map(|&place| metadata[place as usize]);
+        let cells = newest
+            .iter()
+            .filter_map(|&entry| received.full_resolution.get(entry as usize));
         let earlier = earlier.as_ref().filter(|_| !earlier_entries.is_empty());
         let earlier = earlier.map(|earlier| {
             let entries = rows_of(&earlier.warped, &earlier_entries)?;
@@ -100,7 +101,7 @@ impl CoarseAlignment {
             )?,
             received_cells: FullResolutionMap::shallow_clones(cells),
             earlier: earlier.transpose()?,
-            origins: Origins::of(&picked.collect::<Vec<_>>()),
+            origins: Origins::of(&chosen.collect::<Vec<_>>()),
             earlier_entries: { earlier_entries.iter() }
                 .map(|&entry| entry as usize)
                 .collect(),

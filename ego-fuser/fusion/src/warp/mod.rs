@@ -174,10 +174,10 @@ pub(crate) fn check(maps: &Tensor, ego_from_cav: &[Pose], grid: &BevGrid) -> Res
     let &BevGrid { height, width, .. } = grid;
     match found[..] {
         [maps, _, rows, columns] if [rows, columns] == [height, width].map(i64::from) => {
-            match maps == poses as i64 {
-                true => Ok(()),
-                false => Err(WarpError::PoseCount { maps, poses }),
+            if maps != poses as i64 {
+                return Err(WarpError::PoseCount { maps, poses });
             }
+            Ok(())
         }
         _ => Err(WarpError::Shape {
             found,

@@ -53,7 +53,8 @@ pub(crate) fn augmentation_summary() -> String {
 pub(crate) type SampleWithBoxes = (Tensor, Vec<MapMetadata>, Vec<PlacedBox>);
 
 impl Batch {
-    /// The samples with boxes, and the loss of the refinement of each vehicle's boxes. With `rng`, some neighbours send boxes, with all errors; without, all do, as detected.
+    /// The samples with boxes, and the losses of the refinement of each vehicle's boxes. With `rng`, some neighbours send
+    /// boxes, with all errors; without, all do, as detected.
     pub(crate) fn with_boxes(
         &self,
         model: &CooperativeModel,

@@ -197,10 +197,12 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
         let normal = normal.try_normalize(0.5).unwrap_or_else(Vector3::z);
         (voxel, Surfel { centre_m, normal })
     });
-    let scale = metadata.get(COVARIANCE_KEY);
-    let scale = scale.map(|text| serde_json::from_str::<CovarianceScale>(text));
-    let scale = scale.transpose();
-    let scale = scale.map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?;
+    let scale: Option<CovarianceScale> = match metadata.get(COVARIANCE_KEY) {
+        Some(text) => serde_json::from_str(text)
+            .map(Some)
+            .map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?,
+        None => None,
+    };
     let checked = scale.as_ref().map_or(Ok(()), CovarianceScale::check);
     checked.map_err(|error| error.to_string())?;
     Ok(SurfelMap {

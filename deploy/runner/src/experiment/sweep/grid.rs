@@ -59,7 +59,7 @@ pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
     sizes
 }
 
-/// Number of values of an axis; an absent one has that of the link.
+/// Number of values of an axis; 1 if it is absent.
 fn size<T>(axis: &Option<Vec<T>>) -> usize {
     axis.as_ref().map_or(1, Vec::len)
 }
@@ -77,7 +77,10 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
     let grid = &experiment.grid;
     let codec = CodecSpec {
         dtype: experiment.dtype,
-        ..CodecSpec::default()
+        keep: None,
+        zstd_level: None,
+        fit: None,
+        boxes: None,
     };
     let first = { grid.codec.as_ref() }.map(|codecs| codecs.iter().take(1).copied().collect());
     let mut points = Vec::new();

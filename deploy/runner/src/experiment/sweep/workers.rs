@@ -90,8 +90,8 @@ fn silent() -> WorkerError {
 fn start(file: &Path, out: &Path) -> Result<Child> {
     let program = std::env::current_exe().context("this program")?;
     let mut command = Command::new(&program);
-    let [sweep, to, worker] = ["sweep", "--out", "--worker"].map(Path::new);
-    command.args([sweep, file, to, out, worker]);
+    command.arg("sweep").arg(file).arg("--out").arg(out);
+    command.arg("--worker");
     // Standard error stays that of the sweep, so that warnings of workers are seen.
     let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
     child.with_context(|| program.display().to_string())
