@@ -170,7 +170,10 @@ impl Agent {
         let levels = self.levels(&sweep);
         let input = pose_input(&self.cav, input, levels);
         let pose = self.pose_source.estimate(&input);
-        let pose = { self.attack.as_ref() }.map_or(pose, |attack| attack.pose(pose));
+        let pose = self
+            .attack
+            .as_ref()
+            .map_or(pose, |attack| attack.pose(pose));
         (pose, self.pose_stages("pose", began), sweep)
     }
 
@@ -187,7 +190,10 @@ impl Agent {
             return self.perceive_map(&map);
         }
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
-        let encoded = { sweep.encoded.take() }.map_or_else(|| detector.encode_sweep(cloud), Ok)?;
+        let encoded = sweep
+            .encoded
+            .take()
+            .map_or_else(|| detector.encode_sweep(cloud), Ok)?;
         let mut perception = self.perceive_map(&encoded.features)?;
         // The encoder ran first, here or for the pose: its times belong to the sweep.
         perception.times = [encoded.times.as_slice(), &perception.times].concat();

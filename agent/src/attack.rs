@@ -295,7 +295,8 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
     let (from_row, from_column) = (from / width.max(1), from % width.max(1));
     // Copied before the loop: patches may overlap the source and each other.
     let (original, original_confidence) = (features.values.clone(), confidence.to_vec());
-    let means: Vec<f32> = { original.chunks(cells.max(1)) }
+    let means: Vec<f32> = original
+        .chunks(cells.max(1))
         .map(|channel| channel.iter().sum::<f32>() / cells.max(1) as f32)
         .collect();
     for [x, y, _] in places {

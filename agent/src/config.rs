@@ -363,7 +363,9 @@ impl AgentConfig {
 
     /// Options of the agent's node.
     pub fn options(&self) -> NodeOptions {
-        let publish = { self.publish.iter() }
+        let publish = self
+            .publish
+            .iter()
             .filter_map(|publish| publish.stream())
             .flat_map(|stream| self.settings.sent_for(stream));
         NodeOptions {
@@ -374,7 +376,9 @@ impl AgentConfig {
             keeps_running: self.keep_running || self.bus.supervised,
             sweep_log: self.sweep_log.clone(),
             // The log holds the whole configuration: a replay builds the agent from it.
-            inputs: { self.inputs.clone() }
+            inputs: self
+                .inputs
+                .clone()
                 .map(|path| (path, serde_json::to_string(self).unwrap_or_default())),
         }
     }

@@ -29,7 +29,7 @@ impl LoopClock {
     /// A moment on this clock, nanoseconds.
     pub fn nanos(&self, at: Instant) -> u64 {
         // One of the two differences is 0: a moment before the beginning is subtracted.
-        { self.began_nanos }
+        self.began_nanos
             .saturating_add(nanos::between(self.began, at))
             .saturating_sub(nanos::between(at, self.began))
     }

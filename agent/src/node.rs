@@ -124,7 +124,9 @@ impl<'a> Node<'a> {
             tracing::warn!("arrivals of sweeps are not logged: {error}");
             None
         });
-        let log = { options.inputs.as_ref() }
+        let log = options
+            .inputs
+            .as_ref()
             .and_then(|file| InputLog::create(file, KIND, agent.detector()));
         Ok(Self {
             bus,
@@ -190,14 +192,16 @@ impl<'a> Node<'a> {
                     })
                 })
             }
-            Stream::Gnss => {
-                { inbox.decode(arrival, limits) }.map(|gnss| Input::Gnss(capture_nanos, gnss))
-            }
-            Stream::Imu => {
-                { inbox.decode(arrival, limits) }.map(|motion| Input::Motion(capture_nanos, motion))
-            }
+            Stream::Gnss => inbox
+                .decode(arrival, limits)
+                .map(|gnss| Input::Gnss(capture_nanos, gnss)),
+            Stream::Imu => inbox
+                .decode(arrival, limits)
+                .map(|motion| Input::Motion(capture_nanos, motion)),
             // Only paces are left of what the node subscribes to.
-            _ => { inbox.decode(arrival, limits) }.map(|pace| Input::Pace(cav.clone(), pace)),
+            _ => inbox
+                .decode(arrival, limits)
+                .map(|pace| Input::Pace(cav.clone(), pace)),
         };
         let stats = self.bus.stats();
         if *stream == Stream::Lidar
@@ -254,7 +258,7 @@ impl<'a> Node<'a> {
     /// thread, at the map's turn.
     fn publish(&self, message: Box<Unsent>) {
         let stream = message.stream;
-        let Some((_, publisher)) = { self.publishers.iter() }.find(|(of, _)| *of == stream) else {
+        let Some((_, publisher)) = self.publishers.iter().find(|(of, _)| *of == stream) else {
             return;
         };
         let (clock, encoder, log) = (self.clock, Arc::clone(&self.encoder), self.log.clone());

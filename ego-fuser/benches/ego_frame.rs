@@ -287,11 +287,7 @@ fn message(
     let (content, features) = match method.own_content() {
         Exchange::Points => (Content::Points(agent.share_points(&frame.points)), None),
         Exchange::Boxes => (
-            Content::Boxes(
-                { perception.detections.into_iter() }
-                    .map(Into::into)
-                    .collect(),
-            ),
+            Content::Boxes(perception.detections.into_iter().map(Into::into).collect()),
             None,
         ),
         Exchange::Features | Exchange::Nothing => {

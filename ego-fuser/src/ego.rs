@@ -197,7 +197,9 @@ impl Ego {
     pub fn forget(&mut self) {
         self.history.clear();
         self.trust.iter_mut().for_each(MisbehaviourDetector::clear);
-        { self.compensation.iter_mut() }.for_each(LatencyCompensation::clear);
+        self.compensation
+            .iter_mut()
+            .for_each(LatencyCompensation::clear);
     }
 
     /// Detects once without real data, so that the first frame does not wait for the tensor library's preparations.
@@ -260,7 +262,8 @@ impl Ego {
         if let Some(compensation) = &mut self.compensation {
             compensation.forget_absent(own.capture_nanos);
         }
-        let carried: Vec<Cow<'_, View>> = { neighbours.iter() }
+        let carried: Vec<Cow<'_, View>> = neighbours
+            .iter()
             .map(|view| match &mut self.compensation {
                 Some(compensation) => compensation.carried(view, own.capture_nanos),
                 None => Cow::Borrowed(view),

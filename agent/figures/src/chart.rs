@@ -209,7 +209,10 @@ impl Chart {
     /// The quarter of the chart with the fewest points.
     fn emptiest_corner(&self) -> SeriesLabelPosition {
         use SeriesLabelPosition::{LowerLeft, LowerRight, UpperLeft, UpperRight};
-        let points = { self.series.iter() }.flat_map(|series| series.points_on(&self.x, &self.y));
+        let points = self
+            .series
+            .iter()
+            .flat_map(|series| series.points_on(&self.x, &self.y));
         let mut counts = [0_usize; 4];
         for (x, y) in points {
             let (is_right, is_upper) = (self.x.share(x) > 0.5, self.y.share(y) > 0.5);

@@ -84,10 +84,13 @@ impl SweepReports {
         // Without a description as well, or the loop would be woken again at once.
         self.next_nanos = now_nanos.saturating_add(PERIOD_NANOS);
         let newest = self.sweeps.back().map_or(0, |(capture, _)| *capture);
-        let sweeps = { self.sweeps.drain(..) }.map(|(capture, arrived_nanos)| SweepArrival {
-            before_nanos: newest.saturating_sub(capture),
-            arrived_nanos,
-        });
+        let sweeps = self
+            .sweeps
+            .drain(..)
+            .map(|(capture, arrived_nanos)| SweepArrival {
+                before_nanos: newest.saturating_sub(capture),
+                arrived_nanos,
+            });
         let sweeps = sweeps.collect();
         let mut descriptor = self.description.clone()?;
         descriptor.sweeps = sweeps;

@@ -69,7 +69,8 @@ fn gnss(capture_nanos: u64, source: GnssSource) -> Input {
 
 /// Hands inputs to a loop, each with all the steps that follow; returns what is published, as `(stream, number)`.
 fn published(agent_loop: &mut AgentLoop, inputs: Vec<Input>) -> Vec<(Stream, u64)> {
-    { outputs(agent_loop, inputs).into_iter() }
+    outputs(agent_loop, inputs)
+        .into_iter()
         .filter_map(|output| match output {
             Output::Publish(message) => Some((message.stream, message.number)),
             _ => None,

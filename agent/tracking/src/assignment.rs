@@ -72,7 +72,10 @@ impl<'a> Solver<'a> {
         for row in 0..self.costs.nrows() {
             self.connect(row);
         }
-        let pairs = { self.column_of.into_iter().enumerate() }
+        let pairs = self
+            .column_of
+            .into_iter()
+            .enumerate()
             .filter_map(|(row, column)| Some((row, column?)));
         pairs.collect()
     }

@@ -10,7 +10,8 @@ pub(crate) fn judge(scores: &mut FrameScores, frame: EvaluatedFrame, is_timed: b
     let (stamp, frames) = (frame.stamp, frame.frames);
     let cavs = frames.iter().map(|frame| frame.cav.clone());
     let poses: Vec<_> = cavs.zip(frame.poses).collect();
-    let world_from_lidar: Vec<(CavId, _)> = { frames.iter() }
+    let world_from_lidar: Vec<(CavId, _)> = frames
+        .iter()
         .filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?)))
         .collect();
     let latency_ms = is_timed.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);

@@ -82,7 +82,7 @@ impl Fleet {
         let weights = &scenario.models.weights;
         scenario.models.weights = weights_of(weights, scenario.method, scenario.sends_boxes())?;
         let weights = &scenario.models.weights;
-        let detector = { Weights::load(weights) }
+        let detector = Weights::load(weights)
             .and_then(|weights| weights.detector_config())
             .context("weights")?;
         // As the ego-fuser does: weights of another method are refused before any process starts.
@@ -186,7 +186,7 @@ impl Fleet {
 
     /// Name of the pose source that all vehicles share, or `mixed`.
     pub fn pose_source(&self) -> &'static str {
-        let settings = { self.agents.iter() }.map(|cav| self.scenario.settings_of(cav));
+        let settings = self.agents.iter().map(|cav| self.scenario.settings_of(cav));
         let mut names = settings.map(|settings| settings.pose.name());
         let first = names.next().unwrap_or("recorded");
         if names.all(|name| name == first) {
@@ -224,7 +224,10 @@ impl Fleet {
         let vehicles = self.agents.iter().map(|cav| self.settings_of(cav));
         let vehicles: Vec<_> = vehicles.collect();
         // Opened before, when the run was planned.
-        let link = { scenario.link.as_ref() }.and_then(|link| LinkConfig::open(&link.model).ok());
+        let link = scenario
+            .link
+            .as_ref()
+            .and_then(|link| LinkConfig::open(&link.model).ok());
         let link = link.as_ref().map(|(link, folder)| (link, folder.as_path()));
         let weights = scenario.models.weights.clone();
         let files = files_of(scenario.method, weights, &vehicles, link);
@@ -264,14 +267,16 @@ impl Fleet {
 fn scenario_of<'a>(scenarios: &'a [Recorded], scene: &SceneConfig) -> Result<&'a Recorded> {
     let dir = scene.dir.display();
     let recorded = match &scene.scenario {
-        None => { scenarios.first() }
+        None => scenarios
+            .first()
             .with_context(|| format!("scene {dir}: there is no scenario in it"))?,
-        Some(asked) => {
-            { scenarios.iter().find(|known| known.name == *asked) }.with_context(|| {
+        Some(asked) => scenarios
+            .iter()
+            .find(|known| known.name == *asked)
+            .with_context(|| {
                 let found: Vec<_> = scenarios.iter().map(|known| &known.name).collect();
                 format!("scene {dir}: there is no scenario {asked:?}; it has {found:?}")
-            })?
-        }
+            })?,
     };
     let (name, seek, ticks) = (&recorded.name, scene.seek, recorded.ticks.len());
     let agents = texts(&recorded.agents);

@@ -39,11 +39,14 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         use Role::{Agent, Ego, Link, Recorder, Replay, Ros2, Scorer, Viewer};
         let agents = self.agents.iter().map(|cav| Principal::new(Agent, cav));
-        let egos =
-            { self.egos.iter() }.flat_map(|cav| [Ego, Link].map(|role| Principal::new(role, cav)));
+        let egos = self
+            .egos
+            .iter()
+            .flat_map(|cav| [Ego, Link].map(|role| Principal::new(role, cav)));
         // Vehicles that are added later join a fleet whose other processes have certificates already.
         let others = [Replay, Scorer, Recorder, Viewer, Ros2].map(Principal::of_role);
-        let others = { others.into_iter() }
+        let others = others
+            .into_iter()
             .filter(|other| self.force || !self.out.join(other.to_string()).exists());
         let principals = agents.chain(egos).chain(others).collect();
         let mut plan = KeyPlan::new(&self.out, principals, self.days);

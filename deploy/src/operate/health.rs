@@ -73,7 +73,7 @@ pub struct ProcessStatus {
 /// Record of one process.
 #[derive(Debug)]
 struct Noted {
-    /// What its events have shown; the rest is filled in when it is asked for.
+    /// State, restarts and failure from its events; usage and times are added when a status is reported.
     status: ProcessStatus,
     started: Instant,
     /// Last report since this start.
@@ -149,7 +149,9 @@ impl Health {
         self.looked = now;
         // The reports of this program come over the same bus. Without any report at all, the network is down, and no
         // process counts as hung.
-        let mut ages = { last_reports.values() }.map(|at| now.saturating_duration_since(*at));
+        let mut ages = last_reports
+            .values()
+            .map(|at| now.saturating_duration_since(*at));
         let network_is_up = last_reports.is_empty() || ages.any(|age| age <= SILENT);
         let mut hanging = Vec::new();
         for (name, noted) in &mut self.processes {
@@ -197,7 +199,11 @@ impl Health {
                 0 | 1 => String::new(),
                 restarts => format!(", restarted {restarts} times"),
             };
-            { noted.status.last_fall.as_ref() }.map(|how| format!("{name} {how}{times}"))
+            noted
+                .status
+                .last_fall
+                .as_ref()
+                .map(|how| format!("{name} {how}{times}"))
         });
         ends.collect()
     }
@@ -212,7 +218,10 @@ impl Health {
             ProcessStatus {
                 up_s: pid.map_or(0.0, |_| elapsed_s(noted.started, now)),
                 problems: problems.cloned().unwrap_or_default(),
-                silent_s: { noted.last_report.filter(|_| runs) }.map(|at| elapsed_s(at, now)),
+                silent_s: noted
+                    .last_report
+                    .filter(|_| runs)
+                    .map(|at| elapsed_s(at, now)),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,
                 descriptors: usage.descriptors,

@@ -104,13 +104,18 @@ impl RemoteStatus {
         if self.processes.is_empty() {
             return vec!["no process of it is connected to this router".to_owned()];
         }
-        let troubles = { self.processes.iter() }.flat_map(|process| match process.state {
-            RemoteState::Alive => { process.problems.iter() }
-                .map(|problem| format!("{}: {problem}", process.name))
-                .collect(),
-            RemoteState::Silent => vec![format!("{} is silent", process.name)],
-            RemoteState::Gone => vec![format!("{} has left", process.name)],
-        });
+        let troubles = self
+            .processes
+            .iter()
+            .flat_map(|process| match process.state {
+                RemoteState::Alive => process
+                    .problems
+                    .iter()
+                    .map(|problem| format!("{}: {problem}", process.name))
+                    .collect(),
+                RemoteState::Silent => vec![format!("{} is silent", process.name)],
+                RemoteState::Gone => vec![format!("{} has left", process.name)],
+            });
         troubles.collect()
     }
 

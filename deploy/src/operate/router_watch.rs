@@ -78,7 +78,10 @@ impl RouterWatch {
         reported: Option<Instant>,
     ) -> Option<Finding> {
         let now = Instant::now();
-        let silence = { self.probe.as_mut() }.map_or(Duration::ZERO, |probe| probe.silence(now));
+        let silence = self
+            .probe
+            .as_mut()
+            .map_or(Duration::ZERO, |probe| probe.silence(now));
         let reported = reported.map_or(silence, |at| now.saturating_duration_since(at));
         // Any message that came through shows that the router passes messages.
         self.judge(silence.min(reported), scorer.router_lost_since(), now)
@@ -130,7 +133,9 @@ impl RouterWatch {
 
     /// Outages and pauses so far, as text.
     pub(crate) fn causes(&self) -> Vec<String> {
-        let current = { self.gone_s() }.map(|seconds| format!("router gone for {seconds:.1} s"));
+        let current = self
+            .gone_s()
+            .map(|seconds| format!("router gone for {seconds:.1} s"));
         let over = [
             self.outages.sentence("router gone"),
             self.pauses.sentence("suspended"),

@@ -157,7 +157,10 @@ impl RunStatus {
 
     /// Problems as text: of processes during the run; of failed or crashed ones when it is over.
     pub fn troubles(&self) -> Vec<String> {
-        let sick = { self.processes.iter() }.filter(|process| self.is_sick(process));
+        let sick = self
+            .processes
+            .iter()
+            .filter(|process| self.is_sick(process));
         let sick = sick.map(|process| {
             let why = why(process).map_or(String::new(), |why| format!(": {why}"));
             format!("{} is {}{why}", process.name, name_of(&process.state))
@@ -243,7 +246,9 @@ impl RunStatus {
                 number(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
                 number(neighbour.capture_offset_s.map(|seconds| seconds * 1e3), 1),
                 number(neighbour.trust, 2),
-                { neighbour.misbehaviour }.map_or(String::new(), |reason| reason.to_string()),
+                neighbour
+                    .misbehaviour
+                    .map_or(String::new(), |reason| reason.to_string()),
             ]);
         }
         table
@@ -313,7 +318,9 @@ impl StatusWriter {
         processes: impl FnOnce(Instant) -> Vec<ProcessStatus>,
     ) {
         let now = Instant::now();
-        let is_recent = { self.written }.is_some_and(|last| now.duration_since(last) < PERIOD);
+        let is_recent = self
+            .written
+            .is_some_and(|last| now.duration_since(last) < PERIOD);
         if phase == Phase::Running && is_recent {
             return;
         }
@@ -329,7 +336,8 @@ impl StatusWriter {
             frames: progress.frames,
             ticks: progress.ticks,
             rate_hz: progress.rate_hz(),
-            last_result_s: { progress.span }
+            last_result_s: progress
+                .span
                 .map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
             latency_ms: progress.latency_ms,
             fused: progress.fused,

@@ -137,7 +137,10 @@ impl StatusReporter {
             let progress = scorer.progress();
             display.update(&progress);
             // The scorer is in this process, so its own reports prove nothing.
-            let others = { progress.last_reports.iter() }.filter(|(name, _)| *name != SCORER);
+            let others = progress
+                .last_reports
+                .iter()
+                .filter(|(name, _)| *name != SCORER);
             match self.router.look(scorer, others.map(|(_, at)| *at).max()) {
                 Some(Finding::Failed(how)) => return Ending::RouterFailed { how },
                 Some(Finding::Line(line)) => display.print_line(&line),

@@ -22,7 +22,8 @@ pub struct OtherClock {
 pub(super) fn others(neighbours: &BTreeMap<CavId, NeighbourRecord>) -> BTreeMap<CavId, OtherClock> {
     let others = neighbours.iter().filter_map(|(cav, record)| {
         let clock = OtherClock {
-            system_s: { record.clock_offset_s }
+            system_s: record
+                .clock_offset_s
                 .filter(|offset_s| !is_same_clock(*offset_s, NETWORK_TRANSIT_S)),
             capture_s: record.capture_offset_s,
         };

@@ -70,10 +70,16 @@ impl Comparison {
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let runs = { self.0.iter() }.map(|(report, _)| (report.run.as_str(), Side::Right));
+        let runs = self
+            .0
+            .iter()
+            .map(|(report, _)| (report.run.as_str(), Side::Right));
         let mut table = TextTable::new([("run", Side::Left)].into_iter().chain(runs));
         for (name, value) in ROWS {
-            let values = { self.0.iter() }.map(|(report, metrics)| value(report, metrics));
+            let values = self
+                .0
+                .iter()
+                .map(|(report, metrics)| value(report, metrics));
             table.row([name.to_owned()].into_iter().chain(values));
         }
         write!(f, "{table}")?;

@@ -60,7 +60,9 @@ impl Pace {
             agents: agents(processes, metrics.ticks),
             interval_ms: Spread::of(&intervals_ms),
             rate_hz: (span_s > 0.0).then(|| intervals_ms.len() as f64 / span_s),
-            seconds: { first_s.zip(last_s) }.map_or(0.0, |(first, last)| last - first),
+            seconds: first_s
+                .zip(last_s)
+                .map_or(0.0, |(first, last)| last - first),
         }
     }
 

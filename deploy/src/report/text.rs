@@ -44,7 +44,9 @@ impl fmt::Display for Pace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (ticks, answered) = (self.ticks, self.answered);
         let share = self.answered_share().map_or("-".into(), percent);
-        let rate = { self.rate_hz }.map(|rate| format!(", {rate:.1} detections a second"));
+        let rate = self
+            .rate_hz
+            .map(|rate| format!(", {rate:.1} detections a second"));
         let (rate, interval) = (rate.unwrap_or_default(), milliseconds(&self.interval_ms));
         writeln!(
             f,

@@ -114,7 +114,9 @@ impl TrackReport {
         }
         let name = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         let mut report = Self {
-            run: { name.file_name() }.map_or(String::new(), |name| name.display().to_string()),
+            run: name
+                .file_name()
+                .map_or(String::new(), |name| name.display().to_string()),
             method,
             recorded: !results.tracks.is_empty(),
             ..Self::default()
@@ -163,9 +165,7 @@ impl TrackReport {
         let is_unposed = pose.is_some_and(|pose| pose.is_none_or(|pose| pose.validate().is_err()));
         self.without_pose += usize::from(is_unposed);
         let tracks = match result {
-            Some(of) if !self.recorded => {
-                Some({ &mut one.tracker }.follow(line.capture_nanos, &of.result))
-            }
+            Some(of) if !self.recorded => Some(one.tracker.follow(line.capture_nanos, &of.result)),
             _ => recorded,
         };
         let (tracks, left_out) =

@@ -113,7 +113,9 @@ impl MotionInput {
         let reports = std::mem::take(&mut lock(&self.measurements).reports);
         self.publisher.finish();
         let reports = reports.into_iter();
-        { reports.map(|(topic, report)| (topic.to_string(), report)) }.collect()
+        reports
+            .map(|(topic, report)| (topic.to_string(), report))
+            .collect()
     }
 }
 

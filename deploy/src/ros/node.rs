@@ -266,10 +266,13 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let mount = self.options.mount.unwrap_or_default();
         let mut in_robots = self.frames.lidars_in_robots(&self.names);
         let robots: BTreeSet<CavId> = self.options.robots().collect();
-        let frames = { self.agents.iter() }.filter_map(|cav| match robots.contains(cav) {
-            true => in_robots.remove(cav),
-            false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
-        });
+        let frames = self
+            .agents
+            .iter()
+            .filter_map(|cav| match robots.contains(cav) {
+                true => in_robots.remove(cav),
+                false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
+            });
         let frames: Vec<_> = frames.collect();
         // The stamp of a fixed transform has no meaning.
         let cdr = ros2::transforms(0, &frames);

@@ -32,7 +32,9 @@ pub(super) fn watch_namesakes(session: &RosSession) -> Result<Subscriber<()>, Bu
             warn(&own, &other, domain_id);
         }
     });
-    { subscriber.wait() }.map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
+    subscriber
+        .wait()
+        .map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
 }
 
 fn warn(own: &NodeName, other: &NodeName, domain_id: u32) {

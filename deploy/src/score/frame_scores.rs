@@ -167,8 +167,9 @@ impl FrameScores {
             return;
         };
         let agents = truth.agents.iter();
-        let world_from_lidar: Vec<(CavId, Pose)> =
-            { agents.map(|agent| (agent.cav.clone(), agent.world_from_lidar)) }.collect();
+        let world_from_lidar: Vec<(CavId, Pose)> = agents
+            .map(|agent| (agent.cav.clone(), agent.world_from_lidar))
+            .collect();
         // Poses count whether or not the ego has answered.
         self.judge_poses(&tick.poses, &world_from_lidar);
         let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
@@ -252,7 +253,10 @@ impl FrameScores {
         let ages_ms = fused.map(|of| of.age_nanos as f64 * 1e-6);
         let poses = result.pose.world_from_cav().zip(world_from_ego.as_ref());
         let ego_error = poses.map(|(found, truth)| PoseError::between(found, truth));
-        let stale = { result.skipped.iter() }.filter(|one| one.reason == Some(DropReason::Stale));
+        let stale = result
+            .skipped
+            .iter()
+            .filter(|one| one.reason == Some(DropReason::Stale));
         self.records.push(FrameRecord {
             agent_frame: Some(result.agent_frame),
             latency_ms: stamps.detected_ms,

@@ -281,7 +281,8 @@ impl PoseErrors {
 impl Communication {
     /// Summarises `(payload, wire)` bytes of every neighbour and frame; `nominal_values` is the size of a feature map.
     pub fn of(bytes: &[(u64, u64)], nominal_values: u64) -> Self {
-        let (payload, wire): (Vec<f64>, Vec<f64>) = { bytes.iter() }
+        let (payload, wire): (Vec<f64>, Vec<f64>) = bytes
+            .iter()
             .map(|(payload, wire)| (*payload as f64, *wire as f64))
             .unzip();
         let payload = mean(&payload);

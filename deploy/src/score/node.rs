@@ -267,8 +267,9 @@ impl ScorerNode {
             joined.expect("the scorer's thread has no reason to panic");
         let own_stats = self.connection.bus.stats();
         let process = &self.connection.bus.identity().process;
-        let (own, others): (Vec<_>, Vec<_>) =
-            { stats.into_values() }.partition(|stats| stats.process == *process);
+        let (own, others): (Vec<_>, Vec<_>) = stats
+            .into_values()
+            .partition(|stats| stats.process == *process);
         // The scorer receives its own reports like those of others; its current counters are newer.
         let own = ProcessStats {
             process: process.clone(),

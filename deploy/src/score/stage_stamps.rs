@@ -31,7 +31,8 @@ impl StageStamps {
         detected_nanos: u64,
         stages: &[StageTiming],
     ) -> Self {
-        let fusing = { stages.iter() }
+        let fusing = stages
+            .iter()
             .filter(|timing| !matches!(timing.stage.as_str(), "transport" | "wait" | "send"));
         let fusing_ms: f64 = fusing.map(|timing| timing.nanos as f64 / 1e6).sum();
         let detected = ms_between(began_nanos, detected_nanos);

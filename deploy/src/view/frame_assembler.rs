@@ -159,8 +159,10 @@ impl FrameAssembler {
     /// True if nothing is missing at `at`: results come before their tracks.
     fn is_complete(&mut self, at: u64) -> bool {
         // An earlier result is still without: the ego tracks no more.
-        self.awaits_tracks &=
-            !{ self.open.range(..at) }.any(|(_, it)| it.result.is_some() && it.tracks.is_none());
+        self.awaits_tracks &= !self
+            .open
+            .range(..at)
+            .any(|(_, it)| it.result.is_some() && it.tracks.is_none());
         let frame = self.open.get(&at);
         frame.is_some_and(|it| it.result.is_some() && !(self.awaits_tracks && it.tracks.is_none()))
     }
@@ -384,7 +386,7 @@ impl OpenFrame {
             }
         }
         let mut points = Vec::new();
-        let vehicles = { cavs.into_iter() }.map(|cav| self.vehicle(cav, &mut points));
+        let vehicles = cavs.into_iter().map(|cav| self.vehicle(cav, &mut points));
         (vehicles.collect(), points)
     }
 
@@ -392,7 +394,9 @@ impl OpenFrame {
         let truth = self.true_pose(cav);
         let own_result = self.result().filter(|result| result.ego == *cav);
         // The ego's result repeats its pose, for ticks whose pose message is missing.
-        let estimate = { self.poses.get(cav) }
+        let estimate = self
+            .poses
+            .get(cav)
             .map(|(_, estimate)| estimate)
             .or(own_result.map(|result| &result.pose));
         let pose = estimate.and_then(PoseEstimate::world_from_cav);
@@ -420,7 +424,10 @@ impl OpenFrame {
     }
 
     fn sweep(&self, cav: &CavId) -> Vec<u8> {
-        let sweep = { self.sweeps.get(cav) }.and_then(|payload| decoded::<Lidar>(payload));
+        let sweep = self
+            .sweeps
+            .get(cav)
+            .and_then(|payload| decoded::<Lidar>(payload));
         sweep.map_or(Vec::new(), |Lidar { points }| decimate(&points))
     }
 
@@ -462,7 +469,9 @@ impl OpenFrame {
 
     /// Detections that single vehicles sent.
     fn single(&self) -> Vec<ShownBox> {
-        let shown = { self.own_boxes.iter() }
+        let shown = self
+            .own_boxes
+            .iter()
             .flat_map(|(cav, boxes)| self.placed(cav, &boxes.pose, boxes.detections(), Some(cav)));
         shown.collect()
     }

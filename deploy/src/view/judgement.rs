@@ -44,10 +44,14 @@ impl Judgement {
     pub(super) fn counts(&self, result: &Detections, least_score: f32) -> [usize; 3] {
         let all = result.detections.iter().zip(&self.verdicts);
         let shown = all.filter(|(detection, _)| detection.score >= least_score);
-        let matches = { shown.clone() }.filter(|(_, verdict)| matches!(verdict, Verdict::Match(_)));
+        let matches = shown
+            .clone()
+            .filter(|(_, verdict)| matches!(verdict, Verdict::Match(_)));
         let wrong = shown.filter(|(_, verdict)| **verdict == Verdict::FalsePositive);
-        let missed =
-            { self.found.values() }.filter(|score| score.is_none_or(|score| score < least_score));
+        let missed = self
+            .found
+            .values()
+            .filter(|score| score.is_none_or(|score| score < least_score));
         [matches.count(), wrong.count(), missed.count()]
     }
 }
@@ -75,7 +79,9 @@ impl Judge {
 
     /// Name of the protocol.
     pub(super) fn protocol(&self) -> &str {
-        { self.protocol.as_ref() }.map_or("opv2v", |protocol| &protocol.name)
+        self.protocol
+            .as_ref()
+            .map_or("opv2v", |protocol| &protocol.name)
     }
 
     fn rule(&self, area: &DetectionArea) -> GroundTruthRule {

@@ -145,7 +145,9 @@ impl LiveRun {
         RunStatus {
             silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
             unanswered_s: activity.answered.map(|at| at.elapsed().as_secs_f64()),
-            problems: { activity.problems.iter() }
+            problems: activity
+                .problems
+                .iter()
                 .flat_map(|(name, of)| of.iter().map(move |problem| format!("{name}: {problem}")))
                 .collect(),
             is_over: activity.is_over,
@@ -319,7 +321,9 @@ impl Listener {
             return;
         }
         if maps.is_none() {
-            let keys = { wanted.iter() }.map(|cav| Key::stream(&self.run, cav, Stream::Bev));
+            let keys = wanted
+                .iter()
+                .map(|cav| Key::stream(&self.run, cav, Stream::Bev));
             let selectors: Vec<KeyExpr> = keys.map(|key| KeyExpr::one(&key)).collect();
             let opened = self.open(&selectors, "feature maps");
             *maps = opened.map(|opened| (wanted, opened));

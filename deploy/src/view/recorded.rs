@@ -147,16 +147,23 @@ impl RecordedRun {
             arrivals,
             stats,
             areas,
-            protocol: { file.parent() }.and_then(|folder| RunStatus::read(folder).ok()?.protocol),
+            protocol: file
+                .parent()
+                .and_then(|folder| RunStatus::read(folder).ok()?.protocol),
         };
-        let shown = { moments.into_iter() }.filter_map(|(at, entries)| run.moment(at, entries));
+        let shown = moments
+            .into_iter()
+            .filter_map(|(at, entries)| run.moment(at, entries));
         run.moments = shown.collect();
         if run.moments.is_empty() {
             return Err(ViewError::Empty(file));
         }
         let egos = run.egos();
         let no_ego = egos.is_empty().then_some(None);
-        run.timelines = { egos.into_iter().map(Some).chain(no_ego) }
+        run.timelines = egos
+            .into_iter()
+            .map(Some)
+            .chain(no_ego)
             .map(|ego| run.timeline_of(ego))
             .collect::<Result<_, _>>()?;
         Ok(run)
@@ -196,8 +203,10 @@ impl RecordedRun {
         // Reports until the last message of the moment: what was known at that time.
         let until = arrivals.max().unwrap_or(0);
         // Results come last, and complete the scene frame.
-        let (results, others): (Vec<usize>, Vec<usize>) =
-            { moment.entries.iter() }.partition(|at| is_result(&self.entry(**at).key.topic));
+        let (results, others): (Vec<usize>, Vec<usize>) = moment
+            .entries
+            .iter()
+            .partition(|at| is_result(&self.entry(**at).key.topic));
         let reports = self.reports_until(until).into_iter();
         for number in reports.chain(others).chain(results) {
             let entry = self.entry(number);
@@ -298,7 +307,9 @@ impl RecordedRun {
     }
 
     fn timeline_of(&self, ego: Option<CavId>) -> Result<Timeline> {
-        let links = { ego.as_ref() }.map(|ego| LinkSeries::new(self.recording.entries(), ego));
+        let links = ego
+            .as_ref()
+            .map(|ego| LinkSeries::new(self.recording.entries(), ego));
         let links = links.unwrap_or_default();
         let (mut pace, mut judge) = (PaceCounter::default(), Judge::new(self.protocol.clone()));
         let mut summaries = Vec::with_capacity(self.moments.len());
@@ -307,7 +318,9 @@ impl RecordedRun {
             let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;
             summary.links = links.at(moment.capture_nanos, moment.began_nanos);
             if let Some(began) = moment.began_nanos {
-                let done = { summary.latency_ms }.map(|ms| began.saturating_add((ms * 1e6) as u64));
+                let done = summary
+                    .latency_ms
+                    .map(|ms| began.saturating_add((ms * 1e6) as u64));
                 pace.tick(done);
             }
             summaries.push(summary);
@@ -332,7 +345,10 @@ impl RecordedRun {
         });
         let swept_ms = times.map(|(began, arrived)| (arrived as f64 - began as f64) / 1e6);
         let summary = timeline.summaries.get(index);
-        let egos = { self.timelines.iter() }.filter_map(|timeline| timeline.ego.clone());
+        let egos = self
+            .timelines
+            .iter()
+            .filter_map(|timeline| timeline.ego.clone());
         SceneFrame {
             swept_ms,
             tracks: self.tracks_at(index, timeline),
@@ -346,7 +362,10 @@ impl RecordedRun {
     /// Tracks of a scene frame with their trails, the same on every way to it.
     fn tracks_at(&self, index: usize, timeline: &Timeline) -> Vec<ShownTrack> {
         let (mut trails, mut shown) = (Trails::default(), Vec::new());
-        let now_nanos = { self.moments.get(index) }.map_or(0, |moment| moment.capture_nanos);
+        let now_nanos = self
+            .moments
+            .get(index)
+            .map_or(0, |moment| moment.capture_nanos);
         let until = self.moments.iter().zip(&timeline.tracks).take(index + 1);
         for (Moment { capture_nanos, .. }, tracks) in until {
             if Trails::covers(now_nanos, *capture_nanos) {

@@ -255,7 +255,7 @@ fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S
 /// The points of a sweep as sent to the page, evenly decimated if there are many.
 pub(super) fn decimate(points: &PointCloud) -> Vec<u8> {
     let decimated = points.decimate(MAX_POINTS);
-    let coordinates = { decimated.xyzi.iter() }.flat_map(|[x, y, z, _]| [*x, *y, *z]);
+    let coordinates = decimated.xyzi.iter().flat_map(|[x, y, z, _]| [*x, *y, *z]);
     // The cast saturates: beyond 327.67 m a coordinate stays at that limit.
     let bytes = coordinates.flat_map(|metres| ((metres * 100.0).round() as i16).to_le_bytes());
     bytes.collect()

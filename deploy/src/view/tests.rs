@@ -403,7 +403,9 @@ fn a_recorded_run_is_shown_in_any_order() {
 #[test]
 fn a_recording_with_nothing_to_show_is_refused_with_the_reason() {
     let all = messages(0, 0, Stream::Lidar);
-    let of_another_version: Vec<_> = { all.iter().cloned() }
+    let of_another_version: Vec<_> = all
+        .iter()
+        .cloned()
         .map(|(topic, mut payload)| {
             // The version follows the four bytes that begin every message.
             payload[4] ^= 1;
@@ -419,7 +421,8 @@ fn a_recording_with_nothing_to_show_is_refused_with_the_reason() {
             }
         )
     };
-    let sweeps: Vec<_> = { all.into_iter() }
+    let sweeps: Vec<_> = all
+        .into_iter()
         .filter(|(topic, _)| is_sweep(topic))
         .collect();
     let run = RunId::new("test").unwrap();

@@ -25,7 +25,8 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
 /// `step`, but at most a `share` of all, and at least one.
 pub(crate) fn largest(numbers: &[f32], share: f64, least: f32, step: usize) -> Vec<usize> {
     // NaN is not below anything, so it counts.
-    let above = { numbers.iter() }
+    let above = numbers
+        .iter()
         .filter(|number| number.partial_cmp(&&least) != Some(Ordering::Less))
         .count();
     let most = (numbers.len() as f64 * share).ceil() as usize;

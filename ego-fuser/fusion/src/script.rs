@@ -142,7 +142,9 @@ impl Fusion for ScriptFusion {
         let device = features.device();
         let poses: Vec<f32> = maps.metadata.iter().flat_map(planar).collect();
         let poses = tensor(&poses, &[-1, 3], device)?;
-        let about: (Vec<f32>, Vec<f32>) = { maps.metadata.iter() }
+        let about: (Vec<f32>, Vec<f32>) = maps
+            .metadata
+            .iter()
             .map(|map| (map.confidence as f32, map.age_secs as f32))
             .unzip();
         let confidence = tensor(&about.0, &[-1], device)?;

@@ -192,7 +192,7 @@ impl Evaluator {
         let detector = self.detector_of(&settings)?;
         let cav = &scenario.agents[place];
         // A vehicle's own falsification takes precedence over the attack of the run.
-        let attack = { self.setup.attack }.and_then(|attack| attack.of(place, cav));
+        let attack = self.setup.attack.and_then(|attack| attack.of(place, cav));
         let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
         let publish = needed.map_or_else(Vec::new, |stream| settings.sent_for(stream));
@@ -202,9 +202,7 @@ impl Evaluator {
 
     /// The detector of a vehicle: its own network, or that of the run.
     fn detector_of(&self, settings: &AgentSettings) -> Result<Detector, EvaluateError> {
-        let own = { settings.weights.as_deref() }
-            .map(Weights::load)
-            .transpose()?;
+        let own = settings.weights.as_deref().map(Weights::load).transpose()?;
         let own = own.map(|weights| weights.with_precision(self.setup.models.precision));
         let weights = own.as_ref().unwrap_or(&self.weights);
         let config = weights.detector_config()?;

@@ -66,7 +66,7 @@ pub(super) fn corrected(ego_from_cav: Pose, received: &[Detection], own: &[Detec
 /// Number of sent landmarks that match a box of the ego where a pose places them.
 fn matched_boxes(ego_from_cav: &Pose, received: &[Detection], own: &[Detection]) -> usize {
     let ego_from_cav = ego_from_cav.isometry();
-    let landmarks = { received.iter() }.filter(|one| one.score >= LANDMARK_SCORE);
+    let landmarks = received.iter().filter(|one| one.score >= LANDMARK_SCORE);
     let centres = landmarks.map(|one| one.box3d.transformed(&ego_from_cav).center_m);
     let matched = centres.filter(|[x, y, _]| {
         let mut own = own.iter().map(|own| own.box3d.center_m);

@@ -130,9 +130,8 @@ impl Followed {
         refused: &mut usize,
     ) -> &[PerceivedObject] {
         if self.capture_nanos != Some(view.capture_nanos) {
-            let found: Vec<Detection> = { sent.iter() }
-                .map(|object| object.detection.clone())
-                .collect();
+            let found: Vec<Detection> =
+                sent.iter().map(|object| object.detection.clone()).collect();
             self.objects = self.tracker.objects(view.capture_nanos, &view.pose, found);
             self.capture_nanos = Some(view.capture_nanos);
             *refused += usize::from(!self.takes_stated(&view.cav, sent));
@@ -143,7 +142,7 @@ impl Followed {
     /// Takes the stated tracks. Where the ego's own contradict most of them, its own stay: a single one is rather a box that
     /// the ego has taken for another one after a lost message.
     fn takes_stated(&mut self, cav: &CavId, sent: &[PerceivedObject]) -> bool {
-        let pairs = { self.objects.iter() }.zip(sent);
+        let pairs = self.objects.iter().zip(sent);
         let compared =
             pairs.filter_map(|(object, sent)| sent.track.as_ref().zip(object.track.as_ref()));
         let verdicts: Vec<bool> = compared
@@ -214,7 +213,8 @@ mod tests {
             panic!("{view:?}");
         };
         let center = |object: &PerceivedObject| object.detection.box3d.center_m;
-        { objects.iter() }
+        objects
+            .iter()
             .map(|object| [center(object)[0], center(object)[1]])
             .collect()
     }

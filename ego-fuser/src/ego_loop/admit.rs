@@ -160,7 +160,10 @@ impl EgoLoop {
             return Ok(capture_nanos);
         };
         // A frame that still waits may use what is too old for the newest.
-        let oldest = { self.frames.front() }.map_or(newest, |frame| frame.view.capture_nanos);
+        let oldest = self
+            .frames
+            .front()
+            .map_or(newest, |frame| frame.view.capture_nanos);
         if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
             Err(DropReason::Future)
         } else if capture_nanos.saturating_add(self.options.pairing.max_age_nanos) < oldest {

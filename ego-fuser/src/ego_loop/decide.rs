@@ -66,11 +66,16 @@ impl EgoLoop {
         if self.frames.len() > 1 || self.is_complete(frame.view.capture_nanos) {
             return 0;
         }
-        { frame.begun_nanos }.saturating_add(self.options.deadline_nanos)
+        frame
+            .begun_nanos
+            .saturating_add(self.options.deadline_nanos)
     }
 
     fn is_complete(&self, capture_nanos: u64) -> bool {
-        let mut awaited = { self.members.iter() }.filter(|cav| self.silence.is_awaited(cav));
+        let mut awaited = self
+            .members
+            .iter()
+            .filter(|cav| self.silence.is_awaited(cav));
         awaited.all(|cav| {
             let is_other = self.models.is_other(cav);
             // Boxes end the wait for maps that are of another network, or not in time.
@@ -110,8 +115,9 @@ impl EgoLoop {
                 self.outputs.push(Output::Received(self.own_source()));
                 self.leave_out(&output.skipped, &output.fused, &mut choice);
                 let fused = self.use_messages(&own, &output.fused, &choice);
-                let transport =
-                    { frame.transport }.map(|transport| StageTiming::new("transport", transport));
+                let transport = frame
+                    .transport
+                    .map(|transport| StageTiming::new("transport", transport));
                 let (wait, stages) = (StageTiming::new("wait", waited), output.stages);
                 let result = Detections {
                     ego: self.cav.clone(),
@@ -135,7 +141,7 @@ impl EgoLoop {
             }
             Err(error) => {
                 self.report.failed += 1;
-                { &mut self.report.failure }.get_or_insert_with(|| error.to_string());
+                self.report.failure.get_or_insert_with(|| error.to_string());
                 let reason = match error.is_of_frame() {
                     true => DropReason::NotFinite,
                     false => DropReason::Shape,
@@ -235,8 +241,9 @@ impl EgoLoop {
             }
             self.count(view, message, None);
             // A neighbour is one, also by two messages: its boxes are read beside its map.
-            if let Some(same) =
-                { described.iter_mut() }.find(|same: &&mut FusedNeighbour| same.cav == view.cav)
+            if let Some(same) = described
+                .iter_mut()
+                .find(|same: &&mut FusedNeighbour| same.cav == view.cav)
             {
                 same.age_nanos = same.age_nanos.max(view.age_nanos(own));
                 same.payload_bytes += message.payload_bytes;

@@ -87,7 +87,9 @@ impl Waits {
             let problem = format!("{method} needs {stream}, agent {cav} publishes {published}");
             (problem, *since)
         });
-        let gone = { self.gone.iter() }
+        let gone = self
+            .gone
+            .iter()
             .filter(|(_, since)| **since < late_before)
             .map(|(cav, since)| (format!("vehicle {cav} is gone"), *since));
         no_own.into_iter().chain(without).chain(gone).collect()

@@ -92,12 +92,13 @@ impl Evidence {
         };
         let sender = Point2::from(ego_from_cav.translation.vector);
         let [mine, theirs] = [own, theirs].map(|seen| -> Vec<Point2<f64>> {
-            { seen.vehicles.iter() }
-                .map(|at| Point2::from(*at))
-                .collect()
+            seen.vehicles.iter().map(|at| Point2::from(*at)).collect()
         });
         let theirs_here: Vec<_> = theirs.into_iter().map(|at| ego_from_cav * at).collect();
-        for at in { theirs_here.iter() }.filter(|at| at.coords.norm() >= OWN_BODY_M) {
+        for at in theirs_here
+            .iter()
+            .filter(|at| at.coords.norm() >= OWN_BODY_M)
+        {
             let is_mine = is_among(at, &mine, radius_m);
             let sure = own.sure_at([at.x, at.y], radius_m);
             let is_empty = sure.is_some_and(|sure| sure < EMPTY);
@@ -121,10 +122,14 @@ impl Evidence {
     /// anything to compare.
     pub(super) fn judgement(&self) -> Option<(f64, MisbehaviourReason)> {
         use MisbehaviourReason::{GhostObjects, PositionMismatch};
-        let elsewhere = { self.against_elsewhere() }.map(|odds| (odds, PositionMismatch));
-        let invention = { self.against_invention() }.map(|odds| (odds, GhostObjects));
+        let elsewhere = self
+            .against_elsewhere()
+            .map(|odds| (odds, PositionMismatch));
+        let invention = self.against_invention().map(|odds| (odds, GhostObjects));
         let candidates = [elsewhere, invention, self.against_other_attacks()].into_iter();
-        { candidates.flatten() }.min_by(|(one, _), (other, _)| one.total_cmp(other))
+        candidates
+            .flatten()
+            .min_by(|(one, _), (other, _)| one.total_cmp(other))
     }
 
     /// The log likelihood ratio without the type.

@@ -179,7 +179,8 @@ impl MisbehaviourDetector {
         let others = self.peers.iter().filter(|(cav, _)| **cav != view.cav);
         let earlier = others.flat_map(|(_, peer)| peer.last.iter().flatten());
         let fingerprints = earlier.map(|(_, _, fingerprint)| fingerprint);
-        let likeness = { fingerprints.chain([&mine.fingerprint]) }
+        let likeness = fingerprints
+            .chain([&mine.fingerprint])
             .map(|fingerprint| alike(&seen.fingerprint, fingerprint));
         evidence.like_another = likeness.fold(0.0, f64::max);
         if let (Some((capture_nanos, before, fingerprint)), Some(now)) =
@@ -260,7 +261,9 @@ fn kind(view: &View) -> usize {
 /// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
 /// neither has any in its favour.
 fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
-    let log_odds = { evidence.iter() }.map(|evidence| evidence.as_ref()?.log_odds());
+    let log_odds = evidence
+        .iter()
+        .map(|evidence| evidence.as_ref()?.log_odds());
     let fits: Vec<f64> = log_odds.map(|odds| odds.unwrap_or(0.0)).collect();
     for (index, evidence) in evidence.iter_mut().enumerate() {
         let Some(evidence) = evidence else { continue };

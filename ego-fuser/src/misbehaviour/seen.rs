@@ -79,7 +79,9 @@ impl Observation {
 
     pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
         let sure = all.iter().filter(|(_, score)| *score >= SURE);
-        let values = { all.iter() }.flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]);
+        let values = all
+            .iter()
+            .flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]);
         Self {
             vehicles: sure.map(|(at_m, _)| *at_m).collect(),
             fingerprint: values.collect(),
@@ -158,7 +160,8 @@ impl Observation {
             }
             Sure::Boxes(_) if at_m[0].hypot(at_m[1]) > REACH_M => None,
             Sure::Boxes(all) => {
-                let near = { all.iter() }
+                let near = all
+                    .iter()
                     .filter(|([x, y], _)| (x - at_m[0]).hypot(y - at_m[1]) <= radius_m);
                 Some(near.map(|(_, score)| *score).fold(0.0, f32::max))
             }

@@ -24,7 +24,9 @@ impl ValueRange {
     pub(super) fn widen(&mut self, map: &[f32]) {
         let cells = self.cells(map);
         for (largest, channel) in self.0.iter_mut().zip(map.chunks(cells)) {
-            *largest = { channel.iter() }.fold(*largest, |largest, value| largest.max(value.abs()));
+            *largest = channel
+                .iter()
+                .fold(*largest, |largest, value| largest.max(value.abs()));
         }
     }
 
@@ -37,7 +39,9 @@ impl ValueRange {
             if channel.iter().any(|value| value.abs() > limit) {
                 return true;
             }
-            let counted = { channel.iter() }.filter(|value| value.abs() > CHANNEL * largest);
+            let counted = channel
+                .iter()
+                .filter(|value| value.abs() > CHANNEL * largest);
             above += counted.count();
         }
         above as f64 > SHARE * map.len() as f64

@@ -90,7 +90,9 @@ impl From<&EgoConfig> for NodeOptions {
             neighbours: Some(neighbours).filter(|named| !named.is_empty()),
             over_link: config.over_link,
             keeps_running: config.keep_running || config.bus.supervised,
-            inputs: { config.inputs.clone() }
+            inputs: config
+                .inputs
+                .clone()
                 .map(|path| (path, serde_json::to_string(config).unwrap_or_default())),
 
             ..Self::from(&config.ego)
@@ -204,7 +206,9 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         let ego_loop = EgoLoop::new(cav, &ego, options.of_loop);
-        let log = { options.inputs.as_ref() }
+        let log = options
+            .inputs
+            .as_ref()
             .and_then(|file| InputLog::create(file, KIND, Some(ego.detector())));
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         // Ends the wait for the next message at once.
@@ -230,7 +234,9 @@ impl<'a> Node<'a> {
             clock: LoopClock::start(),
             pace: bus.publisher(Topic::stream(cav, Stream::Pace), PublisherOptions::POSE)?,
             detections: Results::open(bus, cav, [Stream::Detections, Stream::DetectionsJson])?,
-            tracks: { options.of_loop.tracks }
+            tracks: options
+                .of_loop
+                .tracks
                 .then(|| Results::open(bus, cav, [Stream::Tracks, Stream::TracksJson]))
                 .transpose()?,
             log,
@@ -330,7 +336,11 @@ impl<'a> Node<'a> {
     fn publish(&mut self, capture_nanos: u64, result: Detections) {
         let stats = self.bus.stats();
         // The own message's transport is counted already.
-        for stage in { result.stages.iter() }.filter(|stage| stage.stage != "transport") {
+        for stage in result
+            .stages
+            .iter()
+            .filter(|stage| stage.stage != "transport")
+        {
             stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
         for neighbour in &result.neighbours {

@@ -63,7 +63,9 @@ impl Node<'_> {
         let offset_nanos = (offset_s * 1e9) as i64;
         let newest_nanos = arrival.header.stamp.capture_nanos;
         // Arrivals are on the clock of the agent. Minus its lead they are on that of the ego.
-        let sweeps = { descriptor.sweeps.iter() }
+        let sweeps = descriptor
+            .sweeps
+            .iter()
             .map(|sweep| SweepTime {
                 capture_nanos: newest_nanos.saturating_sub(sweep.before_nanos),
                 arrived_nanos: sweep.arrived_nanos.saturating_sub_signed(offset_nanos),

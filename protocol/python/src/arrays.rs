@@ -7,7 +7,7 @@ use pyo3::{Py, PyResult, Python};
 /// A matrix of `float64`.
 pub(crate) type Matrix = Py<PyArray2<f64>>;
 
-/// What `make` makes of a value that is there.
+/// An optional value, converted.
 pub(crate) fn optional<T, U>(
     value: Option<T>,
     make: impl FnOnce(T) -> PyResult<U>,

@@ -160,7 +160,9 @@ mod tests {
         }
 
         fn operate(&mut self) -> io::Result<()> {
-            self.operations_left = { self.operations_left.checked_sub(1) }
+            self.operations_left = self
+                .operations_left
+                .checked_sub(1)
                 .ok_or_else(|| io::Error::other("the power is cut"))?;
             Ok(())
         }

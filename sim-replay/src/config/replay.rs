@@ -178,7 +178,7 @@ impl ReplayConfig {
             ready_timeout,
             lockstep: wait.egos.clone(),
             answer_timeout,
-            link: { sensor_link.stages() }.map(|link| (link, sensor_link.seed)),
+            link: sensor_link.stages().map(|link| (link, sensor_link.seed)),
             checkpoint: self.checkpoint.clone(),
         }
     }

@@ -20,7 +20,8 @@ fn copy(mut from: TcpStream, mut to: TcpStream, replaces: bool) {
     let mut buffer = [0; 1 << 16];
     while let Ok(length @ 1..) = from.read(&mut buffer) {
         let bytes = &mut buffer[..length];
-        let places = { bytes.windows(4) }
+        let places = bytes
+            .windows(4)
             .enumerate()
             .filter(|(_, part)| replaces && *part == REPLACED[0]);
         for place in places.map(|(place, _)| place).collect::<Vec<_>>() {

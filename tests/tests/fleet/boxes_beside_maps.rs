@@ -45,7 +45,8 @@ fn maps_that_are_always_late_are_not_awaited_beside_boxes() {
         ..LinkConfig::default()
     };
     let (late, _) = sending(Some(SentBoxes::Beside), slow);
-    let waits_ms: Vec<u64> = { late.iter() }
+    let waits_ms: Vec<u64> = late
+        .iter()
         .map(|frame| {
             let mut stages = frame.result.stages.iter();
             stages.find(|stage| stage.stage == "wait").unwrap().nanos / MS

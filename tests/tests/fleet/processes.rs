@@ -128,7 +128,8 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
 fn check_tracks(run: &Path) {
     let file = run.join("tracks.jsonl");
     let lines = fs::read_to_string(&file).unwrap();
-    let frames: Vec<TracksReport> = { lines.lines() }
+    let frames: Vec<TracksReport> = lines
+        .lines()
         .map(|line| serde_json::from_str(line).unwrap())
         .collect();
     let ticks: Vec<_> = frames.iter().map(|frame| frame.tick).collect();
@@ -329,7 +330,9 @@ fn check_replayed_agents(run: &Path) {
         assert_eq!(published, replay_inputs("agent", &file, &[], codes));
         published
     });
-    let published: Vec<Value> = { replayed.iter().flat_map(|published| published.lines()) }
+    let published: Vec<Value> = replayed
+        .iter()
+        .flat_map(|published| published.lines())
         .map(|line| serde_json::from_str(line).unwrap())
         .collect();
     let recording = Recording::open(&run.join("recording.mcap")).unwrap();

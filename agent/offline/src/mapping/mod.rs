@@ -106,7 +106,9 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
         .then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
     Ok(MapReport {
         place: config.place.clone(),
-        sha256: { sha256.or(scaled) }.unwrap_or_else(|| summary.trained.sha256.clone()),
+        sha256: sha256
+            .or(scaled)
+            .unwrap_or_else(|| summary.trained.sha256.clone()),
         // The cache counts every copy as a sweep.
         training_sweeps: summary.sweeps / plan.copies.max(1),
         copies: plan.copies,
@@ -187,7 +189,10 @@ impl Map<'_> {
         let last = positions.iter().map(|(drive, _)| *drive).max();
         // Drive by drive: the step from the end of one to the start of the next is no part of a path.
         for drive in 0..last.map_or(0, |last| last + 1) {
-            let of_drive = { positions.iter().enumerate() }.filter(|(_, (of, _))| *of == drive);
+            let of_drive = positions
+                .iter()
+                .enumerate()
+                .filter(|(_, (of, _))| *of == drive);
             let known: Vec<(usize, Vector3<f64>)> = of_drive
                 .filter_map(|(index, (_, position))| Some((index, (*position)?)))
                 .collect();

@@ -146,7 +146,8 @@ impl PairMaker {
         let partner_places = places(sweep.cells(), &world_from_partner);
         let grid = Grid::new(&partner_places);
         let candidates = choose(anchor_sweep.cells(), CELLS, rng);
-        let matched = { candidates.into_iter() }
+        let matched = candidates
+            .into_iter()
             .filter_map(|cell| Some((cell, grid.nearest(anchor_places[cell])?)));
         let matched: Vec<(usize, usize)> = matched.collect();
         // The partners of the anchor's cells, and others as negatives.

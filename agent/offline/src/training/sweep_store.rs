@@ -44,7 +44,10 @@ impl StoredSweep {
     ) -> SweepVoxels {
         let turn: Isometry3<f32> = turned_from_sensor.cast();
         // 32 decisions from one draw of the generator would be faster still; this does not dominate the time.
-        let kept = { self.points.iter() }.filter(|_| keep >= 1.0 || rng.random_bool(keep));
+        let kept = self
+            .points
+            .iter()
+            .filter(|_| keep >= 1.0 || rng.random_bool(keep));
         let turned = kept.map(|point| {
             let metres = point.map(|axis| f32::from(axis) * UNIT_M);
             (turn * nalgebra::Point3::from(metres)).into()

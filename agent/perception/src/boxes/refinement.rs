@@ -86,7 +86,9 @@ impl BoxRefinement {
             YAxis::Right => detection.box3d.mirrored_y(),
         });
         let boxes: Vec<Box3d> = boxes.collect();
-        let all: Vec<f32> = { boxes.iter().zip(detections) }
+        let all: Vec<f32> = boxes
+            .iter()
+            .zip(detections)
             .flat_map(|(box3d, detection)| self.values(box3d, detection.score))
             .collect();
         let all = tensor(&all, &[-1, VALUES as i64], map.device())?;

@@ -97,7 +97,7 @@ fn incomplete(error: SafeTensorError) -> String {
 fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorError> {
     let file = SafeTensors::deserialize(bytes)?;
     // Tensors of another type are none of a checkpoint: they are missed by name.
-    let all = { file.iter() }.filter(|(_, view)| view.dtype() == Dtype::F32);
+    let all = file.iter().filter(|(_, view)| view.dtype() == Dtype::F32);
     let all = all.map(|(name, view)| {
         let values = numbers(view.data(), f32::from_le_bytes);
         let shape: Vec<i64> = view.shape().iter().map(|&size| size as i64).collect();

@@ -74,7 +74,9 @@ impl Amota {
 
 impl OperatingPoint {
     fn of(sequences: &[Sequence], min_score: f64) -> Self {
-        let kept = { sequences.iter() }.map(|sequence| sequence.with_min_score(min_score));
+        let kept = sequences
+            .iter()
+            .map(|sequence| sequence.with_min_score(min_score));
         let kept: Vec<Sequence> = kept.collect();
         Self {
             min_score,

@@ -229,7 +229,9 @@ fn velocity_and_covariance_are_along_the_axes_of_the_ego() {
     for tick in 1..=40_u32 {
         let seen = [detection(0.6 * f64::from(tick), 3.0, 0.9)];
         let nanos = u64::from(tick) * TICK_NANOS;
-        tracks = { tracker.update(nanos, &pose, Some(&covariance), &seen) }.unwrap();
+        tracks = tracker
+            .update(nanos, &pose, Some(&covariance), &seen)
+            .unwrap();
     }
     let track = &tracks[0];
     assert!((track.velocity_mps[0] - 6.0).abs() < 0.1 && track.velocity_mps[1].abs() < 0.1);

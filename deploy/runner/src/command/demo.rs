@@ -116,7 +116,8 @@ impl Arguments {
     }
 
     fn scenario(&self) -> Result<PathBuf, BadInput> {
-        { self.scenario.clone() }
+        self.scenario
+            .clone()
             .or_else(|| shared_files::shared(SCENARIO).into_iter().next())
             .ok_or_else(|| {
                 BadInput::new(format!(

@@ -266,7 +266,10 @@ impl Arguments {
         let [maps, boxes] = [Exchange::Features, Exchange::Boxes]
             .map(|content| { self.method.iter() }.any(|one| one.exchange() == content));
         let boxes = boxes || self.boxes.is_some();
-        let messages = !{ self.method.iter() }.all(|one| one.exchange() == Exchange::Nothing);
+        let messages = !self
+            .method
+            .iter()
+            .all(|one| one.exchange() == Exchange::Nothing);
         // With --feature-maps the codec also sets the format of kept maps, whatever is sent.
         let rule = if encodes && self.feature_maps.is_none() && !maps {
             "options of the codec and of the rate are for feature maps: METHODS sends none"

@@ -43,7 +43,9 @@ impl Arguments {
         // One thread for each process: parallel work comes from --jobs alone.
         tch::set_num_threads(1);
         let name = sweep::read(&self.experiment).map_err(BadInput::of)?.name;
-        let out = { self.out }.unwrap_or_else(|| PathBuf::from("sweeps").join(&name));
+        let out = self
+            .out
+            .unwrap_or_else(|| PathBuf::from("sweeps").join(&name));
         let (file, folder) = (self.experiment.to_string_lossy(), out.to_string_lossy());
         let command = ["v2vloc", "sweep", &*file, "--out", &*folder];
         let result = out.join(format!("{name}.csv"));

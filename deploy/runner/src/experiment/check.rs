@@ -32,7 +32,10 @@ pub(super) fn check(experiment: &Experiment) -> Result<()> {
         );
     }
     experiment.ego.validate()?;
-    { experiment.poses.validate() }.map_err(|error| anyhow!("poses: {error}"))?;
+    experiment
+        .poses
+        .validate()
+        .map_err(|error| anyhow!("poses: {error}"))?;
     compute.validate("compute")?;
     let limit_gb = experiment.feature_maps_limit_gb;
     number("feature_maps_limit_gb", limit_gb, 0.0, 10_000.0)?;
@@ -98,7 +101,9 @@ fn of_link_alone(experiment: &Experiment) -> Result<()> {
 
 /// Refuses a name that cannot be one of files.
 fn check_name(field: &str, name: &str) -> Result<()> {
-    let is_plain = { name.chars() }.all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
+    let is_plain = name
+        .chars()
+        .all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
     ensure!(
         !name.is_empty() && is_plain,
         "{field} {name:?} is to name files: letters, digits, - and _"
@@ -216,7 +221,7 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
     // A map captured at t can be fused until t + max_age_ms + deadline_ms: in the last frame that
     // still accepts its age, at the end of that frame's wait.
     let oldest_ms = ego.max_age_ms as f64 + ego.deadline_ms as f64;
-    if let Some(ms) = { grid.latency_ms.iter().flatten() }.find(|ms| **ms > oldest_ms) {
+    if let Some(ms) = grid.latency_ms.iter().flatten().find(|ms| **ms > oldest_ms) {
         bail!(
             "grid.latency_ms is {ms}, but ego.max_age_ms is {}: every message would be too old to be fused",
             ego.max_age_ms

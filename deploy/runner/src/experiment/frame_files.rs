@@ -66,7 +66,8 @@ impl FrameFiles {
         let folder = self.folder;
         let frames = frames_csv(scores.records(), &BTreeMap::new(), Some(&self.scenarios));
         let curve = scores.precision_recall_csv();
-        { self.lines.finish() }
+        self.lines
+            .finish()
             .and_then(|()| atomic_file::write(&folder.join("frames.csv"), frames))
             .and_then(|()| atomic_file::write(&folder.join("precision_recall.csv"), curve))
             .with_context(|| folder.display().to_string())

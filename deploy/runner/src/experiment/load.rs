@@ -20,7 +20,8 @@ impl Experiment {
         if experiment.tables.is_empty() {
             experiment.resolve(path.parent().unwrap_or(Path::new(".")));
         }
-        { experiment.find_networks() }
+        experiment
+            .find_networks()
             .and_then(|()| check::check(&experiment))
             .map_err(|problem| FileError::new(path, problem))?;
         Ok(experiment)
@@ -31,7 +32,11 @@ impl Experiment {
             *place = folder.join(&place);
         }
         // A name that is no preset is the path of a file.
-        if let Some(link) = { self.link.as_mut() }.filter(|it| LinkConfig::preset(it).is_err()) {
+        if let Some(link) = self
+            .link
+            .as_mut()
+            .filter(|it| LinkConfig::preset(it).is_err())
+        {
             *link = folder.join(&link).to_string_lossy().into_owned();
         }
     }

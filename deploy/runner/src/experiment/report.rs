@@ -51,7 +51,9 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
     if metrics.pose.mean_m.is_none() && metrics.pose.no_pose > 0 {
         let dataset = dataset::open(scene).ok();
         let scenarios = dataset.map_or(Vec::new(), |dataset| dataset.scenarios);
-        let map = { scenarios.first() }.and_then(|scenario| scenario.generated_map().ok());
+        let map = scenarios
+            .first()
+            .and_then(|scenario| scenario.generated_map().ok());
         let (map, no_pose) = (map.map(|map| map.to_string()), metrics.pose.no_pose);
         output::note(wrong_place_hint(no_pose, &head, map.as_deref()));
     }
@@ -69,7 +71,10 @@ pub fn run_notes(result: &RunResult) -> String {
             "most messages were still in flight at the end: the link carries next to nothing";
         lines.push(format!("stuck     {stuck}"));
     }
-    let dropped = { messages.dropped.iter() }.map(|(reason, count)| format!("{count} {reason}"));
+    let dropped = messages
+        .dropped
+        .iter()
+        .map(|(reason, count)| format!("{count} {reason}"));
     let dropped = match messages.dropped.is_empty() {
         true => "none".into(),
         false => dropped.collect::<Vec<_>>().join(", "),
@@ -169,7 +174,8 @@ pub fn breakdown(all: &[Metrics]) -> String {
 /// Notes for a comparison: the protocols, differences between runs, and messages that did not reach an ego.
 fn comparison(all: &[Metrics]) -> String {
     let mut text = String::new();
-    let protocols: BTreeSet<String> = { all.iter() }
+    let protocols: BTreeSet<String> = all
+        .iter()
         .filter_map(|metrics| Some(metrics.protocol.as_ref()?.to_string()))
         .collect();
     for protocol in protocols {
@@ -187,7 +193,9 @@ fn comparison(all: &[Metrics]) -> String {
     for metrics in all {
         let (method, Contribution { sent, used, .. }) = (&metrics.method, metrics.contribution);
         if let Some(what) = shared(method).filter(|_| used < sent) {
-            let size = { metrics.contribution.sent_bytes_mean }
+            let size = metrics
+                .contribution
+                .sent_bytes_mean
                 .map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
             let _ = writeln!(
                 text,
@@ -226,7 +234,9 @@ fn latency(metrics: &Metrics) -> String {
 /// Wire bytes of the fused messages, or if there were none, of all messages sent.
 fn wire_bytes(metrics: &Metrics) -> String {
     let sent = metrics.contribution.sent_bytes_mean;
-    { metrics.comm.wire_bytes_mean }
+    metrics
+        .comm
+        .wire_bytes_mean
         .or(sent)
         .map_or("-".into(), bytes)
 }

@@ -142,7 +142,9 @@ fn python(text: &str) -> String {
 
 /// A word as a shell reads it back.
 fn quoted(word: &str) -> String {
-    let is_plain = { word.chars() }.all(|c| c.is_ascii_alphanumeric() || "/._-=,:+".contains(c));
+    let is_plain = word
+        .chars()
+        .all(|c| c.is_ascii_alphanumeric() || "/._-=,:+".contains(c));
     if !word.is_empty() && is_plain {
         word.to_owned()
     } else {

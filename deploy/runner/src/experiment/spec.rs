@@ -173,7 +173,9 @@ impl CodecSpec {
             Some(SentBoxes::Beside) => " and boxes",
             None => "",
         };
-        let fitted = { self.fit }.map_or(String::new(), |share| format!(" fitted to {share}"));
+        let fitted = self
+            .fit
+            .map_or(String::new(), |share| format!(" fitted to {share}"));
         format!("{:?}{fitted}{boxes}", self.dtype).to_lowercase()
     }
 }

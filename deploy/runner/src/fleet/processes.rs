@@ -178,14 +178,16 @@ impl Fleet {
     }
 
     fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
-        let contents: BTreeSet<Stream> = { self.neighbours() }
+        let contents: BTreeSet<Stream> = self
+            .neighbours()
             .flat_map(|cav| self.streams_of(cav))
             .collect();
         LinkProcessConfig {
             run: context.run.clone(),
             ego: self.ego.clone(),
             link: self.scenario.link.clone().unwrap_or_default(),
-            streams: { [Stream::Pose].into_iter() }
+            streams: [Stream::Pose]
+                .into_iter()
                 .chain(contents)
                 .chain([Stream::Descriptor])
                 .collect(),

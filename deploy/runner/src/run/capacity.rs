@@ -161,8 +161,10 @@ fn frame_mb(fleet: &Fleet) -> Result<f64, RunError> {
         Exchange::Features => fleet.map_values(),
         _ => 0,
     };
-    let bytes =
-        { fleet.agents.iter() }.map(|cav| sweep_bytes + map_bytes(&fleet.settings_of(cav), values));
+    let bytes = fleet
+        .agents
+        .iter()
+        .map(|cav| sweep_bytes + map_bytes(&fleet.settings_of(cav), values));
     Ok(bytes.sum::<u64>() as f64 * 1e-6)
 }
 
@@ -206,7 +208,9 @@ fn capacity_of(
         messages_ms,
         period_ms,
         unit_ms,
-        stages: { measured.first() }.map_or_else(Default::default, |one| one.stages.clone()),
+        stages: measured
+            .first()
+            .map_or_else(Default::default, |one| one.stages.clone()),
         free_share,
         needed_ms,
         available_ms,

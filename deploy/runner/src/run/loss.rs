@@ -35,7 +35,9 @@ fn reasons(result: &RunResult) -> Vec<String> {
         (!has_begun).then(|| "ended before its first tick".into()),
         (missed > 0).then(|| format!("{missed} of {} ticks unanswered", metrics.ticks)),
         (!lost.is_empty()).then(|| format!("messages lost ({})", lost.join(", "))),
-        { messages.are_stuck() }.then(|| "most messages were still in flight at the end".into()),
+        messages
+            .are_stuck()
+            .then(|| "most messages were still in flight at the end".into()),
         (!result.balance.is_exact())
             .then(|| format!("{accounts} accounts of ledger.json do not add up")),
         (!metrics.left_out.is_nothing()).then(|| metrics.left_out.to_string()),

@@ -129,7 +129,8 @@ fn go(
     }
     // Not returned at once on an error: scorer and router have to be ended first.
     let watched = watch(fleet, &context, specs, &place, &scorer, &stop);
-    let has_router = !{ watched.as_ref() }
+    let has_router = !watched
+        .as_ref()
         .is_ok_and(|watched| matches!(watched.ending, Ending::RouterFailed { .. }));
     let (scored, refused) = if has_router {
         // Before the scorer closes the session.
@@ -403,7 +404,9 @@ fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
 }
 
 fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
-    let span = { progress.span }.map(|(first, last)| last.duration_since(first));
+    let span = progress
+        .span
+        .map(|(first, last)| last.duration_since(first));
     let seconds = span.map_or(0.0, |span| span.as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     Metrics {

@@ -104,7 +104,8 @@ fn write(
     let (poses, seconds) = (fleet.pose_source(), board.seconds());
     let mut metrics = metrics(board, evaluator, "stepped", poses, seconds);
     metrics.left_out.add_findings(fleet.findings.clone());
-    let provenance = { fleet.provenance(&options.programs) }
+    let provenance = fleet
+        .provenance(&options.programs)
         .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"));
     let provenance = provenance.ok();
     let metrics = Metrics {

@@ -52,12 +52,16 @@ impl Scenario {
             settings.validate()?;
             settings.check_attack(&settings.sent_for(needed))
         })?;
-        { self.record.iter() }.try_for_each(|record| record.validate())
+        self.record.iter().try_for_each(|record| record.validate())
     }
 
     fn check_network(&self) -> Result<(), FieldError> {
         let listen = [("network.listen", &self.network.listen)].into_iter();
-        let connect = { self.network.connect.iter() }.map(|at| ("network.connect", at));
+        let connect = self
+            .network
+            .connect
+            .iter()
+            .map(|at| ("network.connect", at));
         for (field, text) in listen.chain(connect) {
             let rule = match Endpoint::new(text) {
                 Err(_) => "must read tcp/ADDRESS:PORT or quic/ADDRESS:PORT",
@@ -89,7 +93,12 @@ impl Scenario {
         for settings in self.settings() {
             let files = settings.pose.files().into_iter();
             places.extend(files.map(|file| ("agents.pose", file)));
-            places.extend({ settings.weights.iter() }.map(|file| ("agents.weights", file.clone())));
+            places.extend(
+                settings
+                    .weights
+                    .iter()
+                    .map(|file| ("agents.weights", file.clone())),
+            );
         }
         if let Some((field, missing)) = places.iter().find(|(_, file)| !file.exists()) {
             let problem = format_args!("{field}: {} does not exist", missing.display());
@@ -120,7 +129,9 @@ impl Scenario {
     fn check_clock(&self) -> Result<(), FieldError> {
         if self.clock == Clock::Wall {
             let rule = "must be left out unless clock is stepped";
-            let given = { self.stepped }.map(|_| FieldError::new("stepped", "given", rule));
+            let given = self
+                .stepped
+                .map(|_| FieldError::new("stepped", "given", rule));
             return given.map_or(Ok(()), Err);
         }
         let (scene, remote) = (&self.scene, self.remote_agents.first());

@@ -63,7 +63,8 @@ mod tests {
                 ..Default::default()
             }),
         ];
-        let mut vehicles: Vec<AgentSettings> = { poses.into_iter() }
+        let mut vehicles: Vec<AgentSettings> = poses
+            .into_iter()
             .map(|pose| AgentSettings {
                 pose,
                 ..AgentSettings::default()

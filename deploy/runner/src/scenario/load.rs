@@ -75,12 +75,17 @@ fn with_files(
     path: &Path,
     folder: &Path,
 ) -> Result<AgentSettings, FileError> {
-    let pose = { settings.pose }.map_files(|file| without_dots(&folder.join(file)));
-    let pose = { pose.with_networks() }
+    let pose = settings
+        .pose
+        .map_files(|file| without_dots(&folder.join(file)));
+    let pose = pose
+        .with_networks()
         .map_err(|error| FileError::new(path, format_args!("agents.pose: {error}")))?;
     Ok(AgentSettings {
         pose,
-        weights: { settings.weights }.map(|weights| without_dots(&folder.join(weights))),
+        weights: settings
+            .weights
+            .map(|weights| without_dots(&folder.join(weights))),
         ..settings
     })
 }

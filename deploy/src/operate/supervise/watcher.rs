@@ -220,7 +220,10 @@ async fn stop_requested(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
 
 /// Sends SIGTERM to a process, then SIGKILL at the deadline. Returns its exit status; `None`: it had to be killed.
 async fn end(child: &mut Child, deadline: Instant) -> Option<ExitStatus> {
-    if let Some(pid) = { child.id() }.and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?)) {
+    if let Some(pid) = child
+        .id()
+        .and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?))
+    {
         // It may have ended at this moment, which is as good.
         let _ = kill_process(pid, Signal::TERM);
         // A stopped process does not handle SIGTERM.

@@ -31,7 +31,7 @@ impl Contribution {
         let ego_process = format!("{}-", Role::Ego);
         let mut sent_frames = BTreeMap::<&CavId, u64>::new();
         let (mut sent, mut used) = (0, 0);
-        for (account, counts) in { ledger.iter() }.filter(|(of, _)| shares(&of.topic, ego)) {
+        for (account, counts) in ledger.iter().filter(|(of, _)| shares(&of.topic, ego)) {
             // Counted at the sender: what comes out of a link is the same message on another topic.
             if let Topic::Stream { cav, .. } = &account.topic {
                 sent += counts.sent;
@@ -48,7 +48,8 @@ impl Contribution {
             fused_per_frame: (frames > 0).then(|| fused as f64 / frames as f64),
             sent,
             used,
-            sent_bytes_mean: { sent_bytes.filter(|_| sent > 0) }
+            sent_bytes_mean: sent_bytes
+                .filter(|_| sent > 0)
                 .map(|bytes| bytes as f64 / sent_frames as f64),
         }
     }

@@ -49,7 +49,8 @@ pub fn placed<'a>(
 
 /// Support of each box by other senders: the sum over them of the largest product of BEV IoU and confidence.
 pub(super) fn support(boxes: &[PlacedBox]) -> Vec<f64> {
-    let footprints: Vec<Polygon> = { boxes.iter() }
+    let footprints: Vec<Polygon> = boxes
+        .iter()
         .map(|placed| Polygon::footprint(&placed.box3d.corners()))
         .collect();
     let by_box = boxes.iter().zip(&footprints).map(|(own, footprint)| {

@@ -102,7 +102,8 @@ impl CoarseAlignment {
             received_cells: FullResolutionMap::shallow_clones(cells),
             earlier: earlier.transpose()?,
             origins: Origins::of(&chosen.collect::<Vec<_>>()),
-            earlier_entries: { earlier_entries.iter() }
+            earlier_entries: earlier_entries
+                .iter()
                 .map(|&entry| entry as usize)
                 .collect(),
             places,

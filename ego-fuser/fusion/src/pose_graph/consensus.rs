@@ -58,10 +58,14 @@ pub(super) fn consensus(
         candidates,
     };
     let motions = search.motions();
-    let (best, score) = { motions.iter() }.max_by(|one, other| one.1.total_cmp(&other.1))?;
+    let (best, score) = motions
+        .iter()
+        .max_by(|one, other| one.1.total_cmp(&other.1))?;
     // A different motion that fits almost as well makes the match ambiguous: then none is used.
     let far_m = 2.0 * config.fit_tolerance_m;
-    let rival = { motions.iter() }.filter(|(other, _)| apart(boxes.iter(), best, other) > far_m);
+    let rival = motions
+        .iter()
+        .filter(|(other, _)| apart(boxes.iter(), best, other) > far_m);
     let rival = rival.map(|(_, score)| *score);
     if rival.fold(f64::NEG_INFINITY, f64::max) + MIN_LEAD > *score {
         return None;
@@ -163,7 +167,7 @@ impl Search<'_> {
     fn refined(&self, motion: Isometry3<f64>) -> Isometry3<f64> {
         let matches = self.matches(&motion);
         let pairs =
-            { matches.iter() }.map(|&(object, index)| (self.boxes[index], self.objects[object]));
+            (matches.iter()).map(|&(object, index)| (self.boxes[index], self.objects[object]));
         planar_fit::fit(&pairs).unwrap_or(motion)
     }
 }

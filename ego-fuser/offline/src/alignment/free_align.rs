@@ -148,7 +148,10 @@ pub fn align(
         });
     }
     // Some boxes may not be nodes: back to the indices of the given lists.
-    let given = { best.matches.iter() }.map(|&(a, b)| (ego.given[a], neighbour.given[b]));
+    let given = best
+        .matches
+        .iter()
+        .map(|&(a, b)| (ego.given[a], neighbour.given[b]));
     Ok(BoxAlignment {
         matches: given.collect(),
         ..best.clone()
@@ -174,7 +177,9 @@ impl Graph {
     fn new(boxes: &[Box3d], config: &FreeAlignConfig) -> Self {
         // NaN fails the comparison and is left out too.
         let centres = boxes.iter().map(|node| Vector3::from(node.center_m));
-        let nodes = { centres.enumerate() }.filter(|(_, at)| at.iter().all(|c| c.abs() < 1e6));
+        let nodes = centres
+            .enumerate()
+            .filter(|(_, at)| at.iter().all(|c| c.abs() < 1e6));
         let (given, centres): (Vec<_>, Vec<_>) = nodes.take(config.max_boxes).unzip();
         let edges = centres
             .iter()

@@ -132,7 +132,7 @@ impl Arguments {
         if self.json {
             let maps = self.icp_map.iter().map(|folder| dataset::open(folder));
             let maps: Vec<Dataset> = maps.collect::<Result<_, _>>()?;
-            let all = { maps.into_iter() }.flat_map(|data| data.scenarios);
+            let all = maps.into_iter().flat_map(|data| data.scenarios);
             let all: Vec<Scenario> = scenarios.into_iter().chain(all).collect();
             let sources = self.pose_source.iter().map(|(_, file)| file.clone());
             let files = self.weights.iter().cloned().chain(sources);

@@ -47,7 +47,8 @@ impl Arguments {
         }
         let shifts = self.shifts_m.iter().map(|&shift_m| (shift_m, 0.0));
         let turns = self.turns_deg.iter().map(|&turn_deg| (0.0, turn_deg));
-        let offsets: Vec<Offset> = { shifts.chain(turns) }
+        let offsets: Vec<Offset> = shifts
+            .chain(turns)
             .map(|(shift_m, turn_deg)| Offset { shift_m, turn_deg })
             .collect();
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;

@@ -112,7 +112,9 @@ impl Arguments {
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
         let mut tally = Tally::default();
-        let all = { data.iter() }.flat_map(|data| data.scenarios.iter().map(move |it| (data, it)));
+        let all = data
+            .iter()
+            .flat_map(|data| data.scenarios.iter().map(move |it| (data, it)));
         for (data, scenario) in all {
             let rule = data.protocol.rule_within(detector.config().lidar_range_m);
             for tick in 0..scenario.ticks.len() {

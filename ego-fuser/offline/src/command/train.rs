@@ -283,8 +283,11 @@ impl Arguments {
             heading_std_deg: self.noise_heading_std_deg,
             ..NoisyPoseConfig::default()
         });
-        let tables = { self.poses.iter() }.map(|file| PoseTable::read(file).map(Arc::new));
-        let tables = { tables.collect::<Result<_, _>>() }.map_err(BadInput::of)?;
+        let tables = self
+            .poses
+            .iter()
+            .map(|file| PoseTable::read(file).map(Arc::new));
+        let tables = tables.collect::<Result<_, _>>().map_err(BadInput::of)?;
         let poses = SamplePoses {
             tables,
             noise,

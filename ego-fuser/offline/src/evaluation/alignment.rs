@@ -81,9 +81,7 @@ pub fn run(
         if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
             continue;
         }
-        let frames: Vec<Frame> = { loaded.frames.into_iter() }
-            .map(|(_, frame)| frame)
-            .collect();
+        let frames: Vec<Frame> = loaded.frames.into_iter().map(|(_, frame)| frame).collect();
         let truth = frames.iter().map(|frame| {
             let pose = frame.world_from_lidar.map(|pose| pose.isometry());
             pose.ok_or_else(|| AlignError::NoTruth {

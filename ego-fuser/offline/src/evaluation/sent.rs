@@ -71,7 +71,10 @@ impl Answer {
 
     /// True with a pose and a message of each of these streams.
     pub(super) fn is_complete(&self, streams: &[Stream]) -> bool {
-        self.pose.is_some() && { streams.iter() }.all(|stream| self.messages.contains_key(stream))
+        self.pose.is_some()
+            && streams
+                .iter()
+                .all(|stream| self.messages.contains_key(stream))
     }
 
     /// The answer with its messages in the order of these streams, whatever the order of their arrival.
@@ -82,7 +85,8 @@ impl Answer {
             capture_nanos: frame.capture_nanos,
             pose,
             pose_bytes,
-            messages: { streams.iter() }
+            messages: streams
+                .iter()
                 .filter_map(|stream| self.messages.remove(stream))
                 .collect(),
             failure: self.failure,

@@ -121,7 +121,10 @@ impl<'a> Run<'a> {
         }
         let begin = setup.seek.min(scenario.ticks.len());
         let end = begin.saturating_add(setup.frames.unwrap_or(usize::MAX));
-        let began_nanos = { scenario.ticks.get(begin) }.map_or(0, |tick| tick.capture_nanos);
+        let began_nanos = scenario
+            .ticks
+            .get(begin)
+            .map_or(0, |tick| tick.capture_nanos);
         let ego = &scenario.agents[ego_place];
         let mut ego_loop = EgoLoop::new(ego, &evaluator.ego, setup.loop_options(scenario));
         let delivery = DelayedDelivery::new(setup.emulator(scenario)?, ego, began_nanos);

@@ -181,10 +181,12 @@ impl MultiScaleNetwork {
         let selected = resized(sent, [height as i64, width as i64])?.f_gt(0.0)?;
         let selected = selected.f_sum_dim_intlist([1i64, 2, 3].as_slice(), false, Kind::Int64)?;
         let selected: Vec<i64> = Vec::try_from(&selected)?;
-        let bytes = { selected.into_iter() }.map(|selected| match selected.unsigned_abs() {
-            all if all == cells => cells * cell_bytes,
-            selected => cells.div_ceil(8) + selected * cell_bytes,
-        });
+        let bytes = selected
+            .into_iter()
+            .map(|selected| match selected.unsigned_abs() {
+                all if all == cells => cells * cell_bytes,
+                selected => cells.div_ceil(8) + selected * cell_bytes,
+            });
         Ok(bytes.collect())
     }
 

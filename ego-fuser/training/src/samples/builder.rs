@@ -352,7 +352,9 @@ impl SampleBuilder {
             min_corners: 8,
             classes: self.config.classes,
         };
-        let views = { annotators.iter() }.filter_map(|&agent| frames[agent].as_ref());
+        let views = annotators
+            .iter()
+            .filter_map(|&agent| frames[agent].as_ref());
         let mut truth = GroundTruth::of_tick(&views.collect::<Vec<_>>(), 0, &rule);
         for object in truth.objects.iter_mut().chain(&mut truth.ignored) {
             object.box3d = ego_view.box3d(&object.box3d);

@@ -105,7 +105,10 @@ fn sample(
     let agents = found.len();
     // The ego always has its own map.
     let sends_boxes = (0..agents).map(|agent| {
-        agent > 0 && { rng.as_deref_mut() }.is_none_or(|rng| rng.random_bool(BOXES_ONLY))
+        agent > 0
+            && rng
+                .as_deref_mut()
+                .is_none_or(|rng| rng.random_bool(BOXES_ONLY))
     });
     let sends_boxes: Vec<bool> = sends_boxes.collect();
     let shifts: Vec<Shift> = match rng.as_deref_mut() {
@@ -125,7 +128,9 @@ fn sample(
             }
             if rng.random_bool(LATE.0) {
                 let age_secs = rng.random_range(0.0..LATE.1);
-                { of_agent.iter_mut() }.for_each(|placed| carry(placed, age_secs, rng));
+                of_agent
+                    .iter_mut()
+                    .for_each(|placed| carry(placed, age_secs, rng));
             }
         }
         boxes.append(&mut of_agent);

@@ -132,7 +132,9 @@ impl DrawnError {
     ) -> PoseEstimate {
         let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
         // The ego is never lost; where there is a neighbour, the divisor is 1 or more.
-        let lost = { self.lost.as_ref() }
+        let lost = self
+            .lost
+            .as_ref()
             .filter(|lost| agent > 0 && lost.draw % (agents - 1) == agent - 1);
         let (Some(lost), Some((pose, confidence))) = (lost, known(&noisy)) else {
             return noisy;

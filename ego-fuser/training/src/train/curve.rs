@@ -116,7 +116,9 @@ fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
         .collect();
     let size = finite.len().div_ceil(SMOOTH_POINTS).max(1);
     let means = finite.chunks(size).map(|few| {
-        let [x, y] = { few.iter() }.fold([0.0; 2], |[x, y], point| [x + point.0, y + point.1]);
+        let [x, y] = few
+            .iter()
+            .fold([0.0; 2], |[x, y], point| [x + point.0, y + point.1]);
         (x / few.len() as f64, y / few.len() as f64)
     });
     means.collect()

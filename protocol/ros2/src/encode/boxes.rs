@@ -198,7 +198,8 @@ mod tests {
             unseen_s: 0.0,
         };
         let cdr = tracks(7, "f", std::slice::from_ref(&track));
-        let values: Vec<u8> = { [0.5, 0.25].iter() }
+        let values: Vec<u8> = [0.5, 0.25]
+            .iter()
             .flat_map(|value: &f64| value.to_le_bytes())
             .collect();
         let has = |bytes: &[u8]| cdr.windows(bytes.len()).any(|window| window == bytes);

@@ -226,7 +226,9 @@ fn plain_average_precision(
             .filter(|one| one.box3d.center_m[0].abs() + 2.0 <= 80.0)
         {
             let distance = |other: &&&Box3d| (other.center_m[0] - one.box3d.center_m[0]).abs();
-            let best = { open.iter() }.min_by(|a, b| distance(a).total_cmp(&distance(b)));
+            let best = open
+                .iter()
+                .min_by(|a, b| distance(a).total_cmp(&distance(b)));
             match best.copied().filter(|best| overlap(best, &one.box3d)) {
                 Some(best) => {
                     open.retain(|other| *other != best);

@@ -131,7 +131,8 @@ impl SynthOptions {
         require(are_held, "--weather-copies", &copies, rule)?;
         let images = self.image_size();
         let edges = 16..=4096;
-        let are_small = { self.cameras }
+        let are_small = self
+            .cameras
             .is_none_or(|size| edges.contains(&size.width_px) && edges.contains(&size.height_px));
         let rule = "must be 16 to 4096 pixels along each edge";
         require(are_small, "--cameras", &images, rule)?;

@@ -179,7 +179,7 @@ impl GridRay {
         [x - cell[0] as f64, y - cell[1] as f64]
     }
 
-    /// Where it leaves a cell along an axis of slope 1 / `inverse`.
+    /// Place along the ray at which it leaves a cell in the direction of `axis`; `inverse`: 1 / slope of that axis.
     fn leave(&self, axis: usize, cell: i64, inverse: f64) -> f64 {
         let border = (cell + i64::from(self.slope[axis] > 0.0)) as f64;
         let at = (border - self.origin[axis]) * inverse;

@@ -49,7 +49,7 @@ pub(super) fn classes_of_sweeps(head: &SceneHead, cache: &FeatureCache) -> Resul
             head.config().scene_name
         )));
     }
-    let classes = { positions.iter() }.map(|position| nearest(&middles, position));
+    let classes = positions.iter().map(|position| nearest(&middles, position));
     Ok(classes.collect())
 }
 

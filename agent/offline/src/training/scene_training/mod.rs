@@ -307,7 +307,8 @@ fn classifier_time(length: Length) -> Option<Duration> {
 /// The configuration of the head for these features.
 fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig> {
     let (training, format) = (&features.training, &features.format);
-    let refiner = { config.refiner }
+    let refiner = config
+        .refiner
         .then(|| key_grid::covering(&training.targets_m, format.local_channels()));
     Ok(SceneHeadConfig {
         scene_name: config.scene_name.clone(),

@@ -92,14 +92,18 @@ fn codec(point: &Point) -> Option<String> {
     if point.method.exchange() != Exchange::Features {
         return None;
     }
-    let kept = { point.codec.keep }.map_or(String::new(), |keep| format!(" {} %", 100.0 * keep));
+    let kept = point
+        .codec
+        .keep
+        .map_or(String::new(), |keep| format!(" {} %", 100.0 * keep));
     Some(point.codec.name() + &kept)
 }
 
 /// A figure for each field with several values, AP at 0.5 and at 0.7 side by side; means over seeds.
 pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
     // Compared by their labels: the bytes of a message are known only after a run, its codec before.
-    let varying: Vec<&Dimension> = { DIMENSIONS.iter() }
+    let varying: Vec<&Dimension> = DIMENSIONS
+        .iter()
         .filter(|dimension| {
             let texts = runs.iter().filter_map(|run| (dimension.text)(&run.point));
             texts.collect::<BTreeSet<_>>().len() > 1
@@ -148,7 +152,9 @@ fn chart(
     }
     let series = series.into_iter().map(|(name, points)| line(name, points));
     let series: Vec<Series> = series.collect();
-    let xs = { series.iter() }.flat_map(|series| series.points.iter().map(|(x, _)| (*x, *x)));
+    let xs = series
+        .iter()
+        .flat_map(|series| series.points.iter().map(|(x, _)| (*x, *x)));
     let (low, high) = xs.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
     let x = if dimension.name == BANDWIDTH {
         let first = low.log10().floor();

@@ -82,7 +82,10 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
         fit: None,
         boxes: None,
     };
-    let first = { grid.codec.as_ref() }.map(|codecs| codecs.iter().take(1).copied().collect());
+    let first = grid
+        .codec
+        .as_ref()
+        .map(|codecs| codecs.iter().take(1).copied().collect());
     let mut points = Vec::new();
     for (methods, codecs) in [(&grid.method, &grid.codec), (&grid.reference, &first)] {
         let plain = methods.iter().map(|&method| Point {

@@ -85,7 +85,10 @@ fn runs_table(table: &VaryingTable) -> String {
         text += "</tr>\n";
     }
     text += "</tbody></table></div>\n";
-    let constants = { table.constants.iter() }.map(|(name, value)| format!("{name} {value}"));
+    let constants = table
+        .constants
+        .iter()
+        .map(|(name, value)| format!("{name} {value}"));
     if !table.constants.is_empty() {
         let constants = escaped(&constants.collect::<Vec<_>>().join(", "));
         text += &format!("<p>The same in all runs: {constants}.</p>\n");

@@ -38,11 +38,14 @@ impl VaryingTable {
         let varied: Vec<usize> = (0..settings).filter(|&place| varies[place]).collect();
         let kept: Vec<usize> = [&varied[..], &precisions, &others].concat();
         let names = kept.iter().map(|&place| columns[place].to_owned());
-        let cells =
-            { lines.iter() }.map(|line| kept.iter().map(|&place| line[place].clone()).collect());
+        let cells = lines
+            .iter()
+            .map(|line| kept.iter().map(|&place| line[place].clone()).collect());
         let others = (0..columns.len()).filter(|place| !kept.contains(place));
         let constants = others.filter_map(|place| {
-            let value = { column(lines, place).next() }.filter(|value| !value.is_empty())?;
+            let value = column(lines, place)
+                .next()
+                .filter(|value| !value.is_empty())?;
             Some((columns[place].to_owned(), value.to_owned()))
         });
         Self {
@@ -103,7 +106,9 @@ impl VaryingTable {
                 value => value.to_owned(),
             }));
         }
-        let sentence = { self.sentence() }.map_or(String::new(), |it| format!("{it}\n"));
+        let sentence = self
+            .sentence()
+            .map_or(String::new(), |it| format!("{it}\n"));
         format!("{table}{sentence}")
     }
 
@@ -114,7 +119,9 @@ impl VaryingTable {
     }
 
     fn settings_of(&self, line: usize) -> String {
-        let pairs = { self.columns.iter() }
+        let pairs = self
+            .columns
+            .iter()
             .zip(&self.lines[line])
             .take(self.settings);
         let given = pairs.filter(|(_, value)| !value.is_empty());
@@ -136,7 +143,9 @@ impl VaryingTable {
 
 /// Fields of a column, empty where a line is shorter.
 fn column(lines: &[Vec<String>], place: usize) -> impl Iterator<Item = &str> {
-    { lines.iter() }.map(move |line| line.get(place).map_or("", String::as_str))
+    lines
+        .iter()
+        .map(move |line| line.get(place).map_or("", String::as_str))
 }
 
 #[cfg(test)]

@@ -44,7 +44,9 @@ pub fn markdown(table: &FilledTable) -> String {
                 number(&log2, 2),
             ]
         } else {
-            let global = { cells.iter() }.map(|of| precision(of, |cell| cell.metrics.ap_global));
+            let global = cells
+                .iter()
+                .map(|of| precision(of, |cell| cell.metrics.ap_global));
             global.collect()
         };
         let _ = writeln!(text, "| {} | {} |", row.label(), values.join(" | "));

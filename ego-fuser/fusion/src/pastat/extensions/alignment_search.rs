@@ -159,7 +159,8 @@ fn offsets(pairs: &Pairs, area: &Area, config: SearchConfig, train: bool) -> Res
 /// All maps rotated about their senders by the first of some angles, then by the second, and so on.
 fn turned(maps: &Tensor, turns_rad: &[f64], ego_from_cav: &[Pose], area: &Area) -> Result<Tensor> {
     let (count, _, rows, columns) = maps.size4()?;
-    let deltas = { turns_rad.iter() }
+    let deltas = turns_rad
+        .iter()
         .flat_map(|&turn_rad| [0.0, 0.0, turn_rad as f32].repeat(count as usize));
     let deltas = Tensor::f_from_slice(&deltas.collect::<Vec<f32>>())?.f_view([-1, 3])?;
     let poses = ego_from_cav.repeat(turns_rad.len());
