@@ -292,12 +292,13 @@ impl Ego {
             own_boxes = no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
         }
         let aligned = &chosen.aligned;
-        let refused_boxes = self.boxes_over_limit(aligned, own_boxes + MORE_BOXES);
+        let most_boxes = own_boxes + MORE_BOXES;
+        let refused_boxes = self.boxes_over_limit(aligned, most_boxes);
         let detections = no_grad(|| match needed {
             Exchange::Boxes => Ok(self.merge_boxes(aligned, &mut stages)),
             Exchange::Points => self.merge_points(aligned, &mut stages),
             Exchange::Features | Exchange::Nothing => {
-                self.merge_features(aligned, own_boxes, &mut stages)
+                self.merge_features(aligned, most_boxes, &mut stages)
             }
         })?;
         Ok(EgoOutput {
@@ -396,16 +397,16 @@ impl Ego {
         Ok(own.len())
     }
 
-    /// Intermediate fusion, and ego-only detection; boxes of neighbours change the output of the head.
+    /// Intermediate fusion, and ego-only detection; boxes of neighbours, at most `most_boxes` of each, change the output of the
+    /// head.
     fn merge_features(
         &mut self,
         all: &[Aligned<'_>],
-        own_boxes: usize,
+        most_boxes: usize,
         stages: &mut StageTimes,
     ) -> Result<Vec<Detection>, EgoError> {
-        let most = own_boxes + MORE_BOXES;
         let boxes: Vec<PlacedBox> = (1..all.len())
-            .flat_map(|sender| all[sender].boxes(sender, all[0].view, most))
+            .flat_map(|sender| all[sender].boxes(sender, all[0].view, most_boxes))
             .collect();
         let aligned: Vec<Aligned<'_>> = all.iter().filter(|one| one.has_map()).copied().collect();
         let (mut maps, mut sent) = (Vec::new(), Vec::new());
@@ -622,14 +623,20 @@ struct Choice<'a> {
 }
 
 impl Choice<'_> {
-    /// Leaves the marked of the fused neighbours out.
+    /// Leaves the marked of the fused neighbours out; one mark for each of them.
     fn leave_out(&mut self, is_out: &[bool], reason: DropReason) {
+        debug_assert_eq!(self.fused.len(), is_out.len());
+        let mut kept = vec![self.aligned[0]];
+        let neighbours = self.fused.iter().zip(&self.aligned[1..]).zip(is_out);
+        for ((&index, aligned), is_out) in neighbours {
+            match is_out {
+                true => self.skipped.push((index, Skipped::Unusable(reason))),
+                false => kept.push(*aligned),
+            }
+        }
+        self.aligned = kept;
         let mut marks = is_out.iter();
-        let left_out = self.fused.extract_if(.., |_| marks.next() == Some(&true));
-        let left_out = left_out.map(|index| (index, Skipped::Unusable(reason)));
-        self.skipped.extend(left_out);
-        let mut marks = std::iter::once(&false).chain(is_out);
-        self.aligned.retain(|_| marks.next() == Some(&false));
+        self.fused.retain(|_| marks.next() == Some(&false));
     }
 }
 
