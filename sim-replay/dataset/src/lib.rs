@@ -52,7 +52,6 @@ mod listing;
 mod localization;
 mod nclt_ground_truth;
 mod npy;
-mod numpy_tags;
 mod nuscenes;
 mod open;
 mod options;

@@ -107,8 +107,8 @@ fn pose(field: &Field<'_>) -> Result<Pose> {
 mod tests {
     use std::path::Path;
 
-    use super::super::numpy_tags::tests::pickled_matrix;
     use super::super::opv2v::tests::write_frame;
+    use super::super::yaml::numpy_tags::tests::pickled_matrix;
     use crate::frame::{Frame, ObjectClass};
     use crate::ground_truth::{GroundTruthRule, merge};
     use crate::{Layout, LoadOptions, ReadError};

@@ -5,8 +5,8 @@ use nalgebra::{Matrix4, RowVector4};
 use protocol::Pose;
 
 use super::Result;
-use super::numpy_tags::{self, NumpyArray};
 use super::yaml::Field;
+use super::yaml::numpy_tags::{self, NumpyArray};
 use crate::carla_pose::CarlaPose;
 
 /// A pose in the numbers of its file.
@@ -54,8 +54,8 @@ pub(super) fn rigid(matrix: &Matrix4<f64>, field: &Field<'_>) -> Result<Pose> {
 mod tests {
     use std::path::Path;
 
-    use super::super::numpy_tags::tests::pickled_array;
     use super::super::yaml;
+    use super::super::yaml::numpy_tags::tests::pickled_array;
     use super::*;
 
     fn read(text: &str) -> Result<WrittenPose> {

@@ -2,7 +2,7 @@ use std::fs;
 
 use std::path::Path;
 
-use super::super::numpy_tags::tests::{pickled_array, pickled_scalar};
+use super::super::yaml::numpy_tags::tests::{pickled_array, pickled_scalar};
 use super::*;
 use crate::frame::ObjectClass;
 use crate::pcd::{self, Encoding, IntensityField};

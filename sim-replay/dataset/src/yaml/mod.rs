@@ -4,12 +4,16 @@
 //! the repetitions of its parts by aliases.
 
 mod field;
+mod node;
+mod numbers;
+pub(super) mod numpy_tags;
 mod scalar;
 mod tree;
 
 use std::path::Path;
 
 pub(super) use field::Field;
+pub(super) use node::{Node, Value};
 
 use tree::Unsound;
 
@@ -18,29 +22,6 @@ use super::{ReadError, Result};
 
 /// Largest YAML file that is read, bytes. Frames with four cameras and fifty objects have about 20 kB.
 const MAX_BYTES: u64 = 16 << 20;
-
-/// A node of a document.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Node {
-    /// The line where it begins, from 1.
-    pub(super) line: u64,
-    /// Its explicit tag without YAML's own prefix, for example `python/tuple` for `!!python/tuple`.
-    pub(super) tag: Option<Box<str>>,
-    pub(super) value: Value,
-}
-
-/// Content of a node.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum Value {
-    Null,
-    Bool(bool),
-    Integer(i64),
-    Float(f64),
-    Text(String),
-    List(Vec<Node>),
-    /// Entries in the order of the file; keys as written.
-    Map(Vec<(String, Node)>),
-}
 
 /// Reads and parses a file.
 pub(super) fn read(path: &Path) -> Result<Node> {
@@ -58,21 +39,6 @@ pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Node> {
     })?;
     tree::build(text)
         .map_err(|Unsound { line, reason }| malformed(line, format!("no sound YAML: {reason}")))
-}
-
-impl Value {
-    /// Kind and content in few words, for messages.
-    fn kind(&self) -> String {
-        match self {
-            Self::Null => "nothing".into(),
-            Self::Bool(value) => value.to_string(),
-            Self::Integer(value) => value.to_string(),
-            Self::Float(value) => value.to_string(),
-            Self::Text(text) => format!("the text {:?}", text.chars().take(40).collect::<String>()),
-            Self::List(items) => format!("a list of {}", items.len()),
-            Self::Map(entries) => format!("a map of {}", entries.len()),
-        }
-    }
 }
 
 #[cfg(test)]

@@ -4,8 +4,8 @@ use std::collections::{HashMap, HashSet};
 
 use granit_parser::{Event, Parser, ScalarStyle, StrInput, Tag};
 
-use super::{Node, Value, scalar};
-use crate::numpy_tags;
+use super::node::{Node, Value};
+use super::{numpy_tags, scalar};
 
 /// Deepest nesting.
 const MAX_DEPTH: usize = 64;

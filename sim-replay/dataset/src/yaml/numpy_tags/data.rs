@@ -3,9 +3,10 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use super::super::Result;
-use super::super::yaml::{Field, Value};
+use super::super::field::Field;
+use super::super::node::Value;
 use super::{APPLY, args, expect_tag, items};
+use crate::Result;
 use crate::scalar::{Scalar, ScalarKind};
 
 /// `dtype('f8', False, True)` with a state whose second item is the byte order.

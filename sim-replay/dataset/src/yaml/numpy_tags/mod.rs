@@ -9,8 +9,9 @@ mod data;
 
 use std::path::Path;
 
-use super::Result;
-use super::yaml::{Field, Node, Value};
+use super::field::Field;
+use super::node::{Node, Value};
+use crate::Result;
 use data::{binary, numbers, read_dtype};
 
 /// Prefix of tags of Python calls.
@@ -22,38 +23,38 @@ const MAX_NUMBERS: usize = 4096;
 
 /// An array of numbers, row-major.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct NumpyArray {
-    pub(super) shape: Vec<usize>,
-    pub(super) values: Vec<f64>,
+pub(crate) struct NumpyArray {
+    pub(crate) shape: Vec<usize>,
+    pub(crate) values: Vec<f64>,
 }
 
 impl NumpyArray {
-    pub(super) fn new(shape: Vec<usize>, values: Vec<f64>) -> Self {
+    pub(crate) fn new(shape: Vec<usize>, values: Vec<f64>) -> Self {
         Self { shape, values }
     }
 }
 
 /// True if the node carries a tag of Python's.
-pub(super) fn is_python(node: &Node) -> bool {
+pub(crate) fn is_python(node: &Node) -> bool {
     let tag = node.tag.as_deref();
     tag.is_some_and(|tag| tag.starts_with("python/"))
 }
 
 /// True if the node is a pickled call, and not a tuple or list of Python's.
-pub(super) fn is_call(node: &Node) -> bool {
+pub(crate) fn is_call(node: &Node) -> bool {
     let tag = node.tag.as_deref();
     tag.is_some_and(|tag| tag.starts_with(APPLY))
 }
 
 /// The text of a key that is a NumPy scalar; `None` if it is none.
-pub(super) fn key_text(node: &Node) -> Option<String> {
+pub(crate) fn key_text(node: &Node) -> Option<String> {
     scalar(&Field::root(Path::new(""), node))
         .ok()
         .map(|number| number.to_string())
 }
 
 /// Reads `_reconstruct`, `_frombuffer` and `scalar(dtype, data)`, an array without dimensions.
-pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray> {
+pub(crate) fn array(field: &Field<'_>) -> Result<NumpyArray> {
     match function(field) {
         Some("multiarray._reconstruct") => reconstruct(field),
         Some("numeric._frombuffer") => from_buffer(field),
@@ -72,7 +73,7 @@ pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray> {
 }
 
 /// Reads `scalar(dtype, data)` or an array with one number; it must be finite.
-pub(super) fn scalar(field: &Field<'_>) -> Result<f64> {
+pub(crate) fn scalar(field: &Field<'_>) -> Result<f64> {
     let NumpyArray { shape, values } = array(field)?;
     match values[..] {
         [value] if value.is_finite() => Ok(value),
@@ -97,8 +98,9 @@ fn reconstruct(field: &Field<'_>) -> Result<NumpyArray> {
     check_args(&field.required("args")?)?;
     let state_field = field.required("state")?;
     let [version, shape, dtype, is_fortran, data] = tuple::<5>(&state_field)?;
-    if version.integer()? != 1 {
-        return Err(version.error(format!("pickle version {}, expected 1", version.integer()?)));
+    let number = integer(&version)?;
+    if number != 1 {
+        return Err(version.error(format!("pickle version {number}, expected 1")));
     }
     let shape = read_shape(&shape)?;
     let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
@@ -139,6 +141,14 @@ fn expect_tag(field: &Field<'_>, expected: &str) -> Result<()> {
     }
 }
 
+/// Only a plain integer: what NumPy writes beside its numbers.
+fn integer(field: &Field<'_>) -> Result<i64> {
+    match field.node.value {
+        Value::Integer(value) => Ok(value),
+        _ => Err(field.expected("an integer")),
+    }
+}
+
 fn shown(tag: Option<&str>) -> String {
     tag.map_or("is missing".into(), |tag| {
         format!("{:?}", tag.chars().take(80).collect::<String>())
@@ -163,7 +173,7 @@ fn check_args(args: &Field<'_>) -> Result<()> {
     let [class, shape, code] = items::<3>(args)?;
     expect_tag(&class, "python/name:numpy.ndarray")?;
     let [zero] = tuple::<1>(&shape)?;
-    if zero.integer()? != 0 {
+    if integer(&zero)? != 0 {
         return Err(zero.error("expected 0: the shape comes with the state"));
     }
     match binary(&code)?.as_slice() {
@@ -176,7 +186,7 @@ fn read_shape(field: &Field<'_>) -> Result<Vec<usize>> {
     expect_tag(field, "python/tuple")?;
     let items = field.items()?;
     let sizes = items.iter().map(|item| {
-        usize::try_from(item.integer()?).map_err(|_| item.error("a shape is not negative"))
+        usize::try_from(integer(item)?).map_err(|_| item.error("a shape is not negative"))
     });
     let shape = sizes.collect::<Result<Vec<usize>>>()?;
     // Checked here: readers multiply the sizes without a check.
