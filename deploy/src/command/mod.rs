@@ -80,7 +80,8 @@ impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         use malloc_settings::{KEPT_MEMORY, ROUTER_THREADS};
-        let settings = [KEPT_MEMORY.as_slice(), &[ROUTER_THREADS]].concat();
+        let mut settings = KEPT_MEMORY.to_vec();
+        settings.extend(matches!(self, Self::Router(_)).then_some(ROUTER_THREADS));
         // Executes this program again where a setting is missing, so nothing may run before it.
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {

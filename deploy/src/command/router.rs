@@ -6,12 +6,15 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{BusOptions, Endpoint, RejectionLog, RouterProbe, STOP_LIMIT, SharedMemory, open};
+use bus::{
+    BusOptions, Endpoint, Rejection, RejectionLog, RouterProbe, STOP_LIMIT, SharedMemory, open,
+};
 use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::{Session, Wait};
 
 use crate::operate::network::from_here;
+use crate::operate::refusals::{self, Refusal};
 use crate::operate::router_panic;
 use crate::operate::router_watch;
 use crate::operate::security::guarded;
@@ -49,6 +52,9 @@ pub(crate) struct Arguments {
     /// Write the same settings as a configuration for `zenohd -c FILE`, and do not run.
     #[arg(long, value_name = "FILE")]
     zenohd: Option<PathBuf>,
+    /// File for the numbers of refused requests, in JSON (--keys); a router that is started again adds to it.
+    #[arg(long, value_name = "FILE", requires = "keys")]
+    refusals: Option<PathBuf>,
     /// End when standard input ends: for a supervisor that holds the other end of the pipe.
     #[arg(long)]
     supervised: bool,
@@ -83,22 +89,18 @@ impl Arguments {
         let session = open(&options)?;
         let endpoint = options.endpoint();
         output::note(format_args!("routing at {endpoint} (Ctrl-C ends it)"));
-        let mut refusals = RejectionLog::of(options.endpoint());
-        let (mut reported, mut report_at) = (BTreeMap::new(), Instant::now() + REPORT_ROUND);
+        let mut refused = self.refused(&options)?;
+        let mut report_at = Instant::now() + REPORT_ROUND;
         let mut probe = self.probe(&session, &options);
         let failure = loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
             // Also at the end, or refusals since the last report would be lost.
-            if options.guard.is_some() && (ended || Instant::now() > report_at) {
+            if let Some(refused) = refused
+                .as_mut()
+                .filter(|_| ended || Instant::now() > report_at)
+            {
                 report_at = Instant::now() + REPORT_ROUND;
-                refusals.update(&session);
-                for (refusal, count) in refusals.counts() {
-                    let before = reported.insert(refusal.clone(), count).unwrap_or(0);
-                    let (peer, reason, what) = (refusal.peer, refusal.reason, refusal.message);
-                    if count > before {
-                        tracing::warn!(peer, reason, what, count, "refused");
-                    }
-                }
+                refused.report(&session);
             }
             let silence = probe.as_mut().map(|probe| probe.silence(Instant::now()));
             if let Some(panic) = router_panic::first() {
@@ -119,6 +121,22 @@ impl Arguments {
         }
         session.close().wait().map_err(anyhow::Error::from_boxed)?;
         Ok(Outcome::Done)
+    }
+
+    /// The refusals so far of a router with keys.
+    fn refused(&self, options: &BusOptions) -> anyhow::Result<Option<Refused>> {
+        if options.guard.is_none() {
+            return Ok(None);
+        }
+        let before = self.refusals.as_ref().map(|file| {
+            let counts = refusals::read(file).with_context(|| file.display().to_string())?;
+            anyhow::Ok((file.clone(), counts))
+        });
+        Ok(Some(Refused {
+            log: RejectionLog::of(options.endpoint()),
+            reported: BTreeMap::new(),
+            before: before.transpose()?,
+        }))
     }
 
     /// A second session that has to receive what the router's own publishes; `None`, with a warning, if the router cannot
@@ -149,5 +167,36 @@ impl Arguments {
         };
         let runs = self.run.clone().map_or(RunScope::Any, RunScope::One);
         Ok(guarded(options, folder, runs)?)
+    }
+}
+
+/// Refused requests of a router.
+struct Refused {
+    log: RejectionLog,
+    reported: BTreeMap<Rejection, u64>,
+    /// File for the counts, and what the routers before wrote into it.
+    before: Option<(PathBuf, Vec<Refusal>)>,
+}
+
+impl Refused {
+    /// Logs and writes what was refused since the last report.
+    fn report(&mut self, router: &Session) {
+        self.log.update(router);
+        let counts = self.log.counts();
+        if counts == self.reported {
+            return;
+        }
+        for (refusal, count) in &counts {
+            if self.reported.get(refusal) != Some(count) {
+                let (peer, reason, what) = (&refusal.peer, &refusal.reason, &refusal.message);
+                tracing::warn!(peer, reason, what, count, "refused");
+            }
+        }
+        if let Some((file, before)) = &self.before
+            && let Err(error) = refusals::write(file, before, &counts)
+        {
+            tracing::warn!("{}: {error}", file.display());
+        }
+        self.reported = counts;
     }
 }

@@ -1,13 +1,12 @@
-//! Router endpoint of a run: a router inside this process, or one that runs elsewhere.
+//! Router endpoint of a run: of a router of its own, or of one that runs already.
 
+use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
-use bus::shutdown::{self, Overdue};
-use bus::{
-    BusError, BusOptions, Endpoint, ROUTER, RouterProbe, SharedMemory, open, present, process_id,
-};
-use protocol::{Key, KeyExpr, Principal, ProcessId, Role, RunId, RunScope};
+use bus::shutdown::{self, Overdue, Stop};
+use bus::{BusError, BusOptions, Endpoint, RouterProbe, open_unless, present, process_id};
+use protocol::{Key, KeyExpr, Principal, ProcessId, Role, RunId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
@@ -23,7 +22,7 @@ const CLOSE_LIMIT: Duration = Duration::from_millis(500);
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Network {
-    /// Address at which the router inside this run listens; port 0 takes any free one.
+    /// Address at which the router of this run listens; port 0 takes any free one.
     pub listen: String,
     /// Router that runs already (`zenohd`), for example `tcp/10.0.0.1:7447`; no router is started then.
     pub connect: Option<String>,
@@ -31,7 +30,7 @@ pub struct Network {
     /// takes the socket. A router elsewhere has to be attached (`v2vloc router --shared-memory`).
     pub shared_memory_mib: usize,
     /// Longest time for handing one map or sweep to one receiver on another host, seconds, after which the router
-    /// inside this run closes that connection. A receiver behind a slow link needs more (8 MiB at 13 Mbit/s take 5 s).
+    /// of this run closes that connection. A receiver behind a slow link needs more (8 MiB at 13 Mbit/s take 5 s).
     /// Other receivers do not wait for it.
     pub stall_limit_s: f64,
     /// Address at which the scorer serves its counters to Prometheus; the other processes take the ports after it, in
@@ -51,42 +50,42 @@ impl Default for Network {
     }
 }
 
-/// An open session, and the endpoint that the other processes connect to.
+impl Network {
+    /// Endpoint of the router of a run: the one that runs already, or a free address for one to start; with keys over
+    /// QUIC.
+    ///
+    /// # Errors
+    /// [`BusError`] when the port is in use or the endpoint is invalid.
+    pub fn endpoint(&self, has_keys: bool) -> Result<Endpoint, BusError> {
+        match &self.connect {
+            Some(router) => Endpoint::new(router),
+            None => free_endpoint(&self.listen, has_keys),
+        }
+    }
+}
+
+/// A session of the scorer, and the endpoint that the other processes connect to.
 pub struct RouterEndpoint {
     /// The session of this process.
     pub session: Session,
     /// Endpoint that the other processes are given.
     pub endpoint: Endpoint,
-    /// True if the router is in this process and enforces access control.
-    pub is_guarded: bool,
 }
 
 impl RouterEndpoint {
-    /// Opens the router of this run, or connects to the one that the scenario names; with keys over QUIC.
+    /// Connects to the router that listens at `endpoint`, with keys over QUIC, unless `stop` is requested first.
     ///
     /// # Errors
-    /// [`BusError`] when the port is in use, no router answers, the endpoint is invalid or the keys do not fit.
-    pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
-        let options = match &network.connect {
-            Some(router) => as_scorer(BusOptions::client(Endpoint::new(router)?), keys)?,
-            None => {
-                let mut options = BusOptions::router(with_port(&network.listen, keys.is_some())?);
-                options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
-                if network.shared_memory_mib > 0 {
-                    options.shared_memory = SharedMemory::Attached;
-                }
-                let runs = RunScope::One(run.clone());
-                match keys {
-                    Some(keys) => security::guarded(options, &keys.of_process(ROUTER), runs)?,
-                    None => options,
-                }
-            }
-        };
-        let session = open(&options)?;
+    /// [`BusError`] when no router answers or the keys do not fit.
+    pub fn open(
+        endpoint: &Endpoint,
+        keys: Option<&RunKeys>,
+        stop: &Stop,
+    ) -> Result<Self, BusError> {
+        let options = as_scorer(BusOptions::client(from_here(endpoint)?), keys)?;
         Ok(Self {
-            session,
-            endpoint: from_here(options.endpoint())?,
-            is_guarded: options.guard.is_some(),
+            session: open_unless(stop, &options)?,
+            endpoint: options.endpoint().clone(),
         })
     }
 
@@ -112,7 +111,7 @@ impl RouterEndpoint {
         run: &RunId,
         specs: &[ProcessSpec],
     ) -> Result<Vec<ProcessId>, BusError> {
-        // A router of our own is new, so nobody can be present on it.
+        // A router of its own is new, so nobody can be present on it.
         if network.connect.is_none() {
             return Ok(Vec::new());
         }
@@ -151,21 +150,24 @@ pub(crate) fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
     Endpoint::new(&text.replacen("/[::]:", "/[::1]:", 1))
 }
 
-/// The endpoint with port 0 replaced by a port that is free at this moment.
-fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
-    let Some(place) = listen.strip_suffix(":0") else {
-        return Endpoint::new(listen);
-    };
-    let host = place.split_once('/').map_or(place, |(_, host)| host);
-    // If another program takes the port in between, the router reports the error.
-    let any = format!("{host}:0");
+/// A listening address that is free at this moment; port 0 is replaced by a free port.
+fn free_endpoint(listen: &str, has_keys: bool) -> Result<Endpoint, BusError> {
+    let endpoint = Endpoint::new(listen)?;
+    let address = endpoint.address();
     // Free for the protocol in use: QUIC takes a port of UDP.
-    let bound = match secured {
-        true => UdpSocket::bind(any).and_then(|socket| socket.local_addr()),
-        false => TcpListener::bind(any).and_then(|listener| listener.local_addr()),
+    let bound = match has_keys || endpoint.is_secured() {
+        true => UdpSocket::bind(address).and_then(|socket| socket.local_addr()),
+        false => TcpListener::bind(address).and_then(|listener| listener.local_addr()),
     };
-    let port = bound.as_ref().map_or(0, SocketAddr::port);
-    Endpoint::new(&format!("{place}:{port}"))
+    match (bound, listen.strip_suffix(":0")) {
+        // If another program takes the port in between, the router's log has the error.
+        (Ok(bound), Some(place)) => Endpoint::new(&format!("{place}:{}", bound.port())),
+        (Err(error), _) if error.kind() == ErrorKind::AddrInUse => {
+            Err(BusError::PortInUse { endpoint })
+        }
+        // What else is wrong with an address the router says.
+        _ => Ok(endpoint),
+    }
 }
 
 #[cfg(test)]
@@ -179,11 +181,11 @@ mod tests {
             ("tcp/127.0.0.1:0", true),
             ("quic/127.0.0.1:0", true),
         ] {
-            let endpoint = with_port(listen, secured).unwrap();
+            let endpoint = free_endpoint(listen, secured).unwrap();
             assert!(!endpoint.as_str().ends_with(":0"), "{}", endpoint.as_str());
         }
         assert_eq!(
-            with_port("tcp/127.0.0.1:7447", false).unwrap().as_str(),
+            free_endpoint("tcp/127.0.0.1:7447", false).unwrap().as_str(),
             "tcp/127.0.0.1:7447"
         );
     }
@@ -210,10 +212,7 @@ mod tests {
             listen: listen.clone(),
             ..Network::default()
         };
-        let error = RouterEndpoint::open(&network, &"r1".parse().unwrap(), None)
-            .err()
-            .unwrap()
-            .to_string();
+        let error = network.endpoint(false).unwrap_err().to_string();
         assert!(
             error.contains(&listen) && error.contains("in use"),
             "{error}"

@@ -1,4 +1,4 @@
-//! Panics of the router inside this process: noted by a hook, so that a router that routes nothing any more ends.
+//! Panics of a router's threads: noted by a hook, so that a router that routes nothing any more ends.
 //!
 //! A thread of zenoh that panics leaves a lock poisoned: the router lives on, refuses newcomers and passes no message.
 
@@ -15,7 +15,7 @@ static FIRST: OnceLock<String> = OnceLock::new();
 const THREADS: [&str; 5] = ["acc-", "app-", "net-", "rx-", "tx-"];
 
 /// Notes the first panic of a thread of the router from now on, and requests `stop` then.
-pub fn watch(stop: &Stop) {
+pub(crate) fn watch(stop: &Stop) {
     static ONCE: Once = Once::new();
     let stop = stop.clone();
     ONCE.call_once(|| {
@@ -35,7 +35,7 @@ pub fn watch(stop: &Stop) {
 }
 
 /// The first panic of a thread of the router, if there was one.
-pub fn first() -> Option<&'static str> {
+pub(crate) fn first() -> Option<&'static str> {
     FIRST.get().map(String::as_str)
 }
 

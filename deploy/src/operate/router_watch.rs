@@ -14,8 +14,8 @@ pub(crate) const LIMIT: Duration = Duration::from_secs(2);
 pub(crate) enum Finding {
     /// A line for the terminal: the router is gone, or back, or the run was suspended.
     Line(String),
-    /// The router in this process passes no message, with the reason.
-    Failed(String),
+    /// The router of this run is there and passes no message, with the reason: it has to be replaced.
+    Hung(String),
 }
 
 /// Reason for the failure of a router through which nothing came for this time.
@@ -53,8 +53,10 @@ impl Times {
 pub(crate) struct RouterWatch {
     /// Absent where no second session could be opened.
     probe: Option<RouterProbe>,
-    /// True if the router is in this process.
-    is_here: bool,
+    /// True if the router is of this run, which can replace it.
+    is_own: bool,
+    /// True if it was to be replaced in this outage.
+    is_replaced: bool,
     looked: Option<Instant>,
     gone_since: Option<Instant>,
     outages: Times,
@@ -63,10 +65,10 @@ pub(crate) struct RouterWatch {
 
 impl RouterWatch {
     /// A watch over the router that `probe` reaches.
-    pub(crate) fn new(probe: Option<RouterProbe>, is_here: bool) -> Self {
+    pub(crate) fn new(probe: Option<RouterProbe>, is_own: bool) -> Self {
         Self {
             probe,
-            is_here,
+            is_own,
             ..Self::default()
         }
     }
@@ -104,10 +106,6 @@ impl RouterWatch {
             return Some(Finding::Line(line));
         }
         let is_silent = silence > LIMIT;
-        if is_silent && self.is_here {
-            return Some(Finding::Failed(in_words(silence)));
-        }
-        // A router elsewhere may come back, so its silence is an outage and no failure.
         let since = lost_since.or_else(|| is_silent.then(|| now.checked_sub(silence))?);
         let line = match (self.gone_since, since) {
             (None, Some(since)) => {
@@ -116,10 +114,15 @@ impl RouterWatch {
             }
             (Some(since), None) => {
                 let outage = now.saturating_duration_since(since);
-                self.gone_since = None;
+                (self.gone_since, self.is_replaced) = (None, false);
                 self.outages.add(outage);
                 let seconds = outage.as_secs_f64();
                 format!("the router is back after {seconds:.1} s")
+            }
+            // One that has ended is started again without a request.
+            (Some(_), Some(_)) if self.is_own && lost_since.is_none() && !self.is_replaced => {
+                self.is_replaced = true;
+                return Some(Finding::Hung(in_words(silence)));
             }
             _ => return None,
         };
@@ -149,9 +152,9 @@ impl RouterWatch {
     }
 
     /// Ends the probe.
-    pub(crate) fn end(&mut self, has_failed: bool) {
+    pub(crate) fn end(&mut self) {
         if let Some(probe) = self.probe.take() {
-            probe.end(has_failed || self.gone_since.is_some());
+            probe.end(self.gone_since.is_some());
         }
     }
 }
@@ -192,13 +195,23 @@ mod tests {
     }
 
     #[test]
-    fn a_router_here_that_is_silent_has_failed() {
+    fn a_router_of_the_run_that_is_silent_is_replaced_once_in_an_outage() {
         let mut watch = RouterWatch::new(None, true);
-        let now = Instant::now();
+        let mut now = Instant::now();
         assert_eq!(watch.judge(LIMIT, None, now), None);
-        let found = watch.judge(LIMIT + BEAT, None, now + BEAT);
-        let reason = "nothing came through it for 2.1 s".to_owned();
-        assert_eq!(found, Some(Finding::Failed(reason)));
+        for _ in 0..2 {
+            now += BEAT;
+            assert!(line(watch.judge(LIMIT + BEAT, None, now)).contains("gone"));
+            now += BEAT;
+            let found = watch.judge(LIMIT + 2 * BEAT, None, now);
+            let reason = "nothing came through it for 2.2 s".to_owned();
+            assert_eq!(found, Some(Finding::Hung(reason)));
+            assert_eq!(watch.judge(2 * LIMIT, None, now), None, "once");
+            assert!(line(watch.judge(BEAT, None, now)).contains("back"));
+        }
+        // One that has ended is restarted in any case.
+        assert!(line(watch.judge(BEAT, Some(now), now)).contains("gone"));
+        assert_eq!(watch.judge(2 * LIMIT, Some(now), now), None);
     }
 
     #[test]

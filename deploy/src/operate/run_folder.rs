@@ -92,6 +92,11 @@ impl RunFolder {
         self.path.join("log")
     }
 
+    /// Log of a process.
+    pub fn log_of(&self, process: &str) -> PathBuf {
+        self.log_dir().join(format!("{process}.log"))
+    }
+
     /// Path of a file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)

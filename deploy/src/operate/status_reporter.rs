@@ -4,7 +4,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{Endpoint, RouterProbe};
+use bus::{Endpoint, ROUTER, RouterProbe};
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::RunId;
 
@@ -12,7 +12,6 @@ use crate::operate::REPLAY;
 use crate::operate::failures::Failures;
 use crate::operate::health::Health;
 use crate::operate::progress::Display;
-use crate::operate::router_panic;
 use crate::operate::router_watch::{Finding, RouterWatch};
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
@@ -29,11 +28,6 @@ pub enum Ending {
     Over,
     /// The user ended the run.
     Asked,
-    /// The router inside this process passes no message any more.
-    RouterFailed {
-        /// Its panic, or the time of its silence.
-        how: String,
-    },
     /// A process crashed and is not restarted.
     Failed {
         /// Name of the process.
@@ -52,12 +46,12 @@ pub struct StatusReporter {
 }
 
 impl StatusReporter {
-    /// For a run with these timeouts and its router at `endpoint`, in this process or not, that `probe` reaches; judged
-    /// by `protocol`.
+    /// For a run with these timeouts and its router at `endpoint`, a process of the run or not, that `probe` reaches;
+    /// judged by `protocol`.
     pub fn new(
         timeouts: &Timeouts,
         run: &RunId,
-        (endpoint, is_here, probe): (&Endpoint, bool, Option<RouterProbe>),
+        (endpoint, is_own, probe): (&Endpoint, bool, Option<RouterProbe>),
         folder: &RunFolder,
         protocol: EvaluationProtocol,
     ) -> Self {
@@ -68,7 +62,7 @@ impl StatusReporter {
         Self {
             health: Health::new(hang, start),
             failures: Failures::default(),
-            router: RouterWatch::new(probe, is_here),
+            router: RouterWatch::new(probe, is_own),
             status: StatusWriter::new(folder.path(), run, endpoint, Some(protocol)),
         }
     }
@@ -102,9 +96,9 @@ impl StatusReporter {
         self.router.had_outages()
     }
 
-    /// Ends the watch of the router, which may have failed.
-    pub fn end(&mut self, router_failed: bool) {
-        self.router.end(router_failed);
+    /// Ends the watch of the router.
+    pub fn end(&mut self) {
+        self.router.end();
     }
 
     /// Writes the status of the run.
@@ -114,22 +108,17 @@ impl StatusReporter {
         status.write(phase, progress, causes, |at| health.statuses(progress, at));
     }
 
-    /// Displays events and replaces hung processes until the scene is over, the user ends the run, or a process stays
-    /// down.
+    /// Displays events and replaces hung processes, `router` among them, until the scene is over, the user ends the run,
+    /// or a process stays down.
     pub fn follow(
         &mut self,
-        supervisor: &Supervisor,
+        (supervisor, router): (&Supervisor, Option<&Supervisor>),
         events: &Receiver<ProcessEvent>,
         scorer: &ScorerNode,
         stop: &Stop,
         display: &mut Display,
     ) -> Ending {
         loop {
-            // Before the request to stop, which such a panic makes too.
-            if let Some(panic) = router_panic::first() {
-                let how = panic.to_owned();
-                return Ending::RouterFailed { how };
-            }
             if stop.requested() {
                 display.print_line("ending");
                 return Ending::Asked;
@@ -142,7 +131,11 @@ impl StatusReporter {
                 .iter()
                 .filter(|(name, _)| *name != SCORER);
             match self.router.look(scorer, others.map(|(_, at)| *at).max()) {
-                Some(Finding::Failed(how)) => return Ending::RouterFailed { how },
+                Some(Finding::Hung(why)) => {
+                    if let Some(router) = router {
+                        router.replace(ROUTER, &why);
+                    }
+                }
                 Some(Finding::Line(line)) => display.print_line(&line),
                 None => {}
             }

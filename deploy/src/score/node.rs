@@ -1,7 +1,6 @@
 //! Scorer process on the bus: receives truth, detections, tracks, poses and the ledgers of all processes, and keeps the scores.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::mem;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -246,16 +245,6 @@ impl ScorerNode {
         if let Err(overdue) = connection.bus.leave(LEAVE_LIMIT) {
             tracing::warn!("{overdue}");
         }
-        scored
-    }
-
-    /// [`Self::finish`] of a session that no longer answers: it is left as it is until the process ends.
-    ///
-    /// # Panics
-    /// As [`Self::finish`].
-    pub fn abandon(self) -> Scored {
-        let (scored, connection) = self.scored();
-        mem::forget(connection);
         scored
     }
 

@@ -70,7 +70,8 @@ impl Endpoint {
         }
     }
 
-    pub(super) fn address(&self) -> &str {
+    /// `HOST:PORT`.
+    pub fn address(&self) -> &str {
         // Checked by the constructor.
         self.0.split_once('/').map_or("", |(_, address)| address)
     }

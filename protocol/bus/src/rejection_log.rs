@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
 
 use super::endpoint::Endpoint;
@@ -18,7 +19,7 @@ const MAX_REJECTIONS: usize = 1024;
 const UNAUTHORISED: &str = "unauthorised";
 
 /// Rejection of a message or of a connection by a router.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Rejection {
     /// Common name of the certificate, or the session's id without one; `UNAUTHORISED` for peers not admitted.
     pub peer: String,

@@ -333,7 +333,7 @@ pub const OPV2V: &str = "lidar_pose: [1.5, -2.0, 1.9, 0.0, 90.0, 0.0]\ntrue_ego_
 
 /// The same as V2V4Real stores it: matrices as Python wrote them.
 pub const V2V4REAL: &str = concat!(
-    include_str!("../../../sim-replay/dataset/src/numpy_tags/numpy_matrix.yaml"),
+    include_str!("../../../sim-replay/dataset/src/yaml/numpy_tags/numpy_matrix.yaml"),
     "true_ego_pos: [0, 0, 0, 0, 0, 0]\nego_speed: 3.6\nvehicles:\n  1:\n    angle: [0, 90, 0]\n    center: [0, 0, 0]\n    \
      extent: [2, 1, 0.75]\n    location: [10, 4, -1]\n    ass_id: 5\n    obj_type: Truck\n"
 );

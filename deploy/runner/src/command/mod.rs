@@ -43,10 +43,8 @@ pub(crate) enum Command {
 impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        use malloc_settings::{KEPT_MEMORY, ROUTER_THREADS};
-        let settings = [KEPT_MEMORY.as_slice(), &[ROUTER_THREADS]].concat();
         // Executes this program again where a setting is missing, so nothing may run before it.
-        malloc_settings::ensure(&settings).context("this program again")?;
+        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
         match self {
             Self::Bench(arguments) => arguments.run(),
             Self::Capacity(arguments) => arguments.run(),

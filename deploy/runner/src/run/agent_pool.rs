@@ -7,7 +7,6 @@ use std::time::Duration;
 
 use bus::shutdown::Stop;
 use bus::{Bus, Identity};
-use deploy::operate::network::RouterEndpoint;
 use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
 use deploy::operate::supervise::{ProcessEventKind, Supervisor};
@@ -18,6 +17,7 @@ use protocol::{CavId, ProcessId, RunId};
 use crate::fleet::{Fleet, SessionContext};
 use crate::run::RunError;
 use crate::run::common::check_free;
+use crate::run::router_process::Router;
 
 /// Name on the bus of the process that distributes the sweeps.
 const NAME: &str = "stepped";
@@ -28,7 +28,7 @@ const LEAVE_LIMIT: Duration = Duration::from_secs(2);
 pub(crate) struct CrewProcesses {
     supervisor: Supervisor,
     bus: Bus,
-    place: RouterEndpoint,
+    router: Router,
     grace: Duration,
     _keys: Option<RunKeys>,
 }
@@ -45,27 +45,30 @@ impl CrewProcesses {
         programs: &Path,
     ) -> Result<(Self, RemotePool), RunError> {
         let keys = fleet.keys(folder)?;
-        let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
-        let endpoint = &place.endpoint;
-        let specs = fleet.agent_processes(&SessionContext {
+        let context = SessionContext {
             run,
-            endpoint,
+            endpoint: &fleet.scenario.network.endpoint(keys.is_some())?,
             keys: keys.as_ref(),
             programs,
             folder,
+        };
+        let (events, happened) = channel();
+        let stop = Stop::new();
+        let router = Router::start(fleet, &context, (&events, &happened), &stop)?;
+        let specs = fleet.agent_processes(&SessionContext {
+            endpoint: &router.place.endpoint,
+            ..context
         })?;
         // Before any process starts: receivers reject the messages of two fleets of one name.
-        check_free(&place, &fleet.scenario.network, run, &specs)?;
+        check_free(&router.place, &fleet.scenario.network, run, &specs)?;
         let identity = Identity {
             run: run.clone(),
             process: ProcessId::new(NAME).expect("lower-case letters"),
             cav: CavId::new(NAME).expect("lower-case letters"),
         };
-        let bus = Bus::over(place.session.clone(), identity)?;
-        let (events, happened) = channel();
+        let bus = Bus::over(router.place.session.clone(), identity)?;
         // A restarted agent has lost its state, and the result would depend on the time of the crash.
         let supervisor = Supervisor::start(specs, &folder.log_dir(), 0, &events)?;
-        let stop = Stop::new();
         // Ends the wait for an agent that has crashed and is not started again.
         thread::spawn({
             let stop = stop.clone();
@@ -90,7 +93,7 @@ impl CrewProcesses {
         let processes = Self {
             supervisor,
             bus,
-            place,
+            router,
             grace: Duration::from_secs_f64(timeouts.stop_s),
             _keys: keys,
         };
@@ -100,11 +103,10 @@ impl CrewProcesses {
     /// Ends all processes; returns the names of those that had to be killed.
     pub(crate) fn end(self) -> Vec<String> {
         let killed = self.supervisor.stop(self.grace);
-        for closed in [self.bus.leave(LEAVE_LIMIT), self.place.close()] {
-            if let Err(overdue) = closed {
-                tracing::warn!("{overdue}");
-            }
+        if let Err(overdue) = self.bus.leave(LEAVE_LIMIT) {
+            tracing::warn!("{overdue}");
         }
+        self.router.end();
         killed
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use bus::Rejection;
+use deploy::operate::refusals::Refusal;
 use deploy::score::ProcessStats;
 use protocol::{Counts, Ledger, Reconciliation};
 use serde::Serialize;
@@ -24,25 +24,12 @@ pub(crate) struct LedgerReport {
     pub sum: Ledger,
     /// Requests that the router of the run refused: peer, message, reason.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub refused: Vec<RefusedReport>,
+    pub refused: Vec<Refusal>,
     /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub causes: Vec<String>,
     /// Last report of each process; a restarted one has an entry per instance.
     pub processes: Vec<ProcessStats>,
-}
-
-/// Requests of one peer that the router refused.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(crate) struct RefusedReport {
-    /// Common name of its certificate.
-    pub peer: String,
-    /// `put`, `declare`, `query`.
-    pub message: String,
-    /// `access-control` or `low-pass`.
-    pub reason: String,
-    /// Number of refusals.
-    pub count: u64,
 }
 
 impl LedgerReport {
@@ -64,18 +51,6 @@ impl LedgerReport {
             refused: Vec::new(),
             causes: Vec::new(),
             processes: ledgers.to_vec(),
-        }
-    }
-}
-
-impl RefusedReport {
-    /// The requests that the router of the run refused.
-    pub(crate) fn of((refused, count): (&Rejection, &u64)) -> Self {
-        Self {
-            peer: refused.peer.clone(),
-            message: refused.message.clone(),
-            reason: refused.reason.clone(),
-            count: *count,
         }
     }
 }

@@ -8,6 +8,7 @@ pub(crate) mod ledger_report;
 pub(crate) mod loss;
 pub mod machine;
 mod picture;
+pub(crate) mod router_process;
 mod run_error;
 pub mod run_fleet;
 pub mod stepped;

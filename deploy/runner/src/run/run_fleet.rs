@@ -1,23 +1,20 @@
 //! One run from beginning to end: plan, start, watch, end, score, write.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::mem;
 use std::path::Path;
-use std::sync::mpsc::channel;
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use bus::MetricsPeer;
 use bus::shutdown::Stop;
-use bus::{MetricsPeer, Rejection};
 use dataset::findings;
-use deploy::operate::network::RouterEndpoint;
 use deploy::operate::progress::Display;
-use deploy::operate::refusal_watch::RefusalWatch;
-use deploy::operate::router_panic;
+use deploy::operate::refusals::Refusal;
 use deploy::operate::run_folder::{RunFolder, SWEEP_LOG};
 use deploy::operate::status::Phase;
 use deploy::operate::status_reporter::{Ending, StatusReporter};
-use deploy::operate::supervise::{ProcessSpec, Supervisor};
+use deploy::operate::supervise::{ProcessEvent, ProcessSpec, Supervisor};
 use deploy::operate::timeouts::Timeouts;
 use deploy::operate::{RECORDER, REPLAY};
 use deploy::report::{self, Capacity, RunReport};
@@ -31,7 +28,8 @@ use support::provenance::Provenance;
 use crate::fleet::{Fleet, SessionContext};
 use crate::run::capacity::{BUDGET, estimate, remedies};
 use crate::run::common::{check_free, in_folder};
-use crate::run::ledger_report::{LedgerReport, RefusedReport};
+use crate::run::ledger_report::LedgerReport;
+use crate::run::router_process::Router;
 use crate::run::{RunError, stepped};
 use crate::scenario::{Clock, Scenario};
 
@@ -49,9 +47,6 @@ const RECORDER_SHARE: Duration = Duration::from_millis(800);
 
 /// Files of results and of ground truth, a line each.
 const LINES: [&str; 3] = ["detections.jsonl", "truth.jsonl", TRACKS];
-
-/// A run whose router, in this process, passes no message.
-const ROUTER_FAILED: &str = "the router of the run failed, and no message passed any more";
 
 /// Runs a scenario to its end, or until Ctrl-C.
 ///
@@ -91,31 +86,32 @@ fn go(
 ) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
-    // Before the router opens, whose threads it watches.
-    router_panic::watch(&stop);
     // Before anything else of the run takes the cores.
     let capacity = announce_capacity(fleet, &options.programs);
     let fingerprint = fingerprint(fleet, &options.programs);
 
     let keys = fleet.keys(folder)?;
-    let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
-    let (endpoint, programs) = (&place.endpoint, options.programs.as_path());
     let context = SessionContext {
         run,
-        endpoint,
+        endpoint: &fleet.scenario.network.endpoint(keys.is_some())?,
         keys: keys.as_ref(),
-        programs,
+        programs: &options.programs,
         folder,
     };
+    let (events, happened) = channel();
+    let router = Router::start(fleet, &context, (&events, &happened), &stop)?;
+    let context = SessionContext {
+        endpoint: &router.place.endpoint,
+        ..context
+    };
     let specs = fleet.processes(&context)?;
-    check_free(&place, &fleet.scenario.network, run, &specs)?;
-    let refused = RefusalWatch::over(&place)?;
+    check_free(&router.place, &fleet.scenario.network, run, &specs)?;
     let (ego, agents) = (&fleet.ego, &fleet.agents);
     let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let [detections, truth, tracks] = LINES.map(|name| folder.file(name));
     let tracks = fleet.scenario.ego.tracks.then_some(tracks);
     let lines = [detections, truth];
-    let session = place.session.clone();
+    let session = router.place.session.clone();
     // The scorer subscribes before any process starts, so that it misses none of their messages.
     let mut scorer = ScorerNode::start(session, run, agents, ego, board, lines, tracks)?;
     if let Some(address) = fleet.scenario.network.metrics {
@@ -128,38 +124,25 @@ fn go(
         scorer.serve_metrics(address, peers.collect())?;
     }
     // Not returned at once on an error: scorer and router have to be ended first.
-    let watched = watch(fleet, &context, specs, &place, &scorer, &stop);
-    let has_router = !watched
-        .as_ref()
-        .is_ok_and(|watched| matches!(watched.ending, Ending::RouterFailed { .. }));
-    let (scored, refused) = if has_router {
-        // Before the scorer closes the session.
-        let refused = refused.finish();
-        let scored = scorer.finish();
-        if let Err(overdue) = place.close() {
-            tracing::warn!("{overdue}");
-        }
-        (scored, refused)
-    } else {
-        // A poisoned session cannot be closed: the process would abort, and the results with it.
-        mem::forget((place, refused));
-        (scorer.abandon(), BTreeMap::new())
-    };
+    let events = (&events, &happened);
+    let watched = watch(fleet, &context, specs, &router, events, &scorer, &stop);
+    let scored = scorer.finish();
+    let refused = router.end();
     let watched = watched?;
 
     // Also after a failure: the folder gets what was computed until then.
     let result = write(
         fleet,
         (run, folder.clone()),
-        (scored, &refused),
+        (scored, refused),
         &watched,
         fingerprint,
         capacity,
     );
     match watched.ending {
-        Ending::Over | Ending::Asked | Ending::RouterFailed { .. } => Ok(result),
+        Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
-            let log = result.folder.log_dir().join(format!("{process}.log"));
+            let log = result.folder.log_of(&process);
             Err(RunError::Process { process, how, log })
         }
     }
@@ -194,13 +177,12 @@ fn watch(
     fleet: &Fleet,
     context: &SessionContext<'_>,
     specs: Vec<ProcessSpec>,
-    place: &RouterEndpoint,
+    router: &Router,
+    (events, happened): (&Sender<ProcessEvent>, &Receiver<ProcessEvent>),
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched, RunError> {
-    let (run, folder, keys) = (context.run, context.folder, context.keys);
-    let endpoint = &place.endpoint;
-    let (events, happened) = channel();
+    let (run, folder, endpoint) = (context.run, context.folder, context.endpoint);
     let mut display = Display::new(fleet.ticks);
     if let Some(address) = fleet.scenario.network.metrics {
         let line = format!("metrics of all processes at http://{address}/metrics");
@@ -214,33 +196,27 @@ fn watch(
     ));
     let everyone = specs.iter().map(|spec| spec.name.clone());
     let everyone: Vec<String> = everyone.chain([Role::Scorer.to_string()]).collect();
-    let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
+    let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, events)?;
     let mut watch = StatusReporter::new(
         &fleet.scenario.timeouts,
         run,
         (
             endpoint,
-            fleet.scenario.network.connect.is_none(),
-            place.probe(run, keys),
+            router.supervisor().is_some(),
+            router.place.probe(run, context.keys),
         ),
         folder,
         fleet.applied_protocol(),
     );
-    let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
+    let processes = (&supervisor, router.supervisor());
+    let ending = watch.follow(processes, happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
     offline.extend(watch.crashed());
-    let router_failure = match &ending {
-        Ending::RouterFailed { how } => Some(format!("{ROUTER_FAILED}: {how}")),
-        _ => None,
-    };
-    if let Some(failure) = &router_failure {
-        display.print_line(failure);
-    }
     // Messages of any process may have been lost in that time.
-    if watch.had_outages() || router_failure.is_some() {
+    if watch.had_outages() {
         offline.extend(everyone);
     }
-    watch.end(router_failure.is_some());
+    watch.end();
     watch.write_status(Phase::Ending, &scorer.progress());
     let [replay_until, drain_until, all_until] = deadlines(&fleet.scenario.timeouts, &ending);
     // In the order of the data flow, so that messages on their way still arrive.
@@ -257,19 +233,12 @@ fn watch(
     }
     watch.write_status(Phase::Over, &scorer.progress());
     offline.extend(killed.iter().cloned());
-    let (mut failures, mut causes) = (watch.failures(), watch.causes());
-    if let Some(failure) = router_failure {
-        failures.push(failure.clone());
-        causes.push(failure);
-        // They cannot take their leave without a router.
-        killed.clear();
-    }
     Ok(Watched {
         ending,
         killed,
         offline,
-        failures,
-        causes,
+        failures: watch.failures(),
+        causes: watch.causes(),
     })
 }
 
@@ -281,7 +250,6 @@ fn deadlines(timeouts: &Timeouts, ending: &Ending) -> [Instant; 3] {
         // The replay has ended by itself.
         Ending::Over => [0.0, drain_s, drain_s + stop_s],
         Ending::Asked => [stop_s * REPLAY_SHARE, stop_s * DRAIN_SHARE, stop_s],
-        Ending::RouterFailed { .. } => [0.0, 0.0, stop_s],
         // The run has failed, so no further results are waited for.
         Ending::Failed { .. } => [stop_s, 0.0, stop_s],
     };
@@ -312,7 +280,7 @@ fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Pro
 fn write(
     fleet: &Fleet,
     (run, folder): (&RunId, RunFolder),
-    (scored, refused): (Scored, &BTreeMap<Rejection, u64>),
+    (scored, refused): (Scored, Vec<Refusal>),
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
     capacity: Option<Capacity>,
@@ -363,7 +331,7 @@ fn write(
     written.push(folder.write_json(report::FILE, &run_report));
     written.push(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
     let report = LedgerReport {
-        refused: refused.iter().map(RefusedReport::of).collect(),
+        refused,
         causes: watched.causes.clone(),
         ..LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted))
     };

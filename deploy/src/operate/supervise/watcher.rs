@@ -7,7 +7,6 @@ use std::process::{ExitStatus, Stdio};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
-use bus::malloc_settings;
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
@@ -141,13 +140,7 @@ impl Watcher {
     }
 
     fn spawn(&self) -> std::io::Result<Child> {
-        let mut command = Command::new(&self.spec.program);
-        // The many threads are for the router in this program. A value of the user's own is passed on.
-        let (name, of_router) = malloc_settings::ROUTER_THREADS;
-        if std::env::var_os(name).is_some_and(|value| value == of_router) {
-            command.env_remove(name);
-        }
-        command
+        Command::new(&self.spec.program)
             .args(&self.spec.args)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
