@@ -1,16 +1,17 @@
-//! Router that a client's invalid key poisons: it ends with a word, and a run writes its results.
+//! Router that a client's invalid key poisons: it ends with a word, and its run goes on with a new one.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
-use std::path::Path;
 use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use tests::bus::free_port;
-use tests::fleet::{Up, programs, write_scenario};
+use tests::fleet::{Up, programs};
 use tests::locks::exclusive_lock;
 use zenoh::Wait;
+
+use crate::silent_router::assert_replaced;
 
 /// Part of a key, and what it becomes on the way: invalid, of the same length.
 const REPLACED: [&[u8]; 2] = [b"AAAA", b"*\"QQ"];
@@ -69,45 +70,17 @@ fn poison(router: SocketAddr) {
     std::mem::forget(session);
 }
 
-fn assert_written(run: &Path) {
-    for file in [
-        "metrics.json",
-        "ledger.json",
-        "scenario.yaml",
-        "report.json",
-    ] {
-        assert!(run.join(file).is_file(), "{file}");
-    }
+/// Address of the router of a run.
+fn router_of(up: &mut Up) -> SocketAddr {
+    let line = up.wait_for_line("run test at tcp/");
+    let (_, address) = line.split_once("tcp/").unwrap();
+    let (address, _) = address.split_once(": ").unwrap();
+    address.parse().unwrap()
 }
 
 #[test]
-fn a_run_whose_router_is_poisoned_ends_with_its_results() {
-    let _exclusive = exclusive_lock();
-    let folder = tempfile::tempdir().unwrap();
-    let scenario = write_scenario(folder.path(), 3, "loop: true", "");
-    let mut up = Up::start(folder.path(), &scenario);
-    let line = up.wait_for_line("run test at tcp/");
-    let address = line
-        .split("tcp/")
-        .nth(1)
-        .unwrap()
-        .split(": ")
-        .next()
-        .unwrap();
-    up.wait_for_results("some results", |results| results.len() > 5);
-    let began = Instant::now();
-    poison(address.parse().unwrap());
-    let line = up.wait_for_line("the router of the run failed");
-    assert!(began.elapsed() < Duration::from_secs(4), "{line}");
-    let line = up.wait_for_line("exit 3: ");
-    assert!(line.contains("the router of the run failed"), "{line}");
-    assert_eq!(up.wait().code(), Some(3));
-    assert!(
-        began.elapsed() < Duration::from_secs(20),
-        "{:?}",
-        began.elapsed()
-    );
-    assert_written(&up.folder);
+fn a_run_replaces_a_router_that_is_poisoned() {
+    assert_replaced("router ended with code 1", |up| poison(router_of(up)));
 }
 
 #[test]

@@ -88,34 +88,52 @@ fn written_cause(run: &Path) -> String {
     cause
 }
 
-#[test]
-fn a_run_whose_router_hangs_ends_at_once_with_its_results() {
+/// Spoils the router of a run, which has to replace it and to go on; `why` is in the line about its end.
+pub(super) fn assert_replaced(why: &str, spoil: impl FnOnce(&mut Up)) {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 3, "loop: true", "");
     let mut up = Up::start(folder.path(), &scenario);
     up.wait_for_results("some results", |results| results.len() > 5);
     let began = Instant::now();
-    let hung = hang_router_threads(up.pid());
-    let line = up.wait_for_line("the router of the run failed");
-    assert!(line.contains("nothing came through it for 2."), "{line}");
-    assert!(
-        began.elapsed() < Duration::from_secs(4),
-        "{:?}",
-        began.elapsed()
-    );
+    spoil(&mut up);
+    let line = up.wait_for_line("; starting it again");
+    assert!(line.contains(why), "{line}");
+    let line = up.wait_for_line("the router is back after");
+    assert!(began.elapsed() < Duration::from_secs(7), "{line}");
+    let before = results(&up.folder).len();
+    up.wait_for_results("results after it", |results| results.len() > before + 5);
+    signal(up.pid(), "INT");
     let line = up.wait_for_line("exit 3: ");
     assert!(
-        line.contains("nothing came through it") && !line.contains("answer more"),
+        line.contains("router gone for") && !line.contains("answer more"),
         "{line}"
     );
-    // The kernel keeps the process until the threads that are held can end.
-    drop(hung);
     assert_eq!(up.wait().code(), Some(3));
     let ledger = json(&up.folder.join("ledger.json"));
     assert!(ledger["balances"] == true, "{}", ledger["balance"]);
-    assert!(up.folder.join("metrics.json").is_file());
-    assert!(up.folder.join("scenario.yaml").is_file());
+    written_cause(&up.folder);
+}
+
+#[test]
+fn a_run_replaces_a_router_that_hangs() {
+    assert_replaced("router ", |up| {
+        let hung = hang_router_threads(up.pids()["router"]);
+        up.wait_for_line("the router is gone");
+        thread::sleep(Duration::from_secs(1));
+        // The kernel keeps the process until the threads that are held can end.
+        drop(hung);
+    });
+}
+
+#[test]
+fn a_run_replaces_a_router_that_is_stopped_or_killed() {
+    assert_replaced("router nothing came through it for 2.", |up| {
+        signal(up.pids()["router"], "STOP");
+    });
+    assert_replaced("router was ended by signal 9", |up| {
+        signal(up.pids()["router"], "KILL");
+    });
 }
 
 #[test]
