@@ -5,7 +5,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{BusError, Rejection, RejectionLog, Result};
+use bus::{BusError, RejectionLog, Result, RouterRejection};
 
 use crate::operate::network::RouterEndpoint;
 
@@ -52,7 +52,7 @@ impl RefusalWatch {
     }
 
     /// All refusals, which are also logged.
-    pub fn finish(mut self) -> BTreeMap<Rejection, u64> {
+    pub fn finish(mut self) -> BTreeMap<RouterRejection, u64> {
         self.stop.request();
         let read = self.thread.take().and_then(|thread| thread.join().ok());
         let counts = read.map_or_else(BTreeMap::new, |all| all.counts());

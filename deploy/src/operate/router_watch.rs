@@ -11,7 +11,7 @@ pub(crate) const LIMIT: Duration = Duration::from_secs(2);
 
 /// A change of the state of the router or of the run.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Finding {
+pub(crate) enum RouterFinding {
     /// A line for the terminal: the router is gone, or back, or the run was suspended.
     Line(String),
     /// The router in this process passes no message, with the reason.
@@ -26,12 +26,12 @@ pub(crate) fn in_words(silence: Duration) -> String {
 
 /// Times of one kind.
 #[derive(Debug, Default)]
-struct Times {
+struct TimeSum {
     count: usize,
     sum: Duration,
 }
 
-impl Times {
+impl TimeSum {
     fn add(&mut self, time: Duration) {
         self.count += 1;
         self.sum += time;
@@ -57,8 +57,8 @@ pub(crate) struct RouterWatch {
     is_here: bool,
     looked: Option<Instant>,
     gone_since: Option<Instant>,
-    outages: Times,
-    pauses: Times,
+    outages: TimeSum,
+    pauses: TimeSum,
 }
 
 impl RouterWatch {
@@ -76,7 +76,7 @@ impl RouterWatch {
         &mut self,
         scorer: &ScorerNode,
         reported: Option<Instant>,
-    ) -> Option<Finding> {
+    ) -> Option<RouterFinding> {
         let now = Instant::now();
         let silence = self
             .probe
@@ -93,7 +93,7 @@ impl RouterWatch {
         silence: Duration,
         lost_since: Option<Instant>,
         now: Instant,
-    ) -> Option<Finding> {
+    ) -> Option<RouterFinding> {
         let looked = self.looked.replace(now).unwrap_or(now);
         let pause = now.saturating_duration_since(looked);
         // A gap in the own loop says nothing about the router.
@@ -101,11 +101,11 @@ impl RouterWatch {
             self.pauses.add(pause);
             let seconds = pause.as_secs_f64();
             let line = format!("the run was suspended for {seconds:.1} s");
-            return Some(Finding::Line(line));
+            return Some(RouterFinding::Line(line));
         }
         let is_silent = silence > LIMIT;
         if is_silent && self.is_here {
-            return Some(Finding::Failed(in_words(silence)));
+            return Some(RouterFinding::Failed(in_words(silence)));
         }
         // A router elsewhere may come back, so its silence is an outage and no failure.
         let since = lost_since.or_else(|| is_silent.then(|| now.checked_sub(silence))?);
@@ -123,7 +123,7 @@ impl RouterWatch {
             }
             _ => return None,
         };
-        Some(Finding::Line(line))
+        Some(RouterFinding::Line(line))
     }
 
     /// Time since which the router is gone.
@@ -162,9 +162,9 @@ mod tests {
 
     const BEAT: Duration = Duration::from_millis(100);
 
-    fn line(found: Option<Finding>) -> String {
+    fn line(found: Option<RouterFinding>) -> String {
         match found {
-            Some(Finding::Line(line)) => line,
+            Some(RouterFinding::Line(line)) => line,
             other => panic!("{other:?}"),
         }
     }
@@ -198,7 +198,7 @@ mod tests {
         assert_eq!(watch.judge(LIMIT, None, now), None);
         let found = watch.judge(LIMIT + BEAT, None, now + BEAT);
         let reason = "nothing came through it for 2.1 s".to_owned();
-        assert_eq!(found, Some(Finding::Failed(reason)));
+        assert_eq!(found, Some(RouterFinding::Failed(reason)));
     }
 
     #[test]

@@ -13,7 +13,7 @@ use crate::operate::failures::Failures;
 use crate::operate::health::Health;
 use crate::operate::progress::Display;
 use crate::operate::router_panic;
-use crate::operate::router_watch::{Finding, RouterWatch};
+use crate::operate::router_watch::{RouterFinding, RouterWatch};
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind, Supervisor};
@@ -142,8 +142,8 @@ impl StatusReporter {
                 .iter()
                 .filter(|(name, _)| *name != SCORER);
             match self.router.look(scorer, others.map(|(_, at)| *at).max()) {
-                Some(Finding::Failed(how)) => return Ending::RouterFailed { how },
-                Some(Finding::Line(line)) => display.print_line(&line),
+                Some(RouterFinding::Failed(how)) => return Ending::RouterFailed { how },
+                Some(RouterFinding::Line(line)) => display.print_line(&line),
                 None => {}
             }
             for (name, why) in self.health.look(&progress.last_reports, Instant::now()) {

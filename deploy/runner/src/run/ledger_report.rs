@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use bus::Rejection;
+use bus::RouterRejection;
 use deploy::score::ProcessStats;
 use protocol::{Counts, Ledger, Reconciliation};
 use serde::Serialize;
@@ -70,7 +70,7 @@ impl LedgerReport {
 
 impl RefusedReport {
     /// The requests that the router of the run refused.
-    pub(crate) fn of((refused, count): (&Rejection, &u64)) -> Self {
+    pub(crate) fn of((refused, count): (&RouterRejection, &u64)) -> Self {
         Self {
             peer: refused.peer.clone(),
             message: refused.message.clone(),

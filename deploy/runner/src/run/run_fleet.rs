@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{MetricsPeer, Rejection};
+use bus::{MetricsPeer, RouterRejection};
 use dataset::findings;
 use deploy::operate::network::RouterEndpoint;
 use deploy::operate::progress::Display;
@@ -312,7 +312,7 @@ fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Pro
 fn write(
     fleet: &Fleet,
     (run, folder): (&RunId, RunFolder),
-    (scored, refused): (Scored, &BTreeMap<Rejection, u64>),
+    (scored, refused): (Scored, &BTreeMap<RouterRejection, u64>),
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
     capacity: Option<Capacity>,
