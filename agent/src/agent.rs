@@ -2,7 +2,7 @@
 //!
 //! Synchronous and without any network: live process, offline evaluation, tests and benches run the same lines.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use protocol::{
     Boxes, CavId, Detection, EgoMotion, Gnss, PointCloud, Pose, PoseEstimate, StageTiming,
@@ -15,7 +15,7 @@ use crate::attack::{Attack, CapturedMessages};
 use localization::pose_source::{PoseInput, PoseSource};
 use localization::tracker::PoseMeasurement;
 use perception::boxes::postprocess::{PostprocessConfig, detections};
-use perception::detector::{BackboneLevel, Detector, DetectorError, Encoded};
+use perception::detector::{BackboneLevel, Detector, DetectorError, EncoderOutput};
 use tracking::Tracker;
 
 /// All inputs of one sweep.
@@ -36,16 +36,9 @@ pub struct AgentInput<'a> {
 #[derive(Debug)]
 pub(crate) struct EncodedSweep {
     /// Beginning of the first step.
-    began: Instant,
+    pub(crate) began: Instant,
     /// Feature map and levels of the detector; `None` before they are computed.
-    encoded: Option<Encoded>,
-}
-
-impl EncodedSweep {
-    /// Time since the beginning of its first step.
-    pub(crate) fn elapsed(&self) -> Duration {
-        self.began.elapsed()
-    }
+    encoded: Option<EncoderOutput>,
 }
 
 /// One vehicle: estimates its pose and perceives its surroundings.
@@ -57,8 +50,8 @@ pub struct Agent {
     object_tracker: Tracker,
     /// Falsifies everything that is published.
     attack: Option<Attack>,
-    /// Feature map of the next sweep, where it was computed before.
-    known_map: Option<Tensor>,
+    /// Feature map `[1, C, H, W]` of the next sweep, where its encoder computed it before.
+    pub(crate) known_map: Option<Tensor>,
     has_head: bool,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
@@ -92,11 +85,6 @@ impl Agent {
     /// The same with an attack on everything that it publishes.
     pub fn with_attack(self, attack: Option<Attack>) -> Self {
         Self { attack, ..self }
-    }
-
-    /// Sets the feature map `[1, C, H, W]` of the next sweep, if its encoder computed it before.
-    pub(crate) fn set_known_map(&mut self, map: Option<Tensor>) {
-        self.known_map = map;
     }
 
     /// Passes on the last messages of another vehicle, which an attack may replay.
@@ -167,13 +155,9 @@ impl Agent {
         let sweep = EncodedSweep { began, encoded };
         // The encoder's times are those of the perception: the time of the pose begins after it.
         let began = Instant::now();
-        let levels = self.levels(&sweep);
-        let input = pose_input(&self.cav, input, levels);
+        let input = pose_input(&self.cav, input, self.levels(&sweep));
         let pose = self.pose_source.estimate(&input);
-        let pose = self
-            .attack
-            .as_ref()
-            .map_or(pose, |attack| attack.pose(pose));
+        let pose = (self.attack.as_ref()).map_or(pose, |attack| attack.pose(pose));
         (pose, self.pose_stages("pose", began), sweep)
     }
 
@@ -190,10 +174,7 @@ impl Agent {
             return self.perceive_map(&map);
         }
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
-        let encoded = sweep
-            .encoded
-            .take()
-            .map_or_else(|| detector.encode_sweep(cloud), Ok)?;
+        let encoded = (sweep.encoded.take()).map_or_else(|| detector.encode_sweep(cloud), Ok)?;
         let mut perception = self.perceive_map(&encoded.features)?;
         // The encoder ran first, here or for the pose: its times belong to the sweep.
         perception.times = [encoded.times.as_slice(), &perception.times].concat();
@@ -209,8 +190,7 @@ impl Agent {
         sweep: &EncodedSweep,
     ) -> Vec<StageTiming> {
         let began = Instant::now();
-        let levels = self.levels(sweep);
-        let input = pose_input(&self.cav, input, levels);
+        let input = pose_input(&self.cav, input, self.levels(sweep));
         match self.pose_source.observe(&input) {
             true => self.pose_stages("pose measurement", began),
             false => Vec::new(),

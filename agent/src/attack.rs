@@ -182,8 +182,7 @@ impl Attack {
             Falsification::Invented | Falsification::Flood => {
                 let confidence = &mut falsified.confidence;
                 invent(&mut falsified.features, confidence, &self.places);
-                let invented = self.places.iter();
-                let invented = invented.map(|&place| vehicle(place, INVENTED_SCORE));
+                let invented = (self.places.iter()).map(|&place| vehicle(place, INVENTED_SCORE));
                 falsified.detections.extend(invented);
             }
         }
@@ -276,8 +275,7 @@ fn make_noise(features: &mut BevFeatures, random: &mut SplitMix64) {
     for channel in features.values.chunks_mut(cells) {
         let mean = channel.iter().map(|value| f64::from(*value)).sum::<f64>() / cells as f64;
         let offsets = channel.iter().map(|value| f64::from(*value) - mean);
-        let squares = offsets.map(|offset| offset.powi(2));
-        let spread = (squares.sum::<f64>() / cells as f64).sqrt();
+        let spread = (offsets.map(|offset| offset.powi(2)).sum::<f64>() / cells as f64).sqrt();
         channel.fill_with(|| (mean + spread * random.normal()) as f32);
     }
 }

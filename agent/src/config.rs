@@ -123,12 +123,9 @@ impl ModelConfig {
     /// # Errors
     /// [`FieldError`] names what a device needs and this machine lacks.
     pub fn inference(&self) -> Result<Inference, FieldError> {
-        Ok(Inference::new(
-            self.device
-                .open()
-                .map_err(|missing| FieldError::new("models.device", "cuda", missing.to_string()))?,
-            self.precision,
-        ))
+        let device = (self.device.open())
+            .map_err(|missing| FieldError::new("models.device", "cuda", missing.to_string()))?;
+        Ok(Inference::new(device, self.precision))
     }
 }
 
@@ -349,8 +346,7 @@ impl ProcessConfig for AgentConfig {
         }
         self.settings.validate()?;
         // Against the streams as they are sent: boxes may stand in for maps.
-        self.settings
-            .check_attack(&self.options().of_loop.publish)?;
+        (self.settings).check_attack(&self.options().of_loop.publish)?;
         self.bus.validate()
     }
 }
@@ -363,11 +359,8 @@ impl AgentConfig {
 
     /// Options of the agent's node.
     pub fn options(&self) -> NodeOptions {
-        let publish = self
-            .publish
-            .iter()
-            .filter_map(|publish| publish.stream())
-            .flat_map(|stream| self.settings.sent_for(stream));
+        let streams = self.publish.iter().filter_map(|publish| publish.stream());
+        let publish = streams.flat_map(|stream| self.settings.sent_for(stream));
         NodeOptions {
             of_loop: LoopOptions {
                 egos: self.egos.clone(),
@@ -376,9 +369,7 @@ impl AgentConfig {
             keeps_running: self.keep_running || self.bus.supervised,
             sweep_log: self.sweep_log.clone(),
             // The log holds the whole configuration: a replay builds the agent from it.
-            inputs: self
-                .inputs
-                .clone()
+            inputs: (self.inputs.clone())
                 .map(|path| (path, serde_json::to_string(self).unwrap_or_default())),
         }
     }

@@ -18,9 +18,9 @@ use protocol::{KeyExpr, Lidar, Limits, Role, Stream, Topic};
 use support::sweep_log::SweepLog;
 
 use crate::agent::Agent;
-use crate::agent_loop::recorded::{KIND, Published, Record};
+use crate::agent_loop::recorded::{AgentRecord, KIND, Published};
 use crate::agent_loop::{
-    AgentLoop, Input, LoopOptions, LoopReport, MessageEncoder, Output, Sweep, Unsent,
+    AgentLoop, LoopInput, LoopOptions, LoopOutput, LoopReport, MessageEncoder, Sweep, Unsent,
 };
 use crate::input_log::{InputFile, InputLog};
 use crate::loop_clock::LoopClock;
@@ -63,7 +63,7 @@ pub fn run(
 ) -> Result<LoopReport, BusError> {
     let mut agent_loop = AgentLoop::new(agent, options.of_loop.clone());
     agent_loop.warm_up();
-    let mut node = Node::open(bus, agent_loop, options, stop)?;
+    let mut node = AgentNode::open(bus, agent_loop, options, stop)?;
     // Not announced before all subscriptions exist.
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);
@@ -75,7 +75,7 @@ pub fn run(
     Ok(node.agent_loop.report().clone())
 }
 
-struct Node<'a> {
+struct AgentNode<'a> {
     bus: &'a Bus,
     agent_loop: AgentLoop,
     options: &'a NodeOptions,
@@ -83,12 +83,12 @@ struct Node<'a> {
     clock: LoopClock,
     publishers: Vec<(Stream, Publisher)>,
     encoder: Arc<MessageEncoder>,
-    log: Option<InputLog<Input, Published>>,
+    log: Option<InputLog<LoopInput, Published>>,
     sweep_log: Option<SweepLog>,
     _subscriptions: [Subscription; 4],
 }
 
-impl<'a> Node<'a> {
+impl<'a> AgentNode<'a> {
     fn open(
         bus: &'a Bus,
         agent_loop: AgentLoop,
@@ -124,9 +124,7 @@ impl<'a> Node<'a> {
             tracing::warn!("arrivals of sweeps are not logged: {error}");
             None
         });
-        let log = options
-            .inputs
-            .as_ref()
+        let log = (options.inputs.as_ref())
             .and_then(|file| InputLog::create(file, KIND, agent.detector()));
         Ok(Self {
             bus,
@@ -152,10 +150,10 @@ impl<'a> Node<'a> {
                 Pop::TimedOut => {}
                 Pop::Closed => return,
             }
-            self.handle(Input::Wake);
+            self.handle(LoopInput::Wake);
             // To its last step, before the next message: sweeps are superseded in the inbox.
             while self.agent_loop.is_computing() {
-                self.handle(Input::Wake);
+                self.handle(LoopInput::Wake);
             }
         }
     }
@@ -165,11 +163,11 @@ impl<'a> Node<'a> {
             Topic::Stream {
                 stream: Stream::Lidar,
                 ..
-            } if !self.options.keeps_running => self.handle(Input::Ended),
+            } if !self.options.keeps_running => self.handle(LoopInput::Ended),
             Topic::Stream {
                 cav,
                 stream: Stream::Pace,
-            } => self.handle(Input::PaceEnded(cav.clone())),
+            } => self.handle(LoopInput::PaceEnded(cav.clone())),
             _ => {}
         }
     }
@@ -185,23 +183,20 @@ impl<'a> Node<'a> {
             Stream::Lidar => {
                 let arrived_nanos = arrival.unix_nanos();
                 inbox.decode(arrival, limits).map(|Lidar { points }| {
-                    Input::Sweep(Sweep {
+                    LoopInput::Sweep(Sweep {
                         capture_nanos,
                         arrived_nanos,
                         cloud: points,
                     })
                 })
             }
-            Stream::Gnss => inbox
-                .decode(arrival, limits)
-                .map(|gnss| Input::Gnss(capture_nanos, gnss)),
-            Stream::Imu => inbox
-                .decode(arrival, limits)
-                .map(|motion| Input::Motion(capture_nanos, motion)),
+            Stream::Gnss => {
+                (inbox.decode(arrival, limits)).map(|gnss| LoopInput::Gnss(capture_nanos, gnss))
+            }
+            Stream::Imu => (inbox.decode(arrival, limits))
+                .map(|motion| LoopInput::Motion(capture_nanos, motion)),
             // Only paces are left of what the node subscribes to.
-            _ => inbox
-                .decode(arrival, limits)
-                .map(|pace| Input::Pace(cav.clone(), pace)),
+            _ => (inbox.decode(arrival, limits)).map(|pace| LoopInput::Pace(cav.clone(), pace)),
         };
         let stats = self.bus.stats();
         if *stream == Stream::Lidar
@@ -215,30 +210,30 @@ impl<'a> Node<'a> {
     }
 
     /// Records an input, hands it to the loop and carries out what that decides.
-    fn handle(&mut self, input: Input) {
+    fn handle(&mut self, input: LoopInput) {
         let now_nanos = self.clock.now_nanos();
         // Recorded before it is handled: a replay takes it in before it publishes what follows from it.
         if let Some(log) = &self.log {
             let input = input.clone();
-            log.add(&Record::Input { now_nanos, input });
+            log.add(&AgentRecord::Input { now_nanos, input });
         }
         for output in self.agent_loop.handle(input, now_nanos) {
             let (stats, agent) = (self.bus.stats(), self.agent_loop.agent());
             match output {
-                Output::Publish(message) => self.publish(message),
-                Output::Received(stream) => stats.received(&topic(agent, stream)),
-                Output::Dropped(stream, reason) => stats.dropped(&topic(agent, stream), reason),
-                Output::Timed(stages) => {
+                LoopOutput::Publish(message) => self.publish(message),
+                LoopOutput::Received(stream) => stats.received(&topic(agent, stream)),
+                LoopOutput::Dropped(stream, reason) => stats.dropped(&topic(agent, stream), reason),
+                LoopOutput::Timed(stages) => {
                     for stage in stages {
                         stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
                     }
                 }
-                Output::Failed(error) => tracing::error!("cannot compute a sweep: {error}"),
-                Output::Computed {
+                LoopOutput::Failed(error) => tracing::error!("cannot compute a sweep: {error}"),
+                LoopOutput::Computed {
                     capture_nanos,
                     arrived_nanos,
                 } => self.log_sweep(capture_nanos, arrived_nanos),
-                Output::PoseProblem(problem) => {
+                LoopOutput::PoseProblem(problem) => {
                     let problem = problem.map(|(text, since)| (text, self.clock.moment(since)));
                     stats.set_problems("no pose", problem);
                 }
@@ -276,7 +271,7 @@ impl<'a> Node<'a> {
             if let Some(log) = log {
                 let bytes = encoded.as_ref().ok().map(|(encoded, _)| encoded);
                 let published = Published::new(stream, turn, stamp, bytes);
-                log.add(&Record::Published(published));
+                log.add(&AgentRecord::Published(published));
             }
             let (encoded, choice) = encoded?;
             if let Some(choice) = choice {

@@ -103,8 +103,7 @@ impl RateControl {
         turn: Option<&Turn>,
     ) -> Result<Option<ByteLimit>, WireError> {
         let config = self.config;
-        let size = config.message_bytes;
-        let size = size.map(|bytes| (bytes, LimitedBy::MessageSize));
+        let size = (config.message_bytes).map(|bytes| (bytes, LimitedBy::MessageSize));
         let on_air_nanos = self.nanos_since_last(capture_nanos);
         let rate = config.bytes_per_second;
         let rate = rate.map(|rate| (bytes_within(rate, on_air_nanos), LimitedBy::ByteRate));
@@ -117,8 +116,7 @@ impl RateControl {
             None => None,
         };
         // The tightest limit decides, and is named in the message.
-        let limits = [size, rate, queue].into_iter().flatten();
-        let tightest = limits.min_by_key(|(bytes, _)| *bytes);
+        let tightest = ([size, rate, queue].into_iter().flatten()).min_by_key(|(bytes, _)| *bytes);
         Ok(tightest.map(|(bytes, by)| ByteLimit { bytes, by }))
     }
 

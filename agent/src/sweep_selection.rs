@@ -11,15 +11,15 @@ const MAX_SILENCE_NANOS: u64 = 5_000_000_000;
 
 /// Paces of the egos, and the interval of the last computed sweep under each.
 #[derive(Debug, Default)]
-pub(crate) struct SweepSelection {
+pub(crate) struct PaceSelection {
     /// Egos of the run; none: any ego is of it.
     egos: BTreeSet<CavId>,
-    paces: BTreeMap<CavId, Followed>,
+    paces: BTreeMap<CavId, FollowedPace>,
 }
 
 /// Pace of one ego.
 #[derive(Debug)]
-struct Followed {
+struct FollowedPace {
     pace: Pace,
     /// Interval of the last computed sweep.
     last: Option<i128>,
@@ -27,7 +27,7 @@ struct Followed {
     received_nanos: u64,
 }
 
-impl SweepSelection {
+impl PaceSelection {
     /// Selection by the paces of `egos` only; of any ego if they are none.
     pub(crate) fn of(egos: &[CavId]) -> Self {
         Self {
@@ -47,7 +47,7 @@ impl SweepSelection {
         }
         // Egos repeat their pace, which does not begin anew.
         let known = known.filter(|known| known.pace == pace);
-        let followed = Followed {
+        let followed = FollowedPace {
             pace,
             last: known.and_then(|known| known.last),
             received_nanos: now_nanos,
@@ -73,7 +73,7 @@ impl SweepSelection {
         });
         let mut is_admitted = self.paces.is_empty();
         // No early end: the interval of every ego has to be noted.
-        for Followed { pace, last, .. } in self.paces.values_mut() {
+        for FollowedPace { pace, last, .. } in self.paces.values_mut() {
             let interval = pace.interval_of(capture_nanos);
             // Another interval and not a later one: the clock of the scene may be set back.
             if interval.is_none() || interval != *last {
@@ -92,11 +92,7 @@ mod tests {
     /// A time, nanoseconds.
     const NOW: u64 = 1_000_000_000;
 
-    fn computed(
-        selection: &mut SweepSelection,
-        sweeps: std::ops::Range<u64>,
-        now: u64,
-    ) -> Vec<u64> {
+    fn computed(selection: &mut PaceSelection, sweeps: std::ops::Range<u64>, now: u64) -> Vec<u64> {
         sweeps
             .filter(|sweep| selection.admits(sweep * 100_000_000, now))
             .collect()
@@ -114,7 +110,7 @@ mod tests {
     #[test]
     fn vehicles_that_receive_a_pace_at_different_times_compute_the_same_sweeps() {
         let (ego, now) = (CavId::new("1").unwrap(), NOW);
-        let (mut early, mut late) = (SweepSelection::default(), SweepSelection::default());
+        let (mut early, mut late) = (PaceSelection::default(), PaceSelection::default());
         assert_eq!(computed(&mut early, 0..3, now), [0, 1, 2]);
         assert!(early.follow(&ego, every(3), now));
         assert_eq!(computed(&mut early, 3..12, now), [3, 6, 9]);
@@ -131,7 +127,7 @@ mod tests {
 
     #[test]
     fn the_fastest_ego_is_served_and_a_restarted_scene_too() {
-        let (mut selection, now) = (SweepSelection::default(), NOW);
+        let (mut selection, now) = (PaceSelection::default(), NOW);
         assert!(selection.follow(&CavId::new("1").unwrap(), every(4), now));
         assert!(selection.follow(&CavId::new("2").unwrap(), every(2), now));
         assert_eq!(computed(&mut selection, 3..12, now), [3, 5, 7, 9, 11]);
@@ -140,7 +136,7 @@ mod tests {
 
     #[test]
     fn egos_that_leave_or_are_silent_are_forgotten() {
-        let (mut selection, now) = (SweepSelection::default(), NOW);
+        let (mut selection, now) = (PaceSelection::default(), NOW);
         let [slow, fast, faster] = ["1", "2", "3"].map(|ego| CavId::new(ego).unwrap());
         let later = now + MAX_SILENCE_NANOS;
         assert!(selection.follow(&slow, every(4), now) && selection.follow(&fast, every(2), now));
@@ -164,7 +160,7 @@ mod tests {
     #[test]
     fn only_egos_of_the_run_set_the_pace() {
         let [own, stranger] = ["1", "2"].map(|ego| CavId::new(ego).unwrap());
-        let (mut selection, now) = (SweepSelection::of(std::slice::from_ref(&own)), NOW);
+        let (mut selection, now) = (PaceSelection::of(std::slice::from_ref(&own)), NOW);
         assert!(!selection.follow(&stranger, every(100), now));
         assert_eq!(computed(&mut selection, 0..3, now), [0, 1, 2]);
         assert!(selection.follow(&own, every(3), now));
@@ -174,7 +170,7 @@ mod tests {
 
     #[test]
     fn more_egos_than_are_followed_are_refused() {
-        let (mut selection, now) = (SweepSelection::default(), NOW);
+        let (mut selection, now) = (PaceSelection::default(), NOW);
         let ego = |number: usize| CavId::new(&number.to_string()).unwrap();
         assert!((0..MAX_EGOS).all(|number| selection.follow(&ego(number), every(2), now)));
         assert!(!selection.follow(&ego(MAX_EGOS), every(1), now));

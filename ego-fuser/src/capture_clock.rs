@@ -38,11 +38,11 @@ pub struct CaptureClocks {
     fewest: usize,
     /// The ego's own sweeps, by arrival.
     own: VecDeque<SweepTime>,
-    neighbours: BTreeMap<CavId, Clock>,
+    neighbours: BTreeMap<CavId, NeighbourClock>,
 }
 
 #[derive(Debug, Default)]
-struct Clock {
+struct NeighbourClock {
     /// Sweeps that arrived after the ego's newest.
     pending: VecDeque<SweepTime>,
     /// Arrival, nanoseconds, and how far the capture time is ahead, nanoseconds.
@@ -160,7 +160,7 @@ impl CaptureClocks {
     }
 }
 
-impl Clock {
+impl NeighbourClock {
     fn add(&mut self, arrived_nanos: u64, ahead_nanos: i64) {
         self.samples.push_back((arrived_nanos, ahead_nanos));
         // Few sweeps of a slow scene are kept for longer.

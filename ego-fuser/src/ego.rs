@@ -15,7 +15,7 @@ use nalgebra::Isometry3;
 use perception::boxes::decode::Decoded;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, detections, postprocess};
 use perception::detector::{Detector, Heads, check_values};
-use perception::weights::{METHOD_KEY, Weights};
+use perception::weights::Weights;
 use protocol::{
     CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming,
 };
@@ -108,11 +108,7 @@ impl Ego {
         method: Option<Method>,
         device: Device,
     ) -> Result<Self, EgoError> {
-        let method = match (method, weights.metadata(METHOD_KEY)) {
-            (Some(method), _) => method,
-            (None, Some(name)) => name.parse()?,
-            (None, None) => Method::NONE,
-        };
+        let method = Method::of_weights(weights, method)?;
         let detector = Detector::from_weights(weights, &weights.detector_config()?, device)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config(), device)?;
         Ok(Self::assembled(detector, method, fusion))
@@ -129,18 +125,16 @@ impl Ego {
     }
 
     fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
-        let limits = PostprocessConfig::for_detector(detector.config());
-        let history = History::new(fusion.requirements().history.frames);
         let reads_boxes = method.own_content() == Exchange::Features && fusion.reads_boxes();
         Self {
             method,
+            limits: PostprocessConfig::for_detector(detector.config()),
+            history: History::new(fusion.requirements().history.frames),
             detector,
             fusion,
-            history,
             trust: None,
             compensation: reads_boxes.then(LatencyCompensation::default),
             over_limit: BTreeSet::new(),
-            limits,
             comm_range_m: Self::COMM_RANGE_M,
         }
     }
@@ -276,9 +270,7 @@ impl Ego {
             && !chosen.fused.is_empty()
         {
             let others = chosen.aligned[1..].iter();
-            let others: Vec<_> = others
-                .map(|other| (other.view, other.ego_from_cav))
-                .collect();
+            let others: Vec<_> = others.map(|one| (one.view, one.ego_from_cav)).collect();
             let found = no_grad(|| trust.judge(own, &others, &mut self.detector))?;
             let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
             beliefs = chosen.fused.iter().copied().zip(found).collect();
@@ -313,9 +305,9 @@ impl Ego {
     }
 
     /// The views that can be fused: of each neighbour its map and its boxes, or its boxes alone where its map is outdated.
-    fn choose<'a>(&self, own: &'a View, neighbours: &'a [Cow<'_, View>]) -> Choice<'a> {
+    fn choose<'a>(&self, own: &'a View, neighbours: &'a [Cow<'_, View>]) -> ChosenViews<'a> {
         let ego_from_cav = Pose::IDENTITY;
-        let mut choice = Choice {
+        let mut choice = ChosenViews {
             aligned: vec![Aligned {
                 view: own,
                 ego_from_cav,
@@ -613,7 +605,7 @@ fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
 }
 
 /// Views of a frame.
-struct Choice<'a> {
+struct ChosenViews<'a> {
     /// The ego's own, then one for each of `fused`.
     aligned: Vec<Aligned<'a>>,
     /// Indices of the neighbours that are fused.
@@ -622,7 +614,7 @@ struct Choice<'a> {
     skipped: Vec<(usize, Skipped)>,
 }
 
-impl Choice<'_> {
+impl ChosenViews<'_> {
     /// Leaves the marked of the fused neighbours out; one mark for each of them.
     fn leave_out(&mut self, is_out: &[bool], reason: DropReason) {
         debug_assert_eq!(self.fused.len(), is_out.len());

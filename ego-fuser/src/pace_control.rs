@@ -28,7 +28,7 @@ pub(crate) struct PaceControl {
     period_nanos: Option<u64>,
     pace: Pace,
     last_nanos: Option<u64>,
-    judged: VecDeque<Judged>,
+    judged: VecDeque<PacedFrame>,
     /// Time of the last overloaded frame or change, nanoseconds.
     quiet_since_nanos: u64,
     raised_at_nanos: Option<u64>,
@@ -37,7 +37,7 @@ pub(crate) struct PaceControl {
 
 /// A frame since the last change.
 #[derive(Debug)]
-struct Judged {
+struct PacedFrame {
     /// Capture time since the frame before, nanoseconds.
     gap_nanos: u64,
     is_overloaded: bool,
@@ -84,7 +84,7 @@ impl PaceControl {
         if is_overloaded {
             self.quiet_since_nanos = now_nanos;
         }
-        self.judged.push_back(Judged {
+        self.judged.push_back(PacedFrame {
             gap_nanos,
             is_overloaded,
         });

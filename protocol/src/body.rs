@@ -117,17 +117,16 @@ pub(crate) struct PayloadReader<'a> {
 
 impl<'a> PayloadReader<'a> {
     /// Begins after the first `skip` bytes.
-    pub(crate) fn new(pieces: Vec<&'a [u8]>, skip: usize) -> Self {
+    pub(crate) fn new(pieces: Vec<&'a [u8]>, mut skip: usize) -> Self {
         let mut reader = Self {
             pieces: pieces.into_iter(),
             piece: &[],
             crc: Hasher::new(),
         };
-        let mut left = skip;
-        while left > 0
-            && let Some(run) = reader.next_run(left)
+        while skip > 0
+            && let Some(run) = reader.next_run(skip)
         {
-            left -= run.len();
+            skip -= run.len();
         }
         reader
     }

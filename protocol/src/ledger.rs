@@ -255,15 +255,14 @@ impl Ledger {
             if !is_exempt(&account) {
                 continue;
             }
-            let counts = self.counts(&account);
-            match u64::try_from(missing) {
-                Ok(missing) => {
-                    let dropped = counts.dropped.entry(DropReason::PeerOffline).or_default();
-                    *dropped = dropped.saturating_add(missing);
-                }
-                Err(_) => counts.sent = counts.sent.saturating_add(missing.unsigned_abs()),
+            let messages = missing.unsigned_abs();
+            if missing < 0 {
+                let counts = self.counts(&account);
+                counts.sent = counts.sent.saturating_add(messages);
+            } else {
+                self.dropped_many(&account, DropReason::PeerOffline, messages);
             }
-            exempted = exempted.saturating_add(missing.unsigned_abs());
+            exempted = exempted.saturating_add(messages);
         }
         exempted
     }

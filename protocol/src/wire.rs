@@ -74,13 +74,13 @@ pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireErro
 /// # Errors
 /// As [`encode`].
 pub fn encode_any(stamp: &Stamp, message: Message) -> Result<Encoded, WireError> {
-    message.visit(Encoder(stamp))
+    message.visit(StampEncoder(stamp))
 }
 
 /// Encoding of a message of any kind.
-struct Encoder<'a>(&'a Stamp);
+struct StampEncoder<'a>(&'a Stamp);
 
-impl MessageVisitor for Encoder<'_> {
+impl MessageVisitor for StampEncoder<'_> {
     type Output = Result<Encoded, WireError>;
 
     fn visit<M: Payload>(self, message: M) -> Self::Output {
@@ -181,9 +181,7 @@ fn open<'a, 'b>(
     limits: &'b Limits,
 ) -> Result<Opened<'a, 'b>, WireError> {
     let pieces: Vec<&[u8]> = pieces.into_iter().collect();
-    let found = pieces
-        .iter()
-        .fold(0u64, |sum, piece| sum + piece.len() as u64);
+    let found: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
     let header = decode_header(pieces.iter().copied())?;
     let max = limits.max_metadata_bytes.min(Limits::HARD_METADATA_BYTES);
     check_limit("metadata bytes", header.metadata_len.into(), max.into())?;

@@ -92,7 +92,7 @@ pub fn run(
     options: &NodeOptions,
     stop: &Stop,
 ) -> Result<LinkReport, BusError> {
-    let mut node = Node::open(bus, emulator, options, stop)?;
+    let mut node = LinkNode::open(bus, emulator, options, stop)?;
     let presence = bus.announce(Role::Link)?;
     node.carry(stop)?;
     let mut report = node.report;
@@ -114,7 +114,7 @@ pub fn run(
 
 /// One agent, or the ego, of which only the position is used.
 #[derive(Default)]
-struct Vehicle {
+struct LinkVehicle {
     publishers: BTreeMap<Stream, Publisher>,
     /// Streams that have ended.
     ended: BTreeSet<Stream>,
@@ -124,13 +124,13 @@ struct Vehicle {
     _subscriptions: Vec<Subscription>,
 }
 
-struct Node<'a> {
+struct LinkNode<'a> {
     bus: &'a Bus,
     emulator: LinkEmulator,
     options: &'a NodeOptions,
     inbox: Arc<Inbox>,
     membership: Membership,
-    vehicles: BTreeMap<CavId, Vehicle>,
+    vehicles: BTreeMap<CavId, LinkVehicle>,
     /// Vehicles rejected because all slots are taken.
     rejected: BTreeSet<CavId>,
     /// Messages in flight, by id.
@@ -145,7 +145,7 @@ struct Node<'a> {
     report: LinkReport,
 }
 
-impl<'a> Node<'a> {
+impl<'a> LinkNode<'a> {
     fn open(
         bus: &'a Bus,
         emulator: LinkEmulator,
@@ -258,7 +258,7 @@ impl<'a> Node<'a> {
         Ok(())
     }
 
-    fn attach(&self, cav: &CavId) -> Result<Vehicle, BusError> {
+    fn attach(&self, cav: &CavId) -> Result<LinkVehicle, BusError> {
         let gnss = Topic::stream(cav, Stream::Gnss);
         let mut subscriptions = vec![self.bus.subscribe(gnss, &self.inbox)?];
         let mut publishers = BTreeMap::new();
@@ -279,10 +279,10 @@ impl<'a> Node<'a> {
             // The emulator decides the losses; forwarding is lossless.
             publishers.insert(stream, self.bus.publisher(topic, how.waiting(PLACES))?);
         }
-        Ok(Vehicle {
+        Ok(LinkVehicle {
             publishers,
             _subscriptions: subscriptions,
-            ..Vehicle::default()
+            ..LinkVehicle::default()
         })
     }
 
@@ -407,7 +407,7 @@ impl<'a> Node<'a> {
 
 /// A vehicle that has left and has no message in flight; never the ego, whose position is needed.
 fn place_to_free<'v>(
-    vehicles: &'v BTreeMap<CavId, Vehicle>,
+    vehicles: &'v BTreeMap<CavId, LinkVehicle>,
     ego: &CavId,
     has_kept: impl Fn(&CavId) -> bool,
 ) -> Option<&'v CavId> {
@@ -424,14 +424,14 @@ mod tests {
     #[test]
     fn the_slot_of_a_vehicle_that_has_left_is_free() {
         let cav = |id: usize| CavId::new(&id.to_string()).unwrap();
-        let vehicle = |has_left| Vehicle {
+        let vehicle = |has_left| LinkVehicle {
             publishers: BTreeMap::new(),
             ended: BTreeSet::new(),
             position_m: None,
             has_left,
             _subscriptions: Vec::new(),
         };
-        let mut vehicles: BTreeMap<CavId, Vehicle> =
+        let mut vehicles: BTreeMap<CavId, LinkVehicle> =
             (0..4).map(|id| (cav(id), vehicle(id < 3))).collect();
         let [ego, on_its_way] = [cav(0), cav(1)];
         let free = |vehicles: &BTreeMap<_, _>| {

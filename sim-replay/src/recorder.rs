@@ -62,10 +62,7 @@ pub struct RecordReport {
 impl RecordReport {
     /// True if all received messages are in the file.
     pub fn is_complete(&self) -> bool {
-        self.overwritten == 0
-            && self.undelivered == 0
-            && self.not_written == 0
-            && self.failure.is_none()
+        self.loss_in_words().is_none()
     }
 
     /// Description of the missing messages; `None` if there are none.

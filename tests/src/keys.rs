@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bus::{
-    self, AccessControl, Bus, BusError, BusOptions, Credentials, Endpoint, Identity, Rejection,
-    RejectionLog,
+    self, AccessControl, Bus, BusError, BusOptions, Credentials, Endpoint, Identity, RejectionLog,
+    RouterRejection,
 };
 use deploy::operate::keys::{KeyPlan, make};
 use protocol::{CavId, Principal, RunId, RunScope};
@@ -158,7 +158,7 @@ impl GuardedRouter {
     pub fn refused(&self, peer: &str, message: &str) -> u64 {
         let mut refusals = RejectionLog::of(&self.endpoint);
         refusals.update(&self.session);
-        let is_it = |refusal: &Rejection| refusal.peer == peer && refusal.message == message;
+        let is_it = |refusal: &RouterRejection| refusal.peer == peer && refusal.message == message;
         refusals
             .counts()
             .iter()

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use ::training::loss::LossConfig;
 use ::training::samples::{SampleConfig, SampleKind};
-use ::training::train::{Accuracy, Observer, StepReport, TrainConfig};
+use ::training::train::{Accuracy, TrainConfig, TrainObserver, TrainingReport};
 use dataset::OpenOptions;
 use dataset::evaluation_protocol::ProtocolConfig;
 use fusion::Method;
@@ -22,11 +22,11 @@ pub struct Ear {
     pub encoded: usize,
 }
 
-impl Observer for Ear {
+impl TrainObserver for Ear {
     fn encoded(&mut self, _: usize, _: usize) {
         self.encoded += 1;
     }
-    fn stepped(&mut self, report: &StepReport) {
+    fn stepped(&mut self, report: &TrainingReport) {
         self.losses.push(report.score_loss + report.box_loss);
     }
     fn validated(&mut self, step: u64, _: &Accuracy) {

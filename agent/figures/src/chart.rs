@@ -9,7 +9,7 @@ use plotters::prelude::DrawingBackend;
 use plotters::series::LineSeries;
 use plotters::style::{Color, IntoFont, RGBColor, TRANSPARENT, TextStyle};
 
-use super::scale::Scale;
+use super::scale::AxisScale;
 use super::{FONT, PAPER};
 use crate::Result;
 
@@ -75,7 +75,7 @@ pub struct Chart {
     pub series: Vec<Series>,
 }
 
-type Context<'a, DB> = ChartContext<'a, DB, Cartesian2d<Scale, Scale>>;
+type Context<'a, DB> = ChartContext<'a, DB, Cartesian2d<AxisScale, AxisScale>>;
 type Drawn<DB> = Result<(), DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorType>>;
 
 impl Axis {
@@ -96,8 +96,8 @@ impl Axis {
         }
     }
 
-    fn scale(&self) -> Scale {
-        Scale::new(self.drawn_range(), self.is_logarithmic)
+    fn scale(&self) -> AxisScale {
+        AxisScale::new(self.drawn_range(), self.is_logarithmic)
     }
 
     /// The range, or a substitute that can be drawn if it is empty or infinite.
@@ -134,14 +134,6 @@ impl Series {
     ) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
         let points = self.points.iter().copied();
         points.filter(|point| x.contains(point.0) && y.contains(point.1))
-    }
-
-    fn dot_radius(&self) -> Option<u32> {
-        match self.mark {
-            Mark::Dots => Some(2),
-            Mark::LineAndDots => Some(4),
-            Mark::Line => None,
-        }
     }
 }
 
@@ -186,8 +178,12 @@ impl Chart {
         if series.mark != Mark::Dots {
             context.draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?;
         }
-        let radius = series.dot_radius();
         // No dots for lines alone, but the empty series still carries the entry of the legend.
+        let radius: Option<u32> = match series.mark {
+            Mark::Dots => Some(2),
+            Mark::LineAndDots => Some(4),
+            Mark::Line => None,
+        };
         let dots =
             points.flat_map(|at| radius.map(|radius| Circle::new(at, radius, colour.filled())));
         let entry = context.draw_series(dots)?.label(&series.name);
@@ -209,10 +205,8 @@ impl Chart {
     /// The quarter of the chart with the fewest points.
     fn emptiest_corner(&self) -> SeriesLabelPosition {
         use SeriesLabelPosition::{LowerLeft, LowerRight, UpperLeft, UpperRight};
-        let points = self
-            .series
-            .iter()
-            .flat_map(|series| series.points_on(&self.x, &self.y));
+        let all = self.series.iter();
+        let points = all.flat_map(|series| series.points_on(&self.x, &self.y));
         let mut counts = [0_usize; 4];
         for (x, y) in points {
             let (is_right, is_upper) = (self.x.share(x) > 0.5, self.y.share(y) > 0.5);

@@ -6,12 +6,12 @@ use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, Value
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::{IntoLogRange, LogCoord};
 
-pub(super) enum Scale {
+pub(super) enum AxisScale {
     Linear(RangedCoordf64),
     Logarithmic(LogCoord<f64>),
 }
 
-impl Scale {
+impl AxisScale {
     pub(super) fn new([low, high]: [f64; 2], is_logarithmic: bool) -> Self {
         match is_logarithmic {
             true => Self::Logarithmic((low..high).log_scale().into()),
@@ -20,7 +20,7 @@ impl Scale {
     }
 }
 
-impl Ranged for Scale {
+impl Ranged for AxisScale {
     type FormatOption = NoDefaultFormatting;
     type ValueType = f64;
 
@@ -57,7 +57,7 @@ fn decades(range: &Range<f64>) -> Option<Vec<f64>> {
     (last > first).then(|| powers.collect())
 }
 
-impl ValueFormatter<f64> for Scale {
+impl ValueFormatter<f64> for AxisScale {
     /// Shortest readable form.
     fn format(value: &f64) -> String {
         format!("{}", (value * 1000.0).round() / 1000.0)

@@ -4,7 +4,7 @@ use std::cell::Cell;
 use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
-use perception::train::{Length, Progress};
+use perception::train::{Length, TrainingEvent};
 use support::output;
 use terminal::progress;
 
@@ -21,7 +21,7 @@ pub struct TrainingBar {
     bar: ProgressBar,
     is_watched: bool,
     last_line: Cell<Option<Instant>>,
-    encoding: Cell<Option<Encoding>>,
+    encoding: Cell<Option<EncodingProgress>>,
     /// Length of the training.
     length: Length,
     /// True if the length includes the encoding.
@@ -30,7 +30,7 @@ pub struct TrainingBar {
 
 /// Progress of the encoding of one data set.
 #[derive(Debug, Clone, Copy)]
-struct Encoding {
+struct EncodingProgress {
     began: Instant,
     /// Number of sweeps encoded at its start: feature maps that an earlier run has stored count at once.
     first: usize,
@@ -62,16 +62,16 @@ impl TrainingBar {
     }
 
     /// Shows the progress of a training.
-    pub fn show_progress(&self, progress: &Progress) {
+    pub fn show_progress(&self, progress: &TrainingEvent) {
         match progress {
-            Progress::Encoding(done, all) => self.encoded(*done, *all),
-            Progress::Read(data) => {
+            TrainingEvent::Encoding(done, all) => self.encoded(*done, *all),
+            TrainingEvent::Read(data) => {
                 if let Some(text) = data.left_out() {
                     self.print_line(&text);
                 }
             }
-            Progress::Note(text) | Progress::Validated(text) => self.print_line(text),
-            Progress::Stepped(report) => {
+            TrainingEvent::Note(text) | TrainingEvent::Validated(text) => self.print_line(text),
+            TrainingEvent::Stepped(report) => {
                 self.report(report.share_done, report.seconds, &report.text);
             }
         }
@@ -90,7 +90,7 @@ impl TrainingBar {
     /// Shows that `done` of `all` sweeps of a data set are encoded; a smaller number than before belongs to the next
     /// one.
     pub fn encoded(&self, done: usize, all: usize) {
-        let fresh = Encoding {
+        let fresh = EncodingProgress {
             began: Instant::now(),
             first: done,
             latest: done,

@@ -9,7 +9,7 @@ use super::message::Unsent;
 
 /// Something that happens to an agent. Capture times are on the clock of the scene, nanoseconds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub enum Input {
+pub enum LoopInput {
     /// A sweep has arrived.
     Sweep(Sweep),
     /// A pose of that capture time was measured, or is stated.
@@ -39,7 +39,7 @@ pub struct Sweep {
 
 /// Something that an agent does.
 #[derive(Debug)]
-pub enum Output {
+pub enum LoopOutput {
     /// Publishes a message.
     Publish(Box<Unsent>),
     /// Counts a message of a sensor as used.

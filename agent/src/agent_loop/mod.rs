@@ -23,11 +23,11 @@ use crate::agent_output::Perception;
 use crate::attack::{Attack, CapturedMessages, Falsification};
 use crate::rate::RateConfig;
 use crate::sweep_pairing::{PairedSweep, SweepPairing};
-use crate::sweep_selection::{MAX_EGOS, SweepSelection};
+use crate::sweep_selection::{MAX_EGOS, PaceSelection};
 use sweep_reports::SweepReports;
 pub use sweep_reports::descriptor;
 
-pub use input::{Input, Output, Sweep};
+pub use input::{LoopInput, LoopOutput, Sweep};
 pub use message::{Content, MessageEncoder, Unsent};
 
 /// Longest time that a sweep waits for its pose, which was sent before it, nanoseconds.
@@ -102,7 +102,7 @@ pub struct LoopReport {
 
 /// Next step of the loop.
 #[derive(Default)]
-enum Step {
+enum LoopStep {
     /// The pose of the next sweep, when it has waited.
     #[default]
     Localize,
@@ -128,16 +128,16 @@ pub struct AgentLoop {
     agent: Agent,
     options: LoopOptions,
     pairing: SweepPairing<Sweep>,
-    selection: SweepSelection,
+    selection: PaceSelection,
     reports: SweepReports,
-    step: Step,
+    step: LoopStep,
     /// Messages of each stream so far.
     numbers: BTreeMap<Stream, u64>,
     /// Time of the last pose, or of the first sweep, nanoseconds.
     last_pose_nanos: Option<u64>,
     has_ended: bool,
     report: LoopReport,
-    outputs: Vec<Output>,
+    outputs: Vec<LoopOutput>,
 }
 
 impl AgentLoop {
@@ -152,11 +152,11 @@ impl AgentLoop {
         }
         Self {
             pairing: SweepPairing::new(POSE_TIMEOUT_NANOS),
-            selection: SweepSelection::of(&options.egos),
+            selection: PaceSelection::of(&options.egos),
             reports: SweepReports::new(agent.detector(), &options),
             agent,
             options,
-            step: Step::default(),
+            step: LoopStep::default(),
             numbers: BTreeMap::new(),
             last_pose_nanos: None,
             has_ended: false,
@@ -176,7 +176,7 @@ impl AgentLoop {
 
     /// Sets the feature map `[1, C, H, W]` of the next sweep, if its encoder computed it before.
     pub fn set_known_map(&mut self, map: Option<Tensor>) {
-        self.agent.set_known_map(map);
+        self.agent.known_map = map;
     }
 
     /// Passes on the last messages of another vehicle, which an attack may replay.
@@ -184,27 +184,27 @@ impl AgentLoop {
         self.agent.capture(captured);
     }
 
-    /// Takes an input in at `now_nanos`, which does not decrease. Only [`Input::Wake`] computes, and one step at most:
+    /// Takes an input in at `now_nanos`, which does not decrease. Only [`LoopInput::Wake`] computes, and one step at most:
     /// the result of a step is published before the next one.
-    pub fn handle(&mut self, input: Input, now_nanos: u64) -> Vec<Output> {
+    pub fn handle(&mut self, input: LoopInput, now_nanos: u64) -> Vec<LoopOutput> {
         match input {
-            Input::Sweep(sweep) => self.admit(sweep, now_nanos),
-            Input::Gnss(capture_nanos, gnss) if gnss.source == GnssSource::Stated => {
+            LoopInput::Sweep(sweep) => self.admit(sweep, now_nanos),
+            LoopInput::Gnss(capture_nanos, gnss) if gnss.source == GnssSource::Stated => {
                 // A stated pose belongs to no sweep, so it is not paired.
                 self.start_at(capture_nanos, &gnss);
             }
-            Input::Gnss(capture_nanos, gnss) => {
+            LoopInput::Gnss(capture_nanos, gnss) => {
                 let poses = self.pairing.add_pose(capture_nanos, gnss.world_from_lidar);
                 self.drop_messages(Stream::Gnss, poses, DropReason::Superseded);
             }
-            Input::Motion(capture_nanos, motion) => {
+            LoopInput::Motion(capture_nanos, motion) => {
                 let motions = self.pairing.add_motion(capture_nanos, motion);
                 self.drop_messages(Stream::Imu, motions, DropReason::Superseded);
             }
-            Input::Pace(ego, pace) => self.follow(&ego, pace, now_nanos),
-            Input::PaceEnded(ego) => self.selection.forget(&ego),
-            Input::Ended => self.has_ended = true,
-            Input::Wake => self.wake(now_nanos),
+            LoopInput::Pace(ego, pace) => self.follow(&ego, pace, now_nanos),
+            LoopInput::PaceEnded(ego) => self.selection.forget(&ego),
+            LoopInput::Ended => self.has_ended = true,
+            LoopInput::Wake => self.wake(now_nanos),
         }
         std::mem::take(&mut self.outputs)
     }
@@ -221,7 +221,7 @@ impl AgentLoop {
 
     /// True between two steps of a sweep.
     pub fn is_computing(&self) -> bool {
-        !matches!(self.step, Step::Localize)
+        !matches!(self.step, LoopStep::Localize)
     }
 
     /// True after the end, when every sweep is computed.
@@ -254,7 +254,7 @@ impl AgentLoop {
 
     /// Starts the pose source anew at a stated pose.
     fn start_at(&mut self, capture_nanos: u64, stated: &Gnss) {
-        self.outputs.push(Output::Received(Stream::Gnss));
+        self.outputs.push(LoopOutput::Received(Stream::Gnss));
         let [x, y, _] = stated.world_from_lidar.translation_m;
         if self.agent.start_at(capture_nanos, stated) {
             tracing::info!("starts at the stated pose x {x:.2} y {y:.2} m");
@@ -276,7 +276,7 @@ impl AgentLoop {
     }
 
     fn drop_messages(&mut self, stream: Stream, count: usize, reason: DropReason) {
-        let dropped = (0..count).map(|_| Output::Dropped(stream, reason));
+        let dropped = (0..count).map(|_| LoopOutput::Dropped(stream, reason));
         self.outputs.extend(dropped);
     }
 
@@ -289,7 +289,7 @@ impl AgentLoop {
             content,
         };
         *next += 1;
-        self.outputs.push(Output::Publish(Box::new(message)));
+        self.outputs.push(LoopOutput::Publish(Box::new(message)));
     }
 
     /// Publishes the descriptor if it is due.
@@ -304,17 +304,17 @@ impl AgentLoop {
         self.describe(now_nanos);
         // The default is the next sweep: after a step that failed there is none to continue.
         match std::mem::take(&mut self.step) {
-            Step::Localize => {
+            LoopStep::Localize => {
                 // Nothing comes any more that a sweep may wait for.
                 let waited_nanos = if self.has_ended { u64::MAX } else { now_nanos };
                 if let Some(paired) = self.pairing.next(waited_nanos) {
                     self.localize(paired, now_nanos);
                 }
             }
-            Step::Perceive(paired, pose, sweep) => self.perceive(paired, pose, sweep),
-            Step::Observe(paired, sweep) => {
+            LoopStep::Perceive(paired, pose, sweep) => self.perceive(paired, pose, sweep),
+            LoopStep::Observe(paired, sweep) => {
                 let times = self.agent.observe_encoded(&paired.input(), &sweep);
-                self.outputs.push(Output::Timed(times));
+                self.outputs.push(LoopOutput::Timed(times));
             }
         }
     }
@@ -330,15 +330,15 @@ impl AgentLoop {
             paired.motion.map(|_| Stream::Imu),
         ];
         // Counted here and not on arrival: until now they could be superseded with their sweep.
-        let received = used.into_iter().flatten().map(Output::Received);
+        let received = used.into_iter().flatten().map(LoopOutput::Received);
         self.outputs.extend(received);
         let (pose, times, sweep) = self.agent.localize(&paired.input());
         let content = Content::Fixed(Message::Pose(pose));
         self.publish(Stream::Pose, paired.capture_nanos, content);
-        self.outputs.push(Output::Timed(times));
+        self.outputs.push(LoopOutput::Timed(times));
         self.note_pose(&pose, now_nanos);
         self.report.pose_jumps = self.agent.pose_jumps();
-        self.step = Step::Perceive(paired, pose, sweep);
+        self.step = LoopStep::Perceive(paired, pose, sweep);
     }
 
     /// Counts a missing pose; no pose for three seconds is a problem.
@@ -358,7 +358,7 @@ impl AgentLoop {
                     .then(|| (format!("no pose: {reason}"), last_nanos))
             }
         };
-        self.outputs.push(Output::PoseProblem(problem));
+        self.outputs.push(LoopOutput::PoseProblem(problem));
     }
 
     /// Second step: the perception.
@@ -378,33 +378,32 @@ impl AgentLoop {
         match perceived {
             Ok(perception) => {
                 self.report.sweeps += 1;
-                let mut times = vec![StageTiming::new("agent", sweep.elapsed())];
+                let mut times = vec![StageTiming::new("agent", sweep.began.elapsed())];
                 if let Some(perception) = perception {
                     times.extend_from_slice(&perception.times);
                     self.publish_perception(capture_nanos, pose, perception);
                 }
-                self.outputs.push(Output::Timed(times));
+                self.outputs.push(LoopOutput::Timed(times));
                 if self.options.publish.contains(&Stream::Points) {
                     let points = self.agent.share_points(cloud);
                     let content = Content::Fixed(Message::Points(Points { pose, points }));
                     self.publish(Stream::Points, capture_nanos, content);
                 }
-                self.outputs.push(Output::Received(Stream::Lidar));
-                self.step = Step::Observe(paired, sweep);
+                self.outputs.push(LoopOutput::Received(Stream::Lidar));
+                self.step = LoopStep::Observe(paired, sweep);
             }
             Err(error) => {
                 self.report.failed += 1;
-                let first = &mut self.report.failure;
-                first.get_or_insert_with(|| error.to_string());
+                (self.report.failure).get_or_insert_with(|| error.to_string());
                 let reason = match error.is_of_frame() {
                     true => DropReason::NotFinite,
                     false => DropReason::Shape,
                 };
                 self.drop_messages(Stream::Lidar, 1, reason);
-                self.outputs.push(Output::Failed(error));
+                self.outputs.push(LoopOutput::Failed(error));
             }
         }
-        self.outputs.push(Output::Computed {
+        self.outputs.push(LoopOutput::Computed {
             capture_nanos,
             arrived_nanos,
         });

@@ -5,7 +5,7 @@ use protocol::{Encoded, Stamp, Stream};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::Input;
+use super::LoopInput;
 use crate::input_log;
 use crate::rate::Turn;
 
@@ -13,7 +13,7 @@ use crate::rate::Turn;
 pub const KIND: &str = "agent inputs";
 
 /// A record of an agent's inputs.
-pub type Record = input_log::Record<Input, Published>;
+pub type AgentRecord = input_log::Record<LoopInput, Published>;
 
 /// A published message: everything that its bytes depend on beside the inputs, and their digest.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

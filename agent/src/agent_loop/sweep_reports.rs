@@ -36,9 +36,7 @@ pub fn descriptor(detector: &Detector, dtype: Dtype, publish: &[Stream]) -> Desc
         grid: detector.grid(),
         channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
         dtype,
-        streams: std::iter::once(Stream::Pose)
-            .chain(publish.iter().copied())
-            .collect(),
+        streams: (std::iter::once(Stream::Pose).chain(publish.iter().copied())).collect(),
         sweeps: Vec::new(),
     }
 }
@@ -84,16 +82,12 @@ impl SweepReports {
         // Without a description as well, or the loop would be woken again at once.
         self.next_nanos = now_nanos.saturating_add(PERIOD_NANOS);
         let newest = self.sweeps.back().map_or(0, |(capture, _)| *capture);
-        let sweeps = self
-            .sweeps
-            .drain(..)
-            .map(|(capture, arrived_nanos)| SweepArrival {
-                before_nanos: newest.saturating_sub(capture),
-                arrived_nanos,
-            });
-        let sweeps = sweeps.collect();
+        let sweeps = (self.sweeps.drain(..)).map(|(capture, arrived_nanos)| SweepArrival {
+            before_nanos: newest.saturating_sub(capture),
+            arrived_nanos,
+        });
         let mut descriptor = self.description.clone()?;
-        descriptor.sweeps = sweeps;
+        descriptor.sweeps = sweeps.collect();
         Some((newest, descriptor))
     }
 }

@@ -39,7 +39,7 @@ fn agent(weights: &Path) -> Agent {
     Agent::new(cav(), Box::new(RecordedPose), detector)
 }
 
-fn sweep(capture_nanos: u64) -> Input {
+fn sweep(capture_nanos: u64) -> LoopInput {
     let point = |k: u64| {
         [
             ((k + capture_nanos) % 83) as f32 * 0.3 - 12.0,
@@ -48,7 +48,7 @@ fn sweep(capture_nanos: u64) -> Input {
             0.2,
         ]
     };
-    Input::Sweep(Sweep {
+    LoopInput::Sweep(Sweep {
         capture_nanos,
         arrived_nanos: 7_000 + capture_nanos,
         cloud: PointCloud {
@@ -57,34 +57,34 @@ fn sweep(capture_nanos: u64) -> Input {
     })
 }
 
-fn gnss(capture_nanos: u64, source: GnssSource) -> Input {
+fn gnss(capture_nanos: u64, source: GnssSource) -> LoopInput {
     let gnss = Gnss {
         world_from_lidar: Pose::from_xyz_yaw([capture_nanos as f64, 6.0, 0.0], 0.3),
         position_std_m: 0.0,
         heading_std_rad: 0.0,
         source,
     };
-    Input::Gnss(capture_nanos, gnss)
+    LoopInput::Gnss(capture_nanos, gnss)
 }
 
 /// Hands inputs to a loop, each with all the steps that follow; returns what is published, as `(stream, number)`.
-fn published(agent_loop: &mut AgentLoop, inputs: Vec<Input>) -> Vec<(Stream, u64)> {
+fn published(agent_loop: &mut AgentLoop, inputs: Vec<LoopInput>) -> Vec<(Stream, u64)> {
     outputs(agent_loop, inputs)
         .into_iter()
         .filter_map(|output| match output {
-            Output::Publish(message) => Some((message.stream, message.number)),
+            LoopOutput::Publish(message) => Some((message.stream, message.number)),
             _ => None,
         })
         .collect()
 }
 
-fn outputs(agent_loop: &mut AgentLoop, inputs: Vec<Input>) -> Vec<Output> {
+fn outputs(agent_loop: &mut AgentLoop, inputs: Vec<LoopInput>) -> Vec<LoopOutput> {
     let mut outputs = Vec::new();
     for input in inputs {
         outputs.extend(agent_loop.handle(input, NOW));
-        outputs.extend(agent_loop.handle(Input::Wake, NOW));
+        outputs.extend(agent_loop.handle(LoopInput::Wake, NOW));
         while agent_loop.is_computing() {
-            outputs.extend(agent_loop.handle(Input::Wake, NOW));
+            outputs.extend(agent_loop.handle(LoopInput::Wake, NOW));
         }
     }
     outputs
@@ -96,14 +96,14 @@ fn a_sweep_waits_for_its_pose_and_its_steps_are_published_one_by_one() {
     let agent = agent(&write_weights(folder.path()));
     let mut agent_loop = AgentLoop::new(agent, LoopOptions::default());
     // The agent does not know yet that its vehicle measures no motion.
-    let motion = Input::Motion(10, EgoMotion::default());
+    let motion = LoopInput::Motion(10, EgoMotion::default());
     let first = published(&mut agent_loop, vec![motion, sweep(10)]);
     assert_eq!(first, [(Stream::Descriptor, 0), (Stream::Descriptor, 1)]);
     assert!(!agent_loop.is_computing() && agent_loop.wakes_nanos() > NOW);
 
-    let streams = |outputs: Vec<Output>| -> Vec<Stream> {
+    let streams = |outputs: Vec<LoopOutput>| -> Vec<Stream> {
         let stream = |output| match output {
-            Output::Publish(message) => Some(message.stream),
+            LoopOutput::Publish(message) => Some(message.stream),
             _ => None,
         };
         outputs.into_iter().filter_map(stream).collect()
@@ -111,7 +111,7 @@ fn a_sweep_waits_for_its_pose_and_its_steps_are_published_one_by_one() {
     let pose = gnss(10, GnssSource::Recorded);
     assert!(streams(agent_loop.handle(pose, NOW)).is_empty());
     for step in [&[Stream::Pose][..], &[Stream::Bev], &[]] {
-        assert_eq!(streams(agent_loop.handle(Input::Wake, NOW)), step);
+        assert_eq!(streams(agent_loop.handle(LoopInput::Wake, NOW)), step);
     }
     assert!(!agent_loop.is_computing());
     let report = agent_loop.report();
@@ -128,7 +128,7 @@ fn after_the_end_a_sweep_waits_for_nothing() {
     let mut agent_loop = AgentLoop::new(agent, options);
     assert!(published(&mut agent_loop, vec![sweep(10), sweep(20)]).is_empty());
     assert!(!agent_loop.is_finished());
-    let last = published(&mut agent_loop, vec![Input::Ended]);
+    let last = published(&mut agent_loop, vec![LoopInput::Ended]);
     assert_eq!(last, [(Stream::Pose, 0)]);
     assert!(agent_loop.is_finished());
     assert_eq!(agent_loop.report().no_pose, 1);
@@ -138,9 +138,9 @@ fn after_the_end_a_sweep_waits_for_nothing() {
 fn a_sweep_that_does_not_fail_by_its_values_is_counted_apart() {
     let agent = Agent::without_detector(cav(), Box::new(RecordedPose));
     let mut agent_loop = AgentLoop::new(agent, LoopOptions::default());
-    let outputs = outputs(&mut agent_loop, vec![sweep(10), Input::Ended]);
+    let outputs = outputs(&mut agent_loop, vec![sweep(10), LoopInput::Ended]);
     let dropped = outputs.into_iter().filter_map(|output| match output {
-        Output::Dropped(_, reason) => Some(reason),
+        LoopOutput::Dropped(_, reason) => Some(reason),
         _ => None,
     });
     assert_eq!(dropped.collect::<Vec<_>>(), [DropReason::Shape]);
@@ -167,13 +167,13 @@ fn the_same_inputs_give_the_same_bytes() {
             gnss(10, GnssSource::Recorded),
             sweep(10),
             sweep(20),
-            Input::Motion(20, EgoMotion::default()),
+            LoopInput::Motion(20, EgoMotion::default()),
             gnss(20, GnssSource::Recorded),
-            Input::Ended,
+            LoopInput::Ended,
         ];
         let mut bytes = Vec::new();
         for output in outputs(&mut agent_loop, inputs) {
-            let Output::Publish(message) = output else {
+            let LoopOutput::Publish(message) = output else {
                 continue;
             };
             let turn = Turn {

@@ -9,8 +9,8 @@ use protocol::Stream;
 use support::cli::Outcome;
 use support::output;
 
-use crate::agent_loop::recorded::{KIND, Published, Record};
-use crate::agent_loop::{AgentLoop, Input, MessageEncoder, Output, Unsent};
+use crate::agent_loop::recorded::{AgentRecord, KIND, Published};
+use crate::agent_loop::{AgentLoop, LoopInput, LoopOutput, MessageEncoder, Unsent};
 use crate::config::AgentConfig;
 use crate::input_log::RecordedInputs;
 
@@ -28,7 +28,7 @@ pub(crate) struct Arguments {
 }
 
 /// A run that is replayed.
-struct Replay {
+struct InputReplay {
     agent_loop: AgentLoop,
     encoder: MessageEncoder,
     /// Messages that are not published, or not yet, by stream and number.
@@ -40,14 +40,14 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         log_to_stderr();
         let (mut records, mut config) =
-            RecordedInputs::<Input, Published>::open::<AgentConfig>(&self.file, KIND)?;
+            RecordedInputs::<LoopInput, Published>::open::<AgentConfig>(&self.file, KIND)?;
         if let Some(weights) = self.weights {
             config.models.weights = weights;
         }
         let agent = super::run::agent(&config)?;
         records.check_model(agent.detector(), &config.models.weights)?;
         let options = config.options().of_loop;
-        let mut replay = Replay {
+        let mut replay = InputReplay {
             encoder: MessageEncoder::new(&options),
             agent_loop: AgentLoop::new(agent, options),
             unsent: BTreeMap::new(),
@@ -55,8 +55,8 @@ impl Arguments {
         let (mut messages, mut differing) = (0, 0);
         for record in &mut records {
             match record {
-                Record::Input { now_nanos, input } => replay.take_in(input, now_nanos),
-                Record::Published(recorded) => {
+                AgentRecord::Input { now_nanos, input } => replay.take_in(input, now_nanos),
+                AgentRecord::Published(recorded) => {
                     let again = replay.publish(&recorded)?;
                     output::line(serde_json::to_string(&again)?)?;
                     messages += 1;
@@ -66,7 +66,7 @@ impl Arguments {
                     }
                 }
                 // Not yielded: a second beginning ends the records.
-                Record::Start(_) => {}
+                AgentRecord::Start(_) => {}
             }
         }
         ensure!(
@@ -77,12 +77,11 @@ impl Arguments {
     }
 }
 
-impl Replay {
-    fn take_in(&mut self, input: Input, now_nanos: u64) {
+impl InputReplay {
+    fn take_in(&mut self, input: LoopInput, now_nanos: u64) {
         for output in self.agent_loop.handle(input, now_nanos) {
-            if let Output::Publish(message) = output {
-                self.unsent
-                    .insert((message.stream, message.number), message);
+            if let LoopOutput::Publish(message) = output {
+                (self.unsent).insert((message.stream, message.number), message);
             }
         }
     }
@@ -96,8 +95,7 @@ impl Replay {
             format!("the run published message {number} of {stream}, the replay does not")
         })?;
         // Earlier ones were superseded in the queue.
-        self.unsent
-            .retain(|&(of, number), _| of != stream || number > turn.number);
+        (self.unsent).retain(|&(of, number), _| of != stream || number > turn.number);
         let encoded = self.encoder.encode(message, stamp, Some(&turn));
         let bytes = encoded.as_ref().ok().map(|(encoded, _)| encoded);
         Ok(Published::new(stream, turn, stamp, bytes))

@@ -63,8 +63,7 @@ pub(super) fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
 
 fn load(config: &AgentConfig) -> anyhow::Result<Agent> {
     let inference = config.models.inference()?;
-    let pose = config.settings.pose.clone().with_networks()?;
-    let pose_source = pose.build(inference)?;
+    let pose_source = (config.settings.pose.clone().with_networks()?).build(inference)?;
     if config.gives_poses_only() {
         return Ok(Agent::without_detector(config.cav.clone(), pose_source));
     }

@@ -11,9 +11,9 @@ use nalgebra::DMatrix;
 /// not be made.
 pub fn of_lowest_cost(costs: &DMatrix<f64>) -> Vec<(usize, usize)> {
     if costs.nrows() <= costs.ncols() {
-        return Solver::new(costs).solve();
+        return AssignmentSolver::new(costs).solve();
     }
-    let mut pairs = Solver::new(&costs.transpose()).solve();
+    let mut pairs = AssignmentSolver::new(&costs.transpose()).solve();
     for (column, row) in &mut pairs {
         std::mem::swap(column, row);
     }
@@ -41,7 +41,7 @@ pub fn of_allowed(
 }
 
 /// State of the search over a matrix with at most as many rows as columns.
-struct Solver<'a> {
+struct AssignmentSolver<'a> {
     costs: &'a DMatrix<f64>,
     row_price: Vec<f64>,
     column_price: Vec<f64>,
@@ -56,7 +56,7 @@ struct Paths {
     is_final: Vec<bool>,
 }
 
-impl<'a> Solver<'a> {
+impl<'a> AssignmentSolver<'a> {
     fn new(costs: &'a DMatrix<f64>) -> Self {
         let (rows, columns) = costs.shape();
         Self {
@@ -72,11 +72,8 @@ impl<'a> Solver<'a> {
         for row in 0..self.costs.nrows() {
             self.connect(row);
         }
-        let pairs = self
-            .column_of
-            .into_iter()
-            .enumerate()
-            .filter_map(|(row, column)| Some((row, column?)));
+        let rows = self.column_of.into_iter().enumerate();
+        let pairs = rows.filter_map(|(row, column)| Some((row, column?)));
         pairs.collect()
     }
 

@@ -36,10 +36,8 @@ impl ConstantVelocity {
         covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(noise_m2);
         let mut of_velocity = covariance.fixed_view_mut::<2, 2>(2, 2);
         of_velocity.fill_diagonal(sigma_mps * sigma_mps);
-        Self {
-            state: Vector4::new(position_m.x, position_m.y, 0.0, 0.0),
-            covariance,
-        }
+        let state = Vector4::new(position_m.x, position_m.y, 0.0, 0.0);
+        Self { state, covariance }
     }
 
     /// Position, metres.

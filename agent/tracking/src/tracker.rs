@@ -207,10 +207,8 @@ impl Tracker {
     }
 
     fn reported(&self, ego_from_world: &Isometry3<f64>) -> Vec<Track> {
-        let reported = self
-            .tracks
-            .iter()
-            .filter(|track| track.is_reported(&self.config));
+        let tracks = self.tracks.iter();
+        let reported = tracks.filter(|track| track.is_reported(&self.config));
         reported.map(|track| track.report(ego_from_world)).collect()
     }
 
@@ -278,10 +276,8 @@ impl Tracker {
     }
 
     fn begin(&mut self, measurements: &[Measurement], owners: &[Option<usize>]) {
-        let free = measurements
-            .iter()
-            .zip(owners)
-            .filter(|(_, owner)| owner.is_none());
+        let owned = measurements.iter().zip(owners);
+        let free = owned.filter(|(_, owner)| owner.is_none());
         let mut new: Vec<Measurement> = free.map(|(measured, _)| *measured).collect();
         new.retain(|measured| measured.score >= self.config.birth_score);
         let found = new.len();

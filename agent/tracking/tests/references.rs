@@ -8,7 +8,7 @@ use serde_json::Value;
 use tracking::assignment;
 use tracking::kalman::ConstantVelocity;
 use tracking::metrics::{
-    Amota, ClearMot, Hota, Identity, MATCH_DISTANCE_M, Sequence, TrackPoint, TrackedFrame,
+    Amota, ClearMot, Hota, IdentityCounts, MATCH_DISTANCE_M, Sequence, TrackPoint, TrackedFrame,
     TruePoint,
 };
 
@@ -133,7 +133,7 @@ fn hota_and_idf1_are_those_of_trackeval() {
     for (name, sequences, case) in cases() {
         let reference = &case["trackeval"];
         let ours = Hota::of(&sequences).unwrap();
-        let idf1 = Identity::of(&sequences, MATCH_DISTANCE_M).f1();
+        let idf1 = IdentityCounts::of(&sequences, MATCH_DISTANCE_M).f1();
         for (field, ours) in [
             ("hota", Some(ours.hota)),
             ("det_a", Some(ours.det_a)),

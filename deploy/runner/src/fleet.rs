@@ -12,7 +12,7 @@ use anyhow::{Context, Result, anyhow, bail, ensure};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::ground_truth::GroundTruthRule;
 use dataset::{self, OpenOptions, Problem, Scenario as Recorded, findings};
-use deploy::operate::keys::KeyError;
+use deploy::operate::keys::KeyFileError;
 use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
 use ego_fuser::ego::Ego;
@@ -208,8 +208,8 @@ impl Fleet {
     /// Keys of a run of this fleet, if its scenario asks for security.
     ///
     /// # Errors
-    /// [`KeyError`] when they cannot be made.
-    pub fn keys(&self, folder: &RunFolder) -> Result<Option<RunKeys>, KeyError> {
+    /// [`KeyFileError`] when they cannot be made.
+    pub fn keys(&self, folder: &RunFolder) -> Result<Option<RunKeys>, KeyFileError> {
         let security = self.scenario.security.as_ref();
         let keys = security.map(|of| RunKeys::of(of, self.parties(), folder.path()));
         keys.transpose()

@@ -6,9 +6,9 @@ use std::io::{self, BufWriter, Write};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use deploy::score::{TRACKS, TruthLine};
+use deploy::score::{ScenarioLine, TRACKS, TruthLine};
 use ego_fuser_offline::evaluation::EvaluatedFrame;
-use protocol::{CavId, FrameReport};
+use protocol::FrameReport;
 use serde::Serialize;
 
 /// The files; the first error of writing is kept.
@@ -19,15 +19,6 @@ pub(crate) struct FrameLines {
     /// Created with the first tracks.
     tracks: Option<BufWriter<File>>,
     written: io::Result<()>,
-}
-
-/// A line of one scenario among several.
-#[derive(Serialize)]
-struct OfScenario<'a, T> {
-    #[serde(skip_serializing_if = "Option::is_none")]
-    scenario: Option<&'a str>,
-    #[serde(flatten)]
-    line: T,
 }
 
 impl FrameLines {
@@ -65,7 +56,7 @@ impl FrameLines {
         // A frame that failed has no result, but its truth is written all the same.
         if frame.failure.is_none() {
             let line = FrameReport::new(&frame.stamp, tick, &frame.result);
-            write_line(&mut self.detections, &OfScenario { scenario, line })?;
+            write_line(&mut self.detections, &ScenarioLine { scenario, line })?;
         }
         // An ego that does not track leaves no file: readers tell the two apart by that.
         if let Some(tracks) = &frame.tracks {
@@ -74,10 +65,19 @@ impl FrameLines {
                 absent => absent.insert(create(&self.folder, TRACKS)?),
             };
             let line = FrameReport::new(&frame.stamp, tick, tracks);
-            write_line(out, &OfScenario { scenario, line })?;
+            write_line(out, &ScenarioLine { scenario, line })?;
         }
-        let line = truth_line(&frame.result.ego, frame);
-        write_line(&mut self.truth, &OfScenario { scenario, line })
+        let ego = &frame.result.ego;
+        let own = frame.frames.iter().find(|recorded| recorded.cav == *ego);
+        let line = TruthLine {
+            tick: frame.tick as u64,
+            capture_nanos: frame.stamp.capture_nanos,
+            publish_nanos: frame.stamp.capture_nanos,
+            ego: ego.clone(),
+            world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
+            truth: frame.truth.clone(),
+        };
+        write_line(&mut self.truth, &ScenarioLine { scenario, line })
     }
 
     /// Writes what is left.
@@ -104,17 +104,4 @@ fn create(folder: &Path, name: &str) -> io::Result<BufWriter<File>> {
 fn write_line(out: &mut impl Write, value: &impl Serialize) -> io::Result<()> {
     serde_json::to_writer(&mut *out, value)?;
     out.write_all(b"\n")
-}
-
-/// Ground truth of a computed tick.
-fn truth_line(ego: &CavId, frame: &EvaluatedFrame) -> TruthLine {
-    let own = frame.frames.iter().find(|recorded| recorded.cav == *ego);
-    TruthLine {
-        tick: frame.tick as u64,
-        capture_nanos: frame.stamp.capture_nanos,
-        publish_nanos: frame.stamp.capture_nanos,
-        ego: ego.clone(),
-        world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
-        truth: frame.truth.clone(),
-    }
 }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::operate::keys::{KeyError, KeyPlan, make};
+use crate::operate::keys::{KeyFileError, KeyPlan, make};
 use protocol::{CavId, Principal, Role};
 use serde_json::json;
 use support::output;
@@ -53,8 +53,8 @@ impl Arguments {
         plan.hosts.extend(self.hosts);
         plan.replace = self.force;
         let written = make(&plan).map_err(|error| match error {
-            KeyError::Io { .. } => anyhow::Error::from(error),
-            KeyError::There(_) | KeyError::Unusable { .. } => BadInput::of(error).into(),
+            KeyFileError::File(_) => anyhow::Error::from(error),
+            KeyFileError::There(_) | KeyFileError::Unusable { .. } => BadInput::of(error).into(),
         })?;
         if self.json {
             output::line(serde_json::to_string_pretty(&json!({ "files": written }))?)?;

@@ -29,9 +29,9 @@ pub(crate) struct Arguments {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    network: Network,
+    network: NetworkOptions,
     #[command(flatten)]
-    content: Content,
+    content: ContentOptions,
     #[command(flatten)]
     sensors: Sensors,
 }
@@ -39,7 +39,7 @@ pub(crate) struct Arguments {
 /// The ROS 2 network.
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "ROS 2 network")]
-struct Network {
+struct NetworkOptions {
     /// Router of the ROS 2 network (rmw_zenohd) [default: the router of the run].
     #[arg(long, value_name = "ENDPOINT")]
     ros_router: Option<Endpoint>,
@@ -57,7 +57,7 @@ struct Network {
 /// Published messages.
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Messages")]
-struct Content {
+struct ContentOptions {
     /// Do not offer the sweeps of the vehicles.
     #[arg(long)]
     no_points: bool,
@@ -232,7 +232,7 @@ impl Sensors {
     }
 }
 
-impl Network {
+impl NetworkOptions {
     fn domain_id(&self) -> anyhow::Result<u32> {
         let Some(text) = std::env::var_os("ROS_DOMAIN_ID").filter(|_| self.domain_id.is_none())
         else {

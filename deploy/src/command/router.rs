@@ -7,14 +7,15 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use bus::shutdown::Stop;
 use bus::{
-    BusOptions, Endpoint, Rejection, RejectionLog, RouterProbe, STOP_LIMIT, SharedMemory, open,
+    BusOptions, Endpoint, RejectionLog, RouterProbe, RouterRejection, STOP_LIMIT, SharedMemory,
+    open,
 };
 use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::{Session, Wait};
 
 use crate::operate::network::from_here;
-use crate::operate::refusals::{self, Refusal};
+use crate::operate::refusals::{self, RefusalCount};
 use crate::operate::router_panic;
 use crate::operate::router_watch;
 use crate::operate::security::guarded;
@@ -173,9 +174,9 @@ impl Arguments {
 /// Refused requests of a router.
 struct Refused {
     log: RejectionLog,
-    reported: BTreeMap<Rejection, u64>,
+    reported: BTreeMap<RouterRejection, u64>,
     /// File for the counts, and what the routers before wrote into it.
-    before: Option<(PathBuf, Vec<Refusal>)>,
+    before: Option<(PathBuf, Vec<RefusalCount>)>,
 }
 
 impl Refused {

@@ -26,28 +26,27 @@ impl Arguments {
     /// Prints the state of the run.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         if let Some((name, router)) = self.run.remote() {
-            let bus = self.run.bus(name, router)?;
-            let status = RemoteStatus::observe(&bus, OBSERVED)?;
-            self.print(&status, &status.table())?;
-            return check(&status.run, &status.troubles());
+            let status = RemoteStatus::observe(&self.run.bus(name, router)?, OBSERVED)?;
+            return self.print(&status, &status.table(), &status.run, &status.troubles());
         }
         let status = RunStatus::read(&self.run.folder()?).map_err(BadInput::of)?;
-        self.print(&status, &status.table())?;
-        check(&status.run, &status.troubles())
+        self.print(&status, &status.table(), &status.run, &status.troubles())
     }
 
-    fn print(&self, status: &impl serde::Serialize, table: &str) -> anyhow::Result<()> {
+    /// Prints a status; then an error for a run with problems.
+    fn print(
+        &self,
+        status: &impl serde::Serialize,
+        table: &str,
+        run: &str,
+        troubles: &[String],
+    ) -> anyhow::Result<Outcome> {
         match self.json {
             true => output::line(serde_json::to_string_pretty(status)?)?,
             false => output::text(table)?,
         }
-        Ok(())
+        let (is_well, troubles) = (troubles.is_empty(), troubles.join("; "));
+        ensure!(is_well, "run {run} is not well: {troubles}");
+        Ok(Outcome::Done)
     }
-}
-
-/// An error for a run with problems.
-fn check(run: &str, troubles: &[String]) -> anyhow::Result<Outcome> {
-    let (is_well, troubles) = (troubles.is_empty(), troubles.join("; "));
-    ensure!(is_well, "run {run} is not well: {troubles}");
-    Ok(Outcome::Done)
 }

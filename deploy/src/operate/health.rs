@@ -201,15 +201,12 @@ impl Health {
     /// Ends of processes that were unexpected, as text: `agent-4288 was ended by signal 9`.
     pub(crate) fn ends(&self) -> Vec<String> {
         let ends = self.processes.iter().filter_map(|(name, noted)| {
+            let how = noted.status.last_fall.as_ref()?;
             let times = match noted.status.restarts {
                 0 | 1 => String::new(),
                 restarts => format!(", restarted {restarts} times"),
             };
-            noted
-                .status
-                .last_fall
-                .as_ref()
-                .map(|how| format!("{name} {how}{times}"))
+            Some(format!("{name} {how}{times}"))
         });
         ends.collect()
     }
@@ -217,17 +214,14 @@ impl Health {
     /// Status of every process; `progress` has what they reported.
     pub(crate) fn statuses(&self, progress: &Progress, now: Instant) -> Vec<ProcessStatus> {
         let statuses = self.processes.iter().map(|(name, noted)| {
-            let pid = noted.status.pid;
-            let usage = pid.and_then(Usage::of).unwrap_or_default();
-            let runs = pid.is_some();
-            let problems = progress.problems.get(name).filter(|_| runs);
+            let Some(pid) = noted.status.pid else {
+                return noted.status.clone();
+            };
+            let usage = Usage::of(pid).unwrap_or_default();
             ProcessStatus {
-                up_s: pid.map_or(0.0, |_| elapsed_s(noted.started, now)),
-                problems: problems.cloned().unwrap_or_default(),
-                silent_s: noted
-                    .last_report
-                    .filter(|_| runs)
-                    .map(|at| elapsed_s(at, now)),
+                up_s: elapsed_s(noted.started, now),
+                problems: progress.problems.get(name).cloned().unwrap_or_default(),
+                silent_s: noted.last_report.map(|at| elapsed_s(at, now)),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,
                 descriptors: usage.descriptors,

@@ -11,7 +11,7 @@
 //! A host gets the folders of its own processes and nothing else.
 
 use std::fs::{self, OpenOptions};
-use std::io::{self, Write};
+use std::io::Write;
 use std::net::IpAddr;
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
@@ -25,6 +25,7 @@ use rcgen::{
 };
 use support::atomic_file;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
+use support::file_error::{AtFile, FileError};
 
 /// File name of the authority's key.
 const AUTHORITY_KEY: &str = "authority.key";
@@ -69,15 +70,10 @@ impl KeyPlan {
 
 /// Reason why no keys could be made.
 #[derive(Debug, thiserror::Error)]
-pub enum KeyError {
-    /// The file system refuses.
-    #[error("{}: {cause}", path.display())]
-    Io {
-        /// File or folder.
-        path: PathBuf,
-        /// Error of the operating system.
-        cause: io::Error,
-    },
+pub enum KeyFileError {
+    /// The file system refuses a file or folder.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Existing keys are not overwritten without `--force`.
     #[error("{} is there already; --force replaces it; the old one stays valid until it expires", .0.display())]
     There(PathBuf),
@@ -94,8 +90,8 @@ pub enum KeyError {
 /// Makes the keys of the plan; returns every file that it wrote.
 ///
 /// # Errors
-/// [`KeyError`]; files that were written before it stay.
-pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
+/// [`KeyFileError`]; files that were written before it stay.
+pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyFileError> {
     let mut store = KeyStore {
         plan,
         written: Vec::new(),
@@ -105,7 +101,7 @@ pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
     if !plan.replace
         && let Some(taken) = names.clone().find(|name| plan.certificate(name).exists())
     {
-        return Err(KeyError::There(plan.certificate(&taken)));
+        return Err(KeyFileError::There(plan.certificate(&taken)));
     }
     let authority = store.authority()?;
     let router = (plan.replace || !plan.certificate(ROUTER).exists()).then(|| ROUTER.to_owned());
@@ -129,7 +125,7 @@ struct KeyStore<'a> {
 
 impl KeyStore<'_> {
     /// Loads the authority of the folder, or creates one.
-    fn authority(&mut self) -> Result<Authority, KeyError> {
+    fn authority(&mut self) -> Result<Authority, KeyFileError> {
         let folder = &self.plan.folder;
         make_folder(folder)?;
         let (key_path, pem_path) = (folder.join(AUTHORITY_KEY), folder.join(AUTHORITY_FILE));
@@ -154,7 +150,7 @@ impl KeyStore<'_> {
         Ok(Authority { pem, issuer })
     }
 
-    fn certify(&mut self, authority: &Authority, name: &str) -> Result<(), KeyError> {
+    fn certify(&mut self, authority: &Authority, name: &str) -> Result<(), KeyFileError> {
         let folder = &self.plan.folder.join(name);
         let unusable = unusable(format!("a certificate for {name}"));
         let mut params = params(name, self.plan.lifetime)?;
@@ -183,12 +179,11 @@ impl KeyStore<'_> {
     }
 
     /// Writes the router's list of every process in the folder, including earlier ones.
-    fn enlist(&mut self) -> Result<(), KeyError> {
+    fn enlist(&mut self) -> Result<(), KeyFileError> {
         let folder = &self.plan.folder;
-        let io = at(folder);
         let mut members = Vec::new();
-        for entry in fs::read_dir(folder).map_err(&io)? {
-            let entry = entry.map_err(&io)?;
+        for entry in fs::read_dir(folder).at(folder)? {
+            let entry = entry.at(folder)?;
             let name = entry.file_name().to_string_lossy().into_owned();
             if entry.path().join(CERTIFICATE_FILE).exists() && name.parse::<Principal>().is_ok() {
                 members.push(name + "\n");
@@ -200,7 +195,7 @@ impl KeyStore<'_> {
     }
 
     /// Atomic write: leaves neither half a file nor a moment in which others can read a key.
-    fn write(&mut self, path: PathBuf, text: &str, mode: u32) -> Result<(), KeyError> {
+    fn write(&mut self, path: PathBuf, text: &str, mode: u32) -> Result<(), KeyFileError> {
         let begun = path.with_extension("new");
         // A file that an interrupted write has left would stop create_new.
         let _ = fs::remove_file(&begun);
@@ -212,37 +207,29 @@ impl KeyStore<'_> {
             fs::rename(&begun, &path)?;
             atomic_file::sync_name(&path)
         });
-        written.map_err(at(&path))?;
+        written.at(&path)?;
         self.written.push(path);
         Ok(())
     }
 }
 
-fn at(path: &Path) -> impl Fn(io::Error) -> KeyError {
-    move |cause| KeyError::Io {
-        path: path.to_owned(),
-        cause,
-    }
-}
-
-fn unusable(what: String) -> impl Fn(rcgen::Error) -> KeyError {
-    move |cause| KeyError::Unusable {
+fn unusable(what: String) -> impl Fn(rcgen::Error) -> KeyFileError {
+    move |cause| KeyFileError::Unusable {
         what: what.clone(),
         cause,
     }
 }
 
-fn make_folder(path: &Path) -> Result<(), KeyError> {
+fn make_folder(path: &Path) -> Result<(), FileError> {
     let mut builder = fs::DirBuilder::new();
-    let made = builder.recursive(true).mode(0o700).create(path);
-    made.map_err(at(path))
+    builder.recursive(true).mode(0o700).create(path).at(path)
 }
 
-fn read(path: &Path) -> Result<String, KeyError> {
-    bounded_file::read_text(path, MAX_TEXT_BYTES).map_err(at(path))
+fn read(path: &Path) -> Result<String, FileError> {
+    bounded_file::read_text(path, MAX_TEXT_BYTES).at(path)
 }
 
-fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyError> {
+fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyFileError> {
     let mut params = CertificateParams::new(Vec::new()).map_err(unusable(name.to_owned()))?;
     params.distinguished_name = DistinguishedName::new();
     params.distinguished_name.push(DnType::CommonName, name);
@@ -254,7 +241,7 @@ fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyError>
 }
 
 /// A name or an address in a router's certificate.
-fn alternative(host: &str) -> Result<SanType, KeyError> {
+fn alternative(host: &str) -> Result<SanType, KeyFileError> {
     if let Ok(address) = host.parse::<IpAddr>() {
         return Ok(SanType::IpAddress(address));
     }
@@ -316,7 +303,7 @@ mod tests {
         make(&plan).unwrap();
         let read = |name: &str| fs::read(folder.path().join(name).join(CERTIFICATE_FILE)).unwrap();
         let (agent, router) = (read("agent-1"), read("router"));
-        assert!(matches!(make(&plan), Err(KeyError::There(_))));
+        assert!(matches!(make(&plan), Err(KeyFileError::There(_))));
         // A vehicle that is added later is signed by the same authority.
         make(&KeyPlan {
             principals: principals(&["agent-2"]),

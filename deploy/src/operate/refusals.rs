@@ -5,16 +5,16 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
-use bus::Rejection;
+use bus::RouterRejection;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
 
 /// Refused requests of one kind of one peer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Refusal {
+pub struct RefusalCount {
     /// Peer, reason and request.
     #[serde(flatten)]
-    pub rejection: Rejection,
+    pub rejection: RouterRejection,
     /// Number of refusals.
     pub count: u64,
 }
@@ -25,15 +25,15 @@ pub struct Refusal {
 /// The error of the system.
 pub(crate) fn write(
     file: &Path,
-    before: &[Refusal],
-    counts: &BTreeMap<Rejection, u64>,
+    before: &[RefusalCount],
+    counts: &BTreeMap<RouterRejection, u64>,
 ) -> io::Result<()> {
     let mut sum = counts.clone();
     for refusal in before {
         *sum.entry(refusal.rejection.clone()).or_default() += refusal.count;
     }
     let refusals = sum.into_iter();
-    let refusals = refusals.map(|(rejection, count)| Refusal { rejection, count });
+    let refusals = refusals.map(|(rejection, count)| RefusalCount { rejection, count });
     let text = serde_json::to_vec(&refusals.collect::<Vec<_>>())?;
     atomic_file::write_volatile(file, text)
 }
@@ -42,7 +42,7 @@ pub(crate) fn write(
 ///
 /// # Errors
 /// The error of the system; [`io::ErrorKind::InvalidData`] for other content.
-pub fn read(file: &Path) -> io::Result<Vec<Refusal>> {
+pub fn read(file: &Path) -> io::Result<Vec<RefusalCount>> {
     match fs::read(file) {
         Ok(bytes) => Ok(serde_json::from_slice(&bytes)?),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Vec::new()),
@@ -55,11 +55,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_router_goes_on_from_the_counts_of_the_one_before() {
+    fn counts_of_a_replaced_router_are_added() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("refusals.json");
         assert_eq!(read(&file).unwrap(), []);
-        let put = Rejection {
+        let put = RouterRejection {
             peer: "agent-1".into(),
             reason: "access-control".into(),
             message: "put".into(),
@@ -68,7 +68,7 @@ mod tests {
         write(&file, &[], &counts).unwrap();
         let before = read(&file).unwrap();
         write(&file, &before, &counts).unwrap();
-        let sum = Refusal {
+        let sum = RefusalCount {
             rejection: put,
             count: 6,
         };

@@ -11,7 +11,7 @@ pub(crate) const LIMIT: Duration = Duration::from_secs(2);
 
 /// A change of the state of the router or of the run.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Finding {
+pub(crate) enum RouterFinding {
     /// A line for the terminal: the router is gone, or back, or the run was suspended.
     Line(String),
     /// The router of this run is there and passes no message, with the reason: it has to be replaced.
@@ -26,12 +26,12 @@ pub(crate) fn in_words(silence: Duration) -> String {
 
 /// Times of one kind.
 #[derive(Debug, Default)]
-struct Times {
+struct TimeSum {
     count: usize,
     sum: Duration,
 }
 
-impl Times {
+impl TimeSum {
     fn add(&mut self, time: Duration) {
         self.count += 1;
         self.sum += time;
@@ -59,8 +59,8 @@ pub(crate) struct RouterWatch {
     is_replaced: bool,
     looked: Option<Instant>,
     gone_since: Option<Instant>,
-    outages: Times,
-    pauses: Times,
+    outages: TimeSum,
+    pauses: TimeSum,
 }
 
 impl RouterWatch {
@@ -78,7 +78,7 @@ impl RouterWatch {
         &mut self,
         scorer: &ScorerNode,
         reported: Option<Instant>,
-    ) -> Option<Finding> {
+    ) -> Option<RouterFinding> {
         let now = Instant::now();
         let silence = self
             .probe
@@ -95,7 +95,7 @@ impl RouterWatch {
         silence: Duration,
         lost_since: Option<Instant>,
         now: Instant,
-    ) -> Option<Finding> {
+    ) -> Option<RouterFinding> {
         let looked = self.looked.replace(now).unwrap_or(now);
         let pause = now.saturating_duration_since(looked);
         // A gap in the own loop says nothing about the router.
@@ -103,7 +103,7 @@ impl RouterWatch {
             self.pauses.add(pause);
             let seconds = pause.as_secs_f64();
             let line = format!("the run was suspended for {seconds:.1} s");
-            return Some(Finding::Line(line));
+            return Some(RouterFinding::Line(line));
         }
         let is_silent = silence > LIMIT;
         let since = lost_since.or_else(|| is_silent.then(|| now.checked_sub(silence))?);
@@ -122,11 +122,11 @@ impl RouterWatch {
             // One that has ended is started again without a request.
             (Some(_), Some(_)) if self.is_own && lost_since.is_none() && !self.is_replaced => {
                 self.is_replaced = true;
-                return Some(Finding::Hung(in_words(silence)));
+                return Some(RouterFinding::Hung(in_words(silence)));
             }
             _ => return None,
         };
-        Some(Finding::Line(line))
+        Some(RouterFinding::Line(line))
     }
 
     /// Time since which the router is gone.
@@ -165,9 +165,9 @@ mod tests {
 
     const BEAT: Duration = Duration::from_millis(100);
 
-    fn line(found: Option<Finding>) -> String {
+    fn line(found: Option<RouterFinding>) -> String {
         match found {
-            Some(Finding::Line(line)) => line,
+            Some(RouterFinding::Line(line)) => line,
             other => panic!("{other:?}"),
         }
     }
@@ -205,7 +205,7 @@ mod tests {
             now += BEAT;
             let found = watch.judge(LIMIT + 2 * BEAT, None, now);
             let reason = "nothing came through it for 2.2 s".to_owned();
-            assert_eq!(found, Some(Finding::Hung(reason)));
+            assert_eq!(found, Some(RouterFinding::Hung(reason)));
             assert_eq!(watch.judge(2 * LIMIT, None, now), None, "once");
             assert!(line(watch.judge(BEAT, None, now)).contains("back"));
         }

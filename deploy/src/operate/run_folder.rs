@@ -176,9 +176,9 @@ pub fn frames_csv(
 }
 
 /// Name of a column, and its value for a tick whose sweep arrived so many milliseconds after the tick.
-type Column = (&'static str, fn(&FrameRecord, Option<f64>) -> String);
+type FrameColumn = (&'static str, fn(&FrameRecord, Option<f64>) -> String);
 
-const COLUMNS: [Column; 28] = [
+const COLUMNS: [FrameColumn; 28] = [
     ("tick", |of, _| of.tick.to_string()),
     ("agent_frame", |of, _| plain(of.agent_frame)),
     ("capture_nanos", |of, _| of.capture_nanos.to_string()),

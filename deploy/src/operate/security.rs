@@ -8,7 +8,7 @@ use protocol::{Principal, RunScope};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::operate::keys::{self, KeyError, KeyPlan};
+use crate::operate::keys::{self, KeyFileError, KeyPlan};
 
 /// Lifetime of the keys of one run, days.
 const DAYS_OF_A_RUN: u32 = 30;
@@ -34,12 +34,12 @@ impl RunKeys {
     /// Uses the folder that the scenario names, or generates keys for `principals` in `run_folder`.
     ///
     /// # Errors
-    /// [`KeyError`] when they cannot be made.
+    /// [`KeyFileError`] when they cannot be made.
     pub fn of(
         security: &Security,
         principals: Vec<Principal>,
         run_folder: &Path,
-    ) -> Result<Self, KeyError> {
+    ) -> Result<Self, KeyFileError> {
         if let Some(folder) = &security.keys {
             let (folder, is_own) = (folder.clone(), false);
             return Ok(Self { folder, is_own });

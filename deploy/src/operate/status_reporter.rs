@@ -12,7 +12,7 @@ use crate::operate::REPLAY;
 use crate::operate::failures::Failures;
 use crate::operate::health::Health;
 use crate::operate::progress::Display;
-use crate::operate::router_watch::{Finding, RouterWatch};
+use crate::operate::router_watch::{RouterFinding, RouterWatch};
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind, Supervisor};
@@ -131,12 +131,12 @@ impl StatusReporter {
                 .iter()
                 .filter(|(name, _)| *name != SCORER);
             match self.router.look(scorer, others.map(|(_, at)| *at).max()) {
-                Some(Finding::Hung(why)) => {
+                Some(RouterFinding::Hung(why)) => {
                     if let Some(router) = router {
                         router.replace(ROUTER, &why);
                     }
                 }
-                Some(Finding::Line(line)) => display.print_line(&line),
+                Some(RouterFinding::Line(line)) => display.print_line(&line),
                 None => {}
             }
             for (name, why) in self.health.look(&progress.last_reports, Instant::now()) {

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::Pace;
+use super::RunPace;
 
 /// Share of the ticks from which a run counts as keeping up.
 const KEEPS_UP: f64 = 0.99;
@@ -65,7 +65,7 @@ impl Capacity {
     }
 
     /// Expected and answered frames of a run, if they differ by more than 15 %.
-    pub(super) fn deviation(&self, pace: &Pace) -> Option<String> {
+    pub(super) fn deviation(&self, pace: &RunPace) -> Option<String> {
         let expected = self.expected_share * pace.ticks as f64;
         let deviation = pace.answered as f64 / expected - 1.0;
         (deviation.abs() > DEVIATION).then(|| {

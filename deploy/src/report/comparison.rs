@@ -14,9 +14,9 @@ use crate::score::metrics::{self, Metrics};
 pub struct Comparison(Vec<(RunReport, Metrics)>);
 
 /// Name of a quantity, and its value in a run.
-type Row = (&'static str, fn(&RunReport, &Metrics) -> String);
+type ReportRow = (&'static str, fn(&RunReport, &Metrics) -> String);
 
-const ROWS: [Row; 16] = [
+const ROWS: [ReportRow; 16] = [
     ("method", |report, _| report.method.clone()),
     ("poses", |report, _| report.pose_source.clone()),
     ("clock", |report, _| report.clock.clone()),

@@ -21,8 +21,8 @@ use support::statistics::{quantile, sorted};
 pub use capacity::{Capacity, Machine};
 pub use clocks::OtherClock;
 pub use comparison::Comparison;
-pub use pace::{AgentPace, Pace};
-pub use resources::{ProcessResources, StageTimes, StreamBytes};
+pub use pace::{AgentPace, RunPace};
+pub use resources::{ProcessResources, StageReport, StreamBytes};
 pub use tracks::{TrackReport, TrackTable};
 
 use crate::score::metrics::Metrics;
@@ -47,11 +47,11 @@ pub struct RunReport {
     /// Estimate from before the run; `None` if none was made.
     pub capacity: Option<Capacity>,
     /// Share of answered ticks, and intervals between detections.
-    pub pace: Pace,
+    pub pace: RunPace,
     /// From the publication of a tick to that of its detections, milliseconds.
     pub latency_ms: Spread,
     /// Stages by kind of process.
-    pub stages: Vec<StageTimes>,
+    pub stages: Vec<StageReport>,
     /// CPU time and memory of every process.
     pub processes: Vec<ProcessResources>,
     /// Published bytes by stream.
@@ -108,7 +108,7 @@ impl RunReport {
         capacity: Option<Capacity>,
     ) -> Self {
         let latencies = records.iter().filter_map(|record| record.latency_ms);
-        let pace = Pace::of(metrics, records, processes);
+        let pace = RunPace::of(metrics, records, processes);
         Self {
             run: run.to_string(),
             method: metrics.method.clone(),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{ProcessId, Role};
+use protocol::Role;
 use serde::{Deserialize, Serialize};
 
 use super::Spread;
@@ -14,7 +14,7 @@ const WHOLE_SWEEP: &str = "agent";
 
 /// Pace of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Pace {
+pub struct RunPace {
     /// Number of ticks of the scene.
     pub ticks: u64,
     /// Number of ticks with detections.
@@ -38,7 +38,7 @@ pub struct AgentPace {
     pub share: f64,
 }
 
-impl Pace {
+impl RunPace {
     pub(super) fn of(
         metrics: &Metrics,
         records: &[FrameRecord],
@@ -85,7 +85,8 @@ fn published_s(record: &FrameRecord) -> Option<f64> {
 fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace> {
     let mut agents = BTreeMap::<String, AgentPace>::new();
     for stats in processes {
-        let Some(cav) = vehicle_of(&stats.process) else {
+        let name = stats.process.as_str().strip_prefix(Role::Agent.as_str());
+        let Some(cav) = name.and_then(|rest| rest.strip_prefix('-')) else {
             continue;
         };
         let pace = agents.entry(cav.to_owned()).or_default();
@@ -97,12 +98,6 @@ fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace>
         };
     }
     agents
-}
-
-/// Vehicle of an agent's process.
-fn vehicle_of(process: &ProcessId) -> Option<&str> {
-    let rest = process.as_str().strip_prefix(Role::Agent.as_str())?;
-    rest.strip_prefix('-')
 }
 
 /// Number of sweeps that an agent has computed.

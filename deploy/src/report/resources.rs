@@ -5,14 +5,14 @@ use std::collections::BTreeMap;
 use protocol::{Role, Topic};
 use serde::{Deserialize, Serialize};
 
-use super::Pace;
+use super::RunPace;
 use super::pace::sweeps;
 use crate::score::ProcessStats;
 
 /// Durations of one stage in the processes of one kind. Of several processes those of the slowest, for which the ego
 /// waits.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct StageTimes {
+pub struct StageReport {
     /// Kind of process: its role.
     pub kind: String,
     /// Number of processes with this stage.
@@ -61,8 +61,8 @@ pub struct StreamBytes {
 }
 
 /// Stages by kind of process, in the order of the data flow, then of their names.
-pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
-    let mut all = BTreeMap::<(usize, String, String), StageTimes>::new();
+pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageReport> {
+    let mut all = BTreeMap::<(usize, String, String), StageReport>::new();
     for stats in processes {
         let (order, kind) = kind_of(stats.process.as_str());
         for stage in &stats.stages {
@@ -92,7 +92,7 @@ fn kind_of(process: &str) -> (usize, String) {
 }
 
 /// CPU time and memory of every process, in the order of the data flow.
-pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessResources> {
+pub(super) fn processes(processes: &[ProcessStats], pace: &RunPace) -> Vec<ProcessResources> {
     let mut all = BTreeMap::<(usize, String), (ProcessResources, u64)>::new();
     for stats in processes {
         let name = stats.process.to_string();

@@ -4,7 +4,7 @@ use std::fmt;
 
 use terminal::text_table::{TextTable, number};
 
-use super::{Pace, RunReport, Spread};
+use super::{RunPace, RunReport, Spread};
 use crate::operate::progress::bytes;
 
 /// Bytes of a MiB.
@@ -40,7 +40,7 @@ impl fmt::Display for RunReport {
     }
 }
 
-impl fmt::Display for Pace {
+impl fmt::Display for RunPace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (ticks, answered) = (self.ticks, self.answered);
         let share = self.answered_share().map_or("-".into(), percent);

@@ -11,8 +11,8 @@ use std::path::Path;
 
 use dataset::ground_truth::{GroundTruth, TrueBox};
 use protocol::{Box3d, DetectionsReport, Track, TracksReport, corners_within};
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
 use terminal::text_table::{TextTable, number};
@@ -22,7 +22,7 @@ use tracking::metrics::{
 use tracking::{Tracker, TrackerConfig};
 
 use super::ReportError;
-use crate::score::{TRACKS, TruthLine};
+use crate::score::{ScenarioLine, TRACKS, TruthLine};
 
 /// Longest line that is read, bytes: a result with the most boxes that a message may hold has less.
 const MAX_LINE_BYTES: u64 = 16 << 20;
@@ -51,23 +51,8 @@ pub struct TrackReport {
     pub quality: TrackQuality,
 }
 
-/// A line with the scenario that it is of, where there are several.
-#[derive(Deserialize)]
-struct OfScenario<T> {
-    scenario: Option<String>,
-    #[serde(flatten)]
-    line: T,
-}
-
 /// Scenario, ego and tick.
-type Key = (Option<String>, String, u64);
-
-/// Lines of a folder by their key; those of the tracks are empty where the ego did not track.
-#[derive(Default)]
-struct Results {
-    detections: HashMap<Key, DetectionsReport>,
-    tracks: HashMap<Key, TracksReport>,
-}
+type TickKey = (Option<String>, String, u64);
 
 /// Tracks of one ego in one scenario.
 struct Followed {
@@ -84,18 +69,19 @@ impl TrackReport {
     /// # Errors
     /// [`ReportError`] names file and line.
     pub fn read(folder: &Path) -> Result<Self, ReportError> {
-        let mut results = Results::default();
+        // No tracks where the ego did not track.
+        let (mut results, mut tracks) = (HashMap::new(), HashMap::new());
         let mut method = None;
         let mut without_truth = 0;
-        let detections = folder.join("detections.jsonl");
-        for_each_line(&detections, |line: OfScenario<DetectionsReport>| {
-            let OfScenario { scenario, line } = line;
+        let file = folder.join("detections.jsonl");
+        for_each_line(&file, |line: ScenarioLine<String, DetectionsReport>| {
+            let ScenarioLine { scenario, line } = line;
             method.get_or_insert_with(|| line.result.method.clone());
             match line.tick {
                 Some(tick) => {
                     let key = (scenario, line.result.ego.to_string(), tick);
                     // Of several results of a tick the first counts, as in the scores of a run.
-                    results.detections.entry(key).or_insert(line);
+                    results.entry(key).or_insert(line);
                 }
                 None => without_truth += 1,
             }
@@ -103,11 +89,11 @@ impl TrackReport {
         })?;
         let recorded = folder.join(TRACKS);
         if recorded.exists() {
-            for_each_line(&recorded, |line: OfScenario<TracksReport>| {
-                let OfScenario { scenario, line } = line;
+            for_each_line(&recorded, |line: ScenarioLine<String, TracksReport>| {
+                let ScenarioLine { scenario, line } = line;
                 if let Some(tick) = line.tick {
                     let key = (scenario, line.result.ego.to_string(), tick);
-                    results.tracks.entry(key).or_insert(line);
+                    tracks.entry(key).or_insert(line);
                 }
                 Ok(())
             })?;
@@ -118,34 +104,32 @@ impl TrackReport {
                 .file_name()
                 .map_or(String::new(), |name| name.display().to_string()),
             method,
-            recorded: !results.tracks.is_empty(),
+            recorded: !tracks.is_empty(),
             ..Self::default()
         };
         let mut followed: Vec<Followed> = Vec::new();
         let truth = folder.join("truth.jsonl");
-        for_each_line(&truth, |OfScenario { scenario, line }| {
-            report.follow(&mut followed, scenario, &line, &mut results)
+        for_each_line(&truth, |line: ScenarioLine<String, TruthLine>| {
+            let ScenarioLine { scenario, line } = line;
+            let key = (scenario, line.ego.to_string(), line.tick);
+            let found = (results.remove(&key), tracks.remove(&key));
+            report.follow(&mut followed, key, &line, found)
         })?;
         // Results with a line of truth were taken out on the way.
-        report.without_truth = without_truth + results.detections.len();
+        report.without_truth = without_truth + results.len();
         let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
         report.quality = TrackQuality::of(&sequences);
         Ok(report)
     }
 
-    /// Takes a tick of the ground truth, and its result.
+    /// Takes a tick of the ground truth, its result, and its recorded tracks.
     fn follow(
         &mut self,
         followed: &mut Vec<Followed>,
-        scenario: Option<String>,
+        (scenario, ego, _): TickKey,
         line: &TruthLine,
-        results: &mut Results,
+        (result, recorded): (Option<DetectionsReport>, Option<TracksReport>),
     ) -> Result<(), String> {
-        let ego = line.ego.to_string();
-        let key = (scenario, ego, line.tick);
-        let result = results.detections.remove(&key);
-        let recorded = results.tracks.remove(&key).map(|line| line.result);
-        let (scenario, ego, _) = key;
         let last = followed
             .iter()
             .rposition(|one| (&one.scenario, &one.ego) == (&scenario, &ego));
@@ -153,7 +137,17 @@ impl TrackReport {
         let index = match last.filter(|&last| followed[last].last_nanos < line.capture_nanos) {
             Some(last) => last,
             None => {
-                followed.push(Followed::new(scenario, ego, &line.truth));
+                let config = TrackerConfig {
+                    area_m: line.truth.area_m,
+                    ..TrackerConfig::default()
+                };
+                followed.push(Followed {
+                    scenario,
+                    ego,
+                    last_nanos: 0,
+                    tracker: Tracker::new(config),
+                    sequence: Sequence::default(),
+                });
                 followed.len() - 1
             }
         };
@@ -166,29 +160,13 @@ impl TrackReport {
         self.without_pose += usize::from(is_unposed);
         let tracks = match result {
             Some(of) if !self.recorded => Some(one.tracker.follow(line.capture_nanos, &of.result)),
-            _ => recorded,
+            _ => recorded.map(|line| line.result),
         };
         let (tracks, left_out) =
             tracks.map_or_else(Default::default, |of| (of.tracks, of.left_out));
         self.rejected_detections += u64::from(left_out);
         let frame = frame(&line.truth, tracks);
         one.sequence.add(frame).map_err(|error| error.to_string())
-    }
-}
-
-impl Followed {
-    fn new(scenario: Option<String>, ego: String, truth: &GroundTruth) -> Self {
-        let config = TrackerConfig {
-            area_m: truth.area_m,
-            ..TrackerConfig::default()
-        };
-        Self {
-            scenario,
-            ego,
-            last_nanos: 0,
-            tracker: Tracker::new(config),
-            sequence: Sequence::default(),
-        }
     }
 }
 

@@ -10,7 +10,7 @@ use bus::shutdown::Stop;
 use bus::{Bus, BusError, Publisher, PublisherOptions, unix_nanos};
 use dataset::{LiveIntensities, Plausibility};
 use protocol::{CavId, Lidar, Limits, Stream, Topic};
-use ros2::{Qos, RosName, RosType, Sweep, SweepLimits, read_point_cloud};
+use ros2::{Qos, RosName, RosSweep, RosType, SweepLimits, read_point_cloud};
 use serde::Serialize;
 use zenoh::bytes::ZBytes;
 
@@ -64,7 +64,7 @@ impl LidarReport {
 }
 
 /// One LiDAR.
-struct Input {
+struct LidarInput {
     cav: CavId,
     topic: RosName,
     publisher: Publisher,
@@ -79,7 +79,7 @@ struct Input {
 
 /// All LiDARs.
 pub(super) struct LidarInputs {
-    inputs: BTreeMap<CavId, Input>,
+    inputs: BTreeMap<CavId, LidarInput>,
     queue: Arc<BoundedQueue<CavId, ZBytes>>,
     superseded: Arc<AtomicU64>,
     report: LidarReport,
@@ -118,7 +118,7 @@ impl LidarInputs {
                         superseded.fetch_add(1, Ordering::Relaxed);
                     }
                 })?;
-            let input = Input {
+            let input = LidarInput {
                 cav: cav.clone(),
                 topic: topic.clone(),
                 publisher,
@@ -162,7 +162,7 @@ impl LidarInputs {
     }
 }
 
-impl Input {
+impl LidarInput {
     fn take(&mut self, bytes: &[u8], report: &mut LidarReport) {
         let sweep = match read_point_cloud(bytes, LIMITS) {
             Ok(sweep) => sweep,
@@ -199,7 +199,12 @@ impl Input {
         }
     }
 
-    fn pass_on(&mut self, mut sweep: Sweep, previous_nanos: Option<u64>, report: &mut LidarReport) {
+    fn pass_on(
+        &mut self,
+        mut sweep: RosSweep,
+        previous_nanos: Option<u64>,
+        report: &mut LidarReport,
+    ) {
         if let Some(reason) = Plausibility::of(&sweep.points).nothing_in_range() {
             report.without_points += 1;
             self.log.warn(&reason);

@@ -93,7 +93,7 @@ pub fn run(
     let presence = bus.announce(Role::Ros2)?;
     let report = std::thread::scope(|scope| {
         let reading = inputs.map(|inputs| scope.spawn(move || inputs.run()));
-        let node = Node::new(scope, (bus, session, options), frames.clone());
+        let node = RunFollower::new(scope, (bus, session, options), frames.clone());
         let followed = node.and_then(|node| node.follow(&subscriber, &members));
         // After an error the threads of the LiDARs have to end too.
         stop.request();
@@ -117,7 +117,7 @@ struct Forwarding<'scope> {
 }
 
 /// State of the thread that follows the run.
-struct Node<'scope, 'env> {
+struct RunFollower<'scope, 'env> {
     scope: &'scope Scope<'scope, 'env>,
     bus: &'env Bus,
     session: &'env RosSession,
@@ -138,7 +138,7 @@ struct Node<'scope, 'env> {
     left_out: u64,
 }
 
-impl<'scope, 'env> Node<'scope, 'env> {
+impl<'scope, 'env> RunFollower<'scope, 'env> {
     fn new(
         scope: &'scope Scope<'scope, 'env>,
         (bus, session, options): (&'env Bus, &'env RosSession, &'env NodeOptions),
@@ -204,7 +204,11 @@ impl<'scope, 'env> Node<'scope, 'env> {
             while let Pop::Item((), event) = members.take(Some(Instant::now())) {
                 self.note(event)?;
             }
-            self.place_robots()?;
+            // The transforms that robots have got since, and the fixed ones if they have changed.
+            for (nanos, frame) in self.frames.odometry_in_map() {
+                self.publish(RosTopic::Tf, ros2::transforms(nanos, &[frame]))?;
+            }
+            self.publish_static_transforms()?;
             match subscriber.take(Some(Instant::now() + POLL_PERIOD)) {
                 Pop::Item(topic, raw) => self.take(&topic, &raw)?,
                 Pop::TimedOut => {}
@@ -250,14 +254,6 @@ impl<'scope, 'env> Node<'scope, 'env> {
             let topic = RosTopic::Vehicle(cav.clone(), *topic);
             self.publishers.remove(&topic);
         }
-    }
-
-    /// The transforms that robots have got since, and the fixed ones if they have changed.
-    fn place_robots(&mut self) -> Result<()> {
-        for (nanos, frame) in self.frames.odometry_in_map() {
-            self.publish(RosTopic::Tf, ros2::transforms(nanos, &[frame]))?;
-        }
-        self.publish_static_transforms()
     }
 
     /// The bodies of vehicles below their LiDARs, and the LiDARs of robots in the robots' own frames: all of them in one
@@ -323,7 +319,15 @@ impl<'scope, 'env> Node<'scope, 'env> {
             if let Some(nanos) = time_nanos.filter(|_| self.publishes_clock) {
                 self.publish(RosTopic::Clock, ros2::clock(nanos))?;
             }
-            self.publish_initial_pose(cav, capture_nanos, &message)?;
+            let publisher = self.publishers.get(&RosTopic::InitialPose);
+            let initial_pose = self.initial_pose.as_mut().and_then(|initial| {
+                initial.of_message(cav, capture_nanos, &message, || {
+                    publisher.is_some_and(RosPublisher::is_wanted)
+                })
+            });
+            if let Some(cdr) = initial_pose {
+                self.publish(RosTopic::InitialPose, cdr)?;
+            }
             if let Message::Pose(estimate) = &message {
                 let pose = estimate.world_from_cav().map(protocol::Pose::isometry);
                 self.frames.note_pose(cav, capture_nanos, pose);
@@ -333,25 +337,6 @@ impl<'scope, 'env> Node<'scope, 'env> {
             self.publish(message.topic, message.cdr)?;
         }
         Ok(())
-    }
-
-    fn publish_initial_pose(
-        &mut self,
-        cav: &CavId,
-        capture_nanos: u64,
-        message: &Message,
-    ) -> Result<()> {
-        let Some(initial) = &mut self.initial_pose else {
-            return Ok(());
-        };
-        let publisher = self.publishers.get(&RosTopic::InitialPose);
-        let cdr = initial.of_message(cav, capture_nanos, message, || {
-            publisher.is_some_and(RosPublisher::is_wanted)
-        });
-        match cdr {
-            Some(cdr) => self.publish(RosTopic::InitialPose, cdr),
-            None => Ok(()),
-        }
     }
 
     fn declare(&mut self, topic: RosTopic) -> Result<()> {

@@ -17,14 +17,14 @@ const HEARTBEAT: Duration = Duration::from_millis(500);
 
 /// A publisher; its token is withdrawn when this is dropped.
 pub(super) struct RosPublisher {
-    kind: Kind,
+    kind: QosKind,
     gid: Gid,
     /// Number of messages so far.
     published: i64,
     _token: LivelinessToken,
 }
 
-enum Kind {
+enum QosKind {
     /// Volatile.
     Plain {
         publisher: zenoh::pubsub::Publisher<'static>,
@@ -51,11 +51,11 @@ impl RosPublisher {
             let cache = CacheConfig::default().max_samples(qos.depth as usize);
             let sequence = MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT);
             let builder = builder.cache(cache).sample_miss_detection(sequence);
-            Kind::Latched(builder.publisher_detection().wait().map_err(refused)?)
+            QosKind::Latched(builder.publisher_detection().wait().map_err(refused)?)
         } else {
             let publisher = builder.wait().map_err(refused)?;
             let has_subscribers = bus::has_subscribers(&publisher).map_err(refused)?;
-            Kind::Plain {
+            QosKind::Plain {
                 publisher,
                 has_subscribers,
             }
@@ -71,10 +71,10 @@ impl RosPublisher {
     /// True if a message would reach somebody, now or later.
     pub(super) fn is_wanted(&self) -> bool {
         match &self.kind {
-            Kind::Plain {
+            QosKind::Plain {
                 has_subscribers, ..
             } => has_subscribers.load(Ordering::Relaxed),
-            Kind::Latched(_) => true,
+            QosKind::Latched(_) => true,
         }
     }
 
@@ -89,8 +89,8 @@ impl RosPublisher {
         }
         .to_bytes();
         let put = match &self.kind {
-            Kind::Plain { publisher, .. } => publisher.put(cdr).attachment(attachment).wait(),
-            Kind::Latched(publisher) => publisher.put(cdr).attachment(attachment).wait(),
+            QosKind::Plain { publisher, .. } => publisher.put(cdr).attachment(attachment).wait(),
+            QosKind::Latched(publisher) => publisher.put(cdr).attachment(attachment).wait(),
         };
         put.map_err(|cause| BusError::zenoh("publishing on the ROS 2 network", &cause))
     }

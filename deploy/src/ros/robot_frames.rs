@@ -26,12 +26,12 @@ const VALID_NANOS: u64 = 200_000_000;
 /// Robots with an odometry, and the transforms of the network.
 #[derive(Debug, Clone)]
 pub(super) struct RobotFrames {
-    state: Arc<Mutex<State>>,
+    state: Arc<Mutex<FramesState>>,
     mount: Option<Mount>,
 }
 
 #[derive(Debug, Default)]
-struct State {
+struct FramesState {
     tree: TransformTree,
     robots: BTreeMap<CavId, Robot>,
     /// Poses for which there were no transforms.
@@ -64,9 +64,9 @@ enum NoPlace {
 impl RobotFrames {
     /// Frames of `robots`. `mount` is the place of their LiDARs on their bodies; without it that of tf holds.
     pub(super) fn of(robots: impl Iterator<Item = CavId>, mount: Option<Mount>) -> Self {
-        let state = State {
+        let state = FramesState {
             robots: robots.map(|cav| (cav, Robot::default())).collect(),
-            ..State::default()
+            ..FramesState::default()
         };
         Self {
             state: Arc::new(Mutex::new(state)),
@@ -192,7 +192,7 @@ impl RobotFrames {
     }
 }
 
-impl State {
+impl FramesState {
     fn note_odometry(&mut self, cav: &CavId, transform: &Transform) {
         self.tree.add(transform, Origin::Odometry);
         let Some(base) = &transform.child else { return };

@@ -4,7 +4,7 @@ use std::any::Any;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use bus::BusError;
-use ros2::endpoint::{Endpoint, EndpointKind, Node, gid};
+use ros2::endpoint::{EndpointKind, Node, RosEndpoint, gid};
 use ros2::{Distribution, Qos, RosName, RosTopic, RosType};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::sample::{Locality, Sample};
@@ -111,7 +111,7 @@ impl RosSession {
         qos: Qos,
     ) -> String {
         let id = self.endpoints.fetch_add(1, Ordering::Relaxed) + 1;
-        self.node.endpoint_token(&Endpoint {
+        self.node.endpoint_token(&RosEndpoint {
             id,
             kind,
             topic,

@@ -7,7 +7,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
-use bus::{Bus, BusError, RawMessage};
+use bus::{Bus, BusError};
 use protocol::{CavId, KeyExpr, Kind, Limits, Stream, Topic, wire};
 use ros2::{FrameNames, Translator};
 
@@ -38,25 +38,17 @@ pub(super) fn forward(
             let Pop::Item(_, raw) = subscriber.take(Some(Instant::now() + POLL_PERIOD)) else {
                 continue;
             };
-            for message in translated(&mut translator, &topic, &raw) {
-                publisher.publish(message.cdr)?;
+            match wire::decode_any(raw.pieces(), &Limits::DEFAULT) {
+                Ok((header, _)) if header.kind == Kind::Control => {}
+                Ok((header, message)) => {
+                    let capture_nanos = header.stamp.capture_nanos;
+                    for message in translator.translate(&topic, capture_nanos, &message) {
+                        publisher.publish(message.cdr)?;
+                    }
+                }
+                Err(error) => tracing::warn!("{}: left out: {error}", raw.key),
             }
         }
     }
     Ok(())
-}
-
-fn translated(
-    translator: &mut Translator,
-    topic: &Topic,
-    raw: &RawMessage,
-) -> Vec<ros2::RosMessage> {
-    match wire::decode_any(raw.pieces(), &Limits::DEFAULT) {
-        Ok((header, _)) if header.kind == Kind::Control => Vec::new(),
-        Ok((header, message)) => translator.translate(topic, header.stamp.capture_nanos, &message),
-        Err(error) => {
-            tracing::warn!("{}: left out: {error}", raw.key);
-            Vec::new()
-        }
-    }
 }

@@ -25,11 +25,11 @@ pub(super) enum Origin {
 
 /// Frames by name.
 #[derive(Debug, Default)]
-pub(super) struct TransformTree(BTreeMap<String, Frame>);
+pub(super) struct TransformTree(BTreeMap<String, TreeFrame>);
 
 /// A frame in its parent.
 #[derive(Debug)]
-struct Frame {
+struct TreeFrame {
     parent: String,
     origin: Origin,
     parent_from_frame: TimeSeries<Isometry3<f64>>,
@@ -69,14 +69,14 @@ impl TransformTree {
             return false;
         }
         let frame = self.0.entry(child.clone());
-        let frame = frame.or_insert_with(|| Frame::below(parent, origin));
+        let frame = frame.or_insert_with(|| TreeFrame::below(parent, origin));
         // The frame has its place from a better origin: valid, but left out.
         if frame.origin > origin {
             return true;
         }
         // Under another parent, or from a better origin, the old poses mean nothing.
         if frame.origin != origin || frame.parent != *parent {
-            *frame = Frame::below(parent, origin);
+            *frame = TreeFrame::below(parent, origin);
         }
         let pose = transform.parent_from_child.isometry();
         frame.parent_from_frame.add(transform.nanos, pose);
@@ -109,7 +109,7 @@ impl TransformTree {
     }
 }
 
-impl Frame {
+impl TreeFrame {
     fn below(parent: &str, origin: Origin) -> Self {
         Self {
             parent: parent.to_owned(),

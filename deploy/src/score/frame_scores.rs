@@ -7,9 +7,9 @@ use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use protocol::{CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
 use super::frame_record::{FrameRecord, JudgedFrame};
-use super::live_precision::{Answer, LivePrecision, TickTruth};
+use super::live_precision::{LivePrecision, TickAnswer, TickTruth};
 use super::neighbours::{self, NeighbourRecord};
-use super::open_ticks::{OpenTicks, Tick};
+use super::open_ticks::{OpenTick, OpenTicks};
 use super::precision::{FrameCounts, by_iou, by_part, precision_recall_csv};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::ground_truth;
@@ -156,13 +156,13 @@ impl FrameScores {
         steps.map(|nanos| nanos as f64 * 1e-9).sum()
     }
 
-    fn add(&mut self, stamp: &Stamp, fill: impl FnOnce(&mut Tick)) {
+    fn add(&mut self, stamp: &Stamp, fill: impl FnOnce(&mut OpenTick)) {
         if let Some((capture_nanos, tick)) = self.open.add(stamp, fill) {
             self.judge(capture_nanos, tick);
         }
     }
 
-    fn judge(&mut self, capture_nanos: u64, tick: Tick) {
+    fn judge(&mut self, capture_nanos: u64, tick: OpenTick) {
         let Some((began_nanos, truth)) = tick.truth else {
             return;
         };
@@ -231,8 +231,8 @@ impl FrameScores {
             world_from_ego,
             truth: objects,
         };
-        let published = answer.as_ref().map(|(_, published_nanos, result)| Answer {
-            published_nanos: *published_nanos,
+        let published = answer.as_ref().map(|(_, nanos, result)| TickAnswer {
+            published_nanos: *nanos,
             detections: &result.detections,
         });
         let mut record = FrameRecord {

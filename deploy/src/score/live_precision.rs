@@ -20,13 +20,13 @@ pub(super) struct LivePrecision {
     ticks: u64,
     all_ticks: Scorer,
     streaming: Scorer,
-    published: VecDeque<Published>,
+    published: VecDeque<PublishedAnswer>,
     /// True if a result has no time of publication.
     is_untimed: bool,
 }
 
 /// Detections, their time of publication, and tick and pose of the ego at their capture.
-struct Published {
+struct PublishedAnswer {
     nanos: u64,
     tick: u64,
     began_nanos: u64,
@@ -47,7 +47,7 @@ pub(super) struct TickTruth<'a> {
 }
 
 /// Detections of a tick.
-pub(super) struct Answer<'a> {
+pub(super) struct TickAnswer<'a> {
     /// Time of publication, nanoseconds; `None` without a clock.
     pub(super) published_nanos: Option<u64>,
     /// In the ego's LiDAR frame at the capture.
@@ -60,14 +60,22 @@ impl LivePrecision {
     pub(super) fn add(
         &mut self,
         truth: &TickTruth<'_>,
-        answer: Option<Answer<'_>>,
+        answer: Option<TickAnswer<'_>>,
     ) -> Option<StreamedResult> {
         self.ticks += 1;
         self.answered += u64::from(answer.is_some());
         let detections = answer.as_ref().map_or(&[][..], |answer| answer.detections);
         self.all_ticks.add(detections, truth.truth);
         // Before the result of this tick is added: it is published after the tick.
-        let streamed = self.stream(truth);
+        let known = self.newest(truth);
+        let moved = known.as_ref().map_or(&[][..], |(_, moved)| moved);
+        let verdicts = self.streaming.add(moved, truth.truth);
+        let FrameCounts { detected, found } = FrameCounts::of(&self.streaming, &verdicts);
+        let streamed = known.map(|(of, _)| StreamedResult {
+            detected,
+            found,
+            ..of
+        });
         let Some(answer) = answer else {
             return streamed;
         };
@@ -75,7 +83,7 @@ impl LivePrecision {
             self.is_untimed = true;
             return streamed;
         };
-        self.published.push_back(Published {
+        self.published.push_back(PublishedAnswer {
             nanos,
             tick: truth.tick,
             began_nanos: truth.began_nanos,
@@ -106,19 +114,6 @@ impl LivePrecision {
     /// Streaming average precision, ordered by score; `None` if results have no time of publication.
     pub(super) fn streaming(&self) -> Option<ByIou> {
         (self.ticks > 0 && !self.is_untimed).then(|| by_iou(&self.streaming, Ordering::Global))
-    }
-
-    /// Scores the detections that are newest at a tick.
-    fn stream(&mut self, truth: &TickTruth<'_>) -> Option<StreamedResult> {
-        let known = self.newest(truth);
-        let detections = known.as_ref().map_or(&[][..], |(_, detections)| detections);
-        let verdicts = self.streaming.add(detections, truth.truth);
-        let FrameCounts { detected, found } = FrameCounts::of(&self.streaming, &verdicts);
-        known.map(|(of, _)| StreamedResult {
-            detected,
-            found,
-            ..of
-        })
     }
 
     /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick. Older
@@ -189,7 +184,7 @@ mod tests {
                 source: None,
             }];
             let published_nanos = Some(began_nanos + latency_ms * 1_000_000);
-            let answer = answered.contains(&tick).then_some(Answer {
+            let answer = answered.contains(&tick).then_some(TickAnswer {
                 published_nanos,
                 detections: &found,
             });
@@ -266,7 +261,7 @@ mod tests {
         for (tick, truth) in (0..).zip(&[truth_at(-48.0), truth_at(10.0)]) {
             let began_nanos = 1_000 * tick;
             let world_from_ego = Some(Pose::from_xyz_yaw([5.0 * tick as f64, 0.0, 0.0], 0.0));
-            let answer = (tick == 0).then_some(Answer {
+            let answer = (tick == 0).then_some(TickAnswer {
                 published_nanos: Some(began_nanos),
                 detections: &found,
             });
@@ -307,7 +302,7 @@ mod tests {
         };
         live.add(
             &truth,
-            Some(Answer {
+            Some(TickAnswer {
                 published_nanos: None,
                 detections: &found,
             }),

@@ -23,6 +23,7 @@ pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
 pub(crate) use node::SCORER;
 pub use node::{ProcessStats, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
+pub use result_lines::ScenarioLine;
 pub use stage_stamps::StageStamps;
 pub(crate) use true_boxes::ground_truth;
 pub use truth_line::TruthLine;

@@ -128,7 +128,7 @@ pub struct ScorerNode {
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
     thread: JoinHandle<(FrameScores, ScoreStats, [u64; 3])>,
-    connection: Connection,
+    connection: ScorerConnection,
 }
 
 impl ScorerNode {
@@ -171,7 +171,7 @@ impl ScorerNode {
         let (detections, truth_lines) = (lines(detections)?, lines(truth)?);
         let tracks = tracks.as_ref().map(lines).transpose()?;
         let progress = Arc::<Mutex<Progress>>::default();
-        let worker = Worker {
+        let worker = ScorerWorker {
             inbox: Arc::clone(&inbox),
             bus_stats: bus.stats().clone(),
             scores,
@@ -193,7 +193,7 @@ impl ScorerNode {
             inbox,
             progress,
             thread,
-            connection: Connection {
+            connection: ScorerConnection {
                 bus,
                 offline,
                 subscriptions,
@@ -248,7 +248,7 @@ impl ScorerNode {
         scored
     }
 
-    fn scored(self) -> (Scored, Connection) {
+    fn scored(self) -> (Scored, ScorerConnection) {
         // A closed queue is still read to its end.
         self.inbox.close();
         let joined = self.thread.join();
@@ -279,7 +279,7 @@ impl ScorerNode {
 }
 
 /// Connection of a scorer: its bus, subscriptions and liveliness token.
-struct Connection {
+struct ScorerConnection {
     bus: Bus,
     offline: OfflineIntervals,
     subscriptions: Vec<Subscription>,
@@ -295,7 +295,7 @@ pub fn scorer_cav() -> CavId {
 }
 
 /// Thread of the scorer.
-struct Worker {
+struct ScorerWorker {
     inbox: Arc<Inbox>,
     bus_stats: bus::MessageStats,
     scores: FrameScores,
@@ -312,7 +312,7 @@ struct Worker {
     published: BTreeMap<u64, u64>,
 }
 
-impl Worker {
+impl ScorerWorker {
     fn run(mut self) -> (FrameScores, ScoreStats, [u64; 3]) {
         loop {
             match self.inbox.take(None) {

@@ -15,12 +15,12 @@ const ROLES: [Role; 4] = [Role::Agent, Role::Ego, Role::Link, Role::Replay];
 
 /// Records the processes that leave and rejoin.
 pub(crate) struct OfflineIntervals {
-    state: Arc<Mutex<State>>,
+    state: Arc<Mutex<Departures>>,
     _watches: Vec<LivelinessSubscription>,
 }
 
 #[derive(Default)]
-struct State {
+struct Departures {
     /// Offline now.
     gone: BTreeSet<String>,
     /// Were offline and rejoined.
@@ -33,7 +33,7 @@ impl OfflineIntervals {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub(crate) fn watch(bus: &Bus) -> Result<Self, BusError> {
-        let state = Arc::<Mutex<State>>::default();
+        let state = Arc::<Mutex<Departures>>::default();
         let watches = ROLES.into_iter().map(|role| {
             let state = Arc::clone(&state);
             bus.watch(role, move |event| {
@@ -44,9 +44,8 @@ impl OfflineIntervals {
                     }
                     LivelinessEvent::Joined { role, cav } => {
                         let name = process_id(role, &cav).to_string();
-                        if state.gone.remove(&name) {
-                            state.returned.insert(name);
-                        }
+                        let rejoined = state.gone.take(&name);
+                        state.returned.extend(rejoined);
                     }
                 }
             })

@@ -9,7 +9,7 @@ pub(super) const MOST_OPEN: usize = 64;
 
 /// Messages of one tick so far.
 #[derive(Default)]
-pub(super) struct Tick {
+pub(super) struct OpenTick {
     /// Ground truth and its time of publication, nanoseconds.
     pub(super) truth: Option<(u64, Truth)>,
     /// Result of the ego and its time of publication, nanoseconds.
@@ -23,7 +23,7 @@ pub(super) struct Tick {
 /// Incomplete ticks, by capture time.
 #[derive(Default)]
 pub(super) struct OpenTicks {
-    open: BTreeMap<u64, Tick>,
+    open: BTreeMap<u64, OpenTick>,
     closed_until: Option<u64>,
 }
 
@@ -33,8 +33,8 @@ impl OpenTicks {
     pub(super) fn add(
         &mut self,
         stamp: &Stamp,
-        fill: impl FnOnce(&mut Tick),
-    ) -> Option<(u64, Tick)> {
+        fill: impl FnOnce(&mut OpenTick),
+    ) -> Option<(u64, OpenTick)> {
         let capture_nanos = stamp.capture_nanos;
         if { self.closed_until }.is_some_and(|closed| capture_nanos <= closed) {
             return None;
@@ -46,7 +46,7 @@ impl OpenTicks {
     }
 
     /// Removes the oldest tick.
-    pub(super) fn close_oldest(&mut self) -> Option<(u64, Tick)> {
+    pub(super) fn close_oldest(&mut self) -> Option<(u64, OpenTick)> {
         let (capture_nanos, tick) = self.open.pop_first()?;
         self.closed_until = Some(capture_nanos);
         Some((capture_nanos, tick))

@@ -4,6 +4,19 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
+use serde::{Deserialize, Serialize};
+
+/// A line, with the scenario that it is of where there are several.
+#[derive(Debug, Serialize, Deserialize)]
+pub struct ScenarioLine<S, T> {
+    /// Name of the scenario.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<S>,
+    /// The result or tick.
+    #[serde(flatten)]
+    pub line: T,
+}
+
 /// Size of the buffer that waits for a full disk, bytes: some hundred lines.
 const WAITING: usize = 1 << 20;
 

@@ -14,8 +14,8 @@ use protocol::{
 use super::judgement::{DetectionArea, Judge, Judgement};
 use super::pace_counter::PaceCounter;
 use super::scene_frame::{
-    Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, ShownTrack, Vehicle,
-    decimate,
+    Link, MessageCounts, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, ShownTrack,
+    ShownVehicle, decimate,
 };
 use super::trails::Trails;
 
@@ -74,11 +74,11 @@ struct OpenFrame {
     sweeps: BTreeMap<CavId, Vec<u8>>,
     own_boxes: BTreeMap<CavId, Boxes>,
     /// Latest arrival from a vehicle: after the link, if there is one.
-    arrivals: BTreeMap<CavId, Arrival>,
+    arrivals: BTreeMap<CavId, LatestArrival>,
 }
 
 /// Arrival of a message from a vehicle.
-struct Arrival {
+struct LatestArrival {
     /// Preference: after the link before ahead of it, data before poses.
     rank: u8,
     stream: Stream,
@@ -115,7 +115,12 @@ impl FrameAssembler {
         let at = seen.header.stamp.capture_nanos;
         match seen.topic {
             Topic::Stats(_) => {
-                self.keep_ledger(seen);
+                if let Some(stats) = decode::<Stats>(seen) {
+                    let process = stats.process.to_string();
+                    if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
+                        self.ledgers.insert(process, (stats.ledger, stats.stages));
+                    }
+                }
                 return None;
             }
             Topic::Truth => self.begin_again_with(seen.header.stamp.epoch),
@@ -196,16 +201,6 @@ impl FrameAssembler {
             egos: self.egos.iter().cloned().collect(),
             ..frame.frame(capture_nanos, &self.ledgers, &judgement)
         })
-    }
-
-    fn keep_ledger(&mut self, seen: &ReceivedMessage<'_>) {
-        let Some(stats) = decode::<Stats>(seen) else {
-            return;
-        };
-        let process = stats.process.to_string();
-        if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
-            self.ledgers.insert(process, (stats.ledger, stats.stages));
-        }
     }
 
     /// Another replay of the same run begins at its own first tick, which the frames shown so far do not hide.
@@ -289,7 +284,7 @@ impl FrameAssembler {
         let arrivals = &mut self.frame(at).arrivals;
         // Of equal rank the later message counts.
         if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
-            let arrival = Arrival {
+            let arrival = LatestArrival {
                 rank,
                 stream,
                 latency_ms,
@@ -375,7 +370,7 @@ impl OpenFrame {
     }
 
     /// Every vehicle, the ego first, and their points.
-    fn vehicles(&self) -> (Vec<Vehicle>, Vec<u8>) {
+    fn vehicles(&self) -> (Vec<ShownVehicle>, Vec<u8>) {
         let ego = self.result().map(|result| &result.ego);
         let in_truth = self.true_agents().map(|agent| &agent.cav);
         let with_messages = self.poses.keys().chain(self.sweeps.keys());
@@ -390,7 +385,7 @@ impl OpenFrame {
         (vehicles.collect(), points)
     }
 
-    fn vehicle(&self, cav: &CavId, points: &mut Vec<u8>) -> Vehicle {
+    fn vehicle(&self, cav: &CavId, points: &mut Vec<u8>) -> ShownVehicle {
         let truth = self.true_pose(cav);
         let own_result = self.result().filter(|result| result.ego == *cav);
         // The ego's result repeats its pose, for ticks whose pose message is missing.
@@ -400,9 +395,11 @@ impl OpenFrame {
             .map(|(_, estimate)| estimate)
             .or(own_result.map(|result| &result.pose));
         let pose = estimate.and_then(PoseEstimate::world_from_cav);
-        let sweep = self.sweep(cav);
+        let payload = self.sweeps.get(cav);
+        let sweep = payload.and_then(|payload| decoded::<Lidar>(payload));
+        let sweep = sweep.map_or(Vec::new(), |Lidar { points }| decimate(&points));
         points.extend(&sweep);
-        Vehicle {
+        ShownVehicle {
             cav: cav.clone(),
             pose: pose.map(Planar::of),
             confidence: pose.and(estimate).map(PoseEstimate::confidence),
@@ -421,14 +418,6 @@ impl OpenFrame {
             world_from_lidar: pose.or(truth).copied(),
             points: sweep.len() / POINT_BYTES,
         }
-    }
-
-    fn sweep(&self, cav: &CavId) -> Vec<u8> {
-        let sweep = self
-            .sweeps
-            .get(cav)
-            .and_then(|payload| decoded::<Lidar>(payload));
-        sweep.map_or(Vec::new(), |Lidar { points }| decimate(&points))
     }
 
     fn true_boxes(&self, judgement: &Judgement) -> Vec<ShownBox> {
@@ -544,10 +533,10 @@ impl OpenFrame {
 }
 
 /// Sum of all ledgers.
-fn messages<'a>(ledgers: impl Iterator<Item = &'a Ledger>) -> Vec<Messages> {
+fn messages<'a>(ledgers: impl Iterator<Item = &'a Ledger>) -> Vec<MessageCounts> {
     let mut sum = Ledger::default();
     ledgers.for_each(|ledger| sum.merge(ledger));
-    let lines = sum.iter().map(|(account, counts)| Messages {
+    let lines = sum.iter().map(|(account, counts)| MessageCounts {
         topic: account.topic.to_string(),
         to: account.to.as_ref().map(ToString::to_string),
         sent: counts.sent,

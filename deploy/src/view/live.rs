@@ -57,12 +57,12 @@ type NewestFrames = BTreeMap<Option<CavId>, watch::Sender<Bytes>>;
 /// closed page costs nothing. Points are those of previews, which are sent only while they have a subscriber.
 pub struct LiveRun {
     run: RunId,
-    shared: Arc<Shared>,
+    shared: Arc<LiveState>,
     thread: Option<JoinHandle<()>>,
 }
 
 /// State of a live run: the thread writes it, pages read it.
-struct Shared {
+struct LiveState {
     newest: Mutex<NewestFrames>,
     activity: Mutex<RunActivity>,
     images: NewestImages,
@@ -72,7 +72,7 @@ struct Shared {
 
 /// Status of a live run: time since its last message, end, connection.
 #[derive(Debug, Clone, Serialize)]
-pub(super) struct RunStatus {
+pub(super) struct LiveStatus {
     /// Time since the last message of the scene, seconds; `None`: there was none since a page is open.
     pub(super) silent_s: Option<f64>,
     /// Time since the last result, or since the first message where there was no result, seconds.
@@ -87,7 +87,7 @@ pub(super) struct RunStatus {
     pub(super) images_left_out: usize,
 }
 
-/// State behind [`RunStatus`].
+/// State behind [`LiveStatus`].
 #[derive(Debug, Default)]
 struct RunActivity {
     last_message: Option<Instant>,
@@ -106,14 +106,14 @@ impl LiveRun {
     /// [`BusError`] when the system gives no thread.
     pub fn start(bus: Bus, protocol: Option<EvaluationProtocol>) -> Result<Self, BusError> {
         let run = bus.identity().run.clone();
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(LiveState {
             newest: Mutex::default(),
             activity: Mutex::default(),
             images: OnDemand::new(MOST_IMAGES),
             maps: OnDemand::new(MOST_MAPS),
             ending: AtomicBool::new(false),
         });
-        let listener = Listener {
+        let listener = LiveListener {
             bus,
             run: run.clone(),
             shared: Arc::clone(&shared),
@@ -140,9 +140,9 @@ impl LiveRun {
     }
 
     /// State of the run.
-    pub(super) fn status(&self) -> RunStatus {
+    pub(super) fn status(&self) -> LiveStatus {
         let activity = lock(&self.shared.activity);
-        RunStatus {
+        LiveStatus {
             silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
             unanswered_s: activity.answered.map(|at| at.elapsed().as_secs_f64()),
             problems: activity
@@ -224,10 +224,10 @@ impl Drop for LiveRun {
 }
 
 /// State of the thread.
-struct Listener {
+struct LiveListener {
     bus: Bus,
     run: RunId,
-    shared: Arc<Shared>,
+    shared: Arc<LiveState>,
     /// Scene frames of the first ego with results.
     assembly: FrameAssembler,
     /// Scene frames of the egos that pages name.
@@ -249,7 +249,7 @@ fn subscribe(bus: &Bus, run: &RunId) -> Result<[PassiveSubscriber; 2], BusError>
     Ok([previews, bus.tap(&selectors, PLACES)?])
 }
 
-impl Listener {
+impl LiveListener {
     fn run(mut self) {
         let mut subscriptions: Option<[PassiveSubscriber; 2]> = None;
         let (mut cameras, mut maps) = (None, None);

@@ -17,11 +17,11 @@ const MOST_LEFT_OUT: usize = 1024;
 pub(super) struct OnDemand<K, V> {
     /// Largest number of keys that are kept.
     most: usize,
-    state: Mutex<State<K, V>>,
+    state: Mutex<OnDemandState<K, V>>,
 }
 
 #[derive(Debug)]
-struct State<K, V> {
+struct OnDemandState<K, V> {
     /// Last request for each key.
     asked: BTreeMap<K, Instant>,
     newest: BTreeMap<K, V>,
@@ -31,7 +31,7 @@ struct State<K, V> {
 impl<K: Ord + Clone, V: Clone> OnDemand<K, V> {
     /// Keeps the values of up to `most` keys.
     pub(super) fn new(most: usize) -> Self {
-        let state = State {
+        let state = OnDemandState {
             asked: BTreeMap::new(),
             newest: BTreeMap::new(),
             left_out: BTreeSet::new(),

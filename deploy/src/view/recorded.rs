@@ -46,7 +46,7 @@ const SHOWN_SCORE: f32 = 0.2;
 pub struct RecordedRun {
     recording: Recording,
     name: String,
-    moments: Vec<Moment>,
+    moments: Vec<RecordedMoment>,
     /// One for each ego, in the order of their first results; one for a run without results.
     timelines: Vec<Timeline>,
     /// Arrival time of each sweep at the ego's agent, if the run recorded it.
@@ -59,7 +59,7 @@ pub struct RecordedRun {
 }
 
 /// One scene frame: its messages in the recording.
-struct Moment {
+struct RecordedMoment {
     capture_nanos: u64,
     /// Time of publication of its truth.
     began_nanos: Option<u64>,
@@ -294,12 +294,12 @@ impl RecordedRun {
     }
 
     /// `None` if there is neither truth nor result.
-    fn moment(&self, capture_nanos: u64, entries: Vec<usize>) -> Option<Moment> {
+    fn moment(&self, capture_nanos: u64, entries: Vec<usize>) -> Option<RecordedMoment> {
         let mut all = entries.iter().map(|index| self.entry(*index));
         let truth = all.clone().find(|entry| entry.key.topic == Topic::Truth);
         let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
         let is_shown = truth.is_some() || all.any(|entry| is_result(&entry.key.topic));
-        is_shown.then_some(Moment {
+        is_shown.then_some(RecordedMoment {
             capture_nanos,
             began_nanos,
             entries,
@@ -367,7 +367,7 @@ impl RecordedRun {
             .get(index)
             .map_or(0, |moment| moment.capture_nanos);
         let until = self.moments.iter().zip(&timeline.tracks).take(index + 1);
-        for (Moment { capture_nanos, .. }, tracks) in until {
+        for (RecordedMoment { capture_nanos, .. }, tracks) in until {
             if Trails::covers(now_nanos, *capture_nanos) {
                 let tracks = tracks.as_ref();
                 shown = tracks.map_or(Vec::new(), |tracks| trails.add(*capture_nanos, tracks));
@@ -376,7 +376,7 @@ impl RecordedRun {
         shown
     }
 
-    fn entries_of<'a>(&'a self, moment: &'a Moment) -> impl Iterator<Item = &'a Entry> {
+    fn entries_of<'a>(&'a self, moment: &'a RecordedMoment) -> impl Iterator<Item = &'a Entry> {
         moment.entries.iter().map(|index| self.entry(*index))
     }
 
@@ -398,7 +398,7 @@ impl RecordedRun {
 
     fn summary(
         &self,
-        moment: &Moment,
+        moment: &RecordedMoment,
         ego: Option<&CavId>,
         judge: &mut Judge,
     ) -> Result<MomentSummary> {

@@ -39,7 +39,7 @@ pub struct SceneFrame {
     /// From the publication of the tick to that of the ego's pose, milliseconds.
     pub posed_ms: Option<f64>,
     /// Every vehicle from which a message was captured.
-    pub vehicles: Vec<Vehicle>,
+    pub vehicles: Vec<ShownVehicle>,
     /// True objects, each once.
     pub truth: Vec<ShownBox>,
     /// Detections of the ego, placed by its estimated pose.
@@ -63,7 +63,7 @@ pub struct SceneFrame {
     /// Durations of the stages of each process.
     pub processes: Vec<Process>,
     /// Messages of all processes so far, by topic and receiver.
-    pub messages: Vec<Messages>,
+    pub messages: Vec<MessageCounts>,
     /// Points after the JSON document, in order of `vehicles`; three 16-bit numbers each, centimetres.
     #[serde(skip)]
     pub points: Vec<u8>,
@@ -71,7 +71,7 @@ pub struct SceneFrame {
 
 /// A vehicle in a scene frame.
 #[derive(Debug, Clone, Serialize)]
-pub struct Vehicle {
+pub struct ShownVehicle {
     /// Id of the vehicle.
     pub cav: CavId,
     /// Estimated pose.
@@ -181,7 +181,7 @@ pub struct Process {
 
 /// Counters of one topic towards one receiver, or at its sender.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Messages {
+pub struct MessageCounts {
     /// The topic.
     pub topic: String,
     /// The receiving process; `None`: counted by the sender.
@@ -196,7 +196,7 @@ pub struct Messages {
 
 impl SceneFrame {
     /// Every vehicle with its points, metres in the frame of its LiDAR.
-    pub fn clouds(&self) -> impl Iterator<Item = (&Vehicle, Vec<[f32; 3]>)> {
+    pub fn clouds(&self) -> impl Iterator<Item = (&ShownVehicle, Vec<[f32; 3]>)> {
         let mut rest = self.points.as_slice();
         self.vehicles.iter().map(move |vehicle| {
             // A frame that is cut off has fewer points, and is no reason to panic.

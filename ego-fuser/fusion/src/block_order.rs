@@ -37,13 +37,8 @@ impl BlockOrder {
     pub fn tokens(&self, maps: &Tensor) -> Result<Tensor, TchError> {
         let (count, channels, height, width) = maps.size4()?;
         let levels = self.edges.len() as i64 + 1;
-        let shape = [
-            vec![count],
-            self.split(height),
-            self.split(width),
-            vec![channels],
-        ]
-        .concat();
+        let sizes = [self.split(height), self.split(width)].concat();
+        let shape = [&[count][..], &sizes, &[channels]].concat();
         // Row and column of a level side by side, the largest windows first: then each window is one run.
         let by_level = (0..levels).flat_map(|level| [1 + level, 1 + levels + level]);
         let order: Vec<i64> = [0]
@@ -66,15 +61,10 @@ impl BlockOrder {
         let (count, _, channels) = tokens.size3()?;
         let (rows, columns) = (self.split(height), self.split(width));
         let last = 2 * rows.len() as i64 + 1;
-        let sizes = rows
-            .iter()
-            .zip(&columns)
-            .flat_map(|(&row, &column)| [row, column]);
+        let sizes = (0..rows.len()).flat_map(|level| [rows[level], columns[level]]);
         let shape: Vec<i64> = [count].into_iter().chain(sizes).chain([channels]).collect();
         // The inverse: the rows of all levels, which are the odd dimensions, then the columns of all levels.
-        let halves = [1, 2]
-            .into_iter()
-            .flat_map(|first| (first..last).step_by(2));
+        let halves = (1..last).step_by(2).chain((2..last).step_by(2));
         let order: Vec<i64> = [0].into_iter().chain(halves).chain([last]).collect();
         let channels_last = tokens.f_view(shape.as_slice())?.f_permute(order)?;
         channels_last

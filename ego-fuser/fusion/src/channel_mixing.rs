@@ -11,7 +11,7 @@ use protocol::Pose;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-use crate::f64_tensor::{Order, are_numbers, flat, with_order};
+use crate::f64_tensor::{Order, are_numbers, with_order};
 
 /// Name of the parameter in weights files; absent in weights that were trained without it.
 pub(crate) const WEIGHT: &str = "steering.weight";
@@ -60,7 +60,8 @@ impl ChannelMixing {
         }
         let result = with_order(features, order)?;
         for (map, matrix) in (0..).zip(&matrices) {
-            let (from, mut to) = (flat(&features.f_get(map)?)?, flat(&result.f_get(map)?)?);
+            let from = features.f_get(map)?.f_flatten(1, 2)?;
+            let mut to = result.f_get(map)?.f_flatten(1, 2)?;
             match matrix {
                 Some(matrix) => drop(matrix.f_mm_out(&to, &from)?.f_relu_()?),
                 // The library transposes blocks if rows of the result are contiguous.
@@ -91,10 +92,8 @@ fn turned(map: &Tensor, matrix: Option<&Tensor>) -> Result<Tensor, TchError> {
     let Some(matrix) = matrix else {
         return Ok(map.shallow_clone());
     };
-    let weight = matrix
-        .f_to_kind(map.kind())?
-        .f_unsqueeze(-1)?
-        .f_unsqueeze(-1)?;
+    let weight = matrix.f_to_kind(map.kind())?;
+    let weight = weight.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
     map.f_conv2d(&weight, None::<&Tensor>, [1, 1], [0, 0], [1, 1], 1)?
         .f_relu()
 }

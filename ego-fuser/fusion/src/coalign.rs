@@ -11,7 +11,7 @@ use tch::nn;
 use super::interface::Fusion;
 use super::settings::{FusionSettings, Requirements};
 use super::spec::MethodSpec;
-use super::where2comm::{Aggregation, Missing, Where2comm, Where2commConfig};
+use super::where2comm::{MapAggregation, Missing, Where2comm, Where2commConfig};
 use crate::pose_graph::PoseGraphConfig;
 
 /// CoAlign.
@@ -24,7 +24,7 @@ pub static METHOD: MethodSpec = MethodSpec::of_features::<CoAlignConfig>(
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct CoAlignConfig {
     /// Operation that fuses the features of a cell.
-    pub aggregation: Aggregation,
+    pub aggregation: MapAggregation,
     /// Value of cells that were not received.
     pub missing: Missing,
     /// Correction of the poses; absent: poses are used as received.
@@ -34,11 +34,10 @@ pub(crate) struct CoAlignConfig {
 impl Default for CoAlignConfig {
     /// Attention after the correction.
     fn default() -> Self {
-        let pose_graph = Some(PoseGraphConfig::default());
         Self {
-            aggregation: Aggregation::Attention,
+            aggregation: MapAggregation::Attention,
             missing: Missing::Absent,
-            pose_graph,
+            pose_graph: Some(PoseGraphConfig::default()),
         }
     }
 }

@@ -66,17 +66,13 @@ impl Fusion for Cobevt {
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let features = if sees_all { features } else { features * &mask };
         // For published weights: empty slots are maps of zeros that count in the mean at the end.
-        let empty = match self.count_missing {
-            true => (self.fusion.slots() - agents).max(0),
-            false => 0,
-        };
+        let missing = (self.fusion.slots() - agents).max(0);
+        let empty = if self.count_missing { missing } else { 0 };
         let padding = Padding::to_multiples(&features, self.window)?;
         let features = padding.maps(&features, empty)?;
         let is_full = sees_all && empty == 0 && padding.is_empty();
-        let reach = match is_full {
-            true => None,
-            false => Some(padding.mask(&mask, empty)?.f_squeeze_dim(1)?),
-        };
+        let reach = (!is_full).then(|| padding.mask(&mask, empty)?.f_squeeze_dim(1));
+        let reach = reach.transpose()?;
         let slots = Slots {
             asked: agents,
             reach: reach.as_ref(),

@@ -26,10 +26,9 @@ impl Conv {
     }
 
     fn of_shape(path: &nn::Path<'_>, shape: &[i64]) -> Self {
-        let weight = path.var("weight", shape, nn::init::DEFAULT_KAIMING_UNIFORM);
         let bound = 1.0 / (shape[1..].iter().product::<i64>() as f64).sqrt();
         Self {
-            weight,
+            weight: path.var("weight", shape, nn::init::DEFAULT_KAIMING_UNIFORM),
             bias: path.var("bias", &shape[..1], uniform(bound)),
         }
     }
@@ -49,33 +48,27 @@ impl Conv {
 
     /// Contribution of the input channels from `first` on, where `x` holds only those.
     pub(super) fn part(&self, x: &Tensor, first: i64, with_bias: bool) -> Result<Tensor, TchError> {
-        let channels = x.size4()?.1;
-        convolve(
-            x,
-            &self.kernel()?.f_narrow(1, first, channels)?,
-            with_bias.then_some(&self.bias),
-        )
+        let kernel = self.kernel()?.f_narrow(1, first, x.size4()?.1)?;
+        convolve(x, &kernel, with_bias.then_some(&self.bias))
     }
 }
 
 fn convolve(x: &Tensor, kernel: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
     let padding = kernel.size()[2] / 2;
-    let (kernel, bias) = (
-        kernel.f_to_kind(x.kind())?,
-        bias.map(|bias| bias.f_to_kind(x.kind())).transpose()?,
-    );
+    let kernel = kernel.f_to_kind(x.kind())?;
+    let bias = bias.map(|bias| bias.f_to_kind(x.kind())).transpose()?;
     x.f_conv2d(&kernel, bias, [1, 1], [padding; 2], [1, 1], 1)
 }
 
 /// A convolutional GRU of which only the first step is computed.
 #[derive(Debug)]
 pub(super) struct ConvGru {
-    cells: Vec<Cell>,
+    cells: Vec<GruCell>,
     hidden: i64,
 }
 
 #[derive(Debug)]
-struct Cell {
+struct GruCell {
     /// Reset gate, then update gate, of input and state.
     gates: Conv,
     /// New state, of input and state.
@@ -95,7 +88,7 @@ impl ConvGru {
                 .map(|layer| {
                     let path = path / "cell_list" / layer;
                     let input = if layer == 0 { input } else { hidden } + hidden;
-                    Cell {
+                    GruCell {
                         gates: Conv::new(&(&path / "conv_gates"), [input, 2 * hidden], kernel),
                         candidate: Conv::new(&(&path / "conv_can"), [input, hidden], kernel),
                     }
@@ -110,7 +103,7 @@ impl ConvGru {
         let hidden = self.hidden;
         self.cells
             .iter()
-            .try_fold(x.shallow_clone(), |x, Cell { gates, candidate }| {
+            .try_fold(x.shallow_clone(), |x, GruCell { gates, candidate }| {
                 let input = x.size4()?.1;
                 // Update gate and candidate in one convolution over the input alone.
                 let [kernel, bias] = [

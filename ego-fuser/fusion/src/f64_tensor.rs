@@ -30,9 +30,8 @@ pub(crate) fn largest(numbers: &[f32], share: f64, least: f32, step: usize) -> V
         .filter(|number| number.partial_cmp(&&least) != Some(Ordering::Less))
         .count();
     let most = (numbers.len() as f64 * share).ceil() as usize;
-    let wanted = most
-        .min(above.next_multiple_of(step))
-        .clamp(1, numbers.len());
+    let likely = above.next_multiple_of(step);
+    let wanted = most.min(likely).clamp(1, numbers.len());
     let mut order: Vec<usize> = (0..numbers.len()).collect();
     order.sort_by(|a, b| numbers[*b].total_cmp(&numbers[*a]));
     order.truncate(wanted);
@@ -95,10 +94,8 @@ pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tenso
 
 /// Some rows of a tensor.
 pub(crate) fn picked(tensor: &Tensor, rows: &[i64]) -> Result<Tensor, TchError> {
-    tensor.f_index_select(
-        0,
-        &Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?,
-    )
+    let rows = Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?;
+    tensor.f_index_select(0, &rows)
 }
 
 /// The sum over the first dimension.
@@ -112,11 +109,6 @@ pub(crate) fn offsets_around(radius: i64) -> Vec<i64> {
     side.clone()
         .flat_map(|row| side.clone().flat_map(move |column| [column, row]))
         .collect()
-}
-
-/// `[C, H * W]` of a map `[C, H, W]`, without a copy in either memory order.
-pub(crate) fn flat(map: &Tensor) -> Result<Tensor, TchError> {
-    map.f_flatten(1, 2)
 }
 
 /// Maps of the size of `maps` `[N, C, H, W]` in a memory order, not filled.

@@ -81,10 +81,8 @@ impl History {
         }
         let maps = self.kept.entry(cav.clone()).or_default();
         // Repeated or out of order: `before` relies on the order of capture times.
-        if maps
-            .back()
-            .is_some_and(|last| last.capture_nanos >= kept.capture_nanos)
-        {
+        let last = maps.back();
+        if last.is_some_and(|last| last.capture_nanos >= kept.capture_nanos) {
             return;
         }
         maps.push_back(kept);

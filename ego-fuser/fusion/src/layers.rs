@@ -72,9 +72,8 @@ impl Linear {
     }
 
     fn with_init(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool, init: Init) -> Self {
-        let weight = path.var("weight", &[to, from], init);
         Self {
-            weight,
+            weight: path.var("weight", &[to, from], init),
             bias: has_bias.then(|| path.var("bias", &[to], Init::Const(0.0))),
         }
     }
@@ -98,9 +97,8 @@ pub(crate) struct LayerNorm {
 impl LayerNorm {
     /// `weight` and `bias`, `[channels]`, below `path`.
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
-        let weight = path.var("weight", &[channels], Init::Const(1.0));
         Self {
-            weight,
+            weight: path.var("weight", &[channels], Init::Const(1.0)),
             bias: path.var("bias", &[channels], Init::Const(0.0)),
         }
     }
@@ -132,9 +130,8 @@ impl FeedForward {
     /// From `channels` to `hidden` and back.
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
         let net = path / "net";
-        let wide = Linear::new(&(&net / 0), channels, hidden, true);
         Self {
-            wide,
+            wide: Linear::new(&(&net / 0), channels, hidden, true),
             back: Linear::residual(&(&net / 3), hidden, channels, true),
             dropout,
         }

@@ -10,6 +10,7 @@ use std::str::FromStr;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser, ValueParserFactory};
 use clap::{Arg, Command};
 use perception::model_config::DetectorConfig;
+use perception::weights::{METHOD_KEY, Weights};
 use protocol::ConfidenceGate;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Error;
@@ -105,6 +106,19 @@ impl Method {
         match self.0.runs_with_weights_of {
             [] => vec![self.name()],
             names => names.to_vec(),
+        }
+    }
+
+    /// The method to run with a weights file: `named`, or else the one that the file names.
+    ///
+    /// # Errors
+    /// [`UnknownMethod`] when the name in the file is that of no method.
+    pub fn of_weights(weights: &Weights, named: Option<Self>) -> Result<Self, UnknownMethod> {
+        match (named, weights.metadata(METHOD_KEY)) {
+            (Some(method), _) => Ok(method),
+            (None, Some(name)) => name.parse(),
+            // A file without a method is that of a detector alone.
+            (None, None) => Ok(Self::NONE),
         }
     }
 
@@ -213,17 +227,12 @@ impl TypedValueParser for MethodParser {
         value: &OsStr,
     ) -> Result<Method, clap::Error> {
         // The parser below knows the names of the table only and would refuse that of a file.
-        let script = value
-            .to_str()
-            .filter(|text| text.starts_with(script::PREFIX));
-        match script.and_then(|text| text.parse().ok()) {
-            Some(method) => Ok(method),
-            None => {
-                let of_table =
-                    PossibleValuesParser::new(of_table()).try_map(|name| name.parse::<Method>());
-                of_table.parse_ref(command, argument, value)
-            }
+        if let Some(spec) = value.to_str().and_then(script::spec) {
+            return Ok(Method(spec));
         }
+        PossibleValuesParser::new(of_table())
+            .try_map(|name| name.parse::<Method>())
+            .parse_ref(command, argument, value)
     }
 
     fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {

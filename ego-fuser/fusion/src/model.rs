@@ -127,12 +127,11 @@ impl CooperativeModel {
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), config)?;
         let fusion = FusionStage::new(&variables.root(), fusion, method, config)?;
-        let anchors = Anchors::for_detector(config);
         Ok(Self {
             method,
             network,
             variables,
-            anchors,
+            anchors: Anchors::for_detector(config),
             fusion,
             refinement: None,
         })
@@ -156,12 +155,7 @@ impl CooperativeModel {
         fusion: Option<&FusionConfig>,
         device: Device,
     ) -> Result<Self, ModelError> {
-        let method = match (method, weights.metadata(METHOD_KEY)) {
-            (Some(method), _) => method,
-            (None, Some(name)) => name.parse()?,
-            // A file without a method is that of a detector alone.
-            (None, None) => Method::NONE,
-        };
+        let method = Method::of_weights(weights, method)?;
         let config = weights.detector_config()?;
         let fusion = match fusion {
             Some(fusion) => fusion.clone(),

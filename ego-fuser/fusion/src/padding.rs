@@ -39,12 +39,8 @@ impl Padding {
         if self.is_empty() && slots == 0 {
             return Ok(maps.shallow_clone());
         }
-        maps.f_pad(
-            // Before and after, from the last dimension to the first: columns, rows, channels, maps.
-            [0, self.right, 0, self.below, 0, 0, 0, slots],
-            "constant",
-            0.0,
-        )
+        // Before and after, from the last dimension to the first: columns, rows, channels, maps.
+        maps.f_constant_pad_nd([0, self.right, 0, self.below, 0, 0, 0, slots])
     }
 
     /// `maps` with zeros below and to the right, so that rows and columns are multiples of `cells`.
@@ -58,14 +54,11 @@ impl Padding {
         if self.is_empty() && slots == 0 {
             return Ok(mask.shallow_clone());
         }
-        let neighbours = mask.size4()?.0 - 1;
+        let neighbours = mask.f_narrow(0, 1, mask.size4()?.0 - 1)?;
         let ego = mask
             .f_narrow(0, 0, 1)?
             .f_pad([0, self.right, 0, self.below], "constant", 1.0)?;
-        Tensor::f_cat(
-            &[ego, self.maps(&mask.f_narrow(0, 1, neighbours)?, slots)?],
-            0,
-        )
+        Tensor::f_cat(&[ego, self.maps(&neighbours, slots)?], 0)
     }
 
     /// `[C, H, W]` of a padded map.

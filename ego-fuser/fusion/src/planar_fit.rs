@@ -31,10 +31,8 @@ where
     }
     // Least squares in closed form: sine and cosine are in proportion to the sums of cross and dot products.
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), cross.atan2(dot));
-    Some(Isometry3::from_parts(
-        Translation3::from(to - rotation * from),
-        rotation,
-    ))
+    let shift = Translation3::from(to - rotation * from);
+    Some(Isometry3::from_parts(shift, rotation))
 }
 
 #[cfg(test)]

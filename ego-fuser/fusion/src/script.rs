@@ -36,10 +36,8 @@ pub(crate) const FUSION: FusionSpec = FusionSpec {
 /// The method of a file, `None` if it names none. The same name gives the same specification; it is never freed.
 pub(crate) fn spec(name: &str) -> Option<&'static MethodSpec> {
     static SPECS: Mutex<BTreeMap<String, &MethodSpec>> = Mutex::new(BTreeMap::new());
-    let stem = Path::new(name.strip_prefix(PREFIX)?)
-        .file_stem()?
-        .to_str()?
-        .to_owned();
+    let stem = Path::new(name.strip_prefix(PREFIX)?).file_stem()?;
+    let stem = stem.to_str()?.to_owned();
     let mut specs = SPECS.lock().unwrap_or_else(PoisonError::into_inner);
     Some(specs.entry(name.to_owned()).or_insert_with(|| {
         let name: &'static str = name.to_owned().leak();
@@ -88,8 +86,7 @@ impl FusionSettings for ScriptConfig {
 /// Refuses what is no regular file, and an archive that unpacks to far more than its own size: libtorch unpacks all of
 /// its source. A file that is no archive passes; libtorch says what is wrong with it.
 fn check_size(file: &Path) -> io::Result<()> {
-    let opened = bounded_file::open(file)?;
-    let Ok(mut archive) = ZipArchive::new(BufReader::new(opened)) else {
+    let Ok(mut archive) = ZipArchive::new(BufReader::new(bounded_file::open(file)?)) else {
         return Ok(());
     };
     let mut gained_bytes = 0_u64;

@@ -102,7 +102,7 @@ impl FusionConfig {
 
     /// The settings, if they are of this type.
     pub fn settings<S: FusionSettings>(&self) -> Option<&S> {
-        self.0.as_any().downcast_ref()
+        (&*self.0 as &dyn Any).downcast_ref()
     }
 
     /// See [`FusionSettings::requirements`].
@@ -136,9 +136,8 @@ impl PartialEq for FusionConfig {
 }
 
 /// [`FusionSettings`] with the type erased.
-trait AnySettings: Debug + Send + Sync {
+trait AnySettings: Any + Debug + Send + Sync {
     fn kind(&self) -> &'static str;
-    fn as_any(&self) -> &dyn Any;
     fn requirements(&self) -> Requirements;
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError>;
     /// `is_pretty`: over several lines.
@@ -156,10 +155,6 @@ struct Tagged<'a, S> {
 impl<S: FusionSettings> AnySettings for S {
     fn kind(&self) -> &'static str {
         S::KIND
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
     }
 
     fn requirements(&self) -> Requirements {
@@ -183,7 +178,7 @@ impl<S: FusionSettings> AnySettings for S {
     }
 
     fn equals(&self, other: &dyn AnySettings) -> bool {
-        other.as_any().downcast_ref::<S>() == Some(self)
+        (other as &dyn Any).downcast_ref::<S>() == Some(self)
     }
 }
 

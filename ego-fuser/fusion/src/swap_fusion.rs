@@ -349,9 +349,8 @@ impl SwapFusion {
     /// # Errors
     /// [`tch::TchError`] when shapes do not fit.
     pub fn forward(&self, maps: &Tensor, slots: Slots<'_>, train: bool) -> tch::Result<Tensor> {
-        let last = self.halves.len();
-        self.head
-            .forward(&self.through(maps, slots, last, train)?, slots)
+        let x = self.through(maps, slots, self.halves.len(), train)?;
+        self.head.forward(&x, slots)
     }
 
     /// All slots `[S, C, H, W]` after the first `layers` layers.

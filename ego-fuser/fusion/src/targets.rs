@@ -121,15 +121,14 @@ impl TargetAssigner {
         if !column_x.is_sorted_by(|a, b| a < b) || !row_y.is_sorted_by(|a, b| a < b) {
             return Err(AnchorGridError::NotSeparable { index: 0 });
         }
-        let standing: Vec<Standing> = anchors.iter().map(Standing::of).collect();
         let reach = anchors
             .iter()
             .map(|anchor| anchor.size_m[0].hypot(anchor.size_m[1]) / 2.0)
             .fold(0.0, f64::max);
         Ok(Self {
             rule,
+            standing: anchors.iter().map(Standing::of).collect(),
             anchors,
-            standing,
             column_x,
             row_y,
             per_cell,

@@ -129,14 +129,10 @@ impl V2vNet {
     pub fn new(path: &nn::Path<'_>, config: &V2vNetConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         let channels = config.channels;
+        let (io, kernel) = ([2 * channels, channels], config.kernel);
         Ok(Self {
-            message: Conv::new(&(path / "msg_cnn"), [2 * channels, channels], 3),
-            gru: ConvGru::new(
-                &(path / "conv_gru"),
-                [2 * channels, channels],
-                config.kernel,
-                config.gru_layers,
-            ),
+            message: Conv::new(&(path / "msg_cnn"), io, 3),
+            gru: ConvGru::new(&(path / "conv_gru"), io, kernel, config.gru_layers),
             mlp: Conv::linear(&(path / "mlp"), [channels, channels]),
             config: config.clone(),
         })

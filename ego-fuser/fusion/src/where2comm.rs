@@ -42,7 +42,7 @@ const GATE: ConfidenceGate = ConfidenceGate {
 /// Operation that fuses the features of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Aggregation {
+pub enum MapAggregation {
     /// Attention of the ego over all, without parameters.
     Attention,
     /// Element-wise maximum.
@@ -66,7 +66,7 @@ pub enum Missing {
 #[serde(deny_unknown_fields)]
 pub struct Where2commConfig {
     /// Operation that fuses the features of a cell.
-    pub aggregation: Aggregation,
+    pub aggregation: MapAggregation,
     /// Value of cells that were not received.
     #[serde(default)]
     pub missing: Missing,
@@ -76,7 +76,7 @@ impl Default for Where2commConfig {
     /// Attention over the agents that sent the cell.
     fn default() -> Self {
         Self {
-            aggregation: Aggregation::Attention,
+            aggregation: MapAggregation::Attention,
             missing: Missing::Absent,
         }
     }
@@ -121,14 +121,14 @@ impl Fusion for Where2comm {
         };
         let maps = WarpedMaps::new(warped.features.shallow_clone(), mask);
         Ok(match self.0.aggregation {
-            Aggregation::Attention => attended(&maps)?,
-            Aggregation::Max => maximum(&maps)?,
+            MapAggregation::Attention => attended(&maps)?,
+            MapAggregation::Max => maximum(&maps)?,
         }
         .into())
     }
 }
 
-/// Sizes of [`Communication`].
+/// Sizes of [`SparseCommunication`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CommunicationConfig {
@@ -140,13 +140,13 @@ pub struct CommunicationConfig {
 
 /// The published selection on tensors, its window being part of the weights.
 #[derive(Debug)]
-pub struct Communication {
+pub struct SparseCommunication {
     threshold: f64,
     /// `[1, 1, k, k]` and `[1]`.
     window: Option<(Tensor, Tensor)>,
 }
 
-impl Communication {
+impl SparseCommunication {
     /// The window is `gaussian_filter.*` below `path`; it is not trained.
     ///
     /// # Errors
@@ -158,14 +158,10 @@ impl Communication {
             let is_odd = kernel % 2 == 1;
             require(is_odd, "kernel of the smoothing", kernel, "must be odd")?;
             let path = path / "gaussian_filter";
-            let weight = path
-                .var("weight", &[1, 1, kernel, kernel], Init::Const(0.0))
-                .set_requires_grad(false);
-            Ok::<_, ConfigError>((
-                weight,
-                path.var("bias", &[1], Init::Const(0.0))
-                    .set_requires_grad(false),
-            ))
+            let weight = path.var("weight", &[1, 1, kernel, kernel], Init::Const(0.0));
+            let bias = path.var("bias", &[1], Init::Const(0.0));
+            let [weight, bias] = [weight, bias].map(|fixed| fixed.set_requires_grad(false));
+            Ok::<_, ConfigError>((weight, bias))
         });
         Ok(Self {
             threshold: config.threshold,

@@ -13,7 +13,7 @@ use support::cli::Outcome;
 use support::{bounded_file, output};
 
 use crate::config::EgoConfig;
-use crate::ego_loop::recorded::{KIND, Record};
+use crate::ego_loop::recorded::{EgoRecord, KIND};
 use crate::ego_loop::{EgoLoop, Output};
 use crate::node::NodeOptions;
 
@@ -40,7 +40,7 @@ pub(crate) struct Arguments {
 
 /// A line of `truth.jsonl`, as far as it is needed.
 #[derive(Deserialize)]
-struct Tick {
+struct TruthTick {
     tick: u64,
     capture_nanos: u64,
 }
@@ -62,8 +62,8 @@ impl Arguments {
         let mut results: BTreeMap<u64, (Detections, Option<Tracks>)> = BTreeMap::new();
         for record in &mut records {
             let (now_nanos, input) = match record {
-                Record::Input { now_nanos, input } => (now_nanos, input),
-                Record::Published(published) => {
+                EgoRecord::Input { now_nanos, input } => (now_nanos, input),
+                EgoRecord::Published(published) => {
                     if (published.stream == Stream::Tracks) != self.tracks {
                         continue;
                     }
@@ -71,8 +71,7 @@ impl Arguments {
                     let capture_nanos = stamp.capture_nanos;
                     let missing =
                         || format!("no result of the frame captured at {capture_nanos} ns");
-                    let result = results.remove(&capture_nanos);
-                    let (result, tracks) = result.with_context(missing)?;
+                    let (result, tracks) = results.remove(&capture_nanos).with_context(missing)?;
                     let tick = ticks.get(&capture_nanos).copied();
                     output::line(if self.tracks {
                         let tracks = tracks.with_context(missing)?;
@@ -84,7 +83,7 @@ impl Arguments {
                     })?;
                     continue;
                 }
-                Record::Start(_) => continue,
+                EgoRecord::Start(_) => continue,
             };
             let decoded =
                 input.try_map(|message| message.decode(&ego_loop, &Limits::DEFAULT).map(Box::new));
@@ -117,7 +116,7 @@ impl Arguments {
         let mut ticks = BTreeMap::new();
         for line in text.lines() {
             let line = serde_json::from_str(line);
-            let line: Tick = line.with_context(|| path.display().to_string())?;
+            let line: TruthTick = line.with_context(|| path.display().to_string())?;
             ticks.insert(line.capture_nanos, line.tick);
         }
         Ok(ticks)

@@ -38,10 +38,8 @@ impl Arguments {
         } else {
             let (frames, fused, failed) = (report.frames, report.fused, report.failed);
             let at_deadline = report.at_deadline;
-            let reason = report
-                .failure
-                .as_ref()
-                .map_or(String::new(), |reason| format!(", the first: {reason}"));
+            let failure = report.failure.as_ref();
+            let reason = failure.map_or(String::new(), |reason| format!(", the first: {reason}"));
             let boxes = match report.fused_boxes {
                 0 => String::new(),
                 boxes => format!(" ({boxes} of them boxes)"),

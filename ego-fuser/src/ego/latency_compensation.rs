@@ -27,13 +27,13 @@ const FOUND_M: f64 = 0.7;
 /// Trackers of the neighbours that send boxes.
 #[derive(Debug, Default)]
 pub(super) struct LatencyCompensation {
-    of_cav: BTreeMap<CavId, Followed>,
+    of_cav: BTreeMap<CavId, FollowedSender>,
     /// Messages whose velocities were not taken.
     refused: usize,
 }
 
 #[derive(Debug)]
-struct Followed {
+struct FollowedSender {
     tracker: Tracker,
     capture_nanos: Option<u64>,
     /// The objects of that time.
@@ -105,15 +105,14 @@ pub(super) fn probability_carried_right(object: &PerceivedObject, age_s: f64) ->
     1.0 - (-0.5 * FOUND_M.powi(2) / error_m2.max(f64::MIN_POSITIVE)).exp()
 }
 
-impl Default for Followed {
+impl Default for FollowedSender {
     fn default() -> Self {
-        let tracker = Tracker::new(TrackerConfig {
-            max_detections: MAX_TRACKED,
-            max_tracks: MAX_TRACKED,
-            ..TrackerConfig::default()
-        });
         Self {
-            tracker,
+            tracker: Tracker::new(TrackerConfig {
+                max_detections: MAX_TRACKED,
+                max_tracks: MAX_TRACKED,
+                ..TrackerConfig::default()
+            }),
             capture_nanos: None,
             objects: Vec::new(),
             is_contradicted: false,
@@ -121,7 +120,7 @@ impl Default for Followed {
     }
 }
 
-impl Followed {
+impl FollowedSender {
     /// The objects of a message with their tracks; it is taken once and may serve several frames.
     fn objects(
         &mut self,
@@ -143,10 +142,9 @@ impl Followed {
     /// the ego has taken for another one after a lost message.
     fn takes_stated(&mut self, cav: &CavId, sent: &[PerceivedObject]) -> bool {
         let pairs = self.objects.iter().zip(sent);
-        let compared =
-            pairs.filter_map(|(object, sent)| sent.track.as_ref().zip(object.track.as_ref()));
+        let compared = pairs.filter_map(|(object, sent)| sent.track.zip(object.track));
         let verdicts: Vec<bool> = compared
-            .map(|(stated, own)| is_contradicted(stated, own))
+            .map(|(stated, own)| is_contradicted(&stated, &own))
             .collect();
         let contradicted = verdicts.iter().filter(|is_so| **is_so).count();
         if 2 * contradicted > verdicts.len() {

@@ -160,10 +160,8 @@ impl EgoLoop {
             return Ok(capture_nanos);
         };
         // A frame that still waits may use what is too old for the newest.
-        let oldest = self
-            .frames
-            .front()
-            .map_or(newest, |frame| frame.view.capture_nanos);
+        let front = self.frames.front();
+        let oldest = front.map_or(newest, |frame| frame.view.capture_nanos);
         if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
             Err(DropReason::Future)
         } else if capture_nanos.saturating_add(self.options.pairing.max_age_nanos) < oldest {
@@ -265,17 +263,12 @@ impl EgoLoop {
     }
 
     /// Reason why a message was not used. Boxes that came after the map of their sweep was fused are not missing.
-    fn reason_of(
-        &self,
-        (cav, stream): &Source,
-        capture_nanos: u64,
-        reason: DropReason,
-    ) -> DropReason {
+    fn reason_of(&self, (cav, stream): &Source, capture_nanos: u64, why: DropReason) -> DropReason {
         // `None` is less than any time: nothing of this neighbour was fused.
         let is_fused = self.fused_nanos.get(cav) >= Some(&capture_nanos);
         match is_fused && *stream != self.stream {
             true => DropReason::Unneeded,
-            false => reason,
+            false => why,
         }
     }
 

@@ -46,18 +46,14 @@ impl EgoLoop {
         let has_ended =
             self.ends_nanos.is_some() && (is_over || self.members.is_subset(&self.ended));
         if has_ended && self.frames.is_empty() {
-            self.finish();
+            // Messages that wait for a frame that will not come are counted: at the end of time every message is too
+            // old, so that all that were not used are returned.
+            let (_, dropped) = self.pairing.pair(u64::MAX);
+            for lost in dropped {
+                self.drop_lost(lost);
+            }
+            self.is_finished = true;
         }
-    }
-
-    /// Counts the messages that wait for a frame that will not come.
-    fn finish(&mut self) {
-        // At the end of time every message is too old, so that all that were not used are returned.
-        let (_, dropped) = self.pairing.pair(u64::MAX);
-        for lost in dropped {
-            self.drop_lost(lost);
-        }
-        self.is_finished = true;
     }
 
     /// Time at which the oldest frame waits for nothing more; 0: it does not wait.
@@ -66,23 +62,21 @@ impl EgoLoop {
         if self.frames.len() > 1 || self.is_complete(frame.view.capture_nanos) {
             return 0;
         }
-        frame
-            .begun_nanos
-            .saturating_add(self.options.deadline_nanos)
+        let deadline_nanos = self.options.deadline_nanos;
+        frame.begun_nanos.saturating_add(deadline_nanos)
     }
 
     fn is_complete(&self, capture_nanos: u64) -> bool {
-        let mut awaited = self
-            .members
-            .iter()
-            .filter(|cav| self.silence.is_awaited(cav));
-        awaited.all(|cav| {
+        self.members.iter().all(|cav| {
             let is_other = self.models.is_other(cav);
+            // Its feature maps came before the ego's next sweep lately.
+            let frames = self.without_map.get(cav);
+            let is_in_time = frames.is_some_and(|frames| *frames < SILENT_AFTER);
             // Boxes end the wait for maps that are of another network, or not in time.
-            let boxes_do = self.reads_boxes
-                && self.box_senders.contains(cav)
-                && (is_other || !self.sends_maps_in_time(cav));
-            self.ended.contains(cav)
+            let boxes_do =
+                self.reads_boxes && self.box_senders.contains(cav) && (is_other || !is_in_time);
+            !self.silence.is_awaited(cav)
+                || self.ended.contains(cav)
                 || self.has_reached(cav, self.stream, capture_nanos)
                 || if boxes_do {
                     self.has_reached(cav, Stream::Boxes, capture_nanos)
@@ -97,12 +91,6 @@ impl EgoLoop {
         self.pairing.has_reached(&source, capture_nanos)
     }
 
-    /// True for a neighbour whose feature maps came before the ego's next sweep lately.
-    fn sends_maps_in_time(&self, cav: &CavId) -> bool {
-        let frames = self.without_map.get(cav);
-        frames.is_some_and(|frames| *frames < SILENT_AFTER)
-    }
-
     fn fuse(&mut self, ego: &mut Ego, frame: OwnFrame, now_nanos: u64) {
         let own = frame.view;
         let waited = Duration::from_nanos(now_nanos.saturating_sub(frame.begun_nanos));
@@ -111,10 +99,10 @@ impl EgoLoop {
             Ok(output) => {
                 self.report.refused_boxes += output.refused_boxes;
                 self.report.refused_velocities += output.refused_velocities;
-                let neighbours = self.neighbour_reports(&output.beliefs, &choice.views);
+                let neighbours = self.states(&output.beliefs, &choice.views);
                 self.outputs.push(Output::Received(self.own_source()));
                 self.leave_out(&output.skipped, &output.fused, &mut choice);
-                let fused = self.use_messages(&own, &output.fused, &choice);
+                let fused = self.mark_used(&own, &output.fused, &choice);
                 let transport = frame
                     .transport
                     .map(|transport| StageTiming::new("transport", transport));
@@ -149,7 +137,7 @@ impl EgoLoop {
                 self.drop_message(self.own_source(), reason);
                 // The neighbours' messages are valid.
                 let all: Vec<usize> = (0..choice.views.len()).collect();
-                self.use_messages(&own, &all, &choice);
+                self.mark_used(&own, &all, &choice);
                 self.outputs.push(Output::Failed {
                     capture_nanos: own.capture_nanos,
                     error,
@@ -163,13 +151,9 @@ impl EgoLoop {
     }
 
     /// Report of the neighbours received for a frame.
-    fn neighbour_reports(
-        &self,
-        assessments: &[(usize, Assessment)],
-        views: &[View],
-    ) -> Vec<NeighbourState> {
+    fn states(&self, beliefs: &[(usize, Assessment)], views: &[View]) -> Vec<NeighbourState> {
         let reports = views.iter().enumerate().map(|(index, view)| {
-            let assessment = assessments.iter().find(|(known, _)| *known == index);
+            let assessment = beliefs.iter().find(|(known, _)| *known == index);
             let assessment = assessment.map(|(_, assessment)| assessment);
             NeighbourState {
                 trust: assessment.map(|assessment| assessment.trust),
@@ -224,14 +208,9 @@ impl EgoLoop {
     }
 
     /// Counts the views that are in the result as received, and describes them.
-    fn use_messages(
-        &mut self,
-        own: &View,
-        fused: &[usize],
-        choice: &Choice,
-    ) -> Vec<FusedNeighbour> {
+    fn mark_used(&mut self, own: &View, fused: &[usize], choice: &Choice) -> Vec<FusedNeighbour> {
         self.report.fused += fused.len() as u64;
-        let mut described = Vec::with_capacity(fused.len());
+        let mut described: Vec<FusedNeighbour> = Vec::with_capacity(fused.len());
         for &index in fused {
             let (view, message) = (&choice.views[index], &choice.messages[index]);
             self.report.fused_boxes += u64::from(message.stream != self.stream);
@@ -241,10 +220,8 @@ impl EgoLoop {
             }
             self.count(view, message, None);
             // A neighbour is one, also by two messages: its boxes are read beside its map.
-            if let Some(same) = described
-                .iter_mut()
-                .find(|same: &&mut FusedNeighbour| same.cav == view.cav)
-            {
+            let same = described.iter_mut().find(|same| same.cav == view.cav);
+            if let Some(same) = same {
                 same.age_nanos = same.age_nanos.max(view.age_nanos(own));
                 same.payload_bytes += message.payload_bytes;
                 same.wire_bytes += message.wire_bytes;

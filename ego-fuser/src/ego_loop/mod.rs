@@ -134,6 +134,12 @@ impl EgoLoop {
     /// Loop of the vehicle `cav`, whose frames `ego` fuses, before its first input.
     pub fn new(cav: &CavId, ego: &Ego, options: LoopOptions) -> Self {
         let stream = ego.method().own_content().stream();
+        // The objects in the area in which the ego detects are tracked.
+        let [x_low, y_low, _, x_high, y_high, _] = ego.detector().config().lidar_range_m;
+        let tracker = TrackerConfig {
+            area_m: [x_low, y_low, x_high, y_high],
+            ..TrackerConfig::default()
+        };
         Self {
             cav: cav.clone(),
             stream,
@@ -151,7 +157,7 @@ impl EgoLoop {
             clock_offsets_s: BTreeMap::new(),
             frames: VecDeque::new(),
             pace: PaceKeeper::new(options.sets_pace),
-            tracker: options.tracks.then(|| tracker_of(ego)),
+            tracker: options.tracks.then(|| Tracker::new(tracker)),
             own_nanos: None,
             ended: BTreeSet::new(),
             ends_nanos: None,
@@ -210,9 +216,7 @@ impl EgoLoop {
 
     /// Streams of which a neighbour may publish either or both.
     pub fn neighbour_streams(&self) -> impl Iterator<Item = Stream> + use<> {
-        [self.stream]
-            .into_iter()
-            .chain(self.reads_boxes.then_some(Stream::Boxes))
+        std::iter::once(self.stream).chain(self.reads_boxes.then_some(Stream::Boxes))
     }
 
     /// Problems of the ego: missing messages and streams, each with the time of its beginning, nanoseconds.
@@ -229,15 +233,6 @@ impl EgoLoop {
     pub fn unused(&self, source: &Source) -> usize {
         self.pairing.unused(source)
     }
-}
-
-/// A tracker of the objects in the area in which an ego detects.
-fn tracker_of(ego: &Ego) -> Tracker {
-    let [x_low, y_low, _, x_high, y_high, _] = ego.detector().config().lidar_range_m;
-    Tracker::new(TrackerConfig {
-        area_m: [x_low, y_low, x_high, y_high],
-        ..TrackerConfig::default()
-    })
 }
 
 #[cfg(test)]

@@ -11,11 +11,11 @@ use super::{EgoLoop, Input, Message, Reception, Refusal};
 pub const KIND: &str = "ego inputs, 3";
 
 /// A record of an ego's inputs.
-pub type Record = input_log::Record<Input<WireMessage>, Published>;
+pub type EgoRecord = input_log::Record<Input<WireMessage>, PublishedResult>;
 
 /// Published detections or tracks: their stamp, and the measured durations of stages.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Published {
+pub struct PublishedResult {
     /// Their stream.
     pub stream: Stream,
     /// Stamp of the message.

@@ -8,7 +8,7 @@
 use nalgebra::{Isometry2, Point2};
 use protocol::MisbehaviourReason;
 
-use super::seen::Observation;
+use super::seen::SeenMessage;
 
 /// Two boxes this near are the same vehicle, metres; the radius grows with age.
 const SAME_M: f64 = 2.0;
@@ -74,8 +74,8 @@ pub(super) struct Evidence {
 impl Evidence {
     /// Compares a neighbour's message with the ego's own; `age_s` is the difference of their ages, seconds.
     pub(super) fn between(
-        own: &Observation,
-        theirs: &Observation,
+        own: &SeenMessage,
+        theirs: &SeenMessage,
         ego_from_cav: &Isometry2<f64>,
         age_s: f64,
     ) -> Self {
@@ -94,11 +94,8 @@ impl Evidence {
         let [mine, theirs] = [own, theirs].map(|seen| -> Vec<Point2<f64>> {
             seen.vehicles.iter().map(|at| Point2::from(*at)).collect()
         });
-        let theirs_here: Vec<_> = theirs.into_iter().map(|at| ego_from_cav * at).collect();
-        for at in theirs_here
-            .iter()
-            .filter(|at| at.coords.norm() >= OWN_BODY_M)
-        {
+        let theirs: Vec<_> = theirs.into_iter().map(|at| ego_from_cav * at).collect();
+        for at in theirs.iter().filter(|at| at.coords.norm() >= OWN_BODY_M) {
             let is_mine = is_among(at, &mine, radius_m);
             let sure = own.sure_at([at.x, at.y], radius_m);
             let is_empty = sure.is_some_and(|sure| sure < EMPTY);
@@ -113,7 +110,7 @@ impl Evidence {
             }
         }
         let near = mine.iter().filter(|at| is_near_both(at, &sender));
-        let missed = near.filter(|at| !is_among(at, &theirs_here, radius_m));
+        let missed = near.filter(|at| !is_among(at, &theirs, radius_m));
         evidence.missed = missed.count() as u32;
         evidence
     }
@@ -122,9 +119,8 @@ impl Evidence {
     /// anything to compare.
     pub(super) fn judgement(&self) -> Option<(f64, MisbehaviourReason)> {
         use MisbehaviourReason::{GhostObjects, PositionMismatch};
-        let elsewhere = self
-            .against_elsewhere()
-            .map(|odds| (odds, PositionMismatch));
+        let elsewhere = self.against_elsewhere();
+        let elsewhere = elsewhere.map(|odds| (odds, PositionMismatch));
         let invention = self.against_invention().map(|odds| (odds, GhostObjects));
         let candidates = [elsewhere, invention, self.against_other_attacks()].into_iter();
         candidates
@@ -264,13 +260,13 @@ mod tests {
         )
     }
 
-    fn seen(content: &Content) -> Observation {
+    fn seen(content: &Content) -> SeenMessage {
         let Content::Boxes(objects) = content else {
             panic!("boxes")
         };
         let found = objects.iter().map(|object| &object.detection);
         let at = |found: &Detection| [found.box3d.center_m[0], found.box3d.center_m[1]];
-        Observation::of_boxes(found.map(|found| (at(found), found.score)).collect())
+        SeenMessage::of_boxes(found.map(|found| (at(found), found.score)).collect())
     }
 
     const WORLD: [[f64; 2]; 6] = [
@@ -310,7 +306,7 @@ mod tests {
             width: 80,
             height: 80,
         };
-        let own = Observation::of_cells(grid, vec![0.0; grid.cells()]);
+        let own = SeenMessage::of_cells(grid, vec![0.0; grid.cells()]);
         let theirs = seen(&boxes(&WORLD, WORLD[1]));
         let mut evidence =
             Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);

@@ -21,7 +21,7 @@ use protocol::{CavId, MisbehaviourReason, PointCloud, Pose};
 use crate::view::View;
 use evidence::Evidence;
 use fusion::method::Exchange;
-use seen::{Observation, cosine_similarity};
+use seen::{SeenMessage, cosine_similarity};
 use value_range::ValueRange;
 
 /// Weight of a frame against all before it.
@@ -111,15 +111,15 @@ impl MisbehaviourDetector {
     ) -> Result<Vec<Assessment>, DetectorError> {
         let present = neighbours.iter().map(|(view, _)| &view.cav);
         self.forget_absent(own.capture_nanos, present);
-        let mine = Observation::in_message(&own.content, detector, &self.empty)?;
+        let mine = SeenMessage::in_message(&own.content, detector, &self.empty)?;
         self.range.widen(&mine.map);
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
             // A map from which the head makes values or boxes of no detector is evidence against its sender only.
-            let seen = Observation::in_message(&view.content, detector, &self.empty);
+            let seen = SeenMessage::in_message(&view.content, detector, &self.empty);
             all.push(match seen {
                 Err(DetectorError::Values { .. } | DetectorError::Box(_)) => {
-                    Observation::implausible()
+                    SeenMessage::implausible()
                 }
                 seen => seen?,
             });
@@ -166,10 +166,10 @@ impl MisbehaviourDetector {
     fn evidence(
         &self,
         own: &View,
-        mine: &Observation,
+        mine: &SeenMessage,
         view: &View,
         ego_from_cav: &Pose,
-        seen: &Observation,
+        seen: &SeenMessage,
     ) -> Evidence {
         let [x, y, _] = ego_from_cav.translation_m;
         let relative = Isometry2::new([x, y].into(), ego_from_cav.yaw_rad());
@@ -179,9 +179,8 @@ impl MisbehaviourDetector {
         let others = self.peers.iter().filter(|(cav, _)| **cav != view.cav);
         let earlier = others.flat_map(|(_, peer)| peer.last.iter().flatten());
         let fingerprints = earlier.map(|(_, _, fingerprint)| fingerprint);
-        let likeness = fingerprints
-            .chain([&mine.fingerprint])
-            .map(|fingerprint| alike(&seen.fingerprint, fingerprint));
+        let others = fingerprints.chain([&mine.fingerprint]);
+        let likeness = others.map(|other| alike(&seen.fingerprint, other));
         evidence.like_another = likeness.fold(0.0, f64::max);
         if let (Some((capture_nanos, before, fingerprint)), Some(now)) =
             (self.last_of(view), view.pose.world_from_cav())
@@ -260,10 +259,8 @@ fn kind(view: &View) -> usize {
 
 /// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
 /// neither has any in its favour.
-fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
-    let log_odds = evidence
-        .iter()
-        .map(|evidence| evidence.as_ref()?.log_odds());
+fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[SeenMessage]) {
+    let log_odds = evidence.iter().map(|one| one.as_ref()?.log_odds());
     let fits: Vec<f64> = log_odds.map(|odds| odds.unwrap_or(0.0)).collect();
     for (index, evidence) in evidence.iter_mut().enumerate() {
         let Some(evidence) = evidence else { continue };
@@ -441,13 +438,13 @@ mod tests {
         let found = trust.judge(&own, &neighbours, &mut detector).unwrap();
         assert_eq!(found[0], found[1]);
         let empty = trust.empty.clone();
-        let mine = Observation::in_message(&own.content, &mut detector, &empty).unwrap();
+        let mine = SeenMessage::in_message(&own.content, &mut detector, &empty).unwrap();
         for view in &sent {
             let later = View {
                 capture_nanos: view.capture_nanos + 100_000_000,
                 ..view.clone()
             };
-            let seen = Observation::in_message(&later.content, &mut detector, &empty).unwrap();
+            let seen = SeenMessage::in_message(&later.content, &mut detector, &empty).unwrap();
             let evidence = trust.evidence(&own, &mine, &later, &near(), &seen);
             let like_before = evidence.like_before.unwrap();
             assert!(

@@ -20,7 +20,7 @@ const REACH_M: f64 = 35.0;
 
 /// Content of a message.
 #[derive(Debug)]
-pub(super) struct Observation {
+pub(super) struct SeenMessage {
     /// Positions of confidently detected vehicles, metres.
     pub(super) vehicles: Vec<[f64; 2]>,
     /// Confidence of the head in a vehicle at each cell; or all boxes and their scores, where there are boxes only.
@@ -39,7 +39,7 @@ enum Sure {
     Boxes(Vec<([f64; 2], f32)>),
 }
 
-impl Observation {
+impl SeenMessage {
     /// Evaluates a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
     pub(super) fn in_message(
         content: &Content,
@@ -125,7 +125,7 @@ impl Observation {
         let step = (empty.len() / FINGERPRINT_VALUES).max(1);
         let compared = values.iter().zip(empty).step_by(step);
         let fingerprint = compared.map(|(value, nothing)| value - nothing).collect();
-        let seen = Self {
+        let mut seen = Self {
             fingerprint,
             map: values,
             ..Self::of_boxes(found)
@@ -140,10 +140,8 @@ impl Observation {
                 *sure = 0.0;
             }
         }
-        Ok(Self {
-            sure: Sure::Cells(grid, cells),
-            ..seen
-        })
+        seen.sure = Sure::Cells(grid, cells);
+        Ok(seen)
     }
 
     /// True if only boxes are known: a place without one may then be empty or merely uncertain.
@@ -228,7 +226,7 @@ mod tests {
         assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
         let mut sure = vec![0.0; 128];
         sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
-        let seen = Observation::of_cells(grid, sure);
+        let seen = SeenMessage::of_cells(grid, sure);
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
@@ -252,7 +250,7 @@ mod tests {
             score,
             source: None,
         });
-        let seen = Observation::in_message(
+        let seen = SeenMessage::in_message(
             &Content::Boxes(found.map(Into::into).to_vec()),
             &mut detector,
             &[],

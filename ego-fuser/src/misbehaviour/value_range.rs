@@ -24,9 +24,8 @@ impl ValueRange {
     pub(super) fn widen(&mut self, map: &[f32]) {
         let cells = self.cells(map);
         for (largest, channel) in self.0.iter_mut().zip(map.chunks(cells)) {
-            *largest = channel
-                .iter()
-                .fold(*largest, |largest, value| largest.max(value.abs()));
+            let sizes = channel.iter().map(|value| value.abs());
+            *largest = sizes.fold(*largest, f32::max);
         }
     }
 
@@ -39,10 +38,8 @@ impl ValueRange {
             if channel.iter().any(|value| value.abs() > limit) {
                 return true;
             }
-            let counted = channel
-                .iter()
-                .filter(|value| value.abs() > CHANNEL * largest);
-            above += counted.count();
+            let most = CHANNEL * largest;
+            above += channel.iter().filter(|value| value.abs() > most).count();
         }
         above as f64 > SHARE * map.len() as f64
     }

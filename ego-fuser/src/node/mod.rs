@@ -21,7 +21,7 @@ use serde::Serialize;
 
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::Ego;
-use crate::ego_loop::recorded::{KIND, Published, Record, WireMessage};
+use crate::ego_loop::recorded::{EgoRecord, KIND, PublishedResult, WireMessage};
 use crate::ego_loop::{EgoLoop, Input, LoopOptions, LoopReport, Output, Source};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
 use agent::input_log::{InputFile, InputLog};
@@ -86,15 +86,12 @@ impl From<&EgoSettings> for NodeOptions {
 impl From<&EgoConfig> for NodeOptions {
     fn from(config: &EgoConfig) -> Self {
         let neighbours: BTreeSet<CavId> = config.neighbours.iter().cloned().collect();
+        let inputs = config.inputs.clone();
         Self {
             neighbours: Some(neighbours).filter(|named| !named.is_empty()),
             over_link: config.over_link,
             keeps_running: config.keep_running || config.bus.supervised,
-            inputs: config
-                .inputs
-                .clone()
-                .map(|path| (path, serde_json::to_string(config).unwrap_or_default())),
-
+            inputs: inputs.map(|path| (path, serde_json::to_string(config).unwrap_or_default())),
             ..Self::from(&config.ego)
         }
     }
@@ -114,7 +111,7 @@ pub fn run(
     if let Err(error) = ego.warm_up(cav) {
         tracing::warn!("the networks are not warmed up: {error}");
     }
-    let mut node = Node::open(bus, cav, ego, options, stop)?;
+    let mut node = EgoNode::open(bus, cav, ego, options, stop)?;
     let presence = bus.announce(Role::Ego)?;
     node.receive(stop)?;
     node.pace.finish();
@@ -168,12 +165,12 @@ impl Results {
 }
 
 /// Log of the inputs of an ego.
-type Log = InputLog<Input<WireMessage>, Published>;
+type EgoLog = InputLog<Input<WireMessage>, PublishedResult>;
 
 /// Records that a result was published.
-fn note(log: Option<Log>, stream: Stream, stamp: &Stamp, stages: Vec<StageTiming>) {
+fn note(log: Option<EgoLog>, stream: Stream, stamp: &Stamp, stages: Vec<StageTiming>) {
     if let Some(log) = log {
-        log.add(&Record::Published(Published {
+        log.add(&EgoRecord::Published(PublishedResult {
             stream,
             stamp: stamp.clone(),
             stages,
@@ -181,7 +178,7 @@ fn note(log: Option<Log>, stream: Stream, stamp: &Stamp, stages: Vec<StageTiming
     }
 }
 
-struct Node<'a> {
+struct EgoNode<'a> {
     bus: &'a Bus,
     cav: CavId,
     ego: Ego,
@@ -193,11 +190,11 @@ struct Node<'a> {
     pace: Publisher,
     detections: Results,
     tracks: Option<Results>,
-    log: Option<Log>,
+    log: Option<EgoLog>,
     _own: Vec<Subscription>,
 }
 
-impl<'a> Node<'a> {
+impl<'a> EgoNode<'a> {
     fn open(
         bus: &'a Bus,
         cav: &CavId,
@@ -206,10 +203,8 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         let ego_loop = EgoLoop::new(cav, &ego, options.of_loop);
-        let log = options
-            .inputs
-            .as_ref()
-            .and_then(|file| InputLog::create(file, KIND, Some(ego.detector())));
+        let inputs = options.inputs.as_ref();
+        let log = inputs.and_then(|file| InputLog::create(file, KIND, Some(ego.detector())));
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         // Ends the wait for the next message at once.
         let closed = Arc::clone(&inbox);
@@ -259,7 +254,10 @@ impl<'a> Node<'a> {
             }
             // After each message: frames that wait in the loop would be one more queue behind the inbox.
             self.handle(Input::Wake);
-            self.report_problems();
+            // What the ego waits for is reported with the counters of the process.
+            let problems = self.ego_loop.problems(self.clock.now_nanos()).into_iter();
+            let problems = problems.map(|(problem, since)| (problem, self.clock.moment(since)));
+            self.bus.stats().set_problems("ego", problems);
         }
         Ok(())
     }
@@ -291,7 +289,7 @@ impl<'a> Node<'a> {
         if let Some(log) = &self.log
             && let Some(input) = input.without_message()
         {
-            log.add(&Record::Input { now_nanos, input });
+            log.add(&EgoRecord::Input { now_nanos, input });
         }
         self.decide(input, now_nanos);
     }
@@ -326,21 +324,11 @@ impl<'a> Node<'a> {
         }
     }
 
-    /// Reports what the ego waits for with the counters of the process.
-    fn report_problems(&self) {
-        let problems = self.ego_loop.problems(self.clock.now_nanos()).into_iter();
-        let problems = problems.map(|(problem, since)| (problem, self.clock.moment(since)));
-        self.bus.stats().set_problems("ego", problems);
-    }
-
     fn publish(&mut self, capture_nanos: u64, result: Detections) {
         let stats = self.bus.stats();
         // The own message's transport is counted already.
-        for stage in result
-            .stages
-            .iter()
-            .filter(|stage| stage.stage != "transport")
-        {
+        let stages = result.stages.iter();
+        for stage in stages.filter(|stage| stage.stage != "transport") {
             stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
         for neighbour in &result.neighbours {

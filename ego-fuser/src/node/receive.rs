@@ -6,13 +6,13 @@ use bus::{Arrival, LINK_TRANSIT_S, NETWORK_TRANSIT_S};
 use protocol::message::Descriptor;
 use protocol::{CavId, Stream};
 
-use super::Node;
+use super::EgoNode;
 use crate::capture_clock::SweepTime;
-use crate::ego_loop::recorded::{Record, WireMessage};
+use crate::ego_loop::recorded::{EgoRecord, WireMessage};
 use crate::ego_loop::{Input, Reception, Refusal};
 use crate::neighbourhood::sender_of;
 
-impl Node<'_> {
+impl EgoNode<'_> {
     /// Decodes a message and hands it to the loop.
     pub(super) fn admit(&mut self, arrival: &Arrival) {
         let Some((cav, stream)) = sender_of(&arrival.topic) else {
@@ -39,15 +39,14 @@ impl Node<'_> {
         };
         stats.timed("decode", began.elapsed());
         if let Some(transport) = transport {
-            let stage = format!("{stream} transport");
-            stats.timed(&stage, transport);
+            stats.timed(&format!("{stream} transport"), transport);
         }
         // Read after the decoding, and recorded: the replay gets the time that the loop gets.
         let now_nanos = self.clock.now_nanos();
         if let Some(log) = &self.log {
             let bytes = arrival.pieces().flatten().copied().collect();
             let input = Input::Message(WireMessage { reception, bytes });
-            log.add(&Record::Input { now_nanos, input });
+            log.add(&EgoRecord::Input { now_nanos, input });
         }
         self.decide(Input::Message(Box::new(message)), now_nanos);
     }
@@ -63,15 +62,11 @@ impl Node<'_> {
         let offset_nanos = (offset_s * 1e9) as i64;
         let newest_nanos = arrival.header.stamp.capture_nanos;
         // Arrivals are on the clock of the agent. Minus its lead they are on that of the ego.
-        let sweeps = descriptor
-            .sweeps
-            .iter()
-            .map(|sweep| SweepTime {
-                capture_nanos: newest_nanos.saturating_sub(sweep.before_nanos),
-                arrived_nanos: sweep.arrived_nanos.saturating_sub_signed(offset_nanos),
-            })
-            .collect();
-        self.handle(Input::Sweeps(cav.clone(), sweeps));
+        let sweeps = descriptor.sweeps.iter().map(|sweep| SweepTime {
+            capture_nanos: newest_nanos.saturating_sub(sweep.before_nanos),
+            arrived_nanos: sweep.arrived_nanos.saturating_sub_signed(offset_nanos),
+        });
+        self.handle(Input::Sweeps(cav.clone(), sweeps.collect()));
         self.handle(Input::Model(cav.clone(), descriptor));
     }
 

@@ -6,7 +6,7 @@
 use perception::tensor_values::tensor;
 use tch::{Device, Kind, Result, Tensor};
 
-use crate::samples::Offset;
+use crate::samples::PoseOffset;
 use fusion::targets::{BOX_CODE, Labels};
 
 /// Weight of a rotation by a radian relative to a shift by a metre: about the distance of objects that two neighbours
@@ -161,7 +161,7 @@ pub fn detection_loss(
 /// [`tch::TchError`] when a sample has other views than offsets.
 pub(crate) fn alignment_loss(
     corrections: &[Option<Tensor>],
-    offsets: &[Vec<Offset>],
+    offsets: &[Vec<PoseOffset>],
 ) -> Result<Tensor> {
     let unit = Tensor::f_from_slice(&[1.0, 1.0, METRES_PER_RADIAN as f32])?;
     let mut losses = Vec::new();
@@ -169,7 +169,7 @@ pub(crate) fn alignment_loss(
         let Some(moved_by) = moved_by else { continue };
         let device = moved_by.device();
         let of_others = offsets.iter().skip(1);
-        let wanted = of_others.flat_map(|Offset(offset)| offset.map(|value| value as f32));
+        let wanted = of_others.flat_map(|PoseOffset(offset)| offset.map(|value| value as f32));
         let wanted = tensor(&wanted.collect::<Vec<f32>>(), &[-1, 3], device)?;
         let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(device)?;
         // The largest of the three decides about a view as a whole.
@@ -277,12 +277,12 @@ mod tests {
     #[test]
     fn the_alignment_term_is_zero_where_errors_are_undone_and_weighs_turns_by_an_arm() {
         let offsets = vec![vec![
-            Offset::default(),
-            Offset([1.0, -0.5, 0.02]),
-            Offset([0.0, 2.0, 0.0]),
+            PoseOffset::default(),
+            PoseOffset([1.0, -0.5, 0.02]),
+            PoseOffset([0.0, 2.0, 0.0]),
         ]];
         let undone = Tensor::from_slice(&[1.0f32, -0.5, 0.02, 0.0, 2.0, 0.0]).view([2, 3]);
-        let loss = |corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]| {
+        let loss = |corrections: &[Option<Tensor>], offsets: &[Vec<PoseOffset>]| {
             alignment_loss(corrections, offsets)
                 .unwrap()
                 .double_value(&[])
@@ -303,9 +303,9 @@ mod tests {
             "towards the offset"
         );
         let lost = vec![vec![
-            Offset::default(),
-            Offset([9.0, 0.0, 0.0]),
-            Offset([0.0, 0.0, 1.0]),
+            PoseOffset::default(),
+            PoseOffset([9.0, 0.0, 0.0]),
+            PoseOffset([0.0, 0.0, 1.0]),
         ]];
         assert_eq!(
             loss(&[Some(still.detach())], &lost),
@@ -313,7 +313,7 @@ mod tests {
             "a lost vehicle has no alignment loss"
         );
         assert_eq!(
-            loss(&[None], &[vec![Offset::default()]]),
+            loss(&[None], &[vec![PoseOffset::default()]]),
             0.0,
             "ego-only there is nothing to align"
         );

@@ -35,7 +35,7 @@ pub enum Pop<K, T> {
     Closed,
 }
 
-struct State<K, T> {
+struct QueueState<K, T> {
     // Each item carries its index in the order of arrival, so that no lane can starve another.
     lanes: BTreeMap<K, VecDeque<(u64, T)>>,
     next_arrival: u64,
@@ -45,7 +45,7 @@ struct State<K, T> {
 /// Lanes of at most `lane_capacity` items each; safe to share between threads.
 pub struct BoundedQueue<K, T> {
     // A panic elsewhere leaves no half-done change: every method changes the state in one step.
-    state: Mutex<State<K, T>>,
+    state: Mutex<QueueState<K, T>>,
     changed: Condvar,
     lane_capacity: usize,
     max_lanes: usize,
@@ -55,7 +55,7 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     /// An empty queue of at most `max_lanes` lanes of `lane_capacity` items (both at least one).
     pub fn new(lane_capacity: usize, max_lanes: usize) -> Self {
         Self {
-            state: Mutex::new(State {
+            state: Mutex::new(QueueState {
                 lanes: BTreeMap::new(),
                 next_arrival: 0,
                 closed: false,
@@ -68,12 +68,13 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
 
     /// Appends `item` to its lane without waiting; a full lane gives up its oldest item.
     pub fn push(&self, key: K, item: T) -> PushOutcome<T> {
-        self.push_within(self.lane_capacity, key, item)
+        self.push_within(None, key, item)
     }
 
-    /// [`Self::push`] for a lane of another capacity than the others.
-    pub(crate) fn push_within(&self, lane_capacity: usize, key: K, item: T) -> PushOutcome<T> {
-        self.append(key, item, lane_capacity.max(1), false)
+    /// [`Self::push`] for a lane that may have another capacity than the others.
+    pub(crate) fn push_within(&self, capacity: Option<usize>, key: K, item: T) -> PushOutcome<T> {
+        let capacity = capacity.map_or(self.lane_capacity, |capacity| capacity.max(1));
+        self.append(key, item, capacity, false)
     }
 
     /// Appends `item` to its lane, waiting for room without a time limit.

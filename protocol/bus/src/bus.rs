@@ -13,7 +13,7 @@ use zenoh::{Session, Wait};
 use super::flush_barrier::FlushBarrier;
 use super::heartbeat::Heartbeat;
 use super::inbox_limits::InboxLimits;
-use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
+use super::liveliness::present;
 use super::metrics::{self, MetricsPeer};
 use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
@@ -263,28 +263,6 @@ impl Bus {
     /// Publishes `control` without waiting.
     pub fn publish_control(&self, control: Control, capture_nanos: u64) {
         self.status.publish(control, capture_nanos);
-    }
-
-    /// Declares the liveliness token of this process in its role.
-    ///
-    /// # Errors
-    /// [`BusError::Zenoh`] when the session is closed.
-    pub fn announce(&self, role: Role) -> Result<LivelinessToken> {
-        LivelinessToken::announce(&self.session, &self.identity.run, role, &self.identity.cav)
-    }
-
-    /// Subscribes to the liveliness of the processes of a role, present ones first. `report` must not wait or call
-    /// zenoh.
-    ///
-    /// # Errors
-    /// [`BusError::Zenoh`] when the session is closed.
-    pub fn watch(
-        &self,
-        role: Role,
-        report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
-    ) -> Result<LivelinessSubscription> {
-        let tokens = KeyExpr::alive(&self.identity.run, role);
-        LivelinessSubscription::begin(&self.session, &tokens, report)
     }
 
     /// The key of a topic in this run.

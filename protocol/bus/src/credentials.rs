@@ -92,10 +92,7 @@ impl Credentials {
         let text = readable(&path)?;
         let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
         lines
-            .map(|line| {
-                line.parse()
-                    .map_err(|cause: protocol::PrincipalError| bad(&path, &cause))
-            })
+            .map(|line| line.parse::<Principal>().map_err(|what| bad(&path, &what)))
             .collect()
     }
 }

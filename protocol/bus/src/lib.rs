@@ -91,7 +91,7 @@ pub use process_config::{Configured, ProcessConfig, minimal};
 pub use process_usage::{process_cpu_s, process_usage};
 pub use publisher::{Overflow, Publisher, PublisherOptions, has_subscribers, unix_nanos};
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
-pub use rejection_log::{Rejection, RejectionLog};
+pub use rejection_log::{RejectionLog, RouterRejection};
 pub use router_probe::RouterProbe;
 pub use session::{BusOptions, Role as SessionRole, SharedMemory, open, open_unless};
 pub use shared_pool::check_room;

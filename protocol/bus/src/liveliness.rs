@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use protocol::{CavId, Key, KeyExpr, ProcessId, Role, RunId, Topic};
+use protocol::{CavId, Key, KeyExpr, ProcessId, Role, Topic};
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use super::{BusError, process_id};
+use super::{Bus, BusError, process_id};
 use crate::Result;
 
 /// Timeout of a liveliness query to the router.
@@ -21,18 +21,6 @@ const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
 pub struct LivelinessToken(zenoh::liveliness::LivelinessToken);
 
 impl LivelinessToken {
-    /// Declares the liveliness token of `cav`'s process of this role.
-    ///
-    /// # Errors
-    /// [`BusError::Zenoh`] when the session is closed.
-    pub fn announce(session: &Session, run: &RunId, role: Role, cav: &CavId) -> Result<Self> {
-        let key = Key::alive(run, role, cav).to_string();
-        let token = session.liveliness().declare_token(&key).wait();
-        token
-            .map(Self)
-            .map_err(|cause| BusError::zenoh(format!("announcing {key}"), &cause))
-    }
-
     /// Withdraws the token and waits until the session has processed it.
     ///
     /// # Errors
@@ -91,21 +79,35 @@ pub struct LivelinessSubscription(
     #[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>,
 );
 
-impl LivelinessSubscription {
-    /// Calls `report` for every token that matches `selector`, present ones first.
+impl Bus {
+    /// Declares the liveliness token of this process in its role.
+    ///
+    /// # Errors
+    /// [`BusError::Zenoh`] when the session is closed.
+    pub fn announce(&self, role: Role) -> Result<LivelinessToken> {
+        let identity = self.identity();
+        let key = Key::alive(&identity.run, role, &identity.cav).to_string();
+        let token = self.session().liveliness().declare_token(&key).wait();
+        token
+            .map(LivelinessToken)
+            .map_err(|cause| BusError::zenoh(format!("announcing {key}"), &cause))
+    }
+
+    /// Subscribes to the liveliness of the processes of a role, present ones first.
     ///
     /// `report` runs on zenoh's receive thread: it hands over and returns, and must not call zenoh.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn begin(
-        session: &Session,
-        selector: &KeyExpr,
+    pub fn watch(
+        &self,
+        role: Role,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
-    ) -> Result<Self> {
-        let subscriber = session
-            .liveliness()
-            .declare_subscriber(selector.as_str())
+    ) -> Result<LivelinessSubscription> {
+        let tokens = KeyExpr::alive(&self.identity().run, role);
+        let liveliness = self.session().liveliness();
+        let subscriber = liveliness
+            .declare_subscriber(tokens.as_str())
             .history(true)
             .callback(move |sample| {
                 if let Some((role, cav)) = holder(sample.key_expr().as_str()) {
@@ -117,7 +119,7 @@ impl LivelinessSubscription {
             });
         subscriber
             .wait()
-            .map(Self)
-            .map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
+            .map(LivelinessSubscription)
+            .map_err(|cause| BusError::zenoh(format!("watching {tokens}"), &cause))
     }
 }

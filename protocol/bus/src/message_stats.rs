@@ -28,10 +28,10 @@ const KEPT_TIMINGS: usize = 2048;
 
 /// Message counters of one process. Clones share them. Topics outside the accounting ([`Topic::is_counted`]) are not
 /// counted.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub struct MessageStats {
     process: ProcessId,
-    state: Arc<Mutex<State>>,
+    state: Arc<Mutex<CounterState>>,
 }
 
 /// Way of a large message of a process that has a pool of shared memory.
@@ -53,8 +53,8 @@ impl SharedMemoryUse {
     }
 }
 
-#[derive(Default)]
-struct State {
+#[derive(Debug, Default)]
+struct CounterState {
     ledger: Ledger,
     // Messages of an account that have passed this process's queue: out of a sender's queue onto the network, or from
     // the network into a receiver's. The difference to the messages counted is in flight.
@@ -73,7 +73,7 @@ struct State {
     is_full: bool,
 }
 
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Peer {
     clock: Option<ClockOffset>,
     trust: Option<f64>,
@@ -108,7 +108,7 @@ pub(crate) struct StageHistogram {
     pub buckets: Vec<(f64, u64)>,
 }
 
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Timings {
     count: u64,
     sum: Duration,
@@ -205,30 +205,17 @@ impl MessageStats {
 
     /// Counts an arrived message as malformed; logged ever more rarely, as a hostile peer must not fill the log.
     pub fn rejected(&self, topic: &Topic, error: &WireError) {
-        self.count_rejected(topic, error.drop_reason(), error);
+        self.reject(topic, error.drop_reason(), error);
     }
 
-    /// Counts an arrived message as above the rate limit of its topic; logged like a malformed one.
-    pub(super) fn limited(&self, topic: &Topic, why: &'static str) {
-        self.count_rejected(topic, DropReason::RateLimit, &why);
-    }
-
-    /// Logs a notification above the rate limit; not counted, as no sender counts its own notifications.
-    pub(super) fn limited_notice(&self, topic: &Topic, why: &'static str) {
-        self.warn_once(topic, DropReason::RateLimit, &why);
-    }
-
-    /// Counts a valid message whose content its sender may not publish; logged like a malformed one.
-    pub(super) fn reject_invalid(&self, topic: &Topic, why: &'static str) {
-        self.count_rejected(topic, DropReason::Identity, &why);
-    }
-
-    fn count_rejected(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
+    /// Counts an arrived message as not used; logged like a malformed one.
+    pub(super) fn reject(&self, topic: &Topic, reason: DropReason, why: impl fmt::Display) {
         self.dropped(topic, reason);
-        self.warn_once(topic, reason, why);
+        self.warn_rejected(topic, reason, why);
     }
 
-    fn warn_once(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
+    /// Logs a message that is not used, as [`Self::rejected`].
+    pub(super) fn warn_rejected(&self, topic: &Topic, reason: DropReason, why: impl fmt::Display) {
         let times = {
             let mut state = self.lock();
             let has_room =
@@ -412,8 +399,21 @@ impl MessageStats {
     /// Summary of every stage over its most recent frames.
     pub fn stages(&self) -> Vec<StageSummary> {
         let state = self.lock();
-        let stages = state.stages.iter();
-        let summaries = stages.map(|(stage, timings)| timings.summary(stage));
+        let summaries = state.stages.iter().map(|(stage, timings)| {
+            let seconds = timings.last.iter().map(Duration::as_secs_f64);
+            let ms: Vec<f64> = seconds.map(|seconds| seconds * 1e3).collect();
+            let ms = sorted(&ms);
+            let [p50_ms, p95_ms, p99_ms] =
+                [0.50, 0.95, 0.99].map(|q| quantile(&ms, q).unwrap_or(0.0));
+            StageSummary {
+                stage: stage.clone(),
+                count: timings.count,
+                p50_ms,
+                p95_ms,
+                p99_ms,
+                max_ms: timings.max.as_secs_f64() * 1e3,
+            }
+        });
         summaries.collect()
     }
 
@@ -430,7 +430,7 @@ impl MessageStats {
         histograms.collect()
     }
 
-    fn note(&self, topic: &Topic, change: impl FnOnce(&mut State)) {
+    fn note(&self, topic: &Topic, change: impl FnOnce(&mut CounterState)) {
         if topic.is_counted() {
             let mut state = self.lock();
             // Forged ids must not fill the memory, nor make a ledger that exceeds the limit of its receivers.
@@ -442,13 +442,13 @@ impl MessageStats {
         }
     }
 
-    fn note_published(&self, topic: &Topic, change: impl FnOnce(&mut State, Account)) {
+    fn note_published(&self, topic: &Topic, change: impl FnOnce(&mut CounterState, Account)) {
         self.note(topic, |state| {
             change(state, Account::published(topic.clone()))
         });
     }
 
-    fn has_account(&self, state: &State, topic: &Topic) -> bool {
+    fn has_account(&self, state: &CounterState, topic: &Topic) -> bool {
         [self.here(topic), Account::published(topic.clone())]
             .iter()
             .any(|account| state.ledger.get(account).is_some())
@@ -459,12 +459,12 @@ impl MessageStats {
     }
 
     // Counters are changed in one step each: a panic elsewhere leaves them consistent.
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, CounterState> {
         lock(&self.state)
     }
 }
 
-impl State {
+impl CounterState {
     fn peer(&mut self, cav: &CavId) -> Option<&mut Peer> {
         if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
             return None;
@@ -474,23 +474,6 @@ impl State {
 
     fn pass(&mut self, account: Account, messages: u64) {
         *self.passed.entry(account).or_default() += messages;
-    }
-}
-
-impl Timings {
-    fn summary(&self, stage: &str) -> StageSummary {
-        let seconds = self.last.iter().map(Duration::as_secs_f64);
-        let ms: Vec<f64> = seconds.map(|seconds| seconds * 1e3).collect();
-        let ms = sorted(&ms);
-        let [p50_ms, p95_ms, p99_ms] = [0.50, 0.95, 0.99].map(|q| quantile(&ms, q).unwrap_or(0.0));
-        StageSummary {
-            stage: stage.to_owned(),
-            count: self.count,
-            p50_ms,
-            p95_ms,
-            p99_ms,
-            max_ms: self.max.as_secs_f64() * 1e3,
-        }
     }
 }
 
@@ -571,7 +554,7 @@ mod tests {
         for id in 0..3 * MAX_ACCOUNTS {
             stats.subscribed(&topic(id));
             stats.arrived(&topic(id));
-            stats.limited(&topic(id), "too much");
+            stats.reject(&topic(id), DropReason::RateLimit, "too much");
         }
         assert_eq!(stats.ledger().len(), MAX_ACCOUNTS);
         stats.received(&topic(0));

@@ -156,13 +156,8 @@ fn vehicle_label(peer: &PeerSummary) -> [(&'static str, String); 1] {
     [("vehicle", peer.cav.to_string())]
 }
 
+#[derive(Debug)]
 struct StatsCollector(MessageStats);
-
-impl fmt::Debug for StatsCollector {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "message counters of {}", self.0.process())
-    }
-}
 
 impl Collector for StatsCollector {
     fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {

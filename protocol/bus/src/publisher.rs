@@ -169,11 +169,10 @@ impl Publisher {
         let has_subscribers = options
             .is_for_onlookers
             .then(|| has_subscribers(&publisher))
-            .transpose();
-        let has_subscribers = has_subscribers
+            .transpose()
             .map_err(|cause| BusError::zenoh(format!("asking for subscribers of {key}"), &cause))?;
         let queue = Arc::new(BoundedQueue::new(places, 1));
-        let sender = Sender {
+        let sender = SendingThread {
             topic: topic.clone(),
             cav: cav.clone(),
             epoch,
@@ -227,14 +226,15 @@ impl Publisher {
     ) {
         self.push(
             capture_nanos,
-            |stamp, pool| Ok(pool.payload(encode(stamp)?)),
+            Box::new(|stamp, pool| Ok(pool.payload(encode(stamp)?))),
         );
     }
 
     /// Forwards a message unchanged, under the stamp of its sender; nothing is copied.
     pub fn relay(&self, arrival: &Arrival) {
         let bytes = arrival.payload.clone();
-        self.push(arrival.header.stamp.capture_nanos, |_, _| Ok(bytes));
+        let capture_nanos = arrival.header.stamp.capture_nanos;
+        self.push(capture_nanos, Box::new(|_, _| Ok(bytes)));
     }
 
     /// The same with another capture time, that of an erroneous clock.
@@ -251,15 +251,12 @@ impl Publisher {
         writer.append(header.to_bytes().to_vec().into());
         writer.append(rest.to_vec().into());
         let bytes = writer.finish();
-        self.push(capture_nanos, |_, _| Ok(bytes));
+        self.push(capture_nanos, Box::new(|_, _| Ok(bytes)));
     }
 
-    fn push<E>(&self, capture_nanos: u64, encode: E)
-    where
-        E: FnOnce(&Stamp, &SharedPool) -> Result<ZBytes, WireError> + Send + 'static,
-    {
+    fn push(&self, capture_nanos: u64, encode: Encode) {
         self.stats.submitted(&self.topic);
-        let submission: Submission = (capture_nanos, Box::new(encode));
+        let submission = (capture_nanos, encode);
         let pushed = match self.overflow {
             Overflow::KeepLast(_) => self.queue.push((), submission),
             Overflow::Wait(_) => self.queue.push_waiting((), submission),
@@ -290,7 +287,7 @@ impl Drop for Publisher {
 }
 
 /// State of the sending thread.
-struct Sender {
+struct SendingThread {
     topic: Topic,
     cav: CavId,
     epoch: u64,
@@ -308,7 +305,7 @@ struct Sender {
     is_one_at_a_time: bool,
 }
 
-impl Sender {
+impl SendingThread {
     fn run(mut self) {
         batch_scheduling::use_batch_scheduling();
         if self.has_notifications {

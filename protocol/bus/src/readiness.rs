@@ -11,7 +11,7 @@ use std::str::FromStr;
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use protocol::{CavId, Control, KeyExpr, Limits, Principal, ProcessId, Role, Topic};
+use protocol::{CavId, Control, DropReason, KeyExpr, Limits, Principal, ProcessId, Role, Topic};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::sync::{lock, spawn, wait_at_most};
@@ -149,7 +149,10 @@ impl Barrier {
                         self.confirm(&Route::new(topic, sender.clone()));
                     }
                 }
-                Some(_) => inbox.reject_invalid(&topic, "not the sender's own readiness"),
+                Some(_) => {
+                    let why = "not the sender's own readiness";
+                    inbox.stats.reject(&topic, DropReason::Identity, why);
+                }
                 None => {}
             }
         }

@@ -18,9 +18,9 @@ const MAX_REJECTIONS: usize = 1024;
 /// Name of peers that are not authenticated.
 const UNAUTHORISED: &str = "unauthorised";
 
-/// Rejection of a message or of a connection by a router.
+/// RouterRejection of a message or of a connection by a router.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-pub struct Rejection {
+pub struct RouterRejection {
     /// Common name of the certificate, or the session's id without one; `UNAUTHORISED` for peers not admitted.
     pub peer: String,
     /// `access-control`, `low-pass` or `handshake`.
@@ -36,7 +36,7 @@ const PLAIN_TCP: &str = "plain TCP";
 #[derive(Debug)]
 pub struct RejectionLog {
     // zenoh drops the counters of a connection that has ended.
-    seen: BTreeMap<(Rejection, String), u64>,
+    seen: BTreeMap<(RouterRejection, String), u64>,
     /// Failed handshakes, by cause.
     failed_handshakes: BTreeMap<&'static str, u64>,
     plain_tcp: Option<PlainTcp>,
@@ -87,14 +87,14 @@ impl RejectionLog {
     }
 
     /// Number of rejections.
-    pub fn counts(&self) -> BTreeMap<Rejection, u64> {
+    pub fn counts(&self) -> BTreeMap<RouterRejection, u64> {
         let mut counts = BTreeMap::new();
         for ((rejection, _), count) in &self.seen {
             *counts.entry(rejection.clone()).or_default() += count;
         }
         for (cause, count) in &self.failed_handshakes {
             let [peer, reason, message] = [UNAUTHORISED, "handshake", *cause].map(str::to_owned);
-            let rejection = Rejection {
+            let rejection = RouterRejection {
                 peer,
                 reason,
                 message,
@@ -111,7 +111,7 @@ const DROPPED: &str = "zenoh_rx_network_message_dropped_payload_per_transport_by
 /// Reads a line of zenoh's metrics such as
 /// `zenoh_rx_network_message_dropped_payload_per_transport_bytes_count{message="put",reason="access-control",remote_cn="agent-1"}
 /// 3`.
-fn rejected(line: &str) -> Option<((Rejection, String), u64)> {
+fn rejected(line: &str) -> Option<((RouterRejection, String), u64)> {
     let (name, rest) = line.split_once('{')?;
     if name != DROPPED {
         return None;
@@ -125,7 +125,7 @@ fn rejected(line: &str) -> Option<((Rejection, String), u64)> {
         .unwrap_or_else(|| zid.clone());
     // Each priority has a count of its own.
     let connection = format!("{zid} {}", label(labels, "priority")?);
-    let rejection = Rejection {
+    let rejection = RouterRejection {
         peer,
         reason,
         message: label(labels, "message")?,

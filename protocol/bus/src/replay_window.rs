@@ -23,7 +23,7 @@ const TOPICS: usize = 1024;
 /// State of the senders on all topics of an inbox.
 #[derive(Debug, Default)]
 pub(super) struct ReplayWindow {
-    topics: BTreeMap<Topic, Senders>,
+    topics: BTreeMap<Topic, TopicSenders>,
 }
 
 /// Result of the check of a message.
@@ -36,7 +36,7 @@ pub(super) struct Admission {
 }
 
 #[derive(Debug)]
-struct Senders {
+struct TopicSenders {
     current: Sender,
     former: VecDeque<Sender>,
     starts: VecDeque<Instant>,
@@ -80,7 +80,7 @@ impl ReplayWindow {
             }
         }
         let current = Sender::new(epoch, sequence, now);
-        let senders = Senders {
+        let senders = TopicSenders {
             current,
             former: VecDeque::new(),
             starts: VecDeque::new(),
@@ -91,7 +91,7 @@ impl ReplayWindow {
     }
 }
 
-impl Senders {
+impl TopicSenders {
     fn admit(&mut self, epoch: u64, sequence: u64, now: Instant) -> Admission {
         let was_quarantined = self.quarantined_until.is_some();
         self.quarantined_until = self.quarantined_until.filter(|until| now < *until);

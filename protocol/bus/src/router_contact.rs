@@ -13,10 +13,10 @@ use super::BusError;
 
 /// Times without a connection to the router. The router's own session never loses it.
 #[derive(Debug, Clone, Default)]
-pub(super) struct RouterContact(Arc<Mutex<State>>);
+pub(super) struct RouterContact(Arc<Mutex<ContactState>>);
 
 #[derive(Debug, Default)]
-struct State {
+struct ContactState {
     lost_at: Option<Instant>,
     /// Sum of the times that are over.
     lost: Duration,

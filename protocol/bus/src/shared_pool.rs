@@ -25,9 +25,9 @@ const FOLDER: &str = "/dev/shm";
 
 /// The pool of a process, or none. Clones share it.
 #[derive(Clone)]
-pub(super) struct SharedPool(Option<Arc<Pool>>);
+pub(super) struct SharedPool(Option<Arc<ShmPool>>);
 
-struct Pool {
+struct ShmPool {
     provider: ShmProvider<PosixShmProviderBackend>,
     session: Session,
     stats: MessageStats,
@@ -55,7 +55,7 @@ impl SharedPool {
         let provider = ShmProviderBuilder::default_backend(bytes).wait();
         let provider =
             provider.map_err(|cause| BusError::zenoh("making a pool of shared memory", &cause))?;
-        Ok(Self(Some(Arc::new(Pool {
+        Ok(Self(Some(Arc::new(ShmPool {
             provider,
             session: session.clone(),
             stats: stats.clone(),
@@ -79,7 +79,8 @@ impl SharedPool {
     /// A copy of a large body in the pool.
     fn shared(&self, body: &[u8]) -> Option<ZShmMut> {
         let pool = self.0.as_deref().filter(|_| body.len() >= SMALL_BYTES)?;
-        if !is_router_attached(&pool.session) {
+        let info = pool.session.info();
+        if !info.transports().wait().any(|transport| transport.is_shm()) {
             pool.stats.shared(SharedMemoryUse::RouterNotAttached);
             return None;
         }
@@ -97,11 +98,6 @@ impl SharedPool {
         pool.stats.shared(SharedMemoryUse::Carried);
         Some(place)
     }
-}
-
-fn is_router_attached(session: &Session) -> bool {
-    let info = session.info();
-    info.transports().wait().any(|transport| transport.is_shm())
 }
 
 /// Checks that the system has room for pools of `bytes` together: a segment is made without its memory, and a process

@@ -7,17 +7,15 @@ use std::time::{Duration, Instant};
 
 use support::sync::{lock, spawn, wait_at_most};
 
-type Reaction = Box<dyn FnOnce() + Send>;
-
 #[derive(Default)]
-struct State {
+struct StopState {
     requested: bool,
-    reactions: Vec<Reaction>,
+    reactions: Vec<Box<dyn FnOnce() + Send>>,
 }
 
 /// A stop request that every thread of a process can read, make, wait for and react to.
 #[derive(Clone, Default)]
-pub struct Stop(Arc<(Mutex<State>, Condvar)>);
+pub struct Stop(Arc<(Mutex<StopState>, Condvar)>);
 
 impl Stop {
     /// A request that has not been made.

@@ -28,7 +28,7 @@ const PLACES: usize = 64;
 /// Maximum number of topics reported as confirmed, equal to the limit of receivers of the list.
 const MAX_CONFIRMED: usize = 512;
 
-enum Request {
+enum StatusTask {
     Ready,
     /// With its capture time, nanoseconds.
     Control(Control, u64),
@@ -36,25 +36,24 @@ enum Request {
 
 /// A handle to the status thread of this process.
 #[derive(Clone)]
-pub(super) struct StatusPublisher(Arc<Shared>);
+pub(super) struct StatusPublisher(Arc<StatusState>);
 
-struct Shared {
+struct StatusState {
     confirmed: Mutex<BTreeSet<Topic>>,
     // Many probes need one answer.
     answer_due: AtomicBool,
     // Of the worker thread, while it works.
     watchdog: Mutex<Option<Arc<Watchdog>>>,
-    queue: BoundedQueue<(), Request>,
+    queue: BoundedQueue<(), StatusTask>,
 }
 
 impl StatusPublisher {
     pub(super) fn new() -> Self {
-        let queue = BoundedQueue::new(PLACES, 1);
-        Self(Arc::new(Shared {
+        Self(Arc::new(StatusState {
             confirmed: Mutex::default(),
             answer_due: AtomicBool::new(false),
             watchdog: Mutex::default(),
-            queue,
+            queue: BoundedQueue::new(PLACES, 1),
         }))
     }
 
@@ -70,13 +69,13 @@ impl StatusPublisher {
     pub(super) fn probed(&self, topic: &Topic) {
         self.confirm_route(topic);
         if !self.0.answer_due.swap(true, Ordering::AcqRel) {
-            self.push(Request::Ready);
+            self.push(StatusTask::Ready);
         }
     }
 
     /// Publishes `control`.
     pub(super) fn publish(&self, control: Control, capture_nanos: u64) {
-        self.push(Request::Control(control, capture_nanos));
+        self.push(StatusTask::Control(control, capture_nanos));
     }
 
     /// Heartbeats are published only while this thread works; `None`: always.
@@ -89,9 +88,9 @@ impl StatusPublisher {
         self.0.queue.close();
     }
 
-    fn push(&self, request: Request) {
+    fn push(&self, request: StatusTask) {
         let outcome = self.0.queue.push((), request);
-        if let PushOutcome::Replaced(Request::Control(control, _)) = outcome {
+        if let PushOutcome::Replaced(StatusTask::Control(control, _)) = outcome {
             tracing::error!("the network is stalled: {control:?} was not sent");
         }
     }
@@ -116,13 +115,13 @@ pub(super) struct StatusSender {
 }
 
 impl StatusSender {
-    fn run(mut self, shared: &Shared) {
+    fn run(mut self, shared: &StatusState) {
         let mut beats = 0;
         let mut next = Instant::now() + PERIOD;
         loop {
             match shared.queue.take(Some(next)) {
-                Pop::Item((), Request::Ready) => self.ready(shared),
-                Pop::Item((), Request::Control(control, nanos)) => self.control(control, nanos),
+                Pop::Item((), StatusTask::Ready) => self.ready(shared),
+                Pop::Item((), StatusTask::Control(control, nanos)) => self.control(control, nanos),
                 Pop::TimedOut => {
                     // From now, not from the time due: no burst of heartbeats follows a stall.
                     next = Instant::now() + PERIOD;
@@ -137,7 +136,7 @@ impl StatusSender {
         }
     }
 
-    fn ready(&mut self, shared: &Shared) {
+    fn ready(&mut self, shared: &StatusState) {
         // Cleared first: a probe that arrives from here on requests a new answer.
         shared.answer_due.store(false, Ordering::Release);
         let subscribed: Vec<Topic> = lock(&shared.confirmed).iter().cloned().collect();

@@ -26,9 +26,6 @@ use super::{BusError, MessageStats};
 /// Maximum size of a notification. Larger messages are not read to find out whether they are one.
 const MAX_NOTICE_BYTES: usize = 16 << 10;
 
-/// Key of a queue lane, a topic and true for its notifications: separate from its data, which they must never replace.
-type Lane = (Topic, bool);
-
 /// An item of an inbox.
 #[derive(Debug)]
 pub enum Event {
@@ -100,10 +97,11 @@ impl Arrival {
 
 /// Inbox of a thread: the messages of all topics that it subscribed to, in bounded lanes.
 pub struct Inbox {
-    queue: BoundedQueue<Lane, Event>,
+    /// A lane is a topic, and true for its notifications: separate from its data, which they must never replace.
+    queue: BoundedQueue<(Topic, bool), Event>,
     replay_window: Mutex<ReplayWindow>,
     gaps: Mutex<DeliveryGaps>,
-    stats: MessageStats,
+    pub(super) stats: MessageStats,
     meters: RateLimiter,
     max_waiting: usize,
     waiting_bytes: AtomicUsize,
@@ -162,11 +160,6 @@ impl Inbox {
             .ok()
     }
 
-    /// Counts and logs a message on `topic` whose content its sender may not publish.
-    pub(super) fn reject_invalid(&self, topic: &Topic, why: &'static str) {
-        self.stats.reject_invalid(topic, why);
-    }
-
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
         let is_notice = matches!(event, Event::End { .. });
         let lane = (topic.clone(), is_notice);
@@ -176,15 +169,10 @@ impl Inbox {
         let waiting = self.waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
         if waiting.saturating_add(bytes) > self.max_waiting && !is_notice {
             self.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
-            return self
-                .stats
-                .limited(topic, "the limit of queued bytes is reached");
+            let why = "the limit of queued bytes is reached";
+            return self.stats.reject(topic, DropReason::RateLimit, why);
         }
-        let pushed = match places {
-            Some(places) => self.queue.push_within(places, lane, event),
-            None => self.queue.push(lane, event),
-        };
-        let lost = match pushed {
+        let lost = match self.queue.push_within(places, lane, event) {
             PushOutcome::Queued => return,
             PushOutcome::Replaced(event)
             | PushOutcome::NoLane(event)
@@ -213,12 +201,10 @@ impl Subscription {
     ) -> Result<Self, BusError> {
         inbox.stats.subscribed(&key.topic);
         let topic = key.topic.clone();
-        Self::declare(
-            session,
-            &key.to_string(),
-            IngressFilter::new(inbox, places, status),
-            move |_| Some(topic.clone()),
-        )
+        let filter = IngressFilter::new(inbox, places, status);
+        Self::declare(session, &key.to_string(), filter, move |_| {
+            Some(topic.clone())
+        })
     }
 
     pub(super) fn to_all(
@@ -327,11 +313,13 @@ impl IngressFilter {
     /// Rejects a message above the rate limit. Its header decides whether the sender has counted it.
     fn reject(&self, topic: &Topic, payload: &ZBytes) {
         const WHY: &str = "above the rate limit of its sender";
+        let (stats, reason) = (&self.inbox.stats, DropReason::RateLimit);
         if header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header)) {
-            return self.inbox.stats.limited_notice(topic, WHY);
+            // Not counted, as no sender counts its own notifications.
+            return stats.warn_rejected(topic, reason, WHY);
         }
-        self.inbox.stats.arrived(topic);
-        self.inbox.stats.limited(topic, WHY);
+        stats.arrived(topic);
+        stats.reject(topic, reason, WHY);
     }
 
     fn refuse(&self, topic: &Topic, error: &WireError) {

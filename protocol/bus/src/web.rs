@@ -80,7 +80,7 @@ pub enum Answer {
 }
 
 type Handler = dyn Fn(&Request) -> Answer + Send + Sync;
-type Body = UnsyncBoxBody<Bytes, Infallible>;
+type WebBody = UnsyncBoxBody<Bytes, Infallible>;
 
 /// Readers of a server, as counters.
 #[derive(Debug)]
@@ -217,7 +217,7 @@ async fn answer(
     handler: Arc<Handler>,
     local: Option<SocketAddr>,
     request: hyper::Request<Incoming>,
-) -> Result<Response<Body>, Infallible> {
+) -> Result<Response<WebBody>, Infallible> {
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
         let mut refusal = refuse(StatusCode::METHOD_NOT_ALLOWED, "GET and HEAD only".into());
         refusal
@@ -251,16 +251,16 @@ async fn answer(
     })
 }
 
-fn refuse(status: StatusCode, message: String) -> Response<Body> {
+fn refuse(status: StatusCode, message: String) -> Response<WebBody> {
     respond(status, TEXT, whole(message.into()))
 }
 
-fn whole(bytes: Bytes) -> Body {
+fn whole(bytes: Bytes) -> WebBody {
     Full::new(bytes).boxed_unsync()
 }
 
 /// Nothing is cached.
-fn respond(status: StatusCode, content_type: &'static str, body: Body) -> Response<Body> {
+fn respond(status: StatusCode, content_type: &'static str, body: WebBody) -> Response<WebBody> {
     let mut response = Response::new(body);
     *response.status_mut() = status;
     let headers = [

@@ -4,11 +4,11 @@ use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::GroundTruth;
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use protocol::{Box3d, Detection};
-use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods};
+use pyo3::types::{IntoPyDict, PyAnyMethods};
 use pyo3::{Bound, IntoPyObject, PyAny, PyResult, Python, pyfunction};
 
 use crate::error::error;
-use crate::payload::{Detections, Objects};
+use crate::payload::{Objects, PyDetections};
 
 /// Average precision of detections over frames.
 #[pyfunction]
@@ -50,20 +50,14 @@ pub(crate) fn average_precision<'py>(
     });
     match (single, found.first()) {
         (Some(_), Some(found)) => Ok(found.into_pyobject(py)?.into_any()),
-        _ => {
-            let by_iou = PyDict::new(py);
-            for (iou, found) in thresholds.iter().zip(found) {
-                by_iou.set_item(iou, found)?;
-            }
-            Ok(by_iou.into_any())
-        }
+        _ => Ok(thresholds.iter().zip(found).into_py_dict(py)?.into_any()),
     }
 }
 
-type Scored = (Vec<Detection>, GroundTruth);
+type ScoredFrame = (Vec<Detection>, GroundTruth);
 
 /// Detections and ground truth of each frame.
-fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<Vec<Scored>> {
+fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<Vec<ScoredFrame>> {
     let (detections, truth) = (entries("detections", detections)?, entries("truth", truth)?);
     if detections.len() != truth.len() {
         let (found, expected) = (detections.len(), truth.len());
@@ -87,7 +81,7 @@ fn entries<'py>(name: &str, frames: &Bound<'py, PyAny>) -> PyResult<Vec<Bound<'p
 
 fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detection>> {
     let py = found.py();
-    let (boxes, scores) = match found.cast::<Detections>() {
+    let (boxes, scores) = match found.cast::<PyDetections>() {
         Ok(found) => {
             let found = found.get();
             (

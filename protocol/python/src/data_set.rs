@@ -8,7 +8,7 @@ use pyo3::exceptions::PyIndexError;
 use pyo3::{Py, PyErr, PyRef, PyResult, Python, pyclass, pyfunction, pymethods};
 
 use crate::error::error;
-use crate::frame::Frame;
+use crate::frame::FleetFrame;
 use crate::frame_parts::{AgentParts, FrameParts};
 use crate::recording_frames::RecordingFrames;
 
@@ -18,30 +18,19 @@ pub(crate) struct DataSet {
     path: PathBuf,
     options: LoadOptions,
     protocol: EvaluationProtocol,
-    source: Source,
+    source: FrameSet,
 }
 
-enum Source {
+enum FrameSet {
     Folder(Dataset),
     Recording(Box<RecordingFrames>),
 }
 
 impl DataSet {
-    fn count(&self) -> usize {
-        match &self.source {
-            Source::Folder(dataset) => dataset
-                .scenarios
-                .iter()
-                .map(|scenario| scenario.ticks.len())
-                .sum(),
-            Source::Recording(recording) => recording.frames.len(),
-        }
-    }
-
     fn load(&self, index: usize) -> Option<FrameParts> {
         let dataset = match &self.source {
-            Source::Folder(dataset) => dataset,
-            Source::Recording(recording) => return recording.load(index),
+            FrameSet::Folder(dataset) => dataset,
+            FrameSet::Recording(recording) => return recording.load(index),
         };
         let mut tick = index;
         for scenario in &dataset.scenarios {
@@ -70,9 +59,9 @@ impl DataSet {
         None
     }
 
-    fn frame(&self, py: Python<'_>, index: usize) -> PyResult<Option<Frame>> {
+    fn frame(&self, py: Python<'_>, index: usize) -> PyResult<Option<FleetFrame>> {
         py.detach(|| self.load(index))
-            .map(|parts| Frame::new(py, parts))
+            .map(|parts| FleetFrame::new(py, parts))
             .transpose()
     }
 }
@@ -80,11 +69,18 @@ impl DataSet {
 #[pymethods]
 impl DataSet {
     fn __len__(&self) -> usize {
-        self.count()
+        match &self.source {
+            FrameSet::Folder(dataset) => dataset
+                .scenarios
+                .iter()
+                .map(|scenario| scenario.ticks.len())
+                .sum(),
+            FrameSet::Recording(recording) => recording.frames.len(),
+        }
     }
 
-    fn __getitem__(&self, py: Python<'_>, index: isize) -> PyResult<Frame> {
-        let count = self.count();
+    fn __getitem__(&self, py: Python<'_>, index: isize) -> PyResult<FleetFrame> {
+        let count = self.__len__();
         let wanted = if index < 0 {
             count.checked_add_signed(index)
         } else {
@@ -123,28 +119,28 @@ impl DataSet {
     #[getter]
     fn layout(&self) -> &'static str {
         match &self.source {
-            Source::Folder(dataset) => dataset.layout.name(),
-            Source::Recording(_) => Layout::RECORDING.name(),
+            FrameSet::Folder(dataset) => dataset.layout.name(),
+            FrameSet::Recording(_) => Layout::RECORDING.name(),
         }
     }
 
     #[getter]
     fn scenarios(&self) -> Vec<String> {
         match &self.source {
-            Source::Folder(dataset) => dataset
+            FrameSet::Folder(dataset) => dataset
                 .scenarios
                 .iter()
                 .map(|scenario| scenario.name.clone())
                 .collect(),
-            Source::Recording(recording) => vec![recording.run.clone()],
+            FrameSet::Recording(recording) => vec![recording.run.clone()],
         }
     }
 
     #[getter]
     fn problems(&self) -> Vec<String> {
         match &self.source {
-            Source::Folder(dataset) => dataset.problems.iter().map(ToString::to_string).collect(),
-            Source::Recording(recording) => recording.problems(),
+            FrameSet::Folder(dataset) => dataset.problems.iter().map(ToString::to_string).collect(),
+            FrameSet::Recording(recording) => recording.problems(),
         }
     }
 
@@ -153,7 +149,7 @@ impl DataSet {
             "DataSet({:?}, {}, {} frames)",
             self.path,
             self.layout(),
-            self.count()
+            self.__len__()
         )
     }
 }
@@ -173,7 +169,7 @@ impl DataSetIterator {
         slf
     }
 
-    fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<Frame>> {
+    fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<FleetFrame>> {
         self.next += 1;
         self.data_set.get().frame(py, self.next - 1)
     }
@@ -201,12 +197,12 @@ pub(crate) fn read(
         let recording = dataset::recording_of(&path)
             .map(|file| RecordingFrames::open(&file, &options, of_recording.clone()));
         if let Some(Ok(recording)) = recording {
-            return Ok((Source::Recording(Box::new(recording)), of_recording));
+            return Ok((FrameSet::Recording(Box::new(recording)), of_recording));
         }
         // A recording that cannot be read gives the same error here.
         let dataset = dataset::open(&path).map_err(error)?;
         let protocol = protocols.resolve(dataset.layout).map_err(error)?;
-        Ok((Source::Folder(dataset), protocol))
+        Ok((FrameSet::Folder(dataset), protocol))
     });
     let (source, protocol) = opened?;
     Ok(DataSet {

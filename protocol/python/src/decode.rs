@@ -1,18 +1,19 @@
 //! Messages of the wire format, one at a time.
 
-use protocol::{CavId, Header, Key, Kind, Limits, Message as WireMessage, Topic, wire};
+use dataset::frame::Frame;
+use protocol::{CavId, Header, Key, Kind, Limits, Message, Topic, wire};
 use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods};
 use pyo3::{Py, PyAny, PyErr, PyResult, Python, pyclass, pyfunction, pymethods};
 
 use crate::error::error;
-use crate::frame::Agent;
+use crate::frame::PyAgent;
 use crate::frame_parts::{AgentParts, decode_stream};
-use crate::payload::{Bev, Camera, DecodedBev, Detections, PoseEstimate, Tracks};
+use crate::payload::{DecodedBev, PyBev, PyCamera, PyDetections, PyPoseEstimate, PyTracks};
 use crate::{arrays, json};
 
 /// One message: header and payload.
-#[pyclass(frozen, get_all, module = "v2vloc")]
-pub(crate) struct Message {
+#[pyclass(frozen, get_all, name = "Message", module = "v2vloc")]
+pub(crate) struct PyMessage {
     key: Option<String>,
     kind: String,
     cav: String,
@@ -25,18 +26,18 @@ pub(crate) struct Message {
 }
 
 /// A decoded message before Python sees it.
-pub(crate) struct Decoded {
+pub(crate) struct DecodedMessage {
     header: Header,
-    content: Content,
+    content: DecodedContent,
     wire_bytes: usize,
 }
 
-enum Content {
+enum DecodedContent {
     Bev(DecodedBev),
-    Other(WireMessage),
+    Other(Message),
 }
 
-impl Decoded {
+impl DecodedMessage {
     /// Decodes a message of a kind.
     fn of_kind(kind: Kind, bytes: &[u8]) -> Result<Self, protocol::WireError> {
         // Before the payload: a message of another kind is refused without being decoded.
@@ -58,12 +59,12 @@ impl Decoded {
 
     fn new(
         header: Header,
-        message: WireMessage,
+        message: Message,
         wire_bytes: usize,
     ) -> Result<Self, protocol::WireError> {
         let content = match message {
-            WireMessage::Bev(bev) => Content::Bev(DecodedBev::decode(bev)?),
-            message => Content::Other(message),
+            Message::Bev(bev) => DecodedContent::Bev(DecodedBev::decode(bev)?),
+            message => DecodedContent::Other(message),
         };
         Ok(Self {
             header,
@@ -73,12 +74,12 @@ impl Decoded {
     }
 }
 
-impl Message {
-    pub(crate) fn new(py: Python<'_>, key: Option<String>, decoded: Decoded) -> PyResult<Self> {
-        let Header { kind, stamp, .. } = decoded.header;
-        let payload = match decoded.content {
-            Content::Bev(bev) => Bev::new(py, bev)?.into_any(),
-            Content::Other(message) => payload(py, &stamp.cav, message)?,
+impl PyMessage {
+    pub(crate) fn new(py: Python<'_>, key: Option<String>, sent: DecodedMessage) -> PyResult<Self> {
+        let Header { kind, stamp, .. } = sent.header;
+        let payload = match sent.content {
+            DecodedContent::Bev(bev) => PyBev::new(py, bev)?.into_any(),
+            DecodedContent::Other(message) => payload(py, &stamp.cav, message)?,
         };
         Ok(Self {
             key,
@@ -88,28 +89,29 @@ impl Message {
             sequence: stamp.sequence,
             capture_time_ns: stamp.capture_nanos,
             publish_time_ns: stamp.publish_nanos,
-            wire_bytes: decoded.wire_bytes,
+            wire_bytes: sent.wire_bytes,
             payload,
         })
     }
 }
 
-fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyAny>> {
+fn payload(py: Python<'_>, cav: &CavId, message: Message) -> PyResult<Py<PyAny>> {
     Ok(match message {
-        WireMessage::Lidar(sweep) => arrays::rows(py, sweep.points.xyzi)?.into_any(),
-        WireMessage::Radar(sweep) => arrays::rows(py, sweep.points.xyzi)?.into_any(),
-        WireMessage::Pose(pose) => PoseEstimate::new(py, &pose)?.into_any(),
-        WireMessage::Boxes(boxes) => Detections::of_agent(py, cav.as_str(), &boxes)?.into_any(),
-        WireMessage::Detections(found) => Detections::of_ego(py, &found)?.into_any(),
-        WireMessage::Tracks(tracks) => Tracks::new(py, &tracks)?.into_any(),
-        WireMessage::Camera(camera) => Camera::new(py, &camera)?.into_any(),
-        WireMessage::Points(sent) => Agent::new(py, AgentParts::of_points(cav, sent))?
+        Message::Lidar(sweep) => arrays::rows(py, sweep.points.xyzi)?.into_any(),
+        Message::Radar(sweep) => arrays::rows(py, sweep.points.xyzi)?.into_any(),
+        Message::Pose(pose) => PyPoseEstimate::new(py, &pose)?.into_any(),
+        Message::Boxes(boxes) => PyDetections::of_agent(py, cav.as_str(), &boxes)?.into_any(),
+        Message::Detections(found) => PyDetections::of_ego(py, &found)?.into_any(),
+        Message::Tracks(tracks) => PyTracks::new(py, &tracks)?.into_any(),
+        Message::Camera(camera) => PyCamera::new(py, &camera)?.into_any(),
+        Message::Points(sent) => PyAgent::new(py, AgentParts::of_points(cav, sent))?
             .0
             .into_any(),
-        WireMessage::Truth(truth) => {
+        Message::Truth(truth) => {
             let agents = PyDict::new(py);
             for agent in &truth.agents {
-                let (agent, recorded) = Agent::new(py, AgentParts::of_truth(agent))?;
+                let (agent, recorded) =
+                    PyAgent::new(py, AgentParts::recorded(Frame::of_truth(agent), false))?;
                 agents.set_item(recorded.cav.as_str(), agent)?;
             }
             let made = PyDict::new(py);
@@ -117,24 +119,24 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
             made.set_item("agents", agents)?;
             made.into_any().unbind()
         }
-        WireMessage::Gnss(gnss) => {
+        Message::Gnss(gnss) => {
             let made = json::to_python(py, &gnss)?;
             let pose = arrays::pose(py, &gnss.world_from_lidar)?;
             made.set_item("world_from_lidar", pose)?;
             made.unbind()
         }
-        WireMessage::Imu(motion) => json::to_python(py, &motion)?.unbind(),
-        WireMessage::Pace(pace) => json::to_python(py, &pace)?.unbind(),
-        WireMessage::Descriptor(descriptor) => json::to_python(py, &descriptor)?.unbind(),
-        WireMessage::Control(control) => json::to_python(py, &control)?.unbind(),
-        WireMessage::Stats(stats) => json::to_python(py, &stats)?.unbind(),
+        Message::Imu(motion) => json::to_python(py, &motion)?.unbind(),
+        Message::Pace(pace) => json::to_python(py, &pace)?.unbind(),
+        Message::Descriptor(descriptor) => json::to_python(py, &descriptor)?.unbind(),
+        Message::Control(control) => json::to_python(py, &control)?.unbind(),
+        Message::Stats(stats) => json::to_python(py, &stats)?.unbind(),
         // Decoded before, outside of Python's lock.
-        WireMessage::Bev(bev) => Bev::new(py, DecodedBev::decode(bev).map_err(error)?)?.into_any(),
+        Message::Bev(bev) => PyBev::new(py, DecodedBev::decode(bev).map_err(error)?)?.into_any(),
     })
 }
 
 #[pymethods]
-impl Message {
+impl PyMessage {
     fn __repr__(&self) -> String {
         let seconds = self.capture_time_ns as f64 * 1e-9;
         let place = self.key.as_deref().unwrap_or(&self.cav);
@@ -147,7 +149,7 @@ impl Message {
 
 /// Decodes one message of the wire format.
 #[pyfunction]
-pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<Message> {
+pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<PyMessage> {
     // Every key has slashes, and no kind has one.
     if !kind_or_key.contains('/') {
         let kind = kind_or_key.parse::<Kind>().map_err(|_| {
@@ -156,9 +158,9 @@ pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult
                 "{kind_or_key:?} is no kind of message; there are {known}"
             ))
         })?;
-        let decoded = py.detach(|| Decoded::of_kind(kind, data));
+        let decoded = py.detach(|| DecodedMessage::of_kind(kind, data));
         let decoded = decoded.map_err(|cause| error_of(kind_or_key, cause))?;
-        return Message::new(py, None, decoded);
+        return PyMessage::new(py, None, decoded);
     }
     let key = kind_or_key.parse::<Key>();
     let key = key.map_err(|cause| error_of(kind_or_key, cause))?;
@@ -166,9 +168,9 @@ pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult
         let problem = "messages of this key are JSON: use json.loads";
         return Err(error_of(kind_or_key, problem));
     }
-    let decoded = py.detach(|| Decoded::of_key(&key, data));
+    let decoded = py.detach(|| DecodedMessage::of_key(&key, data));
     let decoded = decoded.map_err(|cause| error_of(kind_or_key, cause))?;
-    Message::new(py, Some(kind_or_key.to_owned()), decoded)
+    PyMessage::new(py, Some(kind_or_key.to_owned()), decoded)
 }
 
 fn error_of(kind_or_key: &str, cause: impl std::fmt::Display) -> PyErr {

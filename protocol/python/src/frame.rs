@@ -11,11 +11,11 @@ use pyo3::{Py, PyResult, Python, pyclass, pymethods};
 use crate::arrays::{self, Matrix, optional};
 use crate::error::error;
 use crate::frame_parts::{AgentParts, FrameParts};
-use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate, Tracks};
+use crate::payload::{Objects, PyBev, PyCamera, PyDetections, PyPoseEstimate, PyTracks};
 
 /// One agent at one capture time.
-#[pyclass(frozen, get_all, module = "v2vloc")]
-pub(crate) struct Agent {
+#[pyclass(frozen, get_all, name = "Agent", module = "v2vloc")]
+pub(crate) struct PyAgent {
     cav: String,
     points: Option<Py<PyArray2<f32>>>,
     radar: Option<Py<PyArray2<f32>>>,
@@ -25,18 +25,18 @@ pub(crate) struct Agent {
     speed_mps: Option<f64>,
     yaw_rate_rad_s: Option<f64>,
     objects: Py<Objects>,
-    pose: Option<Py<PoseEstimate>>,
-    bev: Option<Py<Bev>>,
-    boxes: Option<Py<Detections>>,
+    pose: Option<Py<PyPoseEstimate>>,
+    bev: Option<Py<PyBev>>,
+    boxes: Option<Py<PyDetections>>,
 }
 
-impl Agent {
+impl PyAgent {
     /// Converts all parts but the ground truth, which stays in the frame as well.
     pub(crate) fn new(py: Python<'_>, parts: AgentParts) -> PyResult<(Py<Self>, frame::Frame)> {
         let mut recorded = parts.recorded;
         let cameras = PyDict::new(py);
         for (number, camera) in std::mem::take(&mut recorded.cameras) {
-            cameras.set_item(number, Camera::new(py, &camera)?)?;
+            cameras.set_item(number, PyCamera::new(py, &camera)?)?;
         }
         let cav = recorded.cav.to_string();
         let points = std::mem::take(&mut recorded.points).xyzi;
@@ -53,9 +53,9 @@ impl Agent {
             speed_mps: recorded.speed_mps,
             yaw_rate_rad_s: recorded.yaw_rate_rad_s,
             objects: Objects::annotated(py, &recorded)?,
-            pose: optional(parts.pose, |pose| PoseEstimate::new(py, &pose))?,
-            bev: optional(parts.bev, |bev| Bev::new(py, bev))?,
-            boxes: optional(parts.boxes, |boxes| Detections::of_agent(py, &cav, &boxes))?,
+            pose: optional(parts.pose, |pose| PyPoseEstimate::new(py, &pose))?,
+            bev: optional(parts.bev, |bev| PyBev::new(py, bev))?,
+            boxes: optional(parts.boxes, |sent| PyDetections::of_agent(py, &cav, &sent))?,
             cav,
         };
         Ok((Py::new(py, made)?, recorded))
@@ -63,7 +63,7 @@ impl Agent {
 }
 
 #[pymethods]
-impl Agent {
+impl PyAgent {
     fn __repr__(&self, py: Python<'_>) -> String {
         let mut parts = vec![format!("{:?}", self.cav)];
         for (points, name) in [(&self.points, "points"), (&self.radar, "radar points")] {
@@ -86,8 +86,8 @@ impl Agent {
 }
 
 /// Everything of one capture time.
-#[pyclass(frozen, module = "v2vloc")]
-pub(crate) struct Frame {
+#[pyclass(frozen, name = "Frame", module = "v2vloc")]
+pub(crate) struct FleetFrame {
     #[pyo3(get)]
     source: String,
     #[pyo3(get)]
@@ -108,20 +108,20 @@ pub(crate) struct Frame {
     protocol: EvaluationProtocol,
 }
 
-impl Frame {
+impl FleetFrame {
     pub(crate) fn new(py: Python<'_>, parts: FrameParts) -> PyResult<Self> {
         let [agents, detections, tracks] = std::array::from_fn(|_| PyDict::new(py));
         let mut truth = Vec::with_capacity(parts.agents.len());
         for agent in parts.agents {
-            let (agent, recorded) = Agent::new(py, agent)?;
+            let (agent, recorded) = PyAgent::new(py, agent)?;
             agents.set_item(recorded.cav.as_str(), agent)?;
             truth.push(recorded);
         }
         for result in &parts.detections {
-            detections.set_item(result.ego.as_str(), Detections::of_ego(py, result)?)?;
+            detections.set_item(result.ego.as_str(), PyDetections::of_ego(py, result)?)?;
         }
         for found in &parts.tracks {
-            tracks.set_item(found.ego.as_str(), Tracks::new(py, found)?)?;
+            tracks.set_item(found.ego.as_str(), PyTracks::new(py, found)?)?;
         }
         // Without detections the first agent: the ego comes first in the order of a scene.
         let first = parts.detections.first().map(|result| &result.ego);
@@ -153,7 +153,7 @@ impl Frame {
 }
 
 #[pymethods]
-impl Frame {
+impl FleetFrame {
     /// Objects that an ego is expected to find.
     #[pyo3(signature = (ego=None, *, protocol=None, area_m=None))]
     fn ground_truth(

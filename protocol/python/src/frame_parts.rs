@@ -3,8 +3,8 @@
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use protocol::{
-    AgentTruth, Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream,
-    Topic, Tracks, Truth, WireError, wire,
+    Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream, Topic,
+    Tracks, Truth, WireError, wire,
 };
 
 use crate::payload::DecodedBev;
@@ -121,7 +121,7 @@ impl AgentParts {
         Self::recorded(Frame::empty(cav.clone(), 0, Handedness::Right), false)
     }
 
-    /// An agent of a data set.
+    /// An agent of a data set, or of a message of the ground truth.
     pub(crate) fn recorded(recorded: Frame, has_points: bool) -> Self {
         let gnss_world_from_lidar = recorded.gnss_world_from_lidar();
         Self {
@@ -132,11 +132,6 @@ impl AgentParts {
             bev: None,
             boxes: None,
         }
-    }
-
-    /// An agent of a message of the ground truth.
-    pub(crate) fn of_truth(agent: &AgentTruth) -> Self {
-        Self::recorded(Frame::of_truth(agent), false)
     }
 
     /// An agent with points that it shares.

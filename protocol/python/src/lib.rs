@@ -31,13 +31,13 @@ mod package {
     #[pymodule_export]
     use crate::data_set::{DataSet, DataSetIterator, read};
     #[pymodule_export]
-    use crate::decode::{Message, decode};
+    use crate::decode::{PyMessage, decode};
     #[pymodule_export]
     use crate::error::Error;
     #[pymodule_export]
-    use crate::frame::{Agent, Frame};
+    use crate::frame::{FleetFrame, PyAgent};
     #[pymodule_export]
     use crate::listener::{Listener, MessageIterator, listen};
     #[pymodule_export]
-    use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate, Tracks};
+    use crate::payload::{Objects, PyBev, PyCamera, PyDetections, PyPoseEstimate, PyTracks};
 }

@@ -8,12 +8,12 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, PassiveSubscriber, RawMessage};
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{CavId, Principal, Role, RunId, Topic, Verb};
-use pyo3::types::{PyDict, PyDictMethods};
+use pyo3::types::{IntoPyDict, PyDict};
 use pyo3::{Bound, Py, PyAny, PyRef, PyRefMut, PyResult, Python, pyclass, pyfunction, pymethods};
 
-use crate::decode::{Decoded, Message};
+use crate::decode::{DecodedMessage, PyMessage};
 use crate::error::error;
-use crate::frame::Frame;
+use crate::frame::FleetFrame;
 use crate::frame_parts::is_part_of_frames;
 use crate::live_frames::LiveFrames;
 use crate::subscriptions;
@@ -49,7 +49,7 @@ pub(crate) struct Listener {
 }
 
 /// Result of one step of a listener.
-enum Step {
+enum ListenerStep {
     Message(RawMessage),
     /// Nothing within the poll interval.
     Waiting,
@@ -59,10 +59,10 @@ enum Step {
 
 impl Listener {
     /// The next message, waiting for one so long: without Python's lock, and such that Ctrl-C interrupts.
-    fn step(&mut self, py: Python<'_>, wait: Duration) -> PyResult<Step> {
+    fn step(&mut self, py: Python<'_>, wait: Duration) -> PyResult<ListenerStep> {
         py.check_signals()?;
         let Some((bus, subscriber)) = &self.connection else {
-            return Ok(Step::End);
+            return Ok(ListenerStep::End);
         };
         let has_ended = self.is_over && self.last_data.elapsed() >= self.settle;
         // After the end only what is queued is still handed out.
@@ -74,10 +74,10 @@ impl Listener {
             }
             Pop::Item(topic, message) => {
                 self.note(&topic);
-                Ok(Step::Message(message))
+                Ok(ListenerStep::Message(message))
             }
-            Pop::Closed => Ok(Step::End),
-            Pop::TimedOut if has_ended => Ok(Step::End),
+            Pop::Closed => Ok(ListenerStep::End),
+            Pop::TimedOut if has_ended => Ok(ListenerStep::End),
             Pop::TimedOut => self.silence(),
         }
     }
@@ -93,7 +93,7 @@ impl Listener {
     }
 
     /// Nothing has arrived: the end, or a run that is not there.
-    fn silence(&self) -> PyResult<Step> {
+    fn silence(&self) -> PyResult<ListenerStep> {
         let silent = self.last_message.elapsed();
         match self.timeout {
             Some(timeout) if silent >= timeout && self.messages == 0 => Err(error(format!(
@@ -102,8 +102,8 @@ impl Listener {
                 self.endpoint,
                 timeout.as_secs_f64()
             ))),
-            Some(timeout) if silent >= timeout => Ok(Step::End),
-            _ => Ok(Step::Waiting),
+            Some(timeout) if silent >= timeout => Ok(ListenerStep::End),
+            _ => Ok(ListenerStep::Waiting),
         }
     }
 
@@ -115,16 +115,16 @@ impl Listener {
         }
     }
 
-    fn next_message(&mut self, py: Python<'_>) -> PyResult<Option<Message>> {
+    fn next_message(&mut self, py: Python<'_>) -> PyResult<Option<PyMessage>> {
         loop {
             let message = match self.step(py, POLL)? {
-                Step::Message(message) if !message.key.topic.is_json() => message,
-                Step::Message(_) | Step::Waiting => continue,
-                Step::End => return Ok(None),
+                ListenerStep::Message(message) if !message.key.topic.is_json() => message,
+                ListenerStep::Message(_) | ListenerStep::Waiting => continue,
+                ListenerStep::End => return Ok(None),
             };
-            match py.detach(|| Decoded::of_key(&message.key, &message.bytes())) {
+            match py.detach(|| DecodedMessage::of_key(&message.key, &message.bytes())) {
                 Ok(decoded) => {
-                    return Message::new(py, Some(message.key.to_string()), decoded).map(Some);
+                    return PyMessage::new(py, Some(message.key.to_string()), decoded).map(Some);
                 }
                 Err(cause) => self.reject(&message.key, &cause),
             }
@@ -153,26 +153,26 @@ impl Listener {
         slf
     }
 
-    fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<Frame>> {
+    fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<FleetFrame>> {
         loop {
             if let Some(parts) = self.frames.next() {
-                return Frame::new(py, parts).map(Some);
+                return FleetFrame::new(py, parts).map(Some);
             }
             // A loop that is slow finds messages in the queue that belong to frames which look complete.
             let is_settled = self.frames.is_settled();
             match self.step(py, if is_settled { Duration::ZERO } else { POLL })? {
-                Step::Message(message) if is_part_of_frames(&message.key.topic) => {
+                ListenerStep::Message(message) if is_part_of_frames(&message.key.topic) => {
                     let frames = &mut self.frames;
                     if let Err(cause) = py.detach(|| frames.add(&message)) {
                         self.reject(&message.key, &cause);
                     }
                 }
-                Step::Waiting if is_settled => self.frames.hand_over_oldest(),
-                Step::Message(_) | Step::Waiting => {}
-                Step::End => {
+                ListenerStep::Waiting if is_settled => self.frames.hand_over_oldest(),
+                ListenerStep::Message(_) | ListenerStep::Waiting => {}
+                ListenerStep::End => {
                     self.frames.finish();
                     let last = self.frames.next();
-                    return last.map(|parts| Frame::new(py, parts)).transpose();
+                    return last.map(|parts| FleetFrame::new(py, parts)).transpose();
                 }
             }
         }
@@ -213,17 +213,14 @@ impl Listener {
         let subscriber = connection.map(|(_, subscriber)| subscriber);
         let overwritten = subscriber.map_or(0, PassiveSubscriber::overwritten);
         let undelivered = subscriber.map_or(0, PassiveSubscriber::undelivered);
-        let counts = PyDict::new(py);
-        for (name, count) in [
+        let counts = [
             ("messages", self.messages),
             ("undecodable", self.undecodable),
             ("late", self.frames.late),
             ("overwritten", overwritten),
             ("undelivered", undelivered),
-        ] {
-            counts.set_item(name, count)?;
-        }
-        Ok(counts)
+        ];
+        counts.into_py_dict(py)
     }
 
     fn __repr__(&self) -> String {
@@ -248,7 +245,7 @@ impl MessageIterator {
         slf
     }
 
-    fn __next__(&self, py: Python<'_>) -> PyResult<Option<Message>> {
+    fn __next__(&self, py: Python<'_>) -> PyResult<Option<PyMessage>> {
         // An iterator on another thread may be inside: then this is an error of Python, not a deadlock.
         let mut listener: PyRefMut<'_, Listener> = self.listener.try_borrow_mut(py)?;
         listener.next_message(py)

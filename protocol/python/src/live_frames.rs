@@ -50,7 +50,13 @@ impl LiveFrames {
         let at = header.stamp.capture_nanos;
         // The replay publishes the truth, so a new epoch there is a new replay. Agents restart on their own.
         if message.key.topic == Topic::Truth {
-            self.begin_again_with(header.stamp.epoch);
+            let epoch = header.stamp.epoch;
+            let known = self.replay_epoch.replace(epoch);
+            // A replay that is started anew begins at its own first tick.
+            if known.is_some_and(|known| known != epoch) {
+                self.finish();
+                self.handed_over = None;
+            }
         }
         // Frames are handed over by capture time: an older one would come out of order.
         if self.handed_over.is_some_and(|newest| at <= newest) {
@@ -67,15 +73,6 @@ impl LiveFrames {
             self.hand_over_oldest();
         }
         added
-    }
-
-    /// A replay that is started anew begins at its own first tick.
-    fn begin_again_with(&mut self, epoch: u64) {
-        let known = self.replay_epoch.replace(epoch);
-        if known.is_some_and(|known| known != epoch) {
-            self.finish();
-            self.handed_over = None;
-        }
     }
 
     /// The next frame that is complete.

@@ -4,7 +4,7 @@ use dataset::frame::{Frame, Object};
 use dataset::ground_truth::{GroundTruth, upright_box};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose};
-use pyo3::types::{PyBytes, PyDict, PyDictMethods, PyList};
+use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyList};
 use pyo3::{Py, PyAny, PyResult, Python, pyclass, pymethods};
 
 use crate::arrays::{self, Matrix, optional};
@@ -12,8 +12,8 @@ use crate::json;
 
 /// Pose estimate of an agent, or the reason why it has none.
 #[derive(Default)]
-#[pyclass(frozen, get_all, module = "v2vloc")]
-pub(crate) struct PoseEstimate {
+#[pyclass(frozen, get_all, name = "PoseEstimate", module = "v2vloc")]
+pub(crate) struct PyPoseEstimate {
     world_from_cav: Option<Matrix>,
     confidence: Option<f32>,
     covariance: Option<Matrix>,
@@ -21,7 +21,7 @@ pub(crate) struct PoseEstimate {
     inlier_count: Option<u32>,
 }
 
-impl PoseEstimate {
+impl PyPoseEstimate {
     pub(crate) fn new(py: Python<'_>, estimate: &protocol::PoseEstimate) -> PyResult<Py<Self>> {
         let made = match estimate {
             protocol::PoseEstimate::Pose {
@@ -48,7 +48,7 @@ impl PoseEstimate {
 }
 
 #[pymethods]
-impl PoseEstimate {
+impl PyPoseEstimate {
     fn __repr__(&self, py: Python<'_>) -> String {
         let (Some(matrix), Some(confidence)) = (&self.world_from_cav, self.confidence) else {
             return format!(
@@ -68,8 +68,8 @@ impl PoseEstimate {
 }
 
 /// BEV feature map of an agent.
-#[pyclass(frozen, get_all, module = "v2vloc")]
-pub(crate) struct Bev {
+#[pyclass(frozen, get_all, name = "Bev", module = "v2vloc")]
+pub(crate) struct PyBev {
     features: Py<PyArray3<f32>>,
     mask: Option<Py<PyArray2<bool>>>,
     x_min_m: f64,
@@ -78,7 +78,7 @@ pub(crate) struct Bev {
     code_of: Option<u32>,
     dtype: String,
     payload_bytes: usize,
-    pose: Py<PoseEstimate>,
+    pose: Py<PyPoseEstimate>,
 }
 
 /// A decoded feature map with its format and size on the wire.
@@ -103,7 +103,7 @@ impl DecodedBev {
     }
 }
 
-impl Bev {
+impl PyBev {
     pub(crate) fn new(py: Python<'_>, bev: DecodedBev) -> PyResult<Py<Self>> {
         let DecodedFeatures { features, sent } = bev.decoded;
         let grid = features.grid;
@@ -123,14 +123,14 @@ impl Bev {
             code_of: features.code_of,
             dtype: json::name(&bev.codec.dtype)?,
             payload_bytes: bev.payload_bytes,
-            pose: PoseEstimate::new(py, &bev.pose)?,
+            pose: PyPoseEstimate::new(py, &bev.pose)?,
         };
         Py::new(py, made)
     }
 }
 
 #[pymethods]
-impl Bev {
+impl PyBev {
     fn __repr__(&self, py: Python<'_>) -> String {
         let features = self.features.bind(py).readonly();
         let shape = features.as_array().shape().to_vec();
@@ -143,14 +143,14 @@ impl Bev {
 }
 
 /// Detections of an ego, or of one agent from its own sensors.
-#[pyclass(frozen, get_all, module = "v2vloc")]
-pub(crate) struct Detections {
+#[pyclass(frozen, get_all, name = "Detections", module = "v2vloc")]
+pub(crate) struct PyDetections {
     cav: String,
     pub(crate) boxes: Matrix,
     pub(crate) scores: Py<PyArray1<f32>>,
     sources: Py<PyList>,
     tracks: Py<PyAny>,
-    pose: Py<PoseEstimate>,
+    pose: Py<PyPoseEstimate>,
     method: Option<String>,
     agent_frame: Option<u64>,
     fused: Py<PyAny>,
@@ -159,20 +159,18 @@ pub(crate) struct Detections {
     stages_ms: Py<PyDict>,
 }
 
-impl Detections {
+impl PyDetections {
     /// The result of an ego.
     pub(crate) fn of_ego(py: Python<'_>, found: &protocol::Detections) -> PyResult<Py<Self>> {
-        let stages_ms = PyDict::new(py);
-        for timing in &found.stages {
-            stages_ms.set_item(&timing.stage, timing.nanos as f64 * 1e-6)?;
-        }
+        let stages = found.stages.iter();
+        let stages_ms = stages.map(|timing| (&timing.stage, timing.nanos as f64 * 1e-6));
         let made = Self {
             method: Some(found.method.clone()),
             agent_frame: Some(found.agent_frame),
             fused: json::to_python(py, &found.fused)?.unbind(),
             skipped: json::to_python(py, &found.skipped)?.unbind(),
             neighbours: json::to_python(py, &found.neighbours)?.unbind(),
-            stages_ms: stages_ms.unbind(),
+            stages_ms: stages_ms.into_py_dict(py)?.unbind(),
             ..Self::of_list(py, found.ego.as_str(), &found.pose, &found.detections)?
         };
         Py::new(py, made)
@@ -210,7 +208,7 @@ impl Detections {
             scores: column(py, found, |one| one.score),
             sources: PyList::new(py, sources.collect::<Vec<_>>())?.unbind(),
             tracks,
-            pose: PoseEstimate::new(py, pose)?,
+            pose: PyPoseEstimate::new(py, pose)?,
             method: None,
             agent_frame: None,
             fused,
@@ -222,7 +220,7 @@ impl Detections {
 }
 
 #[pymethods]
-impl Detections {
+impl PyDetections {
     fn __repr__(&self, py: Python<'_>) -> String {
         let count = self.__len__(py);
         let method = self.method.as_deref();
@@ -236,8 +234,8 @@ impl Detections {
 }
 
 /// Tracks of an ego.
-#[pyclass(frozen, get_all, module = "v2vloc")]
-pub(crate) struct Tracks {
+#[pyclass(frozen, get_all, name = "Tracks", module = "v2vloc")]
+pub(crate) struct PyTracks {
     cav: String,
     agent_frame: u64,
     ids: Py<PyArray1<u64>>,
@@ -248,11 +246,11 @@ pub(crate) struct Tracks {
     hits: Py<PyArray1<u32>>,
     ages_s: Py<PyArray1<f64>>,
     unseen_s: Py<PyArray1<f64>>,
-    pose: Py<PoseEstimate>,
+    pose: Py<PyPoseEstimate>,
     left_out: u32,
 }
 
-impl Tracks {
+impl PyTracks {
     pub(crate) fn new(py: Python<'_>, found: &protocol::Tracks) -> PyResult<Py<Self>> {
         let tracks = &found.tracks;
         let covariances: Vec<[f32; 4]> = tracks.iter().flat_map(|track| track.covariance).collect();
@@ -269,7 +267,7 @@ impl Tracks {
             hits: column(py, tracks, |track| track.hits),
             ages_s: column(py, tracks, |track| track.age_s),
             unseen_s: column(py, tracks, |track| track.unseen_s),
-            pose: PoseEstimate::new(py, &found.pose)?,
+            pose: PyPoseEstimate::new(py, &found.pose)?,
             left_out: found.left_out,
         };
         Py::new(py, made)
@@ -282,7 +280,7 @@ fn column<R, T: numpy::Element>(py: Python<'_>, rows: &[R], value: fn(&R) -> T) 
 }
 
 #[pymethods]
-impl Tracks {
+impl PyTracks {
     fn __repr__(&self, py: Python<'_>) -> String {
         format!("Tracks(cav={:?}, {} tracks)", self.cav, self.__len__(py))
     }
@@ -362,8 +360,8 @@ impl Objects {
 }
 
 /// Image of a camera, encoded, with its calibration.
-#[pyclass(frozen, get_all, module = "v2vloc")]
-pub(crate) struct Camera {
+#[pyclass(frozen, get_all, name = "Camera", module = "v2vloc")]
+pub(crate) struct PyCamera {
     image: Py<PyBytes>,
     format: String,
     width_px: u32,
@@ -372,7 +370,7 @@ pub(crate) struct Camera {
     lidar_from_camera: Option<Matrix>,
 }
 
-impl Camera {
+impl PyCamera {
     pub(crate) fn new(py: Python<'_>, camera: &protocol::Camera) -> PyResult<Py<Self>> {
         let metadata = &camera.metadata;
         let intrinsics = metadata.pinhole.map(|pinhole| {
@@ -396,7 +394,7 @@ impl Camera {
 }
 
 #[pymethods]
-impl Camera {
+impl PyCamera {
     fn __repr__(&self) -> String {
         format!(
             "Camera({} x {} pixels, {})",

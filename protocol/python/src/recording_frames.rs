@@ -35,8 +35,7 @@ impl RecordingFrames {
             }
         }
         let first = recording.entries().first();
-        let run = first.map(|entry| entry.key.run.to_string());
-        let run = run.unwrap_or_default();
+        let run = first.map_or_else(String::new, |entry| entry.key.run.to_string());
         Ok(Self {
             recording,
             run,

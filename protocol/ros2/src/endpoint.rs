@@ -74,7 +74,7 @@ impl std::fmt::Display for NodeName {
 
 /// One publisher or subscription of a [`Node`].
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Endpoint {
+pub struct RosEndpoint {
     /// Number of the endpoint in its session; the node is number 0.
     pub id: u32,
     /// Publisher or subscription.
@@ -121,8 +121,8 @@ impl Node {
     }
 
     /// Liveliness token of one of its endpoints.
-    pub fn endpoint_token(&self, endpoint: &Endpoint) -> String {
-        let Endpoint { id, qos, .. } = endpoint;
+    pub fn endpoint_token(&self, endpoint: &RosEndpoint) -> String {
+        let RosEndpoint { id, qos, .. } = endpoint;
         let kind = match endpoint.kind {
             EndpointKind::Publisher => "MP",
             EndpointKind::Subscription => "MS",
@@ -191,17 +191,9 @@ pub struct Attachment {
 impl Attachment {
     /// The bytes on the wire.
     pub fn to_bytes(&self) -> [u8; ATTACHMENT_LEN] {
-        let mut bytes = [0; ATTACHMENT_LEN];
-        let parts = [
-            &self.sequence.to_le_bytes()[..],
-            &self.source_nanos.to_le_bytes(),
-            &[16],
-            &self.gid,
-        ];
-        for (place, byte) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
-            *place = *byte;
-        }
-        bytes
+        let numbers = [self.sequence, self.source_nanos].map(i64::to_le_bytes);
+        let mut bytes = numbers.into_iter().flatten().chain([16]).chain(self.gid);
+        std::array::from_fn(|_| bytes.next().unwrap_or_default())
     }
 
     /// Reads the bytes of an attachment; `None` if they have another length or layout.
@@ -240,8 +232,8 @@ mod tests {
         }
     }
 
-    fn points() -> Endpoint {
-        Endpoint {
+    fn points() -> RosEndpoint {
+        RosEndpoint {
             id: 3,
             kind: EndpointKind::Publisher,
             topic: name("/cav_1/points"),

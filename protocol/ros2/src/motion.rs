@@ -96,9 +96,10 @@ impl MotionType {
                     let (field, found) = ("angular_velocity_covariance[0]", first);
                     return Err(MotionError::Unmeasured { field, found });
                 }
+                let most = EgoMotion::MAX_YAW_RATE_RAD_S;
                 EgoMotion {
                     speed_mps: None,
-                    yaw_rate_rad_s: Some(yaw_rate("angular_velocity.z", z)?),
+                    yaw_rate_rad_s: Some(within("angular_velocity.z", z, most)?),
                 }
             }
         };
@@ -116,9 +117,10 @@ fn read_twist(
 ) -> Result<EgoMotion, MotionError> {
     let [speed_mps, _, _] = message.f64s(speed_field)?;
     let [_, _, z] = message.f64s(yaw_rate_field)?;
+    let (most, fastest_turn) = (EgoMotion::MAX_SPEED_MPS, EgoMotion::MAX_YAW_RATE_RAD_S);
     Ok(EgoMotion {
-        speed_mps: Some(within(speed_field, speed_mps, EgoMotion::MAX_SPEED_MPS)?),
-        yaw_rate_rad_s: Some(yaw_rate(yaw_rate_field, z)?),
+        speed_mps: Some(within(speed_field, speed_mps, most)?),
+        yaw_rate_rad_s: Some(within(yaw_rate_field, z, fastest_turn)?),
     })
 }
 
@@ -137,10 +139,6 @@ fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, Moti
         speed_mps,
         yaw_rate_rad_s,
     })
-}
-
-fn yaw_rate(field: &'static str, found: f64) -> Result<f64, MotionError> {
-    within(field, found, EgoMotion::MAX_YAW_RATE_RAD_S)
 }
 
 fn within(field: &'static str, found: f64, limit: f64) -> Result<f64, MotionError> {

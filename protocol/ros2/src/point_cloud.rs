@@ -15,7 +15,7 @@ const MAX_FIELDS: u32 = 256;
 
 /// A sweep of a LiDAR.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Sweep {
+pub struct RosSweep {
     /// Capture time: stamp of the header, nanoseconds.
     pub capture_nanos: u64,
     /// Frame of the points, as the driver names it.
@@ -94,7 +94,7 @@ pub struct SweepLimits {
 ///
 /// # Errors
 /// [`PointCloudError`] names the field and both values.
-pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<Sweep, PointCloudError> {
+pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<RosSweep, PointCloudError> {
     let mut message = Reader::of(bytes)?;
     let (capture_nanos, frame_id) = message.header()?;
     let (height, width) = (message.u32("height")?, message.u32("width")?);
@@ -103,15 +103,15 @@ pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<Sweep, Poin
     let is_big_endian = message.u8("is_bigendian")? != 0;
     let (point_step, row_step) = (message.u32("point_step")?, message.u32("row_step")?);
     let data = message.bytes("data")?;
-    let columns = Columns::find(&fields)?;
-    let layout = Layout {
+    let columns = PointColumns::find(&fields)?;
+    let layout = CloudLayout {
         height,
         width,
         point_step,
         row_step,
     };
     layout.check(&columns, data.len(), limits)?;
-    let mut sweep = Sweep {
+    let mut sweep = RosSweep {
         capture_nanos,
         frame_id: frame_id.into(),
         points: PointCloud::default(),
@@ -174,7 +174,7 @@ impl Datatype {
 }
 
 /// A field of a point, as the message describes it.
-struct Field<'a> {
+struct RosField<'a> {
     name: &'a str,
     offset: u32,
     datatype: u8,
@@ -183,12 +183,12 @@ struct Field<'a> {
 
 /// A field that is read: its place in a point and its type.
 #[derive(Debug, Clone, Copy)]
-struct Column {
+struct PointColumn {
     offset: u32,
     datatype: Datatype,
 }
 
-impl Column {
+impl PointColumn {
     fn end(self) -> u64 {
         u64::from(self.offset) + u64::from(self.datatype.size())
     }
@@ -199,13 +199,13 @@ impl Column {
 }
 
 /// Fields of a point that are read.
-struct Columns<'a> {
-    xyz: [Column; 3],
-    intensity: Option<(&'a str, Column, IntensityKind)>,
+struct PointColumns<'a> {
+    xyz: [PointColumn; 3],
+    intensity: Option<(&'a str, PointColumn, IntensityKind)>,
 }
 
-impl<'a> Columns<'a> {
-    fn find(fields: &[Field<'a>]) -> Result<Self, PointCloudError> {
+impl<'a> PointColumns<'a> {
+    fn find(fields: &[RosField<'a>]) -> Result<Self, PointCloudError> {
         let [x, y, z] = ["x", "y", "z"].map(|name| coordinate(fields, name));
         let (xyz, intensity) = ([x?, y?, z?], intensity(fields)?);
         Ok(Self { xyz, intensity })
@@ -218,7 +218,7 @@ impl<'a> Columns<'a> {
     }
 }
 
-fn coordinate(fields: &[Field<'_>], name: &'static str) -> Result<Column, PointCloudError> {
+fn coordinate(fields: &[RosField<'_>], name: &'static str) -> Result<PointColumn, PointCloudError> {
     let allowed = "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1";
     let found = column(fields, name, allowed, |datatype| {
         matches!(datatype, Datatype::Float32 | Datatype::Float64)
@@ -235,8 +235,8 @@ fn coordinate(fields: &[Field<'_>], name: &'static str) -> Result<Column, PointC
 
 /// The field of the most preferred name of an intensity, else of a packed colour.
 fn intensity<'a>(
-    fields: &[Field<'a>],
-) -> Result<Option<(&'a str, Column, IntensityKind)>, PointCloudError> {
+    fields: &[RosField<'a>],
+) -> Result<Option<(&'a str, PointColumn, IntensityKind)>, PointCloudError> {
     for name in INTENSITY_FIELDS {
         if let Some((name, found)) = column(fields, name, "datatype 1 to 8 and count 1", |_| true)?
         {
@@ -253,21 +253,21 @@ fn intensity<'a>(
             .ok()
             .flatten()
     });
-    Ok(colour.map(|(name, Column { offset, .. })| {
+    Ok(colour.map(|(name, mut found)| {
         // The four bytes are read as an integer, also where the field is stated as a float.
-        let datatype = Datatype::Uint32;
-        (name, Column { offset, datatype }, IntensityKind::RedByte)
+        found.datatype = Datatype::Uint32;
+        (name, found, IntensityKind::RedByte)
     }))
 }
 
 /// The field `name`, compared without case, if there is one, with its name as written.
 fn column<'a>(
-    fields: &[Field<'a>],
+    fields: &[RosField<'a>],
     name: &'static str,
     allowed: &'static str,
     is_allowed: impl Fn(Datatype) -> bool,
-) -> Result<Option<(&'a str, Column)>, PointCloudError> {
-    let Some(&Field {
+) -> Result<Option<(&'a str, PointColumn)>, PointCloudError> {
+    let Some(&RosField {
         name: found,
         offset,
         datatype,
@@ -278,7 +278,7 @@ fn column<'a>(
     };
     match Datatype::of(datatype).filter(|datatype| is_allowed(*datatype)) {
         // Some drivers leave the count at 0.
-        Some(datatype) if count <= 1 => Ok(Some((found, Column { offset, datatype }))),
+        Some(datatype) if count <= 1 => Ok(Some((found, PointColumn { offset, datatype }))),
         _ => Err(PointCloudError::FieldType {
             name,
             datatype,
@@ -289,14 +289,14 @@ fn column<'a>(
 }
 
 /// Sizes of a cloud.
-struct Layout {
+struct CloudLayout {
     height: u32,
     width: u32,
     point_step: u32,
     row_step: u32,
 }
 
-impl Layout {
+impl CloudLayout {
     /// Bytes from one row to the next.
     fn stride(&self) -> u64 {
         let row = u64::from(self.width) * u64::from(self.point_step);
@@ -310,7 +310,7 @@ impl Layout {
 
     fn check(
         &self,
-        columns: &Columns<'_>,
+        columns: &PointColumns<'_>,
         data_len: usize,
         limits: SweepLimits,
     ) -> Result<(), PointCloudError> {
@@ -353,11 +353,11 @@ fn at_most(what: &'static str, found: u64, max: u64) -> Result<(), PointCloudErr
     Err(PointCloudError::TooMany { what, found, max })
 }
 
-fn read_fields<'a>(message: &mut Reader<'a>) -> Result<Vec<Field<'a>>, PointCloudError> {
+fn read_fields<'a>(message: &mut Reader<'a>) -> Result<Vec<RosField<'a>>, PointCloudError> {
     let count = message.u32("length of fields")?;
     at_most("fields", count.into(), MAX_FIELDS.into())?;
     let fields = (0..count).map(|_| {
-        Ok(Field {
+        Ok(RosField {
             name: message.str("fields.name")?,
             offset: message.u32("fields.offset")?,
             datatype: message.u8("fields.datatype")?,
@@ -367,13 +367,13 @@ fn read_fields<'a>(message: &mut Reader<'a>) -> Result<Vec<Field<'a>>, PointClou
     fields.collect()
 }
 
-impl Sweep {
+impl RosSweep {
     /// Adds the points of `data`, whose layout was checked.
     fn fill<BO: ByteOrder>(
         &mut self,
         data: &[u8],
-        layout: &Layout,
-        columns: &Columns<'_>,
+        layout: &CloudLayout,
+        columns: &PointColumns<'_>,
         max_abs_value: f32,
     ) {
         let (stride, step) = (layout.stride(), layout.point_step as usize);
@@ -389,7 +389,7 @@ impl Sweep {
         }
     }
 
-    fn add<BO: ByteOrder>(&mut self, point: &[u8], columns: &Columns<'_>, max_abs_value: f32) {
+    fn add<BO: ByteOrder>(&mut self, point: &[u8], columns: &PointColumns<'_>, max_abs_value: f32) {
         let xyz = columns
             .xyz
             .map(|column| column.value::<BO>(point).unwrap_or(f64::NAN));

@@ -36,11 +36,11 @@ pub enum ReadError {
 
 /// Reader of one message after its encapsulation header, in the byte order that the header states.
 pub(crate) struct Reader<'a> {
-    cdr: Cdr<'a>,
+    cdr: AnyCdr<'a>,
     len: usize,
 }
 
-enum Cdr<'a> {
+enum AnyCdr<'a> {
     BigEndian(CdrReader<'a, BigEndian>),
     LittleEndian(CdrReader<'a, LittleEndian>),
 }
@@ -50,8 +50,8 @@ impl<'a> Reader<'a> {
     pub(crate) fn of(bytes: &'a [u8]) -> Result<Self, ReadError> {
         // Values are aligned from the end of this header on, so the reader begins there.
         let (cdr, len) = match bytes.split_first_chunk() {
-            Some(([0, 0, _, _], body)) => (Cdr::BigEndian(CdrReader::new(body)), body.len()),
-            Some(([0, 1, _, _], body)) => (Cdr::LittleEndian(CdrReader::new(body)), body.len()),
+            Some(([0, 0, _, _], body)) => (AnyCdr::BigEndian(CdrReader::new(body)), body.len()),
+            Some(([0, 1, _, _], body)) => (AnyCdr::LittleEndian(CdrReader::new(body)), body.len()),
             _ => {
                 let found = bytes.iter().take(4).copied().collect();
                 return Err(ReadError::Encoding { found });
@@ -68,8 +68,8 @@ impl<'a> Reader<'a> {
         little: impl FnOnce(&mut CdrReader<'a, LittleEndian>) -> re_cdr::Result<T>,
     ) -> Result<T, ReadError> {
         let (at, read) = match &mut self.cdr {
-            Cdr::BigEndian(cdr) => (cdr.position(), big(cdr)),
-            Cdr::LittleEndian(cdr) => (cdr.position(), little(cdr)),
+            AnyCdr::BigEndian(cdr) => (cdr.position(), big(cdr)),
+            AnyCdr::LittleEndian(cdr) => (cdr.position(), little(cdr)),
         };
         read.map_err(|cause| ReadError::Cdr {
             field,

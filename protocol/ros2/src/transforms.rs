@@ -62,11 +62,8 @@ impl PoseType {
     fn read_one(self, message: &mut Reader<'_>) -> Result<Transform, ReadError> {
         let (nanos, parent) = message.header()?;
         let child = match self {
-            Self::Odometry | Self::TfMessage => {
-                let child = frame(message.str("child_frame_id")?);
-                Some(child).filter(|child| !child.is_empty())
-            }
-            Self::PoseStamped | Self::PoseWithCovarianceStamped => None,
+            Self::Odometry | Self::TfMessage => frame(message.str("child_frame_id")?),
+            Self::PoseStamped | Self::PoseWithCovarianceStamped => String::new(),
         };
         let parent_from_child = message.pose(match self {
             Self::TfMessage => "transform",
@@ -75,7 +72,7 @@ impl PoseType {
         Ok(Transform {
             nanos,
             parent: frame(parent),
-            child,
+            child: Some(child).filter(|child| !child.is_empty()),
             parent_from_child,
         })
     }

@@ -6,7 +6,7 @@ use protocol::{
     Camera, CavId, EgoMotion, Message, PoseEstimate, ProcessId, RunId, Stats, Stream, Topic, Truth,
 };
 
-use super::encode::{self, FrameInParent, Level, Marked, Status};
+use super::encode::{self, FrameInParent, Marked, Status};
 use super::names::{FrameNames, MAP_FRAME};
 use super::topic::{RosTopic, VehicleTopic};
 
@@ -96,7 +96,7 @@ impl Translator {
             (Topic::Truth, Message::Truth(truth)) => self.truth_messages(capture_nanos, truth),
             (Topic::Stats(_), Message::Stats(stats)) => {
                 let status = self.status(stats);
-                let cdr = encode::diagnostics(self.latest_nanos, &[status]);
+                let cdr = encode::diagnostics(self.latest_nanos, &status);
                 vec![RosMessage::new(RosTopic::Diagnostics, cdr)]
             }
             _ => Vec::new(),
@@ -229,7 +229,7 @@ impl Translator {
         let resident = stats.usage.resident_bytes.to_string();
         values.push(("resident memory (bytes)".into(), resident));
         Status {
-            level: if new > 0 { Level::Warn } else { Level::Ok },
+            is_warning: new > 0,
             name: format!("v2vloc: {}", stats.process),
             message: if new > 0 {
                 format!("{new} messages dropped since the last report")
@@ -334,13 +334,13 @@ mod tests {
             traffic: Vec::new(),
             problems: Vec::new(),
         };
-        let mut level = |stats: &Stats| translator.status(stats).level;
-        assert_eq!(level(&stats), Level::Ok);
+        let mut is_warning = |stats: &Stats| translator.status(stats).is_warning;
+        assert!(!is_warning(&stats));
         stats.ledger.dropped(
             &Account::towards(topic(Stream::Lidar), &process),
             DropReason::Superseded,
         );
-        assert_eq!([level(&stats), level(&stats)], [Level::Warn, Level::Ok]);
+        assert_eq!([is_warning(&stats), is_warning(&stats)], [true, false]);
         let message = Message::Stats(stats);
         let messages = translator.translate(&Topic::Stats(process), 0, &message);
         let has = |text: &[u8]| {

@@ -5,8 +5,8 @@ use half::f16;
 use half::slice::HalfFloatSliceExt;
 use serde::{Deserialize, Serialize};
 
+use crate::Result;
 use crate::checks::check_each;
-use crate::{Result, WireError};
 
 /// Values converted at a time, through a buffer on the stack.
 const BLOCK: usize = 1024;
@@ -71,7 +71,7 @@ pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
 /// Appends `[C, K]` finite values; `scales` are those of their channels if the dtype has any.
 ///
 /// # Errors
-/// [`WireError::Value`] when a value is beyond the range of half precision.
+/// [`crate::WireError::Value`] when a value is beyond the range of half precision.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "the low byte of a sum with ROUND is the rounded value"
@@ -107,22 +107,17 @@ pub(super) fn append(
 fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<()> {
     let max = f32::from(f16::MAX);
     let mut block = [f16::ZERO; BLOCK];
-    for (number, chunk) in values.chunks(BLOCK).enumerate() {
+    for chunk in values.chunks(BLOCK) {
         let block = &mut block[..chunk.len()];
         block.convert_from_f32_slice(chunk);
         // Searched only if there is one: the search does not vectorise.
         let finite = block
             .iter()
             .fold(true, |finite, half| finite & half.is_finite());
-        if !finite && let Some(at) = block.iter().position(|half| !half.is_finite()) {
-            let (index, value) = (number * BLOCK + at, f64::from(chunk[at]));
-            return Err(WireError::Value {
-                what: "feature",
-                index,
-                value,
-                min: (-max).into(),
-                max: max.into(),
-            });
+        if !finite {
+            check_each("feature", values, [-max, max], |value| {
+                f16::from_f32(value).is_finite()
+            })?;
         }
         bytes.extend_from_slice(cast_slice(block));
     }
@@ -132,7 +127,7 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<()> {
 /// Reads `[C, K]` values, `selected` = K. Values are not checked to be finite here, scales are.
 ///
 /// # Errors
-/// [`WireError::Value`] when a scale is not a finite number of at least zero.
+/// [`crate::WireError::Value`] when a scale is not a finite number of at least zero.
 #[expect(
     clippy::indexing_slicing,
     reason = "a chunk has at most 2 * BLOCK bytes"
@@ -178,6 +173,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::WireError;
 
     fn round_trip(dtype: Dtype, values: &[f32], channels: usize) -> Result<Vec<f32>, WireError> {
         let scales = if dtype == Dtype::I8 {

@@ -7,7 +7,7 @@ use crate::checks::{check_limit, check_size};
 use crate::{BevGrid, Limits, WireError};
 
 /// Byte ranges of the parts of an unpacked body, and its number of cells.
-pub(super) struct Layout {
+pub(super) struct BodyLayout {
     /// Cells of the grid.
     pub(super) cells: usize,
     /// Cells in the body.
@@ -20,7 +20,7 @@ pub(super) struct Layout {
     pub(super) values: Range<usize>,
 }
 
-impl Layout {
+impl BodyLayout {
     /// All sizes of a feature map, with every product checked against overflow and limits.
     #[expect(
         clippy::cast_possible_truncation,

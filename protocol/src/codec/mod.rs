@@ -27,7 +27,7 @@ use crate::body::check_values;
 use crate::checks::check_size;
 use crate::{BevFeatures, BevGrid, Body, BodyShape, Limits, Result, WireError};
 
-use layout::Layout;
+use layout::BodyLayout;
 
 pub use dtype::Dtype;
 pub use gate::{ConfidenceGate, Smoothing};
@@ -165,7 +165,7 @@ pub fn encode_features(
         selection: Selection::Dense,
         compression: Compression::Raw,
     };
-    let layout = Layout::new(&grid, channels, &dense, &Limits::SENDER)?;
+    let layout = BodyLayout::new(&grid, channels, &dense, &Limits::SENDER)?;
     let expected = layout.cells * channels as usize;
     check_size("features", features.values.len() as u64, expected as u64)?;
     // A budget that holds the dense map does not limit it.
@@ -241,7 +241,7 @@ fn unpacked_body(
     values: &[f32],
     selected: Option<&[u32]>,
 ) -> Result<Vec<u8>> {
-    let layout = Layout::new(grid, channels, codec, &Limits::SENDER)?;
+    let layout = BodyLayout::new(grid, channels, codec, &Limits::SENDER)?;
     let mut bytes = Vec::with_capacity(layout.len());
     let scales = if codec.dtype == Dtype::I8 {
         dtype::scales(values, channels as usize)
@@ -267,7 +267,7 @@ impl EncodedFeatures {
         codec: &Codec,
         limits: &Limits,
     ) -> Result<BodyShape> {
-        let layout = Layout::new(grid, channels, codec, limits)?;
+        let layout = BodyLayout::new(grid, channels, codec, limits)?;
         let len = layout.len() as u64;
         Ok(match (codec.compression, codec.dtype, codec.selection) {
             (Compression::Raw, Dtype::F32, Selection::Dense) => BodyShape::Floats(len / 4),
@@ -303,7 +303,7 @@ impl EncodedFeatures {
     /// [`WireError`] when sizes exceed `limits`, the body does not match shape and codec, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
     pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures> {
-        let layout = Layout::new(&self.grid, self.channels, &self.codec, limits)?;
+        let layout = BodyLayout::new(&self.grid, self.channels, &self.codec, limits)?;
         let (values, sent) = match (self.body, self.codec) {
             (
                 Body::Floats(values),

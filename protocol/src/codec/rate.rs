@@ -6,8 +6,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Codec, CodecConfig, Compression, Dtype, EncodedFeatures, Layout, Selection, encode_features,
-    selection,
+    BodyLayout, Codec, CodecConfig, Compression, Dtype, EncodedFeatures, Selection,
+    encode_features, selection,
 };
 use crate::string_enum::named;
 use crate::{BevFeatures, Limits, Result};
@@ -176,7 +176,7 @@ fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Res
         selection,
         compression: Compression::Raw,
     };
-    Ok(Layout::new(&features.grid, features.channels, &codec, &Limits::SENDER)?.len() as u64)
+    Ok(BodyLayout::new(&features.grid, features.channels, &codec, &Limits::SENDER)?.len() as u64)
 }
 
 #[cfg(test)]

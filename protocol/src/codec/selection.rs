@@ -101,11 +101,10 @@ pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<V
     }
     match selected.last() {
         // The last byte of the mask may have bits beyond the grid.
-        Some(last) if *last as usize >= cells => Err(WireError::Shape {
-            what: "last cell in the mask",
-            expected: cells as u64 - 1,
-            found: (*last).into(),
-        }),
+        Some(last) if *last as usize >= cells => {
+            let (expected, found) = (cells as u64 - 1, (*last).into());
+            Err(WireError::shape("last cell in the mask", expected, found))
+        }
         _ => Ok(selected),
     }
 }

@@ -33,7 +33,14 @@ impl Payload for Bev {
     fn check(metadata: &Self, limits: &Limits) -> Result<BodyShape> {
         let features = &metadata.features;
         metadata.pose.check_values(limits)?;
-        check_code(features.channels, features.code_of, limits)?;
+        if let Some(decoded) = features.code_of.map(u64::from) {
+            check_limit("channels", decoded, limits.max_channels.into())?;
+            // A code has no more channels than the map that it encodes.
+            if u64::from(features.channels) > decoded {
+                let found = features.channels.into();
+                return Err(WireError::shape("channels of a code", decoded, found));
+            }
+        }
         EncodedFeatures::body_shape(&features.grid, features.channels, &features.codec, limits)
     }
 
@@ -41,17 +48,4 @@ impl Payload for Bev {
         metadata.features.body = body;
         Ok(metadata)
     }
-}
-
-/// A code has no more channels than the map that it encodes, and the map no more than permitted.
-fn check_code(channels: u32, code_of: Option<u32>, limits: &Limits) -> Result<()> {
-    let Some(decoded) = code_of else {
-        return Ok(());
-    };
-    check_limit("channels", decoded.into(), limits.max_channels.into())?;
-    if channels > decoded {
-        let (expected, found) = (decoded.into(), channels.into());
-        return Err(WireError::shape("channels of a code", expected, found));
-    }
-    Ok(())
 }

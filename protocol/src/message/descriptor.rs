@@ -68,25 +68,17 @@ impl FromStr for ModelHash {
     type Err = ModelHashError;
 
     fn from_str(text: &str) -> Result<Self, ModelHashError> {
-        let hash = hash_of(text).ok_or_else(|| ModelHashError(text.chars().take(80).collect()))?;
-        Ok(Self(hash))
+        hash_of(text).ok_or_else(|| ModelHashError(text.chars().take(80).collect()))
     }
 }
 
-fn hash_of(text: &str) -> Option<[u8; 32]> {
-    let mut hash = [0; 32];
-    for (byte, [high, low]) in hash.iter_mut().zip(text.as_bytes().as_chunks().0) {
-        *byte = digit(*high)? << 4 | digit(*low)?;
+fn hash_of(text: &str) -> Option<ModelHash> {
+    let mut hash = ModelHash([0; 32]);
+    for (byte, digits) in hash.0.iter_mut().zip(text.as_bytes().chunks(2)) {
+        *byte = u8::from_str_radix(str::from_utf8(digits).ok()?, 16).ok()?;
     }
-    (text.len() == 64).then_some(hash)
-}
-
-fn digit(byte: u8) -> Option<u8> {
-    match byte {
-        b'0'..=b'9' => Some(byte - b'0'),
-        b'a'..=b'f' => Some(byte - b'a' + 10),
-        _ => None,
-    }
+    // Signs, capitals and other lengths are no part of its spelling.
+    (hash.to_string() == text).then_some(hash)
 }
 
 written_as_text!(ModelHash);

@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos,
-    check_within, metadata_only,
+    PoseEstimate, StageTiming, check_count, check_detection, check_name, check_nanos, check_within,
+    metadata_only,
 };
 use crate::{CavId, Detection, DropReason, Limits, MisbehaviourReason, WireError};
 
@@ -93,7 +93,8 @@ impl Detections {
     fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
         check_name("method", &self.method)?;
         self.pose.check_values(limits)?;
-        check_detections(&self.detections, limits)?;
+        check_count("detections", self.detections.len(), limits.max_boxes)?;
+        self.detections.iter().try_for_each(check_detection)?;
         check_count("fused neighbours", self.fused.len(), limits.max_entries)?;
         check_count("skipped neighbours", self.skipped.len(), limits.max_entries)?;
         for neighbour in &self.fused {

@@ -122,11 +122,6 @@ fn check_nanos(what: &'static str, nanos: u64) -> Result<()> {
     check_limit(what, nanos, MAX_NANOS)
 }
 
-fn check_detections(detections: &[crate::Detection], limits: &Limits) -> Result<()> {
-    check_count("detections", detections.len(), limits.max_boxes)?;
-    detections.iter().try_for_each(check_detection)
-}
-
 fn check_detection(detection: &crate::Detection) -> Result<()> {
     detection.box3d.check()?;
     check_within("detection score", detection.score.into(), 0.0, 1.0)

@@ -59,8 +59,7 @@ pub fn note(line: impl Display) {
 
 /// Prints an error to standard error, also where that is quiet.
 pub fn error(line: impl Display) {
-    let line = format_args!("error: {line}");
-    let _ = print(io::stderr().lock(), format_args!("{line}\n"));
+    let _ = print(io::stderr().lock(), format_args!("error: {line}\n"));
 }
 
 fn print(mut to: impl Write, text: impl Display) -> io::Result<()> {

@@ -9,7 +9,7 @@ use protocol::CavId;
 use super::files::Listing;
 use super::frame_files::{AgentFolder, BIN, PCD, RADAR, holds_pairs};
 use super::points::{SweepStorage, Sweeps};
-use super::yaml::{self, Field};
+use super::yaml::{self, YamlField};
 use super::{MissingFrame, OpenOptions, ReadError, Result, Tick, files};
 use support::rounding;
 
@@ -144,10 +144,8 @@ impl ScenarioFolder {
             let agent_dir = dir.join(id.as_str());
             let agent = AgentFolder::new(&agent_dir, listing, suffix, problems);
             if agent.stems.is_empty() {
-                let reason = format!(
-                    "no frame with both YAML and {}: the agent is left out",
-                    &suffix[1..]
-                );
+                let kind = &suffix[1..];
+                let reason = format!("no frame with both YAML and {kind}: the agent is left out");
                 problems.push(ReadError::malformed(&agent_dir, reason));
             } else {
                 by_agent.insert(id.clone(), agent);
@@ -240,28 +238,21 @@ impl ScenarioFolder {
             None
         });
         let numbers: Option<Vec<u64>> = self.stems.iter().map(|stem| stem.parse().ok()).collect();
-        let times: Vec<u64> = match (numbers, tick_nanos) {
-            (Some(numbers), Some(nanos)) => numbers
-                .iter()
-                .map(|number| number.saturating_mul(nanos))
-                .collect(),
+        let (numbers, first, step, nanos) = match (numbers, tick_nanos) {
+            (Some(numbers), Some(nanos)) => (numbers, 0, 1, nanos),
             (numbers, _) => {
                 let numbers = numbers.unwrap_or_else(|| (0..self.stems.len() as u64).collect());
                 let steps = numbers.array_windows().map(|[a, b]| b.saturating_sub(*a));
                 let step = steps.filter(|&step| step > 0).min().unwrap_or(1);
                 let first = numbers.first().copied().unwrap_or(0);
-                let steps = numbers
-                    .iter()
-                    .map(|number| number.saturating_sub(first) / step);
-                steps
-                    .map(|steps| steps.saturating_mul(period_nanos))
-                    .collect()
+                (numbers, first, step, period_nanos)
             }
         };
-        let ticks = self.stems.iter().zip(times);
-        ticks
-            .map(|(stem, capture_nanos)| Tick::new(stem, capture_nanos))
-            .collect()
+        let ticks = self.stems.iter().zip(numbers).map(|(stem, number)| {
+            let steps = number.saturating_sub(first) / step;
+            Tick::new(stem, steps.saturating_mul(nanos))
+        });
+        ticks.collect()
     }
 
     /// The file that may state the length of a tick.
@@ -276,7 +267,7 @@ impl ScenarioFolder {
             return Ok(None);
         }
         let node = yaml::read(&path)?;
-        let Some(world) = Field::root(&path, &node).optional("world")? else {
+        let Some(world) = YamlField::root(&path, &node).optional("world")? else {
             return Ok(None);
         };
         let Some(delta) = world.optional("fixed_delta_seconds")? else {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use protocol::{EgoMotion, Handedness, InvalidPose, Pose};
 
-use super::yaml::{Field, Value};
+use super::yaml::{Value, YamlField};
 use super::{Problem, ReadError, Result, classes};
 use crate::carla_pose::CarlaPose;
 use crate::frame::{Frame, Object, ObjectClass};
@@ -25,13 +25,13 @@ const CLASS_KEYS: [&str; 4] = ["obj_type", "object_type", "class", "type"];
 /// A frame's annotations, and the parts left out of them.
 #[derive(Debug)]
 pub(super) struct Annotations<'a> {
-    root: Field<'a>,
+    root: YamlField<'a>,
     /// Parts that were left out.
     pub(super) problems: Vec<Problem>,
 }
 
 impl<'a> Annotations<'a> {
-    pub(super) fn new(root: Field<'a>) -> Self {
+    pub(super) fn new(root: YamlField<'a>) -> Self {
         Self {
             root,
             problems: Vec::new(),
@@ -42,7 +42,7 @@ impl<'a> Annotations<'a> {
     pub(super) fn optional<T>(
         &mut self,
         keys: &[&str],
-        read: impl Fn(&Field<'a>) -> Result<T>,
+        read: impl Fn(&YamlField<'a>) -> Result<T>,
     ) -> Option<T> {
         let root = self.root.clone();
         self.optional_of(&root, keys, read)
@@ -50,9 +50,9 @@ impl<'a> Annotations<'a> {
 
     fn optional_of<T>(
         &mut self,
-        parent: &Field<'a>,
+        parent: &YamlField<'a>,
         keys: &[&str],
-        read: impl Fn(&Field<'a>) -> Result<T>,
+        read: impl Fn(&YamlField<'a>) -> Result<T>,
     ) -> Option<T> {
         let field = keys
             .iter()
@@ -67,7 +67,7 @@ impl<'a> Annotations<'a> {
     pub(super) fn add_vehicle(
         &mut self,
         frame: &mut Frame,
-        pose: impl Fn(&Field<'a>) -> Result<Pose>,
+        pose: impl Fn(&YamlField<'a>) -> Result<Pose>,
     ) {
         if let Some(imu) = self.root.optional("imu").ok().flatten() {
             let counter_clockwise = match frame.source_handedness {
@@ -97,7 +97,7 @@ impl<'a> Annotations<'a> {
     /// to the world.
     pub(super) fn objects(
         &mut self,
-        id: impl Fn(i64, &Field<'a>) -> Result<i64>,
+        id: impl Fn(i64, &YamlField<'a>) -> Result<i64>,
         pose: impl Fn(&CarlaPose) -> Result<Pose, InvalidPose>,
     ) -> Vec<Object> {
         let entries = self.object_entries().unwrap_or_else(|error| {
@@ -125,8 +125,8 @@ impl<'a> Annotations<'a> {
     fn object(
         &mut self,
         key: &str,
-        field: &Field<'a>,
-        id: &impl Fn(i64, &Field<'a>) -> Result<i64>,
+        field: &YamlField<'a>,
+        id: &impl Fn(i64, &YamlField<'a>) -> Result<i64>,
         pose: &impl Fn(&CarlaPose) -> Result<Pose, InvalidPose>,
     ) -> Result<Object> {
         let listed_id = listed_id(key, field)?;
@@ -141,7 +141,7 @@ impl<'a> Annotations<'a> {
     }
 
     /// The map of annotated objects: `vehicles`, or `objects` in relatives of the format.
-    fn object_entries(&self) -> Result<Vec<(&'a str, Field<'a>)>> {
+    fn object_entries(&self) -> Result<Vec<(&'a str, YamlField<'a>)>> {
         let root = &self.root;
         let key = if !root.has("vehicles") && root.has("objects") {
             "objects"
@@ -162,7 +162,7 @@ impl<'a> Annotations<'a> {
     }
 
     /// A car if no type is given. An unknown type is not a vehicle, and is reported once per scenario.
-    fn class(&mut self, field: &Field<'a>) -> ObjectClass {
+    fn class(&mut self, field: &YamlField<'a>) -> ObjectClass {
         let kind = CLASS_KEYS
             .iter()
             .find_map(|key| Some((*key, field.optional(key).ok().flatten()?)));
@@ -190,7 +190,7 @@ impl<'a> Annotations<'a> {
 
 /// Ids are integers; those that went through an array of floats have a point.
 #[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
-fn listed_id(key: &str, field: &Field<'_>) -> Result<i64> {
+fn listed_id(key: &str, field: &YamlField<'_>) -> Result<i64> {
     let id = key.parse().ok().or_else(|| {
         let number: f64 = key.parse().ok()?;
         (number.fract() == 0.0 && number.abs() < 1e15).then_some(number as i64)
@@ -199,7 +199,7 @@ fn listed_id(key: &str, field: &Field<'_>) -> Result<i64> {
 }
 
 /// Centre and rotation of the box, in the numbers of the file.
-fn place(field: &Field<'_>) -> Result<CarlaPose> {
+fn place(field: &YamlField<'_>) -> Result<CarlaPose> {
     let center = field
         .optional("center")?
         .map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
@@ -215,7 +215,7 @@ fn place(field: &Field<'_>) -> Result<CarlaPose> {
 }
 
 /// `extent` holds half sizes.
-fn size_m(field: &Field<'_>) -> Result<[f64; 3]> {
+fn size_m(field: &YamlField<'_>) -> Result<[f64; 3]> {
     let extent = field.required("extent")?;
     let half = extent.numbers::<3>()?;
     if half
@@ -230,17 +230,17 @@ fn size_m(field: &Field<'_>) -> Result<[f64; 3]> {
 }
 
 /// Speed of an object, metres per second.
-fn speed_mps(field: &Field<'_>) -> Result<f64> {
+fn speed_mps(field: &YamlField<'_>) -> Result<f64> {
     within(field, speed_mps_of_kmh(field)?, MAX_SPEED_MPS, "m/s")
 }
 
 /// Speed of the vehicle itself, metres per second.
-fn own_speed_mps(field: &Field<'_>, speed_mps: f64) -> Result<f64> {
+fn own_speed_mps(field: &YamlField<'_>, speed_mps: f64) -> Result<f64> {
     within(field, speed_mps, EgoMotion::MAX_SPEED_MPS, "m/s")
 }
 
 /// km/h to m/s. Related formats write a vector; its length is the speed.
-fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64> {
+fn speed_mps_of_kmh(field: &YamlField<'_>) -> Result<f64> {
     let kmh = field.number().or_else(|error| {
         let vector = field.array().map_err(|_| error)?.values;
         let squares = vector.iter().map(|component| component * component);
@@ -250,7 +250,7 @@ fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64> {
 }
 
 /// The value, if its size is at most `most`.
-fn within(field: &Field<'_>, value: f64, most: f64, unit: &str) -> Result<f64> {
+fn within(field: &YamlField<'_>, value: f64, most: f64, unit: &str) -> Result<f64> {
     // NaN does not satisfy this comparison.
     match value.abs() <= most {
         true => Ok(value),

@@ -37,7 +37,7 @@ use protocol::Detection;
 use protocol::rotated_iou::Polygon;
 
 use crate::ground_truth::GroundTruth;
-use breakdown::Selection;
+use breakdown::PartMembers;
 use frame_overlaps::FrameOverlaps;
 
 pub use breakdown::Breakdown;
@@ -76,7 +76,7 @@ pub struct Matched {
 
 /// Precision over recall, and the area under it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Curve {
+pub struct PrecisionRecallCurve {
     /// Average precision, 0..1; 0 without objects.
     pub average_precision: f64,
     /// Recall after each detection, with 0 in front and 1 at the end.
@@ -107,7 +107,7 @@ impl Tally {
     }
 
     /// Adds a frame; returns the verdicts in the order of its detections.
-    fn add(&mut self, frame: &FrameOverlaps, part: &Selection) -> Vec<Verdict> {
+    fn add(&mut self, frame: &FrameOverlaps, part: &PartMembers) -> Vec<Verdict> {
         let verdicts = frame.judge(part, self.iou_threshold);
         for candidate in &frame.by_score {
             let verdict = verdicts[candidate.index];
@@ -123,7 +123,7 @@ impl Tally {
     }
 
     /// The curve of everything matched so far.
-    pub fn curve(&self, ordering: Ordering) -> Curve {
+    pub fn curve(&self, ordering: Ordering) -> PrecisionRecallCurve {
         let mut order: Vec<&Matched> = self.matched.iter().collect();
         if ordering == Ordering::Global {
             // A stable sort: equal scores stay in the order of the frames.
@@ -149,7 +149,7 @@ impl Tally {
         let average_precision = steps
             .map(|(recall, precision)| (recall[1] - recall[0]) * precision)
             .sum();
-        Curve {
+        PrecisionRecallCurve {
             average_precision,
             recall,
             precision,
@@ -203,7 +203,7 @@ impl Scorer {
                 tally.add(&frame, &part);
             });
         }
-        let all = Selection::all(detections.len(), truth.objects.len());
+        let all = PartMembers::all(detections.len(), truth.objects.len());
         self.tallies
             .iter_mut()
             .map(|tally| tally.add(&frame, &all))
@@ -213,7 +213,7 @@ impl Scorer {
     /// Adds a frame given as footprints, which all count; to the tallies of all objects only.
     pub fn add_footprints(&mut self, detections: &[(Polygon, f32)], objects: &[Polygon]) {
         let frame = FrameOverlaps::of_footprints(detections, objects);
-        let all = Selection::all(detections.len(), objects.len());
+        let all = PartMembers::all(detections.len(), objects.len());
         self.tallies.iter_mut().for_each(|tally| {
             tally.add(&frame, &all);
         });

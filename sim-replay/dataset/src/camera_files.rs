@@ -8,7 +8,7 @@ use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion};
 use protocol::{Camera, CameraMetadata, ImageFormat, Limits, Payload, Pinhole, Pose};
 
 use super::files;
-use super::yaml::Field;
+use super::yaml::YamlField;
 use super::{ReadError, Result};
 
 /// Prefixes of the number of a camera in file names and in the YAML: OPV2V's and V2X-Real's.
@@ -76,8 +76,8 @@ pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf> {
 pub(super) fn read(
     path: &Path,
     number: u8,
-    root: &Field<'_>,
-    pose: &dyn Fn(&Field<'_>) -> Result<Pose>,
+    root: &YamlField<'_>,
+    pose: &dyn Fn(&YamlField<'_>) -> Result<Pose>,
 ) -> Result<Camera> {
     let image = files::read_limited(path, MAX_BYTES)?;
     let format = ImageFormat::of_bytes(&image)
@@ -110,11 +110,11 @@ pub(super) fn read(
     Ok(Camera { metadata, image })
 }
 
-fn pinhole(field: &Field<'_>) -> Result<Pinhole> {
+fn pinhole(field: &YamlField<'_>) -> Result<Pinhole> {
     let rows = field.items()?;
     let rows = rows
         .iter()
-        .map(Field::numbers::<3>)
+        .map(YamlField::numbers::<3>)
         .collect::<Result<Vec<_>, _>>()?;
     match rows.as_slice() {
         &[[fx_px, _, cx_px], [_, fy_px, cy_px], _] => Ok(Pinhole {
@@ -137,8 +137,7 @@ pub fn body_from_optical() -> Isometry3<f64> {
 
 fn lidar_from_camera(world_from_lidar: &Pose, world_from_body: &Pose) -> Pose {
     let (lidar, body) = (world_from_lidar.isometry(), world_from_body.isometry());
-    let lidar_from_body = lidar.inv_mul(&body);
-    (lidar_from_body * body_from_optical()).into()
+    (lidar.inv_mul(&body) * body_from_optical()).into()
 }
 
 #[cfg(test)]

@@ -48,25 +48,16 @@ impl CarlaPose {
         let [(sr, cr), (sy, cy), (sp, cp)] = self
             .roll_yaw_pitch_deg
             .map(|deg| deg.to_radians().sin_cos());
-        let [x, y, z] = self.position_m;
-        Matrix4::new(
-            cp * cy,
-            cy * sp * sr - sy * cr,
-            -cy * sp * cr - sy * sr,
-            x,
-            sy * cp,
-            sy * sp * sr + cy * cr,
-            -sy * sp * cr + cy * sr,
-            y,
-            sp,
-            -cp * sr,
-            cp * cr,
-            z,
-            0.0,
-            0.0,
-            0.0,
-            1.0,
-        )
+        // By columns.
+        let rotation = Matrix3::from([
+            [cp * cy, sy * cp, sp],
+            [cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, -cp * sr],
+            [-cy * sp * cr - sy * sr, -sy * sp * cr + cy * sr, cp * cr],
+        ]);
+        let mut matrix = rotation.to_homogeneous();
+        let mut translation = matrix.fixed_view_mut::<3, 1>(0, 3);
+        translation.copy_from_slice(&self.position_m);
+        matrix
     }
 
     /// The same pose in our right-handed convention.

@@ -49,10 +49,9 @@ impl ClassSet {
                     .map_err(|error: UnknownClass| error.to_string())?)
             };
         }
-        if set.0 == 0 {
-            Err("no class is given".into())
-        } else {
-            Ok(set)
+        match set.0 {
+            0 => Err("no class is given".into()),
+            _ => Ok(set),
         }
     }
 }

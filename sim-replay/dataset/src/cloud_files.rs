@@ -19,11 +19,11 @@ const SEQUENCE_FOLDERS: [&str; 2] = ["velodyne_sync", "velodyne_left"];
 #[derive(Debug, Clone)]
 pub struct CloudFile {
     path: PathBuf,
-    source: Source,
+    source: CloudSource,
 }
 
 #[derive(Debug, Clone)]
-enum Source {
+enum CloudSource {
     /// A frame of a data set.
     Frame {
         scenario: Arc<Scenario>,
@@ -105,7 +105,7 @@ fn frames_of(scenario: Scenario) -> Vec<CloudFile> {
         let path = if has_many { path.join(stem) } else { path };
         Some(CloudFile {
             path,
-            source: Source::Frame {
+            source: CloudSource::Frame {
                 scenario: Arc::clone(&scenario),
                 agent,
                 tick,
@@ -161,7 +161,7 @@ impl Folders {
         });
         let source = known.map(|known| known.source).unwrap_or_else(|| {
             let alone = self.alone.get(&folder_of(&path)).cloned();
-            Source::File(alone.unwrap_or_default())
+            CloudSource::File(alone.unwrap_or_default())
         });
         CloudFile { path, source }
     }
@@ -199,12 +199,12 @@ impl CloudFile {
     /// with the exceeded limit.
     pub fn read(&self) -> Result<Cloud> {
         let cloud = match &self.source {
-            Source::Frame {
+            CloudSource::Frame {
                 scenario,
                 agent,
                 tick,
             } => scenario.load_points(*agent, *tick, None)?,
-            Source::File(sweeps) => sweeps.read(&single_vehicle_id(), &self.path)?,
+            CloudSource::File(sweeps) => sweeps.read(&single_vehicle_id(), &self.path)?,
         };
         let findings = SweepFindings::of(&cloud);
         let mut points = cloud.points;
@@ -219,7 +219,7 @@ impl CloudFile {
             points,
             left_out,
             findings,
-            is_of_data_set: matches!(self.source, Source::Frame { .. }),
+            is_of_data_set: matches!(self.source, CloudSource::Frame { .. }),
         })
     }
 }

@@ -78,6 +78,19 @@ pub struct Object {
     pub speed_mps: Option<f64>,
 }
 
+impl Object {
+    /// An object whose speed is not recorded.
+    pub(crate) fn new(id: i64, class: ObjectClass, pose: Pose, size_m: [f64; 3]) -> Self {
+        Self {
+            id,
+            class,
+            world_from_object: pose,
+            size_m,
+            speed_mps: None,
+        }
+    }
+}
+
 impl From<&TrueObject> for Object {
     /// An object of a message; a class of another version is [`ObjectClass::Other`].
     fn from(object: &TrueObject) -> Self {

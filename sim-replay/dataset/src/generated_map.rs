@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::Path;
 
-use super::yaml::{self, Field};
+use super::yaml::{self, YamlField};
 use super::{Result, Scenario};
 
 /// A generated map: the name of its roads and the seed of its objects.
@@ -32,7 +32,7 @@ impl Scenario {
         let folder = points.ancestors().nth(2).unwrap_or(Path::new(""));
         let path = folder.join("data_protocol.yaml");
         let node = yaml::read(&path)?;
-        let generator = Field::root(&path, &node).required("generator")?;
+        let generator = YamlField::root(&path, &node).required("generator")?;
         let seed = generator.required("town_seed")?;
         Ok(GeneratedMap {
             name: generator.required("town")?.text()?.to_owned(),

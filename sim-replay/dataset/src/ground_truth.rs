@@ -181,10 +181,8 @@ fn select<'a>(
     is_of_class: impl Fn(ObjectClass) -> bool,
     is_kept: impl Fn(&Box3d) -> bool,
 ) -> Vec<(&'a Object, Box3d)> {
-    let world_from_ego = frames_of_tick
-        .get(ego_index)
-        .and_then(|ego| ego.world_from_lidar);
-    let Some(world_from_ego) = world_from_ego else {
+    let ego = frames_of_tick.get(ego_index);
+    let Some(world_from_ego) = ego.and_then(|ego| ego.world_from_lidar) else {
         return Vec::new();
     };
     let ego_from_world = world_from_ego.isometry().inverse();

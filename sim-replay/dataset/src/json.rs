@@ -59,9 +59,9 @@ fn is_of_word(byte: u8) -> bool {
 }
 
 /// A value with its position in the document.
-pub(super) type Field<'a> = super::field::Field<'a, Value>;
+pub(super) type JsonField<'a> = super::field::Field<'a, Value>;
 
-impl<'a> Field<'a> {
+impl<'a> JsonField<'a> {
     /// Entry `index` of a list.
     pub(super) fn entry(path: &'a Path, index: usize, value: &'a Value) -> Self {
         Self::root(path, value).child(&index.to_string(), value)
@@ -93,6 +93,15 @@ impl<'a> Field<'a> {
         let found = map.get(key);
         let found = found.filter(|value| !value.is_null() && value.as_str() != Some(""));
         Ok(found.map(|value| self.child(key, value)))
+    }
+
+    /// What `read` makes of an optional entry.
+    pub(super) fn optional_of<T>(
+        &self,
+        key: &str,
+        read: impl FnOnce(&Self) -> Result<T>,
+    ) -> Result<Option<T>> {
+        self.optional(key)?.map(|field| read(&field)).transpose()
     }
 
     /// A required entry.
@@ -206,7 +215,7 @@ mod tests {
     #[test]
     fn numbers_come_as_numbers_or_text_and_nested_or_not() {
         let value = json!({"a": [[1], ["2.5"], [-3e-2]], "b": [1, [2, 3]], "c": "7", "d": ["nan"]});
-        let root = Field::root(Path::new("a.json"), &value);
+        let root = JsonField::root(Path::new("a.json"), &value);
         assert_eq!(
             root.required("a").unwrap().numbers().unwrap(),
             [1.0, 2.5, -0.03]
@@ -240,7 +249,7 @@ mod tests {
     fn words_that_are_no_json_cost_the_value_alone_and_are_named() {
         let text = br#"[{"x": NaN, "\"NaN, ": "a, NaN\\"}, {"x": -Infinity, "y": [1e999, true, null, -2.5]}]"#;
         let value = parse(text).unwrap();
-        let list = Field::root(Path::new("a.json"), &value);
+        let list = JsonField::root(Path::new("a.json"), &value);
         let messages: Vec<String> = list
             .items()
             .unwrap()
@@ -262,7 +271,7 @@ mod tests {
     #[test]
     fn missing_and_mistyped_values_are_reported() {
         let value = json!([{"x": null, "y": "", "z": {}}]);
-        let entry = Field::entry(Path::new("a.json"), 3, &value[0]);
+        let entry = JsonField::entry(Path::new("a.json"), 3, &value[0]);
         for key in ["x", "y", "other"] {
             assert!(entry.optional(key).unwrap().is_none());
             assert_eq!(
@@ -280,7 +289,7 @@ mod tests {
             "a.json: 3.z: a map of 0, expected a text"
         );
         assert_eq!(
-            message(Field::root(Path::new("a.json"), &value).required("x")),
+            message(JsonField::root(Path::new("a.json"), &value).required("x")),
             "a.json: a list of 1, expected a map"
         );
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::json::{self, Field};
+use super::json::{self, JsonField};
 use super::{ReadError, Result};
 use support::bounded_file;
 
@@ -20,7 +20,7 @@ const MAX_PROBLEMS: usize = 20;
 /// Tokens of a row, by which needed rows of large tables are selected before the rest is parsed.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct Keys<'a> {
+pub(super) struct RowKeys<'a> {
     #[serde(borrow)]
     pub(super) token: Cow<'a, str>,
     #[serde(borrow)]
@@ -33,7 +33,7 @@ pub(super) fn read_all(
     path: &Path,
     max_bytes: u64,
     problems: &mut Vec<ReadError>,
-    row: impl FnMut(&Field<'_>) -> Result<()>,
+    row: impl FnMut(&JsonField<'_>) -> Result<()>,
 ) -> Result<usize> {
     read(path, max_bytes, problems, |_| true, row)
 }
@@ -49,10 +49,10 @@ pub(super) fn read(
     path: &Path,
     max_bytes: u64,
     problems: &mut Vec<ReadError>,
-    is_needed: impl Fn(&Keys<'_>) -> bool,
-    mut row: impl FnMut(&Field<'_>) -> Result<()>,
+    is_needed: impl Fn(&RowKeys<'_>) -> bool,
+    mut row: impl FnMut(&JsonField<'_>) -> Result<()>,
 ) -> Result<usize> {
-    let (mut used, mut unusable, mut first_problems) = (0, 0, Vec::new());
+    let (mut used, mut unusable) = (0, 0);
     let whole = for_each_row(path, max_bytes, |index, raw| {
         // A row without valid keys is kept for its error message.
         let is_unneeded = match serde_json::from_slice(raw) {
@@ -67,24 +67,23 @@ pub(super) fn read(
             let reason = format!("no sound JSON: {error}");
             ReadError::malformed_at(path, None, Some(&index.to_string()), reason)
         });
-        match value.and_then(|value| row(&Field::entry(path, index, &value))) {
+        match value.and_then(|value| row(&JsonField::entry(path, index, &value))) {
             Ok(()) => used += 1,
             Err(problem) => {
                 unusable += 1;
                 // A table has up to millions of rows: all their problems would fill the memory.
-                if first_problems.len() < MAX_PROBLEMS {
-                    first_problems.push(problem);
+                if unusable <= MAX_PROBLEMS {
+                    problems.push(problem);
                 }
             }
         }
     });
-    if unusable > first_problems.len() {
+    if unusable > MAX_PROBLEMS {
         let reason = format!(
             "{unusable} entries cannot be used: left out; the first {MAX_PROBLEMS} are listed"
         );
-        first_problems.push(ReadError::malformed(path, reason));
+        problems.push(ReadError::malformed(path, reason));
     }
-    problems.append(&mut first_problems);
     match whole {
         Err(error) if used == 0 => return Err(error),
         Err(error) => problems.push(error),

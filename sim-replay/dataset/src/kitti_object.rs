@@ -10,7 +10,7 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
-use super::layout::{LayoutRow, Reader};
+use super::layout::{LayoutReader, LayoutRow};
 use super::points::{SweepStorage, Sweeps};
 use super::{
     FrameSource, Layout, OpenOptions, Problem, ReadError, Result, Scenario, Tick, classes, files,
@@ -26,7 +26,7 @@ pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
     data_sets: "KITTI object detection",
     files: "velodyne/<frame>.bin and calib/<frame>.txt (a folder)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence {
+    reader: Some(LayoutReader::Sequence {
         is_one: is_split,
         open,
     }),
@@ -179,13 +179,7 @@ fn object(
     let world_from_object: Pose = (lidar_from_camera * camera_from_object).into();
     let valid = world_from_object.validate();
     valid.map_err(|error| kitti_text::malformed(path, line, Some(&field), error.to_string()))?;
-    Ok(Object {
-        id,
-        class,
-        world_from_object,
-        size_m,
-        speed_mps: None,
-    })
+    Ok(Object::new(id, class, world_from_object, size_m))
 }
 
 /// The label's position is the centre of the bottom face in the camera frame (x right, y down, z forward); `rotation_y`

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use super::faults::Faults;
 use super::kitti_text::{self, Calibration};
-use super::layout::{LayoutRow, Reader};
+use super::layout::{LayoutReader, LayoutRow};
 use super::points::SweepStorage;
 use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence};
 use support::rounding;
@@ -21,7 +21,7 @@ pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
     data_sets: "KITTI odometry, SemanticKITTI",
     files: "velodyne/<scan>.bin and calib.txt (a file)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence {
+    reader: Some(LayoutReader::Sequence {
         is_one: is_sequence,
         open,
     }),
@@ -46,12 +46,9 @@ pub(super) fn open(
     let (of_times, of_poses) = (dir.join("times.txt"), poses_path(dir).unwrap_or_default());
     keep_those_with(&mut scans, &of_times, times.as_deref(), problems);
     keep_those_with(&mut scans, &of_poses, poses.as_deref(), problems);
-    let mut joins = Vec::new();
+    let (mut joins, count) = (Vec::new(), scans.len());
     for (is_joined, what) in [(poses.is_some(), "poses"), (times.is_some(), "times")] {
-        let line = format!(
-            "{} {what} by number: the line is that of the scan",
-            scans.len()
-        );
+        let line = format!("{count} {what} by number: the line is that of the scan");
         joins.extend(is_joined.then_some(line));
     }
     let clouds = scans.into_iter().map(|(scan, stem)| {

@@ -67,25 +67,18 @@ pub(super) fn numbers<const N: usize>(
     field: Option<&str>,
     text: &str,
 ) -> Result<[f64; N]> {
-    let mut numbers = [0.0; N];
-    let mut found = 0;
-    for word in text.split_ascii_whitespace() {
+    let numbers = text.split_ascii_whitespace().map(|word| {
         let number = word.parse().ok().filter(|number: &f64| number.is_finite());
-        let Some(number) = number else {
+        number.ok_or_else(|| {
             let reason = format!("{:?} is no finite number", excerpt(word, 40));
-            return Err(malformed(path, line, field, reason));
-        };
-        // Counts on beyond `N`, so that the message states how many there are.
-        if let Some(place) = numbers.get_mut(found) {
-            *place = number;
-        }
-        found += 1;
-    }
-    if found == N {
-        return Ok(numbers);
-    }
-    let reason = format!("{found} numbers, expected {N}");
-    Err(malformed(path, line, field, reason))
+            malformed(path, line, field, reason)
+        })
+    });
+    let numbers = numbers.collect::<Result<Vec<f64>>>()?;
+    numbers.try_into().map_err(|numbers: Vec<f64>| {
+        let reason = format!("{} numbers, expected {N}", numbers.len());
+        malformed(path, line, field, reason)
+    })
 }
 
 /// A rigid transform from a row-major 3x4 matrix.

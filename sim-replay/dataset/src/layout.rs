@@ -26,12 +26,12 @@ pub struct LayoutRow {
     /// Name of the evaluation protocol that is the default for it.
     pub(crate) protocol: &'static str,
     /// Its reader; `None`: that of the row before, which detects both.
-    pub(crate) reader: Option<Reader>,
+    pub(crate) reader: Option<LayoutReader>,
 }
 
 /// Reader of one or several layouts.
 #[derive(Debug)]
-pub(crate) enum Reader {
+pub(crate) enum LayoutReader {
     /// Opens the data sets at or below a folder; `Ok(None)` where there are none.
     DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>>),
     /// Opens sequences of a single vehicle, one at a time.

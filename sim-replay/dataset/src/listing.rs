@@ -39,7 +39,13 @@ pub fn content_sha256<'a>(
 ) -> String {
     let mut hash = Sha256::new();
     for scenario in scenarios {
-        list(scenario, &mut hash);
+        hash.update(scenario.name.as_bytes());
+        for agent in &scenario.agents {
+            hash.update(format!("/{agent}"));
+        }
+        for tick in &scenario.ticks {
+            hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos));
+        }
         let files: Vec<PathBuf> = files_of(scenario, variant).into_iter().collect();
         let digests: Vec<Option<[u8; 32]>> =
             // The results keep the order of the files, whichever is read first.
@@ -53,16 +59,6 @@ pub fn content_sha256<'a>(
         }
     }
     hex(&hash.finalize())
-}
-
-fn list(scenario: &Scenario, hash: &mut Sha256) {
-    hash.update(scenario.name.as_bytes());
-    for agent in &scenario.agents {
-        hash.update(format!("/{agent}"));
-    }
-    for tick in &scenario.ticks {
-        hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos));
-    }
 }
 
 /// Every file that the frames of a scenario are read from; images and radar points are not evaluated.

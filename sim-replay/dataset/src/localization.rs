@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 
 use super::hdf5_poses::{self, RowOrder};
 use super::kitti_text::{lines, numbers};
-use super::layout::{LayoutRow, Reader};
+use super::layout::{LayoutReader, LayoutRow};
 use super::points::SweepStorage;
 use super::{
     Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, nclt_ground_truth, sequence,
@@ -35,7 +35,7 @@ pub(crate) static NCLT: LayoutRow = LayoutRow {
     data_sets: "NCLT, as published or as LightLoc converts it",
     files: "<day>/velodyne_sync/<microseconds>.bin, or <day>/velodyne_left/<microseconds>.bin in a folder named by a date",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence {
+    reader: Some(LayoutReader::Sequence {
         is_one: is_sequence,
         open,
     }),
@@ -197,16 +197,13 @@ fn pose_files(dir: &Path) -> Vec<PathBuf> {
 fn first_row(path: &Path) -> Result<[f64; 3]> {
     let mut lines = lines(path)?;
     lines.retain(|(_, text)| !text.trim_start().starts_with('#'));
-    let first = lines.first().map(|(line, text)| (*line, text.clone()));
-    let mut counts = (lines.iter()).map(|(_, row)| row.split_ascii_whitespace().count());
-    match (first, lines.len(), counts.all(|count| count == 3)) {
-        (Some((line, text)), 1 | 2, true) => numbers(path, line, None, &text),
-        (first, ..) => {
-            let all: Vec<String> = lines.into_iter().map(|(_, text)| text).collect();
-            let line = first.map_or(1, |(line, _)| line);
-            numbers(path, line, None, &all.join(" "))
-        }
+    let line = lines.first().map_or(1, |(line, _)| *line);
+    let mut rows: Vec<String> = lines.into_iter().map(|(_, text)| text).collect();
+    let mut counts = rows.iter().map(|row| row.split_ascii_whitespace().count());
+    if rows.len() == 2 && counts.all(|count| count == 3) {
+        rows.truncate(1);
     }
+    numbers(path, line, None, &rows.join(" "))
 }
 
 fn own_name(dir: &Path) -> String {

@@ -6,7 +6,7 @@
 use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
-use crate::scalar::{self, Scalar, ScalarKind, size_of};
+use crate::scalar::{Scalar, ScalarKind, find, place, read_point, size_of};
 
 /// Numbers of a point that are accepted.
 const COLUMNS: std::ops::RangeInclusive<usize> = 3..=32;
@@ -14,9 +14,11 @@ const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// Places of the numbers of a point: `first + index * step`, bytes.
 #[derive(Debug)]
-struct Columns {
+struct NpyColumns {
     places: [Option<(usize, Scalar)>; 4],
     step: usize,
+    /// Size of an entry of the array, bytes.
+    entry_size: usize,
     points: usize,
     /// Name of the intensity.
     intensity: Option<String>,
@@ -26,24 +28,15 @@ struct Columns {
 ///
 /// # Errors
 /// The fault with the found and the expected value. No allocation relies on the header alone.
-#[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
 pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let (header, body) = split(bytes)?;
     let descr = entry(header, "descr").ok_or("no entry descr")?;
     let shape = shape_of(header)?;
-    let (columns, size_of_one) = match descr.strip_prefix('[') {
-        Some(fields) => {
-            let columns = named(fields, &shape)?;
-            let size = columns.step;
-            (columns, size)
-        }
-        None => {
-            let number = number_of(descr)?;
-            let columns = numbered(number, &shape, is_fortran(header))?;
-            (columns, number.size)
-        }
+    let columns = match descr.strip_prefix('[') {
+        Some(fields) => named(fields, &shape)?,
+        None => numbered(number_of(descr)?, &shape, is_fortran(header))?,
     };
-    let (stated, found) = (product(size_of_one, &shape), body.len());
+    let (stated, found) = (product(columns.entry_size, &shape), body.len());
     // Before anything is allocated by the shape. No product means that the shape overflows.
     if stated.is_none_or(|stated| found < stated) {
         return Err(format!(
@@ -51,11 +44,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         ));
     }
     let points = (0..columns.points).map(|index| {
-        columns.places.map(|place| {
-            let value = place
-                .and_then(|(first, scalar)| scalar.read(body.get(first + index * columns.step..)?));
-            value.map_or(0.0, |value| value as f32)
-        })
+        let bytes = body.get(index * columns.step..).unwrap_or_default();
+        read_point(bytes, &columns.places)
     });
     let [.., intensity] = columns.places;
     let intensity = intensity.map(|(_, scalar)| {
@@ -172,32 +162,23 @@ fn product(one: usize, sizes: &[usize]) -> Option<usize> {
         .try_fold(one, |product, &size| product.checked_mul(size))
 }
 
-fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
+fn named(fields: &str, shape: &[usize]) -> Result<NpyColumns, String> {
     let fields = fields_of(fields)?;
     let [x, y, z] = ["x", "y", "z"].map(|name| {
         let names: Vec<&str> = fields.iter().map(|(name, _)| name.as_str()).collect();
-        find(&fields, &[name])
-            .map(|(_, place)| place)
-            .ok_or_else(|| format!("no field {name}, there are {names:?}"))
+        find(&fields, &[name]).ok_or_else(|| format!("no field {name}, there are {names:?}"))
     });
     let intensity = find(&fields, &INTENSITY_FIELDS);
-    let place = intensity.as_ref().map(|(_, place)| *place);
-    Ok(Columns {
-        places: [Some(x?), Some(y?), Some(z?), place],
+    Ok(NpyColumns {
+        places: [Some(x?), Some(y?), Some(z?), intensity].map(|index| place(&fields, index?)),
         step: size_of(&fields),
+        entry_size: size_of(&fields),
         points: product(1, shape).unwrap_or(usize::MAX),
-        intensity: intensity.map(|(name, _)| name),
+        intensity: intensity.and_then(|index| Some(fields.get(index)?.0.clone())),
     })
 }
 
-/// Name and place of the first field of numbers with one of the names, the first preferred.
-fn find(fields: &[(String, Scalar)], names: &[&str]) -> Option<(String, (usize, Scalar))> {
-    let index = scalar::find(fields, names)?;
-    let (name, scalar) = fields.get(index)?;
-    Some((name.clone(), (size_of(fields.get(..index)?), *scalar)))
-}
-
-fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns, String> {
+fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<NpyColumns, String> {
     let (&last, before) = shape.split_last().ok_or_else(|| wrong_shape(shape))?;
     // 3 x 4 could be either: rows are points then.
     let is_by_component = matches!(before, [3 | 4]) && !COLUMNS.contains(&last);
@@ -211,12 +192,13 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
     };
     // C order by component and Fortran order by point are the same bytes: all x, then all y.
     let (column_step, point_step) = if is_planar { (count, 1) } else { (1, columns) };
-    Ok(Columns {
+    Ok(NpyColumns {
         places: [0, 1, 2, 3].map(|column: usize| {
             let first = column.checked_mul(column_step)?.checked_mul(scalar.size)?;
             (column < columns).then_some((first, scalar))
         }),
         step: point_step * scalar.size,
+        entry_size: scalar.size,
         points: count,
         intensity: None,
     })

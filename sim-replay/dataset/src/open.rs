@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::layout::{LayoutRow, Reader, opened};
+use super::layout::{LayoutReader, LayoutRow, opened};
 use super::layouts::LAYOUTS;
 use super::{
     Dataset, OpenOptions, ReadError, Result, Scenario, agent_folders, files, layouts_text,
@@ -51,7 +51,7 @@ fn check_file_system(dir: &Path) -> Result<()> {
 /// Tries `layouts` in their order.
 fn open_among(layouts: &[&LayoutRow], dir: &Path, options: &OpenOptions) -> Result<Dataset> {
     for layout in layouts {
-        if let Some(Reader::DataSet(open)) = layout.reader
+        if let Some(LayoutReader::DataSet(open)) = layout.reader
             && let Some(dataset) = open(dir, options)?
         {
             return Ok(dataset);
@@ -79,7 +79,7 @@ fn open_sequences(
     problems: &mut Vec<ReadError>,
 ) -> Result<()> {
     let reader = layouts.iter().find_map(|layout| match layout.reader {
-        Some(Reader::Sequence { is_one, open }) if is_one(dir) => Some(open),
+        Some(LayoutReader::Sequence { is_one, open }) if is_one(dir) => Some(open),
         _ => None,
     });
     match reader.map(|open| open(root, dir, options, problems)) {
@@ -158,7 +158,7 @@ mod tests {
         data_sets: "none",
         files: "dummy.txt with a number of ticks",
         protocol: "opv2v",
-        reader: Some(Reader::Sequence {
+        reader: Some(LayoutReader::Sequence {
             is_one: |dir| dir.join("dummy.txt").is_file(),
             open: open_dummy,
         }),

@@ -11,7 +11,7 @@ use super::agent_folders::ScenarioFolder;
 use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
-use super::yaml::{self, Field};
+use super::yaml::{self, YamlField};
 use super::{FrameSource, Problem, Result, Tick, camera_files, points};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Frame;
@@ -33,7 +33,7 @@ impl FrameSource for Opv2v {
         }
         let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        let root = Field::root(&path, &node);
+        let root = YamlField::root(&path, &node);
         // A faulty LiDAR pose is an error of the frame: all else in it is relative to it.
         if let Some(field) = root.optional("lidar_pose")? {
             frame.world_from_lidar = Some(self.six_numbers(&field)?);
@@ -65,7 +65,7 @@ impl FrameSource for Opv2v {
             Ok(node) => node,
             Err(error) => return frame.problems.push(Problem::from(&error)),
         };
-        let (root, dir) = (Field::root(&path, &node), self.folder.agent_dir(agent));
+        let (root, dir) = (YamlField::root(&path, &node), self.folder.agent_dir(agent));
         // An agent may have fewer cameras than others.
         let own = self.folder.by_agent.get(agent);
         for &number in numbers
@@ -97,7 +97,7 @@ impl FrameSource for Opv2v {
 
 impl Opv2v {
     /// x, y, z, roll, yaw, pitch in metres and degrees.
-    fn six_numbers(&self, field: &Field<'_>) -> Result<Pose> {
+    fn six_numbers(&self, field: &YamlField<'_>) -> Result<Pose> {
         match WrittenPose::read(field)? {
             WrittenPose::SixNumbers(place) => self.world_from(&place).map_err(|error| field.error(error.to_string())),
             WrittenPose::Matrix(_) => Err(field.error(

@@ -7,12 +7,12 @@ use std::sync::Arc;
 use protocol::Handedness;
 
 use super::agent_folders::{self, ScenarioFolder};
-use super::layout::{LayoutRow, Reader, opened};
+use super::layout::{LayoutReader, LayoutRow, opened};
 use super::options::OpenOptions;
 use super::opv2v::Opv2v;
 use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
-use super::yaml::{self, Field};
+use super::yaml::{self, YamlField};
 use super::{Dataset, FrameSource, Layout, ReadError, Result, Scenario, files};
 
 /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
@@ -22,7 +22,7 @@ pub(crate) static OPV2V: LayoutRow = LayoutRow {
     data_sets: "OPV2V, V2XSet, V2X-R, V2VDet, V2X-Radar, RCooper as its converter writes it, generated scenes",
     files: "<scenario>/<agent>/<frame>.yaml and .pcd; lidar_pose of 6 numbers",
     protocol: "opv2v",
-    reader: Some(Reader::DataSet(open)),
+    reader: Some(LayoutReader::DataSet(open)),
 };
 
 /// V2V4Real: the same folders, with pose matrices and objects in the LiDAR frame, right-handed.
@@ -133,5 +133,5 @@ fn family_layout(folder: &ScenarioFolder) -> Layout {
 
 fn lidar_pose(path: &Path) -> Result<WrittenPose> {
     let node = yaml::read(path)?;
-    WrittenPose::read(&Field::root(path, &node).required("lidar_pose")?)
+    WrittenPose::read(&YamlField::root(path, &node).required("lidar_pose")?)
 }

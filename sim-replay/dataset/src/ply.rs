@@ -6,7 +6,7 @@
 use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
-use crate::scalar::{Scalar, ScalarKind, find, size_of};
+use crate::scalar::{Scalar, ScalarKind, find, place, read_point, size_of};
 
 /// Longest header that is read, bytes.
 const MAX_HEADER: usize = 64 << 10;
@@ -16,7 +16,7 @@ const MAX_PROPERTIES: usize = 256;
 /// Storage of the numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, strum::EnumString)]
 #[strum(serialize_all = "snake_case")]
-enum Storage {
+enum PlyFormat {
     Ascii,
     BinaryLittleEndian,
     BinaryBigEndian,
@@ -24,7 +24,7 @@ enum Storage {
 
 /// Elements of one kind.
 #[derive(Debug)]
-struct Element {
+struct PlyElement {
     name: String,
     count: usize,
     properties: Vec<(String, Scalar)>,
@@ -58,7 +58,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let intensity = find(&vertex.properties, &INTENSITY_FIELDS);
     let columns = [Some(x?), Some(y?), Some(z?), intensity];
     let (points, form) = match storage {
-        Storage::Ascii => (ascii(vertex, before, body, &columns)?, "PLY, ascii"),
+        PlyFormat::Ascii => (ascii(vertex, before, body, &columns)?, "PLY, ascii"),
         _ => (binary(vertex, before, body, &columns)?, "PLY, binary"),
     };
     let intensity = intensity
@@ -68,7 +68,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
 }
 
 /// Storage, elements, and the bytes behind the header.
-fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
+fn header(bytes: &[u8]) -> Result<(PlyFormat, Vec<PlyElement>, &[u8]), String> {
     const END: &[u8] = b"end_header";
     const TOO_EARLY: &str = "a property before the first element";
     // A binary body may have no line end for long: the search for `end_header` is bounded.
@@ -86,7 +86,7 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     }
     let (text, body) = bytes.split_at_checked(len).unwrap_or_default();
     let text = String::from_utf8_lossy(text);
-    let (mut format, mut elements) = (None, Vec::<Element>::new());
+    let (mut format, mut elements) = (None, Vec::<PlyElement>::new());
     for (number, line) in (1..).zip(text.lines()) {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match *words {
@@ -95,7 +95,7 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
                 let count = count
                     .parse()
                     .map_err(|_| format!("line {number}: {count:?} is no number of elements"))?;
-                elements.push(Element {
+                elements.push(PlyElement {
                     name: name.to_owned(),
                     count,
                     properties: Vec::new(),
@@ -123,7 +123,7 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
         }
     }
     let format = format.ok_or("no line format")?;
-    let storage: Storage = format.parse().map_err(|_| {
+    let storage: PlyFormat = format.parse().map_err(|_| {
         format!("format {format:?}, expected ascii, binary_little_endian or binary_big_endian")
     })?;
     // After all lines: `format` may come behind the elements.
@@ -131,7 +131,7 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
         .iter_mut()
         .flat_map(|element| &mut element.properties)
     {
-        scalar.is_big_endian = storage == Storage::BinaryBigEndian;
+        scalar.is_big_endian = storage == PlyFormat::BinaryBigEndian;
     }
     Ok((storage, elements, body))
 }
@@ -153,8 +153,8 @@ fn scalar_of(name: &str) -> Option<Scalar> {
 
 #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
 fn ascii(
-    vertex: &Element,
-    before: &[Element],
+    vertex: &PlyElement,
+    before: &[PlyElement],
     body: &[u8],
     columns: &[Option<usize>; 4],
 ) -> Result<Vec<[f32; 4]>, String> {
@@ -190,10 +190,9 @@ fn ascii(
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
 fn binary(
-    vertex: &Element,
-    before: &[Element],
+    vertex: &PlyElement,
+    before: &[PlyElement],
     body: &[u8],
     columns: &[Option<usize>; 4],
 ) -> Result<Vec<[f32; 4]>, String> {
@@ -217,20 +216,9 @@ fn binary(
             "{count} vertices of {stride} bytes stated, {found} bytes found: the file is cut off"
         ));
     };
-    let places = columns.map(|index| {
-        let index = index?;
-        let (_, scalar) = vertex.properties.get(index)?;
-        let before = vertex.properties.get(..index)?;
-        Some((size_of(before), *scalar))
-    });
-    let points = body.chunks_exact(stride.max(1)).map(|bytes| {
-        places.map(|place| {
-            place
-                .and_then(|(first, scalar)| scalar.read(bytes.get(first..)?))
-                .map_or(0.0, |v| v as f32)
-        })
-    });
-    Ok(points.collect())
+    let places = columns.map(|index| place(&vertex.properties, index?));
+    let points = body.chunks_exact(stride.max(1));
+    Ok(points.map(|bytes| read_point(bytes, &places)).collect())
 }
 
 #[cfg(test)]

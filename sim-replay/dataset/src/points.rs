@@ -180,11 +180,13 @@ pub(super) fn divisor_of_first(clouds: impl Iterator<Item = PcdCloud>, path: &Pa
 }
 
 /// Format of a file, by the ending of its name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::EnumString)]
+#[strum(serialize_all = "snake_case")]
 pub(super) enum FileKind {
     Pcd,
     Ply,
     Npy,
+    #[strum(serialize = "bin")]
     Floats,
 }
 
@@ -197,17 +199,10 @@ impl FileKind {
         let ending = (path.extension())
             .map(|ending| ending.to_string_lossy().to_ascii_lowercase())
             .unwrap_or_default();
-        Ok(match ending.as_str() {
-            "pcd" => Self::Pcd,
-            "ply" => Self::Ply,
-            "npy" => Self::Npy,
-            "bin" => Self::Floats,
-            _ => {
-                let reason = format!(
-                    "{ending:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin"
-                );
-                return Err(ReadError::malformed(path, reason));
-            }
+        ending.parse().map_err(|_| {
+            let reason =
+                format!("{ending:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin");
+            ReadError::malformed(path, reason)
         })
     }
 }

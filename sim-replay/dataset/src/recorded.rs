@@ -9,7 +9,7 @@ use protocol::{
     Truth, wire,
 };
 
-use super::layout::{LayoutRow, Reader};
+use super::layout::{LayoutReader, LayoutRow};
 use super::presence::AbsentFrames;
 use super::{
     Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
@@ -25,7 +25,7 @@ pub(crate) static RECORDING: LayoutRow = LayoutRow {
     data_sets: "runs of v2vloc",
     files: "a file <name>.mcap, or recording.mcap in a run folder",
     protocol: "opv2v",
-    reader: Some(Reader::DataSet(open_given)),
+    reader: Some(LayoutReader::DataSet(open_given)),
 };
 
 /// Name of the recording in a run folder.

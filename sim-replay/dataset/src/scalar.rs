@@ -84,6 +84,21 @@ pub(super) fn find(fields: &[(String, Scalar)], names: &[&str]) -> Option<usize>
     })
 }
 
+/// First byte and type of a field.
+pub(super) fn place(fields: &[(String, Scalar)], index: usize) -> Option<(usize, Scalar)> {
+    let (_, scalar) = fields.get(index)?;
+    Some((size_of(fields.get(..index)?), *scalar))
+}
+
+/// The point at the start of `bytes`, by the first byte and the type of x, y, z and intensity; 0 for those without.
+#[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
+pub(super) fn read_point(bytes: &[u8], places: &[Option<(usize, Scalar)>; 4]) -> [f32; 4] {
+    places.map(|place| {
+        let value = place.and_then(|(first, scalar)| scalar.read(bytes.get(first..)?));
+        value.map_or(0.0, |value| value as f32)
+    })
+}
+
 /// IEEE 754 binary16.
 fn half(bits: u16) -> f64 {
     let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };

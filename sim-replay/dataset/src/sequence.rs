@@ -13,7 +13,7 @@ use crate::pcd::PcdCloud;
 
 /// Sweeps and poses of a sequence.
 #[derive(Debug)]
-struct Sequence {
+struct SequenceSource {
     /// File and `world_from_lidar` by the stem of the tick.
     clouds: HashMap<String, (PathBuf, Option<Pose>)>,
     sweeps: Sweeps,
@@ -38,7 +38,7 @@ pub(super) fn scenario(
     let clouds = clouds
         .into_iter()
         .map(|(tick, file, pose)| (tick.stem, (file, pose)));
-    let source = Sequence {
+    let source = SequenceSource {
         clouds: clouds.collect(),
         sweeps,
         shared_files,
@@ -59,7 +59,7 @@ pub(super) fn or_without<T>(
     })
 }
 
-impl FrameSource for Sequence {
+impl FrameSource for SequenceSource {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = self.clouds.get(&tick.stem).and_then(|(_, pose)| *pose);

@@ -13,7 +13,7 @@ pub(super) struct Trajectory {
 
 /// Reason why there is no pose at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum NoPose {
+pub(super) enum Unposed {
     /// It is before the first pose or after the last.
     Outside,
     /// The poses around it are too far apart.
@@ -49,23 +49,23 @@ impl Trajectory {
     }
 
     /// The pose at a time.
-    pub(super) fn at(&self, time: u64) -> Result<Isometry3<f64>, NoPose> {
+    pub(super) fn at(&self, time: u64) -> Result<Isometry3<f64>, Unposed> {
         let after = self.poses.partition_point(|(other, _)| *other < time);
-        let (next_time, next) = self.poses.get(after).ok_or(NoPose::Outside)?;
+        let (next_time, next) = self.poses.get(after).ok_or(Unposed::Outside)?;
         if *next_time == time {
             return Ok(*next);
         }
         let before = after
             .checked_sub(1)
             .and_then(|before| self.poses.get(before));
-        let (last_time, last) = before.ok_or(NoPose::Outside)?;
+        let (last_time, last) = before.ok_or(Unposed::Outside)?;
         let gap = next_time - last_time;
         let share = (time - last_time) as f64 / gap as f64;
         // Half a turn within a gap cannot be interpolated.
         (gap <= self.max_gap)
             .then(|| last.try_lerp_slerp(next, share, 1e-9))
             .flatten()
-            .ok_or(NoPose::Gap)
+            .ok_or(Unposed::Gap)
     }
 }
 

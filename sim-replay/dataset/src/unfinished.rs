@@ -1,6 +1,6 @@
 //! Marker files of folders whose writing was interrupted.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::{Dataset, ReadError};
 
@@ -9,16 +9,14 @@ pub const UNFINISHED: &str = ".unfinished";
 
 /// Adds a problem for each marker in the opened folder and in those of its scenarios.
 pub(super) fn report(dir: &Path, dataset: &mut Dataset) {
-    let scenarios = dataset
-        .scenarios
-        .iter()
-        .map(|scenario| dir.join(&scenario.name).join(UNFINISHED));
-    let marks: Vec<PathBuf> = std::iter::once(dir.join(UNFINISHED))
-        .chain(scenarios)
-        .filter(|mark| mark.is_file())
-        .collect();
-    dataset.problems.extend(marks.into_iter().map(|mark| {
-        let reason = "the run that wrote this folder did not end: frames may be missing or cut off";
-        ReadError::malformed(&mark, reason)
-    }));
+    let names = dataset.scenarios.iter().map(|one| one.name.as_str());
+    // No name: the opened folder itself.
+    for name in std::iter::once("").chain(names) {
+        let mark = dir.join(name).join(UNFINISHED);
+        if mark.is_file() {
+            let reason =
+                "the run that wrote this folder did not end: frames may be missing or cut off";
+            dataset.problems.push(ReadError::malformed(&mark, reason));
+        }
+    }
 }

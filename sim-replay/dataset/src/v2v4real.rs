@@ -11,7 +11,7 @@ use super::agent_folders::ScenarioFolder;
 use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::{WrittenPose, rigid};
-use super::yaml::{self, Field};
+use super::yaml::{self, YamlField};
 use super::{FrameSource, Result, Tick};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
@@ -31,7 +31,7 @@ impl FrameSource for V2v4Real {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        let root = Field::root(&path, &node);
+        let root = YamlField::root(&path, &node);
         let world_from_lidar = lidar_pose(&root.required("lidar_pose")?)?;
         frame.world_from_lidar = Some(world_from_lidar);
         let mut annotations = Annotations::new(root);
@@ -69,7 +69,7 @@ impl FrameSource for V2v4Real {
 
 impl V2v4Real {
     /// `ass_id` is the id that both agents share; -1 means that only this agent has the object.
-    fn associated_id(&self, agent: &CavId, listed_id: i64, field: &Field<'_>) -> Result<i64> {
+    fn associated_id(&self, agent: &CavId, listed_id: i64, field: &YamlField<'_>) -> Result<i64> {
         let associated = field.optional("ass_id")?;
         match associated.map(|id| id.integer()).transpose()? {
             None => Ok(listed_id),
@@ -86,7 +86,7 @@ impl V2v4Real {
     }
 }
 
-fn lidar_pose(field: &Field<'_>) -> Result<Pose> {
+fn lidar_pose(field: &YamlField<'_>) -> Result<Pose> {
     match WrittenPose::read(field)? {
         WrittenPose::Matrix(matrix) => rigid(&matrix, field),
         WrittenPose::SixNumbers(_) => Err(field.error(
@@ -96,7 +96,7 @@ fn lidar_pose(field: &Field<'_>) -> Result<Pose> {
 }
 
 /// A matrix, or six numbers by the reference's formula in the right-handed axes of this data set: nothing is mirrored.
-fn pose(field: &Field<'_>) -> Result<Pose> {
+fn pose(field: &YamlField<'_>) -> Result<Pose> {
     match WrittenPose::read(field)? {
         WrittenPose::Matrix(matrix) => rigid(&matrix, field),
         WrittenPose::SixNumbers(place) => rigid(&place.left_handed_matrix(), field),

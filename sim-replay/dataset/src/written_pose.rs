@@ -5,7 +5,7 @@ use nalgebra::{Matrix4, RowVector4};
 use protocol::Pose;
 
 use super::Result;
-use super::yaml::Field;
+use super::yaml::YamlField;
 use super::yaml::numpy_tags::{self, NumpyArray};
 use crate::carla_pose::CarlaPose;
 
@@ -20,7 +20,7 @@ pub(super) enum WrittenPose {
 
 impl WrittenPose {
     /// Reads six numbers, sixteen, or four rows of four: lists, arrays, or lists of arrays.
-    pub(super) fn read(field: &Field<'_>) -> Result<Self> {
+    pub(super) fn read(field: &YamlField<'_>) -> Result<Self> {
         let NumpyArray { shape, values } = field.array()?;
         if let Some(number) = values.iter().find(|number| !number.is_finite()) {
             return Err(field.error(format!("{number}, expected finite numbers")));
@@ -40,7 +40,7 @@ impl WrittenPose {
 }
 
 /// A rigid transform from a matrix of a file.
-pub(super) fn rigid(matrix: &Matrix4<f64>, field: &Field<'_>) -> Result<Pose> {
+pub(super) fn rigid(matrix: &Matrix4<f64>, field: &YamlField<'_>) -> Result<Pose> {
     let mut matrix = *matrix;
     let last = RowVector4::new(0.0, 0.0, 0.0, 1.0);
     // Inverting and multiplying matrices leaves rounding errors in the last row.
@@ -61,7 +61,7 @@ mod tests {
     fn read(text: &str) -> Result<WrittenPose> {
         let path = Path::new("0.yaml");
         let node = yaml::parse(path, text.as_bytes())?;
-        WrittenPose::read(&Field::root(path, &node).required("pose")?)
+        WrittenPose::read(&YamlField::root(path, &node).required("pose")?)
     }
 
     const SIX: [f64; 6] = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];

@@ -11,7 +11,7 @@ const WORK_PER_BYTE: u128 = 8_000_000_000;
 
 /// Cumulative service curve of a link.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Capacity {
+pub(super) enum ServiceCurve {
     /// Unlimited rate.
     Unlimited,
     /// Constant rate, bit/s.
@@ -35,7 +35,7 @@ pub(super) fn work(bytes: u64) -> u128 {
     u128::from(bytes) * WORK_PER_BYTE
 }
 
-impl Capacity {
+impl ServiceCurve {
     pub(super) fn new(config: &CapacityConfig, trace: Option<&Trace>) -> Self {
         match (config, trace) {
             (CapacityConfig::TokenBucket { bandwidth_mbps, .. }, _) => {
@@ -146,7 +146,7 @@ mod tests {
 
     use super::*;
 
-    fn steps(rates: &[u64]) -> Capacity {
+    fn steps(rates: &[u64]) -> ServiceCurve {
         let step = |(index, &bits_per_s): (usize, &u64)| Step {
             from_nanos: index as u64 * 700_000_000,
             bits_per_s,
@@ -154,7 +154,7 @@ mod tests {
             loss: 0.0,
         };
         let trace = Trace::Steps(rates.iter().enumerate().map(step).collect());
-        Capacity::new(
+        ServiceCurve::new(
             &CapacityConfig::Trace(TraceConfig::new("trace.csv".as_ref())),
             Some(&trace),
         )
@@ -169,10 +169,10 @@ mod tests {
             times.sort_unstable();
             times.push(5_001);
             let times = times.iter().map(|ms| ms * 1_000_000).collect();
-            let opportunities = Capacity::Opportunities(times);
+            let opportunities = ServiceCurve::Opportunities(times);
             let (all, offset_nanos) = (Box::new(opportunities.clone()), 9 * constant);
-            let later = Capacity::Later { before: all.done_by(offset_nanos), all, offset_nanos };
-            for capacity in [steps(&rates), Capacity::Constant(constant), opportunities, later] {
+            let later = ServiceCurve::Later { before: all.done_by(offset_nanos), all, offset_nanos };
+            for capacity in [steps(&rates), ServiceCurve::Constant(constant), opportunities, later] {
                 let Some(nanos) = capacity.time_of(work(bytes)) else {
                     prop_assert_eq!(rates.last(), Some(&0));
                     continue;
@@ -185,7 +185,7 @@ mod tests {
 
     #[test]
     fn an_opportunity_is_repeated_after_the_last() {
-        let capacity = Capacity::Opportunities(vec![2, 2, 5]);
+        let capacity = ServiceCurve::Opportunities(vec![2, 2, 5]);
         let times: Vec<_> = (1..=7)
             .map(|packet| capacity.time_of(work(packet * 1500)).unwrap())
             .collect();

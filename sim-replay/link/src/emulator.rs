@@ -5,15 +5,16 @@ use std::path::Path;
 
 use protocol::{CavId, DropReason, Stream};
 
-use super::capacity::Capacity;
-use super::chance::{Chance, Purpose, label};
+use super::capacity::ServiceCurve;
+use super::chance::{Purpose, label};
 use super::config::{CapacityConfig, LinkConfig, LinkError, Medium};
 use super::device_clock::DeviceClock;
-use super::loss::{LossState, SentMessage};
+use super::loss::LossState;
 use super::packet::Packet;
 use super::queue_server::{Departure, QueueServer, Rules};
 use super::trace::Trace;
 use support::nanos;
+use support::random::{SplitMix64, derive_seed};
 
 /// Result for a packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,7 +32,7 @@ pub enum Delivery {
 
 /// A packet with its result and the time of the result.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Outcome {
+pub struct PacketOutcome {
     /// Time of the arrival or of the loss, nanoseconds since the beginning of the scene.
     pub nanos: u64,
     /// The packet.
@@ -48,10 +49,10 @@ pub struct LinkEmulator {
     trace: Option<Trace>,
     seed: u64,
     lines: BTreeMap<Option<(CavId, CavId)>, QueueServer>,
-    directions: BTreeMap<(CavId, CavId), Direction>,
+    directions: BTreeMap<(CavId, CavId), DirectionState>,
     /// Future outcomes, by time and number.
-    under_way: BTreeMap<(u64, u64), Outcome>,
-    outcomes: Vec<Outcome>,
+    under_way: BTreeMap<(u64, u64), PacketOutcome>,
+    outcomes: Vec<PacketOutcome>,
     now_nanos: u64,
     /// Number of the next outcome, which orders outcomes of the same time.
     next: u64,
@@ -59,8 +60,9 @@ pub struct LinkEmulator {
 
 /// State of one direction between two vehicles.
 #[derive(Debug)]
-struct Direction {
-    chance: Chance,
+struct DirectionState {
+    /// Seed of all its random numbers.
+    seed: u64,
     loss: LossState,
     /// Latest arrival by stream, nanoseconds.
     latest_nanos: BTreeMap<Stream, u64>,
@@ -84,7 +86,7 @@ impl LinkEmulator {
         config.validate()?;
         let trace = config.read_trace(folder)?;
         let rules = Rules {
-            capacity: Capacity::new(&config.capacity, trace.as_ref()),
+            capacity: ServiceCurve::new(&config.capacity, trace.as_ref()),
             burst_bytes: match config.capacity {
                 CapacityConfig::TokenBucket { burst_bytes, .. } => burst_bytes,
                 _ => 0,
@@ -128,7 +130,7 @@ impl LinkEmulator {
     }
 
     /// Advances the time to `nanos`; returns the outcomes up to then in order of time.
-    pub fn advance(&mut self, nanos: u64) -> Vec<Outcome> {
+    pub fn advance(&mut self, nanos: u64) -> Vec<PacketOutcome> {
         self.run(nanos.max(self.now_nanos));
         std::mem::take(&mut self.outcomes)
     }
@@ -185,33 +187,34 @@ impl LinkEmulator {
     }
 
     fn propagate(&mut self, packet: Packet, start_nanos: u64, end_nanos: u64) {
-        let (config, trace) = (&self.config, self.trace.as_ref());
+        let config = &self.config;
+        let step = self.trace.as_ref().and_then(|trace| trace.at(end_nanos));
         // By direction even on a shared medium: losses and order concern one pair of vehicles.
         let direction = self
             .directions
             .entry((packet.from.clone(), packet.to.clone()))
-            .or_insert_with(|| Direction {
-                chance: Chance::new(self.seed, &packet.from, &packet.to),
+            .or_insert_with(|| DirectionState {
+                // From names, not from indices: another vehicle does not change the draws of this pair.
+                seed: derive_seed(
+                    self.seed,
+                    &[&packet.from, &packet.to].map(|cav| label(cav.as_str())),
+                ),
                 loss: LossState::default(),
                 latest_nanos: BTreeMap::new(),
             });
-        let stream = label(&packet.stream.to_string());
-        let chance = direction.chance;
-        let message = SentMessage {
-            bytes: packet.bytes,
-            distance_m: packet.distance_m,
-            sent_nanos: end_nanos,
-        };
+        let (seed, stream) = (direction.seed, label(&packet.stream.to_string()));
+        let (bytes, sequence) = (packet.bytes, packet.sequence);
+        let random =
+            |purpose: Purpose| SplitMix64::derived(seed, &[purpose as u64, stream, sequence]);
         // Drawn for every sent message, also during an outage: the Markov chain takes one step for each.
-        let random = &mut chance.of(Purpose::Loss, stream, packet.sequence);
-        let (law, loss) = (&config.loss, &mut direction.loss);
-        let is_lost = loss.loses(law, config.loss_unit, &message, trace, random);
+        let mut chance = random(Purpose::Loss);
+        let is_lost = direction.loss.loses(config, &packet, step, &mut chance);
         if is_lost || config.is_cut(start_nanos, end_nanos) {
             self.schedule(end_nanos, packet, Delivery::Dropped(DropReason::LinkLoss));
             return;
         }
-        let mut delay = chance.of(Purpose::Delay, stream, packet.sequence);
-        let delay_nanos = config.latency.draw(&mut delay, trace, &message);
+        let mut delay = random(Purpose::Delay);
+        let delay_nanos = config.latency.draw(&mut delay, step, bytes);
         let exact_nanos = end_nanos.saturating_add(delay_nanos);
         // No packet arrives before its last bit was sent, also with rounding.
         let arrival_nanos = config.floored(packet.submitted_nanos, exact_nanos);
@@ -226,18 +229,16 @@ impl LinkEmulator {
         let mut exact_nanos = exact_nanos.max(arrival_nanos);
         // After the order was kept, and not entered in `latest_nanos`: only this message is late.
         if let Some(reorder) = config.reorder
-            && chance
-                .of(Purpose::Reorder, stream, packet.sequence)
-                .chance(reorder.probability)
+            && random(Purpose::Reorder).chance(reorder.probability)
         {
             exact_nanos = exact_nanos.saturating_add(nanos::of_ms(reorder.extra_ms));
             arrival_nanos = arrival_nanos.max(config.floored(packet.submitted_nanos, exact_nanos));
         }
-        let mut twice = chance.of(Purpose::Duplicate, stream, packet.sequence);
+        let mut twice = random(Purpose::Duplicate);
         // The delay of the copy has a stream of its own too, so that it differs from the first delay.
         let is_repeated = config.duplicate > 0.0 && twice.chance(config.duplicate);
         let copy_nanos = is_repeated.then(|| {
-            let again_nanos = config.latency.draw(&mut twice, trace, &message);
+            let again_nanos = config.latency.draw(&mut twice, step, bytes);
             let exact_nanos = exact_nanos.saturating_add(again_nanos);
             arrival_nanos.max(config.floored(packet.submitted_nanos, exact_nanos))
         });
@@ -256,7 +257,7 @@ impl LinkEmulator {
     }
 
     fn schedule(&mut self, nanos: u64, packet: Packet, delivery: Delivery) {
-        let outcome = Outcome {
+        let outcome = PacketOutcome {
             nanos,
             packet,
             delivery,

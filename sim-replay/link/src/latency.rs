@@ -1,19 +1,13 @@
 //! Propagation delay.
 
 use super::config::LatencyModel;
-use super::loss::SentMessage;
-use super::trace::Trace;
+use super::trace::Step;
 use support::nanos;
 use support::random::SplitMix64;
 
 impl LatencyModel {
-    /// Delay of one message, nanoseconds.
-    pub(super) fn draw(
-        self,
-        random: &mut SplitMix64,
-        trace: Option<&Trace>,
-        message: &SentMessage,
-    ) -> u64 {
+    /// Delay of one message, nanoseconds; `step` is that of the trace at which its last bit was sent.
+    pub(super) fn draw(self, random: &mut SplitMix64, step: Option<&Step>, bytes: u64) -> u64 {
         // Negative draws of the normal distribution become 0 in the conversion.
         nanos::of_ms(match self {
             Self::None => 0.0,
@@ -26,13 +20,11 @@ impl LatencyModel {
                 bandwidth_mbps,
                 fixed_ms,
             } => {
-                let bits = 8.0 * message.bytes as f64;
+                let bits = 8.0 * bytes as f64;
                 // 1 Mbit/s is 1000 bits per millisecond.
                 random.between(0.0, overhead_ms) + bits / (1e3 * bandwidth_mbps) + fixed_ms
             }
-            Self::Trace => trace
-                .and_then(|trace| trace.at(message.sent_nanos))
-                .map_or(0.0, |step| step.latency_ms),
+            Self::Trace => step.map_or(0.0, |step| step.latency_ms),
         })
     }
 }
@@ -44,13 +36,8 @@ mod tests {
     const COUNT: u64 = 20_000;
 
     fn draws(law: LatencyModel) -> Vec<f64> {
-        let message = SentMessage {
-            bytes: 132_500,
-            distance_m: 0.0,
-            sent_nanos: 0,
-        };
         (0..COUNT)
-            .map(|k| law.draw(&mut SplitMix64::derived(3, &[k]), None, &message) as f64 * 1e-6)
+            .map(|k| law.draw(&mut SplitMix64::derived(3, &[k]), None, 132_500) as f64 * 1e-6)
             .collect()
     }
 

@@ -50,7 +50,7 @@ pub use config::{
     QueueConfig, QueueDrop, ReorderConfig,
 };
 pub use device_clock::{ClockStep, DeviceClock};
-pub use emulator::{Delivery, LinkEmulator, Outcome};
+pub use emulator::{Delivery, LinkEmulator, PacketOutcome};
 pub use packet::Packet;
 pub use preset::PRESETS;
 pub use trace::{Step, Trace};

@@ -1,7 +1,8 @@
 //! Loss models: Bernoulli, Gilbert-Elliott, by distance, or from a trace.
 
-use super::config::{FRAGMENT_BYTES, LossModel, LossUnit};
-use super::trace::Trace;
+use super::config::{FRAGMENT_BYTES, LinkConfig, LossModel, LossUnit};
+use super::packet::Packet;
+use super::trace::Step;
 use support::random::SplitMix64;
 
 /// State of the loss model on one direction of one link.
@@ -10,36 +11,26 @@ pub(super) struct LossState {
     is_bad: bool,
 }
 
-/// A message that has been sent.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct SentMessage {
-    pub(super) bytes: u64,
-    pub(super) distance_m: f64,
-    pub(super) sent_nanos: u64,
-}
-
 impl LossState {
-    /// True if a message is lost. Called for the messages of a link in the order in which they are sent.
+    /// True if a message is lost; `step` is that of the trace at which its last bit was sent. Called for the messages of
+    /// a link in the order in which they are sent.
     pub(super) fn loses(
         &mut self,
-        law: &LossModel,
-        unit: LossUnit,
-        message: &SentMessage,
-        trace: Option<&Trace>,
+        config: &LinkConfig,
+        packet: &Packet,
+        step: Option<&Step>,
         random: &mut SplitMix64,
     ) -> bool {
-        let units = match unit {
+        let units = match config.loss_unit {
             LossUnit::Message => 1,
             // An empty message is one fragment too: without any it could never be lost.
-            LossUnit::Fragment => message.bytes.div_ceil(FRAGMENT_BYTES).max(1),
+            LossUnit::Fragment => packet.bytes.div_ceil(FRAGMENT_BYTES).max(1),
         };
-        let share = match law {
+        let share = match &config.loss {
             LossModel::None => return false,
             LossModel::Bernoulli(share) => *share,
-            LossModel::Distance(points) => interpolate(points, message.distance_m),
-            LossModel::Trace => trace
-                .and_then(|trace| trace.at(message.sent_nanos))
-                .map_or(0.0, |step| step.loss),
+            LossModel::Distance(points) => interpolate(points, packet.distance_m),
+            LossModel::Trace => step.map_or(0.0, |step| step.loss),
             LossModel::GilbertElliott {
                 to_bad,
                 to_good,
@@ -75,19 +66,32 @@ fn interpolate(points: &[[f64; 2]], x: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use protocol::{CavId, Stream};
+
     use super::*;
 
     const COUNT: u64 = 100_000;
 
     fn losses(law: &LossModel, unit: LossUnit, bytes: u64, distance_m: f64) -> f64 {
         let mut state = LossState::default();
-        let message = SentMessage {
+        let config = LinkConfig {
+            loss: law.clone(),
+            loss_unit: unit,
+            ..LinkConfig::default()
+        };
+        let [from, to] = ["1", "2"].map(|cav| CavId::new(cav).unwrap());
+        let packet = Packet {
+            id: 0,
+            from,
+            to,
+            stream: Stream::Bev,
+            sequence: 0,
             bytes,
+            submitted_nanos: 0,
             distance_m,
-            sent_nanos: 0,
         };
         let lost = (0..COUNT)
-            .filter(|&k| state.loses(law, unit, &message, None, &mut SplitMix64::derived(7, &[k])));
+            .filter(|&k| state.loses(&config, &packet, None, &mut SplitMix64::derived(7, &[k])));
         lost.count() as f64 / COUNT as f64
     }
 

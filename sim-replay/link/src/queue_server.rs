@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use protocol::DropReason;
 
-use super::capacity::{Capacity, work};
+use super::capacity::{ServiceCurve, work};
 use super::config::{QueueConfig, QueueDrop};
 use super::packet::Packet;
 
@@ -49,7 +49,7 @@ pub(super) enum Departure {
 /// Parameters of a queue.
 #[derive(Debug)]
 pub(super) struct Rules {
-    pub(super) capacity: Capacity,
+    pub(super) capacity: ServiceCurve,
     pub(super) burst_bytes: u64,
     pub(super) queue: QueueConfig,
 }
@@ -58,7 +58,7 @@ impl QueueServer {
     /// Submits a packet now. The queue has been advanced to now.
     pub(super) fn submit(&mut self, packet: Packet, rules: &Rules, left: &mut Vec<Departure>) {
         let nanos = packet.submitted_nanos;
-        if rules.capacity == Capacity::Unlimited {
+        if rules.capacity == ServiceCurve::Unlimited {
             left.push(Departure::Sent {
                 packet,
                 start_nanos: nanos,

@@ -102,8 +102,7 @@ fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
     file.read_exact_at(&mut end, footer_begin)?;
     let (head, rest) = end.split_at(RECORD_HEAD);
     let (footer, magic) = rest.split_at(FOOTER_LEN);
-    let begin = footer.first_chunk().copied();
-    let begin = begin.map_or(0, u64::from_le_bytes);
+    let begin = footer.first_chunk().copied().map_or(0, u64::from_le_bytes);
     let len = footer_begin
         .checked_sub(begin)
         // A position of 0 means that the file has no summary.

@@ -63,7 +63,7 @@ mod writer;
 pub use damage::Damage;
 pub use error::{RecordingError, Result};
 pub use export::{ExportReport, ExportTimes, export_ros2};
-pub use mcap_file::{McapFile, Place};
+pub use mcap_file::{McapFile, McapPlace};
 pub use reader::{Entry, Recording};
 pub use recover::{RecoverReport, recover};
 pub use sink::Store;

@@ -24,7 +24,7 @@ const MAX_DAMAGED: usize = 1000;
 
 /// Position of a message in an MCAP file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct McapPlace {
     /// Index of the record that holds it.
     holder: usize,
     /// Index of the message in that record.
@@ -41,13 +41,13 @@ struct Holder {
 }
 
 /// Messages of one record.
-pub(super) type Messages = Arc<Vec<Message<'static>>>;
+pub(super) type RecordMessages = Arc<Vec<Message<'static>>>;
 
 /// All channels, and a cache of the messages read last.
 #[derive(Debug)]
 struct Unpacked {
     channels: Channels,
-    kept: VecDeque<(usize, Messages)>,
+    kept: VecDeque<(usize, RecordMessages)>,
 }
 
 /// An MCAP file of any program, whose messages can be read in any order.
@@ -77,14 +77,14 @@ impl McapFile {
     /// [`RecordingError`] if the file cannot be read or is no MCAP file.
     pub fn open(
         path: &Path,
-        visit: &mut dyn FnMut(&Message<'static>, Place) -> bool,
+        visit: &mut dyn FnMut(&Message<'static>, McapPlace) -> bool,
     ) -> Result<Self, RecordingError> {
         let file = bounded_file::open(path).map_err(RecordingError::io(path))?;
         let size = file.metadata().map_err(RecordingError::io(path))?.len();
         let mut records = Records::open(&file, size)
             .map_err(RecordingError::io(path))?
             .ok_or_else(|| RecordingError::not_ours(path, "not an MCAP file"))?;
-        let mut contents = Contents {
+        let mut contents = FileScan {
             channels: Channels::of_summary(&file, size).map_err(RecordingError::io(path))?,
             holders: Vec::new(),
             arrivals: Vec::new(),
@@ -95,16 +95,14 @@ impl McapFile {
         };
         let read = contents.look_through(&mut records, size);
         read.map_err(RecordingError::io(path))?;
-        let damage = contents.damage();
-        let unpacked = Unpacked {
-            channels: contents.channels,
-            kept: VecDeque::new(),
-        };
         Ok(Self {
             path: path.into(),
+            damage: contents.damage(),
             holders: contents.holders,
-            damage,
-            unpacked: Mutex::new(unpacked),
+            unpacked: Mutex::new(Unpacked {
+                channels: contents.channels,
+                kept: VecDeque::new(),
+            }),
             file,
         })
     }
@@ -123,7 +121,7 @@ impl McapFile {
     ///
     /// # Errors
     /// [`RecordingError`] if the file has changed since it was opened.
-    pub fn read(&self, place: Place) -> Result<Vec<u8>, RecordingError> {
+    pub fn read(&self, place: McapPlace) -> Result<Vec<u8>, RecordingError> {
         let messages = self.messages(place.holder)?;
         let message = messages
             .get(place.index)
@@ -132,7 +130,7 @@ impl McapFile {
     }
 
     /// The messages of all channels, in the order of the file.
-    pub(super) fn all(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
+    pub(super) fn all(&self) -> impl Iterator<Item = Result<RecordMessages, RecordingError>> {
         (0..self.holders.len()).map(|holder| self.messages(holder))
     }
 
@@ -144,7 +142,7 @@ impl McapFile {
         }
     }
 
-    fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
+    fn messages(&self, holder: usize) -> Result<RecordMessages, RecordingError> {
         // Held while the chunk is read: two readers of the same chunk would unpack it twice.
         let mut unpacked = self.unpacked.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
@@ -173,7 +171,7 @@ impl McapFile {
 
 /// A part of the file that is skipped.
 #[derive(Debug)]
-struct Lost {
+struct LostPart {
     begin: u64,
     end: u64,
     /// Number of timed messages before it.
@@ -182,19 +180,19 @@ struct Lost {
 }
 
 /// Result of scanning a file.
-struct Contents<'a> {
+struct FileScan<'a> {
     channels: Channels,
     holders: Vec<Holder>,
     /// Times of the messages between which damage is timed.
     arrivals: Vec<u64>,
-    lost: Vec<Lost>,
+    lost: Vec<LostPart>,
     /// Bytes that the chunks so far unpack to, and the most that those of a file of this size may.
     unpacked_bytes: u64,
     most_unpacked: u64,
-    visit: &'a mut dyn FnMut(&Message<'static>, Place) -> bool,
+    visit: &'a mut dyn FnMut(&Message<'static>, McapPlace) -> bool,
 }
 
-impl Contents<'_> {
+impl FileScan<'_> {
     /// Reads all records of a file of `size` bytes, except damaged ones.
     fn look_through(&mut self, records: &mut Records<'_>, size: u64) -> std::io::Result<()> {
         loop {
@@ -287,7 +285,7 @@ impl Contents<'_> {
 
     fn add(&mut self, begin: u64, len: usize, is_chunk: bool, messages: &[Message<'static>]) {
         for (index, message) in messages.iter().enumerate() {
-            let place = Place {
+            let place = McapPlace {
                 holder: self.holders.len(),
                 index,
             };
@@ -308,7 +306,7 @@ impl Contents<'_> {
             Some(last) if last.end == begin && end > begin && last.end > last.begin => {
                 last.end = end
             }
-            _ => self.lost.push(Lost {
+            _ => self.lost.push(LostPart {
                 begin,
                 end,
                 before: self.arrivals.len(),

@@ -5,7 +5,7 @@ use std::path::Path;
 use protocol::{Header, Key, wire};
 
 use super::damage::Damage;
-use super::mcap_file::{McapFile, Place, is_foreign};
+use super::mcap_file::{McapFile, McapPlace, is_foreign};
 use super::{RecordingError, is_own};
 
 /// A message of a recording: its position and its header.
@@ -17,7 +17,7 @@ pub struct Entry {
     pub header: Header,
     /// Time of arrival at the recorder, nanoseconds on the Unix clock.
     pub arrived_nanos: u64,
-    place: Place,
+    place: McapPlace,
 }
 
 /// A recording whose messages can be read in any order.

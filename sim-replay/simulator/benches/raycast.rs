@@ -7,7 +7,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use simulator::generate::lidar::{LIDAR_MOUNT_M, Lidar};
-use simulator::generate::raycast::{Body, BodyShape, Placement, Sweep};
+use simulator::generate::raycast::{Course, Placement, RayBody, SolidShape};
 use simulator::generate::vehicle::Vehicle;
 use simulator::generate::{Weather, ground_surface};
 use simulator::map::{MapModel, RoadMapSource, build};
@@ -18,7 +18,7 @@ const SPACING_M: f64 = 20.0;
 const RANGE_M: f64 = 120.0;
 
 /// The lane and the position on it of the sensor.
-fn sensor_motion(map_model: &MapModel) -> Sweep {
+fn sensor_motion(map_model: &MapModel) -> Course {
     let center = |lane: &&simulator::map::Lane| {
         let [x, y, _] = lane.at(0.5 * lane.length_m).0;
         x.hypot(y)
@@ -36,14 +36,14 @@ fn sensor_motion(map_model: &MapModel) -> Sweep {
         Placement::level(position, heading)
     };
     // 12 m/s.
-    Sweep {
+    Course {
         start: at(15.0),
         end: at(15.6),
     }
     .mounted(LIDAR_MOUNT_M)
 }
 
-fn vehicles(map_model: &MapModel, around: &Placement) -> Vec<(Vehicle, Sweep)> {
+fn vehicles(map_model: &MapModel, around: &Placement) -> Vec<(Vehicle, Course)> {
     let mut random = SplitMix64::new(1);
     let mut vehicles = Vec::new();
     for lane in &map_model.lanes.lanes {
@@ -55,7 +55,7 @@ fn vehicles(map_model: &MapModel, around: &Placement) -> Vec<(Vehicle, Sweep)> {
             if (6.0..RANGE_M).contains(&distance) {
                 let end = Placement::level(position, heading);
                 let start = end.mounted([-0.5, 0.0, 0.0]);
-                vehicles.push((Vehicle::random_driving(&mut random), Sweep { start, end }));
+                vehicles.push((Vehicle::random_driving(&mut random), Course { start, end }));
             }
             s_m += SPACING_M;
         }
@@ -67,12 +67,12 @@ fn bench_map(criterion: &mut Criterion, name: &str, source: &RoadMapSource) {
     let map_model = build(source, 0).expect("procedural maps always build");
     let sensor = sensor_motion(&map_model);
     let ground = ground_surface(&map_model);
-    let standing: Vec<(BodyShape, Placement)> = map_model
+    let standing: Vec<(SolidShape, Placement)> = map_model
         .solids
         .iter()
         .map(|solid| {
             (
-                BodyShape::from(solid),
+                SolidShape::from(solid),
                 Placement::level(solid.center_m, solid.yaw_rad),
             )
         })
@@ -82,14 +82,14 @@ fn bench_map(criterion: &mut Criterion, name: &str, source: &RoadMapSource) {
         })
         .collect();
     let vehicles = vehicles(&map_model, &sensor.end);
-    let moving = vehicles.iter().map(|(vehicle, motion)| Body {
+    let moving = vehicles.iter().map(|(vehicle, motion)| RayBody {
         shape: &vehicle.shape,
         motion: *motion,
     });
-    let bodies: Vec<Body<'_>> = moving
-        .chain(standing.iter().map(|(shape, place)| Body {
+    let bodies: Vec<RayBody<'_>> = moving
+        .chain(standing.iter().map(|(shape, place)| RayBody {
             shape,
-            motion: Sweep::still(*place),
+            motion: Course::still(*place),
         }))
         .collect();
     let mut lidar = Lidar::default();

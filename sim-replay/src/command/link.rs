@@ -9,7 +9,7 @@ use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use support::output;
 
 use super::{join, leave, print_json};
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost.
 #[derive(Debug)]
@@ -64,23 +64,19 @@ impl FromArgMatches for Args {
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     match args {
         Args::Forward(args) => forward(*args),
-        Args::Print(name) => match LinkConfig::open(&name) {
-            Ok((link, _)) => {
-                output::text(link.to_yaml())?;
-                Ok(Outcome::Done)
-            }
-            Err(error) => Ok(Outcome::bad_input(&error)),
-        },
+        Args::Print(name) => {
+            let (link, _) = LinkConfig::open(&name).map_err(BadInput::of)?;
+            output::text(link.to_yaml())?;
+            Ok(Outcome::Done)
+        }
     }
 }
 
 fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = args.config.validated()?;
-    let emulator = match LinkEmulator::open(&config.link.model, config.link.seed) {
-        Ok(emulator) => emulator,
-        Err(error) => return Ok(Outcome::bad_input(&error)),
-    };
+    let emulator = LinkEmulator::open(&config.link.model, config.link.seed);
+    let emulator = emulator.map_err(BadInput::of)?;
     let (stop, bus) = join(&config.bus, &config.run, Role::Link, &config.ego)?;
     let options = NodeOptions {
         keeps_running: config.keep_running || config.bus.supervised,

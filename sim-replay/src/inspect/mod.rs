@@ -72,15 +72,15 @@ pub struct AgentReport {
     /// Ticks at which it has a readable sweep.
     pub frames: usize,
     /// Points of a sweep.
-    pub points: Option<Summary>,
+    pub points: Option<CountSummary>,
     /// Form and intensities of its sweeps; `None` if none has a point.
     pub sweeps: Option<SweepReport>,
     /// Points left out because a number is not finite, over all sweeps. Organised clouds have many.
     pub dropped_points: usize,
     /// Radar points of a frame.
-    pub radar_points: Option<Summary>,
+    pub radar_points: Option<CountSummary>,
     /// Annotated objects of a frame.
-    pub boxes: Option<Summary>,
+    pub boxes: Option<CountSummary>,
     /// Boxes that hold none of the agent's own points, over all frames. Many of them hint at wrong axes.
     pub boxes_without_points: usize,
     /// Path length of the LiDAR, metres, over all frames with a pose; `None` without poses.
@@ -89,7 +89,7 @@ pub struct AgentReport {
 
 /// Smallest, mean and largest of a count per frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Summary {
+pub struct CountSummary {
     /// Smallest.
     pub min: usize,
     /// Mean.
@@ -98,7 +98,7 @@ pub struct Summary {
     pub max: usize,
 }
 
-impl Summary {
+impl CountSummary {
     /// Summary of counts, one per frame; `None` if there is none.
     pub fn of(counts: &[usize]) -> Option<Self> {
         let (min, max) = (*counts.iter().min()?, *counts.iter().max()?);

@@ -7,13 +7,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use protocol::CavId;
 use rayon::prelude::*;
 
-use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
+use super::{AgentReport, CountSummary, Problem, Report, ScenarioReport, TickReport};
 use crate::stream::median_step_nanos;
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::findings::{self, FrameFindings, SweepReport};
 use dataset::frame::Frame;
 use dataset::ground_truth::{self, GroundTruthRule};
-use dataset::pcd::{PcdCloud, Place};
+use dataset::pcd::{PcdCloud, PcdPlace};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
 
 /// Largest share of points that are not finite: with more of them a sweep is faulty, not merely sparse.
@@ -134,18 +134,13 @@ fn scenario_problems(
 }
 
 fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> TickFindings {
-    let mut agents = Vec::with_capacity(scenario.agents.len());
-    let mut frames = Vec::with_capacity(scenario.agents.len());
-    for agent in 0..scenario.agents.len() {
-        if !scenario.is_present(agent, tick) {
-            agents.push(FrameSurvey::default());
-            continue;
-        }
-        let (survey, frame) = survey_frame(scenario, agent, tick);
-        agents.push(survey);
-        frames.extend(frame);
-    }
-    let frames: Vec<&Frame> = frames.iter().collect();
+    let surveys = (0..scenario.agents.len()).map(|agent| {
+        let is_present = scenario.is_present(agent, tick);
+        is_present.then(|| survey_frame(scenario, agent, tick))
+    });
+    let (agents, frames): (Vec<FrameSurvey>, Vec<Option<Frame>>) =
+        surveys.map(Option::unwrap_or_default).unzip();
+    let frames: Vec<&Frame> = frames.iter().flatten().collect();
     let objects = frames.iter().flat_map(|frame| &frame.objects);
     let targets = objects
         .filter(|object| rule.classes.contains(object.class))
@@ -167,9 +162,7 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey,
         ..Default::default()
     };
     let frame = scenario.load(agent, tick, &without_points);
-    let frame = frame
-        .map_err(|error| survey.problems.push(Problem::from(&error)))
-        .ok();
+    let frame = or_problem(frame, &mut survey.problems);
     // Read apart from the frame: a fault of the annotations must not hide one of the sweep.
     let sweep = survey_points(scenario, agent, tick, None, &mut survey.problems);
     for variant in &scenario.lidar_variants {
@@ -181,12 +174,16 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey,
         survey.problems.extend(frame.problems.iter().cloned());
     }
     if scenario.has_radar {
-        match scenario.load_radar(agent, tick) {
-            Ok(cloud) => survey.radar_points = Some(cloud.points.len()),
-            Err(error) => survey.problems.push(Problem::from(&error)),
-        }
+        let radar = or_problem(scenario.load_radar(agent, tick), &mut survey.problems);
+        survey.radar_points = radar.map(|cloud| cloud.points.len());
     }
     (survey, frame)
+}
+
+/// What was read; an error becomes a problem.
+fn or_problem<T>(read: Result<T, ReadError>, problems: &mut Vec<Problem>) -> Option<T> {
+    read.map_err(|error| problems.push(Problem::from(&error)))
+        .ok()
 }
 
 fn survey_points(
@@ -196,10 +193,7 @@ fn survey_points(
     variant: Option<&str>,
     problems: &mut Vec<Problem>,
 ) -> Option<PcdCloud> {
-    let cloud = scenario.load_points(agent, tick, variant);
-    let cloud = cloud
-        .map_err(|error| problems.push(Problem::from(&error)))
-        .ok()?;
+    let cloud = or_problem(scenario.load_points(agent, tick, variant), problems)?;
     let path = scenario.points_path(agent, tick, variant);
     let path = path.unwrap_or_default();
     // Organised clouds have a point for every ray, including rays without a hit.
@@ -213,8 +207,10 @@ fn survey_points(
 
 fn not_finite(path: &Path, cloud: &PcdCloud) -> Problem {
     let (line, place) = match cloud.first_dropped {
-        Some(Place::Line(line)) => (Some(line), format!("the first in line {line}")),
-        Some(Place::Point(point)) => (None, format!("the first is point {point}, counted from 0")),
+        Some(PcdPlace::Line(line)) => (Some(line), format!("the first in line {line}")),
+        Some(PcdPlace::Point(point)) => {
+            (None, format!("the first is point {point}, counted from 0"))
+        }
         None => (None, String::new()),
     };
     let path = path.display().to_string();
@@ -265,6 +261,10 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         .last()
         .zip(times.first())
         .map_or(0, |(last, first)| last.saturating_sub(*first));
+    let agents = scenario.agents.iter().enumerate().map(|(agent, id)| {
+        let frames = findings.iter().map(|tick| &tick.agents[agent]);
+        summarize_agent(id, &frames.collect::<Vec<_>>())
+    });
     ScenarioReport {
         name: scenario.name.clone(),
         layout: scenario.layout,
@@ -272,13 +272,7 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         frames: scenario.ticks.len(),
         seconds: span as f64 / 1e9,
         rate_hz: median_step_nanos(&times).map(|step| 1e9 / step as f64),
-        agents: (0..scenario.agents.len())
-            .map(|agent| {
-                let frames: Vec<&FrameSurvey> =
-                    findings.iter().map(|tick| &tick.agents[agent]).collect();
-                summarize_agent(&scenario.agents[agent], &frames)
-            })
-            .collect(),
+        agents: agents.collect(),
         lidar_variants: scenario.lidar_variants.clone(),
         has_radar: scenario.has_radar,
         cameras: scenario.cameras.clone(),
@@ -316,9 +310,9 @@ fn summarize_agent(id: &CavId, frames: &[&FrameSurvey]) -> AgentReport {
 fn summary_of(
     frames: &[&FrameSurvey],
     count: fn(&FrameSurvey) -> Option<usize>,
-) -> Option<Summary> {
+) -> Option<CountSummary> {
     let counts: Vec<usize> = frames.iter().filter_map(|frame| count(frame)).collect();
-    Summary::of(&counts)
+    CountSummary::of(&counts)
 }
 
 #[cfg(test)]
@@ -383,7 +377,7 @@ mod tests {
         let agent = &scenario.agents[0];
         assert_eq!(
             agent.points,
-            Some(Summary {
+            Some(CountSummary {
                 min: 1,
                 mean: 2.0,
                 max: 3
@@ -444,7 +438,7 @@ mod tests {
         let agent = &report.scenarios[0].agents[0];
         assert_eq!(
             (agent.points, agent.dropped_points),
-            (Summary::of(&[1, 0, 2, 2]), 3)
+            (CountSummary::of(&[1, 0, 2, 2]), 3)
         );
         assert_eq!(
             report.ticks.len(),
@@ -611,7 +605,10 @@ mod tests {
                 "/1/000012.yaml:4: vehicles.8.angle: missing: the object is left out",
             ]
         );
-        assert_eq!(report.scenarios[0].agents[0].boxes, Summary::of(&[2, 2]));
+        assert_eq!(
+            report.scenarios[0].agents[0].boxes,
+            CountSummary::of(&[2, 2])
+        );
     }
 
     #[test]

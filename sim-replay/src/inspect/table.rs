@@ -5,7 +5,7 @@ use std::fmt;
 
 use protocol::Handedness;
 
-use super::{AgentReport, Report, ScenarioReport, Summary};
+use super::{AgentReport, CountSummary, Report, ScenarioReport};
 use dataset::Layout;
 use terminal::text_table::{Side, TextTable};
 
@@ -88,11 +88,11 @@ impl Report {
             if is_alone { alone } else { together }.push(tick.merged_boxes);
         }
         for (ego, (alone, together)) in by_ego {
-            let with_others = match Summary::of(&together) {
+            let with_others = match CountSummary::of(&together) {
                 Some(summary) => format!(", {} with those in range", shown(Some(summary))),
                 None => String::new(),
             };
-            let alone = shown(Summary::of(&alone));
+            let alone = shown(CountSummary::of(&alone));
             writeln!(
                 f,
                 "  ground truth of ego {ego}: {alone} ego-only{with_others}"
@@ -152,11 +152,11 @@ fn agents_table(agents: &[AgentReport]) -> TextTable {
 }
 
 /// The mean, and the range if there is one.
-fn shown(summary: Option<Summary>) -> String {
+fn shown(summary: Option<CountSummary>) -> String {
     match summary {
         None => "-".into(),
-        Some(Summary { min, max, .. }) if min == max => min.to_string(),
-        Some(Summary { min, mean, max }) => format!("{mean:.1} ({min} to {max})"),
+        Some(CountSummary { min, max, .. }) if min == max => min.to_string(),
+        Some(CountSummary { min, mean, max }) => format!("{mean:.1} ({min} to {max})"),
     }
 }
 

@@ -12,6 +12,7 @@ use super::schedule::Position;
 use bus::bounded_queue::{BoundedQueue, Pop};
 use support::atomic_file;
 use support::bounded_file;
+use support::file_error::FileError;
 
 /// Largest file that is read: a checkpoint is a few numbers.
 const MAX_BYTES: u64 = 64 << 10;
@@ -38,31 +39,23 @@ impl Place {
     /// The state left by the previous process instance in a scenario of `ticks` ticks; `None` if there was none.
     ///
     /// # Errors
-    /// [`CheckpointError`] if the file holds no state, or that of another scene.
-    pub fn read(
-        path: &Path,
-        scenario: &str,
-        ticks: usize,
-    ) -> Result<Option<Self>, CheckpointError> {
-        let (read, path) = (bounded_file::read_text(path, MAX_BYTES), path.to_owned());
-        let text = match read {
+    /// [`FileError`] if the file holds no state, or that of another scene.
+    pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, FileError> {
+        let text = match bounded_file::read_text(path, MAX_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(source) => return Err(CheckpointError::Read { path, source }),
+            Err(error) => return Err(FileError::new(path, error)),
         };
-        let place: Self = match serde_json::from_str(&text) {
-            Ok(place) => place,
-            Err(source) => return Err(CheckpointError::Text { path, source }),
-        };
+        let place: Self = serde_json::from_str(&text).map_err(|error| {
+            FileError::new(path, format_args!("not a replay checkpoint: {error}"))
+        })?;
         // A next tick equal to `ticks` is valid: the scene was played to its end.
         if place.scenario != scenario || place.position.next_tick > ticks {
             let (tick, of) = (place.position.next_tick, place.scenario);
-            return Err(CheckpointError::Elsewhere {
-                path,
-                place: format!("is tick {tick} of scenario {of}"),
-                scenario: scenario.into(),
-                ticks,
-            });
+            let problem = format_args!(
+                "the checkpoint is tick {tick} of scenario {of}, but scenario {scenario} has {ticks} ticks: remove the file, or choose another"
+            );
+            return Err(FileError::new(path, problem));
         }
         Ok(Some(place))
     }
@@ -80,39 +73,6 @@ impl Place {
             ..StreamReport::default()
         }
     }
-}
-
-/// Reasons why a checkpoint cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum CheckpointError {
-    /// The file cannot be read.
-    #[error("{}: {source}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
-    /// The file holds no checkpoint.
-    #[error("{}: not a replay checkpoint: {source}", path.display())]
-    Text {
-        /// The file.
-        path: PathBuf,
-        /// Error of the parser.
-        source: serde_json::Error,
-    },
-    /// The checkpoint belongs to another scene.
-    #[error("{}: the checkpoint {place}, but scenario {scenario} has {ticks} ticks: remove the file, or choose another", path.display())]
-    Elsewhere {
-        /// The file.
-        path: PathBuf,
-        /// Position in the file.
-        place: String,
-        /// The scenario that is played.
-        scenario: String,
-        /// Number of its ticks.
-        ticks: usize,
-    },
 }
 
 /// Writes checkpoints on its own thread: the clock does not wait for the disk.
@@ -227,8 +187,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
         write(&path, &place()).unwrap();
-        let error_of =
-            |found: Result<Option<Place>, CheckpointError>| found.unwrap_err().to_string();
+        let error_of = |found: Result<Option<Place>, FileError>| found.unwrap_err().to_string();
         for (scenario, ticks) in [("town4", 10), ("town1", 6)] {
             let error = error_of(Place::read(&path, scenario, ticks));
             assert!(

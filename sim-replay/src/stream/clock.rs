@@ -29,9 +29,7 @@ impl ReplayClock {
 
     /// Runs on from here, at another rate if one is given.
     pub(crate) fn resume(&mut self, rate: Option<f64>) {
-        self.rate = rate.unwrap_or(self.rate);
-        self.steps = None;
-        self.anchor = None;
+        *self = Self::new(rate.unwrap_or(self.rate));
     }
 
     /// Halts after the current tick.

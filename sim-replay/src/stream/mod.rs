@@ -16,7 +16,7 @@ mod schedule;
 mod sensor_link;
 mod sensor_publisher;
 
-pub use checkpoint::{CheckpointError, Place};
+pub use checkpoint::Place;
 pub(crate) use clock::ReplayClock;
 pub use replay::{Replay, StreamError, StreamOptions};
 pub use report::{Lateness, StreamReport, Unreadable};

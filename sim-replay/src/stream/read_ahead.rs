@@ -1,19 +1,19 @@
 //! Read-ahead: reads the next ticks from disk during the wait for the current one.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::sync::{Arc, Condvar, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use dataset::frame::Frame;
 use dataset::{LoadOptions, ReadError, Scenario};
-use support::sync::{wait, wait_at_most};
+use support::sync::{lock, wait, wait_at_most};
 
 /// The frames of one tick, one for each requested agent, in that order.
 pub(crate) type TickFrames = Vec<Result<Frame, ReadError>>;
 
 #[derive(Default)]
-struct State {
+struct ReadAheadState {
     wanted: VecDeque<usize>,
     ready: BTreeMap<usize, TickFrames>,
     is_closed: bool,
@@ -21,7 +21,7 @@ struct State {
 
 /// A thread that reads the requested ticks, in order, and keeps no others.
 pub(crate) struct ReadAhead {
-    shared: Arc<(Mutex<State>, Condvar)>,
+    shared: Arc<(Mutex<ReadAheadState>, Condvar)>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -35,7 +35,7 @@ impl ReadAhead {
         agents: Vec<usize>,
         options: LoadOptions,
     ) -> std::io::Result<Self> {
-        let shared: Arc<(Mutex<State>, Condvar)> = Arc::default();
+        let shared: Arc<(Mutex<ReadAheadState>, Condvar)> = Arc::default();
         let thread = thread::Builder::new().name("read ahead".into()).spawn({
             let shared = Arc::clone(&shared);
             move || {
@@ -45,7 +45,7 @@ impl ReadAhead {
                         .iter()
                         .map(|&agent| scenario.load(agent, tick, &options))
                         .collect();
-                    let mut state = lock(&shared);
+                    let mut state = lock(&shared.0);
                     // The tick may no longer be requested after a jump.
                     if state.wanted.contains(&tick) {
                         state.ready.insert(tick, frames);
@@ -62,7 +62,7 @@ impl ReadAhead {
 
     /// Sets the ticks that will be taken next, in order; other frames that were read are dropped.
     pub(crate) fn want(&self, ticks: &[usize]) {
-        let mut state = lock(&self.shared);
+        let mut state = lock(&self.shared.0);
         state.wanted = ticks.iter().copied().collect();
         state.ready.retain(|tick, _| ticks.contains(tick));
         self.shared.1.notify_all();
@@ -70,7 +70,7 @@ impl ReadAhead {
 
     /// The frames of a requested tick, as soon as they are read; empty if the reading thread has ended.
     pub(crate) fn take(&self, tick: usize) -> TickFrames {
-        let mut state = lock(&self.shared);
+        let mut state = lock(&self.shared.0);
         loop {
             if let Some(frames) = state.ready.remove(&tick) {
                 return frames;
@@ -90,7 +90,7 @@ impl ReadAhead {
 
 impl Drop for ReadAhead {
     fn drop(&mut self) {
-        lock(&self.shared).is_closed = true;
+        lock(&self.shared.0).is_closed = true;
         self.shared.1.notify_all();
         if let Some(thread) = self.thread.take() {
             // A panic of the reader was already reported.
@@ -99,8 +99,8 @@ impl Drop for ReadAhead {
     }
 }
 
-fn next_wanted(shared: &(Mutex<State>, Condvar)) -> Option<usize> {
-    let mut state = lock(shared);
+fn next_wanted(shared: &(Mutex<ReadAheadState>, Condvar)) -> Option<usize> {
+    let mut state = lock(&shared.0);
     loop {
         if state.is_closed {
             return None;
@@ -111,8 +111,4 @@ fn next_wanted(shared: &(Mutex<State>, Condvar)) -> Option<usize> {
         }
         state = wait(&shared.1, state);
     }
-}
-
-fn lock(shared: &(Mutex<State>, Condvar)) -> MutexGuard<'_, State> {
-    support::sync::lock(&shared.0)
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
 
 use super::ReplayClock;
-use super::checkpoint::{Checkpoint, CheckpointError, Place};
+use super::checkpoint::{Checkpoint, Place};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
 use super::schedule::{Planned, Schedule};
@@ -22,6 +22,7 @@ use bus::{
 };
 use dataset::{LoadOptions, Scenario};
 use link::{LinkConfig, LinkError};
+use support::file_error::FileError;
 
 /// Ticks read ahead of the clock.
 const READ_AHEAD: usize = 4;
@@ -126,7 +127,7 @@ pub enum StreamError {
     LinkInLockstep,
     /// The checkpoint is invalid.
     #[error("checkpoint: {0}")]
-    Checkpoint(#[from] CheckpointError),
+    Checkpoint(#[from] FileError),
     /// Not every route is up.
     #[error("the fleet is not ready: {0}")]
     NotReady(#[from] NotReady),
@@ -349,10 +350,8 @@ impl<'a> Replay<'a> {
 
     /// Publishes the frames that have passed the emulated link.
     fn deliver(&mut self) {
-        let Some(link) = &mut self.sensor_link else {
-            return;
-        };
-        for sweep in link.arrived(Instant::now()) {
+        let links = self.sensor_link.iter_mut();
+        for sweep in links.flat_map(|link| link.arrived(Instant::now())) {
             let (agent, nanos) = (sweep.agent, sweep.capture_nanos);
             self.publisher.submit(agent, nanos, sweep.frame);
         }
@@ -360,17 +359,16 @@ impl<'a> Replay<'a> {
 
     /// After a tick was submitted completely: a restarted replay resumes with the next one.
     fn note_place(&self) {
-        let Some(checkpoint) = &self.checkpoint else {
-            return;
-        };
-        checkpoint.note(Place {
-            scenario: self.scenario.clone(),
-            position: self.schedule.position,
-            is_halted: self.clock.is_halted(),
-            ticks: self.report.ticks,
-            unanswered: self.report.unanswered,
-            unreadable_frames: self.report.unreadable_frames,
-        });
+        if let Some(checkpoint) = &self.checkpoint {
+            checkpoint.note(Place {
+                scenario: self.scenario.clone(),
+                position: self.schedule.position,
+                is_halted: self.clock.is_halted(),
+                ticks: self.report.ticks,
+                unanswered: self.report.unanswered,
+                unreadable_frames: self.report.unreadable_frames,
+            });
+        }
     }
 
     fn apply(&mut self, command: Control) {

@@ -14,7 +14,7 @@ const LOSSLESS_PLACES: usize = 16;
 const PREVIEW_POINTS: usize = 4_000;
 
 /// The sensors of one vehicle.
-struct Sensors {
+struct VehiclePublishers {
     lidar: Publisher,
     gnss: Publisher,
     imu: Publisher,
@@ -26,7 +26,7 @@ struct Sensors {
 
 /// All publishers of a replay.
 pub(super) struct SensorPublisher {
-    sensors: Vec<Sensors>,
+    sensors: Vec<VehiclePublishers>,
     truth: Publisher,
     sent: Vec<TopicCount>,
 }
@@ -51,7 +51,7 @@ impl SensorPublisher {
             false => options,
         });
         let sensors = agents.iter().map(|cav| {
-            Ok(Sensors {
+            Ok(VehiclePublishers {
                 // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
                 lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), sweep)?,
                 gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), pose)?,

@@ -7,7 +7,7 @@ use dataset::cloud_files::clouds_at;
 use dataset::pcd;
 use dataset::{self, LoadOptions, Tick};
 use ego_fuser::ego_loop::Input;
-use ego_fuser::ego_loop::recorded::{KIND, Record};
+use ego_fuser::ego_loop::recorded::{EgoRecord, KIND};
 use link::{LinkConfig, Trace};
 use localization::pose_source::{ErrorTable, PoseTable};
 use localization::registration::icp::surfel_map::SurfelMap;
@@ -432,9 +432,9 @@ fn read_recording(path: &Path, _: &[u8]) -> bool {
 /// them.
 fn read_inputs(path: &Path, bytes: &[u8]) -> bool {
     let read = || {
-        RecordReader::<Record>::open(path, KIND).is_ok_and(|mut records| {
+        RecordReader::<EgoRecord>::open(path, KIND).is_ok_and(|mut records| {
             records.all(|record| match record {
-                Ok(Record::Input {
+                Ok(EgoRecord::Input {
                     input: Input::Message(message),
                     ..
                 }) => wire::decode_any([&message.bytes[..]], &Limits::DEFAULT).is_ok(),

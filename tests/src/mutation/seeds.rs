@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use agent::input_log::Start;
 use dataset::pcd::{Encoding, IntensityField, encode};
-use ego_fuser::ego_loop::recorded::{KIND, Published, Record, WireMessage};
+use ego_fuser::ego_loop::recorded::{EgoRecord, KIND, PublishedResult, WireMessage};
 use ego_fuser::ego_loop::{Input, Reception};
 use localization::registration::icp::IcpTarget;
 use localization::registration::icp::surfel_map::SurfelMap;
@@ -279,19 +279,19 @@ pub fn ego_inputs(scratch: &Path) -> Vec<u8> {
         Input::Left(cav.clone()),
         Input::Ended(cav.clone()),
     ]);
-    let start = Record::Start(Start {
+    let start = EgoRecord::Start(Start {
         config: "{\"run\":\"test\"}".into(),
         model_hash: Some(descriptor.model_hash),
         version: "0.1.0".into(),
     });
-    let published = Record::Published(Published {
+    let published = EgoRecord::Published(PublishedResult {
         stream: Stream::Detections,
         stamp: stamp.clone(),
         stages: Vec::new(),
     });
     let inputs = (0..)
         .zip(inputs)
-        .map(|(now_nanos, input)| Record::Input { now_nanos, input });
+        .map(|(now_nanos, input)| EgoRecord::Input { now_nanos, input });
     let path = scratch.join("seed-inputs.log");
     let mut writer = RecordWriter::create(&path, KIND).expect("a writable folder");
     for record in std::iter::once(start).chain(inputs).chain([published]) {

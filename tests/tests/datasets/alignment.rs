@@ -8,8 +8,8 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use dataset::pcd;
 use dataset::{self, LeftOut, LoadOptions};
 use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
-use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
-use ego_fuser_offline::evaluation::alignment::table::Tally;
+use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, GivenPose, Poses};
+use ego_fuser_offline::evaluation::alignment::table::PairTally;
 use ego_fuser_offline::evaluation::alignment::{self, BoxSource, PairOutcome};
 use localization::pose_source::{PoseSource, RecordedPose};
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
@@ -151,9 +151,9 @@ fn approaches_meet_on_generated_scenes() {
     assert!(map.planes() > 1000);
     let source = IcpMapPose::new(map, config.clone());
     let methods = [
-        Poses::spec("true", Measured::True, || Ok(Box::new(RecordedPose))),
-        Poses::spec("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose))),
-        Poses::spec("icp-map", Measured::Gnss, move || {
+        Poses::spec("true", GivenPose::True, || Ok(Box::new(RecordedPose))),
+        Poses::spec("gnss", GivenPose::Gnss, || Ok(Box::new(RecordedPose))),
+        Poses::spec("icp-map", GivenPose::Gnss, move || {
             Ok(Box::new(source.clone()) as Box<dyn PoseSource>)
         }),
         CloudIcp::spec(config.clone(), false),
@@ -164,7 +164,7 @@ fn approaches_meet_on_generated_scenes() {
     let found = outcomes(&scenes, &methods);
     let rows: Vec<_> = (methods.iter().enumerate())
         .map(|(number, method)| {
-            let mut tally = Tally::default();
+            let mut tally = PairTally::default();
             found
                 .iter()
                 .filter(|outcome| outcome.method == number)

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use dataset::frame::Frame;
 use ego_fuser::ego::Ego;
-use ego_fuser_offline::multi_scale::{MultiScaleNetwork, OfflineDetector, Placement};
+use ego_fuser_offline::multi_scale::{MapAlignment, MultiScaleNetwork, OfflineDetector};
 use fusion::FusionConfig;
 use fusion::Method;
 use fusion::disconet::DiscoNetConfig;
@@ -82,11 +82,11 @@ fn golden_converted_multi_scale_networks_answer_as_the_reference() {
         let cell_m = number(&golden.config()["voxel_size"][0]);
         let normalized =
             coalign::normalized(&tensor(&golden, "in.pairwise"), height, width, cell_m).unwrap();
-        let samples: Vec<Placement> = (0..)
+        let samples: Vec<MapAlignment> = (0..)
             .zip(golden.i64("in.record_len").1)
             .map(|(sample, agents)| {
                 let theta = normalized.get(sample).get(0).narrow(0, 0, agents);
-                Placement {
+                MapAlignment {
                     agents,
                     theta: (!network.config().one_frame).then_some(theta),
                 }
@@ -137,7 +137,7 @@ fn golden_converted_where2comm_of_one_scale_runs_live() {
     );
     let fusion: FusionConfig = weights.metadata_json("fusion").unwrap();
     let expected = Where2commConfig {
-        aggregation: where2comm::Aggregation::Attention,
+        aggregation: where2comm::MapAggregation::Attention,
         missing: Missing::Zero,
     };
     assert_eq!(fusion, FusionConfig::new(expected));

@@ -1,7 +1,7 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
 use ::training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
-use dataset::average_precision::{Curve, Ordering, Scorer};
+use dataset::average_precision::{Ordering, PrecisionRecallCurve, Scorer};
 use fusion::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
 use fusion::warp::{coalign, warp_to_ego};
 use fusion::{AlignedMaps, AttentionFusion, Fusion, MapMetadata, MaxFusion};
@@ -126,7 +126,7 @@ fn golden_c4_average_precision() {
             (Ordering::Frame, "frame_order"),
             (Ordering::Global, "global"),
         ] {
-            let Curve {
+            let PrecisionRecallCurve {
                 average_precision,
                 recall,
                 precision,

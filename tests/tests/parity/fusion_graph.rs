@@ -1,13 +1,13 @@
 //! V2VNet, DiscoNet, Where2comm and CoAlign against the reference implementations.
 
 use ego_fuser_offline::multi_scale::{
-    Levels, MultiScaleConfig, MultiScaleNetwork, Placement, Senders, fuse_levels,
+    Levels, MapAlignment, MultiScaleConfig, MultiScaleNetwork, Senders, fuse_levels,
 };
 use fusion::disconet::{DiscoNet, DiscoNetConfig};
 use fusion::v2vnet::{self, Incoming, V2vNet, V2vNetConfig};
 use fusion::warp::coalign;
 use fusion::where2comm::{
-    Aggregation, Communication, CommunicationConfig, Missing, Where2comm, Where2commConfig,
+    CommunicationConfig, MapAggregation, Missing, SparseCommunication, Where2comm, Where2commConfig,
 };
 use fusion::{AlignedMaps, Fusion, MapMetadata};
 use perception::layers::backbone::BevBackbone;
@@ -174,9 +174,9 @@ fn golden_c6_where2comm_opencood() {
     assert_codec_agrees(&multi["communication"], "threshold", &logits, &sent);
     let sent = exempt(&sent, &agents, |agent| agent == 0);
     assert_eq!(values(&sent), golden.f32("out.masks").1, "masks");
-    let samples: Vec<Placement> = agents
+    let samples: Vec<MapAlignment> = agents
         .iter()
-        .map(|&agents| Placement {
+        .map(|&agents| MapAlignment {
             agents,
             theta: None,
         })
@@ -185,7 +185,7 @@ fn golden_c6_where2comm_opencood() {
         &golden,
         &golden.config()["backbone"],
         &samples,
-        Aggregation::Attention,
+        MapAggregation::Attention,
         &sent,
     );
     assert_close(
@@ -205,7 +205,7 @@ fn golden_c6_where2comm_opencood() {
     let sent = exempt(&sent, &agents, |agent| agent == 0);
     let maps = tensor(&golden, "single.in.x") * sent;
     let fusion = Where2comm::new(&Where2commConfig {
-        aggregation: Aggregation::Attention,
+        aggregation: MapAggregation::Attention,
         missing: Missing::Zero,
     });
     let fused: Vec<Tensor> = maps
@@ -251,8 +251,8 @@ fn golden_c6_where2comm_orig_multi_scale() {
             &config["downsample_rate"],
         );
         let aggregation = match config["agg_operator"]["mode"].as_str() {
-            Some("ATTEN") => Aggregation::Attention,
-            Some("MAX") => Aggregation::Max,
+            Some("ATTEN") => MapAggregation::Attention,
+            Some("MAX") => MapAggregation::Max,
             other => panic!("unknown operator {other:?}"),
         };
         let fused = fused_levels(&golden, config, &samples, aggregation, &sent);
@@ -286,7 +286,7 @@ fn golden_c6_where2comm_orig_single() {
         &config["downsample_rate"],
     );
     let fusion = Where2comm::new(&Where2commConfig {
-        aggregation: Aggregation::Attention,
+        aggregation: MapAggregation::Attention,
         missing: Missing::Zero,
     });
     let fused: Vec<Tensor> = (0..)
@@ -319,7 +319,7 @@ fn golden_c6_e2e_coalign() {
         ..detector_config(&golden, "res_bev_backbone")
     };
     let config = MultiScaleConfig {
-        aggregation: Aggregation::Attention,
+        aggregation: MapAggregation::Attention,
         communication: None,
         senders: Senders::Neighbours,
         one_frame: false,
@@ -339,7 +339,7 @@ fn golden_c6_e2e_where2comm_multi() {
     let fusion = &golden.config()["where2comm_fusion"];
     assert_eq!(fusion["multi_scale"], true);
     let config = MultiScaleConfig {
-        aggregation: Aggregation::Attention,
+        aggregation: MapAggregation::Attention,
         communication: Some(communication(&fusion["communication"], "threshold")),
         senders: Senders::Neighbours,
         one_frame: true,
@@ -348,9 +348,9 @@ fn golden_c6_e2e_where2comm_multi() {
         MultiScaleNetwork::new(&where2comm_detector(&golden), &config, Device::Cpu).unwrap();
     load(&network.variables, &golden, "");
     let (_, agents) = golden.i64("in.record_len");
-    let samples: Vec<Placement> = agents
+    let samples: Vec<MapAlignment> = agents
         .iter()
-        .map(|&agents| Placement {
+        .map(|&agents| MapAlignment {
             agents,
             theta: None,
         })
@@ -379,7 +379,7 @@ fn golden_c6_e2e_where2comm_single() {
     let [fused, rates] = [0, 1].map(|_| Vec::<Tensor>::new());
     let (mut fused, mut rates) = (fused, rates);
     let fusion = Where2comm::new(&Where2commConfig {
-        aggregation: Aggregation::Attention,
+        aggregation: MapAggregation::Attention,
         missing: Missing::Zero,
     });
     let mut first = 0;
@@ -469,7 +469,7 @@ fn where2comm_detector(golden: &Golden) -> DetectorConfig {
 }
 
 /// Compares both heads, and returns the share of cells that is sent.
-fn check_heads(golden: &Golden, network: &MultiScaleNetwork, samples: &[Placement]) -> f64 {
+fn check_heads(golden: &Golden, network: &MultiScaleNetwork, samples: &[MapAlignment]) -> f64 {
     let (sweeps, _) = pillars(golden);
     let batch = PillarBatch::new(
         &sweeps.iter().collect::<Vec<_>>(),
@@ -517,7 +517,7 @@ fn placements(
     agents: &[i64],
     [height, width]: [i64; 2],
     downsampled: &Value,
-) -> Vec<Placement> {
+) -> Vec<MapAlignment> {
     let pixel_m = number(&golden.config()["voxel_size"][0]) * number(downsampled);
     let normalized =
         coalign::normalized(&tensor(golden, "in.pairwise"), height, width, pixel_m).unwrap();
@@ -525,7 +525,7 @@ fn placements(
         .zip(agents)
         .map(|(sample, &agents)| {
             let theta = Some(normalized.get(sample).get(0).narrow(0, 0, agents));
-            Placement { agents, theta }
+            MapAlignment { agents, theta }
         })
         .collect()
 }
@@ -533,8 +533,8 @@ fn placements(
 fn fused_levels(
     golden: &Golden,
     sizes: &Value,
-    samples: &[Placement],
-    aggregation: Aggregation,
+    samples: &[MapAlignment],
+    aggregation: MapAggregation,
     sent: &Tensor,
 ) -> Tensor {
     let canvas = tensor(golden, "in.x");
@@ -602,7 +602,7 @@ fn masks(
 ) -> Tensor {
     let variables = VarStore::new(Device::Cpu);
     let communication =
-        Communication::new(&variables.root(), &communication(config, threshold)).unwrap();
+        SparseCommunication::new(&variables.root(), &communication(config, threshold)).unwrap();
     if !variables.variables().is_empty() {
         load(
             &variables,

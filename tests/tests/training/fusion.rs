@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::MutexGuard;
 
 use ::training::Error;
-use ::training::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig};
+use ::training::train::{self, Accuracy, TrainConfig, TrainObserver, TrainSummary, TrainingReport};
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup};
 use fusion::Method;
 use perception::train::{Length, RunConfig};
@@ -38,7 +38,7 @@ fn config(scene: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
     }
 }
 
-fn run(config: &TrainConfig) -> (Summary, Ear) {
+fn run(config: &TrainConfig) -> (TrainSummary, Ear) {
     let mut ear = Ear::default();
     (train::run(config, &mut ear).unwrap(), ear)
 }
@@ -117,8 +117,8 @@ fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
 /// Trains and interrupts in the first report after the first checkpoint; the steps of that checkpoint.
 fn train_until_checkpoint(config: &TrainConfig) -> u64 {
     struct Plug(PathBuf);
-    impl Observer for Plug {
-        fn stepped(&mut self, _: &StepReport) {
+    impl TrainObserver for Plug {
+        fn stepped(&mut self, _: &TrainingReport) {
             // The report of step 10 comes before the checkpoint of step 10: the existing one is of step 5.
             assert!(self.0.exists(), "a checkpoint at step 5");
             panic!("pulled");

@@ -15,7 +15,7 @@ use localization::baselines::sgloc::SgLocConfig;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localize, Localizer, LocalizerError, LocalizerInput, SceneEncoder};
 use perception::inference::Inference;
-use perception::train::{Length, Observe, Progress, RunConfig, TrainingError};
+use perception::train::{Length, Observe, RunConfig, TrainingError, TrainingEvent};
 use perception::weights::Weights;
 use protocol::{NoPoseReason, PointCloud, PoseError, PoseEstimate};
 use simulator::generate::{Subset, SynthOptions, generate};
@@ -91,10 +91,10 @@ fn trained_encoder(scenes: &Path, out: &Path) -> PathBuf {
     let mut losses = Vec::new();
     let mut validations = 0;
     let config = encoder_config(scenes, out, 40);
-    let mut observe = |progress: &Progress| match progress {
-        Progress::Read(data) => assert_eq!(data.left_out(), None),
-        Progress::Stepped(report) => losses.push(report.means[0]),
-        Progress::Validated(_) => validations += 1,
+    let mut observe = |progress: &TrainingEvent| match progress {
+        TrainingEvent::Read(data) => assert_eq!(data.left_out(), None),
+        TrainingEvent::Stepped(report) => losses.push(report.means[0]),
+        TrainingEvent::Validated(_) => validations += 1,
         other => panic!("{other:?}"),
     };
     let summary = train_encoder(&config, &mut observe).unwrap();
@@ -118,7 +118,7 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     let mut errors = Vec::new();
     let config = scene_config(&scenes, &encoder, &dir.path().join("head"), 400);
     let summary = train_scene(&config, &mut |progress| {
-        if let Progress::Stepped(report) = progress {
+        if let TrainingEvent::Stepped(report) = progress {
             errors.push(report.means[0]);
         }
     })
@@ -233,8 +233,8 @@ fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
     };
     let (mut errors, mut encoded) = (Vec::new(), 0);
     let trained = train_sgloc(&config(150), &mut |progress| match progress {
-        Progress::Encoding(done, _) => encoded = *done,
-        Progress::Stepped(report) => errors.push(report.means[0]),
+        TrainingEvent::Encoding(done, _) => encoded = *done,
+        TrainingEvent::Stepped(report) => errors.push(report.means[0]),
         _ => {}
     })
     .unwrap();
@@ -291,7 +291,7 @@ fn pose_regression_learns(
     };
     let (mut poses_l1, mut places) = (Vec::new(), Vec::new());
     let summary = train(&config(steps), &mut |progress| {
-        if let Progress::Stepped(report) = progress {
+        if let TrainingEvent::Stepped(report) = progress {
             poses_l1.push(report.means[0]);
             places.push(report.means[1]);
         }
@@ -365,8 +365,8 @@ fn interrupted_trainings_resume_and_refuse_foreign_files() {
     // Stopped at the second validation, whose checkpoint is then not yet written.
     let mut validations = 0;
     let stopped = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-        let mut stop = |progress: &Progress| {
-            validations += u32::from(matches!(progress, Progress::Validated(_)));
+        let mut stop = |progress: &TrainingEvent| {
+            validations += u32::from(matches!(progress, TrainingEvent::Validated(_)));
             assert!(validations < 2, "stopped by the test");
         };
         train_encoder(&encoder_config(&scenes, &b, 20), &mut stop)

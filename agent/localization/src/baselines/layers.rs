@@ -7,13 +7,13 @@ use crate::pgc::dense::Dense;
 
 /// Normalises the last dimension, in the precision of the input.
 #[derive(Debug)]
-pub(super) struct LayerNorm {
+pub(super) struct TokenNorm {
     weight: Tensor,
     bias: Tensor,
     eps: f64,
 }
 
-impl LayerNorm {
+impl TokenNorm {
     /// Identity on normalised input; `eps` is added to the variance.
     pub(super) fn new(path: &nn::Path<'_>, width: i64, eps: f64) -> Self {
         Self {

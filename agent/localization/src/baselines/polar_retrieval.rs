@@ -6,7 +6,7 @@ use std::fmt::Debug;
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use protocol::{NoPoseReason, PointCloud};
 use support::stage_times::StageTimes;
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 use super::regressed_pose::{PoseRegressor, RegressPose, localization, no_pose};
 use super::tokens::{RINGS, SECTORS};
@@ -52,12 +52,9 @@ impl ScanContext {
 impl DescribePolar for ScanContext {
     fn polar(&self, cloud: &PointCloud, times: &mut StageTimes) -> tch::Result<Option<Tensor>> {
         let heights = Self::heights(cloud);
-        let device = tch::Device::Cpu;
         let described = heights.iter().any(|&height| height > 0.0);
         times.lap(ENCODE);
-        described
-            .then(|| tensor(&heights, &[-1, Self::RINGS as i64], device))
-            .transpose()
+        (described.then(|| tensor(&heights, &[-1, Self::RINGS as i64], Device::Cpu))).transpose()
     }
 }
 
@@ -117,9 +114,7 @@ impl PolarRetrieval {
 }
 
 fn normalised(descriptor: &Tensor) -> tch::Result<Tensor> {
-    let length = descriptor
-        .f_square()?
-        .f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+    let length = (descriptor.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?;
     descriptor.f_div(&length.f_sqrt()?.f_clamp_min(1e-6)?)
 }
 

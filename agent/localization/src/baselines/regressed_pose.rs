@@ -84,10 +84,9 @@ impl<N: RegressPose> PoseRegressor<N> {
         require(is_place, "origin_m", config.origin_m, "must be finite")?;
         let encoder = SceneEncoder::new(&(path / "encoder"), &config.encoder)?;
         let projection = TokenProjection::new(&(path / "tokens"), config.encoder.cell_channels());
-        let below = path / "regressor";
         Ok(Self {
             places: PlaceClasses::new(&(path / "places"), config.classes),
-            network: N::build(&below, projection.channels(), config.classes)?,
+            network: N::build(&(path / "regressor"), projection.channels(), config.classes)?,
             encoder,
             projection,
             config: config.clone(),
@@ -153,9 +152,8 @@ impl<N: RegressPose> Localize for PoseRegressor<N> {
         };
         let tokens = tokens.f_unsqueeze(0)?;
         let found = no_grad(|| self.network.poses(&tokens, &self.places, Kind::Float))?;
-        let pose = values(&found)?
-            .first_chunk()
-            .and_then(|&of| upright(of, self.config.origin_m));
+        let pose =
+            (values(&found)?.first_chunk()).and_then(|&of| upright(of, self.config.origin_m));
         times.lap(REGRESS);
         Ok(localization(pose, times))
     }

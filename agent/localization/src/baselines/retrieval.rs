@@ -34,8 +34,7 @@ pub struct SweepDatabase {
 impl SweepDatabase {
     /// A database of descriptors of equal length; `None` if there is none or they are empty.
     pub fn new(sweeps: &[DescribedSweep]) -> Option<Self> {
-        let first = &sweeps.first()?.descriptor;
-        let channels = Some(first.len()).filter(|&channels| channels > 0)?;
+        let channels = Some(sweeps.first()?.descriptor.len()).filter(|&channels| channels > 0)?;
         let mean = (0..channels).map(|channel| mean_of(sweeps, |of| of[channel]));
         let mean: Vec<f32> = mean.collect();
         let variances = (0..channels)
@@ -47,9 +46,7 @@ impl SweepDatabase {
             descriptors: Vec::new(),
             world_from_sensor: (sweeps.iter().map(|sweep| sweep.world_from_sensor)).collect(),
         };
-        let normalised = sweeps
-            .iter()
-            .flat_map(|sweep| database.normalise(&sweep.descriptor));
+        let normalised = (sweeps.iter()).flat_map(|sweep| database.normalise(&sweep.descriptor));
         database.descriptors = normalised.collect();
         Some(database)
     }

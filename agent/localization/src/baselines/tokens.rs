@@ -8,7 +8,7 @@ use std::f32::consts::{PI, TAU};
 use perception::tensor_values::tensor;
 use tch::{Kind, Tensor, nn, no_grad};
 
-use crate::pgc::Cell;
+use crate::pgc::SweepCell;
 
 /// Directions around the sensor, counter-clockwise from the rear.
 pub const SECTORS: i64 = 32;
@@ -42,7 +42,7 @@ pub fn token_of([x, y, _]: [f32; 3]) -> (usize, f32) {
 ///
 /// # Errors
 /// Those of the tensor library.
-pub fn pool(cells: &[Cell], features: &Tensor) -> tch::Result<Tensor> {
+pub fn pool(cells: &[SweepCell], features: &Tensor) -> tch::Result<Tensor> {
     let (mut rows, mut tokens) = (Vec::new(), Vec::new());
     let mut geometry =
         vec![[0.0, 0.0, f32::INFINITY, 0.0, f32::NEG_INFINITY, 0.0]; TOKENS as usize];
@@ -69,10 +69,9 @@ pub fn pool(cells: &[Cell], features: &Tensor) -> tch::Result<Tensor> {
             false => [0.0; GEOMETRY as usize],
         };
     }
-    let size = [TOKENS, features.size()[1]];
     let tokens = tensor(&tokens, &[-1], device)?;
     let standing = features.f_index_select(0, &tensor(&rows, &[-1], device)?)?;
-    let means = Tensor::f_zeros(size, (Kind::Float, device))?
+    let means = Tensor::f_zeros([TOKENS, features.size()[1]], (Kind::Float, device))?
         .f_index_add(0, &tokens, &standing.f_to_kind(Kind::Float)?)?
         .f_div(&tensor(&counts, &[-1, 1], device)?)?;
     let geometry = tensor(geometry.as_flattened(), &[-1, GEOMETRY], device)?;
@@ -113,23 +112,17 @@ impl TokenProjection {
         let features = pooled.f_index_select(0, &rows)?.f_narrow(1, 0, channels)?;
         let features = features.f_to_kind(Kind::Double)?;
         let mean = features.f_mean_dim(0_i64, false, Kind::Double)?;
-        let deviation = features
-            .f_std_dim(0_i64, false, false)?
-            .f_clamp_min(LEAST)?;
+        let deviation = (features.f_std_dim(0_i64, false, false)?).f_clamp_min(LEAST)?;
         let normal = (features - &mean).f_div(&deviation)?;
         let covariance = normal.f_tr()?.f_matmul(&normal)? / (rows.size()[0].max(1) as f64);
         let (variances, vectors) = covariance.f_linalg_eigh("L")?;
         let least = LEAST * variances.f_max()?.f_double_value(&[])?.max(LEAST);
         // Eigenvalues ascend: the last components are the principal ones.
         let first = channels - components;
-        let variances = variances
-            .f_narrow(0, first, components)?
-            .f_clamp_min(least)?;
+        let variances = (variances.f_narrow(0, first, components)?).f_clamp_min(least)?;
         let vectors = vectors.f_narrow(1, first, components)?;
         // Whitening: one product standardises the channels, turns them and scales the components to 1.
-        let basis = vectors
-            .f_div(&deviation.f_view([-1, 1])?)?
-            .f_div(&variances.f_sqrt()?)?;
+        let basis = (vectors.f_div(&deviation.f_view([-1, 1])?)?).f_div(&variances.f_sqrt()?)?;
         // As they are stored.
         no_grad(|| {
             self.mean.f_copy_(&mean.f_to_kind(Kind::Half)?)?;
@@ -145,10 +138,7 @@ impl TokenProjection {
         let pooled = pooled.f_to_kind(Kind::Float)?;
         let channels = self.basis.size()[0];
         let geometry = pooled.f_narrow(-1, channels, GEOMETRY)?;
-        let is_occupied = geometry
-            .f_narrow(-1, 0, 1)?
-            .f_gt(0.0)?
-            .f_to_kind(Kind::Float)?;
+        let is_occupied = (geometry.f_narrow(-1, 0, 1)?.f_gt(0.0)?).f_to_kind(Kind::Float)?;
         let centred = pooled.f_narrow(-1, 0, channels)?.f_sub(&self.mean)?;
         let components = centred.f_matmul(&self.basis)?.f_mul(&is_occupied)?;
         Tensor::f_cat(&[components, geometry], -1)
@@ -162,8 +152,8 @@ mod tests {
 
     use super::*;
 
-    fn cell(centroid_m: [f32; 3], extent_m: f32) -> Cell {
-        Cell {
+    fn cell(centroid_m: [f32; 3], extent_m: f32) -> SweepCell {
+        SweepCell {
             centroid_m,
             extent_m,
             points: 5,

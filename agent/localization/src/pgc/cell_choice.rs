@@ -2,13 +2,13 @@
 
 use support::sampling::evenly_spread;
 
-use super::voxelise::Cell;
+use super::voxelise::SweepCell;
 
 /// Largest share of the chosen cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
 
 /// Up to `count` cells, evenly over the sweep, flat ground no more than its share.
-pub(crate) fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
+pub(crate) fn choose_evenly(cells: &[SweepCell], count: usize) -> Vec<usize> {
     let (flat, high): (Vec<usize>, Vec<usize>) =
         (0..cells.len()).partition(|&cell| cells[cell].is_flat());
     let mut chosen = evenly_spread(&high, (count as f64 * (1.0 - FLAT_SHARE)) as usize);
@@ -24,10 +24,10 @@ mod tests {
 
     #[test]
     fn ground_is_never_more_than_its_share() {
-        let cells = |high: usize, flat: usize| -> Vec<Cell> {
-            let cell = |extent_m| Cell {
+        let cells = |high: usize, flat: usize| -> Vec<SweepCell> {
+            let cell = |extent_m| SweepCell {
                 extent_m,
-                ..Cell::default()
+                ..SweepCell::default()
             };
             std::iter::repeat_n(cell(2.0), high)
                 .chain(std::iter::repeat_n(cell(0.1), flat))

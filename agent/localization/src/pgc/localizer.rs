@@ -34,7 +34,7 @@ pub(crate) const CELLS: usize = 256;
 const REFINEMENT_CELLS: usize = 768;
 
 /// A sweep behind the encoder.
-pub(super) struct EncodedSweep {
+pub(super) struct SweepFeatures {
     sweep: PreparedSweep,
     features: SceneFeatures,
     /// Cells of the pose refinement.
@@ -90,9 +90,7 @@ impl Localizer {
             })?;
         // The head's file has the scales of both networks.
         if let Some(scales) = weights.activation_scales()? {
-            let quantised = network
-                .quantise(&scales)
-                .and_then(|()| scene_head.quantise(&scales));
+            let quantised = (network.quantise(&scales)).and_then(|()| scene_head.quantise(&scales));
             quantised.map_err(|error| weights.quantise_error(error))?;
         }
         let localizer = Self {
@@ -148,8 +146,7 @@ impl Localizer {
         let Some(encoded) = self.encode(sweep, &mut times)? else {
             return Ok((SceneCoordinates::default(), times));
         };
-        let logits = self.classify(&encoded)?;
-        let coordinates = self.regress(&encoded, CELLS, &logits, &mut times)?;
+        let coordinates = self.regress(&encoded, CELLS, &self.classify(&encoded)?, &mut times)?;
         Ok((coordinates, times))
     }
 
@@ -172,7 +169,7 @@ impl Localizer {
         &self,
         input: LocalizerInput<'_>,
         times: &mut StageTimes,
-    ) -> Result<Option<EncodedSweep>> {
+    ) -> Result<Option<SweepFeatures>> {
         let sweep = self.encoder.format().prepare(&input.cloud.xyzi);
         times.lap(VOXELISE);
         let refined = choose_evenly(sweep.cells(), REFINEMENT_CELLS);
@@ -182,7 +179,7 @@ impl Localizer {
         let features = self.encoder.encode_one(&sweep, input.levels)?;
         let refinement_cells = SweepCells::pick(sweep.cells(), &features, &refined)?;
         times.lap(ENCODE);
-        Ok(Some(EncodedSweep {
+        Ok(Some(SweepFeatures {
             sweep,
             features,
             refinement_cells,
@@ -190,7 +187,7 @@ impl Localizer {
     }
 
     /// Logits `[1, classes]` of the parts of the scene.
-    pub(super) fn classify(&self, encoded: &EncodedSweep) -> tch::Result<Tensor> {
+    pub(super) fn classify(&self, encoded: &SweepFeatures) -> tch::Result<Tensor> {
         no_grad(|| self.head.classify(&encoded.features.sweeps, false))
     }
 
@@ -198,7 +195,7 @@ impl Localizer {
     /// (Eq. 4).
     pub(super) fn regress(
         &self,
-        encoded: &EncodedSweep,
+        encoded: &SweepFeatures,
         count: usize,
         logits: &Tensor,
         times: &mut StageTimes,

@@ -54,11 +54,11 @@ pub use scene_coordinates::{Regression, SceneCoordinates, sigma};
 pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
 pub use scene_regression::SceneHead;
 pub use voxel_batch::VoxelBatch;
-pub use voxelise::{Cell, SweepVoxels};
+pub use voxelise::{SweepCell, SweepVoxels};
 
 use extensions::{along_street, levelling, other_parts, wider_search};
 use localization::REFINE;
-use localizer::{CELLS, EncodedSweep};
+use localizer::{CELLS, SweepFeatures};
 use pose_search::{Attempt, PoseSearch};
 use pose_solver::FoundPose;
 
@@ -94,7 +94,7 @@ impl Localize for Localizer {
 }
 
 impl Localizer {
-    fn search<'a>(&'a self, encoded: &'a EncodedSweep) -> PoseSearch<'a> {
+    fn search<'a>(&'a self, encoded: &'a SweepFeatures) -> PoseSearch<'a> {
         PoseSearch {
             head: &self.head,
             solver: &self.solver,
@@ -109,7 +109,7 @@ impl Localizer {
         &self,
         mut best: Attempt,
         mut coordinates: SceneCoordinates,
-        encoded: &EncodedSweep,
+        encoded: &SweepFeatures,
         logits: &Tensor,
         times: &mut StageTimes,
     ) -> Result<Attempt, LocalizerError> {
@@ -135,7 +135,7 @@ impl Localizer {
     /// it.
     fn refine_near(
         &self,
-        encoded: &EncodedSweep,
+        encoded: &SweepFeatures,
         world_from_sensor: &Isometry3<f64>,
         times: &mut StageTimes,
     ) -> Result<Option<FoundPose>, LocalizerError> {

@@ -139,16 +139,14 @@ fn mean_sigma(cells: &[u32], epsilon_m: &[f32]) -> f64 {
 /// Mean over some cells; 0 for none.
 fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f64 {
     let known = (cells.iter()).filter_map(|&cell| epsilon_m.get(cell as usize));
-    let values = known.map(|&epsilon| value(epsilon));
-    values.sum::<f64>() / cells.len().max(1) as f64
+    known.map(|&epsilon| value(epsilon)).sum::<f64>() / cells.len().max(1) as f64
 }
 
 /// Upper median over all cells; 0 for none. The fitted confidence model depends on this rule.
 fn median(epsilon_m: &[f32]) -> f64 {
     let mut sorted = epsilon_m.to_vec();
     sorted.sort_unstable_by(f32::total_cmp);
-    let middle = sorted.get(sorted.len() / 2);
-    middle.copied().map_or(0.0, f64::from)
+    sorted.get(sorted.len() / 2).copied().map_or(0.0, f64::from)
 }
 
 /// Standard deviations of a pose: of the refined one, if there is one.
@@ -161,8 +159,7 @@ pub(super) fn std_of(
         return second.std;
     }
     let pairs = coordinates.correspondences();
-    let inliers = registration.inliers.iter();
-    let inliers = inliers.filter_map(|&cell| pairs.get(cell as usize));
+    let inliers = (registration.inliers.iter()).filter_map(|&cell| pairs.get(cell as usize));
     let weighted = inliers.map(|pair| (pair, f64::from(pair.weight)));
     PoseStd::of(&registration.target_from_source, weighted)
 }

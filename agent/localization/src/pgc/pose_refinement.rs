@@ -7,7 +7,7 @@ use tch::{Kind, Tensor, no_grad};
 use super::pose_std::PoseStd;
 use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
-use super::voxelise::Cell;
+use super::voxelise::SweepCell;
 use crate::registration::refine::{forgiveness, reweighted};
 use crate::registration::{Correspondence, Registration};
 
@@ -32,16 +32,15 @@ pub struct SweepCells {
 impl SweepCells {
     /// The chosen ones of the cells of a sweep, which has these features.
     pub(crate) fn pick(
-        cells: &[Cell],
+        cells: &[SweepCell],
         features: &SceneFeatures,
         chosen: &[usize],
     ) -> tch::Result<Self> {
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
         let rows = tensor(&rows, &[-1], features.cells.device())?;
-        let centroids = chosen.iter().map(|&cell| cells[cell].centroid_m);
         Ok(Self {
             features: no_grad(|| features.cells.f_index_select(0, &rows))?,
-            sensor_m: centroids.collect(),
+            sensor_m: chosen.iter().map(|&cell| cells[cell].centroid_m).collect(),
         })
     }
 }

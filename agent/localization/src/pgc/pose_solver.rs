@@ -98,10 +98,9 @@ impl PoseSolver {
     ) -> Result<Registration, NoRegistration> {
         let pairs = coordinates.correspondences();
         if pairs.len() < MIN_CELLS {
-            let (usable, given) = (pairs.len(), pairs.len());
             return Err(NoRegistration::TooFewCorrespondences {
-                usable,
-                given,
+                usable: pairs.len(),
+                given: pairs.len(),
                 required: MIN_CELLS,
             });
         }
@@ -166,8 +165,7 @@ pub(super) fn confirm(
     start: &Isometry3<f64>,
     origin_m: &Vector3<f64>,
 ) -> Option<FoundPose> {
-    let is_confirmed = refined.registration.inlier_ratio >= CONFIRMING_RATIO;
-    is_confirmed.then(|| {
+    (refined.registration.inlier_ratio >= CONFIRMING_RATIO).then(|| {
         let error_m = LEAST_ERROR_M.hypot(CORRELATION_FACTOR * refined.std.position_m);
         let mut world_from_sensor = refined.registration.target_from_source;
         world_from_sensor.translation.vector += origin_m;

@@ -42,9 +42,7 @@ impl PoseStd {
                 - Vector3::from(pair.target_m.map(f64::from));
             // d(residual) = dt + dw x arm, for a small rotation dw about the sensor.
             let mut jacobian = SMatrix::<f64, 3, 6>::identity();
-            jacobian
-                .fixed_columns_mut::<3>(3)
-                .copy_from(&-arm.cross_matrix());
+            (jacobian.fixed_columns_mut::<3>(3)).copy_from(&-arm.cross_matrix());
             information += jacobian.transpose() * jacobian * weight;
             let gradient = jacobian.transpose() * residual * weight;
             gradients += gradient * gradient.transpose();
@@ -92,17 +90,17 @@ fn bounded_std(variance: f64, most: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::registration::kabsch::PairMoments;
-    use crate::registration::test_problem::Problem;
+    use crate::registration::test_problem::TestProblem;
 
     #[test]
     fn it_matches_the_spread_of_fits() {
         let (mut square_m, mut expected_m) = (0.0_f64, 0.0_f64);
         for seed in 0..200 {
-            let problem = Problem {
+            let problem = TestProblem {
                 count: 80,
                 outliers: 0.0,
                 noise_m: 0.3,
-                ..Problem::default()
+                ..TestProblem::default()
             }
             .drawn(seed);
             let mut moments = PairMoments::default();

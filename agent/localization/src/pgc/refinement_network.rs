@@ -13,6 +13,7 @@ use super::dense::Dense;
 use super::error::LocalizerError;
 use super::head_config::RefinerConfig;
 use super::scene_coordinates::Regression;
+use super::scene_encoder::rows;
 
 /// Initial factor of the similarities; learnt from there on.
 const FIRST_SHARPNESS: f64 = 2.0;
@@ -43,10 +44,9 @@ impl Refiner {
         let corners = columns * rows;
         let (keys, width) = (config.keys, config.width);
         let stdev = 0.2;
-        let key = Init::Randn { mean: 0.0, stdev };
         Ok(Self {
             config: config.clone(),
-            keys: path.var("keys", &[corners, keys], key),
+            keys: path.var("keys", &[corners, keys], Init::Randn { mean: 0.0, stdev }),
             heights: path.var("heights", &[corners, 1], Init::Const(0.0)),
             sharpness: path.var("sharpness", &[1], Init::Const(FIRST_SHARPNESS)),
             inward: Dense::new(&(path / "inward"), config.local_channels + 3, width, 1.0),
@@ -110,7 +110,7 @@ impl Refiner {
     }
 
     /// The corners around each position.
-    fn window(&self, assumed_m: &Tensor) -> tch::Result<Window> {
+    fn window(&self, assumed_m: &Tensor) -> tch::Result<RefinementWindow> {
         let config = &self.config;
         let (spacing_m, reach, low_m) = (config.spacing_m, config.reach, config.low_m);
         let [columns, rows] = config.corners();
@@ -118,9 +118,7 @@ impl Refiner {
         // The whole window stays on the grid: a cell beyond the edge gets the outermost one.
         let [column, row] = [(0, columns), (1, rows)].map(|(axis, size): (usize, i64)| {
             let steps = (assumed_m.f_select(1, axis as i64)? - low_m[axis]) / spacing_m;
-            steps
-                .f_round()?
-                .f_clamp(reach as f64, (size - 1 - reach) as f64)
+            (steps.f_round()?).f_clamp(reach as f64, (size - 1 - reach) as f64)
         });
         let (column, row) = (column?, row?);
         let middle = [&column * spacing_m + low_m[0], &row * spacing_m + low_m[1]];
@@ -134,17 +132,16 @@ impl Refiner {
             }
         }
         let count = assumed_m.size()[0];
-        let places_m = tensor(&places, &[1, -1, 2], device)?;
-        Ok(Window {
+        Ok(RefinementWindow {
             corners: first.f_unsqueeze(1)? + tensor(&shifts, &[-1], device)?,
-            places_m: places_m.f_expand([count, -1, -1], false)?,
+            places_m: tensor(&places, &[1, -1, 2], device)?.f_expand([count, -1, -1], false)?,
             middle_m: Tensor::f_stack(&middle, 1)?,
         })
     }
 }
 
 /// Candidates of some cells.
-struct Window {
+struct RefinementWindow {
     /// `[N, K]` rows of keys.
     corners: Tensor,
     /// `[N, K, 2]`: positions relative to the centre, metres.
@@ -153,12 +150,10 @@ struct Window {
     middle_m: Tensor,
 }
 
-/// `[N, K, C]` rows of `[R, C]` by `[N, K]`; its gradient is fast because the index is expanded, not written out.
-fn gather(rows: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
-    let channels = rows.size()[1];
-    let flat = index.f_reshape([-1, 1])?.f_expand([-1, channels], false)?;
-    let gathered = rows.f_gather(0, &flat, false)?;
-    gathered.f_view([index.size()[0], index.size()[1], channels])
+/// `[N, K, C]` rows of `[R, C]` by `[N, K]`.
+fn gather(of: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
+    let (count, corners) = index.size2()?;
+    rows(of, &index.f_reshape([-1])?)?.f_view([count, corners, of.size()[1]])
 }
 
 #[cfg(test)]

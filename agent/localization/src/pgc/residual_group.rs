@@ -52,9 +52,9 @@ impl ResidualGroup {
         on_activation: &mut OnActivation<'_>,
     ) -> tch::Result<Tensor> {
         let inner = self.inward.forward(x, index)?.f_relu()?;
-        on_activation(&inward_activation(name), &inner)?;
+        on_activation(&activation(name, "inward"), &inner)?;
         let inner = self.middle.forward(&inner)?.f_relu()?;
-        on_activation(&middle_activation(name), &inner)?;
+        on_activation(&activation(name, "middle"), &inner)?;
         let inner = self.outward.forward(&inner, index)?;
         match &self.skip {
             Some(skip) => (inner + x.f_matmul(&skip.to_kind(x.kind()))?).f_relu(),
@@ -69,8 +69,8 @@ impl ResidualGroup {
         name: &str,
         scales: &ActivationScales,
     ) -> Result<Int8ResidualGroup, QuantiseError> {
-        let inward = scales.get(&inward_activation(name))?;
-        let middle = scales.get(&middle_activation(name))?;
+        let inward = scales.get(&activation(name, "inward"))?;
+        let middle = scales.get(&activation(name, "middle"))?;
         let skip = self.skip.as_ref();
         let skip = skip.map(|skip| int8_linear(skip, None, LayerFormat::last(input)));
         Ok(Int8ResidualGroup {
@@ -96,10 +96,6 @@ impl Int8ResidualGroup {
     }
 }
 
-fn inward_activation(name: &str) -> String {
-    format!("{name}.inward")
-}
-
-fn middle_activation(name: &str) -> String {
-    format!("{name}.middle")
+fn activation(name: &str, layer: &str) -> String {
+    format!("{name}.{layer}")
 }

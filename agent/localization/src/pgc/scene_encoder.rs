@@ -159,8 +159,7 @@ impl SceneEncoder {
             down.push(conv.int8(LayerFormat::hidden(input, output))?);
             (before, input) = (input, output);
         }
-        let fine = self.fine.as_ref();
-        let fine = fine.map(|group| group.int8(before, FINE, scales));
+        let fine = (self.fine.as_ref()).map(|group| group.int8(before, FINE, scales));
         let fine = fine.transpose()?;
         let last = input;
         let mut coarse = Vec::with_capacity(self.coarse.len());
@@ -190,7 +189,7 @@ impl SceneEncoder {
     ) -> tch::Result<SceneFeatures> {
         let mut parts = vec![local.cells.shallow_clone()];
         if !self.config.context_m.is_empty() {
-            let plane = Plane::new(&local.coarse, batch)?;
+            let plane = CoarsePlane::new(&local.coarse, batch)?;
             for edge_m in &self.config.context_m {
                 // Odd, so that the cell is in the centre.
                 let window = 2 * (edge_m / self.config.coarse_cell_m() / 2.0).round() as i64 + 1;
@@ -258,21 +257,20 @@ fn coarse_activation(group: usize) -> String {
 }
 
 /// Rows of `x` by index; its gradient is fast because the index is expanded, not written out.
-fn rows(x: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
-    let channels = x.size()[1];
-    let index = index.f_unsqueeze(1)?.f_expand([-1, channels], false)?;
+pub(super) fn rows(x: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
+    let index = index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?;
     x.f_gather(0, &index, false)
 }
 
 /// Coarse features summed over height into the plane of each sweep.
-struct Plane {
+struct CoarsePlane {
     /// `[sweeps, channels, edge, edge]`.
     sum: Tensor,
     /// `[sweeps, 1, edge, edge]`: number of coarse cells above one another.
     count: Tensor,
 }
 
-impl Plane {
+impl CoarsePlane {
     fn new(coarse: &Tensor, batch: &VoxelBatch) -> tch::Result<Self> {
         let coarse = coarse.f_to_kind(Kind::Float)?;
         let ones = coarse.f_new_ones([coarse.size()[0], 1], (Kind::Float, coarse.device()))?;

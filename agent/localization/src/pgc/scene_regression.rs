@@ -101,8 +101,7 @@ impl SceneHead {
     /// # Errors
     /// Those of the tensor library.
     pub fn classify(&self, sweeps: &Tensor, train: bool) -> tch::Result<Tensor> {
-        self.classifier
-            .forward(&self.sweep_norm.forward(sweeps)?, train)
+        (self.classifier).forward(&self.sweep_norm.forward(sweeps)?, train)
     }
 
     /// World coordinates of `[N, cell_channels]` normalised features, given the logits `[N, classes]` of the sweep of
@@ -133,8 +132,7 @@ impl SceneHead {
         // Half precision would round positions beyond 256 m to quarters of a metre.
         let output = self.outward.forward(&hidden)?.f_to_kind(Kind::Float)?;
         let centres = self.config.centres;
-        let log_shares = output.f_narrow(1, 0, centres)?;
-        let log_shares = log_shares.f_log_softmax(1, Kind::Float)?;
+        let log_shares = (output.f_narrow(1, 0, centres)?).f_log_softmax(1, Kind::Float)?;
         let offset = output.f_narrow(1, centres, 3)? * OFFSET_SCALE_M;
         let epsilon_m = output.f_narrow(1, centres + 3, 1)?.f_squeeze_dim(1)?;
         let regression = Regression {
@@ -252,8 +250,7 @@ impl Classifier {
     fn forward(&self, x: &Tensor, train: bool) -> tch::Result<Tensor> {
         let mut x = x.shallow_clone();
         for (layer, norm) in self.layers.iter().zip(&self.norms) {
-            let activation = norm.forward(&layer.forward(&x), train).f_relu()?;
-            x = activation.f_dropout(DROPOUT, train)?;
+            x = (norm.forward(&layer.forward(&x), train).f_relu()?).f_dropout(DROPOUT, train)?;
         }
         Ok(self.last.forward(&x))
     }

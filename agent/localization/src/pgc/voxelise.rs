@@ -8,7 +8,7 @@ const INPUT_SCALE_M: f32 = 10.0;
 
 /// A part of the sweep that a scene coordinate is regressed for.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Cell {
+pub struct SweepCell {
     /// Mean of its points, metres in the sensor frame.
     pub centroid_m: [f32; 3],
     /// Highest minus lowest point, metres.
@@ -17,7 +17,7 @@ pub struct Cell {
     pub points: u32,
 }
 
-impl Cell {
+impl SweepCell {
     /// Height below which cells look the same everywhere, metres.
     const FLAT_M: f32 = 0.3;
 
@@ -51,8 +51,8 @@ impl CellPoints {
         self.count += 1;
     }
 
-    pub(super) fn cell(&self) -> Cell {
-        Cell {
+    pub(super) fn cell(&self) -> SweepCell {
+        SweepCell {
             centroid_m: self.sum_m.map(|sum| sum / self.count as f32),
             extent_m: self.high_m - self.low_m,
             points: self.count,
@@ -78,7 +78,7 @@ pub struct SweepVoxels {
     /// For each row of the last level its column in the plane, `y * edge + x`.
     pub(super) columns: Vec<u32>,
     /// The cells.
-    pub(super) cells: Vec<Cell>,
+    pub(super) cells: Vec<SweepCell>,
 }
 
 impl SweepVoxels {
@@ -105,9 +105,7 @@ impl SweepVoxels {
             let (halved, parents) = sites.halved();
             down.push(Rulebook::strided(&sites, &halved));
             if level <= cell_level {
-                cell_of_point
-                    .iter_mut()
-                    .for_each(|row| *row = parents[*row as usize]);
+                (cell_of_point.iter_mut()).for_each(|row| *row = parents[*row as usize]);
             } else {
                 fine = Some(Rulebook::submanifold(&sites));
                 coarse_of_cell = parents;
@@ -130,7 +128,7 @@ impl SweepVoxels {
     }
 
     /// The cells, in the order of the encoder's rows.
-    pub fn cells(&self) -> &[Cell] {
+    pub fn cells(&self) -> &[SweepCell] {
         &self.cells
     }
 
@@ -175,7 +173,7 @@ fn describe(
     input
 }
 
-fn cells(points: &[[f32; 3]], rows: &[u32], count: usize) -> Vec<Cell> {
+fn cells(points: &[[f32; 3]], rows: &[u32], count: usize) -> Vec<SweepCell> {
     let mut cells = vec![CellPoints::NONE; count];
     for (point, &row) in points.iter().zip(rows) {
         cells[row as usize].add(*point);

@@ -48,8 +48,7 @@ pub fn lowest_m(cloud: &PointCloud) -> Option<f32> {
 /// The hint that clouds without a pose are in the frame of the vehicle, of the heights of their lowest points
 /// ([`lowest_m`]): their ground is at a height of 0, not a metre or more below the LiDAR.
 pub fn vehicle_frame_hint(lowest_m: &[f32]) -> Option<String> {
-    let level = lowest_m.iter().filter(|height| height.abs() < LEVEL_M);
-    let count = level.count();
+    let count = (lowest_m.iter().filter(|height| height.abs() < LEVEL_M)).count();
     (count > 0).then(|| {
         format!(
             "{count} of {} clouds without a pose have their ground at z 0, as in the frame of the vehicle (base_link): give \

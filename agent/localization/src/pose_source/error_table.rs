@@ -46,10 +46,9 @@ impl ErrorTable {
         let file = CsvFile::read(path, HEADER, MAX_BYTES)?;
         let rows: Vec<TableRow> = file.rows().map(parse_row).collect::<Result<_, _>>()?;
         if rows.is_empty() {
-            Err(FileError::new(path, "no row below the header"))
-        } else {
-            Ok(Self { rows })
+            return Err(FileError::new(path, "no row below the header"));
         }
+        Ok(Self { rows })
     }
 
     /// The row of a step if the first step has row `start`; after the last row comes the first one.

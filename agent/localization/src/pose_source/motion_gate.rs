@@ -55,7 +55,7 @@ impl Default for MotionGateConfig {
 
 /// Classification of a pose, given those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum MotionVerdict {
     /// The pose can be reached from the last accepted one, or there is none.
     Reachable,
     /// The pose cannot be reached.
@@ -94,10 +94,10 @@ impl MotionGate {
     }
 
     /// Factor on the confidence of a pose with this verdict.
-    pub(crate) fn factor(&self, verdict: Verdict) -> f64 {
+    pub(crate) fn factor(&self, verdict: MotionVerdict) -> f64 {
         match verdict {
-            Verdict::Jump => self.config.penalty,
-            Verdict::Reachable | Verdict::NewPlace => 1.0,
+            MotionVerdict::Jump => self.config.penalty,
+            MotionVerdict::Reachable | MotionVerdict::NewPlace => 1.0,
         }
     }
 
@@ -106,7 +106,7 @@ impl MotionGate {
         &mut self,
         capture_nanos: u64,
         world_from_lidar: &Isometry3<f64>,
-    ) -> Verdict {
+    ) -> MotionVerdict {
         let pose = TimedPose {
             capture_nanos,
             world_from_lidar: *world_from_lidar,
@@ -116,12 +116,12 @@ impl MotionGate {
             // There is no pose yet, or the scene restarted.
             self.accepted.clear();
             self.accept(pose);
-            return Verdict::Reachable;
+            return MotionVerdict::Reachable;
         };
         // The speed is that of earlier poses, this one not among them: a jump must not explain itself.
         if self.can_reach(&last, &pose, self.speed_mps()) {
             self.accept(pose);
-            return Verdict::Reachable;
+            return MotionVerdict::Reachable;
         }
         self.jumps += 1;
         // At any speed: the accepted poses, which would give it, are the ones in doubt.
@@ -134,18 +134,17 @@ impl MotionGate {
         }
         self.elsewhere.push(pose);
         if self.elsewhere.len() < self.config.agreeing {
-            return Verdict::Jump;
+            return MotionVerdict::Jump;
         }
         // All of the row, so that a speed at the new place can follow from it.
         self.accepted = std::mem::take(&mut self.elsewhere).into();
-        Verdict::NewPlace
+        MotionVerdict::NewPlace
     }
 
     fn accept(&mut self, pose: TimedPose) {
         self.elsewhere.clear();
         self.accepted.push_back(pose);
-        self.accepted
-            .retain(|kept| seconds(kept, &pose) <= SPEED_WINDOW_S);
+        (self.accepted).retain(|kept| seconds(kept, &pose) <= SPEED_WINDOW_S);
     }
 
     /// True if a pose is recent enough to check a later one against.
@@ -198,7 +197,7 @@ mod tests {
     }
 
     /// Verdicts on poses a tenth of a second apart.
-    fn verdicts(motion_gate: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
+    fn verdicts(motion_gate: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<MotionVerdict> {
         let capture = |step: usize| step as u64 * TENTH_NANOS;
         poses
             .iter()
@@ -229,7 +228,7 @@ mod tests {
         assert!(
             verdicts(&mut motion_gate, &drive)
                 .iter()
-                .all(|&verdict| verdict == Verdict::Reachable)
+                .all(|&verdict| verdict == MotionVerdict::Reachable)
         );
         assert_eq!(motion_gate.jumps, 0);
     }
@@ -243,16 +242,16 @@ mod tests {
         let verdicts = verdicts(&mut motion_gate, &drive);
         for (step, verdict) in verdicts.into_iter().enumerate() {
             let expected = if step == 6 || step == 9 {
-                Verdict::Jump
+                MotionVerdict::Jump
             } else {
-                Verdict::Reachable
+                MotionVerdict::Reachable
             };
             assert_eq!(verdict, expected, "step {step}");
         }
         assert_eq!(motion_gate.jumps, 2);
         assert!(
-            motion_gate.factor(Verdict::Jump) < 0.5
-                && motion_gate.factor(Verdict::Reachable) == 1.0
+            motion_gate.factor(MotionVerdict::Jump) < 0.5
+                && motion_gate.factor(MotionVerdict::Reachable) == 1.0
         );
     }
 
@@ -261,7 +260,7 @@ mod tests {
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         let mut drive = vec![at(500.0, 0.0, 0.0)];
         drive.extend((0..5).map(|step| at(f64::from(step), 0.0, 0.0)));
-        use Verdict::{Jump, NewPlace, Reachable};
+        use MotionVerdict::{Jump, NewPlace, Reachable};
         assert_eq!(
             verdicts(&mut motion_gate, &drive),
             [Reachable, Jump, Jump, NewPlace, Reachable, Reachable]
@@ -282,11 +281,11 @@ mod tests {
         assert!(
             verdicts(&mut motion_gate, &drive)[1..]
                 .iter()
-                .all(|&verdict| verdict == Verdict::Jump)
+                .all(|&verdict| verdict == MotionVerdict::Jump)
         );
         assert_eq!(
             motion_gate.judge(21 * TENTH_NANOS, &at(20.0, 0.0, 0.0)),
-            Verdict::Reachable
+            MotionVerdict::Reachable
         );
     }
 
@@ -298,7 +297,7 @@ mod tests {
         // A car at 50 m/s could be there, one that stood a moment ago cannot.
         assert_eq!(
             motion_gate.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)),
-            Verdict::Jump
+            MotionVerdict::Jump
         );
     }
 
@@ -307,15 +306,15 @@ mod tests {
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         assert_eq!(
             motion_gate.judge(90_000_000_000, &at(0.0, 0.0, 0.0)),
-            Verdict::Reachable
+            MotionVerdict::Reachable
         );
         assert_eq!(
             motion_gate.judge(0, &at(900.0, 0.0, 0.0)),
-            Verdict::Reachable
+            MotionVerdict::Reachable
         );
         assert_eq!(
             motion_gate.judge(60_000_000_000, &at(0.0, 0.0, 90.0)),
-            Verdict::Reachable
+            MotionVerdict::Reachable
         );
     }
 }

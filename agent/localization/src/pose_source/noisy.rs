@@ -136,8 +136,7 @@ pub enum NoiseMode {
 
 impl NoiseMode {
     fn name(self) -> String {
-        self.to_possible_value()
-            .map_or_else(String::new, |mode| mode.get_name().into())
+        (self.to_possible_value()).map_or_else(String::new, |mode| mode.get_name().into())
     }
 
     /// True if the ego's pose has no error, as in OpenCOOD's code: with one offset on all vehicles the relative poses
@@ -156,11 +155,11 @@ impl NoiseMode {
 pub struct NoisyPose {
     seed: u64,
     step_nanos: f64,
-    kind: Kind,
+    kind: Noise,
 }
 
 #[derive(Debug, Clone)]
-enum Kind {
+enum Noise {
     Fixed(PoseNoise),
     Independent(PoseNoise),
     Autoregressive(PoseNoise, f64),
@@ -177,10 +176,10 @@ impl NoisyPose {
         let yaw_std_rad = config.heading_std_deg.to_radians();
         let noise = PoseNoise::new(config.position_std_m, yaw_std_rad, config.seed);
         let kind = match config.mode {
-            NoiseMode::Fixed => Kind::Fixed(noise),
-            NoiseMode::Independent => Kind::Independent(noise),
-            NoiseMode::Autoregressive => Kind::Autoregressive(noise, correlation(config)),
-            NoiseMode::Replayed => Kind::Replayed(ErrorTable::read(
+            NoiseMode::Fixed => Noise::Fixed(noise),
+            NoiseMode::Independent => Noise::Independent(noise),
+            NoiseMode::Autoregressive => Noise::Autoregressive(noise, correlation(config)),
+            NoiseMode::Replayed => Noise::Replayed(ErrorTable::read(
                 config.table.as_deref().unwrap_or(Path::new("")),
             )?),
         };
@@ -196,10 +195,10 @@ impl NoisyPose {
         // To the nearest step: capture times that jitter about a step keep its error.
         let step = (capture_nanos as f64 / self.step_nanos).round() as u64;
         let error = match &self.kind {
-            Kind::Fixed(noise) => noise.fixed(),
-            Kind::Independent(noise) => noise.independent(cav, step),
-            Kind::Autoregressive(noise, rho) => noise.autoregressive(cav, step, *rho),
-            Kind::Replayed(table) => return replayed(table.row(self.first_row(cav), step), pose),
+            Noise::Fixed(noise) => noise.fixed(),
+            Noise::Independent(noise) => noise.independent(cav, step),
+            Noise::Autoregressive(noise, rho) => noise.autoregressive(cav, step, *rho),
+            Noise::Replayed(table) => return replayed(table.row(self.first_row(cav), step), pose),
         };
         // Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
         let confidence = 1.0 / (1.0 + error.distance_m().powi(2));

@@ -59,7 +59,12 @@ impl PoseTable {
         for row in CsvFile::read(path, HEADER, MAX_BYTES)?.rows() {
             let row = row.complete()?;
             let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
-            let before = of_scenario.insert(sweep_key(&row)?, estimate(&row)?);
+            let key = sweep_key(&row)?;
+            let estimate = match row.field(11) {
+                "" => pose(&row)?,
+                _ => no_pose(&row)?,
+            };
+            let before = of_scenario.insert(key, estimate);
             // Two rows of one sweep, as in a table that was appended to twice: neither can be preferred.
             if before.is_some() {
                 return Err(row.fault("duplicate row of the sweep"));
@@ -85,8 +90,7 @@ impl PoseTable {
 
     /// Estimate of a sweep.
     pub fn get(&self, scenario: &str, cav: &CavId, capture_nanos: u64) -> Option<&PoseEstimate> {
-        let of_scenario = self.scenarios.get(last_part(scenario))?;
-        of_scenario.get(&(cav.clone(), capture_nanos))
+        (self.scenarios.get(last_part(scenario))?).get(&(cav.clone(), capture_nanos))
     }
 
     /// Appends the rows of a scenario to a file, which gets its header where it is new.
@@ -99,12 +103,9 @@ impl PoseTable {
             true => CsvText::headless(),
             false => CsvText::new(HEADER),
         };
-        rows.iter()
-            .for_each(|row| text.row(fields(last_part(scenario), row)));
-        let text = text.finish();
+        (rows.iter()).for_each(|row| text.row(fields(last_part(scenario), row)));
         let file = OpenOptions::new().create(true).append(true).open(path);
-        file.and_then(|mut file| file.write_all(text.as_bytes()))
-            .at(path)
+        (file.and_then(|mut file| file.write_all(text.finish().as_bytes()))).at(path)
     }
 
     /// The poses of one scenario: the requested one, or the only one there is.
@@ -216,14 +217,6 @@ fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey> {
     Ok((cav, capture_nanos))
 }
 
-fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate> {
-    if row.field(11).is_empty() {
-        pose(row)
-    } else {
-        no_pose(row)
-    }
-}
-
 fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
     let mut numbers = [0.0; 7];
     for (column, number) in (3..).zip(&mut numbers) {
@@ -242,8 +235,7 @@ fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
 fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
     let reason = serde_json::from_value::<NoPoseReason>(row.field(11).into());
     let reason = reason.map_err(|_| row.wrong(11, "a reason for no pose"))?;
-    let inliers = row.field(12).parse::<u32>();
-    let inliers = inliers.map_err(|_| row.wrong(12, "a count"))?;
+    let inliers = (row.field(12).parse::<u32>()).map_err(|_| row.wrong(12, "a count"))?;
     Ok(PoseEstimate::no_pose(reason, inliers))
 }
 

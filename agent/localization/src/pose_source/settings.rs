@@ -44,9 +44,7 @@ pub(crate) trait PoseSettings {
     fn files(&mut self) -> Vec<&mut PathBuf> {
         let networks = self.networks().into_iter().flat_map(|(files, _)| files);
         // A surfel map is optional.
-        networks
-            .filter(|file| !file.as_os_str().is_empty())
-            .collect()
+        (networks.filter(|file| !file.as_os_str().is_empty())).collect()
     }
 
     /// Prefix of the identifiers of its options, before the name of the field.

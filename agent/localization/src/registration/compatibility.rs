@@ -33,8 +33,7 @@ impl Bits {
     ) -> Self {
         let chunks = entries.chunks(size.max(1)).flat_map(|row| row.chunks(64));
         let words = chunks.map(|entries| {
-            let bits = entries.iter().enumerate();
-            bits.fold(0_u64, |word, (bit, &entry)| {
+            (entries.iter().enumerate()).fold(0_u64, |word, (bit, &entry)| {
                 word | u64::from(condition(entry)) << bit
             })
         });

@@ -91,13 +91,11 @@ impl Registration {
                 squares += residual_m * residual_m;
             }
         }
-        let count = inliers.len().max(1) as f64;
-        let inlier_ratio = inliers.len() as f64 / pairs.len().max(1) as f64;
         Self {
             target_from_source,
+            inlier_ratio: inliers.len() as f64 / pairs.len().max(1) as f64,
+            rms_m: (squares / inliers.len().max(1) as f64).sqrt(),
             inliers,
-            inlier_ratio,
-            rms_m: (squares / count).sqrt(),
         }
     }
 

@@ -13,7 +13,7 @@ const LANES: usize = 16;
 const PREFIX_BLOCKS: usize = 24;
 
 /// One coordinate or weight of all pairs, padded with zeros to whole blocks.
-type Column = Vec<[f32; LANES]>;
+type PairColumn = Vec<[f32; LANES]>;
 
 /// Score of a motion: a truncated quadratic (MSAC) with the sign reversed, so that more is better.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -24,26 +24,25 @@ pub(super) struct Gain {
     pub total: f32,
 }
 
-fn column(pairs: &[&Correspondence], value: impl Fn(&Correspondence) -> f32) -> Column {
+fn column(pairs: &[&Correspondence], value: impl Fn(&Correspondence) -> f32) -> PairColumn {
     // Padding has weight 0 and adds nothing to a score.
-    let blocks = pairs
-        .chunks(LANES)
+    let blocks = (pairs.chunks(LANES))
         .map(|block| std::array::from_fn(|lane| block.get(lane).map_or(0.0, |pair| value(pair))));
     blocks.collect()
 }
 
 /// Usable correspondences, highest weights first, column by column.
 #[derive(Debug)]
-pub(super) struct Pairs {
-    source: [Column; 3],
-    target: [Column; 3],
-    weight: Column,
+pub(super) struct PairColumns {
+    source: [PairColumn; 3],
+    target: [PairColumn; 3],
+    weight: PairColumn,
     count: usize,
     /// Subtracted from all targets, so that `f32` is precise enough anywhere on earth, metres.
     origin: Vector3<f64>,
 }
 
-impl Pairs {
+impl PairColumns {
     /// Stores the usable ones; pairs of equal weight in random order, so that a prefix of them is a fair sample.
     pub(super) fn new(pairs: &[Correspondence], random: &mut ChaCha8Rng) -> Self {
         let mut usable: Vec<&Correspondence> = pairs.iter().filter(|pair| pair.usable()).collect();
@@ -120,10 +119,9 @@ impl Pairs {
         if prefix < 0.5 * best.prefix {
             return None;
         }
-        let rest = self.block_gain(&model, scale, PREFIX_BLOCKS.min(blocks)..blocks);
         Some(Gain {
             prefix,
-            total: prefix + rest,
+            total: prefix + self.block_gain(&model, scale, PREFIX_BLOCKS.min(blocks)..blocks),
         })
     }
 
@@ -159,7 +157,7 @@ impl Pairs {
     }
 }
 
-fn at(columns: &[Column; 3], index: usize) -> Vector3<f64> {
+fn at(columns: &[PairColumn; 3], index: usize) -> Vector3<f64> {
     let (block, lane) = (index / LANES, index % LANES);
     Vector3::from_fn(|axis, _| f64::from(columns[axis][block][lane]))
 }
@@ -187,19 +185,19 @@ mod tests {
     use rand::SeedableRng;
 
     use super::*;
-    use crate::registration::test_problem::Problem;
+    use crate::registration::test_problem::TestProblem;
 
     #[test]
     fn the_gain_is_that_of_the_definition() {
-        let problem = Problem {
+        let problem = TestProblem {
             count: 1001,
             outliers: 0.4,
             noise_m: 0.5,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(3);
         let mut random = ChaCha8Rng::seed_from_u64(1);
-        let pairs = Pairs::new(&problem.pairs, &mut random);
+        let pairs = PairColumns::new(&problem.pairs, &mut random);
         assert_eq!(pairs.len(), 1001);
         let mut local = problem.truth;
         local.translation.vector -= pairs.origin;
@@ -242,6 +240,6 @@ mod tests {
             [f32::NAN, f32::INFINITY, 0.0, -1.0].map(|weight| Correspondence { weight, ..good });
         let all = [&bad[..], &heavy[..], &[good]].concat();
         let mut random = ChaCha8Rng::seed_from_u64(1);
-        assert_eq!(Pairs::new(&all, &mut random).len(), 1);
+        assert_eq!(PairColumns::new(&all, &mut random).len(), 1);
     }
 }

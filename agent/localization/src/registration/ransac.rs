@@ -10,7 +10,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::pairs::{Gain, Pairs};
+use super::pairs::{Gain, PairColumns};
 use super::sampling::{self, SampleTest};
 use super::{Correspondence, NoRegistration, Registration, check_enough, refine};
 
@@ -140,8 +140,8 @@ pub fn solve(
     let required = config.min_inliers.max(3);
     check_enough(correspondences, required)?;
     let mut random = ChaCha8Rng::seed_from_u64(config.seed);
-    let pairs = Pairs::new(correspondences, &mut random);
-    let search = Search {
+    let pairs = PairColumns::new(correspondences, &mut random);
+    let search = RansacSearch {
         pairs: &pairs,
         config,
         best: None,
@@ -174,13 +174,13 @@ pub fn solve(
 }
 
 /// The draws and the best motion so far.
-struct Search<'a> {
-    pairs: &'a Pairs,
+struct RansacSearch<'a> {
+    pairs: &'a PairColumns,
     config: &'a RansacConfig,
     best: Option<(Gain, Isometry3<f64>)>,
 }
 
-impl Search<'_> {
+impl RansacSearch<'_> {
     fn run(mut self, random: &mut ChaCha8Rng) -> Option<Isometry3<f64>> {
         let test = self.config.sample_test();
         // The best score of a motion as drawn, before any optimisation: the next draw has to exceed it.
@@ -223,8 +223,7 @@ impl Search<'_> {
             .and_then(|optimised| Some((self.gain(&optimised, &gain)?, optimised)))
             .filter(|(optimised, _)| optimised.total > gain.total);
         let candidate = optimised.unwrap_or((gain, *motion));
-        let before = self.best.as_ref();
-        let better = before.is_none_or(|(best, _)| candidate.0.total > best.total);
+        let better = (self.best.as_ref()).is_none_or(|(best, _)| candidate.0.total > best.total);
         if better {
             self.best = Some(candidate);
         }
@@ -244,13 +243,13 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::registration::test_problem::Problem;
+    use crate::registration::test_problem::TestProblem;
 
     proptest! {
         #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]
         #[test]
         fn motions_are_found_among_outliers(seed in 0_u64..1000, outliers in 0.0..0.85) {
-            let problem = Problem { count: 600, outliers, noise_m: 0.1, ..Problem::default() }.drawn(seed);
+            let problem = TestProblem { count: 600, outliers, noise_m: 0.1, ..TestProblem::default() }.drawn(seed);
             for config in [RansacConfig::default(), RansacConfig::any_rotation(1.5)] {
                 let found = solve(&problem.pairs, &config).unwrap();
                 let (metres, degrees) = problem.error(&found.target_from_source);
@@ -275,13 +274,13 @@ mod tests {
 
     #[test]
     fn any_rotation_is_found_where_it_is_allowed() {
-        let mut problem = Problem {
+        let mut problem = TestProblem {
             count: 500,
             outliers: 0.5,
             noise_m: 0.05,
-            ..Problem::default()
+            ..TestProblem::default()
         };
-        problem = Problem {
+        problem = TestProblem {
             tilt_rad: 1.5,
             ..problem
         }
@@ -303,11 +302,11 @@ mod tests {
     #[test]
     fn eight_in_a_hundred_suffice() {
         for seed in 0..20 {
-            let problem = Problem {
+            let problem = TestProblem {
                 count: 1500,
                 outliers: 0.92,
                 noise_m: 0.5,
-                ..Problem::default()
+                ..TestProblem::default()
             }
             .drawn(seed);
             let found = solve(&problem.pairs, &RansacConfig::default()).unwrap();
@@ -321,11 +320,11 @@ mod tests {
 
     #[test]
     fn the_same_seed_gives_the_same_bits() {
-        let problem = Problem {
+        let problem = TestProblem {
             count: 900,
             outliers: 0.7,
             noise_m: 0.5,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(4);
         let config = RansacConfig {
@@ -340,10 +339,10 @@ mod tests {
 
     #[test]
     fn positions_far_from_the_origin_keep_precision() {
-        let mut problem = Problem {
+        let mut problem = TestProblem {
             count: 400,
             noise_m: 0.02,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(5);
         let far = nalgebra::Vector3::new(16384.0, -8192.0, 128.0);
@@ -367,10 +366,10 @@ mod tests {
                 required: 12
             }
         );
-        let nonsense = Problem {
+        let nonsense = TestProblem {
             count: 200,
             outliers: 1.0,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(6);
         let few = solve(&nonsense.pairs, &config).unwrap_err();
@@ -414,9 +413,9 @@ mod tests {
 
     #[test]
     fn a_mirrored_sweep_is_not_registered_as_a_whole() {
-        let mut problem = Problem {
+        let mut problem = TestProblem {
             count: 400,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(8);
         problem
@@ -436,9 +435,9 @@ mod tests {
     fn upside_down_is_no_vehicle() {
         let flip = UnitQuaternion::from_euler_angles(std::f64::consts::PI, 0.0, 0.0);
         let motion = Isometry3::from_parts(Translation3::new(5.0, 6.0, 7.0), flip);
-        let problem = Problem {
+        let problem = TestProblem {
             count: 200,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(9);
         let pairs: Vec<_> = (problem.pairs.iter())

@@ -85,9 +85,9 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
-    use crate::registration::test_problem::Problem;
+    use crate::registration::test_problem::TestProblem;
 
-    fn pairs(problem: &Problem) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
+    fn pairs(problem: &TestProblem) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
         let vector = |point: [f32; 3]| Vector3::from(point.map(f64::from));
         problem
             .pairs
@@ -98,11 +98,11 @@ mod tests {
 
     #[test]
     fn a_coarse_motion_is_refined_among_outliers() {
-        let problem = Problem {
+        let problem = TestProblem {
             count: 600,
             outliers: 0.5,
             noise_m: 0.2,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(1);
         let off = Isometry3::new(Vector3::new(1.2, -0.8, 0.5), Vector3::new(0.01, 0.0, 0.04));
@@ -118,7 +118,7 @@ mod tests {
 
     #[test]
     fn no_pair_near_is_an_error() {
-        let problem = Problem::default().drawn(2);
+        let problem = TestProblem::default().drawn(2);
         let elsewhere = Isometry3::translation(0.0, 0.0, 1e4);
         assert_eq!(
             converge(&pairs(&problem), &elsewhere, 1.0, 5),

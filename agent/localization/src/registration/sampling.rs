@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::pairs::Pairs;
+use super::pairs::PairColumns;
 
 /// Shares of the pairs of highest weight that successive draws are taken from. Half of the draws follow the weights,
 /// half do not, so that uninformative weights cost a factor of two and no more.
@@ -25,7 +25,7 @@ pub(super) struct SampleTest {
 
 /// Draws a motion from three pairs, or `None` if they are inconsistent.
 pub(super) fn three_points(
-    pairs: &Pairs,
+    pairs: &PairColumns,
     draw: u32,
     test: &SampleTest,
     random: &mut ChaCha8Rng,
@@ -51,7 +51,7 @@ pub(super) fn three_points(
 
 /// Draws a motion about the vertical from two pairs, or `None` if they are inconsistent.
 pub(super) fn two_points(
-    pairs: &Pairs,
+    pairs: &PairColumns,
     draw: u32,
     test: &SampleTest,
     random: &mut ChaCha8Rng,
@@ -120,17 +120,17 @@ mod tests {
     use rand::SeedableRng;
 
     use super::*;
-    use crate::registration::test_problem::Problem;
+    use crate::registration::test_problem::TestProblem;
 
     #[test]
     fn clean_samples_fix_the_motion() {
-        let problem = Problem {
+        let problem = TestProblem {
             tilt_rad: 0.0,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(7);
         let mut random = ChaCha8Rng::seed_from_u64(2);
-        let pairs = Pairs::new(&problem.pairs, &mut random);
+        let pairs = PairColumns::new(&problem.pairs, &mut random);
         let test = SampleTest {
             min_edge_m: 6.0,
             edge_tolerance_m: 0.1,

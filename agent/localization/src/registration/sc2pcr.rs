@@ -5,6 +5,8 @@
 //! consensus sets in two stages, one weighted fit per seed, the fit with most inliers, refinement. Equal scores keep
 //! the order of their correspondences; the published one leaves that order to an unstable sort.
 
+use std::cmp::Ordering;
+
 use nalgebra::{Isometry3, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -142,15 +144,14 @@ pub fn consensus(
         .filter(|pair| pair.usable())
         .map(|pair| (pair.source_m, pair.target_m))
         .unzip();
-    let points = Points { source, target };
+    let points = PairPoints { source, target };
     let count = points.source.len();
     let threshold = config.distance_threshold_m as f32;
     let source_distances = distances(&points.source);
     let changes = changes(&source_distances, &distances(&points.target));
 
     // Step: first-order compatibility, its leading eigenvector as confidence, and the seeds.
-    let first_order = changes.iter().map(|&change| soft(change, threshold));
-    let first_order: Vec<f32> = first_order.collect();
+    let first_order: Vec<f32> = (changes.iter().map(|&change| soft(change, threshold))).collect();
     let confidence = leading_eigenvectors(&first_order, count, config.power_iterations);
     let seeds = pick_seeds(&source_distances, &confidence, config);
 
@@ -167,8 +168,7 @@ pub fn consensus(
         })
         .collect();
     // Step: one fit per seed. Without a seed, in tiny sets, there is none.
-    let best = points.best_fit(&sets, config);
-    let Some((target_from_source, inlier_count)) = best else {
+    let Some((target_from_source, inlier_count)) = points.best_fit(&sets, config) else {
         return Err(NoRegistration::TooFewInliers {
             found: 0,
             required: SMALL_SET,
@@ -245,10 +245,7 @@ fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfi
 /// Indices in descending order of value; equal values keep their order.
 fn descending<T: PartialOrd>(values: &[T]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..values.len()).collect();
-    order.sort_by(|&a, &b| {
-        let order = values[b].partial_cmp(&values[a]);
-        order.unwrap_or(std::cmp::Ordering::Equal)
-    });
+    order.sort_by(|&a, &b| (values[b].partial_cmp(&values[a])).unwrap_or(Ordering::Equal));
     order
 }
 
@@ -257,12 +254,12 @@ fn vector(point: &[f32; 3]) -> Vector3<f64> {
 }
 
 /// The correspondences that are used.
-struct Points {
+struct PairPoints {
     source: Vec<[f32; 3]>,
     target: Vec<[f32; 3]>,
 }
 
-impl Points {
+impl PairPoints {
     /// The correspondences that support a seed, the seed's strongest first: the best of the second-order compatibility
     /// `scores`, and of these the most compatible with the first.
     fn consensus_set(&self, scores: &[u32], config: &Sc2PcrConfig) -> Vec<usize> {
@@ -331,8 +328,7 @@ impl Points {
 
     fn inliers(&self, motion: &Isometry3<f64>, threshold_m: f64) -> usize {
         let rotation = motion.rotation.to_rotation_matrix();
-        let pairs = self.source.iter().zip(&self.target);
-        let near = pairs.filter(|(source, target)| {
+        let near = (self.source.iter().zip(&self.target)).filter(|(source, target)| {
             let moved = rotation * vector(source) + motion.translation.vector;
             (moved - vector(target)).norm() < threshold_m
         });
@@ -343,16 +339,16 @@ impl Points {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::registration::test_problem::Problem;
+    use crate::registration::test_problem::TestProblem;
 
     #[test]
     fn motions_are_found_among_outliers() {
         for seed in 0..8 {
-            let problem = Problem {
+            let problem = TestProblem {
                 count: 500,
                 outliers: 0.7,
                 noise_m: 0.1,
-                ..Problem::default()
+                ..TestProblem::default()
             }
             .drawn(seed);
             let found = solve(&problem.pairs, &Sc2PcrConfig::default()).unwrap();
@@ -366,11 +362,11 @@ mod tests {
 
     #[test]
     fn few_correspondences_use_small_sets() {
-        let problem = Problem {
+        let problem = TestProblem {
             count: 20,
             outliers: 0.2,
             noise_m: 0.02,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(3);
         let config = Sc2PcrConfig {
@@ -390,10 +386,10 @@ mod tests {
             solve(&[], &config),
             Err(NoRegistration::TooFewCorrespondences { given: 0, .. })
         ));
-        let nonsense = Problem {
+        let nonsense = TestProblem {
             count: 60,
             outliers: 1.0,
-            ..Problem::default()
+            ..TestProblem::default()
         }
         .drawn(6);
         assert!(matches!(

@@ -9,7 +9,7 @@ use super::Correspondence;
 
 /// Parameters of a problem, and the pairs drawn.
 #[derive(Debug, Clone)]
-pub(crate) struct Problem {
+pub(crate) struct TestProblem {
     /// Number of pairs.
     pub(crate) count: usize,
     /// Share of pairs whose target is anywhere in the scene.
@@ -24,7 +24,7 @@ pub(crate) struct Problem {
     pub(crate) pairs: Vec<Correspondence>,
 }
 
-impl Default for Problem {
+impl Default for TestProblem {
     fn default() -> Self {
         Self {
             count: 300,
@@ -37,7 +37,7 @@ impl Default for Problem {
     }
 }
 
-impl Problem {
+impl TestProblem {
     /// Draws motion and pairs: a sweep of 60 m radius in a scene of 400 m.
     pub(crate) fn drawn(mut self, seed: u64) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(seed);

@@ -13,7 +13,7 @@ use protocol::{EgoMotion, PlanarCovariance};
 
 pub use measurement::PoseMeasurement;
 pub use track::SpeedContradiction;
-use track::{SpeedTrust, Track};
+use track::{SpeedTrust, VehicleTrack};
 
 /// Number of rejected measurements in a row that have to agree on another place.
 const AGREEING: usize = 3;
@@ -61,7 +61,7 @@ pub enum Correction {
 #[derive(Debug, Clone)]
 pub struct PoseTracker {
     limits: TrackerLimits,
-    track: Option<Track>,
+    track: Option<VehicleTrack>,
     speed_trust: SpeedTrust,
     /// Last accepted measurement.
     accepted: Option<PoseMeasurement>,
@@ -173,14 +173,15 @@ impl PoseTracker {
         let before = self.accepted.replace(*measurement);
         let before = before.filter(|before| can_follow(before, measurement));
         let speed = before.map(|before| [speed_mps(&before, measurement), SPEED_STD_MPS]);
-        self.track = Some(Track::at(measurement, speed));
+        self.track = Some(VehicleTrack::at(measurement, speed));
         self.rejected.clear();
     }
 
     /// True if a measurement is needed now: the last one was rejected, or the speed is not known well.
     pub fn needs_measurement(&self) -> bool {
         let track = self.track.as_ref();
-        self.is_contradicted() || track.is_none_or(|track| track.speed_std_mps() > SPEED_STD_MPS)
+        self.is_contradicted()
+            || track.is_none_or(|track| track.unaided.speed_std_mps() > SPEED_STD_MPS)
     }
 
     /// The speed that is not used any more, since measured poses contradict it.

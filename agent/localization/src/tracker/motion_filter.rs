@@ -53,7 +53,7 @@ const LEVER: usize = 6;
 const SCALE: usize = 7;
 const STATES: usize = 8;
 
-type State = SVector<f64, STATES>;
+type CavState = SVector<f64, STATES>;
 type Covariance = SMatrix<f64, STATES, STATES>;
 
 /// State of a vehicle at one time, with its covariance.
@@ -64,7 +64,7 @@ pub(super) struct MotionFilter {
     /// x, y (metres, world) and yaw (radians) of the LiDAR, speed along the heading (m/s), yaw rate (rad/s), bias of the
     /// gyroscope (rad/s), the LiDAR's place ahead of the rear axle (metres), and the share of the measured speed by which
     /// the true one exceeds it.
-    state: State,
+    state: CavState,
     covariance: Covariance,
     /// Height (metres, world) and vertical speed beside that of the slope (m/s).
     height: Vector2<f64>,
@@ -81,7 +81,7 @@ impl MotionFilter {
         let [x, y, z] = measurement.world_from_lidar.translation.vector.data.0[0];
         let (roll_rad, pitch_rad, yaw) = measurement.world_from_lidar.rotation.euler_angles();
         let (position, [speed, yaw_rate]) = (measurement.position_std_m, FIRST_STD);
-        let std = State::from([
+        let std = CavState::from([
             position,
             position,
             measurement.yaw_std_rad,
@@ -93,7 +93,7 @@ impl MotionFilter {
         ]);
         Self {
             capture_nanos: measurement.capture_nanos,
-            state: State::from([x, y, yaw, 0.0, 0.0, 0.0, 0.0, 0.0]),
+            state: CavState::from([x, y, yaw, 0.0, 0.0, 0.0, 0.0, 0.0]),
             covariance: Covariance::from_diagonal(&std.component_mul(&std)),
             height: Vector2::new(z, 0.0),
             height_covariance: Matrix2::new(position * position, 0.0, 0.0, 1.0),
@@ -145,12 +145,12 @@ impl MotionFilter {
         // Step: process noise. An acceleration is constant within a step: its effects are fully correlated.
         let (push_x, push_y) = (half_square * cos, half_square * sin);
         let pushed =
-            State::from([push_x, push_y, 0.0, time_s, 0.0, 0.0, 0.0, 0.0]) * ACCELERATION_STD;
-        let turned =
-            State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0, 0.0]) * yaw_acceleration_std;
+            CavState::from([push_x, push_y, 0.0, time_s, 0.0, 0.0, 0.0, 0.0]) * ACCELERATION_STD;
+        let turned = CavState::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0, 0.0])
+            * yaw_acceleration_std;
         // A random walk: its variance, not its deviation, grows with time.
         let slipped =
-            State::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
+            CavState::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
         self.covariance = step * self.covariance * step.transpose()
             + pushed * pushed.transpose()
             + turned * turned.transpose()
@@ -208,9 +208,7 @@ impl MotionFilter {
     /// Squared Mahalanobis distance between a pose of the same time and the state: x, y and yaw.
     pub(super) fn distance_squared(&self, measurement: &PoseMeasurement) -> f64 {
         let (off, spread) = self.innovation(measurement);
-        spread
-            .cholesky()
-            .map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
+        (spread.cholesky()).map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
     }
 
     /// Uses a pose of the same time.
@@ -294,7 +292,7 @@ impl MotionFilter {
     }
 
     /// Moves the state by `change` and keeps `remaining` of the covariance.
-    fn move_by(&mut self, change: &State, remaining: &Covariance) {
+    fn move_by(&mut self, change: &CavState, remaining: &Covariance) {
         self.state += change;
         self.state[YAW] = wrapped_rad(self.state[YAW]);
         let covariance = remaining * self.covariance;

@@ -52,13 +52,13 @@ impl SpeedTrust {
 
 /// State of a vehicle that is not lost.
 #[derive(Debug, Clone)]
-pub(super) struct Track {
+pub(super) struct VehicleTrack {
     pub(super) filter: MotionFilter,
-    /// Filter without the measured speed.
-    unaided: MotionFilter,
+    /// Filter without the measured speed: its speed is that which the poses alone give.
+    pub(super) unaided: MotionFilter,
 }
 
-impl Track {
+impl VehicleTrack {
     /// Track from a first pose on, at a speed with its standard deviation if one is known (metres per second).
     pub(super) fn at(measurement: &PoseMeasurement, speed_mps: Option<[f64; 2]>) -> Self {
         let mut filter = MotionFilter::at(measurement);
@@ -104,10 +104,5 @@ impl Track {
         self.filter.correct(measurement);
         self.unaided.correct(measurement);
         true
-    }
-
-    /// Standard deviation of the speed that the poses alone give, metres per second.
-    pub(super) fn speed_std_mps(&self) -> f64 {
-        self.unaided.speed_std_mps()
     }
 }

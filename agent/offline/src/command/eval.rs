@@ -291,11 +291,9 @@ impl Args {
     }
 
     fn tracking(&self, head: &Path) -> Result<Subject, BadInput> {
-        let config = TrackedPoseConfig {
-            encoder: self.encoder(head)?,
-            head: head.to_owned(),
-            ..self.tracker.0.clone()
-        };
+        let mut config = self.tracker.0.clone();
+        config.encoder = self.encoder(head)?;
+        config.head = head.to_owned();
         config.validate().map_err(BadInput::of)?;
         let localizer = TrackedPose::localizer(&config, self.inference()?).map_err(BadInput::of)?;
         let source = TrackedPose::new(self.registered(localizer)?, config);
@@ -499,7 +497,15 @@ fn report_line(report: &FitReport) -> String {
 fn table(summary: &LocalizationSummary) -> String {
     let (rejected, ms) = (&summary.rejected, &summary.ms);
     let [under_3m, under_1m] = [summary.success_3m, summary.success_1m].map(percent);
-    let total = ms.get("total").copied();
+    let [mean_m, p95_m, p99_m] = numbers([summary.mean_m, summary.p95_m, summary.p99_m], 2);
+    let [mean_deg, p95_deg] = numbers([summary.mean_deg, summary.p95_deg], 2);
+    let [p50_m, p50_deg] = numbers([summary.p50_m, summary.p50_deg], 3);
+    let total_ms = ms.get("total").copied();
+    let [max_m, max_deg, total_ms] = numbers([summary.max_m, summary.max_deg, total_ms], 1);
+    let [sigma, ratio] = numbers([summary.sigma_spearman, summary.inlier_ratio_spearman], 2);
+    let [calibration] = numbers([summary.calibration_error], 3);
+    let shares = [rejected.bad_share, rejected.good_share];
+    let [bad_share, good_share] = shares.map(|share| share.map_or("-".into(), percent));
     let stages = ms.iter().filter(|(stage, _)| *stage != "total");
     let stages: Vec<String> = stages
         .map(|(stage, ms)| format!("{stage} {ms:.1}"))
@@ -511,36 +517,20 @@ fn table(summary: &LocalizationSummary) -> String {
         ),
         format!("success    {under_3m} under 3 m, {under_1m} under 1 m"),
         format!(
-            "position   mean {} m, median {}, 95 % {}, 99 % {}, largest {}",
-            number(summary.mean_m, 2),
-            number(summary.p50_m, 3),
-            number(summary.p95_m, 2),
-            number(summary.p99_m, 2),
-            number(summary.max_m, 1)
+            "position   mean {mean_m} m, median {p50_m}, 95 % {p95_m}, 99 % {p99_m}, largest {max_m}"
         ),
         format!(
-            "rotation   mean {} degrees, median {}, 95 % {}, largest {}",
-            number(summary.mean_deg, 2),
-            number(summary.p50_deg, 3),
-            number(summary.p95_deg, 2),
-            number(summary.max_deg, 1)
+            "rotation   mean {mean_deg} degrees, median {p50_deg}, 95 % {p95_deg}, largest {max_deg}"
         ),
         format!(
-            "sigma      rank correlation {} (inlier ratio {}), calibration error {}",
-            number(summary.sigma_spearman, 2),
-            number(summary.inlier_ratio_spearman, 2),
-            number(summary.calibration_error, 3)
+            "sigma      rank correlation {sigma} (inlier ratio {ratio}), calibration error {calibration}"
         ),
         format!(
-            "rejected   {} poses: {} of {} errors above 3 m, {} of the others",
-            rejected.poses,
-            rejected.bad_share.map_or("-".into(), percent),
-            rejected.bad,
-            rejected.good_share.map_or("-".into(), percent)
+            "rejected   {} poses: {bad_share} of {} errors above 3 m, {good_share} of the others",
+            rejected.poses, rejected.bad
         ),
         format!(
-            "time       {} ms median, {:.1} mean: {}",
-            number(total, 1),
+            "time       {total_ms} ms median, {:.1} mean: {}",
             summary.mean_ms,
             stages.join(", ")
         ),
@@ -567,8 +557,8 @@ fn table(summary: &LocalizationSummary) -> String {
     lines.chain(bound).map(|line| line + "\n").collect()
 }
 
-fn number(value: Option<f64>, digits: usize) -> String {
-    value.map_or("-".into(), |value| format!("{value:.digits$}"))
+fn numbers<const N: usize>(values: [Option<f64>; N], digits: usize) -> [String; N] {
+    values.map(|value| value.map_or("-".into(), |value| format!("{value:.digits$}")))
 }
 
 fn percent(share: f64) -> String {

@@ -51,12 +51,12 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     let done = match args.out.exists() {
-        true => PoseTable::read(&args.out).map_err(bad)?,
+        true => PoseTable::read(&args.out).map_err(BadInput::of)?,
         false => PoseTable::default(),
     };
     let mut scenarios = Vec::new();
     for folder in &args.dataset {
-        scenarios.extend(dataset::open(folder).map_err(bad)?.scenarios);
+        scenarios.extend(dataset::open(folder).map_err(BadInput::of)?.scenarios);
     }
     scenarios.retain(|scenario| !done.has(&scenario.name));
     // All heads are found before any is computed with.
@@ -66,7 +66,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let first_head = heads.first().copied();
     let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
-        return Err(bad(anyhow::anyhow!("no sweep in {:?}", args.dataset)));
+        return Err(BadInput::new(format!("no sweep in {:?}", args.dataset)).into());
     }
     let bar = progress::bar(sweeps, "sweeps");
     let mut found = 0;
@@ -98,7 +98,7 @@ impl Args {
         bar: &ProgressBar,
     ) -> anyhow::Result<usize> {
         let config = PgcConfig {
-            encoder: encoder_or_named(self.encoder.as_deref(), head).map_err(bad)?,
+            encoder: encoder_or_named(self.encoder.as_deref(), head).map_err(BadInput::of)?,
             head: head.to_owned(),
             surfel_map: surfel_map(self.surfel_map.as_deref())?,
             ..PgcConfig::default()
@@ -106,7 +106,7 @@ impl Args {
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
         let inference = Inference::new(Device::Cpu, self.precision);
         for (agent, cav) in scenario.agents.iter().enumerate() {
-            let mut source = LocalizedPose::pgc(&config, inference).map_err(bad)?;
+            let mut source = LocalizedPose::pgc(&config, inference).map_err(BadInput::of)?;
             for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
                 bar.inc(1);
                 let frame = match scenario.load(agent, tick, &LoadOptions::default()) {
@@ -133,8 +133,4 @@ impl Args {
 /// Number of frames of a scenario.
 fn frames(scenario: &Scenario) -> usize {
     scenario.agents.len() * scenario.ticks.len() - scenario.absent_frames()
-}
-
-fn bad(error: impl Into<anyhow::Error>) -> anyhow::Error {
-    BadInput::of(error).into()
 }

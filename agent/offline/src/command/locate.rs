@@ -56,8 +56,8 @@ pub(crate) struct Args {
     min_confidence: f64,
     /// Direction of the y axis in files that belong to no data set: left, right (CARLA, OPV2V), or whichever gives a pose,
     /// left first.
-    #[arg(long, value_enum, default_value_t = YAxis::Auto)]
-    y_axis: YAxis,
+    #[arg(long, value_enum, default_value_t = CloudYAxis::Auto)]
+    y_axis: CloudYAxis,
     /// Number format in which networks are computed.
     #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
@@ -70,7 +70,7 @@ pub(crate) struct Args {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum YAxis {
+enum CloudYAxis {
     Auto,
     Left,
     Right,
@@ -213,16 +213,16 @@ impl Args {
         sweeps.push(read.findings);
         // The reader of a data set has removed its handedness already.
         let y_axis = match read.is_of_data_set {
-            true => YAxis::Left,
+            true => CloudYAxis::Left,
             false => self.y_axis,
         };
-        if y_axis == YAxis::Right {
+        if y_axis == CloudYAxis::Right {
             mirror(&mut points);
         }
         let mut localization = localizer.localize(LocalizerInput::of(&points))?;
-        let mut is_mirrored = y_axis == YAxis::Right;
+        let mut is_mirrored = y_axis == CloudYAxis::Right;
         // A mirrored cloud looks like another place, so a pose tells which direction y has.
-        if y_axis == YAxis::Auto && published(&localization).is_none() {
+        if y_axis == CloudYAxis::Auto && published(&localization).is_none() {
             mirror(&mut points);
             let other = localizer.localize(LocalizerInput::of(&points))?;
             if published(&other).is_some() {
@@ -272,12 +272,11 @@ fn mirror(points: &mut protocol::PointCloud) {
 impl LocatedPose {
     fn of(found: FoundPose) -> Self {
         let pose = found.world_from_sensor;
-        let (translation, rotation) = (pose.translation, pose.rotation);
-        let (roll, pitch, yaw) = rotation.euler_angles();
+        let (roll, pitch, yaw) = pose.rotation.euler_angles();
         Self {
-            position_m: translation.vector.into(),
+            position_m: pose.translation.vector.into(),
             roll_pitch_yaw_deg: [roll, pitch, yaw].map(f64::to_degrees),
-            quaternion_xyzw: rotation.coords.into(),
+            quaternion_xyzw: pose.rotation.coords.into(),
             covariance: pose_covariance(&found),
             bound_m: position_bound_m(&found),
             confidence: found.sigma,

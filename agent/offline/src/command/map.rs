@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use agent_offline::TrainingBar;
 use agent_offline::icp_map::{check_spacing, read_map};
-use agent_offline::mapping::{MapConfig, MapProgress, MapReport, make_map};
+use agent_offline::mapping::{MapConfig, MapProgress, PlaceReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
 use dataset::LeftOut;
@@ -200,7 +200,7 @@ fn name_of(folder: &Path) -> String {
 }
 
 /// Report as text.
-fn text(report: &MapReport) -> String {
+fn text(report: &PlaceReport) -> String {
     let accuracy = match &report.held_out {
         Some(accuracy) => accuracy.text(),
         None => "not measured: too few sweeps".to_owned(),
@@ -232,7 +232,7 @@ fn indented(text: &str) -> String {
 }
 
 /// Writes the model card and the report.
-fn write(config: &MapConfig, report: &MapReport) -> anyhow::Result<()> {
+fn write(config: &MapConfig, report: &PlaceReport) -> anyhow::Result<()> {
     let title = format!("Scene head of {}", report.place);
     let about =
         "World coordinates of cells on the features of a frozen encoder, made by `agent map`.";

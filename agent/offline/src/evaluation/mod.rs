@@ -131,7 +131,7 @@ pub fn evaluate(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    evaluate_with(options, on_sweep, |frame| {
+    evaluate_with(options, on_sweep, |frame, _| {
         localizer.localize(LocalizerInput::of(&frame.points))
     })
 }
@@ -145,7 +145,7 @@ pub fn evaluate_source(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    evaluate_with(options, on_sweep, |frame| {
+    evaluate_with(options, on_sweep, |frame, _| {
         let measured = frame.gnss_world_from_lidar();
         let mut times = stopwatch();
         let estimate = estimate_pose(source, frame, measured.as_ref());
@@ -183,17 +183,10 @@ pub fn evaluate_nearest(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    evaluate_with(options, on_sweep, |frame| {
-        let truth = frame
-            .world_from_lidar
-            .map(|pose| pose.isometry().translation.vector);
+    evaluate_with(options, on_sweep, |_, truth| {
+        let truth = truth.isometry().translation.vector;
         let nearest = world_from_sensor.iter().min_by(|a, b| {
-            // A frame without a true pose is refused before this is asked: the 0 is never used.
-            let [a, b] = [a, b].map(|pose| {
-                truth.map_or(0.0, |truth| {
-                    (pose.translation.vector - truth).norm_squared()
-                })
-            });
+            let [a, b] = [a, b].map(|pose| (pose.translation.vector - truth).norm_squared());
             a.total_cmp(&b)
         });
         let estimate = nearest.map_or(NO_SOURCE, |&pose| PoseEstimate::new(pose.into(), 1.0));
@@ -204,7 +197,7 @@ pub fn evaluate_nearest(
 fn evaluate_with(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
-    mut localize: impl FnMut(&Frame) -> Result<Localization, LocalizerError>,
+    mut localize: impl FnMut(&Frame, &Pose) -> Result<Localization, LocalizerError>,
 ) -> Result<Evaluated, Error> {
     let datasets = options.scenes.iter().map(|dir| dataset::open(dir));
     let datasets = datasets.collect::<Result<Vec<_>, _>>()?;
@@ -249,7 +242,7 @@ fn evaluate_with(
         };
         evaluated.sweeps.push(EvaluatedSweep {
             scenario: scenario.name.clone(),
-            localization: localize(&frame)?,
+            localization: localize(&frame, &truth)?,
             cav: frame.cav,
             stem,
             truth,

@@ -8,6 +8,7 @@ use support::statistics::{mean, median, quantile, sorted};
 use super::{EvaluatedSweep, outcome};
 use figures::{Axis, Chart, Mark, Series};
 use localization::pgc::confidence::{BAD_M, observed};
+use localization::pgc::pose_solver::FoundPose;
 use localization::statistics::spearman;
 
 /// Number of groups of equally many sweeps in the calibration curve.
@@ -109,12 +110,11 @@ pub struct RejectionSummary {
     pub good_share: Option<f64>,
 }
 
-/// Sigma and error of an estimated pose.
+/// An estimated pose and its error.
 #[derive(Debug, Clone, Copy)]
 struct Judged {
-    sigma: f64,
+    found: FoundPose,
     error_m: f64,
-    is_rejected: bool,
 }
 
 impl LocalizationSummary {
@@ -130,12 +130,9 @@ impl LocalizationSummary {
             good.count() as f64 / sweeps.len().max(1) as f64
         });
         let judged = judged(sweeps);
-        let (sigmas, errors): (Vec<f64>, Vec<f64>) =
-            (judged.iter().map(|pose| (pose.sigma, pose.error_m))).unzip();
-        // Every found pose has an error, so these pair with `errors`.
-        let ratios: Vec<f64> = (sweeps.iter().filter_map(|sweep| sweep.localization.found))
-            .map(|found| found.evidence.inlier_ratio)
-            .collect();
+        let sigmas = each(&judged, |pose| pose.found.sigma);
+        let ratios = each(&judged, |pose| pose.found.evidence.inlier_ratio);
+        let errors = each(&judged, |pose| pose.error_m);
         let calibration = calibration(&judged);
         let mut outcomes = BTreeMap::new();
         for sweep in sweeps {
@@ -177,11 +174,9 @@ impl LocalizationSummary {
 
 fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
     let judged = sweeps.iter().filter_map(|sweep| {
-        let (found, error) = (sweep.localization.found?, sweep.error()?);
         Some(Judged {
-            sigma: found.sigma,
-            error_m: error.distance_m,
-            is_rejected: found.is_rejected,
+            found: sweep.localization.found?,
+            error_m: sweep.error()?.distance_m,
         })
     });
     judged.collect()
@@ -189,14 +184,14 @@ fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
 
 fn calibration(judged: &[Judged]) -> Vec<CalibrationBin> {
     let mut by_sigma = judged.to_vec();
-    by_sigma.sort_by(|a, b| a.sigma.total_cmp(&b.sigma));
+    by_sigma.sort_by(|a, b| a.found.sigma.total_cmp(&b.found.sigma));
     let all = by_sigma.len();
     (0..BINS)
         .map(|bin| &by_sigma[bin * all / BINS..(bin + 1) * all / BINS])
         .filter(|poses| !poses.is_empty())
         .map(|poses| CalibrationBin {
             poses: poses.len(),
-            sigma: mean(&each(poses, |pose| pose.sigma)).unwrap_or(0.0),
+            sigma: mean(&each(poses, |pose| pose.found.sigma)).unwrap_or(0.0),
             observed: mean(&each(poses, |pose| observed(pose.error_m))).unwrap_or(0.0),
             p50_m: median(&each(poses, |pose| pose.error_m)).unwrap_or(0.0),
             success_3m: mean(&each(poses, |pose| f64::from(pose.error_m < BAD_M))).unwrap_or(0.0),
@@ -212,11 +207,11 @@ fn rejected(judged: &[Judged]) -> RejectionSummary {
     let (good, bad): (Vec<&Judged>, Vec<&Judged>) =
         judged.iter().partition(|pose| pose.error_m <= BAD_M);
     let [bad_share, good_share] = [&bad, &good].map(|poses| {
-        let rejected = poses.iter().filter(|pose| pose.is_rejected).count();
+        let rejected = poses.iter().filter(|it| it.found.is_rejected).count();
         (!poses.is_empty()).then_some(rejected as f64 / poses.len() as f64)
     });
     RejectionSummary {
-        poses: judged.iter().filter(|pose| pose.is_rejected).count(),
+        poses: judged.iter().filter(|it| it.found.is_rejected).count(),
         bad: bad.len(),
         bad_share,
         good_share,
@@ -229,10 +224,9 @@ fn beyond_95(sweeps: &[EvaluatedSweep]) -> BTreeMap<&'static str, f64> {
     for (axis, is_beyond) in samples.flat_map(|sample| sample.beyond_95()) {
         by_axis.entry(axis).or_default().push(f64::from(is_beyond));
     }
-    let shares = by_axis.into_iter();
-    shares
-        .filter_map(|(axis, all)| Some((axis, mean(&all)?)))
-        .collect()
+    let by_axis = by_axis.into_iter();
+    let shares = by_axis.filter_map(|(axis, all)| Some((axis, mean(&all)?)));
+    shares.collect()
 }
 
 /// Error in the plane of a published pose with a covariance, and its bound of 95 %, metres.
@@ -282,9 +276,9 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let bins = calibration(&judged);
     let published = sweeps.iter().filter_map(EvaluatedSweep::published_error);
     let [kept, rejected] = [("published", false), ("rejected", true)].map(|(name, is_rejected)| {
-        let poses = judged.iter().filter(|pose| pose.is_rejected == is_rejected);
+        let poses = (judged.iter()).filter(|pose| pose.found.is_rejected == is_rejected);
         // The axis is logarithmic: errors beyond its ends are drawn there.
-        let points = poses.map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)));
+        let points = poses.map(|pose| (pose.found.sigma, pose.error_m.clamp(0.01, 1000.0)));
         series(name, points.collect(), Mark::Dots)
     });
     let (all, published) = (sweeps.len(), published.count());

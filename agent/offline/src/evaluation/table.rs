@@ -3,7 +3,7 @@
 use std::io;
 use std::path::Path;
 
-use protocol::{Pose, PoseEstimate};
+use protocol::Pose;
 use support::atomic_file;
 use support::csv_file::CsvText;
 
@@ -99,17 +99,14 @@ fn pose(pose: &Pose) -> [String; 4] {
 fn error_table(sweeps: &[EvaluatedSweep]) -> String {
     let mut text = CsvText::new("x_m,y_m,z_m,yaw_deg,confidence");
     for sweep in sweeps {
-        match &sweep.localization.estimate {
-            PoseEstimate::Pose {
-                world_from_cav,
-                confidence,
-                ..
-            } => {
+        let estimate = &sweep.localization.estimate;
+        match estimate.world_from_cav() {
+            Some(world_from_cav) => {
                 let error = sweep.truth.isometry().inv_mul(&world_from_cav.isometry());
                 let [x, y, z, yaw] = pose(&error.into());
-                text.row([x, y, z, yaw, format!("{confidence:.4}")]);
+                text.row([x, y, z, yaw, format!("{:.4}", estimate.confidence())]);
             }
-            PoseEstimate::NoPose { .. } => text.row(["no_pose"]),
+            None => text.row(["no_pose"]),
         }
     }
     text.finish()

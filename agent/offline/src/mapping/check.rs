@@ -4,13 +4,12 @@
 
 use std::time::Instant;
 
-use nalgebra::Isometry3;
 use protocol::{PointCloud, Pose};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::evaluation::EvaluatedSweep;
-use crate::training::{SweepList, yaw};
+use crate::training::{SweepList, thin_and_turn, yaw};
 use localization::pgc::confidence::{BAD_M, Labelled};
 use localization::pgc::{Localize, Localizer, LocalizerError, LocalizerInput};
 
@@ -89,14 +88,8 @@ pub(super) fn check(
 fn turned(cloud: &PointCloud, world_from_sensor: &Pose, rng: &mut impl Rng) -> (PointCloud, Pose) {
     let turned_from_sensor = yaw(rng.random_range(-TURN_RAD..TURN_RAD));
     let keep = rng.random_range(KEEP..1.0);
-    let turn: Isometry3<f32> = turned_from_sensor.cast();
     let mut xyzi = cloud.xyzi.clone();
-    xyzi.retain(|_| rng.random_bool(keep));
-    for point in &mut xyzi {
-        let [x, y, z, intensity] = *point;
-        let turned = turn * nalgebra::Point3::new(x, y, z);
-        *point = [turned.x, turned.y, turned.z, intensity];
-    }
+    thin_and_turn(&mut xyzi, &turned_from_sensor, keep, rng);
     let world_from_turned = world_from_sensor.isometry() * turned_from_sensor.inverse();
     (PointCloud { xyzi }, world_from_turned.into())
 }

@@ -13,13 +13,13 @@ use std::time::{Duration, Instant};
 use nalgebra::Vector3;
 
 pub use coverage::{Coverage, CoveredCell};
-pub use report::{HeldOutAccuracy, MapReport};
+pub use report::{HeldOutAccuracy, PlaceReport};
 
 use self::check::Check;
 use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
 use crate::evaluation::LocalizationSummary;
 use crate::training::{
-    CELLS, FeatureCache, SceneSummary, SceneSweeps, SceneTrainConfig, SweepAugmentation, SweepList,
+    CELLS, FeatureCache, SceneSummary, SceneTrainConfig, SweepAugmentation, SweepList,
     train_scene_on,
 };
 use crate::{Error, Result};
@@ -31,7 +31,7 @@ use localization::pgc::head_files::ENCODER_FILE;
 use localization::pgc::{CellEncoder, Localizer};
 use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};
-use perception::train::{Length, Progress, RunConfig};
+use perception::train::{Length, RunConfig, TrainingEvent};
 use perception::weights::annotate;
 use support::file_error::AtFile;
 use support::sampling::evenly_spread;
@@ -77,8 +77,8 @@ pub enum MapProgress {
 ///
 /// # Errors
 /// [`Error`]; a checkpoint may stay.
-pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Result<MapReport> {
-    let mut map = Map {
+pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Result<PlaceReport> {
+    let mut map = MapMaking {
         config,
         started: Instant::now(),
         observe,
@@ -104,7 +104,7 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
     data.without_pose += sweeps.without_pose;
     let accuracy = (!checked.sweeps.is_empty())
         .then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
-    Ok(MapReport {
+    Ok(PlaceReport {
         place: config.place.clone(),
         sha256: sha256
             .or(scaled)
@@ -125,7 +125,7 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
 }
 
 /// Sweeps with poses.
-struct Sweeps {
+struct MapSweeps {
     list: SweepList,
     /// Drive and position of each sweep of the list, metres; `None` without a pose.
     positions: Vec<(usize, Option<Vector3<f64>>)>,
@@ -134,7 +134,7 @@ struct Sweeps {
     without_pose: usize,
 }
 
-impl Sweeps {
+impl MapSweeps {
     /// Coverage of some sweeps.
     fn coverage(&self, indices: &[usize]) -> Option<Coverage> {
         let positions = indices.iter().map(|&index| self.positions[index]);
@@ -146,13 +146,13 @@ impl Sweeps {
     }
 }
 
-struct Map<'a> {
+struct MapMaking<'a> {
     config: &'a MapConfig,
     started: Instant,
     observe: &'a mut dyn FnMut(MapProgress),
 }
 
-impl Map<'_> {
+impl MapMaking<'_> {
     fn seconds(&self) -> f64 {
         self.started.elapsed().as_secs_f64()
     }
@@ -178,7 +178,7 @@ impl Map<'_> {
     }
 
     /// Reads the poses and holds sweeps out.
-    fn survey(&mut self) -> Result<Sweeps> {
+    fn survey(&mut self) -> Result<MapSweeps> {
         let list = SweepList::open(&self.config.drives)?;
         self.at(format!("reading the poses of {} sweeps", list.len()));
         let poses = list.poses().into_iter();
@@ -186,18 +186,13 @@ impl Map<'_> {
             .map(|(drive, pose)| (drive, pose.map(|pose| pose.translation.vector)))
             .collect();
         let (mut training, mut held) = (Vec::new(), Vec::new());
-        let last = positions.iter().map(|(drive, _)| *drive).max();
+        let known: Vec<(usize, usize, Vector3<f64>)> = (positions.iter().enumerate())
+            .filter_map(|(index, &(drive, position))| Some((index, drive, position?)))
+            .collect();
         // Drive by drive: the step from the end of one to the start of the next is no part of a path.
-        for drive in 0..last.map_or(0, |last| last + 1) {
-            let of_drive = positions
-                .iter()
-                .enumerate()
-                .filter(|(_, (of, _))| *of == drive);
-            let known: Vec<(usize, Vector3<f64>)> = of_drive
-                .filter_map(|(index, (_, position))| Some((index, (*position)?)))
-                .collect();
-            let path: Vec<Vector3<f64>> = known.iter().map(|(_, position)| *position).collect();
-            for ((index, _), is_held_out) in known.into_iter().zip(held_out::held_out(&path)) {
+        for drive in known.chunk_by(|(_, one, _), (_, next, _)| one == next) {
+            let path: Vec<Vector3<f64>> = drive.iter().map(|(.., position)| *position).collect();
+            for (&(index, ..), is_held_out) in drive.iter().zip(held_out::held_out(&path)) {
                 match is_held_out {
                     true => held.push(index),
                     false => training.push(index),
@@ -208,7 +203,7 @@ impl Map<'_> {
             return Err(self.no_poses(&list));
         }
         let without_pose = list.len() - training.len() - held.len();
-        Ok(Sweeps {
+        Ok(MapSweeps {
             list,
             positions,
             training,
@@ -218,7 +213,7 @@ impl Map<'_> {
     }
 
     /// Measures the time of a sweep, plans and announces; or takes the plan of the map that is resumed.
-    fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan> {
+    fn plan(&mut self, sweeps: &MapSweeps) -> Result<Plan> {
         let run = &self.config.run;
         let with_pose = sweeps.training.len() + sweeps.held_out.len();
         // A new measurement could give another plan, and with it another batch, which the checkpoint refuses.
@@ -241,7 +236,7 @@ impl Map<'_> {
         // The cache reports after every batch of 4 sweeps, so this number is met exactly.
         let first = 4.min(probes.len());
         let built = FeatureCache::build(&probes, &encoder, unchanged, run, &mut |progress| {
-            if matches!(progress, Progress::Encoding(done, _) if *done == first) {
+            if matches!(progress, TrainingEvent::Encoding(done, _) if *done == first) {
                 first_s = began.elapsed().as_secs_f64();
             }
         });
@@ -271,7 +266,7 @@ impl Map<'_> {
         Ok(plan)
     }
 
-    fn announce(&mut self, sweeps: &Sweeps, plan: &Plan, wanted: usize) {
+    fn announce(&mut self, sweeps: &MapSweeps, plan: &Plan, wanted: usize) {
         let (training, checked, copies) = (plan.training, plan.checked, plan.copies);
         let total_s = self.config.time.as_secs_f64();
         if training < wanted {
@@ -304,11 +299,9 @@ impl Map<'_> {
         // Above 0 however long the preparation took: a negative duration would panic.
         let left_s =
             (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
-        let run = RunConfig {
-            length: Length::Time(Duration::from_secs_f64(left_s)),
-            batch: (plan.training * plan.copies * CELLS / BATCHES).clamp(LEAST_BATCH, MOST_BATCH),
-            ..self.config.run.clone()
-        };
+        let mut run = self.config.run.clone();
+        run.length = Length::Time(Duration::from_secs_f64(left_s));
+        run.batch = (plan.training * plan.copies * CELLS / BATCHES).clamp(LEAST_BATCH, MOST_BATCH);
         let classes = (plan.training / 12).clamp(4, 150).min(plan.training.max(1)) as i64;
         let config = SceneTrainConfig {
             init: None,
@@ -331,26 +324,22 @@ impl Map<'_> {
             run: run.clone(),
             validate_every: CHECKPOINT_EVERY,
         };
-        let sweeps = SceneSweeps {
-            training: Arc::clone(training),
-            validation: None,
-        };
         let started = self.started;
         let observe = &mut *self.observe;
         let training_end_s = self.config.time.as_secs_f64() - plan.after_training_s();
         let mut steps_began_s = None;
-        let summary = train_scene_on(&config, &sweeps, &mut |progress| {
+        let summary = train_scene_on(&config, training, None, &mut |progress| {
             let mut seconds = started.elapsed().as_secs_f64();
             let text = match progress {
-                Progress::Encoding(done, total) => format!("encoding, {done} of {total} sweeps"),
-                Progress::Note(text) => text.clone(),
-                Progress::Stepped(report) => {
+                TrainingEvent::Encoding(done, all) => format!("encoding, {done} of {all} sweeps"),
+                TrainingEvent::Note(text) => text.clone(),
+                TrainingEvent::Stepped(report) => {
                     // A resumed training has a part behind it.
                     let began_s: f64 = *steps_began_s.get_or_insert(seconds);
                     seconds = began_s + report.share_done * (training_end_s - began_s).max(0.0);
                     format!("training, {}", report.text)
                 }
-                Progress::Read(_) | Progress::Validated(_) => return,
+                TrainingEvent::Read(_) | TrainingEvent::Validated(_) => return,
             };
             observe(MapProgress::At(seconds, text));
         })?;

@@ -15,7 +15,7 @@ const ENOUGH_REJECTED: f64 = 0.9;
 
 /// A head for a place, and its measured accuracy.
 #[derive(Debug, Clone, Serialize)]
-pub struct MapReport {
+pub struct PlaceReport {
     /// Name of the place.
     pub place: String,
     /// SHA-256 of the weights, confidence and scales included.
@@ -89,7 +89,7 @@ impl HeldOutAccuracy {
     }
 }
 
-impl MapReport {
+impl PlaceReport {
     /// The driven area, in one line.
     pub fn coverage_text(&self) -> String {
         let coverage = &self.coverage;

@@ -87,7 +87,9 @@ impl Contrast {
         let anchors = chosen(0..pairs.len())?;
         let partners = chosen(pairs.len()..2 * pairs.len())?;
         let matches = matches(pairs, device)?;
-        let logits = self.similarities(&anchors, &partners)? + neither(pairs, device)?;
+        let (queries, keys) = (self.embed(&anchors)?, self.embed(&partners)?);
+        let similarities = queries.f_matmul(&keys.f_tr()?)? / TEMPERATURE;
+        let logits = similarities + neither(pairs, device)?;
         let log_shares = logits.f_log_softmax(1, Kind::Float)?;
         let contrast =
             log_shares.f_nll_loss::<Tensor>(&matches, None, tch::Reduction::Mean, -100)?;
@@ -101,11 +103,6 @@ impl Contrast {
             top1: found.f_mean(Kind::Float)?.f_double_value(&[])?,
             offset_m: offset.f_double_value(&[])?,
         })
-    }
-
-    fn similarities(&self, anchors: &Tensor, partners: &Tensor) -> Result<Tensor, TchError> {
-        let (anchors, partners) = (self.embed(anchors)?, self.embed(partners)?);
-        Ok(anchors.f_matmul(&partners.f_tr()?)? / TEMPERATURE)
     }
 
     fn embed(&self, x: &Tensor) -> Result<Tensor, TchError> {

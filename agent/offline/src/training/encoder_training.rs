@@ -15,7 +15,7 @@ use super::sweep_store::SweepStore;
 use crate::Error;
 use localization::pgc::{SceneEncoder, SceneEncoderConfig};
 use perception::train::{
-    Curve, Means, Observe, Prefetch, Progress, RunConfig, SaveEvery, Task, Trained, Trainer,
+    Curve, Means, Observe, Prefetch, RunConfig, SaveEvery, Task, Trained, Trainer, TrainingEvent,
 };
 
 /// Number of pairs of a validation.
@@ -121,7 +121,7 @@ fn read(
     observe: &mut Observe<'_>,
 ) -> Result<(PairMaker, Arc<SweepStore>), Error> {
     let store = Arc::new(SweepStore::read(folders, config.range_m)?);
-    observe(&Progress::Read(store.data.clone()));
+    observe(&TrainingEvent::Read(store.data.clone()));
     let maker = PairMaker::new(Arc::clone(&store), config.clone(), seed)?;
     Ok((maker, store))
 }
@@ -203,7 +203,7 @@ impl Task for Training<'_> {
         let [_, top1, offset_m] = means.get();
         self.accuracy = Some(EncoderAccuracy { top1, offset_m });
         let (step, top1) = (trainer.steps(), 100.0 * top1);
-        (self.observe)(&Progress::Validated(format!(
+        (self.observe)(&TrainingEvent::Validated(format!(
             "step {step}: validation top-1 {top1:.1} % offset {offset_m:.2} m"
         )));
         Ok(())

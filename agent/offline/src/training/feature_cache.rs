@@ -11,9 +11,9 @@ use tch::{Kind, TchError, Tensor, no_grad};
 use super::sweep_store::{SweepList, mean_position_m, yaw};
 use super::turned_sweep::{CELLS, TurnedSweep};
 use crate::Error;
-use localization::pgc::{Cell, CellEncoder, PreparedSweep};
+use localization::pgc::{CellEncoder, PreparedSweep, SweepCell};
 use perception::tensor_values::tensor;
-use perception::train::{Observe, Prefetch, Progress, RunConfig};
+use perception::train::{Observe, Prefetch, RunConfig, TrainingEvent};
 
 /// Number of sweeps of one forward pass.
 const BATCH: u64 = 4;
@@ -102,7 +102,7 @@ impl FeatureCache {
         });
         let size = [(total * CELLS) as i64, encoder.format().cell_channels()];
         let cells = Tensor::f_empty(size, (Kind::Half, device))?;
-        let mut builder = Builder::default();
+        let mut builder = CacheBuilder::default();
         let mut done = 0;
         while done < total {
             let batch = loader.next_batch()?;
@@ -110,7 +110,7 @@ impl FeatureCache {
                 builder.add(&cells, &batch, encoder, run.precision.kind())?;
             }
             done = (done + BATCH as usize).min(total);
-            observe(&Progress::Encoding(done, total));
+            observe(&TrainingEvent::Encoding(done, total));
         }
         builder.finish(cells)
     }
@@ -152,15 +152,15 @@ impl FeatureCache {
 }
 
 #[derive(Default)]
-struct Builder {
+struct CacheBuilder {
     sweeps: Vec<Tensor>,
     sweep_of_cell: Vec<i64>,
-    places: Vec<Cell>,
+    places: Vec<SweepCell>,
     points: Vec<usize>,
     poses: Vec<Isometry3<f64>>,
 }
 
-impl Builder {
+impl CacheBuilder {
     /// Adds sweeps; the features of their cells are written to the next rows of `cells`, one block from the start:
     /// thousands of pieces would stay in the allocator's lists for the whole training.
     fn add(
@@ -200,8 +200,7 @@ impl Builder {
         let origin_m = mean_position_m(&self.poses);
         let mut targets = Vec::with_capacity(3 * self.places.len());
         for (cell, &sweep) in self.places.iter().zip(&self.sweep_of_cell) {
-            let [x, y, z] = cell.centroid_m.map(f64::from);
-            let place = self.poses[sweep as usize] * Point3::new(x, y, z);
+            let place = self.poses[sweep as usize] * Point3::from(cell.centroid_m.map(f64::from));
             // Subtracted in f64: world coordinates are too large for f32.
             targets.extend((0..3).map(|axis| (place[axis] - origin_m[axis]) as f32));
         }

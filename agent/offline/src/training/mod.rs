@@ -24,9 +24,9 @@ pub use pose_regression::{
 };
 pub(crate) use redundancy::Redundancy;
 pub use redundancy::{LeaveOut, RedundancyConfig};
+pub(crate) use scene_training::train_scene_on;
 pub use scene_training::{SceneSummary, SceneTrainConfig, train_scene};
-pub(crate) use scene_training::{SceneSweeps, train_scene_on};
 pub use scene_validation::SceneAccuracy;
 pub use sgloc_training::{SgLocTrainConfig, train_sgloc};
 pub(crate) use sweep_store::{SweepList, yaw};
-pub(crate) use turned_sweep::CELLS;
+pub(crate) use turned_sweep::{CELLS, thin_and_turn};

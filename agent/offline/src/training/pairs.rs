@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::sweep_store::{StoredSweep, SweepStore, heading_rad, yaw};
 use crate::Error;
-use localization::pgc::{Cell, SceneEncoderConfig, SweepVoxels};
+use localization::pgc::{SceneEncoderConfig, SweepCell, SweepVoxels};
 
 /// Largest distance of the sensors of a pair in the plane, metres.
 const PAIR_RANGE_M: f64 = 12.0;
@@ -144,7 +144,7 @@ impl PairMaker {
         let (sweep, world_from_partner) = turned_partner;
         let anchor_places = places(anchor_sweep.cells(), &world_from_anchor);
         let partner_places = places(sweep.cells(), &world_from_partner);
-        let grid = Grid::new(&partner_places);
+        let grid = CubeIndex::new(&partner_places);
         let candidates = choose(anchor_sweep.cells(), CELLS, rng);
         let matched = candidates
             .into_iter()
@@ -200,7 +200,7 @@ fn lean(rng: &mut impl Rng) -> Isometry3<f64> {
 }
 
 /// Up to `count` cells at random, flat ground no more than its share.
-pub(super) fn choose(cells: &[Cell], count: usize, rng: &mut impl Rng) -> Vec<usize> {
+pub(super) fn choose(cells: &[SweepCell], count: usize, rng: &mut impl Rng) -> Vec<usize> {
     let (mut flat, mut high): (Vec<usize>, Vec<usize>) =
         (0..cells.len()).partition(|&cell| cells[cell].is_flat());
     high.shuffle(rng);
@@ -211,22 +211,21 @@ pub(super) fn choose(cells: &[Cell], count: usize, rng: &mut impl Rng) -> Vec<us
     high
 }
 
-fn places(cells: &[Cell], world_from_sensor: &Isometry3<f64>) -> Vec<[f32; 3]> {
+fn places(cells: &[SweepCell], world_from_sensor: &Isometry3<f64>) -> Vec<[f32; 3]> {
     let places = cells.iter().map(|cell| {
-        let [x, y, z] = cell.centroid_m.map(f64::from);
-        let point = world_from_sensor * Point3::new(x, y, z);
+        let point = world_from_sensor * Point3::from(cell.centroid_m.map(f64::from));
         [point.x as f32, point.y as f32, point.z as f32]
     });
     places.collect()
 }
 
 /// Index of positions by cubes of [`MATCH_M`].
-struct Grid<'a> {
+struct CubeIndex<'a> {
     places_m: &'a [[f32; 3]],
     cubes: HashMap<[i32; 3], Vec<u32>>,
 }
 
-impl<'a> Grid<'a> {
+impl<'a> CubeIndex<'a> {
     fn new(places_m: &'a [[f32; 3]]) -> Self {
         let mut cubes: HashMap<[i32; 3], Vec<u32>> = HashMap::new();
         for (index, &place) in (0..).zip(places_m) {

@@ -11,7 +11,9 @@ use super::{CELLS, FeatureCache, SweepAugmentation, SweepList};
 use crate::Error;
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{CellEncoder, LocalizerError, SceneEncoder, SceneEncoderConfig};
-use perception::train::{Means, Observe, Progress, RunConfig, SaveEvery, Task, Trained, Trainer};
+use perception::train::{
+    Means, Observe, RunConfig, SaveEvery, Task, Trained, Trainer, TrainingEvent,
+};
 use perception::weights::Weights;
 
 /// Steps between two checkpoints.
@@ -45,7 +47,7 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
     let cache = FeatureCache::build(&list, &encoder, SweepAugmentation::NONE, run, observe)?;
-    observe(&Progress::Read(list.data()));
+    observe(&TrainingEvent::Read(list.data()));
     let network_config = SgLocConfig {
         scene_name: config.scene_name.clone(),
         origin_m: cache.origin_m,
@@ -57,7 +59,7 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     network.set_statistics(&cache.cells.f_index_select(0, &sample)?)?;
     adopt_encoder(&variables, &config.encoder, &network_config.encoder)?;
     let mut trainer = Trainer::begin(run, &variables, None, started)?;
-    let mut training = Training {
+    let mut training = SgLocTraining {
         run,
         observe,
         sweeps: list.len(),
@@ -71,7 +73,7 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     Ok(trainer.save_network(variables, kind, &network_config, list.data())?)
 }
 
-struct Training<'a> {
+struct SgLocTraining<'a> {
     run: &'a RunConfig,
     observe: &'a mut Observe<'a>,
     sweeps: usize,
@@ -81,7 +83,7 @@ struct Training<'a> {
     means: Means<1>,
 }
 
-impl Task for Training<'_> {
+impl Task for SgLocTraining<'_> {
     type Error = Error;
     const REPORT_EVERY: u64 = 10;
 

@@ -44,10 +44,8 @@ impl StoredSweep {
     ) -> SweepVoxels {
         let turn: Isometry3<f32> = turned_from_sensor.cast();
         // 32 decisions from one draw of the generator would be faster still; this does not dominate the time.
-        let kept = self
-            .points
-            .iter()
-            .filter(|_| keep >= 1.0 || rng.random_bool(keep));
+        let points = self.points.iter();
+        let kept = points.filter(|_| keep >= 1.0 || rng.random_bool(keep));
         let turned = kept.map(|point| {
             let metres = point.map(|axis| f32::from(axis) * UNIT_M);
             (turn * nalgebra::Point3::from(metres)).into()
@@ -83,7 +81,7 @@ pub(super) fn mean_position_m(world_from_sensor: &[Isometry3<f64>]) -> [f64; 3] 
 /// Paths of sweeps with true poses on disk. Each folder is one world: poses in different folders are unrelated.
 #[derive(Debug, Default)]
 pub(crate) struct SweepList {
-    places: Vec<Place>,
+    places: Vec<SweepPlace>,
     sha256: String,
     problems: Vec<String>,
     /// Indices of the sweeps without a pose among those read so far.
@@ -93,7 +91,7 @@ pub(crate) struct SweepList {
 }
 
 #[derive(Debug, Clone)]
-struct Place {
+struct SweepPlace {
     scenario: Arc<Scenario>,
     agent: usize,
     tick: usize,
@@ -114,7 +112,7 @@ impl SweepList {
             findings::note(&findings::sampled(&dataset.scenarios, IntensityScale::AUTO));
             problems.extend(dataset.problems.iter().map(ToString::to_string));
             for scenario in dataset.scenarios.into_iter().map(Arc::new) {
-                places.extend(present_sweeps(&scenario).map(|(agent, tick)| Place {
+                places.extend(present_sweeps(&scenario).map(|(agent, tick)| SweepPlace {
                     scenario: Arc::clone(&scenario),
                     agent,
                     tick,
@@ -184,7 +182,7 @@ impl SweepList {
     }
 
     /// The frame of a sweep; one that cannot be read is noted.
-    fn load(&self, index: usize, place: &Place, options: &LoadOptions) -> Option<Frame> {
+    fn load(&self, index: usize, place: &SweepPlace, options: &LoadOptions) -> Option<Frame> {
         let loaded = place.scenario.load(place.agent, place.tick, options);
         let noted = loaded.inspect_err(|error| {
             lock(&self.unreadable).insert(index, error.to_string());

@@ -32,14 +32,7 @@ impl TurnedSweep {
         format: &SweepFormat,
     ) -> Self {
         let in_range = points.len();
-        points.retain(|_| keep >= 1.0 || rng.random_bool(keep));
-        let turn: Isometry3<f32> = turned_from_sensor.cast();
-        if turn != Isometry3::identity() {
-            points.iter_mut().for_each(|[x, y, z, _]| {
-                let turned = turn * Point3::new(*x, *y, *z);
-                (*x, *y, *z) = (turned.x, turned.y, turned.z);
-            });
-        }
+        thin_and_turn(&mut points, turned_from_sensor, keep, rng);
         let prepared = format.prepare(&points);
         Self {
             rows: choose(prepared.cells(), CELLS, rng),
@@ -47,5 +40,22 @@ impl TurnedSweep {
             points: in_range,
             world_from_sensor: world_from_sensor * turned_from_sensor.inverse(),
         }
+    }
+}
+
+/// Keeps each point with a probability, and rotates the others into the frame of the turned sensor.
+pub(crate) fn thin_and_turn(
+    points: &mut Vec<[f32; 4]>,
+    turned_from_sensor: &Isometry3<f64>,
+    keep: f64,
+    rng: &mut impl Rng,
+) {
+    points.retain(|_| keep >= 1.0 || rng.random_bool(keep));
+    let turn: Isometry3<f32> = turned_from_sensor.cast();
+    if turn != Isometry3::identity() {
+        points.iter_mut().for_each(|[x, y, z, _]| {
+            let turned = turn * Point3::new(*x, *y, *z);
+            (*x, *y, *z) = (turned.x, turned.y, turned.z);
+        });
     }
 }

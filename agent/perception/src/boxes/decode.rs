@@ -61,7 +61,7 @@ pub fn decode(
     let cells = anchors.len() / per_cell.max(1);
     // The sigmoid is increasing: a logit clearly below the threshold's needs no exponential.
     // The margin covers the rounding of this logit.
-    let lowest = logit(threshold) - 1e-3;
+    let lowest = (threshold / (1.0 - threshold)).ln() - 1e-3;
     let mut decoded = Vec::new();
     for cell in 0..cells {
         for anchor in 0..per_cell {
@@ -107,10 +107,6 @@ pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
 /// `1 / (1 + e^-x)`.
 pub fn sigmoid(logit: f32) -> f32 {
     (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
-}
-
-fn logit(probability: f32) -> f32 {
-    (probability / (1.0 - probability)).ln()
 }
 
 #[cfg(test)]

@@ -99,9 +99,17 @@ pub fn detections(boxes: &[Decoded], config: &PostprocessConfig) -> Vec<Detectio
 ///
 /// Returns the detections by descending score.
 pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec<Candidate> {
-    let candidates = agents.iter().enumerate();
-    let candidates = candidates.flat_map(|(agent, boxes)| project(agent, boxes));
-    let mut candidates: Vec<Candidate> = candidates.collect();
+    let mut candidates = Vec::new();
+    for (agent, boxes) in agents.iter().enumerate() {
+        for decoded in boxes.boxes {
+            candidates.push(Candidate {
+                corners: (decoded.box3d.corners())
+                    .map(|corner| (boxes.output_from_agent * Point3::from(corner)).into()),
+                score: decoded.score,
+                agent,
+            });
+        }
+    }
     // Before the suppression: an implausible box must not remove a good one.
     candidates.retain(|candidate| is_vehicle_sized(&candidate.corners, config));
     let mut kept = suppress(&candidates, config);
@@ -110,23 +118,15 @@ pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec
     kept
 }
 
-/// The candidates of one agent in the output frame.
-fn project<'a>(
-    agent: usize,
-    boxes: &'a AgentBoxes<'_>,
-) -> impl Iterator<Item = Candidate> + use<'a> {
-    boxes.boxes.iter().map(move |decoded| Candidate {
-        corners: (decoded.box3d.corners())
-            .map(|corner| (boxes.output_from_agent * Point3::from(corner)).into()),
-        score: decoded.score,
-        agent,
-    })
-}
-
 /// True if the size and height are plausible for a vehicle: no side over the limit, not flat, all corners between the
 /// heights.
 pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> bool {
-    let [x, y, z] = bounds(corners);
+    // Lowest and highest x, y, z.
+    let [x, y, z]: [[f64; 2]; 3] = std::array::from_fn(|axis| {
+        let values = corners.iter().map(|corner| corner[axis]);
+        let low = values.clone().fold(f64::INFINITY, f64::min);
+        [low, values.fold(f64::NEG_INFINITY, f64::max)]
+    });
     let [x_m, y_m, z_m] = [x, y, z].map(|[low, high]| high - low);
     let sized = x_m <= config.max_extent_m && y_m <= config.max_extent_m && z_m > 0.0;
     sized && z[0] >= config.z_range_m[0] && z[1] <= config.z_range_m[1]
@@ -175,15 +175,6 @@ impl Candidate {
             source,
         }
     }
-}
-
-/// Lowest and highest x, y, z.
-fn bounds(corners: &[[f64; 3]; 8]) -> [[f64; 2]; 3] {
-    std::array::from_fn(|axis| {
-        let values = corners.iter().map(|corner| corner[axis]);
-        let low = values.clone().fold(f64::INFINITY, f64::min);
-        [low, values.fold(f64::NEG_INFINITY, f64::max)]
-    })
 }
 
 #[cfg(test)]

@@ -86,12 +86,9 @@ impl BoxRefinement {
             YAxis::Right => detection.box3d.mirrored_y(),
         });
         let boxes: Vec<Box3d> = boxes.collect();
-        let all: Vec<f32> = boxes
-            .iter()
-            .zip(detections)
-            .flat_map(|(box3d, detection)| self.values(box3d, detection.score))
-            .collect();
-        let all = tensor(&all, &[-1, VALUES as i64], map.device())?;
+        let scored = boxes.iter().zip(detections);
+        let all = scored.flat_map(|(box3d, detection)| self.values(box3d, detection.score));
+        let all = tensor(&all.collect::<Vec<_>>(), &[-1, VALUES as i64], map.device())?;
         let hidden = self.roi.forward(map, &boxes, &all)?;
         let corrections = self.out.forward(&hidden);
         match self.y_axis {

@@ -68,14 +68,12 @@ impl RoiEncoder {
 /// `[N * POSITIONS, C]`: the map at the sampling positions of each box, bilinear between cells; zeros beyond its edges.
 fn read(map: &Tensor, boxes: &[Box3d], grid: &BevGrid) -> Result<Tensor> {
     let [width_m, height_m] = [grid.width, grid.height].map(|cells| grid.cell_m * f64::from(cells));
-    let positions = boxes
-        .iter()
-        .flat_map(sampling_positions)
-        .flat_map(|[x_m, y_m]| {
-            let x = normalised(x_m - grid.x_min_m, width_m);
-            // x comes first, although the map is `[1, C, H, W]`.
-            [x, normalised(y_m - grid.y_min_m, height_m)]
-        });
+    let positions = boxes.iter().flat_map(sampling_positions);
+    let positions = positions.flat_map(|[x_m, y_m]| {
+        let x = normalised(x_m - grid.x_min_m, width_m);
+        // x comes first, although the map is `[1, C, H, W]`.
+        [x, normalised(y_m - grid.y_min_m, height_m)]
+    });
     let positions: Vec<f32> = positions.collect();
     let positions = tensor(&positions, &[1, -1, 1, 2], map.device())?;
     // Bilinear between the cells, zeros beyond them.

@@ -17,7 +17,7 @@ use tch::{Device, Kind, Tensor};
 pub use backbone_level::BackboneLevel;
 pub use error::DetectorError;
 pub(crate) use error::Result;
-pub use output::{Encoded, Heads, check_values};
+pub use output::{EncoderOutput, Heads, check_values};
 
 use encoder::BevEncoder;
 use output::{check_boxes, flat};
@@ -109,10 +109,8 @@ impl Detector {
     /// # Errors
     /// [`QuantiseError`] names the activation whose scale is missing.
     pub fn quantised(self, scales: &ActivationScales) -> Result<Self, QuantiseError> {
-        Ok(Self {
-            encoder: self.encoder.quantised(scales)?,
-            ..self
-        })
+        let encoder = self.encoder.quantised(scales)?;
+        Ok(Self { encoder, ..self })
     }
 
     /// Uses a network, trained or not, on its device; its norms are folded into the convolutions.
@@ -202,7 +200,7 @@ impl Detector {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded> {
+    pub fn encode(&mut self, cloud: &PointCloud) -> Result<EncoderOutput> {
         self.encode_within(self.crop, cloud)
     }
 
@@ -213,7 +211,7 @@ impl Detector {
     ///
     /// # Errors
     /// As [`Self::encode_sweep`].
-    pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded> {
+    pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<EncoderOutput> {
         let encoded = self.encode_within(self.crop.range_only(), cloud)?;
         self.checked_sweep(encoded, cloud)
     }
@@ -222,18 +220,16 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::NoPoints`], [`DetectorError::Values`], [`DetectorError::Saturated`]; those of the tensor library.
-    pub fn encode_sweep(&mut self, cloud: &PointCloud) -> Result<Encoded> {
+    pub fn encode_sweep(&mut self, cloud: &PointCloud) -> Result<EncoderOutput> {
         let encoded = self.encode(cloud)?;
         self.checked_sweep(encoded, cloud)
     }
 
-    fn checked_sweep(&self, encoded: Encoded, cloud: &PointCloud) -> Result<Encoded> {
+    fn checked_sweep(&self, encoded: EncoderOutput, cloud: &PointCloud) -> Result<EncoderOutput> {
         // The map of an empty sweep is valid and would pass for an empty road.
         if encoded.points == 0 {
-            return Err(DetectorError::NoPoints {
-                points: cloud.len(),
-                area_m: self.config.lidar_range_m,
-            });
+            let (points, area_m) = (cloud.len(), self.config.lidar_range_m);
+            return Err(DetectorError::NoPoints { points, area_m });
         }
         check_values("the feature map of the sweep", &encoded.features)?;
         // A scale that is far too small leaves the map finite, and wrong.
@@ -273,7 +269,7 @@ impl Detector {
         self.voxeliser.voxelise(&self.cropped)
     }
 
-    fn encode_within(&mut self, crop: Crop, cloud: &PointCloud) -> Result<Encoded> {
+    fn encode_within(&mut self, crop: Crop, cloud: &PointCloud) -> Result<EncoderOutput> {
         let mut times = StageTimes::start();
         let pillars = self.pillars(crop, cloud);
         times.lap("voxelise");
@@ -284,7 +280,7 @@ impl Detector {
             Ok::<_, DetectorError>((self.encoder.features(&levels)?, levels))
         })?;
         times.lap("backbone");
-        Ok(Encoded {
+        Ok(EncoderOutput {
             features,
             levels,
             points: self.cropped.len(),

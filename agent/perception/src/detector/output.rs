@@ -10,7 +10,7 @@ use crate::layers::head::HeadOutput;
 
 /// Output of the encoder for one sweep.
 #[derive(Debug)]
-pub struct Encoded {
+pub struct EncoderOutput {
     /// `[1, C, H, W]` `f32`, contiguous, before the compressor if there is one:
     /// [`Detector::compressed`](super::Detector::compressed) gives the transmitted feature map.
     pub features: Tensor,
@@ -89,11 +89,8 @@ pub(super) fn check_boxes(boxes: &[Decoded]) -> Result<(), DetectorError> {
         box3d.check().map_err(DetectorError::Box)?;
         let mut centre_m = box3d.center_m.into_iter();
         if let Some(value) = centre_m.find(|along_m| along_m.abs() > MAX_CENTRE_M) {
-            return Err(DetectorError::Values {
-                what: "a detected box (centre, metres)",
-                value,
-                limit: MAX_CENTRE_M,
-            });
+            let (what, limit) = ("a detected box (centre, metres)", MAX_CENTRE_M);
+            return Err(DetectorError::Values { what, value, limit });
         }
     }
     Ok(())

@@ -2,7 +2,7 @@
 
 use tch::{IValue, TchError, Tensor};
 
-use super::layer::{Layer, LayerFormat};
+use super::layer::{Int8Layer, LayerFormat};
 
 /// Map size `[H, W]` that the library orders the weights for.
 const USUAL_MAP: [i64; 2] = [96, 128];
@@ -22,7 +22,7 @@ pub struct ConvGeometry {
 /// Convolution of `u8` maps, channels innermost in memory, to `u8` or `f32`.
 #[derive(Debug)]
 pub struct Int8Convolution {
-    layer: Layer,
+    layer: Int8Layer,
     geometry: ConvGeometry,
 }
 
@@ -38,7 +38,7 @@ impl Int8Convolution {
         format: LayerFormat,
     ) -> Result<Self, TchError> {
         let inputs = weight.size4()?.1;
-        let layer = Layer::new(weight, bias, format, |operators, quantised| {
+        let layer = Int8Layer::new(weight, bias, format, |operators, quantised| {
             let [height, width] = USUAL_MAP;
             let arguments = [
                 IValue::Tensor(quantised.steps.shallow_clone()),

@@ -44,14 +44,14 @@ impl LayerFormat {
 
 /// Weight, bias and format of a layer.
 #[derive(Debug)]
-pub(super) struct Layer {
+pub(super) struct Int8Layer {
     packed: Tensor,
     quantised: QuantisedWeight,
     bias: Option<Tensor>,
     format: LayerFormat,
 }
 
-impl Layer {
+impl Int8Layer {
     /// Quantises a weight `[C_out, ...]` with bias `[C_out]`; `pack` brings the quantised one into the order of the
     /// operator.
     pub(super) fn new(

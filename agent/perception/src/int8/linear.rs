@@ -2,14 +2,14 @@
 
 use tch::{IValue, Result, Tensor};
 
-use super::layer::{Layer, LayerFormat};
+use super::layer::{Int8Layer, LayerFormat};
 
 /// Number of rows that the library orders the weights for.
 const USUAL_ROWS: i64 = 1024;
 
 /// Linear layer of `u8` rows, to `u8` or `f32`.
 #[derive(Debug)]
-pub struct Int8Linear(Layer);
+pub struct Int8Linear(Int8Layer);
 
 impl Int8Linear {
     /// Quantises a layer `[C_out, C_in]` with bias `[C_out]`.
@@ -18,7 +18,7 @@ impl Int8Linear {
     /// Those of the tensor library.
     pub fn new(weight: &Tensor, bias: Option<&Tensor>, format: LayerFormat) -> Result<Self> {
         let inputs = weight.size2()?.1;
-        let layer = Layer::new(weight, bias, format, |operators, quantised| {
+        let layer = Int8Layer::new(weight, bias, format, |operators, quantised| {
             let shape = IValue::IntList(vec![USUAL_ROWS, inputs]);
             let arguments = [IValue::Tensor(quantised.steps.shallow_clone()), shape];
             operators.call("pack_linear", &arguments)

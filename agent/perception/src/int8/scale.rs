@@ -57,10 +57,8 @@ fn is_zero(value: &u8) -> bool {
 impl Quantisation {
     /// Quantisation of values that are never negative.
     pub const fn unsigned(scale: Scale) -> Self {
-        Self {
-            scale,
-            zero_point: 0,
-        }
+        let zero_point = 0;
+        Self { scale, zero_point }
     }
 
     /// Nearest quantised values, `u8`, in the memory order of `x`; values out of range become the nearest in range.
@@ -73,9 +71,8 @@ impl Quantisation {
         if self.zero_point != 0 {
             steps = steps.f_add_scalar_(i64::from(self.zero_point))?;
         }
-        steps
-            .f_clamp_(0, i64::from(u8::MAX))?
-            .f_to_kind(Kind::Uint8)
+        let steps = steps.f_clamp_(0, i64::from(u8::MAX))?;
+        steps.f_to_kind(Kind::Uint8)
     }
 
     /// Quantises plain values as [`Self::quantise`] does, one into each place of `steps`.

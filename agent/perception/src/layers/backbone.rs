@@ -9,13 +9,13 @@ use crate::model_config::{BlockKind, DetectorConfig};
 /// Blocks of 3x3 convolutions and their up-sampling branches.
 #[derive(Debug)]
 pub struct BevBackbone {
-    blocks: Vec<Block>,
+    blocks: Vec<BackboneBlock>,
     deblocks: Vec<ConvLayer>,
 }
 
 /// Layers of one level.
 #[derive(Debug)]
-enum Block {
+enum BackboneBlock {
     Plain(Vec<ConvLayer>),
     Residual(Vec<ResidualBlock>),
 }
@@ -25,30 +25,26 @@ impl BevBackbone {
     /// `deblocks.<level>.<0|1>.*` under `path`.
     pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Self {
         let mut input = config.pillar_channels;
-        let mut backbone = Self {
-            blocks: Vec::new(),
-            deblocks: Vec::new(),
-        };
+        let (mut blocks, mut deblocks) = (Vec::new(), Vec::new());
         for (level, &filters) in config.num_filters.iter().enumerate() {
             let (layers, stride) = (config.layer_nums[level], config.layer_strides[level]);
             let io = [input, filters];
-            backbone.blocks.push(match config.blocks {
+            blocks.push(match config.blocks {
                 BlockKind::Plain => {
-                    Block::Plain(block(&(path / "blocks" / level), io, layers, stride))
+                    BackboneBlock::Plain(block(&(path / "blocks" / level), io, layers, stride))
                 }
                 BlockKind::Residual => {
                     let path = path / "resnet" / format!("layer{level}");
-                    Block::Residual(ResidualBlock::chain(&path, io, layers, stride))
+                    BackboneBlock::Residual(ResidualBlock::chain(&path, io, layers, stride))
                 }
             });
             let deblock = path / "deblocks" / level;
             let io = [filters, config.num_upsample_filters[level]];
             let (conv, norm, up) = (&deblock / 0, &deblock / 1, config.upsample_strides[level]);
-            let layer = ConvLayer::upsampling(&conv, &norm, io, up);
-            backbone.deblocks.push(layer);
+            deblocks.push(ConvLayer::upsampling(&conv, &norm, io, up));
             input = filters;
         }
-        backbone
+        Self { blocks, deblocks }
     }
 
     /// `[N, C, H, W]` to the concatenated levels `[N, sum of C_up, H', W']`.
@@ -77,8 +73,10 @@ impl BevBackbone {
     /// When there is no such level.
     pub fn level(&self, level: usize, x: &Tensor, train: bool) -> Tensor {
         match &self.blocks[level] {
-            Block::Plain(layers) => ConvLayer::through(layers, x, train),
-            Block::Residual(blocks) => ResidualBlock::through(blocks, x.shallow_clone(), train),
+            BackboneBlock::Plain(layers) => ConvLayer::through(layers, x, train),
+            BackboneBlock::Residual(blocks) => {
+                ResidualBlock::through(blocks, x.shallow_clone(), train)
+            }
         }
     }
 
@@ -96,8 +94,8 @@ impl BevBackbone {
     /// Layers of every level and up-sampling layers; `None` with residual blocks.
     pub(crate) fn plain_layers(&self) -> Option<(Vec<&[ConvLayer]>, &[ConvLayer])> {
         let levels = self.blocks.iter().map(|block| match block {
-            Block::Plain(layers) => Some(layers.as_slice()),
-            Block::Residual(_) => None,
+            BackboneBlock::Plain(layers) => Some(layers.as_slice()),
+            BackboneBlock::Residual(_) => None,
         });
         Some((levels.collect::<Option<Vec<_>>>()?, &self.deblocks))
     }
@@ -105,15 +103,16 @@ impl BevBackbone {
     /// The same backbone for inference, norms folded into the convolutions.
     pub fn folded(&self) -> Self {
         let blocks = self.blocks.iter().map(|block| match block {
-            Block::Plain(layers) => Block::Plain(layers.iter().map(ConvLayer::folded).collect()),
-            Block::Residual(blocks) => {
-                Block::Residual(blocks.iter().map(ResidualBlock::folded).collect())
+            BackboneBlock::Plain(layers) => {
+                BackboneBlock::Plain(layers.iter().map(ConvLayer::folded).collect())
+            }
+            BackboneBlock::Residual(blocks) => {
+                BackboneBlock::Residual(blocks.iter().map(ResidualBlock::folded).collect())
             }
         });
-        Self {
-            blocks: blocks.collect(),
-            deblocks: self.deblocks.iter().map(ConvLayer::folded).collect(),
-        }
+        let blocks = blocks.collect();
+        let deblocks = self.deblocks.iter().map(ConvLayer::folded).collect();
+        Self { blocks, deblocks }
     }
 }
 

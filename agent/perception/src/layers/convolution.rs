@@ -80,7 +80,7 @@ impl Norm {
 
 /// Direction of a convolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Direction {
+enum ConvDirection {
     /// `[out, in, k, k]` weights.
     Down,
     /// Transposed: `[in, out, k, k]` weights.
@@ -94,7 +94,7 @@ pub struct ConvLayer {
     bias: Option<Tensor>,
     stride: i64,
     padding: i64,
-    direction: Direction,
+    direction: ConvDirection,
     norm: Option<Norm>,
     relu: bool,
 }
@@ -108,9 +108,8 @@ impl ConvLayer {
         kernel: i64,
         stride: i64,
     ) -> Self {
-        Self::unbiased(conv, io, kernel, stride)
-            .with_norm(norm, io[1])
-            .with_relu()
+        let conv = Self::unbiased(conv, io, kernel, stride);
+        conv.with_norm(Norm::new(norm, io[1])).with_relu()
     }
 
     /// `kernel x kernel` convolution with bias and nothing after it.
@@ -134,16 +133,15 @@ impl ConvLayer {
     /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
     pub fn upsampling(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], stride: i64) -> Self {
         let shape = [io[0], io[1], stride, stride];
-        let layer = Self {
+        Self {
             weight: conv.var("weight", &shape, nn::init::DEFAULT_KAIMING_UNIFORM),
             bias: None,
             stride,
             padding: 0,
-            direction: Direction::Up,
-            norm: None,
-            relu: false,
-        };
-        layer.with_norm(norm, io[1]).with_relu()
+            direction: ConvDirection::Up,
+            norm: Some(Norm::new(norm, io[1])),
+            relu: true,
+        }
     }
 
     fn down(path: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64, bias: bool) -> Self {
@@ -157,19 +155,14 @@ impl ConvLayer {
             bias: conv.bs,
             stride,
             padding: kernel / 2,
-            direction: Direction::Down,
+            direction: ConvDirection::Down,
             norm: None,
             relu: false,
         }
     }
 
     /// The same with a batch norm after the convolution.
-    pub(crate) fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
-        self.normed_by(Norm::new(norm, channels))
-    }
-
-    /// The same with this batch norm after the convolution.
-    pub(crate) fn normed_by(self, norm: Norm) -> Self {
+    pub(crate) fn with_norm(self, norm: Norm) -> Self {
         let norm = Some(norm);
         Self { norm, ..self }
     }
@@ -189,8 +182,10 @@ impl ConvLayer {
         let weight = self.weight.to_kind(x.kind());
         let bias = self.bias.as_ref().map(|bias| bias.to_kind(x.kind()));
         let x = match self.direction {
-            Direction::Down => x.conv2d(&weight, bias, stride, padding, [1, 1], 1),
-            Direction::Up => x.conv_transpose2d(&weight, bias, stride, padding, [0, 0], 1, [1, 1]),
+            ConvDirection::Down => x.conv2d(&weight, bias, stride, padding, [1, 1], 1),
+            ConvDirection::Up => {
+                x.conv_transpose2d(&weight, bias, stride, padding, [0, 0], 1, [1, 1])
+            }
         };
         let mut x = match &self.norm {
             Some(norm) => norm.forward(&x, train),
@@ -215,7 +210,7 @@ impl ConvLayer {
         let pointwise = batch == 1
             && kernel[2..] == [1, 1]
             && self.stride == 1
-            && self.direction == Direction::Down;
+            && self.direction == ConvDirection::Down;
         let (true, Some(bias), None) = (pointwise, &self.bias, &self.norm) else {
             return self.forward(x, false).f_contiguous();
         };
@@ -247,8 +242,8 @@ impl ConvLayer {
         };
         let mut bias = self.bias.as_ref().map(Tensor::shallow_clone);
         let weight = match self.direction {
-            Direction::Down => self.weight.f_contiguous()?,
-            Direction::Up => {
+            ConvDirection::Down => self.weight.f_contiguous()?,
+            ConvDirection::Up => {
                 let (input, output, edge, _) = self.weight.size4()?;
                 (geometry.stride, geometry.upsampling) = (1, edge);
                 // Output channels become `[edge, edge, C_out]`: biases repeat for each cell of the square.
@@ -264,8 +259,8 @@ impl ConvLayer {
     /// pass over the map; weights are channels-last, as the maps are.
     pub fn folded(&self) -> Self {
         let output_dim = match self.direction {
-            Direction::Down => 0,
-            Direction::Up => 1,
+            ConvDirection::Down => 0,
+            ConvDirection::Up => 1,
         };
         let bias = self.bias.as_ref().map(Tensor::detach);
         let (weight, bias) = match &self.norm {
@@ -326,7 +321,8 @@ mod tests {
             ConvLayer::normed(&(&root / "a"), &(&root / "an"), [12, 20], 1, 1),
             ConvLayer::normed(&(&root / "b"), &(&root / "bn"), [12, 20], 3, 2),
             ConvLayer::upsampling(&(&root / "c"), &(&root / "cn"), [12, 20], 4),
-            ConvLayer::biased(&(&root / "d"), [12, 20], 1, 1).with_norm(&(&root / "dn"), 20),
+            ConvLayer::biased(&(&root / "d"), [12, 20], 1, 1)
+                .with_norm(Norm::new(&(&root / "dn"), 20)),
         ];
         for (name, mut variable) in network.variables() {
             let low = if name.contains("var") { 0.3 } else { -0.5 };

@@ -41,10 +41,9 @@ impl DetectionHead {
             ..usual
         };
         let numbers = anchors * BOX_CODE;
-        Self {
-            scores: nn::conv2d(path / "cls_head", channels, anchors, 1, prior),
-            offsets: nn::conv2d(path / "reg_head", channels, numbers, 1, usual),
-        }
+        let scores = nn::conv2d(path / "cls_head", channels, anchors, 1, prior);
+        let offsets = nn::conv2d(path / "reg_head", channels, numbers, 1, usual);
+        Self { scores, offsets }
     }
 
     /// `[B, C, H, W]` features to scores and offsets.
@@ -52,10 +51,9 @@ impl DetectionHead {
     /// # Errors
     /// Those of the tensor library, when the features have another number of channels than the head.
     pub fn forward(&self, features: &Tensor) -> Result<HeadOutput, TchError> {
-        Ok(HeadOutput {
-            scores: convolved(features, &self.scores)?,
-            offsets: convolved(features, &self.offsets)?,
-        })
+        let scores = convolved(features, &self.scores)?;
+        let offsets = convolved(features, &self.offsets)?;
+        Ok(HeadOutput { scores, offsets })
     }
 
     /// The same of one map `[1, C, H, W]` for inference: one matrix product, in whatever order the map is in memory.

@@ -65,7 +65,7 @@ impl ResidualBlock {
 
 fn layer([conv, norm]: [nn::Path<'_>; 2], io: [i64; 2], kernel: i64, stride: i64) -> ConvLayer {
     // Epsilon and momentum are PyTorch's own rather than those of PointPillars.
-    ConvLayer::unbiased(&conv, io, kernel, stride).normed_by(Norm::with_defaults(&norm, io[1]))
+    ConvLayer::unbiased(&conv, io, kernel, stride).with_norm(Norm::with_defaults(&norm, io[1]))
 }
 
 #[cfg(test)]

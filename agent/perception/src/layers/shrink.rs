@@ -2,7 +2,7 @@
 
 use tch::{TchError, Tensor, nn};
 
-use crate::layers::convolution::ConvLayer;
+use crate::layers::convolution::{ConvLayer, Norm};
 use crate::model_config::ShrinkConfig;
 
 /// Reduces the concatenated backbone levels.
@@ -45,9 +45,8 @@ impl Shrink {
 
     /// The same for inference, norms folded in.
     pub fn folded(&self) -> Self {
-        Self {
-            layers: self.layers.iter().map(ConvLayer::folded).collect(),
-        }
+        let layers = self.layers.iter().map(ConvLayer::folded).collect();
+        Self { layers }
     }
 }
 
@@ -85,14 +84,14 @@ impl Compressor {
 
     /// The same for inference, norms folded in.
     pub fn folded(&self) -> Self {
-        Self {
-            encoder: self.encoder.folded(),
-            decoder: self.decoder.iter().map(ConvLayer::folded).collect(),
-        }
+        let encoder = self.encoder.folded();
+        let decoder = self.decoder.iter().map(ConvLayer::folded).collect();
+        Self { encoder, decoder }
     }
 }
 
 fn layer(part: &nn::Path<'_>, position: i64, io: [i64; 2]) -> ConvLayer {
     let conv = ConvLayer::biased(&(part / position), io, 3, 1);
-    conv.with_norm(&(part / (position + 1)), io[1]).with_relu()
+    let norm = Norm::new(&(part / (position + 1)), io[1]);
+    conv.with_norm(norm).with_relu()
 }

@@ -76,7 +76,11 @@ impl PillarBatch {
         for (sweep, pillars) in sweeps.iter().enumerate() {
             let first_cell = sweep * pillar_grid.width * pillar_grid.height;
             for (points, coord) in pillars.iter() {
-                push_features(&mut features, points, pillar_grid.center_m(coord));
+                let (mean, center) = (mean_xyz(points), pillar_grid.center_m(coord));
+                for &[x, y, z, intensity] in points {
+                    features.extend([x, y, z, intensity, x - mean[0], y - mean[1], z - mean[2]]);
+                    features.extend([x - center[0], y - center[1], z - center[2]]);
+                }
                 cells.push((first_cell + pillar_grid.cell(coord)) as i64);
                 counts.push(points.len() as i64);
             }
@@ -127,16 +131,6 @@ impl PillarBatch {
         canvas
             .view([self.sweeps, height, width, channels])
             .permute([0, 3, 1, 2])
-    }
-}
-
-/// Appends the ten features of every point of one pillar.
-fn push_features(features: &mut Vec<f32>, points: &[[f32; 4]], center: [f32; 3]) {
-    let mean = mean_xyz(points);
-    for point in points {
-        let [x, y, z, intensity] = *point;
-        features.extend([x, y, z, intensity, x - mean[0], y - mean[1], z - mean[2]]);
-        features.extend([x - center[0], y - center[1], z - center[2]]);
     }
 }
 

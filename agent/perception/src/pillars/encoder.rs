@@ -23,10 +23,8 @@ impl PillarEncoder {
         let layer = path / "pfn_layers" / "0";
         let shape = [channels, POINT_FEATURES as i64];
         let linear = (&layer / "linear").var("weight", &shape, nn::init::DEFAULT_KAIMING_UNIFORM);
-        Self {
-            linear,
-            norm: Norm::new(&(&layer / "norm"), channels),
-        }
+        let norm = Norm::new(&(&layer / "norm"), channels);
+        Self { linear, norm }
     }
 
     /// Features of every pillar: `[M, C]`.

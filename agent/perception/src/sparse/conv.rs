@@ -21,10 +21,9 @@ impl SparseConv {
     pub fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
         let stdev = (2.0 / (10.0 * inputs as f64)).sqrt();
         let shape = [KERNEL_VOLUME as i64 * inputs, outputs];
-        Self {
-            weight: path.var("weight", &shape, Init::Randn { mean: 0.0, stdev }),
-            bias: path.var("bias", &[outputs], Init::Const(0.0)),
-        }
+        let weight = path.var("weight", &shape, Init::Randn { mean: 0.0, stdev });
+        let bias = path.var("bias", &[outputs], Init::Const(0.0));
+        Self { weight, bias }
     }
 
     /// `[N_in, C_in]` to `[N_out, C_out]`, in the precision of `x`.

@@ -36,7 +36,7 @@ impl Default for AdamWConfig {
 
 /// Result of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Step {
+pub enum OptimizerStep {
     /// Parameters were updated; the norm of the gradient before it was clipped.
     Taken(f64),
     /// The gradient was not finite, so nothing was updated.
@@ -47,12 +47,12 @@ pub enum Step {
 #[derive(Debug)]
 pub struct AdamW {
     config: AdamWConfig,
-    entries: Vec<Entry>,
+    entries: Vec<TrainedVariable>,
     steps: i64,
 }
 
 #[derive(Debug)]
-struct Entry {
+struct TrainedVariable {
     name: String,
     variable: Tensor,
     mean: Tensor,
@@ -65,7 +65,7 @@ impl AdamW {
     pub fn new(variables: &VarStore, config: AdamWConfig) -> Self {
         let named: BTreeMap<String, Tensor> = variables.variables().into_iter().collect();
         let trained = (named.into_iter()).filter(|(_, variable)| variable.requires_grad());
-        let entries = trained.map(|(name, variable)| Entry {
+        let entries = trained.map(|(name, variable)| TrainedVariable {
             name,
             mean: no_grad(|| variable.zeros_like()),
             square: no_grad(|| variable.zeros_like()),
@@ -90,13 +90,13 @@ impl AdamW {
     ///
     /// # Errors
     /// [`TchError`] from the tensor library.
-    pub fn step(&mut self, learning_rate: f64) -> Result<Step, TchError> {
+    pub fn step(&mut self, learning_rate: f64) -> Result<OptimizerStep, TchError> {
         no_grad(|| {
             let gradients = self.entries.iter().map(|entry| entry.variable.grad());
             let gradients: Vec<Tensor> = gradients.collect();
             let norm = global_norm(&gradients)?;
             if !norm.is_finite() {
-                return Ok(Step::Skipped);
+                return Ok(OptimizerStep::Skipped);
             }
             // The small term keeps a gradient of zero from a division by zero.
             let scale = (self.config.max_gradient_norm / (norm + 1e-6)).min(1.0);
@@ -126,7 +126,7 @@ impl AdamW {
                 let change = (&*mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
                 let _ = entry.variable.f_sub_(&change)?;
             }
-            Ok(Step::Taken(norm))
+            Ok(OptimizerStep::Taken(norm))
         })
     }
 
@@ -165,11 +165,9 @@ impl AdamW {
 
 /// Norm of all gradients together; variables that are not part of the loss count as zero.
 fn global_norm(gradients: &[Tensor]) -> Result<f64, TchError> {
-    let squares: Result<Vec<Tensor>, TchError> =
-        (gradients.iter().filter(|gradient| gradient.defined()))
-            .map(|gradient| gradient.f_square()?.f_sum(Kind::Double))
-            .collect();
-    let squares = squares?;
+    let defined = gradients.iter().filter(|gradient| gradient.defined());
+    let squares = defined.map(|gradient| gradient.f_square()?.f_sum(Kind::Double));
+    let squares = squares.collect::<Result<Vec<Tensor>, TchError>>()?;
     if squares.is_empty() {
         return Ok(0.0);
     }
@@ -197,7 +195,10 @@ mod tests {
                 .square()
                 .sum(Kind::Float)
                 .backward();
-            assert!(matches!(optimizer.step(0.1).unwrap(), Step::Taken(_)));
+            assert!(matches!(
+                optimizer.step(0.1).unwrap(),
+                OptimizerStep::Taken(_)
+            ));
         }
     }
 
@@ -241,7 +242,7 @@ mod tests {
         let (variables, point) = quadratic();
         let mut optimizer = AdamW::new(&variables, AdamWConfig::default());
         (&point * f64::NAN).sum(Kind::Float).backward();
-        assert_eq!(optimizer.step(0.1).unwrap(), Step::Skipped);
+        assert_eq!(optimizer.step(0.1).unwrap(), OptimizerStep::Skipped);
         assert_eq!(Vec::<f32>::try_from(&point.detach()).unwrap(), [3.0, 3.0]);
     }
 }

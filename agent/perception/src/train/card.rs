@@ -18,9 +18,8 @@ pub struct ModelCard {
 impl ModelCard {
     /// A card with an empty table.
     pub fn new(title: &str, about: &str) -> Self {
-        Self {
-            text: format!("# {title}\n\n{about}\n\n| | |\n| --- | --- |\n"),
-        }
+        let text = format!("# {title}\n\n{about}\n\n| | |\n| --- | --- |\n");
+        Self { text }
     }
 
     /// Appends a row to the table.

@@ -15,7 +15,7 @@ mod schedule;
 mod task;
 mod trainer;
 
-pub use adamw::{AdamW, AdamWConfig, Step};
+pub use adamw::{AdamW, AdamWConfig, OptimizerStep};
 pub use card::ModelCard;
 pub use curve::Curve;
 pub use data_listing::DataListing;
@@ -24,6 +24,6 @@ pub use interruption::Interruption;
 pub use options::{OptionsError, TrainingOptions, check_out};
 pub use prefetch::Prefetch;
 pub use run_config::{ComputePrecision, Length, RunConfig};
-pub use schedule::{Schedule, one_cycle};
-pub use task::{Means, Observe, Progress, SaveEvery, StepReport, Task};
+pub use schedule::{RateSchedule, one_cycle};
+pub use task::{Means, Observe, SaveEvery, StepReport, Task, TrainingEvent};
 pub use trainer::{Trained, Trainer};

@@ -1,6 +1,6 @@
 //! Prefetching: threads that prepare batches ahead of a training.
 
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use super::error::TrainingError;
@@ -30,8 +30,15 @@ impl<T: Send + 'static> Prefetch<T> {
         let count = threads.max(1);
         let started = (0..count).map(|thread| {
             let (sender, receiver) = sync_channel(AHEAD);
-            let (prepare, first) = (prepare.clone(), first + thread as u64);
-            let thread = thread::spawn(move || work(prepare, first, count, &sender));
+            let (mut prepare, first) = (prepare.clone(), first + thread as u64);
+            let thread = thread::spawn(move || {
+                for number in (first..).step_by(count) {
+                    // The receiver is dropped when the training has ended.
+                    if sender.send(prepare(number)).is_err() {
+                        return;
+                    }
+                }
+            });
             (receiver, thread)
         });
         let (queues, threads) = started.unzip();
@@ -61,15 +68,6 @@ impl<T> Drop for Prefetch<T> {
         for thread in self.threads.drain(..) {
             // A panic has been reported, and `next_batch` has returned an error.
             let _ = thread.join();
-        }
-    }
-}
-
-fn work<T>(mut prepare: impl FnMut(u64) -> T, first: u64, step: usize, queue: &SyncSender<T>) {
-    for number in (first..).step_by(step) {
-        // The receiver is dropped when the training has ended.
-        if queue.send(prepare(number)).is_err() {
-            return;
         }
     }
 }

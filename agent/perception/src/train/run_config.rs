@@ -9,7 +9,7 @@ use tch::{Device, Kind};
 use super::adamw::AdamWConfig;
 use super::checkpoint::CHECKPOINT_FILE;
 use super::interruption::Interruption;
-use super::schedule::Schedule;
+use super::schedule::RateSchedule;
 
 /// Configuration of a training run, for any network.
 #[derive(Debug, Clone)]
@@ -21,7 +21,7 @@ pub struct RunConfig {
     /// Highest learning rate.
     pub learning_rate: f64,
     /// Course of the learning rate.
-    pub schedule: Schedule,
+    pub schedule: RateSchedule,
     /// Constants of the optimizer.
     pub optimizer: AdamWConfig,
     /// Seed of parameters, order and augmentation.
@@ -49,7 +49,7 @@ impl RunConfig {
             length,
             batch: 1,
             learning_rate: 1e-3,
-            schedule: Schedule::default(),
+            schedule: RateSchedule::default(),
             optimizer: AdamWConfig::default(),
             seed: 0,
             device: Device::Cpu,

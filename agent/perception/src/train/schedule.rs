@@ -16,7 +16,7 @@ const HELD_RISE: f64 = 0.02;
 
 /// Course of the learning rate over a training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Schedule {
+pub enum RateSchedule {
     /// Up in a tenth of the training, then down.
     #[default]
     OneCycle,
@@ -24,7 +24,7 @@ pub enum Schedule {
     HeldRate,
 }
 
-impl Schedule {
+impl RateSchedule {
     /// The learning rate with this peak when a share of the training is done, 0..1.
     pub fn rate(self, peak: f64, progress: f64) -> f64 {
         match self {
@@ -67,7 +67,7 @@ mod tests {
 
     #[test]
     fn a_held_rate_stays_at_the_peak_for_four_fifths() {
-        let at = |share: f64| Schedule::HeldRate.rate(2e-3, share);
+        let at = |share: f64| RateSchedule::HeldRate.rate(2e-3, share);
         assert_eq!((at(0.0), at(0.1), at(0.79)), (8e-5, 2e-3, 2e-3));
         assert!((at(0.9) - 1e-3).abs() < 1e-5);
         assert!((at(1.0) - 2e-6).abs() < 1e-12 && at(2.0) == at(1.0));

@@ -9,9 +9,9 @@ use super::data_listing::DataListing;
 use super::error::TrainingError;
 use super::trainer::Trainer;
 
-/// Progress of a training.
+/// Event in the course of a training.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Progress {
+pub enum TrainingEvent {
     /// Sweeps are being encoded: number done and number of all.
     Encoding(usize, usize),
     /// The data to learn from or to validate on have been read.
@@ -40,7 +40,7 @@ pub struct StepReport {
 }
 
 /// Receiver of the progress of a training.
-pub type Observe<'a> = dyn FnMut(&Progress) + 'a;
+pub type Observe<'a> = dyn FnMut(&TrainingEvent) + 'a;
 
 /// Interval between two validations and checkpoints.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -129,9 +129,9 @@ impl Trainer {
     }
 
     /// Report of the steps done, with the means since the last report.
-    pub fn step_report(&self, share_done: f64, means: Vec<f64>, text: &str) -> Progress {
+    pub fn step_report(&self, share_done: f64, means: Vec<f64>, text: &str) -> TrainingEvent {
         let step = self.steps();
-        Progress::Stepped(StepReport {
+        TrainingEvent::Stepped(StepReport {
             step,
             share_done: share_done.min(1.0),
             seconds: self.seconds(),
@@ -150,10 +150,8 @@ pub struct Means<const N: usize> {
 
 impl<const N: usize> Default for Means<N> {
     fn default() -> Self {
-        Self {
-            sums: [0.0; N],
-            steps: 0,
-        }
+        let (sums, steps) = ([0.0; N], 0);
+        Self { sums, steps }
     }
 }
 

@@ -11,7 +11,7 @@ use support::file_error::{AtFile, FileError};
 use tch::Tensor;
 use tch::nn::VarStore;
 
-use super::adamw::{AdamW, Step};
+use super::adamw::{AdamW, OptimizerStep};
 use super::checkpoint::{self, CHECKPOINT_FILE};
 use super::curve::Curve;
 use super::data_listing::DataListing;
@@ -25,7 +25,8 @@ const MAX_SKIPPED: u32 = 20;
 
 /// State of a training beside parameters and moments, in its checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Progress {
+#[serde(rename = "Progress")]
+struct CheckpointState {
     step: u64,
     seconds: f64,
     /// Of these, seconds before the first step of each run.
@@ -37,7 +38,7 @@ struct Progress {
     method: Option<String>,
 }
 
-impl Progress {
+impl CheckpointState {
     /// Rejects the state of a training with another seed, batch or method.
     fn check(&self, requested: &Self) -> Result<(), TrainingError> {
         let [found, wanted] =
@@ -82,7 +83,7 @@ pub struct Trained {
 pub struct Trainer {
     run: RunConfig,
     optimizer: AdamW,
-    progress: Progress,
+    progress: CheckpointState,
     skipped: u32,
     started: Instant,
     seconds_before: f64,
@@ -102,7 +103,7 @@ impl Trainer {
         started: Instant,
     ) -> Result<Self, TrainingError> {
         let mut optimizer = AdamW::new(variables, run.optimizer);
-        let mut progress = Progress {
+        let mut progress = CheckpointState {
             step: 0,
             seconds: 0.0,
             preparing_seconds: 0.0,
@@ -111,7 +112,7 @@ impl Trainer {
             method: method.map(str::to_owned),
         };
         if run.resume {
-            let stored: Progress =
+            let stored: CheckpointState =
                 checkpoint::restore(&checkpoint_path(run), variables, &mut optimizer)?;
             stored.check(&progress)?;
             progress = stored;
@@ -178,7 +179,7 @@ impl Trainer {
     pub fn step(&mut self, loss: &Tensor, share_done: f64) -> Result<bool, TrainingError> {
         self.optimizer.zero_grad();
         loss.f_backward()?;
-        let taken = self.optimizer.step(self.learning_rate(share_done))? != Step::Skipped;
+        let taken = self.optimizer.step(self.learning_rate(share_done))? != OptimizerStep::Skipped;
         self.skipped = if taken { 0 } else { self.skipped + 1 };
         if self.skipped >= MAX_SKIPPED {
             return Err(TrainingError::Diverged(self.skipped));
@@ -263,14 +264,14 @@ mod tests {
 
     #[test]
     fn progress_of_localizers_and_detectors_is_read_and_another_training_rejected() {
-        let localizer: Progress =
+        let localizer: CheckpointState =
             serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4}"#).unwrap();
-        let detector: Progress =
+        let detector: CheckpointState =
             serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4,"method":"max"}"#)
                 .unwrap();
         assert!(
             localizer
-                .check(&Progress {
+                .check(&CheckpointState {
                     step: 0,
                     seconds: 0.0,
                     ..localizer.clone()
@@ -279,21 +280,21 @@ mod tests {
         );
         for (requested, expected) in [
             (
-                Progress {
+                CheckpointState {
                     seed: 4,
                     ..detector.clone()
                 },
                 "seed 3, not 4",
             ),
             (
-                Progress {
+                CheckpointState {
                     batch: 8,
                     ..detector.clone()
                 },
                 "batch 4, not 8",
             ),
             (
-                Progress {
+                CheckpointState {
                     method: Some("attention".into()),
                     ..detector.clone()
                 },

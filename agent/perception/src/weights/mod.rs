@@ -72,10 +72,9 @@ impl Weights {
             return Err(FileError::new(path, "a folder, must be one weights file"));
         }
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-        let (_, header) = SafeTensors::read_metadata(&bytes)
-            .map_err(|error| incomplete(path, bytes.len(), error))?;
-        let file = SafeTensors::deserialize(&bytes)
-            .map_err(|error| incomplete(path, bytes.len(), error))?;
+        let truncated = |error| incomplete(path, bytes.len(), error);
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(truncated)?;
+        let file = SafeTensors::deserialize(&bytes).map_err(truncated)?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.iter() {
             if let Some(values) = read_values(path, name, &view)? {
@@ -123,12 +122,6 @@ impl Weights {
     /// True if there is a tensor of that name.
     pub fn contains(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
-    }
-
-    /// Number of parameters.
-    pub fn parameters(&self) -> usize {
-        let sizes = self.tensors.values().map(|tensor| tensor.values.len());
-        sizes.sum()
     }
 
     /// The text under a metadata key.

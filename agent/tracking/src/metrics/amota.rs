@@ -74,14 +74,11 @@ impl Amota {
 
 impl OperatingPoint {
     fn of(sequences: &[Sequence], min_score: f64) -> Self {
-        let kept = sequences
-            .iter()
-            .map(|sequence| sequence.with_min_score(min_score));
+        let all = sequences.iter();
+        let kept = all.map(|sequence| sequence.with_min_score(min_score));
         let kept: Vec<Sequence> = kept.collect();
-        Self {
-            min_score,
-            counts: ClearMot::of(&kept, MATCH_DISTANCE_M),
-        }
+        let counts = ClearMot::of(&kept, MATCH_DISTANCE_M);
+        Self { min_score, counts }
     }
 
     fn clipped_mota(&self) -> f64 {

@@ -42,7 +42,7 @@ pub struct ClearMot {
 
 /// History of an object.
 #[derive(Debug, Clone, Default)]
-struct History {
+struct ObjectHistory {
     frames: u32,
     tracked: u32,
     last_track: Option<u64>,
@@ -54,11 +54,16 @@ impl ClearMot {
     pub fn of(sequences: &[Sequence], max_distance_m: f64) -> Self {
         let mut counts = Self::default();
         for sequence in sequences {
-            let mut histories = BTreeMap::new();
+            let mut histories = BTreeMap::<i64, ObjectHistory>::new();
             for frame in sequence.frames() {
                 counts.add(frame, &mut histories, max_distance_m);
             }
-            counts.finish(&histories);
+            for history in histories.values() {
+                let share = f64::from(history.tracked) / f64::from(history.frames);
+                counts.mostly_tracked += usize::from(share >= MOSTLY_TRACKED);
+                counts.mostly_lost += usize::from(share < MOSTLY_LOST);
+            }
+            counts.true_tracks += histories.len();
         }
         counts
     }
@@ -84,7 +89,7 @@ impl ClearMot {
     fn add(
         &mut self,
         frame: &TrackedFrame,
-        histories: &mut BTreeMap<i64, History>,
+        histories: &mut BTreeMap<i64, ObjectHistory>,
         max_distance_m: f64,
     ) {
         let pairs = pairs(frame, histories, max_distance_m);
@@ -117,21 +122,12 @@ impl ClearMot {
         self.objects += frame.objects.len();
         self.false_positives += frame.tracks.len() - pairs.len();
     }
-
-    fn finish(&mut self, histories: &BTreeMap<i64, History>) {
-        for history in histories.values() {
-            let share = f64::from(history.tracked) / f64::from(history.frames);
-            self.mostly_tracked += usize::from(share >= MOSTLY_TRACKED);
-            self.mostly_lost += usize::from(share < MOSTLY_LOST);
-        }
-        self.true_tracks += histories.len();
-    }
 }
 
 /// Pairs of indices of objects and tracks in a frame.
 fn pairs(
     frame: &TrackedFrame,
-    histories: &BTreeMap<i64, History>,
+    histories: &BTreeMap<i64, ObjectHistory>,
     max_distance_m: f64,
 ) -> Vec<(usize, usize)> {
     let (objects, tracks) = (frame.objects.len(), frame.tracks.len());

@@ -34,7 +34,7 @@ struct Sums {
 }
 
 /// Amount by pair of object and track.
-type Pairs = BTreeMap<(i64, u64), f64>;
+type PairValues = BTreeMap<(i64, u64), f64>;
 
 impl Hota {
     /// HOTA over all sequences; `None` without objects and tracks.
@@ -74,7 +74,7 @@ fn similarities(frame: &TrackedFrame) -> DMatrix<f64> {
 fn add(sequence: &Sequence, sums: &mut [Sums; THRESHOLDS]) {
     let lengths = sequence.lengths();
     let alignment = alignment(sequence, &lengths);
-    let mut matches: [Pairs; THRESHOLDS] = Default::default();
+    let mut matches: [PairValues; THRESHOLDS] = Default::default();
     for frame in sequence.frames() {
         let similarity = similarities(frame);
         let costs = DMatrix::from_fn(similarity.nrows(), similarity.ncols(), |object, track| {
@@ -107,8 +107,8 @@ fn add(sequence: &Sequence, sums: &mut [Sums; THRESHOLDS]) {
 
 /// Jaccard index of each object and track over the sequence, with matches weighted by their similarity among those of
 /// the frame.
-fn alignment(sequence: &Sequence, lengths: &(Lengths<i64>, Lengths<u64>)) -> Pairs {
-    let mut weights = Pairs::new();
+fn alignment(sequence: &Sequence, lengths: &(Lengths<i64>, Lengths<u64>)) -> PairValues {
+    let mut weights = PairValues::new();
     for frame in sequence.frames() {
         let similarity = similarities(frame);
         // The sum of all columns: one number per row, that is per object.

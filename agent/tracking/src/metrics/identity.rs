@@ -9,7 +9,7 @@ use crate::assignment;
 
 /// Points with the right identity, and all points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Identity {
+pub struct IdentityCounts {
     /// Object points whose track is the one mapped to their object (IDTP).
     pub matches: u64,
     /// Object points.
@@ -18,7 +18,7 @@ pub struct Identity {
     pub tracks: u64,
 }
 
-impl Identity {
+impl IdentityCounts {
     /// Points over all sequences; pairs at less than `max_distance_m` can match. The mapping is made for each sequence.
     pub fn of(sequences: &[Sequence], max_distance_m: f64) -> Self {
         let mut points = Self::default();

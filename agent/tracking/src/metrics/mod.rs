@@ -6,7 +6,7 @@
 //! - [`ClearMot`]: MOTA, MOTP, IDS, FRAG, MT, ML (Bernardin and Stiefelhagen 2008), equal to `motmetrics`.
 //! - [`Amota`]: AMOTA and AMOTP over 40 recall values (Weng et al. 2020), equal to `nuscenes-devkit`.
 //! - [`Hota`]: HOTA, DetA, AssA (Luiten et al. 2021), equal to `trackeval`.
-//! - [`Identity`]: IDF1 (Ristani et al. 2016), equal to `trackeval` and `motmetrics`.
+//! - [`IdentityCounts`]: IDF1 (Ristani et al. 2016), equal to `trackeval` and `motmetrics`.
 //! - [`TrackQuality`]: all of them, as tables show them.
 
 mod amota;
@@ -19,7 +19,7 @@ mod sequence;
 pub use amota::{Amota, OperatingPoint};
 pub use clear_mot::ClearMot;
 pub use hota::Hota;
-pub use identity::Identity;
+pub use identity::IdentityCounts;
 pub use quality::TrackQuality;
 pub use sequence::{DuplicateId, Sequence, TrackPoint, TrackedFrame, TruePoint};
 

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::{Amota, Hota, Identity, MATCH_DISTANCE_M, Sequence};
+use super::{Amota, Hota, IdentityCounts, MATCH_DISTANCE_M, Sequence};
 
 /// Quality of tracks; `None` where a number is not defined.
 ///
@@ -80,7 +80,7 @@ impl TrackQuality {
             hota: hota.map(|hota| hota.hota),
             det_a: hota.map(|hota| hota.det_a),
             ass_a: hota.map(|hota| hota.ass_a),
-            idf1: Identity::of(&kept, MATCH_DISTANCE_M).f1(),
+            idf1: IdentityCounts::of(&kept, MATCH_DISTANCE_M).f1(),
             ..averages
         }
     }

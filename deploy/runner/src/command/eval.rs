@@ -263,13 +263,10 @@ impl Arguments {
         let encodes =
             self.codec.0 != CodecConfig::default() || self.rate.0 != RateConfig::default();
         let listens = self.attack.is_some() || self.trust || self.delay_ms > 0;
-        let [maps, boxes] = [Exchange::Features, Exchange::Boxes]
-            .map(|content| { self.method.iter() }.any(|one| one.exchange() == content));
-        let boxes = boxes || self.boxes.is_some();
-        let messages = !self
-            .method
-            .iter()
-            .all(|one| one.exchange() == Exchange::Nothing);
+        let contents: Vec<Exchange> = self.method.iter().map(|one| one.exchange()).collect();
+        let maps = contents.contains(&Exchange::Features);
+        let boxes = contents.contains(&Exchange::Boxes) || self.boxes.is_some();
+        let messages = contents.iter().any(|one| *one != Exchange::Nothing);
         // With --feature-maps the codec also sets the format of kept maps, whatever is sent.
         let rule = if encodes && self.feature_maps.is_none() && !maps {
             "options of the codec and of the rate are for feature maps: METHODS sends none"

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use figures::FigureError;
-use runner::experiment::sweep::{self, Sweep, WorkerError};
+use runner::experiment::sweep::{self, ExperimentSweep, WorkerError};
 use support::output;
 
 use super::left_out;
@@ -55,10 +55,10 @@ impl Arguments {
         }
         let jobs = usize::from(self.jobs);
         if self.dry_run {
-            Sweep::announce(&self.experiment, &out, jobs).map_err(BadInput::of)?;
+            ExperimentSweep::announce(&self.experiment, &out, jobs).map_err(BadInput::of)?;
             return Ok(Outcome::Done);
         }
-        let sweep = Sweep::open(&self.experiment, &out).map_err(BadInput::of)?;
+        let sweep = ExperimentSweep::open(&self.experiment, &out).map_err(BadInput::of)?;
         // Before the slice: a worker of a Slurm task inherits the variables of its array.
         if self.worker {
             sweep.work()?;

@@ -39,7 +39,17 @@ pub(super) fn check(experiment: &Experiment) -> Result<()> {
     compute.validate("compute")?;
     let limit_gb = experiment.feature_maps_limit_gb;
     number("feature_maps_limit_gb", limit_gb, 0.0, 10_000.0)?;
-    of_link_alone(experiment)?;
+    if let Some(ego) = &experiment.ego.id {
+        bail!("ego.id is {ego}: choose by protocol.ego_kind instead");
+    }
+    ensure!(
+        experiment.ego.inbox == InboxConfig::default(),
+        "ego.inbox is given, but receive limits do not apply in simulation time"
+    );
+    ensure!(
+        experiment.link().is_some() || compute == ComputeTimes::default(),
+        "compute is given, but without link no time passes"
+    );
     let link = experiment.link().map(LinkConfig::open).transpose();
     let link = link.map_err(|error| anyhow!("link: {error}"))?;
     if !experiment.tables.is_empty() {
@@ -79,23 +89,6 @@ fn tables(experiment: &Experiment) -> Result<()> {
             "table {name:?}: delay_ms and link contradict each other"
         );
     }
-    Ok(())
-}
-
-/// Refuses settings that mean nothing without a link, or in an evaluation at all.
-fn of_link_alone(experiment: &Experiment) -> Result<()> {
-    let ego = &experiment.ego;
-    if let Some(ego) = &ego.id {
-        bail!("ego.id is {ego}: choose by protocol.ego_kind instead");
-    }
-    ensure!(
-        ego.inbox == InboxConfig::default(),
-        "ego.inbox is given, but receive limits do not apply in simulation time"
-    );
-    ensure!(
-        experiment.link().is_some() || experiment.compute == ComputeTimes::default(),
-        "compute is given, but without link no time passes"
-    );
     Ok(())
 }
 
@@ -202,8 +195,7 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
     } else if grid.bandwidth_mbps.is_some() && has_capacity {
         Some(["bandwidth_mbps", "capacity"])
     } else {
-        let is_twice = grid.loss.is_some() && link.loss != LossModel::None;
-        is_twice.then_some(["loss", "loss"])
+        (grid.loss.is_some() && link.loss != LossModel::None).then_some(["loss", "loss"])
     };
     if let Some([axis, field]) = twice {
         let name = experiment.link.as_deref().unwrap_or_default();

@@ -109,7 +109,7 @@ pub fn run_notes(result: &RunResult) -> String {
 }
 
 /// A column: whether it is shown, its name, alignment and cells.
-type Column = (bool, &'static str, Side, fn(&Metrics) -> String);
+type MetricColumn = (bool, &'static str, Side, fn(&Metrics) -> String);
 
 /// One line per run or evaluation, and the facts that are needed to compare the lines.
 pub fn table(all: &[Metrics]) -> String {
@@ -118,7 +118,7 @@ pub fn table(all: &[Metrics]) -> String {
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
     let has_network = all.iter().any(|metrics| metrics.contribution.sent > 0);
     let name = if is_live { "answered" } else { "frames" };
-    let columns: [Column; 13] = [
+    let columns: [MetricColumn; 13] = [
         (true, "method", Left, |of| of.method.clone()),
         (true, "poses", Left, |of| of.pose_source.clone()),
         (true, name, Right, frames),
@@ -142,7 +142,7 @@ pub fn table(all: &[Metrics]) -> String {
         (true, "bytes", Right, wire_bytes),
     ];
     let columns = columns.into_iter().filter(|(is_shown, ..)| *is_shown);
-    let columns: Vec<Column> = columns.collect();
+    let columns: Vec<MetricColumn> = columns.collect();
     let mut table = TextTable::new(columns.iter().map(|(_, name, side, _)| (*name, *side)));
     for metrics in all {
         table.row(columns.iter().map(|(.., cell)| cell(metrics)));

@@ -89,34 +89,26 @@ impl Engine {
         let command: Vec<String> = command.iter().map(|word| quoted(word)).collect();
         let command = command.join(" ");
         match self {
-            Self::Slurm => slurm(&command, count),
-            Self::Parallel => parallel(&command, count),
+            // The slice of a task is in its environment.
+            Self::Slurm => format!(
+                "#!/usr/bin/env bash\n\
+                 # Options of sbatch (--partition, --time, ..) are taken from SBATCH_* variables.\n\
+                 set -euo pipefail\n\
+                 slices=$(sbatch --parsable --array=1-{count} --cpus-per-task=1 --wrap {wrapped})\n\
+                 sbatch --parsable --wait --kill-on-invalid-dep=yes --dependency=afterok:\"$slices\" --cpus-per-task=1 --wrap {wrapped}\n",
+                wrapped = quoted(&command),
+            ),
+            // GNU parallel hands its words to a shell once more, so the quoted command is quoted again.
+            Self::Parallel => format!(
+                "#!/usr/bin/env bash\n\
+                 set -euo pipefail\n\
+                 seq {count} | parallel {} --slice {{}}/{count}\n\
+                 {command}\n",
+                quoted(&command),
+            ),
             Self::Snakemake => snakemake(&command, count, result),
         }
     }
-}
-
-fn slurm(command: &str, count: usize) -> String {
-    // The slice of a task is in its environment.
-    format!(
-        "#!/usr/bin/env bash\n\
-         # Options of sbatch (--partition, --time, ..) are taken from SBATCH_* variables.\n\
-         set -euo pipefail\n\
-         slices=$(sbatch --parsable --array=1-{count} --cpus-per-task=1 --wrap {wrapped})\n\
-         sbatch --parsable --wait --kill-on-invalid-dep=yes --dependency=afterok:\"$slices\" --cpus-per-task=1 --wrap {wrapped}\n",
-        wrapped = quoted(command),
-    )
-}
-
-fn parallel(command: &str, count: usize) -> String {
-    // GNU parallel hands its words to a shell once more, so the quoted command is quoted again.
-    format!(
-        "#!/usr/bin/env bash\n\
-         set -euo pipefail\n\
-         seq {count} | parallel {} --slice {{}}/{count}\n\
-         {command}\n",
-        quoted(command),
-    )
 }
 
 fn snakemake(command: &str, count: usize, result: &Path) -> String {

@@ -144,7 +144,7 @@ pub struct Grid {
 }
 
 /// Encoding of feature maps.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CodecSpec {
     /// Number format of the values.

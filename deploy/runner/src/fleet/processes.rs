@@ -45,8 +45,7 @@ impl Fleet {
         &self,
         context: &SessionContext<'_>,
     ) -> Result<Vec<ProcessSpec>, RunFolderError> {
-        let mut planner = self.planner(context);
-        self.plan_agents(&mut planner)?;
+        let mut planner = self.planner(context)?;
         let (ego, link) = (format!("ego-{}", self.ego), format!("link-{}", self.ego));
         planner.plan(ego, "ego-fuser run", RestartPolicy::Service, |bus| {
             self.ego_config(context, bus)
@@ -85,12 +84,11 @@ impl Fleet {
         &self,
         context: &SessionContext<'_>,
     ) -> Result<Vec<ProcessSpec>, RunFolderError> {
-        let mut planner = self.planner(context);
-        self.plan_agents(&mut planner)?;
-        Ok(planner.specs)
+        Ok(self.planner(context)?.specs)
     }
 
-    fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Planner<'a> {
+    /// A plan of the agents that this run starts, for further processes.
+    fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Result<Planner<'a>, RunFolderError> {
         let wanted_mib = self.scenario.network.shared_memory_mib;
         let bus = BusConfig {
             connect: context.endpoint.clone(),
@@ -98,30 +96,26 @@ impl Fleet {
             supervised: true,
             ..BusConfig::default()
         };
-        Planner {
+        let mut planner = Planner {
             context,
             bus,
             metrics: self.scenario.network.metrics,
             specs: Vec::new(),
+        };
+        let remote = &self.scenario.remote_agents;
+        for cav in self.agents.iter().filter(|cav| !remote.contains(cav)) {
+            let name = format!("agent-{cav}");
+            planner.plan(name, "agent run", RestartPolicy::Service, |bus| {
+                self.agent_config(cav, context, bus)
+            })?;
         }
+        Ok(planner)
     }
 
     /// Processes that this run starts at most: agents, ego and replay, and link and recorder where there are such.
     fn process_count(&self) -> usize {
         let others = [self.is_over_link(), self.scenario.record.is_some()];
         self.agents.len() + 2 + others.iter().filter(|is_there| **is_there).count()
-    }
-
-    fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
-        let remote = &self.scenario.remote_agents;
-        for cav in self.agents.iter().filter(|cav| !remote.contains(cav)) {
-            let context = planner.context;
-            let name = format!("agent-{cav}");
-            planner.plan(name, "agent run", RestartPolicy::Service, |bus| {
-                self.agent_config(cav, context, bus)
-            })?;
-        }
-        Ok(())
     }
 
     fn agent_config(

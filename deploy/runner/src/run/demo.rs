@@ -7,7 +7,7 @@ use deploy::score::{FrameScores, JudgedFrame};
 use protocol::{CavId, Pose};
 
 use crate::fleet::Fleet;
-use crate::run::picture::{Picture, View};
+use crate::run::picture::{CavView, Picture};
 
 /// Margin around boxes and vehicles, metres.
 const MARGIN_M: f64 = 12.0;
@@ -62,7 +62,7 @@ fn try_draw(
             .map(|(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
         around(boxes.chain(vehicles), limit)
     });
-    let views = loaded.iter().map(|(name, ego_from_cav, xyzi)| View {
+    let views = loaded.iter().map(|(name, ego_from_cav, xyzi)| CavView {
         name: name.clone(),
         ego_from_cav: *ego_from_cav,
         xyzi,

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use deploy::operate::refusals::Refusal;
+use deploy::operate::refusals::RefusalCount;
 use deploy::score::ProcessStats;
 use protocol::{Counts, Ledger, Reconciliation};
 use serde::Serialize;
@@ -24,7 +24,7 @@ pub(crate) struct LedgerReport {
     pub sum: Ledger,
     /// Requests that the router of the run refused: peer, message, reason.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub refused: Vec<Refusal>,
+    pub refused: Vec<RefusalCount>,
     /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub causes: Vec<String>,

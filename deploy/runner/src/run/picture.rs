@@ -44,11 +44,11 @@ const CAV_COLOURS: [RGBColor; 6] = [
 ];
 
 /// The plan view: metres in the ego's LiDAR frame, x to the right and y up.
-type Plane<'a> = DrawingArea<BitMapBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+type Sheet<'a> = DrawingArea<BitMapBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 /// Point cloud of one CAV.
 #[derive(Debug, Clone)]
-pub(crate) struct View<'a> {
+pub(crate) struct CavView<'a> {
     /// Name of the CAV.
     pub name: String,
     /// Its LiDAR's pose in the ego's LiDAR frame.
@@ -67,7 +67,7 @@ pub(crate) struct Picture<'a> {
     /// Lower and upper y of the plan view, metres.
     pub y_m: [f64; 2],
     /// Point clouds of all CAVs; the ego first.
-    pub views: Vec<View<'a>>,
+    pub views: Vec<CavView<'a>>,
     /// True boxes.
     pub truth: Vec<Box3d>,
     /// Detected boxes, with their scores, 0..1.
@@ -126,7 +126,7 @@ impl Picture<'_> {
         self.draw_legend(&legend)
     }
 
-    fn coloured_views(&self) -> impl DoubleEndedIterator<Item = (&View<'_>, RGBColor)> {
+    fn coloured_views(&self) -> impl DoubleEndedIterator<Item = (&CavView<'_>, RGBColor)> {
         let views = self.views.iter().enumerate();
         views.map(|(index, view)| (view, CAV_COLOURS[index % CAV_COLOURS.len()]))
     }
@@ -139,7 +139,7 @@ impl Picture<'_> {
     }
 
     /// A line every 10 m.
-    fn draw_grid(&self, plane: &Plane<'_>) -> Result<()> {
+    fn draw_grid(&self, plane: &Sheet<'_>) -> Result<()> {
         for x in tens(self.x_m) {
             plane.draw(&PathElement::new(self.y_m.map(|y| (x, y)), GRID))?;
         }
@@ -149,7 +149,7 @@ impl Picture<'_> {
         Ok(())
     }
 
-    fn draw_points(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<()> {
+    fn draw_points(&self, view: &CavView<'_>, colour: RGBColor, plane: &Sheet<'_>) -> Result<()> {
         let ego_from_cav = view.ego_from_cav.isometry();
         for &[x, y, z, _] in view.xyzi {
             let point =
@@ -164,7 +164,7 @@ impl Picture<'_> {
     }
 
     /// The outline, with a stroke from the centre to the front.
-    fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &Plane<'_>) -> Result<()> {
+    fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &Sheet<'_>) -> Result<()> {
         let corners = shape.corners();
         let mut places = corners.iter();
         if !places.all(|[x, y, _]| self.is_near(*x, *y, BOX_MARGIN_M)) {
@@ -198,7 +198,7 @@ impl Picture<'_> {
         labelled
     }
 
-    fn draw_score(&self, found: &Box3d, score: f32, plane: &Plane<'_>) -> Result<()> {
+    fn draw_score(&self, found: &Box3d, score: f32, plane: &Sheet<'_>) -> Result<()> {
         let [x, y, _] = found.center_m;
         if !self.is_near(x, y, 0.0) {
             return Ok(());
@@ -208,7 +208,7 @@ impl Picture<'_> {
         Ok(plane.draw(&(EmptyElement::at((x, y)) + text))?)
     }
 
-    fn draw_position(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<()> {
+    fn draw_position(&self, view: &CavView<'_>, colour: RGBColor, plane: &Sheet<'_>) -> Result<()> {
         let [x, y, _] = view.ego_from_cav.translation_m;
         if !self.is_near(x, y, 0.0) {
             return Ok(());
@@ -297,7 +297,7 @@ mod tests {
             title: "tick 7".into(),
             x_m: [-40.0, 40.0],
             y_m: [-20.0, 20.0],
-            views: vec![View {
+            views: vec![CavView {
                 name: "4279".into(),
                 ego_from_cav: Pose::IDENTITY,
                 xyzi,
@@ -393,13 +393,13 @@ mod tests {
             [1e30, -1e30, 0.0, 0.0],
         ];
         let mut far = picture(&points);
-        far.views.push(View {
+        far.views.push(CavView {
             name: "far".into(),
             ..far.views[0].clone()
         });
         far.views[1].ego_from_cav.translation_m = [1e30, f64::NAN, 0.0];
         let mut near = picture(&[]);
-        near.views.push(View {
+        near.views.push(CavView {
             xyzi: &[],
             ego_from_cav: Pose::IDENTITY,
             ..far.views[1].clone()

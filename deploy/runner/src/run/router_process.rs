@@ -8,7 +8,7 @@ use std::time::Duration;
 use bus::ROUTER;
 use bus::shutdown::Stop;
 use deploy::operate::network::{Network, RouterEndpoint};
-use deploy::operate::refusals::{self, Refusal};
+use deploy::operate::refusals::{self, RefusalCount};
 use deploy::operate::supervise::{
     ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, Supervisor,
 };
@@ -62,7 +62,7 @@ impl Router {
     }
 
     /// Closes the session and ends the router. Returns the requests that it refused.
-    pub(crate) fn end(self) -> Vec<Refusal> {
+    pub(crate) fn end(self) -> Vec<RefusalCount> {
         if let Err(overdue) = self.place.close() {
             tracing::warn!("{overdue}");
         }
@@ -74,7 +74,7 @@ impl Router {
             tracing::warn!("{}: {error}", process.refusals.display());
             Vec::new()
         });
-        for Refusal { rejection, count } in &refused {
+        for RefusalCount { rejection, count } in &refused {
             let (peer, reason, what) = (&rejection.peer, &rejection.reason, &rejection.message);
             tracing::warn!(%peer, %reason, %what, count, "refused by the router");
         }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use bus::BusError;
-use deploy::operate::keys::KeyError;
+use deploy::operate::keys::KeyFileError;
 use deploy::operate::run_folder::RunFolderError;
 use deploy::operate::supervise::SuperviseError;
 use deploy::score::ScorerError;
@@ -37,7 +37,7 @@ pub enum RunError {
     },
     /// No keys could be made for the processes.
     #[error("security: {0}")]
-    Keys(#[from] KeyError),
+    Keys(#[from] KeyFileError),
     /// The scorer cannot start.
     #[error("scorer: {0}")]
     Scorer(#[from] ScorerError),

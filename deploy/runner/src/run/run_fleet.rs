@@ -10,7 +10,7 @@ use bus::MetricsPeer;
 use bus::shutdown::Stop;
 use dataset::findings;
 use deploy::operate::progress::Display;
-use deploy::operate::refusals::Refusal;
+use deploy::operate::refusals::RefusalCount;
 use deploy::operate::run_folder::{RunFolder, SWEEP_LOG};
 use deploy::operate::status::Phase;
 use deploy::operate::status_reporter::{Ending, StatusReporter};
@@ -280,7 +280,7 @@ fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Pro
 fn write(
     fleet: &Fleet,
     (run, folder): (&RunId, RunFolder),
-    (scored, refused): (Scored, Vec<Refusal>),
+    (scored, refused): (Scored, Vec<RefusalCount>),
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
     capacity: Option<Capacity>,

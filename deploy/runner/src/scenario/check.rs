@@ -93,12 +93,7 @@ impl Scenario {
         for settings in self.settings() {
             let files = settings.pose.files().into_iter();
             places.extend(files.map(|file| ("agents.pose", file)));
-            places.extend(
-                settings
-                    .weights
-                    .iter()
-                    .map(|file| ("agents.weights", file.clone())),
-            );
+            places.extend(settings.weights.map(|file| ("agents.weights", file)));
         }
         if let Some((field, missing)) = places.iter().find(|(_, file)| !file.exists()) {
             let problem = format_args!("{field}: {} does not exist", missing.display());

@@ -119,11 +119,11 @@ pub enum SuperviseError {
 /// Processes of a run. Dropping it kills those that still run.
 pub struct Supervisor {
     runtime: Runtime,
-    watched: Vec<Watched>,
+    watched: Vec<WatchedProcess>,
 }
 
 /// State of one supervised process.
-struct Watched {
+struct WatchedProcess {
     name: String,
     stop: watch::Sender<Option<Instant>>,
     replace: mpsc::Sender<String>,
@@ -168,10 +168,8 @@ impl Supervisor {
                 events: events.clone(),
                 stop: stop_request,
                 replace: replace_request,
-                crashes: 0,
-                restarted: 0,
             };
-            watched.push(Watched {
+            watched.push(WatchedProcess {
                 name,
                 stop,
                 replace,
@@ -199,7 +197,7 @@ impl Supervisor {
     /// ended, with the names of those that were killed.
     pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> Vec<String> {
         let chosen = self.watched.extract_if(.., |watched| which(&watched.name));
-        let chosen: Vec<Watched> = chosen.collect();
+        let chosen: Vec<WatchedProcess> = chosen.collect();
         // All are asked before any is waited for, so that they end at the same time.
         for watched in &chosen {
             watched.stop.send_replace(Some(deadline));

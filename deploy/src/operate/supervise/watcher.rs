@@ -64,15 +64,13 @@ pub(super) struct Watcher {
     pub(super) stop: watch::Receiver<Option<Instant>>,
     /// Reasons for which it is to be killed and restarted.
     pub(super) replace: mpsc::Receiver<String>,
-    /// Number of crashes without a recovery in between.
-    pub(super) crashes: u32,
-    /// Number of restarts.
-    pub(super) restarted: u32,
 }
 
 impl Watcher {
     /// Runs until asked to stop or the process stays down. Returns true if it had to be killed.
     pub(super) async fn run(mut self) -> bool {
+        // Crashes without a recovery in between, and all restarts.
+        let (mut crashes, mut restarted) = (0_u32, 0_u32);
         loop {
             let born = Instant::now();
             let mut may_restart = self.spec.life != RestartPolicy::Optional;
@@ -118,19 +116,19 @@ impl Watcher {
                 }
             };
             if born.elapsed() > RECOVERED {
-                self.crashes = 0;
+                crashes = 0;
             }
-            self.crashes += 1;
-            if !may_restart || self.crashes > self.restarts {
+            crashes += 1;
+            if !may_restart || crashes > self.restarts {
                 return self.give_up(&how);
             }
             // The exponent is bounded, as the number of crashes is not.
-            let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.crashes - 1).min(5)));
-            self.restarted += 1;
+            let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (crashes - 1).min(5)));
+            restarted += 1;
             self.report(ProcessEventKind::Crashed {
                 how,
                 again_after: pause,
-                restart: self.restarted,
+                restart: restarted,
             });
             tokio::select! {
                 () = tokio::time::sleep(pause) => {}

@@ -106,14 +106,13 @@ impl BoxInput {
                 ..head
             });
         }
-        let device = fused.device();
-        let pairs = Pairs::new(&found, &head)?;
+        let pairs = CoveredCells::new(&found, &head)?;
         let by_cell = fused
             .f_detach()?
             .f_squeeze_dim(0)?
             .f_flatten(1, 2)?
             .f_transpose(0, 1)?;
-        let values = tensor(&found.values, &[-1, VALUES as i64], device)?;
+        let values = tensor(&found.values, &[-1, VALUES as i64], fused.device())?;
         let placed: Vec<Box3d> = boxes.iter().map(|placed| placed.box3d).collect();
         let around = self.roi.forward(fused, &placed, &values)?;
         let input = [
@@ -134,7 +133,7 @@ impl BoxInput {
 }
 
 /// Pairs of a box and a cell that it covers.
-struct Pairs {
+struct CoveredCells {
     /// `[K]`.
     box_of: Tensor,
     /// `[K]`.
@@ -149,7 +148,7 @@ struct Pairs {
     own: Tensor,
 }
 
-impl Pairs {
+impl CoveredCells {
     fn new(found: &BoxCells, head: &HeadOutput) -> Result<Self> {
         let device = head.scores.device();
         let [box_of, cell_of] = [&found.box_of, &found.cell_of]
@@ -358,7 +357,7 @@ mod tests {
         let before = head(&detector);
         let anchors = Anchors::for_detector(&detector);
         let found = BoxCells::new(&[car(1)], &detector.feature_grid(), &anchors);
-        let pairs = Pairs::new(&found, &before).unwrap();
+        let pairs = CoveredCells::new(&found, &before).unwrap();
         let count = found.cell_of.len() as i64;
         let changes = Tensor::zeros([count, 2 * CHANGES + 1], (Kind::Float, Device::Cpu));
         for anchor in 0..2 {

@@ -21,7 +21,7 @@ const TOO_LITTLE: f64 = 1e-6;
 /// (the planar case has a closed form). A cell that is similar everywhere matches at its own position, so it pulls
 /// towards no correction. Everything is differentiable and trained by the detection loss.
 #[derive(Debug)]
-pub(super) struct Consensus {
+pub(super) struct FeatureConsensus {
     key: Linear,
     /// `[]` logarithm of the sharpness of the similarity weights.
     sharpness: Tensor,
@@ -33,14 +33,14 @@ pub(super) struct Consensus {
 
 /// A planar motion of a feature map about its centre, in cells: `ego = rotation * map + shift`.
 #[derive(Debug)]
-pub(super) struct Motion {
+pub(super) struct MapMotion {
     /// `[]` radians.
     angle: Tensor,
     /// `[2]` columns, rows.
     shift: Tensor,
 }
 
-impl Consensus {
+impl FeatureConsensus {
     /// Variables `key`, `sharpness` and `trust` below `path`; compares `cells` cells within `reach` cells to each side.
     pub(super) fn new(path: &nn::Path<'_>, channels: i64, cells: i64, reach: i64) -> Self {
         Self {
@@ -60,15 +60,13 @@ impl Consensus {
         ego: &Tensor,
         other: &Tensor,
         weight: &Tensor,
-    ) -> Result<Option<Motion>, TchError> {
+    ) -> Result<Option<MapMotion>, TchError> {
         let (height, width, channels) = ego.size3()?;
         let count = self.cells.min(height * width);
         // Step: the cells that count most for both. Their choice has no gradient, their weights have.
-        let (_, best) = weight
-            .f_detach()?
-            .f_view([-1])?
-            .f_topk(count, 0, true, false)?;
-        let weight = weight.f_view([-1])?.f_index_select(0, &best)?;
+        let weight = weight.f_view([-1])?;
+        let (_, best) = weight.f_detach()?.f_topk(count, 0, true, false)?;
+        let weight = weight.f_index_select(0, &best)?;
         if weight.f_sum(Kind::Float)?.f_double_value(&[])? < TOO_LITTLE {
             return Ok(None);
         }
@@ -116,7 +114,7 @@ impl Consensus {
     }
 
     /// The motion of points `from` `[K, 2]` by `moved`, scaled by the learnt share.
-    fn fit(&self, from: &Tensor, moved: &Tensor, weight: &Tensor) -> Result<Motion, TchError> {
+    fn fit(&self, from: &Tensor, moved: &Tensor, weight: &Tensor) -> Result<MapMotion, TchError> {
         let weight = weight
             .f_div(&(weight.f_sum(Kind::Float)? + TOO_LITTLE))?
             .f_unsqueeze(1)?;
@@ -135,11 +133,11 @@ impl Consensus {
         let turned = rotated(&angle, &centre)?;
         // About the weighted centre c of the cells: R (p - c) + c + step, with R c in `turned`.
         let shift = &centre + step * trust - turned;
-        Ok(Motion { angle, shift })
+        Ok(MapMotion { angle, shift })
     }
 }
 
-impl Motion {
+impl MapMotion {
     /// A feature map `[H, W, C]` moved by this motion, zeros outside, and the mask `[H, W]` moved with it.
     pub(super) fn apply(&self, map: &Tensor, mask: &Tensor) -> Result<(Tensor, Tensor), TchError> {
         let (height, width, channels) = map.size3()?;
@@ -186,10 +184,10 @@ mod tests {
 
     use super::*;
 
-    fn trusting() -> (VarStore, Consensus) {
+    fn trusting() -> (VarStore, FeatureConsensus) {
         tch::manual_seed(3);
         let variables = VarStore::new(Device::Cpu);
-        let consensus = Consensus::new(&variables.root(), 16, 64, 3);
+        let consensus = FeatureConsensus::new(&variables.root(), 16, 64, 3);
         let _ = tch::no_grad(|| consensus.trust.shallow_clone().fill_(20.0));
         let _ = tch::no_grad(|| consensus.sharpness.shallow_clone().fill_(4.0));
         (variables, consensus)

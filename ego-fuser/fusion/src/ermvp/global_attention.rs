@@ -22,14 +22,10 @@ struct Extract {
 
 impl Extract {
     fn new(path: &nn::Path<'_>, channels: i64) -> Self {
-        let compressed = (channels / SQUEEZE).max(1);
+        let (compressed, kernel) = ((channels / SQUEEZE).max(1), [channels, 1, 3, 3]);
         let path = path / "conv";
         Self {
-            depthwise: (&path / 0).var(
-                "weight",
-                &[channels, 1, 3, 3],
-                nn::init::DEFAULT_KAIMING_UNIFORM,
-            ),
+            depthwise: (&path / 0).var("weight", &kernel, nn::init::DEFAULT_KAIMING_UNIFORM),
             squeeze: Linear::new(&(&path / 2 / "fc" / 0), channels, compressed, false),
             excite: Linear::new(&(&path / 2 / "fc" / 2), compressed, channels, false),
             mix: Linear::residual(&(&path / 3), channels, channels, false),

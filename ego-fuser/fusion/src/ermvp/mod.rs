@@ -26,7 +26,7 @@ use protocol::config::{require, within};
 use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, nn};
 
-use self::consensus::Consensus;
+use self::consensus::FeatureConsensus;
 use self::global_attention::{GlobalHalf, REDUCTION};
 use self::sampling::Sampler;
 use super::cobevt::nearest_first;
@@ -109,7 +109,7 @@ impl FusionSettings for ErmvpConfig {
 
 /// Attention with queries of the window, then with queries of the whole map.
 #[derive(Debug)]
-struct Layer {
+struct ErmvpLayer {
     local: HalfBlock,
     global: GlobalHalf,
 }
@@ -118,8 +118,8 @@ struct Layer {
 #[derive(Debug)]
 pub struct Ermvp {
     sampler: Sampler,
-    consensus: Consensus,
-    layers: Vec<Layer>,
+    consensus: FeatureConsensus,
+    layers: Vec<ErmvpLayer>,
     head: MeanHead,
     window: i64,
 }
@@ -132,25 +132,21 @@ impl Ermvp {
     pub fn new(path: &nn::Path<'_>, config: &ErmvpConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         let sizes = &config.layers;
+        let (channels, cells, reach) = (sizes.channels, config.compared, config.search);
         Ok(Self {
-            sampler: Sampler::new(&(path / "sampler"), sizes.channels, config.kept),
-            consensus: Consensus::new(
-                &(path / "consensus"),
-                sizes.channels,
-                config.compared,
-                config.search,
-            ),
+            sampler: Sampler::new(&(path / "sampler"), channels, config.kept),
+            consensus: FeatureConsensus::new(&(path / "consensus"), channels, cells, reach),
             layers: (0..sizes.depth)
                 .map(|index| {
                     let path = path / "layers" / index;
                     let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
-                    Layer {
+                    ErmvpLayer {
                         local: HalfBlock::new(Partition::Window, &attention, &feed, sizes),
                         global: GlobalHalf::new(&path, sizes),
                     }
                 })
                 .collect(),
-            head: MeanHead::new(&(path / "mlp_head"), sizes.channels),
+            head: MeanHead::new(&(path / "mlp_head"), channels),
             window: sizes.window,
         })
     }

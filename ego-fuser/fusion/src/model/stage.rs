@@ -267,10 +267,9 @@ impl FusionStage {
     /// Memory order in which the fusion reads its maps: one with pooled earlier maps takes the maximum over the newest
     /// cell by cell.
     fn order(&self) -> Order {
-        if self.requirements.history.earlier_cells.is_some() {
-            Order::Cells
-        } else {
-            Order::Planes
+        match self.requirements.history.earlier_cells {
+            Some(_) => Order::Cells,
+            None => Order::Planes,
         }
     }
 
@@ -425,9 +424,7 @@ fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
 /// Index of the time step of an entry: how many newer maps of the same agent are listed before it.
 fn step_of(entry: usize, facts: &[MapMetadata]) -> usize {
     let before = facts[..entry].iter();
-    before
-        .filter(|before| before.agent == facts[entry].agent)
-        .count()
+    before.filter(|map| map.agent == facts[entry].agent).count()
 }
 
 /// Names the method of the weights beside an error, if it is another one.

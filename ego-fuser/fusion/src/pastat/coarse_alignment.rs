@@ -75,6 +75,7 @@ impl CoarseAlignment {
             Some(sent) => sent.shallow_clone(),
             None => warped.mask.f_ones_like()?,
         };
+        let received_maps = WarpedMaps::new(received.maps.shallow_clone(), sent);
         let earlier_entries = match earlier {
             Some(earlier) => reaching(&earlier.warped.mask, false)?,
             None => Vec::new(),
@@ -95,10 +96,7 @@ impl CoarseAlignment {
         });
         Ok(CoarseMaps {
             newest: padded(&rows_of(warped, &newest)?, self.padding_cells)?,
-            received: rows_of(
-                &WarpedMaps::new(received.maps.shallow_clone(), sent),
-                &newest,
-            )?,
+            received: rows_of(&received_maps, &newest)?,
             received_cells: FullResolutionMap::shallow_clones(cells),
             earlier: earlier.transpose()?,
             origins: Origins::of(&chosen.collect::<Vec<_>>()),

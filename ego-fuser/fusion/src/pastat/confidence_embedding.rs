@@ -37,9 +37,8 @@ impl ConfidenceEmbedding {
     /// Its variable is `ce.weight` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         // One over the root of the fan-in of the patch embedding, of which this is one more input channel.
-        let bound = ((config.channels * config.patch * config.patch) as f64)
-            .sqrt()
-            .recip();
+        let inputs = (config.channels * config.patch * config.patch) as f64;
+        let bound = inputs.sqrt().recip();
         let weight = config
             .ce
             .then(|| (path / "ce").var("weight", &[config.dim], uniform(bound)));

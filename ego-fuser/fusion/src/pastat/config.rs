@@ -182,10 +182,8 @@ impl PastatConfig {
             Some(None) => PARTS * self.earlier_cells,
             None => 1,
         };
-        lcm(
-            self.patch * self.windows.iter().copied().fold(1, lcm),
-            parts,
-        )
+        let windows = self.patch * self.windows.iter().copied().fold(1, lcm);
+        lcm(windows, parts)
     }
 
     /// Checks that a module can be built.

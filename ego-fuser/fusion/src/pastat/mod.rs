@@ -29,7 +29,7 @@ use self::extensions::map_refinement::MapRefinement;
 use self::extensions::temporal_memory::TemporalMemory;
 use self::patches::Patches;
 use self::spatial_alignment::SpatialAlignment;
-use self::temporal_encoding::TemporalEncoding;
+use self::temporal_encoding::AgeEncoding;
 use self::transformer::Transformer;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
@@ -53,13 +53,12 @@ impl FusionSettings for PastatConfig {
     }
 
     fn requirements(&self) -> Requirements {
-        let history = HistorySpec {
-            frames: self.frames,
-            earlier_cells: Some(self.earlier_cells),
-            full_resolution: self.temporal_memory.is_some(),
-        };
         Requirements {
-            history,
+            history: HistorySpec {
+                frames: self.frames,
+                earlier_cells: Some(self.earlier_cells),
+                full_resolution: self.temporal_memory.is_some(),
+            },
             ..Requirements::default()
         }
     }
@@ -72,7 +71,7 @@ pub(crate) struct Pastat {
     patches: Patches,
     confidence_embedding: ConfidenceEmbedding,
     spatial_alignment: SpatialAlignment,
-    temporal_encoding: TemporalEncoding,
+    temporal_encoding: AgeEncoding,
     transformer: Transformer,
     decoder: Decoder,
     temporal_memory: Option<TemporalMemory>,
@@ -93,7 +92,7 @@ impl Pastat {
             patches: Patches::new(path, config),
             confidence_embedding: ConfidenceEmbedding::new(path, config),
             spatial_alignment: SpatialAlignment::new(path, config),
-            temporal_encoding: TemporalEncoding::new(path, config),
+            temporal_encoding: AgeEncoding::new(path, config),
             transformer: Transformer::new(path, config),
             decoder: Decoder::new(path, config),
             temporal_memory: memory.map(|memory| TemporalMemory::new(path, config, memory)),
@@ -138,7 +137,9 @@ impl Fusion for Pastat {
         // The refinement sees the map as the detection head will, after everything else.
         let refined = match &self.map_refinement {
             Some(refinement) => {
-                let likely = likely(&fused, maps)?;
+                // Without earlier maps the input does not contain the class head.
+                let classes = maps.earlier_full_resolution().map(|(_, classes)| classes);
+                let likely = classes.map(|classes| classes.likely(&fused)).transpose()?;
                 refinement.forward(fused, likely.as_ref(), maps.is_training)?
             }
             None => fused,
@@ -163,13 +164,6 @@ impl Fusion for Pastat {
             .as_mut()
             .map_or(Ok(()), |refinement| refinement.quantise(scales))
     }
-}
-
-/// Likelihood of a vehicle by the detector's class head, `[1, 1, H, W]`; `None` without earlier maps, since the input
-/// contains the head together with these.
-fn likely(fused: &Tensor, maps: &AlignedMaps) -> Result<Option<Tensor>, TchError> {
-    let head = maps.earlier_full_resolution();
-    head.map(|(_, classes)| classes.likely(fused)).transpose()
 }
 
 #[cfg(test)]

@@ -11,12 +11,12 @@ const MAX_AGE_SECS: f64 = 10.0;
 
 /// Adds the encodings of each map to its tokens.
 #[derive(Debug)]
-pub(super) struct TemporalEncoding {
+pub(super) struct AgeEncoding {
     config: PastatConfig,
     device: Device,
 }
 
-impl TemporalEncoding {
+impl AgeEncoding {
     /// It has no variables; `path` is that of the module.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         Self {
@@ -61,11 +61,9 @@ fn encoding(age_secs: f64, config: &PastatConfig) -> Vec<f32> {
         .map(|channel| {
             // Even channels 2k have the sine, odd channels 2k + 1 the cosine, each with its own exponent.
             let angle = t / 10_000_f64.powf(channel as f64 / dim);
-            (if channel % 2 == 1 {
-                angle.cos()
-            } else {
-                angle.sin()
-            }) as f32
+            let (sin, cos) = angle.sin_cos();
+            let wave = if channel % 2 == 1 { cos } else { sin };
+            wave as f32
         })
         .collect()
 }

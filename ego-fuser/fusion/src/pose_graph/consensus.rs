@@ -11,7 +11,7 @@ const MIN_EDGE_M: f64 = 2.0;
 const MIN_LEAD: f64 = 0.5;
 
 /// A motion with its inliers.
-pub(super) struct Consensus {
+pub(super) struct ConsensusMotion {
     /// Transforms points of the agent's frame to the ego's.
     pub(super) motion: Isometry3<f64>,
     /// Pairs of object and box.
@@ -42,7 +42,7 @@ pub(super) fn consensus(
     boxes: &[Vector3<f64>],
     prior: &Isometry3<f64>,
     config: &PoseGraphConfig,
-) -> Option<Consensus> {
+) -> Option<ConsensusMotion> {
     // Pairs of object and box that may match at the uncorrected pose.
     let mut candidates = Vec::new();
     for (index, center) in boxes.iter().enumerate() {
@@ -50,7 +50,7 @@ pub(super) fn consensus(
         let near = (0..objects.len()).filter(|&at| (objects[at] - place).norm() < config.search_m);
         candidates.extend(near.map(|object| (object, index)));
     }
-    let search = Search {
+    let search = MotionSearch {
         objects,
         boxes,
         prior,
@@ -72,14 +72,14 @@ pub(super) fn consensus(
     }
     let refined = search.refined(*best);
     let matches = search.matches(&refined);
-    (matches.len() >= config.min_shared.max(2)).then(|| Consensus {
+    (matches.len() >= config.min_shared.max(2)).then(|| ConsensusMotion {
         score: search.score(&refined, &matches),
         matches,
         motion: refined,
     })
 }
 
-struct Search<'a> {
+struct MotionSearch<'a> {
     objects: &'a [Vector3<f64>],
     boxes: &'a [Vector3<f64>],
     prior: &'a Isometry3<f64>,
@@ -87,17 +87,14 @@ struct Search<'a> {
     candidates: Vec<(usize, usize)>,
 }
 
-impl Search<'_> {
+impl MotionSearch<'_> {
     /// Motion and score by each pair of candidates, where it is within bounds and has enough inliers.
     fn motions(&self) -> Vec<(Isometry3<f64>, f64)> {
-        let pairs = self
-            .candidates
-            .iter()
-            .enumerate()
-            .flat_map(|(index, &first)| {
-                let later = self.candidates[index + 1..].iter();
-                later.map(move |&second| (first, second))
-            });
+        let candidates = self.candidates.iter().enumerate();
+        let pairs = candidates.flat_map(|(index, &first)| {
+            let later = self.candidates[index + 1..].iter();
+            later.map(move |&second| (first, second))
+        });
         let motions = pairs.filter_map(|(first, second)| {
             let motion = self.motion(first, second)?;
             let matches = self.matches(&motion);
@@ -127,10 +124,8 @@ impl Search<'_> {
             UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn) * self.prior.rotation;
         let middle = (self.objects[first.0] + self.objects[second.0]) / 2.0;
         let from = rotation * (self.boxes[first.1] + self.boxes[second.1]) / 2.0;
-        Some(Isometry3::from_parts(
-            Translation3::from(middle - from),
-            rotation,
-        ))
+        let shift = Translation3::from(middle - from);
+        Some(Isometry3::from_parts(shift, rotation))
     }
 
     /// Candidates that a motion aligns, each box and each object once, the nearest first.

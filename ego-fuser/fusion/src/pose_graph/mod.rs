@@ -19,7 +19,7 @@ use protocol::{Detection, Pose};
 
 pub use config::PoseGraphConfig;
 use consensus::{apart, consensus, moved};
-use optimise::{Graph, Node, Observation};
+use optimise::{Graph, Observation, PlanarPose};
 
 /// An agent with its detections.
 #[derive(Debug, Clone, Copy)]
@@ -123,24 +123,24 @@ fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<ObservedBox
 
 /// Planar position and heading.
 fn flattened(pose: &Pose) -> Isometry3<f64> {
-    planar(&Node::new(&pose.translation_m.into(), pose.yaw_rad()))
+    planar(&PlanarPose::new(&pose.translation_m.into(), pose.yaw_rad()))
 }
 
-fn planar(node: &Node) -> Isometry3<f64> {
+fn planar(node: &PlanarPose) -> Isometry3<f64> {
     let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), node.heading_rad);
     Isometry3::from_parts(node.place().into(), turn)
 }
 
 /// The inverse of [`planar`].
-fn node_of(motion: &Isometry3<f64>) -> Node {
-    Node::new(&motion.translation.vector, motion.rotation.euler_angles().2)
+fn node_of(motion: &Isometry3<f64>) -> PlanarPose {
+    PlanarPose::new(&motion.translation.vector, motion.rotation.euler_angles().2)
 }
 
 /// The graph while agents join it.
 #[derive(Default)]
 struct Assembly {
     /// In the frame of the ego.
-    objects: Vec<Node>,
+    objects: Vec<PlanarPose>,
     /// Agents here are indices into `joined`.
     observations: Vec<Observation>,
     joined: Vec<(usize, Isometry3<f64>)>,
@@ -154,8 +154,8 @@ impl Assembly {
         seen: &[Vec<ObservedBox>],
         priors: &[Isometry3<f64>],
         config: &PoseGraphConfig,
-    ) -> Option<(usize, consensus::Consensus)> {
-        let objects: Vec<Vector3<f64>> = self.objects.iter().map(Node::place).collect();
+    ) -> Option<(usize, consensus::ConsensusMotion)> {
+        let objects: Vec<Vector3<f64>> = self.objects.iter().map(PlanarPose::place).collect();
         let found = waiting.iter().enumerate().filter_map(|(place, &agent)| {
             let centers: Vec<Vector3<f64>> = seen[agent].iter().map(|seen| seen.center).collect();
             let consensus = consensus(&objects, &centers, &priors[agent], config)?;
@@ -180,14 +180,14 @@ impl Assembly {
                 None => {
                     let place = moved(ego_from_agent, &seen.center);
                     let heading_rad = heading + seen.heading_rad;
-                    self.objects.push(Node::new(&place, heading_rad));
+                    self.objects.push(PlanarPose::new(&place, heading_rad));
                     self.objects.len() - 1
                 }
             };
             self.observations.push(Observation {
                 agent: node,
                 object,
-                seen: Node::new(&seen.center, seen.heading_rad),
+                seen: PlanarPose::new(&seen.center, seen.heading_rad),
                 information: [seen.std_m, seen.std_m, seen.std_rad].map(|std| std.powi(-2)),
             });
         }

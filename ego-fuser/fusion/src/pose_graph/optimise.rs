@@ -13,13 +13,13 @@ const HUBER: f64 = 2.5;
 
 /// A planar position and heading.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Node {
+pub(super) struct PlanarPose {
     pub(super) x_m: f64,
     pub(super) y_m: f64,
     pub(super) heading_rad: f64,
 }
 
-impl Node {
+impl PlanarPose {
     /// At a place whose height is left out.
     pub(super) fn new(place: &Vector3<f64>, heading_rad: f64) -> Self {
         Self {
@@ -49,7 +49,7 @@ pub(super) struct Observation {
     pub(super) agent: usize,
     pub(super) object: usize,
     /// In the frame of the agent.
-    pub(super) seen: Node,
+    pub(super) seen: PlanarPose,
     /// Inverse variances of x, y and heading.
     pub(super) information: [f64; 3],
 }
@@ -57,12 +57,12 @@ pub(super) struct Observation {
 /// Agents, of which the first is fixed, and objects.
 #[derive(Debug)]
 pub(super) struct Graph {
-    pub(super) agents: Vec<Node>,
+    pub(super) agents: Vec<PlanarPose>,
     /// Prior poses of the agents.
-    pub(super) priors: Vec<Node>,
+    pub(super) priors: Vec<PlanarPose>,
     /// Inverse variances of x, y and heading.
     pub(super) prior_information: [f64; 3],
-    pub(super) objects: Vec<Node>,
+    pub(super) objects: Vec<PlanarPose>,
     pub(super) observations: Vec<Observation>,
 }
 
@@ -130,10 +130,8 @@ impl Graph {
 
     /// Residual of an observation and its square in standard deviations.
     fn weighed(&self, observation: &Observation) -> (Vector3<f64>, f64) {
-        let (agent, object) = (
-            &self.agents[observation.agent],
-            &self.objects[observation.object],
-        );
+        let agent = &self.agents[observation.agent];
+        let object = &self.objects[observation.object];
         let (sin, cos) = agent.heading_rad.sin_cos();
         let (dx, dy) = (object.x_m - agent.x_m, object.y_m - agent.y_m);
         let turn = object.heading_rad - agent.heading_rad - observation.seen.heading_rad;
@@ -166,19 +164,14 @@ impl Graph {
     }
 
     fn add(&self, observation: &Observation, equations: &mut Equations) {
-        let (agent, object) = (
-            &self.agents[observation.agent],
-            &self.objects[observation.object],
-        );
+        let agent = &self.agents[observation.agent];
+        let object = &self.objects[observation.object];
         let (sin, cos) = agent.heading_rad.sin_cos();
         let (dx, dy) = (object.x_m - agent.x_m, object.y_m - agent.y_m);
         let (residual, square) = self.weighed(observation);
         // Huber loss by iteratively reweighted least squares.
-        let robust = if square.sqrt() <= HUBER {
-            1.0
-        } else {
-            HUBER / square.sqrt()
-        };
+        let far = square.sqrt();
+        let robust = if far <= HUBER { 1.0 } else { HUBER / far };
         let information = Matrix3::from_diagonal(&Vector3::from(observation.information)) * robust;
         // Jacobian by the object: R^T, and 1 for the heading.
         let by_object = Matrix3::new(cos, sin, 0.0, -sin, cos, 0.0, 0.0, 0.0, 1.0);
@@ -191,22 +184,12 @@ impl Graph {
             return;
         };
         // Jacobian by the agent: -R^T, the derivative of R^T by the heading, and -1.
-        let by_agent = Matrix3::new(
-            -cos,
-            -sin,
-            -sin * dx + cos * dy,
-            sin,
-            -cos,
-            -cos * dx - sin * dy,
-            0.0,
-            0.0,
-            -1.0,
-        );
+        let (x_turn, y_turn) = (-sin * dx + cos * dy, -cos * dx - sin * dy);
+        let by_agent = Matrix3::new(-cos, -sin, x_turn, sin, -cos, y_turn, 0.0, 0.0, -1.0);
         let weighed = by_agent.transpose() * information;
         equations.add_agent(row, &(weighed * by_agent), &(weighed * residual));
-        equations
-            .mixed
-            .push((row, observation.object, weighed * by_object));
+        let mixed = weighed * by_object;
+        equations.mixed.push((row, observation.object, mixed));
     }
 }
 
@@ -265,11 +248,8 @@ fn squared(residual: &Vector3<f64>, information: &[f64; 3]) -> f64 {
         .sum()
 }
 
-fn difference(one: &Node, other: &Node) -> Vector3<f64> {
+fn difference(one: &PlanarPose, other: &PlanarPose) -> Vector3<f64> {
     let turn = one.heading_rad - other.heading_rad;
-    Vector3::new(
-        one.x_m - other.x_m,
-        one.y_m - other.y_m,
-        turn.sin().atan2(turn.cos()),
-    )
+    let (x, y) = (one.x_m - other.x_m, one.y_m - other.y_m);
+    Vector3::new(x, y, turn.sin().atan2(turn.cos()))
 }

@@ -57,12 +57,11 @@ impl FusionSettings for TrafAlignConfig {
     }
 
     fn requirements(&self) -> Requirements {
-        let history = HistorySpec {
-            frames: self.frames,
-            ..HistorySpec::default()
-        };
         Requirements {
-            history,
+            history: HistorySpec {
+                frames: self.frames,
+                ..HistorySpec::default()
+            },
             ..Requirements::default()
         }
     }
@@ -92,13 +91,9 @@ impl TrafAlign {
     pub(crate) fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         let (channels, patch, dim) = (config.channels, config.patch, config.dim);
+        let (tokens, norm) = (path / "tokens", path / "tokens_norm");
         Ok(Self {
-            tokeniser: ConvLayer::patches(
-                &(path / "tokens"),
-                &(path / "tokens_norm"),
-                [channels, dim],
-                patch,
-            ),
+            tokeniser: ConvLayer::patches(&tokens, &norm, [channels, dim], patch),
             age: path.var("age", &[2 * WAVES, dim], SMALL),
             trajectories: Trajectories::new(&(path / "trajectories"), config),
             layers: (0..config.layers)

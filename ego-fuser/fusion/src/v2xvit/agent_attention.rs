@@ -37,14 +37,8 @@ struct Asked {
 
 impl AgentAttention {
     /// Variables `q_linears`, `k_linears`, `v_linears`, `a_linears`, `relation_att` and `relation_msg` below `path`.
-    pub fn new(
-        path: &nn::Path<'_>,
-        channels: i64,
-        heads: i64,
-        head_channels: i64,
-        dropout: f64,
-    ) -> Self {
-        let inner = heads * head_channels;
+    pub fn new(path: &nn::Path<'_>, channels: i64, heads: i64, each: i64, dropout: f64) -> Self {
+        let inner = heads * each;
         let [query, key, value] = ["q_linears", "k_linears", "v_linears"].map(|name| {
             std::array::from_fn(|kind| Linear::new(&(path / name / kind), channels, inner, true))
         });
@@ -56,8 +50,8 @@ impl AgentAttention {
             out: std::array::from_fn(|kind| {
                 Linear::residual(&(path / "a_linears" / kind), inner, channels, true)
             }),
-            relation_att: relation(path, "relation_att", heads, head_channels),
-            relation_msg: relation(path, "relation_msg", heads, head_channels),
+            relation_att: relation(path, "relation_att", heads, each),
+            relation_msg: relation(path, "relation_msg", heads, each),
             dropout,
         }
     }
@@ -126,15 +120,13 @@ impl AgentAttention {
         let bias = bias.transpose()?;
         let mut answers: Vec<Option<Tensor>> = (0..queries).map(|_| None).collect();
         for (kind, asked) in asked {
-            let askers: Vec<usize> = (0..queries)
-                .filter(|&agent| types[agent] == *kind)
+            let askers: Vec<i64> = (0..queries as i64)
+                .filter(|&agent| types[agent as usize] == *kind)
                 .collect();
             // Usually all agents are of one type and all ask: then nothing is copied.
-            let query = if askers.len() == types.len() {
-                x.shallow_clone()
-            } else {
-                let rows: Vec<i64> = askers.iter().map(|&agent| agent as i64).collect();
-                picked(x, &rows)?
+            let query = match askers.len() == types.len() {
+                true => x.shallow_clone(),
+                false => picked(x, &askers)?,
             };
             let answer = self.answer(&query, x, types, asked, bias.as_ref())?;
             let answer = self.out[*kind].forward(&answer)?.f_transpose(0, 1)?;
@@ -142,8 +134,8 @@ impl AgentAttention {
             if askers.len() == queries {
                 return Ok(answer);
             }
-            for (index, &agent) in askers.iter().enumerate() {
-                answers[agent] = Some(answer.f_get(index as i64)?);
+            for (index, &agent) in (0..).zip(&askers) {
+                answers[agent as usize] = Some(answer.f_get(index)?);
             }
         }
         let answers: Vec<Tensor> = answers.into_iter().flatten().collect();

@@ -21,25 +21,14 @@ pub struct Block {
 impl Block {
     fn new(path: &nn::Path<'_>, config: &V2xVitConfig, order: &BlockOrder) -> Self {
         let channels = config.channels;
-        let (agents, windows) = (path / 0, path / 1);
+        let (heads, each) = (config.agent_heads, config.agent_head_channels);
+        let (sizes, merge, dropout) = (&config.windows, config.merge, config.dropout);
+        let (agents, cells) = (path / 0, path / 1);
         Self {
             agent_norm: LayerNorm::new(&(&agents / "norm"), channels),
-            agents: AgentAttention::new(
-                &(&agents / "fn"),
-                channels,
-                config.agent_heads,
-                config.agent_head_channels,
-                config.dropout,
-            ),
-            window_norm: LayerNorm::new(&(&windows / "norm"), channels),
-            windows: WindowAttention::new(
-                &(&windows / "fn"),
-                channels,
-                &config.windows,
-                config.merge,
-                order,
-                config.dropout,
-            ),
+            agents: AgentAttention::new(&(&agents / "fn"), channels, heads, each, dropout),
+            window_norm: LayerNorm::new(&(&cells / "norm"), channels),
+            windows: WindowAttention::new(&(&cells / "fn"), channels, sizes, merge, order, dropout),
         }
     }
 
@@ -101,23 +90,19 @@ pub struct Encoder {
 impl Encoder {
     /// Variables `layers` and `rte` below `path`. `config` is valid and its order is `order`.
     pub fn new(path: &nn::Path<'_>, config: &V2xVitConfig, order: &BlockOrder) -> Self {
-        let temporal = config
-            .temporal_encoding
-            .then(|| TemporalEncoding::new(&(path / "rte"), config.channels));
+        let (channels, hidden, dropout) = (config.channels, config.hidden, config.dropout);
+        let has_temporal = config.temporal_encoding;
+        let temporal = has_temporal.then(|| TemporalEncoding::new(&(path / "rte"), channels));
         Self {
             layers: (0..config.depth)
                 .map(|index| {
                     let path = path / "layers" / index;
+                    let (blocks, feed) = (&path / 0 / "layers", &path / 1);
                     Layer {
                         blocks: (0..config.blocks)
-                            .map(|block| Block::new(&(&path / 0 / "layers" / block), config, order))
+                            .map(|block| Block::new(&(&blocks / block), config, order))
                             .collect(),
-                        feed_forward: FeedForwardBlock::new(
-                            &(&path / 1),
-                            config.channels,
-                            config.hidden,
-                            config.dropout,
-                        ),
+                        feed_forward: FeedForwardBlock::new(&feed, channels, hidden, dropout),
                     }
                 })
                 .collect(),

@@ -2,7 +2,7 @@
 
 use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
-use tch::{Kind, TchError, Tensor};
+use tch::{TchError, Tensor};
 
 use crate::f64_tensor::picked;
 use crate::layers::Linear;
@@ -68,9 +68,7 @@ fn waves(channels: i64) -> Tensor {
             (wave / (channels as f64).sqrt()) as f32
         })
         .collect();
-    Tensor::from_slice(&values)
-        .view([ROWS, channels])
-        .to_kind(Kind::Float)
+    Tensor::from_slice(&values).view([ROWS, channels])
 }
 
 #[cfg(test)]

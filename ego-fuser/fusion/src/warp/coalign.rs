@@ -16,14 +16,9 @@ use super::{BILINEAR, PADDING_ZEROS};
 pub fn normalized(pairwise: &Tensor, height: i64, width: i64, pixel_m: f64) -> Result<Tensor> {
     let (height, width) = (height as f64, width as f64);
     // Terms across axes by the ratio of the edges, translations from metres to half edges of the map.
-    let scale = [
-        1.0,
-        height / width,
-        2.0 / (pixel_m * width),
-        width / height,
-        1.0,
-        2.0 / (pixel_m * height),
-    ];
+    let (xy, yx) = (height / width, width / height);
+    let [x0, y0] = [width, height].map(|edge| 2.0 / (pixel_m * edge));
+    let scale = [1.0, xy, x0, yx, 1.0, y0];
     let scale = Tensor::from_slice(&scale)
         .f_view([2, 3])?
         .f_to_kind(pairwise.kind())?

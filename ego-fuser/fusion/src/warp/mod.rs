@@ -116,10 +116,8 @@ pub fn warp_to_ego(
         .map(|pose| cav_from_ego_normalized(pose, grid))
         .collect();
     if affine.iter().all(|&affine| affine == UNMOVED) {
-        return Ok(WarpedMaps {
-            features: features.shallow_clone(),
-            mask: sent.f_to_kind(features.kind())?,
-        });
+        let mask = sent.f_to_kind(features.kind())?;
+        return Ok(WarpedMaps::new(features.shallow_clone(), mask));
     }
     let warped = (0..).zip(affine).map(|(index, affine)| {
         let map = features.f_narrow(0, index, 1)?;
@@ -132,10 +130,8 @@ pub fn warp_to_ego(
         read(&map, &sent, &sampling_grid)
     });
     let (moved, masks): (Vec<_>, Vec<_>) = warped.collect::<Result<_, TchError>>()?;
-    Ok(WarpedMaps {
-        features: Tensor::f_cat(&moved, 0)?,
-        mask: Tensor::f_cat(&masks, 0)?,
-    })
+    let [features, mask] = [moved, masks].map(|maps| Tensor::f_cat(&maps, 0));
+    Ok(WarpedMaps::new(features?, mask?))
 }
 
 /// [`warp_to_ego`] of maps `[N, C, H, W]` whose channels of each cell are contiguous, as in the result, each with its
@@ -242,10 +238,8 @@ fn read_by_tensors(
         .f_to_kind(map.kind())?;
     // `grid_sampler` needs positions of the kind of the values that it reads.
     let sampling_grid = sampling_grid.f_to_kind(map.kind())?;
-    Ok((
-        map.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)? * &mask,
-        mask,
-    ))
+    let map = map.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)? * &mask;
+    Ok((map, mask))
 }
 
 /// The identity.
@@ -263,15 +257,8 @@ pub fn cav_from_ego_normalized(ego_from_cav: &Pose, grid: &BevGrid) -> [f32; 6] 
     let (from_x, from_y) = (middle_x - ego_x, middle_y - ego_y);
     let x0 = (cos * from_x + sin * from_y - middle_x) / half_x;
     let y0 = (-sin * from_x + cos * from_y - middle_y) / half_y;
-    [
-        cos,
-        sin * half_y / half_x,
-        x0,
-        -sin * half_x / half_y,
-        cos,
-        y0,
-    ]
-    .map(|value| value as f32)
+    let (xy, yx) = (sin * half_y / half_x, -sin * half_x / half_y);
+    [cos, xy, x0, yx, cos, y0].map(|value| value as f32)
 }
 
 #[cfg(test)]

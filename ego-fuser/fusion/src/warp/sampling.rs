@@ -22,7 +22,7 @@ pub(crate) const SUM: i64 = 0;
 
 /// A position on a map: the four cells around it with their weights, which are zero beyond the edges.
 #[derive(Clone, Copy)]
-struct Place {
+struct SampledPlace {
     cells: [usize; 4],
     weights: [f32; 4],
     /// The nearest cell, if it is on the map.
@@ -71,10 +71,8 @@ impl Cells {
             }
         }
         let read = Tensor::f_from_slice(&read)?.f_view([-1, rows, columns])?;
-        Ok((
-            read,
-            Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?,
-        ))
+        let reached = Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?;
+        Ok((read, reached))
     }
 
     /// The channels at a position, and the validity there.
@@ -99,23 +97,17 @@ impl Cells {
 
 /// From -1..1 over the whole extent of a map, edges of the outer cells included.
 #[inline]
-fn place([x, y]: [f32; 2], [height, width]: [usize; 2]) -> Place {
-    let columns = Pair::around(along(x, width), width);
-    let rows = Pair::around(along(y, height), height);
+fn place([x, y]: [f32; 2], [height, width]: [usize; 2]) -> SampledPlace {
+    let columns = AxisCells::around(along(x, width), width);
+    let rows = AxisCells::around(along(y, height), height);
     let ([top, bottom], [left, right]) = (rows.places, columns.places);
     let ([up, down], [before, behind]) = (rows.weights, columns.weights);
-    Place {
-        cells: [
-            top * width + left,
-            top * width + right,
-            bottom * width + left,
-            bottom * width + right,
-        ],
+    let corners = [(top, left), (top, right), (bottom, left), (bottom, right)];
+    let cell = |(row, column): (usize, usize)| row * width + column;
+    SampledPlace {
+        cells: corners.map(cell),
         weights: [up * before, up * behind, down * before, down * behind],
-        nearest: rows
-            .nearest
-            .zip(columns.nearest)
-            .map(|(row, column)| row * width + column),
+        nearest: rows.nearest.zip(columns.nearest).map(cell),
     }
 }
 
@@ -197,7 +189,7 @@ fn along(at: f32, size: usize) -> f32 {
 }
 
 /// The two cells around a position along one axis.
-struct Pair {
+struct AxisCells {
     /// Those nearest to them on the map.
     places: [usize; 2],
     /// Zero for one that is not on it.
@@ -206,7 +198,7 @@ struct Pair {
     nearest: Option<usize>,
 }
 
-impl Pair {
+impl AxisCells {
     #[inline]
     fn around(at: f32, size: usize) -> Self {
         // By hand, since the processor's own rounding is not available on every processor and a call per value would
@@ -217,11 +209,8 @@ impl Pair {
         let (second, share) = (first.saturating_add(1), at - first as f32);
         let last = size as i32 - 1;
         let on_map = 0..=last;
-        let nearest = if share > 0.5 || (share == 0.5 && first & 1 != 0) {
-            second
-        } else {
-            first
-        };
+        let is_second = share > 0.5 || (share == 0.5 && first & 1 != 0);
+        let nearest = if is_second { second } else { first };
         Self {
             // Beyond the edge the weight is zero, and the clamped index can still be read.
             places: [first, second].map(|cell| cell.clamp(0, last) as usize),
@@ -241,7 +230,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_place_lies_between_the_cells_around_it(at in -9.0..20.0f32, size in 1..12usize) {
-            let Pair { places, weights, nearest } = Pair::around(at, size);
+            let AxisCells { places, weights, nearest } = AxisCells::around(at, size);
             let on_map = |cell: f32| (0.0..size as f32).contains(&cell).then_some(cell as usize);
             let around = [at.floor(), at.floor() + 1.0];
             for ((place, weight), cell) in places.into_iter().zip(weights).zip(around) {
@@ -256,7 +245,7 @@ mod tests {
 
     #[test]
     fn half_way_the_even_cell_is_the_nearest_and_what_is_no_place_has_none() {
-        let nearest = |at: f32| Pair::around(at, 4).nearest;
+        let nearest = |at: f32| AxisCells::around(at, 4).nearest;
         assert_eq!(
             [0.5, 1.5, 2.5, -0.5, 3.5].map(nearest),
             [Some(0), Some(2), Some(2), Some(0), None]
@@ -264,7 +253,7 @@ mod tests {
         for at in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 3e9, -3e9] {
             assert_eq!(nearest(at), None);
             assert_eq!(
-                Pair::around(at, 4).weights.map(|weight| weight == 0.0),
+                AxisCells::around(at, 4).weights.map(|weight| weight == 0.0),
                 [true; 2]
             );
         }

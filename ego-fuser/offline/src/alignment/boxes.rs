@@ -1,17 +1,14 @@
 //! Alignment methods that exchange boxes.
 
+use localization::pose_source::NO_SOURCE;
 use nalgebra::Isometry3;
 use protocol::message::{Boxes, Message};
-use protocol::{Box3d, Detection, NoPoseReason, PoseEstimate};
+use protocol::{Box3d, Detection};
 
 use super::box_icp;
 use super::free_align::{self, FreeAlignConfig};
-use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
-
-/// No pose is known: these methods do not need one.
-pub(super) const NO_POSE: PoseEstimate = PoseEstimate::NoPose {
-    reason: NoPoseReason::NoSource,
-    inlier_count: 0,
+use super::method::{
+    AlignError, AlignInput, Alignment, AlignmentMethod, AlignmentSpec, NotAligned,
 };
 
 /// Matches the graphs of both vehicles' boxes.
@@ -31,17 +28,12 @@ impl FreeAlign {
 }
 
 impl AlignmentMethod for FreeAlign {
-    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
+    fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
         let sent = vehicle.boxes.len().min(self.config.max_boxes);
         Ok(message(&vehicle.boxes[..sent]))
     }
 
-    fn align(
-        &self,
-        _: &Vehicle<'_>,
-        own: &Message,
-        received: &Message,
-    ) -> Result<Isometry3<f64>, NotAligned> {
+    fn align(&self, _: &AlignInput<'_>, own: &Message, received: &Message) -> Alignment {
         let (ego, neighbour) = (boxes(own)?, boxes(received)?);
         Ok(free_align::align(&ego, &neighbour, &self.config)?.ego_from_neighbour)
     }
@@ -59,16 +51,11 @@ impl BoxIcp {
 }
 
 impl AlignmentMethod for BoxIcp {
-    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
+    fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
         Ok(message(vehicle.boxes))
     }
 
-    fn align(
-        &self,
-        _: &Vehicle<'_>,
-        own: &Message,
-        received: &Message,
-    ) -> Result<Isometry3<f64>, NotAligned> {
+    fn align(&self, _: &AlignInput<'_>, own: &Message, received: &Message) -> Alignment {
         let (ego, neighbour) = (boxes(own)?, boxes(received)?);
         Ok(box_icp::align(&ego, &neighbour, &Isometry3::identity())?)
     }
@@ -82,7 +69,8 @@ fn message(boxes: &[Box3d]) -> Message {
         source: None,
     });
     let objects: Vec<_> = detections.map(Into::into).collect();
-    Message::Boxes(Boxes::new(NO_POSE, &objects))
+    // No pose is known: these methods do not need one.
+    Message::Boxes(Boxes::new(NO_SOURCE, &objects))
 }
 
 fn boxes(message: &Message) -> Result<Vec<Box3d>, NotAligned> {

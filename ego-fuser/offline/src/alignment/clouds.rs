@@ -1,12 +1,14 @@
 //! Alignment by sweeps: ICP of the neighbour's sweep against the ego's.
 
+use localization::pose_source::NO_SOURCE;
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
 use nalgebra::Isometry3;
 use protocol::message::{Message, Points};
 use protocol::{PointCloud, PoseEstimate};
 
-use super::boxes::NO_POSE;
-use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
+use super::method::{
+    AlignError, AlignInput, Alignment, AlignmentMethod, AlignmentSpec, NotAligned, pose_difference,
+};
 
 /// Registers the neighbour's decimated sweep against the ego's own.
 #[derive(Debug, Clone)]
@@ -24,23 +26,10 @@ impl CloudIcp {
             starts_at_gnss,
         })
     }
-
-    fn start(
-        &self,
-        own: &PoseEstimate,
-        received: &PoseEstimate,
-    ) -> Result<Isometry3<f64>, NotAligned> {
-        if !self.starts_at_gnss {
-            return Ok(Isometry3::identity());
-        }
-        let own = own.world_from_cav().ok_or(NotAligned::NoPose)?;
-        let received = received.world_from_cav().ok_or(NotAligned::NoPose)?;
-        Ok(own.from_world(received).isometry())
-    }
 }
 
 impl AlignmentMethod for CloudIcp {
-    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
+    fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
         let decimate = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
         let points = decimate.points_m().iter();
         let xyzi = points.map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]);
@@ -49,20 +38,18 @@ impl AlignmentMethod for CloudIcp {
         };
         let measured = vehicle.frame.gnss_world_from_lidar();
         let measured = measured.filter(|_| self.starts_at_gnss);
-        let pose = measured.map_or(NO_POSE, |pose| PoseEstimate::new(pose, 1.0));
+        let pose = measured.map_or(NO_SOURCE, |pose| PoseEstimate::new(pose, 1.0));
         Ok(Message::Points(Points { pose, points }))
     }
 
-    fn align(
-        &self,
-        ego: &Vehicle<'_>,
-        own: &Message,
-        received: &Message,
-    ) -> Result<Isometry3<f64>, NotAligned> {
+    fn align(&self, ego: &AlignInput<'_>, own: &Message, received: &Message) -> Alignment {
         let (Message::Points(own), Message::Points(received)) = (own, received) else {
             return Err(NotAligned::Message);
         };
-        let start = self.start(&own.pose, &received.pose)?;
+        let start = match self.starts_at_gnss {
+            true => pose_difference(&own.pose, &received.pose)?,
+            false => Isometry3::identity(),
+        };
         // The ego has its own sweep at full density: flatter planes than from a decimated one.
         let target = IcpTarget::of_sweep(&ego.frame.points.xyzi, &self.config);
         let source = IcpSource::of_sweep(&received.points.xyzi, &self.config);

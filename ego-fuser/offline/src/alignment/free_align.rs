@@ -106,7 +106,7 @@ pub fn align(
     neighbour: &[Box3d],
     config: &FreeAlignConfig,
 ) -> Result<BoxAlignment, NoAlignment> {
-    let (ego, neighbour) = (Graph::new(ego, config), Graph::new(neighbour, config));
+    let (ego, neighbour) = (BoxGraph::new(ego, config), BoxGraph::new(neighbour, config));
     let required = config.min_matches.max(2);
     if ego.len() < required || neighbour.len() < required {
         return Err(NoAlignment::TooFewBoxes {
@@ -115,7 +115,7 @@ pub fn align(
             required,
         });
     }
-    let mut search = Search {
+    let mut search = MatchSearch {
         ego: &ego,
         neighbour: &neighbour,
         config,
@@ -148,10 +148,8 @@ pub fn align(
         });
     }
     // Some boxes may not be nodes: back to the indices of the given lists.
-    let given = best
-        .matches
-        .iter()
-        .map(|&(a, b)| (ego.given[a], neighbour.given[b]));
+    let matches = best.matches.iter();
+    let given = matches.map(|&(a, b)| (ego.given[a], neighbour.given[b]));
     Ok(BoxAlignment {
         matches: given.collect(),
         ..best.clone()
@@ -165,7 +163,7 @@ fn same_motion(a: &Isometry3<f64>, b: &Isometry3<f64>, tolerance_m: f64) -> bool
 }
 
 /// Boxes and the distances between them.
-struct Graph {
+struct BoxGraph {
     /// Index of each node in the given list.
     given: Vec<usize>,
     centres: Vec<Vector3<f64>>,
@@ -173,7 +171,7 @@ struct Graph {
     edges: Vec<f64>,
 }
 
-impl Graph {
+impl BoxGraph {
     fn new(boxes: &[Box3d], config: &FreeAlignConfig) -> Self {
         // NaN fails the comparison and is left out too.
         let centres = boxes.iter().map(|node| Vector3::from(node.center_m));
@@ -209,11 +207,11 @@ impl Graph {
 }
 
 /// A node of the ego's graph and its candidate in the neighbour's.
-type Match = (usize, usize);
+type BoxMatch = (usize, usize);
 
-struct Search<'a> {
-    ego: &'a Graph,
-    neighbour: &'a Graph,
+struct MatchSearch<'a> {
+    ego: &'a BoxGraph,
+    neighbour: &'a BoxGraph,
     config: &'a FreeAlignConfig,
     /// Most inliers so far.
     largest: usize,
@@ -221,7 +219,7 @@ struct Search<'a> {
     motions: Vec<(usize, Isometry3<f64>)>,
 }
 
-impl Search<'_> {
+impl MatchSearch<'_> {
     /// Grows a common subgraph from every pair of anchors.
     fn run(&mut self) {
         for a in 0..self.ego.len() {
@@ -229,7 +227,7 @@ impl Search<'_> {
                 let candidates = self.agreeing_with((a, b));
                 // The other order of the two anchors is the same pair.
                 for &(_, second) in candidates.iter().filter(|(_, second)| second.0 > a) {
-                    let matches = self.grown((a, b), second, &candidates);
+                    let matches = self.grown([(a, b), second], &candidates);
                     self.largest = self.largest.max(matches.len());
                     // Two anchors agree by construction: only further nodes are evidence.
                     if matches.len() >= self.config.min_matches.max(3) {
@@ -241,7 +239,7 @@ impl Search<'_> {
     }
 
     /// All matches whose edge to the anchor has the same length in both graphs, best first.
-    fn agreeing_with(&self, anchor: Match) -> Vec<(f64, Match)> {
+    fn agreeing_with(&self, anchor: BoxMatch) -> Vec<(f64, BoxMatch)> {
         let mut found = Vec::new();
         for k in 0..self.ego.len() {
             let length = self.ego.edge(anchor.0, k);
@@ -262,9 +260,10 @@ impl Search<'_> {
     }
 
     /// The anchors and, greedily, all nodes with the same distances to every node of the subgraph, on the same side.
-    fn grown(&self, first: Match, second: Match, candidates: &[(f64, Match)]) -> Vec<Match> {
+    fn grown(&self, anchors: [BoxMatch; 2], candidates: &[(f64, BoxMatch)]) -> Vec<BoxMatch> {
         let tolerance = self.config.edge_tolerance_m;
-        let mut matches = vec![first, second];
+        let [first, second] = anchors;
+        let mut matches = anchors.to_vec();
         for &(_, (k, l)) in candidates {
             // A mirror image has the same distances and the other sign.
             let sides = self.ego.left_of((first.0, second.0), k)
@@ -282,7 +281,7 @@ impl Search<'_> {
         matches
     }
 
-    fn note(&mut self, matches: &[Match]) {
+    fn note(&mut self, matches: &[BoxMatch]) {
         let Some(motion) = self.fit(matches) else {
             return;
         };
@@ -297,7 +296,7 @@ impl Search<'_> {
         }
     }
 
-    fn fit(&self, matches: &[Match]) -> Option<Isometry3<f64>> {
+    fn fit(&self, matches: &[BoxMatch]) -> Option<Isometry3<f64>> {
         let (ego, neighbour) = (&self.ego.centres, &self.neighbour.centres);
         planar_fit::fit(&matches.iter().map(|&(a, b)| (neighbour[b], ego[a])))
     }
@@ -331,14 +330,14 @@ impl Search<'_> {
     }
 
     /// Inliers of a motion, one to one, nearest first.
-    fn together(&self, motion: &Isometry3<f64>) -> Vec<Match> {
+    fn together(&self, motion: &Isometry3<f64>) -> Vec<BoxMatch> {
         let all = (0..self.ego.len()).flat_map(|a| (0..self.neighbour.len()).map(move |b| (a, b)));
-        let mut near: Vec<(f64, Match)> = all
+        let mut near: Vec<(f64, BoxMatch)> = all
             .map(|pair| (self.apart(pair, motion), pair))
             .filter(|(distance, _)| *distance < self.config.fit_tolerance_m)
             .collect();
         near.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let mut matches: Vec<Match> = Vec::new();
+        let mut matches: Vec<BoxMatch> = Vec::new();
         for (_, pair) in near {
             let mut known = matches.iter();
             if known.all(|known| known.0 != pair.0 && known.1 != pair.1) {
@@ -349,7 +348,7 @@ impl Search<'_> {
     }
 
     /// Horizontal distance between two boxes after a motion, metres.
-    fn apart(&self, (a, b): Match, motion: &Isometry3<f64>) -> f64 {
+    fn apart(&self, (a, b): BoxMatch, motion: &Isometry3<f64>) -> f64 {
         let moved = motion.rotation * self.neighbour.centres[b] + motion.translation.vector;
         (moved - self.ego.centres[a]).xy().norm()
     }

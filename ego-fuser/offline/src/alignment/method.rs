@@ -4,13 +4,13 @@ use dataset::frame::Frame;
 use localization::pose_source::PoseSourceError;
 use nalgebra::Isometry3;
 use protocol::message::Message;
-use protocol::{Box3d, WireError};
+use protocol::{Box3d, PoseEstimate, WireError};
 
 use super::free_align::NoAlignment;
 
 /// Input of a vehicle for alignment.
 #[derive(Debug, Clone, Copy)]
-pub struct Vehicle<'a> {
+pub struct AlignInput<'a> {
     /// Its frame. The true poses in it are for evaluation, and for sources that are configured to use them.
     pub frame: &'a Frame,
     /// Its boxes in the frame of its LiDAR, the most confident first; empty where no method needs them.
@@ -23,15 +23,21 @@ pub trait AlignmentMethod {
     ///
     /// # Errors
     /// [`AlignError`] when the method cannot continue at all.
-    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError>;
+    fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError>;
 
-    /// `ego_from_neighbour`, both in the frames of their LiDARs, or the reason why there is none.
-    fn align(
-        &self,
-        ego: &Vehicle<'_>,
-        own: &Message,
-        received: &Message,
-    ) -> Result<Isometry3<f64>, NotAligned>;
+    /// Aligns the ego with a neighbour by the messages of both.
+    fn align(&self, ego: &AlignInput<'_>, own: &Message, received: &Message) -> Alignment;
+}
+
+/// `ego_from_neighbour`, both in the frames of their LiDARs, or the reason why there is none.
+pub type Alignment = Result<Isometry3<f64>, NotAligned>;
+
+/// Difference of the poses of two vehicles.
+pub(super) fn pose_difference(own: &PoseEstimate, received: &PoseEstimate) -> Alignment {
+    match (own.world_from_cav(), received.world_from_cav()) {
+        (Some(own), Some(received)) => Ok(own.from_world(received).isometry()),
+        _ => Err(NotAligned::NoPose),
+    }
 }
 
 type Construct = Box<dyn Fn() -> Box<dyn AlignmentMethod>>;
@@ -40,7 +46,7 @@ type Construct = Box<dyn Fn() -> Box<dyn AlignmentMethod>>;
 pub struct AlignmentSpec {
     /// Name in tables.
     pub name: String,
-    /// True if it uses [`Vehicle::boxes`].
+    /// True if it uses [`AlignInput::boxes`].
     pub needs_boxes: bool,
     construct: Construct,
 }

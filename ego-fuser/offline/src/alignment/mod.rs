@@ -24,5 +24,5 @@ mod method;
 pub use boxes::{BoxIcp, FreeAlign};
 pub use clouds::CloudIcp;
 pub use free_align::{NoAlignment, align as align_boxes};
-pub use method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
-pub use poses::{Measured, Poses};
+pub use method::{AlignError, AlignInput, Alignment, AlignmentMethod, AlignmentSpec, NotAligned};
+pub use poses::{GivenPose, Poses};

@@ -5,15 +5,16 @@ use std::rc::Rc;
 
 use agent_offline::evaluation::estimate_pose;
 use localization::pose_source::{PoseSource, PoseSourceError};
-use nalgebra::Isometry3;
 use protocol::CavId;
 use protocol::message::Message;
 
-use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
+use super::method::{
+    AlignError, AlignInput, Alignment, AlignmentMethod, AlignmentSpec, NotAligned, pose_difference,
+};
 
 /// Pose of the recording that a source gets as its measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Measured {
+pub enum GivenPose {
     /// The true one: for sources that add an error to it. Sources that localise by sweeps ignore it.
     True,
     /// Estimate of the GNSS and IMU filter.
@@ -25,7 +26,7 @@ type Build = dyn Fn() -> Result<Box<dyn PoseSource>, PoseSourceError>;
 /// Aligns by the difference of both vehicles' poses.
 pub struct Poses {
     build: Rc<Build>,
-    measured: Measured,
+    measured: GivenPose,
     /// A source for each vehicle: some keep the previous pose.
     sources: BTreeMap<CavId, Box<dyn PoseSource>>,
 }
@@ -34,7 +35,7 @@ impl Poses {
     /// A method over any pose source; `build` makes one for each vehicle of a scene.
     pub fn spec(
         name: impl Into<String>,
-        measured: Measured,
+        measured: GivenPose,
         build: impl Fn() -> Result<Box<dyn PoseSource>, PoseSourceError> + 'static,
     ) -> AlignmentSpec {
         let build: Rc<Build> = Rc::new(build);
@@ -47,11 +48,11 @@ impl Poses {
 }
 
 impl AlignmentMethod for Poses {
-    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
+    fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
         let frame = vehicle.frame;
         let measured = match self.measured {
-            Measured::True => frame.world_from_lidar,
-            Measured::Gnss => frame.gnss_world_from_lidar(),
+            GivenPose::True => frame.world_from_lidar,
+            GivenPose::Gnss => frame.gnss_world_from_lidar(),
         };
         let source = match self.sources.entry(frame.cav.clone()) {
             std::collections::btree_map::Entry::Occupied(known) => known.into_mut(),
@@ -61,18 +62,10 @@ impl AlignmentMethod for Poses {
         Ok(Message::Pose(estimate))
     }
 
-    fn align(
-        &self,
-        _: &Vehicle<'_>,
-        own: &Message,
-        received: &Message,
-    ) -> Result<Isometry3<f64>, NotAligned> {
-        let (Message::Pose(own), Message::Pose(received)) = (own, received) else {
-            return Err(NotAligned::Message);
-        };
-        match (own.world_from_cav(), received.world_from_cav()) {
-            (Some(own), Some(received)) => Ok(own.from_world(received).isometry()),
-            _ => Err(NotAligned::NoPose),
+    fn align(&self, _: &AlignInput<'_>, own: &Message, received: &Message) -> Alignment {
+        match (own, received) {
+            (Message::Pose(own), Message::Pose(received)) => pose_difference(own, received),
+            _ => Err(NotAligned::Message),
         }
     }
 }

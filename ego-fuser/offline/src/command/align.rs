@@ -10,8 +10,8 @@ use bus::config_file;
 use clap::ValueEnum;
 use dataset::{self, Dataset, LeftOut, Scenario};
 use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
-use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
-use ego_fuser_offline::evaluation::alignment::table::{Row, Tally, markdown};
+use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, GivenPose, Poses};
+use ego_fuser_offline::evaluation::alignment::table::{MethodRow, PairTally, markdown};
 use ego_fuser_offline::evaluation::alignment::{self, BoxSource};
 use localization::pose_source::{PoseSource, PoseSourceConfig, RecordedPose};
 use localization::registration::icp::IcpConfig;
@@ -36,13 +36,13 @@ pub(crate) struct Arguments {
     data: DataSets,
     /// Methods; none named: all but icp-map.
     #[arg(long, num_args = 1.., value_delimiter = ',', value_enum)]
-    method: Vec<Method>,
+    method: Vec<BuiltIn>,
     /// One more method: the poses of a source, described as in a scenario file. May be repeated.
     #[arg(long, value_name = "NAME=FILE.yaml", value_parser = parse_source)]
     pose_source: Vec<(String, PathBuf)>,
     /// Sources of boxes; with several, methods that match boxes have a row for each.
     #[arg(long, value_enum, num_args = 1.., value_delimiter = ',', default_value = "detected")]
-    boxes: Vec<Boxes>,
+    boxes: Vec<BoxOrigin>,
     /// Weights of the detector, for detected boxes.
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
@@ -68,7 +68,7 @@ pub(crate) struct Arguments {
 
 /// A built-in method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Method {
+enum BuiltIn {
     /// The difference of both vehicles' GNSS and IMU estimates.
     Gnss,
     /// ICP of the neighbour's sweep against the ego's, starting at the identity.
@@ -85,7 +85,7 @@ enum Method {
 
 /// Source of boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Boxes {
+enum BoxOrigin {
     /// The detector.
     Detected,
     /// The annotations of the objects in a vehicle's view, as in the paper.
@@ -122,8 +122,8 @@ impl Arguments {
             for (mut row, method) in found.into_iter().zip(&methods) {
                 if self.boxes.len() > 1 && method.needs_boxes {
                     row.method += match boxes {
-                        Boxes::Detected => ", detected boxes",
-                        Boxes::Annotated => ", annotated boxes",
+                        BoxOrigin::Detected => ", detected boxes",
+                        BoxOrigin::Annotated => ", annotated boxes",
                     };
                 }
                 rows.push(row);
@@ -144,7 +144,7 @@ impl Arguments {
     }
 
     fn methods(&self, left_out: &mut LeftOut) -> Result<Vec<AlignmentSpec>> {
-        use Method::{BoxIcp as BoxIcpMethod, FreeAlign as FreeAlignMethod, Gnss, Icp, IcpGnss};
+        use BuiltIn::{BoxIcp as BoxIcpMethod, FreeAlign as FreeAlignMethod, Gnss, Icp, IcpGnss};
         let all = [Gnss, Icp, IcpGnss, BoxIcpMethod, FreeAlignMethod];
         let named = match &self.method[..] {
             [] => &all[..],
@@ -156,14 +156,14 @@ impl Arguments {
             .collect()
     }
 
-    fn built_in(&self, method: Method, left_out: &mut LeftOut) -> Result<AlignmentSpec> {
+    fn built_in(&self, method: BuiltIn, left_out: &mut LeftOut) -> Result<AlignmentSpec> {
         Ok(match method {
-            Method::Gnss => Poses::spec("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose))),
-            Method::Icp => CloudIcp::spec(IcpConfig::default(), false),
-            Method::IcpGnss => CloudIcp::spec(IcpConfig::default(), true),
-            Method::IcpMap => self.icp_map(left_out)?,
-            Method::BoxIcp => BoxIcp::spec(),
-            Method::FreeAlign => FreeAlign::spec(FreeAlignConfig::default()),
+            BuiltIn::Gnss => Poses::spec("gnss", GivenPose::Gnss, || Ok(Box::new(RecordedPose))),
+            BuiltIn::Icp => CloudIcp::spec(IcpConfig::default(), false),
+            BuiltIn::IcpGnss => CloudIcp::spec(IcpConfig::default(), true),
+            BuiltIn::IcpMap => self.icp_map(left_out)?,
+            BuiltIn::BoxIcp => BoxIcp::spec(),
+            BuiltIn::FreeAlign => FreeAlign::spec(FreeAlignConfig::default()),
         })
     }
 
@@ -177,14 +177,14 @@ impl Arguments {
             read_map(&self.icp_map, self.map_spacing_m, &config, left_out).map_err(BadInput::of)?;
         tracing::info!(planes = map.planes(), "map");
         let source = IcpMapPose::new(Arc::new(map), config);
-        Ok(Poses::spec("icp-map", Measured::Gnss, move || {
+        Ok(Poses::spec("icp-map", GivenPose::Gnss, move || {
             Ok(Box::new(source.clone()) as Box<dyn PoseSource>)
         }))
     }
 
-    fn box_source(&self, boxes: Boxes, methods: &[AlignmentSpec]) -> Result<BoxSource> {
+    fn box_source(&self, boxes: BoxOrigin, methods: &[AlignmentSpec]) -> Result<BoxSource> {
         // Where no method needs boxes nothing is detected, and no weights are needed.
-        if boxes == Boxes::Annotated || !methods.iter().any(|method| method.needs_boxes) {
+        if boxes == BoxOrigin::Annotated || !methods.iter().any(|method| method.needs_boxes) {
             return Ok(BoxSource::Annotated);
         }
         let Some(weights) = &self.weights else {
@@ -203,9 +203,9 @@ impl Arguments {
         boxes: &mut BoxSource,
         scenarios: &[Scenario],
         left_out: &mut LeftOut,
-    ) -> Result<Vec<Row>> {
+    ) -> Result<Vec<MethodRow>> {
         let bar = progress::bar(scenarios.len(), "scenes");
-        let mut tallies = vec![Tally::default(); methods.len()];
+        let mut tallies = vec![PairTally::default(); methods.len()];
         for scenario in scenarios {
             let ticks = (0..scenario.ticks.len())
                 .step_by(self.every as usize)
@@ -229,7 +229,7 @@ fn from_source((name, file): &(String, PathBuf)) -> Result<AlignmentSpec> {
     // Built once already here: a source that cannot be built is an error before the comparison.
     let built = config.build(Inference::default());
     built.at(file).map_err(BadInput::of)?;
-    Ok(Poses::spec(name.clone(), Measured::True, move || {
+    Ok(Poses::spec(name.clone(), GivenPose::True, move || {
         config.build(Inference::default())
     }))
 }

@@ -21,7 +21,7 @@ use support::output;
 use terminal::progress;
 
 /// A data set with its evaluation protocol.
-struct Data {
+struct EvalSet {
     protocol: EvaluationProtocol,
     scenarios: Vec<Scenario>,
 }
@@ -60,32 +60,26 @@ impl Arguments {
         let mut left_out = LeftOut::default();
         let data = self.open(&mut left_out)?;
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
-        if weights.metadata(KIND_KEY) == Some(MULTI_SCALE_KIND) {
-            self.run_multi_scale(&data, &mut left_out)?;
-            return Ok(print_left_out(&left_out));
-        }
-        let methods = match &self.method[..] {
-            [] => vec![None],
-            methods => methods.iter().copied().map(Some).collect(),
-        };
-        let mut rows = Vec::new();
-        for method in methods {
-            let mut setup = Setup {
-                method,
-                ..Setup::default()
+        let (rows, area_m) = if weights.metadata(KIND_KEY) == Some(MULTI_SCALE_KIND) {
+            self.evaluate_multi_scale(&data, &mut left_out)?
+        } else {
+            let methods = match &self.method[..] {
+                [] => vec![None],
+                methods => methods.iter().copied().map(Some).collect(),
             };
-            setup.models.weights.clone_from(&self.weights);
-            setup.models.precision = self.precision;
-            let (row, lost) = evaluate(&setup, &data, self.json)?;
-            left_out.merge(&lost);
-            rows.push(row);
+            let rows = methods.into_iter();
+            let rows = rows.map(|method| self.evaluate(method, &data, &mut left_out));
+            let rows = rows.collect::<Result<Vec<_>>>()?;
+            (rows, weights.detector_config()?.lidar_range_m)
+        };
+        if self.json {
+            self.print_json(rows, &data, area_m)?;
         }
-        self.print_json(rows, &data, weights.detector_config()?.lidar_range_m)?;
         Ok(print_left_out(&left_out))
     }
 
     /// The data sets, each with the agents of its protocol.
-    fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
+    fn open(&self, left_out: &mut LeftOut) -> Result<Vec<EvalSet>> {
         let mut all = Vec::with_capacity(self.data.data.len());
         for opened in self.data.open(left_out)? {
             let protocol = self.protocol.resolve(opened.layout);
@@ -96,7 +90,7 @@ impl Arguments {
                 let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
                 scenario.ticks.truncate(most);
             }
-            all.push(Data {
+            all.push(EvalSet {
                 protocol,
                 scenarios,
             });
@@ -104,14 +98,18 @@ impl Arguments {
         Ok(all)
     }
 
-    /// A network that fuses at every level is one method of its own.
-    fn run_multi_scale(&self, data: &[Data], left_out: &mut LeftOut) -> Result<()> {
+    /// Row and area of a network that fuses at every level: it is one method of its own.
+    fn evaluate_multi_scale(
+        &self,
+        data: &[EvalSet],
+        left_out: &mut LeftOut,
+    ) -> Result<(Vec<Value>, [f64; 6])> {
         if !self.method.is_empty() {
             let reason = "a multi-scale network has one method: leave --method out";
             return Err(BadInput::new(reason).into());
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
-        let mut tally = Tally::default();
+        let mut tally = MethodTotals::default();
         let all = data
             .iter()
             .flat_map(|data| data.scenarios.iter().map(move |it| (data, it)));
@@ -142,19 +140,67 @@ impl Arguments {
                 tally.payload_bytes.extend(sent_bytes);
             }
         }
-        let row = tally.row("multi_scale");
-        if !self.json {
-            print_row(&row)?;
-        }
-        self.print_json(vec![row], data, detector.config().lidar_range_m)
+        let row = self.row(&tally, "multi_scale")?;
+        Ok((vec![row], detector.config().lidar_range_m))
     }
 
-    /// If JSON is asked for, prints rows with the protocol of each data set, as it applies to the area of the network,
-    /// and with command and digests of the program, the weights, the scripts and the evaluated data.
-    fn print_json(&self, mut rows: Vec<Value>, data: &[Data], area_m: [f64; 6]) -> Result<()> {
-        if !self.json {
-            return Ok(());
+    /// Row of one method over all data.
+    fn evaluate(
+        &self,
+        method: Option<Method>,
+        data: &[EvalSet],
+        left_out: &mut LeftOut,
+    ) -> Result<Value> {
+        let (mut tally, mut lost) = (MethodTotals::default(), LeftOut::default());
+        let mut name = "";
+        for data in data {
+            let mut setup = Setup {
+                method,
+                protocol: Some(data.protocol.clone()),
+                ..Setup::default()
+            };
+            setup.models.weights.clone_from(&self.weights);
+            setup.models.precision = self.precision;
+            let mut evaluator = Evaluator::new(setup).map_err(BadInput::of)?;
+            name = evaluator.ego().method().name();
+            let frames = data.scenarios.iter().map(|scenario| scenario.ticks.len());
+            let bar = progress::bar(frames.sum(), "frames").with_message(name);
+            for scenario in &data.scenarios {
+                // The callback never ends the run.
+                let _ = evaluator.run(scenario, &mut |frame| {
+                    tally.add(&frame);
+                    bar.inc(1);
+                    ControlFlow::Continue(())
+                })?;
+            }
+            bar.finish_and_clear();
+            lost.merge(evaluator.left_out());
         }
+        left_out.merge(&lost);
+        Ok(self.row(&tally, name)?)
+    }
+
+    /// The row of a method, which is printed unless JSON is asked for.
+    fn row(&self, tally: &MethodTotals, method: &str) -> std::io::Result<Value> {
+        let row = tally.row(method);
+        if !self.json {
+            let [global, frame] = ["ap_global", "ap_frame_order"].map(|name| {
+                let aps = THRESHOLDS.map(|iou| row[name][format!("{iou}")].as_f64().unwrap_or(0.0));
+                aps.map(|ap| format!("{ap:.4}")).join(" ")
+            });
+            output::line(format_args!(
+                "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
+                row["method"].as_str().unwrap_or_default(),
+                row["frames"],
+                row["payload_bytes_mean"]
+            ))?;
+        }
+        Ok(row)
+    }
+
+    /// Prints rows as JSON with the protocol of each data set, as it applies to the area of the network, and with
+    /// command and digests of the program, the weights, the scripts and the evaluated data.
+    fn print_json(&self, mut rows: Vec<Value>, data: &[EvalSet], area_m: [f64; 6]) -> Result<()> {
         let protocols = data.iter().map(|data| data.protocol.within(area_m));
         let protocols = json!(protocols.collect::<Vec<_>>());
         for row in &mut rows {
@@ -168,56 +214,15 @@ impl Arguments {
     }
 }
 
-/// Results of one method over all data, and the data that were left out.
-fn evaluate(setup: &Setup, data: &[Data], json: bool) -> Result<(Value, LeftOut)> {
-    let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
-    for data in data {
-        let mut setup = setup.clone();
-        setup.protocol = Some(data.protocol.clone());
-        let mut evaluator = Evaluator::new(setup).map_err(BadInput::of)?;
-        name = evaluator.ego().method().name();
-        let frames = data.scenarios.iter().map(|scenario| scenario.ticks.len());
-        let bar = progress::bar(frames.sum(), "frames").with_message(name);
-        for scenario in &data.scenarios {
-            // The callback never ends the run.
-            let _ = evaluator.run(scenario, &mut |frame| {
-                tally.add(&frame);
-                bar.inc(1);
-                ControlFlow::Continue(())
-            })?;
-        }
-        bar.finish_and_clear();
-        left_out.merge(evaluator.left_out());
-    }
-    let row = tally.row(name);
-    if !json {
-        print_row(&row)?;
-    }
-    Ok((row, left_out))
-}
-
-fn print_row(row: &Value) -> std::io::Result<()> {
-    let [global, frame] = ["ap_global", "ap_frame_order"].map(|name| {
-        let aps = THRESHOLDS.map(|iou| row[name][format!("{iou}")].as_f64().unwrap_or(0.0));
-        aps.map(|ap| format!("{ap:.4}")).join(" ")
-    });
-    output::line(format_args!(
-        "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
-        row["method"].as_str().unwrap_or_default(),
-        row["frames"],
-        row["payload_bytes_mean"]
-    ))
-}
-
 /// Totals over the frames of one method.
 #[derive(Default)]
-struct Tally {
+struct MethodTotals {
     scorer: Scorer,
     frames: usize,
     payload_bytes: Vec<u64>,
 }
 
-impl Tally {
+impl MethodTotals {
     /// Adds a frame; one that failed has no result to add.
     fn add(&mut self, frame: &EvaluatedFrame) {
         if frame.failure.is_some() {
@@ -226,8 +231,7 @@ impl Tally {
         self.frames += 1;
         self.scorer.add(&frame.result.detections, &frame.truth);
         let fused = frame.result.fused.iter();
-        self.payload_bytes
-            .extend(fused.map(|neighbour| neighbour.payload_bytes));
+        self.payload_bytes.extend(fused.map(|it| it.payload_bytes));
     }
 
     fn row(&self, method: &str) -> Value {

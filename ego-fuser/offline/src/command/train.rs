@@ -13,14 +13,14 @@ use fusion::pastat::{Part, ablated};
 use fusion::{Exchange, FusionConfig, Method};
 use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseTable};
 use perception::model_config::DetectorConfig;
-use perception::train::{AdamWConfig, DataListing, RunConfig, TrainingOptions};
+use perception::train::{DataListing, TrainingOptions};
 use perception::weights::Weights;
 use protocol::Dtype;
 use training::Error;
 use training::feature_store::KeptMaps;
 use training::loss::{LossConfig, Unassigned};
 use training::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
-use training::train::{self, Accuracy, Observer, StepReport, TrainConfig};
+use training::train::{self, Accuracy, TrainConfig, TrainObserver, TrainingReport};
 
 use super::DataSets;
 use support::bounded_file;
@@ -157,7 +157,7 @@ impl Arguments {
     /// Trains and reports the result.
     pub(crate) fn run(&self) -> Result<()> {
         let config = self.config()?;
-        let mut bar = Progress(TrainingBar::of(config.run.length));
+        let mut bar = BarObserver(TrainingBar::of(config.run.length));
         if let Some(hint) = self.hint() {
             bar.0.print_line(hint);
         }
@@ -236,7 +236,8 @@ impl Arguments {
             false => Unassigned::Background,
         };
         let run = self.options.run_config(self.batch, self.lr);
-        let run = run.map_err(BadInput::of)?;
+        let mut run = run.map_err(BadInput::of)?;
+        run.optimizer.weight_decay = self.weight_decay;
         Ok(TrainConfig {
             data: self.data.data.clone(),
             validation: self.validation.clone(),
@@ -256,13 +257,7 @@ impl Arguments {
                 intensity_scale: self.data.intensity.scale,
             }),
             box_input: self.box_input,
-            run: RunConfig {
-                optimizer: AdamWConfig {
-                    weight_decay: self.weight_decay,
-                    ..run.optimizer
-                },
-                ..run
-            },
+            run,
             validate_every: self.validate_every_steps,
             validation_frames: self.validation_frames,
             samples,
@@ -283,10 +278,8 @@ impl Arguments {
             heading_std_deg: self.noise_heading_std_deg,
             ..NoisyPoseConfig::default()
         });
-        let tables = self
-            .poses
-            .iter()
-            .map(|file| PoseTable::read(file).map(Arc::new));
+        let files = self.poses.iter();
+        let tables = files.map(|file| PoseTable::read(file).map(Arc::new));
         let tables = tables.collect::<Result<_, _>>().map_err(BadInput::of)?;
         let poses = SamplePoses {
             tables,
@@ -338,9 +331,9 @@ enum Exactness {
 }
 
 /// Progress on standard error.
-struct Progress(TrainingBar);
+struct BarObserver(TrainingBar);
 
-impl Observer for Progress {
+impl TrainObserver for BarObserver {
     fn opened(&mut self, data: &DataListing) {
         data.left_out()
             .iter()
@@ -353,7 +346,7 @@ impl Observer for Progress {
         }
     }
 
-    fn stepped(&mut self, report: &StepReport) {
+    fn stepped(&mut self, report: &TrainingReport) {
         let text = format!(
             "step {} epoch {:.2} loss {:.3} = scores {:.3} + boxes {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
             report.step,

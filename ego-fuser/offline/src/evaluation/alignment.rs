@@ -14,7 +14,7 @@ use protocol::message::Message;
 use protocol::{Box3d, HEADER_LEN, wire};
 
 use super::participant::stamp;
-use crate::alignment::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
+use crate::alignment::{AlignError, AlignInput, AlignmentMethod, AlignmentSpec, NotAligned};
 use ego_fuser::ego::Ego;
 
 /// Source of boxes.
@@ -37,26 +37,16 @@ pub struct PairOutcome {
     /// itself. Boxes are available anyway: their detection does not count.
     pub time: Duration,
     /// Its error, or the reason why there is no alignment.
-    pub result: Result<AlignmentError, NotAligned>,
+    pub result: Result<PairError, NotAligned>,
 }
 
 /// Error of an alignment.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct AlignmentError {
+pub struct PairError {
     /// Metres, in three dimensions.
     pub metres: f64,
     /// Degrees, about any axis.
     pub degrees: f64,
-}
-
-impl AlignmentError {
-    fn between(truth: &Isometry3<f64>, found: &Isometry3<f64>) -> Self {
-        let off = truth.inv_mul(found);
-        Self {
-            metres: off.translation.vector.norm(),
-            degrees: off.rotation.angle().to_degrees(),
-        }
-    }
 }
 
 /// Compares methods on the ticks of a scenario in `ticks`; reports every pair when it is done. Returns the frames that
@@ -117,11 +107,11 @@ fn moment(
             None => Ok(Vec::new()),
         })
         .collect::<Result<Vec<_>, _>>()?;
-    let vehicles = near.iter().zip(&boxes).map(|(&index, boxes)| Vehicle {
+    let vehicles = near.iter().zip(&boxes).map(|(&index, boxes)| AlignInput {
         frame: &frames[index],
         boxes,
     });
-    let vehicles: Vec<Vehicle<'_>> = vehicles.collect();
+    let vehicles: Vec<AlignInput<'_>> = vehicles.collect();
     for (number, method) in methods.iter_mut().enumerate() {
         let prepared = vehicles.iter().map(|it| prepare(method.as_mut(), it));
         let prepared = prepared.collect::<Result<Vec<_>, _>>()?;
@@ -131,11 +121,16 @@ fn moment(
         for (received, &index) in neighbours.iter().zip(&near[1..]) {
             let start = Instant::now();
             let found = method.align(&vehicles[0], &own.message, &received.message);
+            let time = own.time.max(received.time) + start.elapsed();
+            let off = found.map(|found| ego_from[index].inv_mul(&found));
             on_outcome(PairOutcome {
                 method: number,
                 bytes: received.bytes,
-                time: own.time.max(received.time) + start.elapsed(),
-                result: found.map(|found| AlignmentError::between(&ego_from[index], &found)),
+                time,
+                result: off.map(|off| PairError {
+                    metres: off.translation.vector.norm(),
+                    degrees: off.rotation.angle().to_degrees(),
+                }),
             });
         }
     }
@@ -143,7 +138,7 @@ fn moment(
 }
 
 /// A vehicle's message, its size and its preparation time.
-struct Prepared {
+struct PreparedMessage {
     message: Message,
     bytes: u64,
     time: Duration,
@@ -151,14 +146,14 @@ struct Prepared {
 
 fn prepare(
     method: &mut dyn AlignmentMethod,
-    vehicle: &Vehicle<'_>,
-) -> Result<Prepared, AlignError> {
+    vehicle: &AlignInput<'_>,
+) -> Result<PreparedMessage, AlignError> {
     let start = Instant::now();
     let message = method.prepare(vehicle)?;
     let time = start.elapsed();
     let stamp = stamp(&vehicle.frame.cav, vehicle.frame.capture_nanos);
     let bytes = wire::encode_any(&stamp, message.clone())?.wire_bytes() - HEADER_LEN;
-    Ok(Prepared {
+    Ok(PreparedMessage {
         message,
         bytes: bytes as u64,
         time,

@@ -3,14 +3,14 @@
 use std::time::Duration;
 
 use agent::agent::Agent;
-use agent::agent_loop::{AgentLoop, Input, LoopOptions, MessageEncoder, Output, Sweep};
+use agent::agent_loop::{AgentLoop, LoopInput, LoopOptions, LoopOutput, MessageEncoder, Sweep};
 use agent::attack::CapturedMessages;
 use dataset::frame::Frame;
 use protocol::{CavId, Limits, StageTiming, Stamp, Stream, wire};
 use tch::Tensor;
 
 use super::EvaluateError;
-use super::sent::{Answer, Sent};
+use super::sent::{Replies, Sent};
 
 pub(super) struct Participant {
     agent_loop: AgentLoop,
@@ -60,12 +60,13 @@ impl Participant {
             arrived_nanos: capture_nanos,
             cloud: frame.points.clone(),
         };
+        let gnss = frame.gnss();
         let measured = [
-            frame.gnss().map(|gnss| Input::Gnss(capture_nanos, gnss)),
-            Some(Input::Motion(capture_nanos, frame.motion())),
-            Some(Input::Sweep(sweep)),
+            gnss.map(|gnss| LoopInput::Gnss(capture_nanos, gnss)),
+            Some(LoopInput::Motion(capture_nanos, frame.motion())),
+            Some(LoopInput::Sweep(sweep)),
         ];
-        let mut answer = Answer::default();
+        let mut answer = Replies::default();
         let mut is_over = false;
         for input in measured.into_iter().flatten() {
             is_over |= self.handle(input, &mut answer)?;
@@ -73,28 +74,30 @@ impl Participant {
         while !is_over || self.agent_loop.is_computing() {
             // A sweep without a recorded pose waits for one as long as in a live run.
             self.now_nanos = self.now_nanos.max(self.agent_loop.wakes_nanos());
-            is_over |= self.handle(Input::Wake, &mut answer)?;
+            is_over |= self.handle(LoopInput::Wake, &mut answer)?;
         }
         Ok(answer.into_sent(frame, &self.streams))
     }
 
     /// Hands an input to the loop and carries out what that decides. True if the sweep is computed, or left out.
-    fn handle(&mut self, input: Input, answer: &mut Answer) -> Result<bool, EvaluateError> {
+    fn handle(&mut self, input: LoopInput, answer: &mut Replies) -> Result<bool, EvaluateError> {
         let mut is_over = false;
         for output in self.agent_loop.handle(input, self.now_nanos) {
             match output {
-                Output::Publish(message) if message.stream != Stream::Descriptor => {
+                LoopOutput::Publish(message) if message.stream != Stream::Descriptor => {
                     let stamp = stamp(self.agent_loop.agent().cav(), message.capture_nanos);
                     let (encoded, _) = self.encoder.encode(message, &stamp, None)?;
                     let (_, message) = wire::decode_any(encoded.pieces(), &Limits::default())?;
                     answer.note(message, encoded.wire_bytes() as u64)?;
                 }
-                Output::Timed(stages) => self.steps.push(stages),
-                Output::Failed(error) if error.is_of_frame() => {
+                LoopOutput::Timed(stages) => self.steps.push(stages),
+                LoopOutput::Failed(error) if error.is_of_frame() => {
                     answer.failure = Some(error.to_string());
                 }
-                Output::Failed(error) => return Err(error.into()),
-                Output::Computed { .. } | Output::Dropped(Stream::Lidar, _) => is_over = true,
+                LoopOutput::Failed(error) => return Err(error.into()),
+                LoopOutput::Computed { .. } | LoopOutput::Dropped(Stream::Lidar, _) => {
+                    is_over = true
+                }
                 _ => {}
             }
         }

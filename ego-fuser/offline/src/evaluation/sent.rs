@@ -35,14 +35,14 @@ pub(super) struct SentMessage {
 
 /// The messages of a sweep as they come in.
 #[derive(Default)]
-pub(super) struct Answer {
+pub(super) struct Replies {
     pose: Option<(PoseEstimate, u64)>,
     messages: BTreeMap<Stream, SentMessage>,
     /// Reason why the sweep cannot be computed.
     pub(super) failure: Option<String>,
 }
 
-impl Answer {
+impl Replies {
     /// Takes a message of so many bytes on the wire.
     pub(super) fn note(&mut self, message: Message, bytes: u64) -> Result<(), WireError> {
         let mut rate = None;

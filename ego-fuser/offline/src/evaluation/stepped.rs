@@ -21,7 +21,7 @@ pub use remote::{RemoteError, RemotePool};
 
 use super::participant::{Participant, stamp};
 use super::sent::Sent;
-use super::sweeps::Sweep;
+use super::sweeps::AgentSweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
@@ -39,7 +39,7 @@ pub(super) fn run(
     let Some(&ego_place) = places.first() else {
         return Ok(ControlFlow::Continue(()));
     };
-    let mut run = Run::open(evaluator, scenario, (places, ego_place), observers)?;
+    let mut run = SteppedRun::open(evaluator, scenario, (places, ego_place), observers)?;
     let mut flow = ControlFlow::Continue(());
     for tick in run.begin..run.end {
         let Some(frame) = run.decide(tick)? else {
@@ -66,7 +66,7 @@ struct Computed {
 /// Result and tracks of a tick, or the reason of its failure.
 type Fused = Result<(Detections, Option<Tracks>), String>;
 
-struct Run<'a> {
+struct SteppedRun<'a> {
     evaluator: &'a mut Evaluator,
     compute: ComputeTimes,
     scenario: &'a Scenario,
@@ -94,7 +94,7 @@ struct Run<'a> {
     ego_free_nanos: u64,
 }
 
-impl<'a> Run<'a> {
+impl<'a> SteppedRun<'a> {
     /// A run of the agents at `places`, of which one is the ego's.
     fn open(
         evaluator: &'a mut Evaluator,
@@ -121,10 +121,8 @@ impl<'a> Run<'a> {
         }
         let begin = setup.seek.min(scenario.ticks.len());
         let end = begin.saturating_add(setup.frames.unwrap_or(usize::MAX));
-        let began_nanos = scenario
-            .ticks
-            .get(begin)
-            .map_or(0, |tick| tick.capture_nanos);
+        let first = scenario.ticks.get(begin);
+        let began_nanos = first.map_or(0, |tick| tick.capture_nanos);
         let ego = &scenario.agents[ego_place];
         let mut ego_loop = EgoLoop::new(ego, &evaluator.ego, setup.loop_options(scenario));
         let delivery = DelayedDelivery::new(setup.emulator(scenario)?, ego, began_nanos);
@@ -237,13 +235,13 @@ impl<'a> Run<'a> {
     }
 
     /// Messages of all vehicles for the sweeps of a tick.
-    fn perceive(&mut self, sweeps: &[Sweep]) -> Result<Vec<Sent>, EvaluateError> {
+    fn perceive(&mut self, sweeps: &[AgentSweep]) -> Result<Vec<Sent>, EvaluateError> {
         if let Some(remote) = &self.evaluator.remote {
             let frames: Vec<&Frame> = sweeps.iter().map(|sweep| &sweep.frame).collect();
             return Ok(remote.request(&frames).map_err(Box::new)?);
         }
         let mut all: Vec<Sent> = Vec::with_capacity(sweeps.len());
-        for Sweep { place, frame, map } in sweeps {
+        for AgentSweep { place, frame, map } in sweeps {
             let index = self.places.iter().position(|it| it == place);
             if let Some(participant) = index.and_then(|index| self.participants.get_mut(index)) {
                 // A replaying attacker repeats the message of the vehicle before it.

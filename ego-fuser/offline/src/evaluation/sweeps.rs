@@ -10,7 +10,7 @@ use training::Error;
 
 /// The sweep of one agent.
 #[derive(Debug)]
-pub(super) struct Sweep {
+pub(super) struct AgentSweep {
     /// Index of the agent in the scenario.
     pub(super) place: usize,
     /// Pose, annotations and, where needed, points.
@@ -29,7 +29,7 @@ impl Evaluator {
         places: &[usize],
         load: &LoadOptions,
         with_maps: impl Fn(usize) -> bool,
-    ) -> Result<Vec<Sweep>, EvaluateError> {
+    ) -> Result<Vec<AgentSweep>, EvaluateError> {
         let mut loaded = scenario.load_tick(tick, places.iter().copied(), load);
         // The account takes the first as the ego, which may be any agent of the recording.
         for (agent, _) in &mut loaded.unreadable {
@@ -38,7 +38,10 @@ impl Evaluator {
         self.left_out.add_tick(&loaded);
         let mut sweeps = Vec::with_capacity(loaded.frames.len());
         for (place, frame) in loaded.frames {
-            let map = match self.map_of(scenario, place, tick, with_maps(place)) {
+            let maps = self.maps.as_mut().filter(|_| with_maps(place));
+            let maps = maps.and_then(|maps| Some((maps.index_of(&scenario.name)?, maps)));
+            let map = maps.map(|(index, maps)| maps.map(index, scenario, place, tick));
+            let map = match map.transpose() {
                 // It fails again where the vehicle perceives it, and is counted there.
                 Err(Error::Detector(error)) if error.is_of_frame() => None,
                 Err(Error::Read(error)) => {
@@ -48,7 +51,7 @@ impl Evaluator {
                 }
                 map => map.map_err(Box::new)?,
             };
-            sweeps.push(Sweep { place, frame, map });
+            sweeps.push(AgentSweep { place, frame, map });
         }
         Ok(sweeps)
     }
@@ -76,22 +79,6 @@ impl Evaluator {
     /// Data that were left out so far.
     pub fn left_out(&self) -> &LeftOut {
         &self.left_out
-    }
-
-    /// The stored map of a sweep; `None` where none are stored or none is needed.
-    fn map_of(
-        &mut self,
-        scenario: &Scenario,
-        agent: usize,
-        tick: usize,
-        is_needed: bool,
-    ) -> Result<Option<Tensor>, Error> {
-        if let Some(maps) = self.maps.as_mut().filter(|_| is_needed)
-            && let Some(index) = maps.index_of(&scenario.name)
-        {
-            return maps.map(index, scenario, agent, tick).map(Some);
-        }
-        Ok(None)
     }
 }
 

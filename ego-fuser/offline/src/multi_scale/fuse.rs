@@ -6,11 +6,11 @@ use protocol::{BevGrid, Pose};
 use tch::{TchError, Tensor};
 
 use fusion::warp::{cav_from_ego_normalized, coalign};
-use fusion::where2comm::Aggregation;
+use fusion::where2comm::MapAggregation;
 
 /// Alignment of the maps of a sample; the first is the ego's.
 #[derive(Debug)]
-pub struct Placement {
+pub struct MapAlignment {
     /// Number of agents.
     pub agents: i64,
     /// `[agents, 2, 3]`, from coordinates -1..1 of the ego's map to those of each agent's, outer edges at -1 and 1: the
@@ -18,7 +18,7 @@ pub struct Placement {
     pub theta: Option<Tensor>,
 }
 
-impl Placement {
+impl MapAlignment {
     /// By poses, the ego's first; `grid` is that of any level.
     ///
     /// # Errors
@@ -40,10 +40,10 @@ impl Placement {
 #[derive(Debug)]
 pub struct Levels<'a> {
     /// The agents of each sample, which follow each other along dimension 0 of the maps.
-    pub samples: &'a [Placement],
+    pub samples: &'a [MapAlignment],
     /// Operation that fuses the features of a cell; cells that were not received are zeros, as in the training of these
     /// networks.
-    pub aggregation: Aggregation,
+    pub aggregation: MapAggregation,
     /// `[sum of agents, 1, h, w]`: mask of the sent cells of the first level's maps, and thereby of those below.
     pub sent: Option<&'a Tensor>,
 }
@@ -92,8 +92,8 @@ fn fuse_samples(maps: &Tensor, levels: &Levels<'_>) -> Result<Tensor, TchError> 
                 None => maps,
             };
             match levels.aggregation {
-                Aggregation::Attention => attend_ego(&maps, None),
-                Aggregation::Max => maps.f_amax([0i64].as_slice(), false),
+                MapAggregation::Attention => attend_ego(&maps, None),
+                MapAggregation::Max => maps.f_amax([0i64].as_slice(), false),
             }
         });
     Tensor::f_stack(&fused.collect::<Result<Vec<_>, _>>()?, 0)
@@ -120,7 +120,7 @@ mod tests {
             [2, config.pillar_channels, 32, 32],
             (Kind::Float, Device::Cpu),
         );
-        let fused = |samples: &[Placement], aggregation| {
+        let fused = |samples: &[MapAlignment], aggregation| {
             no_grad(|| {
                 fuse_levels(
                     &backbone,
@@ -135,15 +135,15 @@ mod tests {
         };
         let expected = no_grad(|| backbone.forward(&canvas, false));
         let grid = config.feature_grid();
-        let alone = || Placement::of_poses(&[Pose::IDENTITY], &grid).unwrap();
-        for aggregation in [Aggregation::Attention, Aggregation::Max] {
+        let alone = || MapAlignment::of_poses(&[Pose::IDENTITY], &grid).unwrap();
+        for aggregation in [MapAggregation::Attention, MapAggregation::Max] {
             let alone = fused(&[alone(), alone()], aggregation).unwrap();
             assert!(
                 alone.allclose(&expected, 1e-4, 1e-4, false),
                 "{aggregation:?}"
             );
             let together = fused(
-                &[Placement {
+                &[MapAlignment {
                     agents: 2,
                     theta: None,
                 }],
@@ -160,11 +160,11 @@ mod tests {
         }
         assert!(
             fused(
-                &[Placement {
+                &[MapAlignment {
                     agents: 3,
                     theta: None
                 }],
-                Aggregation::Max
+                MapAggregation::Max
             )
             .is_err()
         );

@@ -12,10 +12,10 @@ use serde::{Deserialize, Serialize};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::fuse::{Levels, Placement, fuse_levels, resized};
+use super::fuse::{Levels, MapAlignment, fuse_levels, resized};
 use fusion::FUSION_KEY;
 use fusion::model::ModelError;
-use fusion::where2comm::{Aggregation, Communication, CommunicationConfig};
+use fusion::where2comm::{CommunicationConfig, MapAggregation, SparseCommunication};
 
 /// Kind of the weights files of these networks.
 pub const MULTI_SCALE_KIND: &str = "multi_scale_detector";
@@ -37,7 +37,7 @@ pub enum Senders {
 #[serde(deny_unknown_fields)]
 pub struct MultiScaleConfig {
     /// Operation that fuses the features of a cell.
-    pub aggregation: Aggregation,
+    pub aggregation: MapAggregation,
     /// Selection of the cells that agents send; absent: all.
     #[serde(default)]
     pub communication: Option<CommunicationConfig>,
@@ -56,7 +56,7 @@ pub struct MultiScaleNetwork {
     pub variables: VarStore,
     config: MultiScaleConfig,
     network: PointPillars,
-    communication: Option<Communication>,
+    communication: Option<SparseCommunication>,
 }
 
 /// Output of a network for samples.
@@ -89,7 +89,7 @@ impl MultiScaleNetwork {
         let network = PointPillars::new(&variables.root(), detector)?;
         let path = variables.root() / "fusion_net" / "naive_communication";
         let communication = config.communication.as_ref();
-        let communication = communication.map(|config| Communication::new(&path, config));
+        let communication = communication.map(|config| SparseCommunication::new(&path, config));
         Ok(Self {
             variables,
             config: config.clone(),
@@ -128,7 +128,7 @@ impl MultiScaleNetwork {
     pub fn forward(
         &self,
         pillars: &PillarBatch,
-        samples: &[Placement],
+        samples: &[MapAlignment],
     ) -> Result<MultiScaleOutput, TchError> {
         let network = &self.network;
         let encoded = network.encoder.forward(pillars, false);
@@ -165,7 +165,7 @@ impl MultiScaleNetwork {
     fn sent_bytes(
         &self,
         sent: Option<&Tensor>,
-        samples: &[Placement],
+        samples: &[MapAlignment],
     ) -> Result<Vec<u64>, TchError> {
         let (pillar_grid, config) = (self.network.pillar_grid(), &self.network.config);
         let stride = config.layer_strides[0];
@@ -194,16 +194,15 @@ impl MultiScaleNetwork {
     fn without_the_exempt(
         &self,
         masks: &Tensor,
-        samples: &[Placement],
+        samples: &[MapAlignment],
     ) -> Result<Tensor, TchError> {
         let sends_all = samples.iter().flat_map(|sample| {
             (0..sample.agents).map(|agent| match self.config.senders {
-                Senders::Neighbours => agent == 0,
-                Senders::EverySecond => agent % 2 == 0,
+                Senders::Neighbours => f32::from(agent == 0),
+                Senders::EverySecond => f32::from(agent % 2 == 0),
             })
         });
-        let sends_all: Vec<f32> = sends_all.map(|all| if all { 1.0 } else { 0.0 }).collect();
-        let sends_all = Tensor::f_from_slice(&sends_all)?
+        let sends_all = Tensor::f_from_slice(&sends_all.collect::<Vec<f32>>())?
             .f_view([-1, 1, 1, 1])?
             .f_to_device(masks.device())?;
         masks.f_maximum(&sends_all)
@@ -211,7 +210,7 @@ impl MultiScaleNetwork {
 }
 
 /// The share of cells that is sent, averaged over samples as the reference does.
-fn mean_rate(masks: &Tensor, samples: &[Placement]) -> Result<f64, TchError> {
+fn mean_rate(masks: &Tensor, samples: &[MapAlignment]) -> Result<f64, TchError> {
     let counts: Vec<i64> = samples.iter().map(|sample| sample.agents).collect();
     let shares = masks.f_split_with_sizes(&counts, 0)?;
     let sum: f64 = shares

@@ -14,7 +14,7 @@ use perception::pillars::voxels::{Pillars, Voxeliser};
 use protocol::{Detection, PointCloud, Pose};
 use tch::{Device, no_grad};
 
-use super::{MultiScaleNetwork, Placement};
+use super::{MapAlignment, MultiScaleNetwork};
 use ego_fuser::ego::Ego;
 use fusion::model::ModelError;
 use fusion::points::merge_points;
@@ -114,12 +114,12 @@ impl OfflineDetector {
         let mirrored: Vec<Pose> = poses.iter().map(Pose::mirrored_y).collect();
         let poses = if self.is_mirrored() { &mirrored } else { poses };
         let placement = if self.network.config().one_frame {
-            Placement {
+            MapAlignment {
                 agents: poses.len() as i64,
                 theta: None,
             }
         } else {
-            Placement::of_poses(poses, &network.config.feature_grid())?
+            MapAlignment::of_poses(poses, &network.config.feature_grid())?
         };
         let output = no_grad(|| self.network.forward(&batch, &[placement]))?;
         let heads = Heads::new(&output.heads)?;

@@ -78,9 +78,8 @@ impl ViewAugment {
     /// A box of that frame after the change.
     pub fn box3d(&self, box3d: &Box3d) -> Box3d {
         let side = if self.mirrored { -1.0 } else { 1.0 };
-        let center = self.turn() * Vector3::from(self.mirror(box3d.center_m)) * self.scale;
         Box3d {
-            center_m: center.into(),
+            center_m: self.moved(box3d.center_m).into(),
             size_m: box3d.size_m.map(|size| size * self.scale),
             heading_rad: side * box3d.heading_rad + self.turn_rad,
         }
@@ -89,8 +88,7 @@ impl ViewAugment {
     /// `ego_from_cav` between two changed frames: `self` is the ego's change, `cav` the other's.
     pub fn pose(&self, ego_from_cav: &Pose, cav: &Self) -> Pose {
         let isometry = ego_from_cav.isometry();
-        let translation =
-            self.turn() * Vector3::from(self.mirror(ego_from_cav.translation_m)) * self.scale;
+        let translation = self.moved(ego_from_cav.translation_m);
         let mut rotation = *isometry.rotation.to_rotation_matrix().matrix();
         if self.mirrored {
             // S R S with S = diag(1, -1, 1): the product of two reflections and a rotation is a rotation.
@@ -108,8 +106,10 @@ impl ViewAugment {
         UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.turn_rad)
     }
 
-    fn mirror(&self, [x, y, z]: [f64; 3]) -> [f64; 3] {
-        [x, if self.mirrored { -y } else { y }, z]
+    /// A point of that frame after the change.
+    fn moved(&self, [x, y, z]: [f64; 3]) -> Vector3<f64> {
+        let y = if self.mirrored { -y } else { y };
+        self.turn() * Vector3::new(x, y, z) * self.scale
     }
 }
 

@@ -14,7 +14,7 @@ use tch::Tensor;
 
 use super::augment::{Augmentation, ViewAugment};
 use super::moments::Moments;
-use super::poses::{DrawnError, Offset, SamplePoses, known, without_pose};
+use super::poses::{DrawnError, PoseOffset, SamplePoses, known, without_pose};
 use super::scenes::{SceneSet, TickRef};
 use crate::feature_store::MapSource;
 use crate::{Error, Result};
@@ -95,7 +95,7 @@ pub struct Sample {
     /// Metadata of every view, the ego's pose being the identity.
     pub facts: Vec<MapMetadata>,
     /// Error that was added to each view's pose.
-    pub offsets: Vec<Offset>,
+    pub offsets: Vec<PoseOffset>,
     /// True boxes in the ego frame with their centre on the BEV grid.
     pub truth: GroundTruth,
     /// Targets of those boxes.
@@ -116,7 +116,7 @@ pub struct SampleBuilder {
 }
 
 /// One view on its way into a sample.
-struct Entry {
+struct RawView {
     /// Index of its vehicle in the scenario.
     agent: usize,
     /// Index of its vehicle in the sample, the ego's being 0.
@@ -204,7 +204,7 @@ impl SampleBuilder {
 
     /// Views of a sample: the newest of every vehicle, the ego first, then older ones. Vehicles without a pose have no
     /// part; an ego without a pose is alone with its newest view.
-    fn entries(&self, now: TickRef, agents: &[usize], rng: &mut impl Rng) -> Result<Vec<Entry>> {
+    fn entries(&self, now: TickRef, agents: &[usize], rng: &mut impl Rng) -> Result<Vec<RawView>> {
         let ticks = &self.scenes.scenario(now).ticks;
         let gap = rng.random_range(1..=self.config.moments.gap.max(1));
         let error = self.config.poses.draw(rng)?;
@@ -229,7 +229,7 @@ impl SampleBuilder {
                     }
                 };
                 let age_nanos = ticks[now.tick].capture_nanos - ticks[tick].capture_nanos;
-                let entry = Entry {
+                let entry = RawView {
                     agent,
                     place,
                     tick,
@@ -244,7 +244,7 @@ impl SampleBuilder {
                 }
             }
             if is_ego && newest.is_empty() {
-                return Ok(vec![Entry {
+                return Ok(vec![RawView {
                     agent,
                     place,
                     tick: now.tick,
@@ -281,7 +281,7 @@ impl SampleBuilder {
     fn pillars(
         &mut self,
         scenario: usize,
-        entries: &[Entry],
+        entries: &[RawView],
         changes: &[ViewAugment],
         facts: &mut Vec<MapMetadata>,
     ) -> Result<Vec<Pillars>> {
@@ -352,9 +352,7 @@ impl SampleBuilder {
             min_corners: 8,
             classes: self.config.classes,
         };
-        let views = annotators
-            .iter()
-            .filter_map(|&agent| frames[agent].as_ref());
+        let views = annotators.iter().filter_map(|&of| frames[of].as_ref());
         let mut truth = GroundTruth::of_tick(&views.collect::<Vec<_>>(), 0, &rule);
         for object in truth.objects.iter_mut().chain(&mut truth.ignored) {
             object.box3d = ego_view.box3d(&object.box3d);
@@ -370,7 +368,7 @@ impl SampleBuilder {
 }
 
 /// Metadata of the views, and their pose errors; both after the changes of the scene.
-fn metadata(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Vec<Offset>) {
+fn metadata(entries: &[RawView], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Vec<PoseOffset>) {
     let of_entries = entries.iter().zip(changes).map(|(entry, change)| {
         let reported = entries[0].world_from_cav.from_world(&entry.world_from_cav);
         let real = entries[0].found.from_world(&entry.found);
@@ -381,7 +379,7 @@ fn metadata(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Ve
             confidence: entry.confidence,
             age_secs: entry.age_secs,
         };
-        (facts, Offset::between(&ego_from_cav, &real))
+        (facts, PoseOffset::between(&ego_from_cav, &real))
     });
     of_entries.unzip()
 }

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
 use super::builder::{Sample, SampleBuilder, SampleViews};
-use super::poses::Offset;
+use super::poses::PoseOffset;
 use super::scenes::TickRef;
 use crate::Error;
 use fusion::MapMetadata;
@@ -33,7 +33,7 @@ pub struct Batch {
     /// Metadata of the views of each sample, ego first.
     pub facts: Vec<Vec<MapMetadata>>,
     /// Errors that were added to the poses of the views of each sample.
-    pub offsets: Vec<Vec<Offset>>,
+    pub offsets: Vec<Vec<PoseOffset>>,
     /// Targets of each sample.
     pub labels: Vec<Labels>,
     /// Objects of each sample.
@@ -98,7 +98,7 @@ pub fn batches(
     run: &RunConfig,
     first: u64,
 ) -> Prefetch<Result<Batch, Error>> {
-    let mut order = Order::new(builder.scenes().ticks().to_vec(), run.seed);
+    let mut order = TickOrder::new(builder.scenes().ticks().to_vec(), run.seed);
     let mut builder = builder.clone();
     let size = run.batch as u64;
     Prefetch::start(run.loader_threads, first, move |number| {
@@ -116,14 +116,14 @@ pub fn batches(
 
 /// Every tick once per epoch, in an order that depends on the seed and the epoch only.
 #[derive(Clone, Default)]
-struct Order {
+struct TickOrder {
     ticks: Vec<TickRef>,
     shuffled: Vec<TickRef>,
     epoch: Option<u64>,
     seed: u64,
 }
 
-impl Order {
+impl TickOrder {
     fn new(ticks: Vec<TickRef>, seed: u64) -> Self {
         Self {
             ticks,
@@ -154,7 +154,7 @@ mod tests {
     #[test]
     fn an_epoch_has_every_tick_once_and_the_next_another_order() {
         let ticks: Vec<TickRef> = (0..50).map(|tick| TickRef { scenario: 0, tick }).collect();
-        let mut order = Order::new(ticks.clone(), 7);
+        let mut order = TickOrder::new(ticks.clone(), 7);
         let first: Vec<TickRef> = (0..50).map(|index| order.tick(index)).collect();
         let second: Vec<TickRef> = (50..100).map(|index| order.tick(index)).collect();
         assert_ne!(first, second);
@@ -164,7 +164,7 @@ mod tests {
             assert_eq!(sorted, ticks);
         }
         // A resumed training that begins mid-epoch uses the same ticks.
-        let mut resumed = Order::new(ticks, 7);
+        let mut resumed = TickOrder::new(ticks, 7);
         assert_eq!(resumed.tick(73), second[23]);
     }
 }

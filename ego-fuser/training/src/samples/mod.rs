@@ -17,5 +17,5 @@ pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews};
 pub use loader::{Batch, BatchViews, batches};
 pub use moments::Moments;
 pub(crate) use neighbour_boxes::augmentation_summary as box_augmentation;
-pub use poses::{Offset, SamplePoses};
+pub use poses::{PoseOffset, SamplePoses};
 pub use scenes::{SceneSet, TickRef};

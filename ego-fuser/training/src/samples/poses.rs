@@ -71,9 +71,9 @@ impl SamplePoses {
 /// Correction that moves a map with a wrong pose to its place: a shift along x and y of the ego, metres, and a rotation
 /// about the map's sender, radians.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Offset(pub [f64; 3]);
+pub struct PoseOffset(pub [f64; 3]);
 
-impl Offset {
+impl PoseOffset {
     /// The offset between a sender's reported and true pose, both in the ego frame.
     pub fn between(reported: &Pose, real: &Pose) -> Self {
         let [dx, dy] = [0, 1].map(|axis| real.translation_m[axis] - reported.translation_m[axis]);
@@ -168,14 +168,7 @@ impl DrawnError {
 
 /// Pose and confidence of an estimate.
 pub(super) fn known(estimate: &PoseEstimate) -> Option<(Pose, f32)> {
-    match *estimate {
-        PoseEstimate::Pose {
-            world_from_cav,
-            confidence,
-            ..
-        } => Some((world_from_cav, confidence)),
-        PoseEstimate::NoPose { .. } => None,
-    }
+    Some((*estimate.world_from_cav()?, estimate.confidence()))
 }
 
 /// The error of a frame without a pose, whose view cannot be aligned.
@@ -287,13 +280,13 @@ mod tests {
     fn an_offset_brings_a_map_back() {
         let real = Pose::from_xyz_yaw([20.0, -5.0, 0.0], 3.1);
         let reported = Pose::from_xyz_yaw([21.0, -5.5, 0.0], -3.1);
-        let Offset([dx, dy, turn_rad]) = Offset::between(&reported, &real);
+        let PoseOffset([dx, dy, turn_rad]) = PoseOffset::between(&reported, &real);
         assert!((dx + 1.0).abs() < 1e-9 && (dy - 0.5).abs() < 1e-9);
         assert!(
             (turn_rad - (6.2 - std::f64::consts::TAU)).abs() < 1e-9,
             "{turn_rad}"
         );
-        assert_eq!(Offset::between(&real, &real), Offset::default());
+        assert_eq!(PoseOffset::between(&real, &real), PoseOffset::default());
     }
 
     #[test]

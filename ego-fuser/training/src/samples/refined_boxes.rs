@@ -67,14 +67,9 @@ impl Targets {
     ) -> Self {
         let ego_from_cav = ego_from_cav.isometry();
         let cav_from_ego = ego_from_cav.inverse();
-        let objects = truth
-            .objects
-            .iter()
-            .map(|of| of.box3d.transformed(&cav_from_ego));
+        let objects = truth.boxes().map(|of| of.transformed(&cav_from_ego));
         let objects: Vec<Box3d> = objects.collect();
-        let footprints = objects
-            .iter()
-            .map(|object| Polygon::footprint(&object.corners()));
+        let footprints = objects.iter().map(|of| Polygon::footprint(&of.corners()));
         let footprints: Vec<Polygon> = footprints.collect();
         let mut targets = Self::default();
         for (detection, refined) in found.iter().zip(refined) {
@@ -110,9 +105,7 @@ impl Targets {
         let is_object = column(&self.is_object, device)?;
         let boxes = boxes.f_mul(&is_object)?.f_sum(Kind::Float)?;
         // Scores of exactly 0 or 1 have no finite logit.
-        let before = found
-            .iter()
-            .map(|detection| detection.score.clamp(1e-4, 1.0 - 1e-4));
+        let before = found.iter().map(|it| it.score.clamp(1e-4, 1.0 - 1e-4));
         let before: Vec<f32> = before.collect();
         // A score is corrected by a sum of logits, as in inference.
         let logit = column(&before, device)?.f_logit(None)? + corrections.f_narrow(1, OF_BOX, 1)?;

@@ -4,7 +4,7 @@ use perception::train::ModelCard;
 
 use super::config::TrainConfig;
 use super::frozen::sample_config;
-use super::observer::Summary;
+use super::observer::TrainSummary;
 use crate::samples::{SceneSet, box_augmentation};
 use fusion::model::CooperativeModel;
 
@@ -13,7 +13,7 @@ pub(super) fn card(
     config: &TrainConfig,
     model: &CooperativeModel,
     scenes: &SceneSet,
-    summary: &Summary,
+    summary: &TrainSummary,
 ) -> ModelCard {
     let (detector, method, run) = (model.config(), model.method, &config.run);
     let mut card = ModelCard::new(

@@ -7,8 +7,7 @@ use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::csv_file;
 use support::file_error::{AtFile, Result};
 
-use super::accuracy::Accuracy;
-use super::observer::StepReport;
+use super::observer::{Accuracy, TrainingReport};
 use crate::Error;
 
 const HEADER: &str = "step,epoch,seconds,learning_rate,loss,score_loss,box_loss,samples_per_second,waiting,ap_30,ap_50,ap_70";
@@ -24,7 +23,7 @@ impl DetectorCurve {
         Ok(Self(trainer.curve(HEADER)?))
     }
 
-    pub(super) fn step(&mut self, report: &StepReport) -> Result<()> {
+    pub(super) fn step(&mut self, report: &TrainingReport) -> Result<()> {
         let (score_loss, box_loss) = (report.score_loss, report.box_loss);
         self.0.row(&format!(
             "{},{:.3},{:.1},{:.3e},{:.5},{score_loss:.5},{box_loss:.5},{:.2},{:.3},,,",
@@ -116,9 +115,7 @@ fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
         .collect();
     let size = finite.len().div_ceil(SMOOTH_POINTS).max(1);
     let means = finite.chunks(size).map(|few| {
-        let [x, y] = few
-            .iter()
-            .fold([0.0; 2], |[x, y], point| [x + point.0, y + point.1]);
+        let [x, y] = few.iter().fold([0.0; 2], |[x, y], p| [x + p.0, y + p.1]);
         (x / few.len() as f64, y / few.len() as f64)
     });
     means.collect()
@@ -128,8 +125,8 @@ fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
 mod tests {
     use super::*;
 
-    fn report(step: u64, score_loss: f64) -> StepReport {
-        StepReport {
+    fn report(step: u64, score_loss: f64) -> TrainingReport {
+        TrainingReport {
             step,
             epoch: 0.5,
             progress: 0.1,

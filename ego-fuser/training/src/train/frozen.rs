@@ -6,7 +6,7 @@ use perception::int8::InferencePrecision;
 use perception::weights::Weights;
 
 use super::config::TrainConfig;
-use super::observer::Observer;
+use super::observer::TrainObserver;
 use crate::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use crate::samples::{Augmentation, SampleBuilder, SampleConfig};
 use crate::{Error, Result};
@@ -46,7 +46,7 @@ impl<'a> FrozenEncoder<'a> {
     pub(super) fn give_maps(
         &self,
         builder: &mut SampleBuilder,
-        observer: &mut dyn Observer,
+        observer: &mut dyn TrainObserver,
     ) -> Result<()> {
         let store = FeatureStore::open(
             self.kept,

@@ -1,8 +1,7 @@
 //! Training of a method on recorded or generated scenes.
 //!
-//! [`run`] writes only files: the caller gets every step through [`Observer`].
+//! [`run`] writes only files: the caller gets every step through [`TrainObserver`].
 
-mod accuracy;
 mod card;
 mod config;
 mod curve;
@@ -22,9 +21,8 @@ use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 use tch::nn::VarStore;
 
-pub use accuracy::Accuracy;
 pub use config::TrainConfig;
-pub use observer::{Observer, StepReport, Summary};
+pub use observer::{Accuracy, TrainObserver, TrainSummary, TrainingReport};
 pub(crate) use validation::Validator;
 
 use self::curve::DetectorCurve;
@@ -38,8 +36,8 @@ use fusion::model::{CooperativeModel, ModelError};
 ///
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
-pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary> {
-    let (mut training, mut trainer) = Training::prepare(config, observer)?;
+pub fn run(config: &TrainConfig, observer: &mut dyn TrainObserver) -> Result<TrainSummary> {
+    let (mut training, mut trainer) = FusionTraining::prepare(config, observer)?;
     trainer.run(&mut training, SaveEvery::Steps(config.validate_every))?;
     training.finish(&trainer)
 }
@@ -69,9 +67,9 @@ fn first_model(config: &TrainConfig) -> Result<CooperativeModel> {
     })
 }
 
-struct Training<'a> {
+struct FusionTraining<'a> {
     config: &'a TrainConfig,
-    observer: &'a mut dyn Observer,
+    observer: &'a mut dyn TrainObserver,
     model: CooperativeModel,
     scenes: Arc<SceneSet>,
     loader: Prefetch<Result<Batch>>,
@@ -83,8 +81,11 @@ struct Training<'a> {
     accuracy: Option<Accuracy>,
 }
 
-impl<'a> Training<'a> {
-    fn prepare(config: &'a TrainConfig, observer: &'a mut dyn Observer) -> Result<(Self, Trainer)> {
+impl<'a> FusionTraining<'a> {
+    fn prepare(
+        config: &'a TrainConfig,
+        observer: &'a mut dyn TrainObserver,
+    ) -> Result<(Self, Trainer)> {
         let (is_frozen, merged) = (config.frozen_encoder.is_some(), config.samples.merged_truth);
         let kind = sample_kind(config.method, is_frozen, merged)?;
         let run = &config.run;
@@ -161,10 +162,10 @@ impl<'a> Training<'a> {
         Ok(about)
     }
 
-    fn finish(self, trainer: &Trainer) -> Result<Summary> {
+    fn finish(self, trainer: &Trainer) -> Result<TrainSummary> {
         self.draw_curve()?;
         let (config, model, scenes) = (self.config, &self.model, &self.scenes);
-        let summary = Summary {
+        let summary = TrainSummary {
             trained: trainer.save_weights(&model.variables, self.about()?, scenes.data())?,
             accuracy: self.accuracy,
         };
@@ -173,7 +174,7 @@ impl<'a> Training<'a> {
     }
 }
 
-impl Task for Training<'_> {
+impl Task for FusionTraining<'_> {
     type Error = Error;
     /// Reading the loss waits for the device.
     const REPORT_EVERY: u64 = 10;
@@ -239,7 +240,7 @@ impl Task for Training<'_> {
         let [score_loss, box_loss] = window.losses.map(|sum| sum / window.finite as f64);
         let seconds = window.since.elapsed().as_secs_f64().max(1e-9);
         let share_done = self.share_done(trainer);
-        let report = StepReport {
+        let report = TrainingReport {
             step: trainer.steps(),
             epoch: self.epoch(trainer.steps()),
             progress: share_done.min(1.0),

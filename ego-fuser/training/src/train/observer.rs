@@ -1,12 +1,11 @@
 //! Observer of a training: progress, validations and the result.
 
 use perception::train::{DataListing, Trained};
-
-use super::accuracy::Accuracy;
+use serde::Serialize;
 
 /// Report over some steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StepReport {
+pub struct TrainingReport {
     /// Steps done.
     pub step: u64,
     /// Passes over the data.
@@ -27,25 +26,32 @@ pub struct StepReport {
     pub waiting: f64,
 }
 
+/// AP over the frames of a validation.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Accuracy {
+    /// Frames.
+    pub frames: usize,
+    /// AP at 0.3, 0.5 and 0.7, sorted over all frames.
+    pub ap_global: [f64; 3],
+    /// The same in the order of frames.
+    pub ap_frame_order: [f64; 3],
+}
+
 /// Receives the progress of a training.
-pub trait Observer {
+pub trait TrainObserver {
     /// The data to learn from is known.
-    fn opened(&mut self, data: &DataListing) {
-        let _ = data;
-    }
+    fn opened(&mut self, _data: &DataListing) {}
     /// Number of encoded sweeps and of all, for a frozen encoder.
-    fn encoded(&mut self, done: usize, all: usize) {
-        let _ = (done, all);
-    }
+    fn encoded(&mut self, _done: usize, _all: usize) {}
     /// Some steps are done.
-    fn stepped(&mut self, report: &StepReport);
+    fn stepped(&mut self, report: &TrainingReport);
     /// A validation is done.
     fn validated(&mut self, step: u64, accuracy: &Accuracy);
 }
 
 /// Result of a training.
 #[derive(Debug, Clone)]
-pub struct Summary {
+pub struct TrainSummary {
     /// The weights and the cost of the training.
     pub trained: Trained,
     /// The last validation.

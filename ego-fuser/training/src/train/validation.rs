@@ -10,11 +10,9 @@ use rand_chacha::ChaCha8Rng;
 use support::sampling::evenly_spread;
 use tch::no_grad;
 
-use super::accuracy::Accuracy;
+use super::observer::Accuracy;
 use crate::Error;
-use crate::samples::{
-    Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SamplePoses, SceneSet, TickRef,
-};
+use crate::samples::{Augmentation, Batch, SampleBuilder, SampleConfig, SceneSet, TickRef};
 
 /// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
 /// error.
@@ -36,24 +34,13 @@ impl Validator {
         frames: usize,
     ) -> Result<Self, Error> {
         let scenes = Arc::new(scenes);
-        let all = scenes.ticks();
-        let ticks = evenly_spread(all, frames.max(1));
-        let samples = SampleConfig {
-            augmentation: Augmentation::OFF,
-            drop_neighbour: 0.0,
-            poses: SamplePoses {
-                noise: None,
-                lost_share: 0.0,
-                ..samples.poses.clone()
-            },
-            moments: Moments {
-                max_delay_nanos: 0,
-                gap: 1,
-                ..samples.moments
-            },
-            merged_truth: true,
-            ..samples.clone()
-        };
+        let ticks = evenly_spread(scenes.ticks(), frames.max(1));
+        let mut samples = samples.clone();
+        samples.augmentation = Augmentation::OFF;
+        samples.drop_neighbour = 0.0;
+        (samples.poses.noise, samples.poses.lost_share) = (None, 0.0);
+        (samples.moments.max_delay_nanos, samples.moments.gap) = (0, 1);
+        samples.merged_truth = true;
         let assigner = Arc::new(model.assigner()?);
         let builder = SampleBuilder::new(scenes, samples, model.config().clone(), assigner);
         Ok(Self { builder, ticks })

@@ -2,41 +2,30 @@
 
 use crate::cdr;
 
-/// Level of a status.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u8)]
-pub(crate) enum Level {
-    /// Nothing to report.
-    Ok = 0,
-    /// Messages were lost.
-    Warn = 1,
-}
-
 /// Status of one process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Status {
-    pub(crate) level: Level,
+    /// Level `WARN`, as messages were lost; else `OK`.
+    pub(crate) is_warning: bool,
     pub(crate) name: String,
     pub(crate) message: String,
     pub(crate) hardware_id: String,
     pub(crate) values: Vec<(String, String)>,
 }
 
-/// The status of some processes.
-pub(crate) fn diagnostics(nanos: u64, status: &[Status]) -> Vec<u8> {
+/// The status of a process.
+pub(crate) fn diagnostics(nanos: u64, status: &Status) -> Vec<u8> {
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, "");
-        cdr.write_sequence_length(status.len());
-        for one in status {
-            cdr.write_u8(one.level as u8);
-            for text in [&one.name, &one.message, &one.hardware_id] {
-                cdr.write_string(text);
-            }
-            cdr.write_sequence_length(one.values.len());
-            for (key, value) in &one.values {
-                cdr.write_string(key);
-                cdr.write_string(value);
-            }
+        cdr.write_sequence_length(1);
+        cdr.write_u8(status.is_warning.into());
+        for text in [&status.name, &status.message, &status.hardware_id] {
+            cdr.write_string(text);
+        }
+        cdr.write_sequence_length(status.values.len());
+        for (key, value) in &status.values {
+            cdr.write_string(key);
+            cdr.write_string(value);
         }
     })
 }
@@ -48,7 +37,7 @@ mod tests {
     #[test]
     fn a_status_is_laid_out_as_ros_lays_it_out() {
         let status = Status {
-            level: Level::Warn,
+            is_warning: true,
             name: "n".into(),
             message: "lost".into(),
             hardware_id: String::new(),
@@ -57,6 +46,6 @@ mod tests {
         let mut expected = b"\0\x01\0\0\x01\0\0\0\x02\0\0\0\x01\0\0\0\0\0\0\0\x01\0\0\0".to_vec();
         expected.extend(b"\x01\0\0\0\x02\0\0\0n\0\0\0\x05\0\0\0lost\0\0\0\0\x01\0\0\0\0\0\0\0");
         expected.extend(b"\x01\0\0\0\x02\0\0\0k\0\0\0\x02\0\0\0v\0");
-        assert_eq!(diagnostics(1_000_000_002, &[status]), expected);
+        assert_eq!(diagnostics(1_000_000_002, &status), expected);
     }
 }

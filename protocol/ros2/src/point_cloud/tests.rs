@@ -90,7 +90,7 @@ impl Cloud {
         bytes
     }
 
-    fn read(&self) -> Result<Sweep, PointCloudError> {
+    fn read(&self) -> Result<RosSweep, PointCloudError> {
         read_point_cloud(&self.bytes::<LittleEndian>([0, 1, 0, 0]), LIMITS)
     }
 }
@@ -115,7 +115,7 @@ fn what_is_written_for_ros_is_read_back() {
     };
     let bytes = crate::encode::point_cloud(1_700_000_000_123_456_789, "cav_1/lidar", &points);
     let sweep = read_point_cloud(&bytes, LIMITS).unwrap();
-    let expected = Sweep {
+    let expected = RosSweep {
         capture_nanos: 1_700_000_000_123_456_789,
         frame_id: "cav_1/lidar".into(),
         points,

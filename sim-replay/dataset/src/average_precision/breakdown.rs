@@ -21,14 +21,14 @@ pub enum Breakdown {
 }
 
 /// Objects and unmatched detections of a frame that belong to a part.
-pub(super) struct Selection {
+pub(super) struct PartMembers {
     /// For each object that counts.
     pub(super) objects: Vec<bool>,
     /// For each detection.
     pub(super) detections: Vec<bool>,
 }
 
-impl Selection {
+impl PartMembers {
     /// All objects and detections.
     pub(super) fn all(detections: usize, objects: usize) -> Self {
         Self {
@@ -46,9 +46,9 @@ impl Breakdown {
         bins.map(Self::Distance).chain(classes)
     }
 
-    pub(super) fn selection(self, detections: &[Detection], truth: &GroundTruth) -> Selection {
+    pub(super) fn selection(self, detections: &[Detection], truth: &GroundTruth) -> PartMembers {
         let found = detections.iter();
-        Selection {
+        PartMembers {
             objects: truth.objects.iter().map(|one| self.has(one)).collect(),
             detections: found.map(|one| self.has_place(&one.box3d)).collect(),
         }

@@ -5,18 +5,18 @@ use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Detection, corners_within};
 
 use super::Verdict;
-use super::breakdown::Selection;
+use super::breakdown::PartMembers;
 use crate::ground_truth::{GroundTruth, TrueBox};
 
 /// Detections that may count, by falling score, with their overlaps.
 pub(super) struct FrameOverlaps {
     /// Number of detections, those beyond the range included.
     detections: usize,
-    pub(super) by_score: Vec<Candidate>,
+    pub(super) by_score: Vec<ScoredCandidate>,
 }
 
 /// A detection within the range.
-pub(super) struct Candidate {
+pub(super) struct ScoredCandidate {
     /// Index among the detections of the frame.
     pub(super) index: usize,
     pub(super) score: f32,
@@ -54,7 +54,7 @@ impl FrameOverlaps {
     }
 
     /// Verdicts on all detections, in their order, for a part of the objects.
-    pub(super) fn judge(&self, part: &Selection, iou_threshold: f64) -> Vec<Verdict> {
+    pub(super) fn judge(&self, part: &PartMembers, iou_threshold: f64) -> Vec<Verdict> {
         let threshold = iou_threshold as f32;
         // Detections beyond the range are no candidates, so they keep this verdict.
         let mut verdicts = vec![Verdict::Ignored; self.detections];
@@ -81,9 +81,9 @@ fn candidates(
     found: impl Iterator<Item = (usize, f32, Polygon)>,
     objects: &[Polygon],
     ignored: &[Polygon],
-) -> Vec<Candidate> {
-    let mut candidates: Vec<Candidate> = found
-        .map(|(index, score, found)| Candidate {
+) -> Vec<ScoredCandidate> {
+    let mut candidates: Vec<ScoredCandidate> = found
+        .map(|(index, score, found)| ScoredCandidate {
             index,
             score,
             overlaps: overlaps(&found, objects).collect(),

@@ -44,7 +44,7 @@ pub(super) enum TimeColumns {
 
 /// Meaning of a column's name.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Role {
+enum ColumnRole {
     /// Value of a pose: index into [`VALUES`].
     Value(usize),
     Time(Option<Unit>),
@@ -113,10 +113,10 @@ impl Columns {
     /// # Errors
     /// A sentence that names the columns which are missing or given twice.
     pub(super) fn of_names(names: &[&str]) -> Result<Self, String> {
-        let roles: Vec<Role> = names.iter().map(|name| role(name)).collect();
+        let roles: Vec<ColumnRole> = names.iter().map(|name| role(name)).collect();
         let mut values = [0; 7];
         for (index, (place, value)) in values.iter_mut().zip(VALUES).enumerate() {
-            let wanted = Role::Value(index);
+            let wanted = ColumnRole::Value(index);
             *place = match roles.iter().filter(|role| **role == wanted).count() {
                 1 => place_of(&roles, wanted).unwrap_or_default(),
                 0 => return Err(format!("no column {value} {}", expected(names))),
@@ -126,28 +126,29 @@ impl Columns {
         Ok(Self {
             width: names.len(),
             pose: PoseColumns::Quaternion(values),
-            name: place_of(&roles, Role::Name),
-            number: place_of(&roles, Role::Number),
+            name: place_of(&roles, ColumnRole::Name),
+            number: place_of(&roles, ColumnRole::Number),
             time: time_of(&roles),
             key: None,
         })
     }
 }
 
-fn place_of(roles: &[Role], wanted: Role) -> Option<usize> {
+fn place_of(roles: &[ColumnRole], wanted: ColumnRole) -> Option<usize> {
     roles.iter().position(|role| *role == wanted)
 }
 
 /// Seconds and nanoseconds, or the first column that is a time.
-fn time_of(roles: &[Role]) -> Option<TimeColumns> {
-    let (seconds, nanos) = (place_of(roles, Role::Seconds), place_of(roles, Role::Nanos));
+fn time_of(roles: &[ColumnRole]) -> Option<TimeColumns> {
+    let [seconds, nanos] =
+        [ColumnRole::Seconds, ColumnRole::Nanos].map(|role| place_of(roles, role));
     if let (Some(seconds), Some(nanos)) = (seconds, nanos) {
         return Some(TimeColumns::SecondsAndNanos(seconds, nanos));
     }
     (0..).zip(roles).find_map(|(column, role)| match role {
-        Role::Time(unit) => Some(TimeColumns::One(column, *unit)),
-        Role::Seconds => Some(TimeColumns::One(column, Some(Unit::Seconds))),
-        Role::Nanos => Some(TimeColumns::One(column, Some(Unit::Nanoseconds))),
+        ColumnRole::Time(unit) => Some(TimeColumns::One(column, *unit)),
+        ColumnRole::Seconds => Some(TimeColumns::One(column, Some(Unit::Seconds))),
+        ColumnRole::Nanos => Some(TimeColumns::One(column, Some(Unit::Nanoseconds))),
         _ => None,
     })
 }
@@ -160,19 +161,19 @@ fn expected(names: &[&str]) -> String {
 /// Values of a quaternion that names give, in their order: 0 to 3 for x, y, z, w.
 pub(super) fn quaternion_order(names: &[&str]) -> Vec<usize> {
     let parts = names.iter().filter_map(|name| match role(name) {
-        Role::Value(index) => index.checked_sub(3),
+        ColumnRole::Value(index) => index.checked_sub(3),
         _ => None,
     });
     parts.collect()
 }
 
 /// Meaning of a name such as `qw`, `p_RS_R_x [m]`, `field.pose.orientation.w` or `timestamp [ns]`.
-fn role(name: &str) -> Role {
+fn role(name: &str) -> ColumnRole {
     let lower = name.to_ascii_lowercase();
     let (plain, bracket) = lower.split_once(['[', '(']).unwrap_or((&lower, ""));
     let words: Vec<&str> = words(plain).collect();
     let (Some(last), false) = (words.last(), has(&words, OTHER_WORDS)) else {
-        return Role::Other;
+        return ColumnRole::Other;
     };
     // Axes first: `t_x` is a position, though `t` alone is a time.
     if let Some(axis) = axis(last, &words) {
@@ -181,26 +182,26 @@ fn role(name: &str) -> Role {
     let stated = self::words(bracket).find_map(unit);
     match unit(last) {
         // `sec` may be one half of `sec, nsec`, which `time_of` decides.
-        Some(Unit::Seconds) if *last != "s" && stated.is_none() => return Role::Seconds,
-        Some(Unit::Nanoseconds) if *last != "ns" && stated.is_none() => return Role::Nanos,
+        Some(Unit::Seconds) if *last != "s" && stated.is_none() => return ColumnRole::Seconds,
+        Some(Unit::Nanoseconds) if *last != "ns" && stated.is_none() => return ColumnRole::Nanos,
         _ => {}
     }
     if has(&words, TIME_WORDS) || last.ends_with("timestamp") || unit(last).is_some() {
         let of_name = (*last == "utime").then_some(Unit::Microseconds);
-        return Role::Time(stated.or(of_name).or_else(|| unit(last)));
+        return ColumnRole::Time(stated.or(of_name).or_else(|| unit(last)));
     }
     // `header.frame_id` names a frame of coordinates.
     if has(&[last], NUMBER_WORDS) && !words.contains(&"header") {
-        return Role::Number;
+        return ColumnRole::Number;
     }
     match has(&[last], NAME_WORDS) {
-        true => Role::Name,
-        false => Role::Other,
+        true => ColumnRole::Name,
+        false => ColumnRole::Other,
     }
 }
 
 /// A component of the position or the quaternion: its letter, after a word or as the end of one.
-fn axis(last: &str, words: &[&str]) -> Option<Role> {
+fn axis(last: &str, words: &[&str]) -> Option<ColumnRole> {
     let letter = last.chars().next_back()?;
     let index = ['x', 'y', 'z', 'w']
         .iter()
@@ -210,10 +211,10 @@ fn axis(last: &str, words: &[&str]) -> Option<Role> {
     let stem = [fused];
     let stems = if fused.is_empty() { words } else { &stem };
     if has(stems, QUATERNION_WORDS) {
-        return Some(Role::Value(3 + index));
+        return Some(ColumnRole::Value(3 + index));
     }
     let is_plain = words == [last] && fused.is_empty();
-    (index < 3 && (is_plain || has(stems, POSITION_WORDS))).then_some(Role::Value(index))
+    (index < 3 && (is_plain || has(stems, POSITION_WORDS))).then_some(ColumnRole::Value(index))
 }
 
 fn has(words: &[&str], known: &str) -> bool {

@@ -56,7 +56,7 @@ pub(super) fn join(stems: &[&str], clouds: &Keys, poses: &PoseFile) -> Result<Jo
             return Ok(joined);
         }
     }
-    by_order(clouds, poses)
+    by_order(stems.len(), clouds, poses)
 }
 
 /// Stems or names of files; the endings and folders of the rows' names do not count.
@@ -125,8 +125,8 @@ fn shift(clouds: &[u64], rows: &[u64]) -> Option<String> {
 }
 
 /// One row per cloud, in order.
-fn by_order(clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
-    let (rows, count) = (poses.poses.len(), clouds.len());
+fn by_order(count: usize, clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
+    let rows = poses.poses.len();
     let (cloud, row) = (clouds.shown(), poses.keys.first().map(Keys::shown));
     let keys = match row {
         Some(row) => format!("clouds have {cloud}, poses {row}"),
@@ -143,19 +143,19 @@ fn by_order(clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
     if poses.keys.iter().any(|keys| matches!(keys, Keys::Names(_))) {
         return Err(format!("no cloud has the name of a pose; {keys}"));
     }
-    if let Some(times) = &poses.times
+    if let Some(times) = poses.times()
         && times.windows(2).any(|pair| pair.first() > pair.last())
     {
         return Err(format!(
             "the times of the poses are not in order, so rows cannot be assigned to clouds; {keys}"
         ));
     }
-    if let (Keys::Times(clouds), Some(times)) = (clouds, &poses.times)
+    if let (Keys::Times(clouds), Some(times)) = (clouds, poses.times())
         && (clouds.len() != times.len() || !have_equal_steps(clouds, times))
     {
         return Err(format!("no cloud has the time of a pose; {keys}"));
     }
-    if rows == count && is_without_gap(clouds, poses.times.as_deref()) {
+    if rows == count && is_without_gap(clouds, poses.times()) {
         return Ok(Join::new("order", (0..count).map(Some)));
     }
     if let Some(joined) = by_line(clouds, rows) {
@@ -221,14 +221,9 @@ mod tests {
     use super::*;
 
     fn poses(keys: Vec<Keys>, count: usize) -> PoseFile {
-        let times = keys.iter().find_map(|keys| match keys {
-            Keys::Times(times) => Some(times.clone()),
-            _ => None,
-        });
         PoseFile {
             poses: vec![Some(protocol::Pose::IDENTITY); count],
             keys,
-            times,
         }
     }
 

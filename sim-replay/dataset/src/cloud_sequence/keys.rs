@@ -114,13 +114,6 @@ impl Keys {
         }
     }
 
-    pub(super) fn len(&self) -> usize {
-        match self {
-            Self::Names(names) => names.len(),
-            Self::Numbers(values) | Self::Times(values) => values.len(),
-        }
-    }
-
     /// The number of a cloud, or its place among all.
     pub(super) fn count(&self, index: usize) -> u64 {
         match self {

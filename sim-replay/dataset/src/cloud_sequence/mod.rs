@@ -17,7 +17,7 @@ use self::join::join;
 use self::keys::Keys;
 use self::pose_file::PoseFile;
 use super::faults::Faults;
-use super::layout::{LayoutRow, Reader};
+use super::layout::{LayoutReader, LayoutRow};
 use super::points::{SweepStorage, clouds_in};
 use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence};
 
@@ -30,7 +30,7 @@ pub(crate) static CLOUDS: LayoutRow = LayoutRow {
             <sequence>_poses_tum.txt or optimized_poses.txt (x y z qx qy qz qw or the columns of a header, 3x4 or 4x4 \
             matrices; possibly with time, number or name of the cloud)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence {
+    reader: Some(LayoutReader::Sequence {
         is_one: |dir| place_of(dir).is_some(),
         open,
     }),
@@ -106,7 +106,13 @@ fn open(
             without.push(ReadError::malformed(file, reason));
             continue;
         };
-        let nanos = capture_nanos(&keys, &poses, (index, *row))
+        let nanos = match &keys {
+            Keys::Times(times) => times.get(index),
+            // Without a time in its name a cloud has that of its pose.
+            Keys::Numbers(_) | Keys::Names(_) => row.and_then(|row| poses.times()?.get(row)),
+        };
+        let nanos = nanos
+            .copied()
             .unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
         let cloud = (
             Tick::new(*stem, nanos),
@@ -138,10 +144,8 @@ fn stems_of(files: &[PathBuf]) -> Vec<&str> {
 /// Refuses two clouds of one number, time or stem: one pose cannot be that of both.
 fn no_two_alike(files: &[PathBuf], keys: &Keys) -> Result<()> {
     // The files are in order, so equal keys are neighbours.
-    for (pair, index) in files.windows(2).zip(0..) {
-        if keys.are_equal(index, index + 1)
-            && let [first, second] = pair
-        {
+    for ([first, second], index) in files.array_windows().zip(0..) {
+        if keys.are_equal(index, index + 1) {
             let reason = format!(
                 "has the number, time or name of {}: a pose cannot be that of both",
                 first.display()
@@ -150,18 +154,6 @@ fn no_two_alike(files: &[PathBuf], keys: &Keys) -> Result<()> {
         }
     }
     Ok(())
-}
-
-/// Time of a cloud, by its index and row: that in its name, or of its pose.
-fn capture_nanos(
-    keys: &Keys,
-    poses: &PoseFile,
-    (index, row): (usize, Option<usize>),
-) -> Option<u64> {
-    match keys {
-        Keys::Times(times) => times.get(index).copied(),
-        Keys::Numbers(_) | Keys::Names(_) => poses.times.as_ref()?.get(row?).copied(),
-    }
 }
 
 #[cfg(test)]

@@ -16,18 +16,16 @@ use crate::{ReadError, Result, poses};
 const COMMENT: [char; 2] = ['#', '%'];
 
 /// The poses of a file.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct PoseFile {
     /// `world_from_lidar` of each row; `None` if it cannot be read.
     pub(super) poses: Vec<Option<Pose>>,
     /// Keys of all rows, the most telling first; none if the file has none.
     pub(super) keys: Vec<Keys>,
-    /// Times of all rows, nanoseconds.
-    pub(super) times: Option<Vec<u64>>,
 }
 
 /// A line of values, or a blank one.
-struct Row<'a> {
+struct FileRow<'a> {
     line: u64,
     words: Vec<&'a str>,
 }
@@ -40,12 +38,12 @@ impl PoseFile {
     /// [`ReadError`] if the file cannot be read, or its header is not understood.
     pub(super) fn read(path: &Path, faults: &mut Faults) -> Result<Self> {
         let lines = counted_lines(path)?;
-        let (comments, mut rows): (Vec<Row<'_>>, Vec<Row<'_>>) = lines
+        let (comments, mut rows): (Vec<FileRow<'_>>, Vec<FileRow<'_>>) = lines
             .iter()
-            .map(|(line, text)| Row::of(*line, text))
-            .partition(Row::is_comment);
+            .map(|(line, text)| FileRow::of(*line, text))
+            .partition(FileRow::is_comment);
         let first = rows.iter().position(|row| !row.words.is_empty());
-        let header = first.filter(|&first| rows.get(first).is_some_and(Row::is_names));
+        let header = first.filter(|&first| rows.get(first).is_some_and(FileRow::is_names));
         let header = header.map(|first| rows.remove(first));
         let columns = columns(path, header, &comments, usual_width(&rows))?;
         if columns.has_key() {
@@ -57,7 +55,15 @@ impl PoseFile {
             .collect();
         Ok(Self {
             poses,
-            ..keys(&rows, &columns)
+            keys: keys(&rows, &columns),
+        })
+    }
+
+    /// Times of all rows, nanoseconds.
+    pub(super) fn times(&self) -> Option<&[u64]> {
+        self.keys.iter().find_map(|keys| match keys {
+            Keys::Times(times) => Some(times.as_slice()),
+            _ => None,
         })
     }
 }
@@ -65,8 +71,8 @@ impl PoseFile {
 /// The columns: by the header, or a comment that names all of them, else by their number.
 fn columns(
     path: &Path,
-    header: Option<Row<'_>>,
-    comments: &[Row<'_>],
+    header: Option<FileRow<'_>>,
+    comments: &[FileRow<'_>],
     width: usize,
 ) -> Result<Columns> {
     if let Some(header) = &header {
@@ -74,20 +80,17 @@ fn columns(
     }
     for comment in comments {
         // Prose may name the columns of a quaternion too: in TUM's order it changes nothing.
-        match quaternion_order(&comment.names())[..] {
-            [_, _, _, _] if comment.names().len() == width => {
-                return comment.columns(path, width);
-            }
-            [0, 1, 2, 3] => {}
-            [_, _, _, _] => return comment.columns(path, width),
-            _ => {}
+        let names = comment.names();
+        let order = quaternion_order(&names);
+        if order.len() == 4 && (names.len() == width || order != [0, 1, 2, 3]) {
+            return comment.columns(path, width);
         }
     }
     Columns::of_width(width).map_err(|reason| ReadError::malformed(path, reason))
 }
 
 /// The number of values that most rows have.
-fn usual_width(rows: &[Row<'_>]) -> usize {
+fn usual_width(rows: &[FileRow<'_>]) -> usize {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
     for row in rows.iter().filter(|row| !row.words.is_empty()) {
         *counts.entry(row.words.len()).or_default() += 1;
@@ -96,12 +99,12 @@ fn usual_width(rows: &[Row<'_>]) -> usize {
     usual.map_or(0, |(width, _)| width)
 }
 
-fn words<'a>(rows: &[Row<'a>], column: usize) -> Vec<&'a str> {
+fn words<'a>(rows: &[FileRow<'a>], column: usize) -> Vec<&'a str> {
     rows.iter().map(|row| row.word(column)).collect()
 }
 
-/// Keys and times of the rows.
-fn keys(rows: &[Row<'_>], columns: &Columns) -> PoseFile {
+/// Keys of the rows.
+fn keys(rows: &[FileRow<'_>], columns: &Columns) -> Vec<Keys> {
     let mut keys = Vec::new();
     if let Some(column) = columns.name {
         let names = words(rows, column).into_iter().map(str::to_owned).collect();
@@ -128,18 +131,10 @@ fn keys(rows: &[Row<'_>], columns: &Columns) -> PoseFile {
     keys.extend(times);
     let unknown = columns.key.map(|column| words(rows, column));
     keys.extend(unknown.and_then(|words| Keys::of_words(&words)));
-    let times = keys.iter().find_map(|keys| match keys {
-        Keys::Times(times) => Some(times.clone()),
-        _ => None,
-    });
-    PoseFile {
-        poses: Vec::new(),
-        keys,
-        times,
-    }
+    keys
 }
 
-impl<'a> Row<'a> {
+impl<'a> FileRow<'a> {
     fn of(line: u64, text: &'a str) -> Self {
         // With a byte order mark the first word would be no number.
         let text = text.trim_start_matches('\u{feff}').trim();

@@ -5,9 +5,9 @@ use std::path::Path;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
 use super::Sides;
-use super::index::{Kind, Pair, offset_m};
+use super::index::{FramePair, Kind, offset_m};
 use crate::Result;
-use crate::json::{self, Field};
+use crate::json::{self, JsonField};
 
 /// Folders of the vehicle's calibration: from LiDAR to its GNSS and IMU unit (NovAtel), and from there to the world.
 pub(super) const VEHICLE: [&str; 2] = [
@@ -35,7 +35,7 @@ impl VehiclePoses {
 }
 
 /// Reads the poses of the vehicle.
-pub(super) fn vehicle(sides: &Sides, pair: &Pair) -> Result<VehiclePoses> {
+pub(super) fn vehicle(sides: &Sides, pair: &FramePair) -> Result<VehiclePoses> {
     let [novatel_from_lidar, world_from_novatel] =
         VEHICLE.map(|folder| sides.json(folder, &pair.vehicle));
     Ok(VehiclePoses {
@@ -49,7 +49,7 @@ pub(super) fn vehicle(sides: &Sides, pair: &Pair) -> Result<VehiclePoses> {
 /// The world frames of the two sides differ slightly. DAIR-V2X adds the pair's offset in the world, V2X-Seq in the
 /// vehicle's LiDAR frame (`Coord_transformation` and `Coord_transformation_spd` of the data sets' own code). Without an
 /// offset of the pair that of the calibration file is used (`relative_error`), as in early releases.
-pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64>> {
+pub(super) fn infrastructure(sides: &Sides, pair: &FramePair) -> Result<Isometry3<f64>> {
     let path = sides.json(INFRASTRUCTURE, &pair.infrastructure);
     let (world_from_lidar, own_offset_m) = read_transform(&path)?;
     let [x_m, y_m] = pair.offset_m.unwrap_or(own_offset_m);
@@ -65,11 +65,8 @@ pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64
 /// A transform, and the offset given with it, metres: `{rotation, translation}`, in some files below `transform`.
 fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2])> {
     let value = json::read(path)?;
-    let root = Field::root(path, &value);
-    let own_offset_m = root
-        .optional("relative_error")?
-        .map(|offset| offset_m(&offset))
-        .transpose()?;
+    let root = JsonField::root(path, &value);
+    let own_offset_m = root.optional_of("relative_error", offset_m)?;
     let transform = root.optional("transform")?.unwrap_or(root);
     let rotation = nearest_rotation(&transform.required("rotation")?)?;
     let translation = Translation3::from(transform.required("translation")?.numbers::<3>()?);
@@ -80,7 +77,7 @@ fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2])> {
 }
 
 /// The rotation nearest to a 3x3 matrix, row by row.
-fn nearest_rotation(field: &Field<'_>) -> Result<UnitQuaternion<f64>> {
+fn nearest_rotation(field: &JsonField<'_>) -> Result<UnitQuaternion<f64>> {
     let matrix = Matrix3::from_row_slice(&field.numbers::<9>()?);
     let deviation = (matrix * matrix.transpose() - Matrix3::identity()).amax();
     let determinant = matrix.determinant();

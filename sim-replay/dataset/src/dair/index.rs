@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::Path;
 
 use crate::faults::Faults;
-use crate::json::Field;
+use crate::json::JsonField;
 use crate::{Layout, ReadError, Result, Tick, json_table, time_stamps};
 
 /// The pairs, below the root.
@@ -42,7 +42,7 @@ impl Kind {
 
 /// Two frames that belong together, by their ids.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Pair {
+pub(super) struct FramePair {
     pub(super) vehicle: String,
     pub(super) infrastructure: String,
     /// Correction of the roadside unit's position, metres, where the pair states one.
@@ -64,7 +64,7 @@ struct Capture {
 pub(super) struct Index {
     pub(super) kind: Kind,
     /// By the name of the batch or sequence.
-    pub(super) groups: BTreeMap<String, Vec<(Tick, Pair)>>,
+    pub(super) groups: BTreeMap<String, Vec<(Tick, FramePair)>>,
 }
 
 impl Index {
@@ -86,12 +86,16 @@ impl Index {
         }
         let captures = read_captures(root, kind, problems);
         let has_times = captures.values().any(|capture| capture.micros.is_some());
-        let mut groups: BTreeMap<String, Vec<(u64, Pair)>> = BTreeMap::new();
+        let mut groups: BTreeMap<String, Vec<(u64, FramePair)>> = BTreeMap::new();
+        let (noun, _) = kind.group();
         for pair in pairs {
             let capture = captures.get(&pair.vehicle);
             let group = capture.and_then(|capture| capture.group.as_ref());
-            let group = group_name(kind, group.or(pair.sequence.as_ref()));
-            let group = groups.entry(group).or_default();
+            let name = match group.or(pair.sequence.as_ref()) {
+                Some(group) => format!("{noun}_{group}"),
+                None => noun.to_owned(),
+            };
+            let group = groups.entry(name).or_default();
             match capture.and_then(|capture| capture.micros) {
                 Some(micros) => group.push((micros, pair)),
                 // Without any time stamp the order of the list is the best available.
@@ -116,13 +120,8 @@ impl Index {
     }
 }
 
-fn group_name(kind: Kind, group: Option<&String>) -> String {
-    let (noun, _) = kind.group();
-    group.map_or_else(|| noun.to_owned(), |group| format!("{noun}_{group}"))
-}
-
 /// Ticks by time, from the first on.
-fn in_order(mut pairs: Vec<(u64, Pair)>) -> Vec<(Tick, Pair)> {
+fn in_order(mut pairs: Vec<(u64, FramePair)>) -> Vec<(Tick, FramePair)> {
     pairs.sort_by(|(a, first), (b, second)| (a, &first.vehicle).cmp(&(b, &second.vehicle)));
     let start = pairs.first().map_or(0, |(micros, _)| *micros);
     let ticks = pairs.into_iter().map(|(micros, pair)| {
@@ -132,9 +131,9 @@ fn in_order(mut pairs: Vec<(u64, Pair)>) -> Vec<(Tick, Pair)> {
     ticks.collect()
 }
 
-fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<Pair>)> {
+fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<FramePair>)> {
     let mut kind = None;
-    let mut pairs: Vec<Pair> = Vec::new();
+    let mut pairs: Vec<FramePair> = Vec::new();
     let mut seen = HashSet::new();
     json_table::read_all(path, MAX_BYTES, problems, |entry| {
         let pair = pair(entry, &mut kind)?;
@@ -149,27 +148,21 @@ fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<P
 }
 
 /// The first entry decides which of the two data sets it is.
-fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair> {
+fn pair(entry: &JsonField<'_>, kind: &mut Option<Kind>) -> Result<FramePair> {
     let is_sequence = entry.optional("vehicle_frame")?.is_some();
     let kind = *kind.get_or_insert(match is_sequence {
         true => Kind::V2xSeq,
         false => Kind::Dair,
     });
-    Ok(Pair {
+    Ok(FramePair {
         vehicle: id_of_side(entry, kind, "vehicle")?,
         infrastructure: id_of_side(entry, kind, "infrastructure")?,
-        offset_m: entry
-            .optional("system_error_offset")?
-            .map(|offset| offset_m(&offset))
-            .transpose()?,
-        sequence: entry
-            .optional("vehicle_sequence")?
-            .map(|sequence| frame_id(&sequence))
-            .transpose()?,
+        offset_m: entry.optional_of("system_error_offset", offset_m)?,
+        sequence: entry.optional_of("vehicle_sequence", frame_id)?,
     })
 }
 
-fn id_of_side(pair: &Field<'_>, kind: Kind, side: &str) -> Result<String> {
+fn id_of_side(pair: &JsonField<'_>, kind: Kind, side: &str) -> Result<String> {
     if kind == Kind::V2xSeq {
         return frame_id(&pair.required(&format!("{side}_frame"))?);
     }
@@ -182,18 +175,18 @@ fn id_of_side(pair: &Field<'_>, kind: Kind, side: &str) -> Result<String> {
 }
 
 /// The id of a frame: the name of its files without suffix.
-fn stem(path: &Field<'_>) -> Result<String> {
+fn stem(path: &JsonField<'_>) -> Result<String> {
     let text = path.text()?;
     let name = text.rsplit(['/', '\\']).next().unwrap_or(text);
     checked_id(path, name.rsplit_once('.').map_or(name, |(stem, _)| stem))
 }
 
-fn frame_id(field: &Field<'_>) -> Result<String> {
+fn frame_id(field: &JsonField<'_>) -> Result<String> {
     checked_id(field, &field.id()?)
 }
 
 /// Ids become names of files.
-fn checked_id(field: &Field<'_>, id: &str) -> Result<String> {
+fn checked_id(field: &JsonField<'_>, id: &str) -> Result<String> {
     let mut letters = id.chars();
     if id.is_empty()
         || id.len() > 64
@@ -241,18 +234,17 @@ fn read_captures(
 }
 
 /// Id of a frame, and its batch or sequence where the entry states one.
-fn frame_and_group(entry: &Field<'_>, kind: Kind) -> Result<(String, Option<String>)> {
+fn frame_and_group(entry: &JsonField<'_>, kind: Kind) -> Result<(String, Option<String>)> {
     let id = match entry.optional("frame_id")? {
         Some(id) => frame_id(&id)?,
         None => stem(&entry.required("pointcloud_path")?)?,
     };
     let (_, group_key) = kind.group();
-    let group = entry.optional(group_key)?;
-    Ok((id, group.map(|group| frame_id(&group)).transpose()?))
+    Ok((id, entry.optional_of(group_key, frame_id)?))
 }
 
 /// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.
-pub(super) fn offset_m(offset: &Field<'_>) -> Result<[f64; 2]> {
+pub(super) fn offset_m(offset: &JsonField<'_>) -> Result<[f64; 2]> {
     let [x, y] = ["delta_x", "delta_y"].map(|key| {
         let delta = offset.optional(key)?;
         delta.map_or(Ok(0.0), |delta| delta.number())

@@ -7,7 +7,7 @@ use protocol::Pose;
 
 use crate::frame::{Object, ObjectClass};
 use crate::ground_truth::upright_box;
-use crate::json::{self, Field};
+use crate::json::{self, JsonField};
 use crate::{Problem, ReadError, Result, classes};
 use protocol::rotated_iou::Polygon;
 
@@ -22,20 +22,20 @@ const BLOCK: i64 = 1 << 40;
 const SAME_OBJECT_IOU: f64 = 0.05;
 
 /// Valid objects, and the faults of the others.
-pub(super) type Objects = (Vec<Object>, Vec<Problem>);
+pub(super) type LabelledObjects = (Vec<Object>, Vec<Problem>);
 
 /// Id, pose in the world and size of a labelled box.
 type LabelledBox = (i64, Pose, [f64; 3]);
 
 /// Source of a list. The lists number their objects independently, so each has its own range of ids.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Block {
+pub(super) enum LabelList {
     Cooperative,
     Vehicle,
     Infrastructure,
 }
 
-impl Block {
+impl LabelList {
     pub(super) fn id(self, number: i64) -> i64 {
         number.saturating_add(self as i64 * BLOCK)
     }
@@ -43,10 +43,10 @@ impl Block {
 
 /// Cooperative labels of DAIR-V2X: eight corners in the world. They have no ids: the number in the list serves as one,
 /// and does not identify the object at another tick.
-pub(super) fn in_world(path: &Path) -> Result<Objects> {
+pub(super) fn in_world(path: &Path) -> Result<LabelledObjects> {
     read(path, |number, label| {
         let found = from_corners(&label.required("world_8_points")?)?;
-        Ok(found.map(|(pose, size_m)| (Block::Cooperative.id(number), pose, size_m)))
+        Ok(found.map(|(pose, size_m)| (LabelList::Cooperative.id(number), pose, size_m)))
     })
 }
 
@@ -55,8 +55,8 @@ pub(super) fn in_world(path: &Path) -> Result<Objects> {
 pub(super) fn in_frame(
     path: &Path,
     world_from_lidar: &Isometry3<f64>,
-    block: Block,
-) -> Result<Objects> {
+    block: LabelList,
+) -> Result<LabelledObjects> {
     read(path, |number, label| {
         let Some(size_m) = size_m(&label.required("3d_dimensions")?)? else {
             return Ok(None);
@@ -80,10 +80,10 @@ pub(super) fn in_frame(
 
 fn read(
     path: &Path,
-    labelled: impl Fn(i64, &Field<'_>) -> Result<Option<LabelledBox>>,
-) -> Result<Objects> {
+    labelled: impl Fn(i64, &JsonField<'_>) -> Result<Option<LabelledBox>>,
+) -> Result<LabelledObjects> {
     let value = json::read(path)?;
-    let labels = Field::root(path, &value);
+    let labels = JsonField::root(path, &value);
     let labels = labels.items()?;
     if labels.len() > MAX_BOXES {
         let reason = format!("{} boxes, expected at most {MAX_BOXES}", labels.len());
@@ -97,14 +97,9 @@ fn read(
         match found.and_then(|found| Ok((found, label.required("type")?.text()?))) {
             Ok(((id, world_from_object, size_m), kind)) => {
                 problems.extend(classes::unknown_label(path, kind));
-                objects.push(Object {
-                    id,
-                    // An object of unknown type is not a vehicle.
-                    class: classes::of_name(kind).unwrap_or(ObjectClass::Other),
-                    world_from_object,
-                    size_m,
-                    speed_mps: None,
-                });
+                // An object of unknown type is not a vehicle.
+                let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
+                objects.push(Object::new(id, class, world_from_object, size_m));
             }
             Err(error) => problems.push(Problem::from(
                 &error.with_consequence("the object is left out"),
@@ -115,7 +110,7 @@ fn read(
 }
 
 /// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
-fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>> {
+fn size_m(dimensions: &JsonField<'_>) -> Result<Option<[f64; 3]>> {
     let size_m = numbers_of(dimensions, ["l", "w", "h"])?;
     if size_m.contains(&0.0) {
         return Ok(None);
@@ -123,7 +118,7 @@ fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>> {
     dimensions.checked_size(size_m).map(Some)
 }
 
-fn numbers_of(field: &Field<'_>, keys: [&str; 3]) -> Result<[f64; 3]> {
+fn numbers_of(field: &JsonField<'_>, keys: [&str; 3]) -> Result<[f64; 3]> {
     let [first, second, third] = keys.map(|key| field.required(key)?.number());
     Ok([first?, second?, third?])
 }
@@ -132,7 +127,7 @@ fn numbers_of(field: &Field<'_>, keys: [&str; 3]) -> Result<[f64; 3]> {
 /// them. The edge from the third and fourth corner to the second and first points ahead; the first may be on either
 /// side.
 #[expect(clippy::indexing_slicing, reason = "24 numbers are 8 corners")]
-fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>> {
+fn from_corners(field: &JsonField<'_>) -> Result<Option<(Pose, [f64; 3])>> {
     let numbers = field.numbers::<24>()?;
     let corners = numbers.as_chunks::<3>().0.iter();
     let corners: Vec<Vector3<f64>> = corners.map(|corner| Vector3::from(*corner)).collect();

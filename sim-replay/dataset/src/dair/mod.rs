@@ -21,9 +21,9 @@ use std::sync::Arc;
 
 use protocol::{CavId, Handedness};
 
-use self::index::{Index, Kind, Pair};
-use self::labels::{Block, Objects};
-use super::layout::{LayoutRow, Reader, opened};
+use self::index::{FramePair, Index, Kind};
+use self::labels::{LabelList, LabelledObjects};
+use super::layout::{LayoutReader, LayoutRow, opened};
 use super::points::{SweepStorage, Sweeps};
 use super::{
     Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Result, Scenario, Tick,
@@ -39,7 +39,7 @@ pub(crate) static DAIR: LayoutRow = LayoutRow {
     data_sets: "DAIR-V2X-C",
     files: "cooperative/data_info.json with vehicle_pointcloud_path, vehicle-side/, infrastructure-side/",
     protocol: "dair",
-    reader: Some(Reader::DataSet(open)),
+    reader: Some(LayoutReader::DataSet(open)),
 };
 
 /// V2X-Seq (SPD): DAIR-V2X as sequences with track ids.
@@ -109,7 +109,7 @@ fn open_root(
 fn scenario(
     name: String,
     sides: Sides,
-    pairs: Vec<(Tick, Pair)>,
+    pairs: Vec<(Tick, FramePair)>,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
 ) -> Scenario {
@@ -127,7 +127,7 @@ fn scenario(
             continue;
         }
         for agent in &agents {
-            if let Some(path) = sides.missing_file(&pair, Side::of(agent)) {
+            if let Some(path) = sides.missing_file(&pair, PairSide::of(agent)) {
                 let reason = format!("does not exist: {agent} is absent at {}", tick.stem);
                 problems.push(ReadError::malformed(&path, reason));
                 missing.push(MissingFrame::new(agent, &tick.stem));
@@ -139,11 +139,11 @@ fn scenario(
     let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
     for agent in &agents {
         let files = (moments.iter())
-            .filter_map(|tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent))));
+            .filter_map(|tick| Some(sides.points(kept.get(&tick.stem)?, PairSide::of(agent))));
         sweeps = sweeps.with_agent(agent.clone(), files);
     }
     let layout = sides.kind.layout();
-    let source = Arc::new(Source {
+    let source = Arc::new(DairSource {
         sides,
         pairs: kept,
         sweeps,
@@ -157,12 +157,12 @@ fn scenario(
 
 /// Side of a pair: vehicle or roadside unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Side {
+enum PairSide {
     Vehicle,
     Infrastructure,
 }
 
-impl Side {
+impl PairSide {
     fn of(agent: &CavId) -> Self {
         match agent.as_str() {
             VEHICLE => Self::Vehicle,
@@ -179,20 +179,20 @@ struct Sides {
 }
 
 impl Sides {
-    fn points(&self, pair: &Pair, side: Side) -> PathBuf {
+    fn points(&self, pair: &FramePair, side: PairSide) -> PathBuf {
         let (folder, id) = match side {
-            Side::Vehicle => (VEHICLE_SIDE, &pair.vehicle),
-            Side::Infrastructure => (INFRASTRUCTURE_SIDE, &pair.infrastructure),
+            PairSide::Vehicle => (VEHICLE_SIDE, &pair.vehicle),
+            PairSide::Infrastructure => (INFRASTRUCTURE_SIDE, &pair.infrastructure),
         };
         let folder = self.root.join(folder).join("velodyne");
         folder.join(format!("{id}.pcd"))
     }
 
     /// Labels of a side's own sweep.
-    fn labels(&self, pair: &Pair, side: Side) -> PathBuf {
+    fn labels(&self, pair: &FramePair, side: PairSide) -> PathBuf {
         let (folder, id) = match side {
-            Side::Vehicle => ("vehicle-side/label/lidar", &pair.vehicle),
-            Side::Infrastructure => (
+            PairSide::Vehicle => ("vehicle-side/label/lidar", &pair.vehicle),
+            PairSide::Infrastructure => (
                 "infrastructure-side/label/virtuallidar",
                 &pair.infrastructure,
             ),
@@ -200,7 +200,7 @@ impl Sides {
         self.json(folder, id)
     }
 
-    fn cooperative_labels(&self, pair: &Pair) -> PathBuf {
+    fn cooperative_labels(&self, pair: &FramePair) -> PathBuf {
         let folder = match self.kind {
             Kind::Dair => "cooperative/label_world",
             Kind::V2xSeq => "cooperative/label",
@@ -212,16 +212,16 @@ impl Sides {
         self.root.join(folder).join(format!("{id}.json"))
     }
 
-    fn calibrations(&self, pair: &Pair, side: Side) -> Vec<PathBuf> {
+    fn calibrations(&self, pair: &FramePair, side: PairSide) -> Vec<PathBuf> {
         let (folders, id): (&[&str], _) = match side {
-            Side::Vehicle => (&calibration::VEHICLE, &pair.vehicle),
-            Side::Infrastructure => (&[calibration::INFRASTRUCTURE], &pair.infrastructure),
+            PairSide::Vehicle => (&calibration::VEHICLE, &pair.vehicle),
+            PairSide::Infrastructure => (&[calibration::INFRASTRUCTURE], &pair.infrastructure),
         };
         folders.iter().map(|folder| self.json(folder, id)).collect()
     }
 
     /// The first required file of a side that does not exist.
-    fn missing_file(&self, pair: &Pair, side: Side) -> Option<PathBuf> {
+    fn missing_file(&self, pair: &FramePair, side: PairSide) -> Option<PathBuf> {
         let mut files = self.calibrations(pair, side);
         files.insert(0, self.points(pair, side));
         files.into_iter().find(|path| !path.is_file())
@@ -230,15 +230,15 @@ impl Sides {
 
 /// A batch or sequence.
 #[derive(Debug)]
-struct Source {
+struct DairSource {
     sides: Sides,
     /// By the stem of the tick.
-    pairs: HashMap<String, Pair>,
+    pairs: HashMap<String, FramePair>,
     sweeps: Sweeps,
 }
 
-impl Source {
-    fn pair(&self, tick: &Tick) -> Result<&Pair> {
+impl DairSource {
+    fn pair(&self, tick: &Tick) -> Result<&FramePair> {
         self.pairs.get(&tick.stem).ok_or_else(|| {
             let reason = format!("no pair of vehicle frame {}", tick.stem);
             ReadError::malformed(&self.sides.root, reason)
@@ -252,14 +252,14 @@ impl Source {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(world_from_lidar.into());
         frame.world_from_vehicle = Some(poses.world_from_novatel.into());
-        let path = self.sides.labels(pair, Side::Vehicle);
-        let own = labels::in_frame(&path, &world_from_lidar, Block::Vehicle);
+        let path = self.sides.labels(pair, PairSide::Vehicle);
+        let own = labels::in_frame(&path, &world_from_lidar, LabelList::Vehicle);
         frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
         let path = self.sides.cooperative_labels(pair);
         // DAIR-V2X has these labels in the world, V2X-Seq in the frame of the vehicle's LiDAR.
         let cooperative = match self.sides.kind {
             Kind::Dair => labels::in_world(&path),
-            Kind::V2xSeq => labels::in_frame(&path, &world_from_lidar, Block::Cooperative),
+            Kind::V2xSeq => labels::in_frame(&path, &world_from_lidar, LabelList::Cooperative),
         };
         // Without a readable list the annotations of the two sides are merged instead.
         frame.cooperative_objects = usable(cooperative, &mut frame.problems);
@@ -271,13 +271,13 @@ impl Source {
         let world_from_lidar = calibration::infrastructure(&self.sides, pair)?;
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(world_from_lidar.into());
-        let path = self.sides.labels(pair, Side::Infrastructure);
-        let own = labels::in_frame(&path, &world_from_lidar, Block::Infrastructure);
+        let path = self.sides.labels(pair, PairSide::Infrastructure);
+        let own = labels::in_frame(&path, &world_from_lidar, LabelList::Infrastructure);
         frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
         // Faults of the vehicle's labels are problems of its frame.
         let vehicle = calibration::vehicle(&self.sides, pair).and_then(|poses| {
-            let path = self.sides.labels(pair, Side::Vehicle);
-            labels::in_frame(&path, &poses.world_from_lidar(), Block::Vehicle)
+            let path = self.sides.labels(pair, PairSide::Vehicle);
+            labels::in_frame(&path, &poses.world_from_lidar(), LabelList::Vehicle)
         });
         if let Ok((others, _)) = vehicle {
             labels::share_ids(&mut frame.objects, &others, &world_from_lidar.inverse());
@@ -287,7 +287,7 @@ impl Source {
 }
 
 /// The objects of a list; its faults are added to the frame's problems.
-fn usable(labels: Result<Objects>, problems: &mut Vec<Problem>) -> Option<Vec<Object>> {
+fn usable(labels: Result<LabelledObjects>, problems: &mut Vec<Problem>) -> Option<Vec<Object>> {
     match labels {
         Ok((objects, wrong)) => {
             problems.extend(wrong);
@@ -300,11 +300,11 @@ fn usable(labels: Result<Objects>, problems: &mut Vec<Problem>) -> Option<Vec<Ob
     }
 }
 
-impl FrameSource for Source {
+impl FrameSource for DairSource {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
-        match Side::of(agent) {
-            Side::Vehicle => self.vehicle_frame(agent, tick),
-            Side::Infrastructure => self.infrastructure_frame(agent, tick),
+        match PairSide::of(agent) {
+            PairSide::Vehicle => self.vehicle_frame(agent, tick),
+            PairSide::Infrastructure => self.infrastructure_frame(agent, tick),
         }
     }
 
@@ -324,7 +324,7 @@ impl FrameSource for Source {
             return Vec::new();
         };
         let mut files = vec![self.sides.cooperative_labels(pair)];
-        for side in [Side::Vehicle, Side::Infrastructure] {
+        for side in [PairSide::Vehicle, PairSide::Infrastructure] {
             files.extend(self.sides.calibrations(pair, side));
             files.push(self.sides.labels(pair, side));
         }
@@ -334,7 +334,7 @@ impl FrameSource for Source {
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
         // A tick of another scenario has no file here.
         match self.pairs.get(&tick.stem) {
-            Some(pair) => self.sides.points(pair, Side::of(agent)),
+            Some(pair) => self.sides.points(pair, PairSide::of(agent)),
             None => self.sides.root.clone(),
         }
     }

@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use protocol::PointCloud;
 use serde_json::{Value, json};
 
-use super::labels::Block;
+use super::labels::LabelList;
 use super::*;
 use crate::frame::ObjectClass;
 use crate::ground_truth::{GroundTruthRule, merge};
@@ -322,7 +322,7 @@ fn without_cooperative_labels_both_sides_count_and_common_objects_once() {
     };
     assert_eq!(
         (*car, *truck),
-        (Block::Vehicle.id(0), Block::Infrastructure.id(1))
+        (LabelList::Vehicle.id(0), LabelList::Infrastructure.id(1))
     );
     assert!(close(car_box.center_m, [10.0, 1.0, -1.0]) && (car_box.heading_rad - 0.1).abs() < 1e-9);
     // The truck is at (141.5, 199.5, 22) in the world.

@@ -38,13 +38,14 @@ impl EvaluationProtocol {
                 "v2xreal-i2i" | "rcooper" => (AgentKinds::Units, EgoKind::Unit),
                 _ => (AgentKinds::All, EgoKind::Vehicle),
             };
+            let (ground_truth, max_agents) = rule(name);
             Self {
                 name: name.to_owned(),
-                ground_truth: rule(name),
+                ground_truth,
                 exact_range: false,
                 agents,
                 ego,
-                max_agents: max_agents(name),
+                max_agents,
                 ap_order: match name {
                     "v2v4real" => ApOrder::Frame,
                     _ => ApOrder::Global,
@@ -54,26 +55,29 @@ impl EvaluationProtocol {
     }
 }
 
-fn rule(name: &str) -> GroundTruthRule {
+/// Boxes that count, and the largest number of agents.
+fn rule(name: &str) -> (GroundTruthRule, usize) {
     match name {
-        "v2v4real" => GroundTruthRule::V2V4REAL,
+        "v2v4real" => (GroundTruthRule::V2V4REAL, 2),
         // V2X-R: opencood/hypes_yaml/V2X-R, ground truth as wide as the points.
-        "v2xr" => vehicles_in(140.8, 40.0, [-3.0, 1.0], 70.0),
+        "v2xr" => (vehicles_in(140.8, 40.0, [-3.0, 1.0], 70.0), 5),
         // HEAL, dairv2x configurations: the range of the points, z widened by 1 m where labels are filtered. V2X-Seq's
         // own code takes every pair, however far apart.
-        "dair" | "v2xseq" => vehicles_in(102.4, 51.2, [-4.5, 2.5], 100.0),
+        "dair" | "v2xseq" => (vehicles_in(102.4, 51.2, [-4.5, 2.5], 100.0), 2),
         // V2X-Real: opencood/data_utils/datasets/__init__.py.
-        "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => vehicles_in(100.0, 40.0, [-15.0, 15.0], 50.0),
+        "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => {
+            (vehicles_in(100.0, 40.0, [-15.0, 15.0], 50.0), 4)
+        }
         // HEAL, v2xsim2 configurations, vehicles only. CoAlign has z -3..2 m and 50 m.
-        "v2xsim" => vehicles_in(32.0, 32.0, [-3.0, 1.0], 70.0),
+        "v2xsim" => (vehicles_in(32.0, 32.0, [-3.0, 1.0], 70.0), 5),
         // V2X-Radar: communication range of its configurations.
-        "v2xradar" => vehicles_in(140.8, 40.0, [-3.0, 1.0], 300.0),
+        "v2xradar" => (vehicles_in(140.8, 40.0, [-3.0, 1.0], 300.0), 7),
         // RCooper: roadside units up to 200 m apart.
-        "rcooper" => vehicles_in(200.0, 40.0, [-20.0, 0.0], 200.0),
+        "rcooper" => (vehicles_in(200.0, 40.0, [-20.0, 0.0], 200.0), 7),
         // Open MARS has no annotations and so no protocol: chosen for this project.
-        "mars" => vehicles_in(51.2, 51.2, [-5.0, 3.0], 70.0),
+        "mars" => (vehicles_in(51.2, 51.2, [-5.0, 3.0], 70.0), 7),
         // OPV2V, V2XSet, V2VDet.
-        _ => GroundTruthRule::OPV2V,
+        _ => (GroundTruthRule::OPV2V, 7),
     }
 }
 
@@ -86,14 +90,5 @@ fn vehicles_in(x: f64, y: f64, z_m: [f64; 2], comm_range_m: f64) -> GroundTruthR
         comm_range_m,
         min_corners: 8,
         classes: ClassSet::VEHICLES,
-    }
-}
-
-fn max_agents(name: &str) -> usize {
-    match name {
-        "v2v4real" | "dair" | "v2xseq" => 2,
-        "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => 4,
-        "v2xr" | "v2xsim" => 5,
-        _ => 7,
     }
 }

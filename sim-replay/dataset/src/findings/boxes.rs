@@ -2,7 +2,7 @@
 
 use protocol::{CavId, PointCloud, Pose};
 
-use super::cells::Cells;
+use super::cells::PointCells;
 use crate::Problem;
 use crate::frame::Frame;
 
@@ -38,7 +38,7 @@ pub(super) fn mostly_empty(
 
 /// Number of boxes that hold none of the points.
 pub(super) fn without_points(frame: &Frame, world_from_lidar: &Pose, points: &PointCloud) -> usize {
-    let (cells, world_from_lidar) = (Cells::new(points), world_from_lidar.isometry());
+    let (cells, world_from_lidar) = (PointCells::new(points), world_from_lidar.isometry());
     let empty = frame.objects.iter().filter(|object| {
         let world_from_object = object.world_from_object.isometry();
         let object_from_lidar = world_from_object.inv_mul(&world_from_lidar);

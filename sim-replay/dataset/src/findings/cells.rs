@@ -10,7 +10,7 @@ const CELLS: usize = 40;
 const ACROSS: usize = 2 * CELLS;
 
 /// The points of a sweep, sorted by cell.
-pub(super) struct Cells {
+pub(super) struct PointCells {
     points: Vec<[f32; 3]>,
     /// Start of the points of each cell, and the end of the last.
     begins: Vec<usize>,
@@ -20,7 +20,7 @@ pub(super) struct Cells {
     clippy::indexing_slicing,
     reason = "columns and rows are below ACROSS, begins has one for each cell and the end, axes are 0 to 2"
 )]
-impl Cells {
+impl PointCells {
     pub(super) fn new(cloud: &PointCloud) -> Self {
         let mut begins = vec![0; ACROSS * ACROSS + 1];
         for point in &cloud.xyzi {
@@ -94,7 +94,7 @@ mod tests {
                 let local = box_from_lidar * Point3::new(point[0], point[1], point[2]);
                 (0..3).all(|axis| local[axis].abs() <= half[axis])
             };
-            let cells = Cells::new(&PointCloud { xyzi: points.clone() });
+            let cells = PointCells::new(&PointCloud { xyzi: points.clone() });
             prop_assert_eq!(cells.holds_point(&box_from_lidar, half), points.iter().any(holds));
         }
     }

@@ -148,30 +148,21 @@ fn intensity_fault(
 
 impl std::fmt::Display for SweepReport {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self {
-            form,
-            intensity,
-            min_intensity: min,
-            median_intensity: median,
-            max_intensity: max,
-        } = self;
-        write!(f, "{form}; ")?;
-        let Some(IntensityOrigin {
-            field,
-            kind,
-            divisor,
-        }) = intensity
-        else {
+        write!(f, "{}; ", self.form)?;
+        let Some(origin) = &self.intensity else {
             return f.write_str("no intensity");
         };
-        let stored = match kind {
+        let (field, divisor) = (&origin.field, origin.divisor);
+        let (min, max) = (self.min_intensity, self.max_intensity);
+        let stored = match origin.kind {
             IntensityKind::RedByte => ", red byte",
             IntensityKind::Byte => ", a byte",
             IntensityKind::Number => "",
         };
         write!(
             f,
-            "intensity from {field}{stored}, divided by {divisor}: {min:.3} to {max:.3}, median {median:.3}"
+            "intensity from {field}{stored}, divided by {divisor}: {min:.3} to {max:.3}, median {:.3}",
+            self.median_intensity
         )
     }
 }

@@ -4,11 +4,11 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use nalgebra::{Isometry3, Point3};
-use protocol::{PointCloud, Pose};
+use protocol::PointCloud;
 
 use super::rows::{read_all, referred, transform};
 use crate::frame::{Object, ObjectClass};
-use crate::json::Field;
+use crate::json::JsonField;
 use crate::{ReadError, Result, classes};
 
 /// Largest distance of a point outside a box that counts as a hit, metres: the margin of the public converter of
@@ -81,7 +81,7 @@ fn read_instances(
     Ok(instances)
 }
 
-fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object> {
+fn object(row: &JsonField<'_>, instances: &HashMap<String, Instance>) -> Result<Object> {
     let token = row.required("instance_token")?;
     let Instance { id, class } = instances
         .get(&token.id()?)
@@ -89,14 +89,8 @@ fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Obje
     let size = row.required("size")?;
     // nuScenes has the width first. Sizes here begin with the length.
     let [width, length, height] = size.checked_size(size.numbers()?)?;
-    let world_from_object: Pose = transform(row)?.into();
-    Ok(Object {
-        id: *id,
-        class: *class,
-        world_from_object,
-        size_m: [length, width, height],
-        speed_mps: None,
-    })
+    let (pose, size_m) = (transform(row)?.into(), [length, width, height]);
+    Ok(Object::new(*id, *class, pose, size_m))
 }
 
 /// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle

@@ -20,8 +20,8 @@ use nalgebra::Isometry3;
 use protocol::{CavId, Handedness};
 
 use self::rig::QuarterTurns;
-use self::tables::{Sample, Scene, Sweep, Tables};
-use super::layout::{LayoutRow, Reader, opened};
+use self::tables::{SampleSweep, Scene, SceneSample};
+use super::layout::{LayoutReader, LayoutRow, opened};
 use super::points::{SweepStorage, Sweeps};
 use super::{
     Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
@@ -37,7 +37,7 @@ pub(crate) static V2XSIM: LayoutRow = LayoutRow {
     data_sets: "V2X-Sim 2.0",
     files: "<version>/sample.json and sample_data.json (nuScenes tables), a LiDAR LIDAR_TOP_id_<agent>",
     protocol: "v2xsim",
-    reader: Some(Reader::DataSet(open)),
+    reader: Some(LayoutReader::DataSet(open)),
 };
 
 /// Open MARS: nuScenes tables of several vehicles.
@@ -90,14 +90,11 @@ fn open_version(
     let root = files::above(version)
         .find(|root| root.is_dir())
         .unwrap_or_else(|| version.to_owned());
-    let Tables {
-        scenes,
-        samples,
-        objects,
-    } = tables::read(version, problems)?;
-    let layout = layout(version, &samples)?;
-    let mut moments: Vec<Vec<(Sample, Vec<Object>)>> = scenes.iter().map(|_| Vec::new()).collect();
-    for (sample, objects) in samples.into_iter().zip(objects) {
+    let tables = tables::read(version, problems)?;
+    let (scenes, layout) = (tables.scenes, layout(version, &tables.samples)?);
+    let mut moments: Vec<Vec<(SceneSample, Vec<Object>)>> =
+        scenes.iter().map(|_| Vec::new()).collect();
+    for (sample, objects) in tables.samples.into_iter().zip(tables.objects) {
         if let Some(moments) = moments.get_mut(sample.scene) {
             moments.push((sample, objects));
         }
@@ -110,7 +107,7 @@ fn open_version(
         if !taken.insert(name.clone()) {
             name = format!("{name}_{index}");
         }
-        let builder = Builder {
+        let builder = SceneBuilder {
             root: &root,
             version,
             layout,
@@ -124,7 +121,7 @@ fn open_version(
 }
 
 /// The layout of the first supported channel.
-fn layout(version: &Path, samples: &[Sample]) -> Result<Layout> {
+fn layout(version: &Path, samples: &[SceneSample]) -> Result<Layout> {
     let channels = samples.iter().flat_map(|sample| sample.sweeps.keys());
     let channels: BTreeSet<&str> = channels.map(String::as_str).collect();
     channels.iter().find_map(|channel| Some(rig::agent_of(channel)?.0)).ok_or_else(|| {
@@ -137,7 +134,7 @@ fn layout(version: &Path, samples: &[Sample]) -> Result<Layout> {
 }
 
 /// Inputs of a scenario.
-struct Builder<'a> {
+struct SceneBuilder<'a> {
     root: &'a Path,
     version: &'a Path,
     layout: Layout,
@@ -145,11 +142,11 @@ struct Builder<'a> {
     name: String,
 }
 
-impl Builder<'_> {
+impl SceneBuilder<'_> {
     /// The scenario of a scene; nothing if no vehicle has a sweep.
     fn build(
         self,
-        mut samples: Vec<(Sample, Vec<Object>)>,
+        mut samples: Vec<(SceneSample, Vec<Object>)>,
         options: &OpenOptions,
         problems: &mut Vec<ReadError>,
     ) -> Result<Option<Scenario>> {
@@ -186,7 +183,7 @@ impl Builder<'_> {
                 }
                 missing.push(MissingFrame::new(agent, &tick.stem));
             }
-            contents.insert(tick.stem.clone(), Moment { sweeps, objects });
+            contents.insert(tick.stem.clone(), TickContents { sweeps, objects });
             moments.push(tick);
         }
         let agents = agents.into_iter().map(|(agent, _)| agent).collect();
@@ -199,7 +196,7 @@ impl Builder<'_> {
         self,
         agents: Vec<CavId>,
         moments: &[Tick],
-        contents: HashMap<String, Moment>,
+        contents: HashMap<String, TickContents>,
         options: &OpenOptions,
     ) -> Scenario {
         let units = agents.iter();
@@ -213,7 +210,7 @@ impl Builder<'_> {
             });
             sweeps = sweeps.with_agent(agent.clone(), files);
         }
-        let source = Arc::new(Source {
+        let source = Arc::new(SceneSource {
             root: self.root.to_owned(),
             version: self.version.to_owned(),
             layout: self.layout,
@@ -228,7 +225,7 @@ impl Builder<'_> {
 
     /// Agents with the channels of their LiDARs, ego first: vehicles in the order of the data set or of their names, a
     /// roadside unit last.
-    fn agents(&self, moments: &[(Sample, Vec<Object>)]) -> Result<Vec<(CavId, String)>> {
+    fn agents(&self, moments: &[(SceneSample, Vec<Object>)]) -> Result<Vec<(CavId, String)>> {
         let channels = moments.iter().flat_map(|(sample, _)| sample.sweeps.keys());
         let mut agents = Vec::new();
         for channel in channels.collect::<BTreeSet<&String>>() {
@@ -259,7 +256,7 @@ impl Builder<'_> {
     /// Times from the first on. If time stamps do not increase, capture times are assumed to be evenly spaced.
     fn capture_times(
         &self,
-        moments: &[(Sample, Vec<Object>)],
+        moments: &[(SceneSample, Vec<Object>)],
         options: &OpenOptions,
         problems: &mut Vec<ReadError>,
     ) -> Vec<u64> {
@@ -282,7 +279,7 @@ impl Builder<'_> {
     }
 }
 
-impl Sweep {
+impl SampleSweep {
     /// The name of its file without suffixes.
     fn stem(&self) -> String {
         let name = self.file.rsplit('/').next().unwrap_or(&self.file);
@@ -302,25 +299,25 @@ impl Sweep {
 
 /// A tick: sweeps of the agents that are present, and all annotations.
 #[derive(Debug)]
-struct Moment {
-    sweeps: HashMap<CavId, Sweep>,
+struct TickContents {
+    sweeps: HashMap<CavId, SampleSweep>,
     objects: Vec<Object>,
 }
 
 /// A scene.
 #[derive(Debug)]
-struct Source {
+struct SceneSource {
     root: PathBuf,
     /// Folder of the tables.
     version: PathBuf,
     layout: Layout,
     /// By the stem of the tick.
-    moments: HashMap<String, Moment>,
+    moments: HashMap<String, TickContents>,
     sweeps: Sweeps,
 }
 
-impl Source {
-    fn sweep(&self, agent: &CavId, tick: &Tick) -> Result<(&Moment, &Sweep)> {
+impl SceneSource {
+    fn sweep(&self, agent: &CavId, tick: &Tick) -> Result<(&TickContents, &SampleSweep)> {
         let moment = self.moments.get(&tick.stem);
         let found = moment.and_then(|moment| Some((moment, moment.sweeps.get(agent)?)));
         found.ok_or_else(|| {
@@ -340,7 +337,7 @@ impl Source {
     }
 }
 
-impl FrameSource for Source {
+impl FrameSource for SceneSource {
     /// Reads the sweep as well: an agent lists the objects hit by it.
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let (moment, sweep) = self.sweep(agent, tick)?;
@@ -359,7 +356,7 @@ impl FrameSource for Source {
     fn points(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> Result<PcdCloud> {
         let (_, sweep) = self.sweep(agent, tick)?;
         let mut cloud = self.sweeps.read(agent, &self.root.join(&sweep.file))?;
-        // By the turns that `Sweep::world_from_lidar` takes back in the pose.
+        // By the turns that `SampleSweep::world_from_lidar` takes back in the pose.
         sweep.turns().apply(&mut cloud.points);
         Ok(cloud)
     }

@@ -7,8 +7,8 @@ use nalgebra::Isometry3;
 use protocol::Pose;
 use protocol::text::excerpt;
 
-use crate::json::Field;
-use crate::json_table::{self, Keys};
+use crate::json::JsonField;
+use crate::json_table::{self, RowKeys};
 use crate::{ReadError, Result};
 
 /// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
@@ -24,8 +24,8 @@ pub(super) fn read_rows(
     version: &Path,
     name: &str,
     problems: &mut Vec<ReadError>,
-    is_needed: impl Fn(&Keys<'_>) -> bool,
-    row: impl FnMut(&Field<'_>) -> Result<()>,
+    is_needed: impl Fn(&RowKeys<'_>) -> bool,
+    row: impl FnMut(&JsonField<'_>) -> Result<()>,
 ) -> Result<usize> {
     json_table::read(&version.join(name), MAX_BYTES, problems, is_needed, row)
 }
@@ -35,13 +35,13 @@ pub(super) fn read_all(
     version: &Path,
     name: &str,
     problems: &mut Vec<ReadError>,
-    row: impl FnMut(&Field<'_>) -> Result<()>,
+    row: impl FnMut(&JsonField<'_>) -> Result<()>,
 ) -> Result<usize> {
     read_rows(version, name, problems, |_| true, row)
 }
 
 /// The index of the row that a token refers to.
-pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize> {
+pub(super) fn referred(row: &JsonField<'_>, key: &str, indices: &Indices) -> Result<usize> {
     let token = row.required(key)?;
     let text = token.id()?;
     let index = indices.get(&text).copied();
@@ -49,7 +49,7 @@ pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<
 }
 
 /// `translation` in metres and `rotation` as quaternion w, x, y, z.
-pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>> {
+pub(super) fn transform(row: &JsonField<'_>) -> Result<Isometry3<f64>> {
     let translation_m = row.required("translation")?.numbers::<3>()?;
     let rotation = row.required("rotation")?;
     let rotation_wxyz = rotation.numbers::<4>()?;

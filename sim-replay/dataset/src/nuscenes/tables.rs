@@ -9,7 +9,7 @@ use nalgebra::Isometry3;
 use super::annotations;
 use super::rows::{Indices, read_all, read_rows, referred, transform};
 use crate::frame::Object;
-use crate::json_table::Keys;
+use crate::json_table::RowKeys;
 use crate::time_stamps;
 use crate::{ReadError, Result};
 
@@ -36,17 +36,17 @@ pub(super) struct Scene {
 
 /// A sample of a drive, with the sweeps of all LiDARs.
 #[derive(Debug)]
-pub(super) struct Sample {
+pub(super) struct SceneSample {
     /// Index of the scene.
     pub(super) scene: usize,
     pub(super) micros: u64,
     /// By channel, for example `LIDAR_TOP`.
-    pub(super) sweeps: HashMap<String, Sweep>,
+    pub(super) sweeps: HashMap<String, SampleSweep>,
 }
 
 /// File of a sweep, and the pose of its LiDAR.
 #[derive(Debug, Clone)]
-pub(super) struct Sweep {
+pub(super) struct SampleSweep {
     /// Path below the root of the data set.
     pub(super) file: String,
     pub(super) world_from_vehicle: Isometry3<f64>,
@@ -57,14 +57,14 @@ pub(super) struct Sweep {
 #[derive(Debug, Default)]
 pub(super) struct Tables {
     pub(super) scenes: Vec<Scene>,
-    pub(super) samples: Vec<Sample>,
+    pub(super) samples: Vec<SceneSample>,
     /// Annotated objects by sample.
     pub(super) objects: Vec<Vec<Object>>,
 }
 
 /// A LiDAR on a vehicle.
 #[derive(Debug, Clone)]
-struct Mount {
+struct SensorMount {
     channel: String,
     vehicle_from_lidar: Isometry3<f64>,
 }
@@ -73,7 +73,7 @@ struct Mount {
 struct SweepRow {
     sample: usize,
     file: String,
-    mount: Mount,
+    mount: SensorMount,
 }
 
 /// Reads the tables in the folder `version`. Unusable rows are left out, with a problem each.
@@ -95,7 +95,10 @@ pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tabl
 }
 
 /// LiDARs by the token of their calibration.
-fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<String, Mount>> {
+fn read_mounts(
+    version: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<HashMap<String, SensorMount>> {
     let mut channels = HashMap::new();
     read_all(version, "sensor.json", problems, |row| {
         let channel = row.required("channel")?.text()?;
@@ -111,7 +114,7 @@ fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<
     let mut mounts = HashMap::new();
     read_all(version, "calibrated_sensor.json", problems, |row| {
         if let Some(channel) = channels.get(&row.required("sensor_token")?.id()?) {
-            let mount = Mount {
+            let mount = SensorMount {
                 channel: channel.clone(),
                 vehicle_from_lidar: transform(row)?,
             };
@@ -125,12 +128,10 @@ fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<
 fn read_scenes(version: &Path, problems: &mut Vec<ReadError>) -> Result<(Vec<Scene>, Indices)> {
     let (mut scenes, mut indices) = (Vec::new(), Indices::new());
     read_all(version, "scene.json", problems, |row| {
-        let mut vehicles = Vec::new();
-        if let Some(list) = row.optional("vehicle_list")? {
-            for vehicle in list.items()? {
-                vehicles.push(vehicle.id()?);
-            }
-        }
+        let vehicles = row.optional_of("vehicle_list", |list| {
+            list.items()?.map(|vehicle| vehicle.id()).collect()
+        });
+        let vehicles: Vec<String> = vehicles?.unwrap_or_default();
         let name = row.required("name")?.id()?;
         indices.insert(row.required("token")?.id()?, scenes.len());
         scenes.push(Scene { name, vehicles });
@@ -143,14 +144,14 @@ fn read_samples(
     version: &Path,
     scenes: &Indices,
     problems: &mut Vec<ReadError>,
-) -> Result<(Vec<Sample>, Indices)> {
+) -> Result<(Vec<SceneSample>, Indices)> {
     let (mut samples, mut stamps, mut indices) = (Vec::new(), Vec::new(), Indices::new());
     read_all(version, "sample.json", problems, |row| {
         let scene = referred(row, "scene_token", scenes)?;
         let stamp = row.required("timestamp")?.time()?;
         indices.insert(row.required("token")?.id()?, samples.len());
         stamps.push(stamp);
-        samples.push(Sample {
+        samples.push(SceneSample {
             scene,
             micros: 0,
             sweeps: HashMap::new(),
@@ -167,12 +168,12 @@ fn read_samples(
 /// Sweeps of key frames by the token of their vehicle's pose.
 fn read_sweeps(
     version: &Path,
-    mounts: &HashMap<String, Mount>,
+    mounts: &HashMap<String, SensorMount>,
     samples: &Indices,
     problems: &mut Vec<ReadError>,
 ) -> Result<HashMap<String, Vec<SweepRow>>> {
     let mut sweeps: HashMap<String, Vec<SweepRow>> = HashMap::new();
-    let is_needed = |keys: &Keys<'_>| {
+    let is_needed = |keys: &RowKeys<'_>| {
         // A row without this key counts as one of a key frame.
         keys.is_key_frame != Some(false) && mounts.contains_key(&*keys.calibrated_sensor_token)
     };
@@ -204,16 +205,16 @@ fn read_sweeps(
 fn place(
     version: &Path,
     mut rows: HashMap<String, Vec<SweepRow>>,
-    samples: &mut [Sample],
+    samples: &mut [SceneSample],
     problems: &mut Vec<ReadError>,
 ) -> Result<()> {
     let tokens: std::collections::HashSet<String> = rows.keys().cloned().collect();
-    let is_needed = |keys: &Keys<'_>| tokens.contains(&*keys.token);
+    let is_needed = |keys: &RowKeys<'_>| tokens.contains(&*keys.token);
     read_rows(version, "ego_pose.json", problems, is_needed, |row| {
         let world_from_vehicle = transform(row)?;
         let token = row.required("token")?.id()?;
         for row in rows.remove(&token).unwrap_or_default() {
-            let sweep = Sweep {
+            let sweep = SampleSweep {
                 file: row.file,
                 world_from_vehicle,
                 vehicle_from_lidar: row.mount.vehicle_from_lidar,

@@ -40,7 +40,7 @@ const FAR_OVERLAP: f32 = 0.1;
 
 /// Two sweeps of an agent, by their ticks.
 #[derive(Debug, Clone, Copy)]
-struct Pair {
+struct SweepPair {
     ticks: [usize; 2],
     /// Motion by the poses: `first_from_second`.
     stated: Isometry3<f64>,
@@ -48,7 +48,7 @@ struct Pair {
 
 /// A pair whose poses the sweeps contradict.
 struct Contradiction {
-    pair: Pair,
+    pair: SweepPair,
     /// Overlap at the stated motion.
     overlap: f32,
     best: Match,
@@ -79,18 +79,14 @@ fn agent_problem(scenario: &Scenario, index: usize, agent: &CavId) -> Option<Pro
         .points_path(index, first.pair.ticks[0], None)
         .ok()?;
     let path = path.parent().unwrap_or(&path).display().to_string();
-    let stems = first.pair.ticks.map(|tick| {
-        scenario
-            .ticks
-            .get(tick)
-            .map_or("", |tick| tick.stem.as_str())
+    let [from, to] = first.pair.ticks.map(|tick| {
+        let tick = scenario.ticks.get(tick);
+        tick.map_or("", |tick| tick.stem.as_str())
     });
     let reason = format!(
-        "agent {agent}: {} of {count} pairs of sweeps contradict the poses: from {} to {} the poses have {} \
+        "agent {agent}: {} of {count} pairs of sweeps contradict the poses: from {from} to {to} the poses have {} \
          ({:.0} % of the structure overlap), the sweeps {} ({:.0} %): poses of other sweeps, other axes or other units",
         wrong.len(),
-        stems[0],
-        stems[1],
         shown(&first.pair.stated.cast()),
         100.0 * first.overlap,
         shown(&first.best.first_from_second),
@@ -106,19 +102,19 @@ fn shown(motion: &Isometry3<f32>) -> String {
 }
 
 /// Pairs that are spread evenly, and those that turn most.
-fn pairs(scenario: &Scenario, agent: usize) -> Vec<Pair> {
+fn pairs(scenario: &Scenario, agent: usize) -> Vec<SweepPair> {
     let ticks: Vec<usize> = (0..scenario.ticks.len())
         .filter(|&tick| scenario.is_present(agent, tick))
         .collect();
     let step = ticks.len().div_ceil(CANDIDATES).max(1);
-    let mut candidates: Vec<Pair> = (0..ticks.len())
+    let mut candidates: Vec<SweepPair> = (0..ticks.len())
         .step_by(step)
         .filter_map(|first| pair(scenario, agent, &ticks, first))
         .collect();
     // Step: pairs spread evenly over the drive, from the middle of each part.
     let step = candidates.len().div_ceil(SPREAD).max(1);
     let spread = candidates.iter().skip(step / 2).step_by(step);
-    let mut chosen: Vec<Pair> = spread.copied().collect();
+    let mut chosen: Vec<SweepPair> = spread.copied().collect();
     // Step: of the others, those with the largest turn.
     candidates.retain(|pair| chosen.iter().all(|known| known.ticks != pair.ticks));
     candidates.sort_by(|a, b| {
@@ -130,7 +126,7 @@ fn pairs(scenario: &Scenario, agent: usize) -> Vec<Pair> {
 }
 
 /// A sweep and its successor, or a later one where that is close.
-fn pair(scenario: &Scenario, agent: usize, ticks: &[usize], first: usize) -> Option<Pair> {
+fn pair(scenario: &Scenario, agent: usize, ticks: &[usize], first: usize) -> Option<SweepPair> {
     let successive = [*ticks.get(first)?, *ticks.get(first + 1)?];
     let next = pair_of(scenario, agent, successive)?;
     if next.stated.translation.vector.norm() > MOVED_M {
@@ -141,7 +137,7 @@ fn pair(scenario: &Scenario, agent: usize, ticks: &[usize], first: usize) -> Opt
     Some(later.unwrap_or(next))
 }
 
-fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Pair> {
+fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<SweepPair> {
     let blind = LoadOptions::without_points();
     let [start, end] = ticks.map(|tick| scenario.ticks.get(tick).map(|tick| tick.capture_nanos));
     if end?.abs_diff(start?) > SOON_NANOS {
@@ -151,7 +147,7 @@ fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Pair>
         let frame = scenario.load(agent, tick, &blind).ok()?;
         Some(frame.world_from_lidar?.isometry())
     });
-    Some(Pair {
+    Some(SweepPair {
         ticks,
         stated: world_from_first?.inv_mul(&world_from_second?),
     })
@@ -159,7 +155,7 @@ fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Pair>
 
 /// `None` if the pair cannot be judged; `Some(None)` if the sweeps agree with the poses.
 #[expect(clippy::cast_possible_truncation, reason = "a radius of some metres")]
-fn judge(scenario: &Scenario, agent: usize, pair: Pair) -> Option<Option<Contradiction>> {
+fn judge(scenario: &Scenario, agent: usize, pair: SweepPair) -> Option<Option<Contradiction>> {
     let [first, second] = pair.ticks.map(|tick| {
         let cloud = scenario.load_points(agent, tick, None).ok()?;
         Structure::of(&cloud.points)

@@ -1,13 +1,13 @@
 //! Points as lines of decimal numbers.
 
-use super::header::{Header, IntensitySource};
+use super::header::{IntensitySource, PcdHeader};
 use super::number::{is_separator, ordinary, unusual};
-use super::{PcdCloud, PcdError, Place, unpack_rgb};
+use super::{PcdCloud, PcdError, PcdPlace, unpack_rgb};
 use crate::scalar::ScalarKind;
 
 /// Use of the numbers of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Column {
+enum AsciiColumn {
     /// Stored in this component of the point.
     Component(usize),
     /// A packed colour printed as a float: its bits are used.
@@ -17,7 +17,7 @@ enum Column {
     Ignored,
 }
 
-pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
+pub(super) fn decode(header: &PcdHeader, body: &[u8]) -> Result<PcdCloud, PcdError> {
     // A number and its separator are two bytes at least: the header cannot cause a reservation of more than the file's
     // size.
     let possible = body.len() / (2 * header.columns()) + 1;
@@ -25,7 +25,15 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
     let mut points = Vec::with_capacity(header.points.min(possible));
     let mut labels = Vec::with_capacity(if is_labelled { points.capacity() } else { 0 });
     let mut first_dropped = None;
-    let mut lines = Lines::new(header, body);
+    let columns = columns(header);
+    let mut lines = Lines {
+        header,
+        columns: &columns,
+        rest: body,
+        begun: body,
+        line: header.lines + 1,
+        colours: Colours::default(),
+    };
     while let Some((point, label)) = lines
         .next_point()
         .map_err(|error| lines.cut_off(error, points.len()))?
@@ -35,7 +43,7 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
             return Err(PcdError::at(lines.line, "POINTS", reason));
         }
         if first_dropped.is_none() && !point.iter().all(|value| value.is_finite()) {
-            first_dropped = Some(Place::Line(lines.line));
+            first_dropped = Some(PcdPlace::Line(lines.line));
         }
         points.push(point);
         if is_labelled {
@@ -58,8 +66,8 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
 
 /// The lines that are left to read.
 struct Lines<'a> {
-    header: &'a Header,
-    columns: Vec<Column>,
+    header: &'a PcdHeader,
+    columns: &'a [AsciiColumn],
     rest: &'a [u8],
     /// From the first value of the line that was begun last.
     begun: &'a [u8],
@@ -69,18 +77,6 @@ struct Lines<'a> {
 }
 
 impl<'a> Lines<'a> {
-    fn new(header: &'a Header, body: &'a [u8]) -> Self {
-        let columns = columns(header);
-        Self {
-            header,
-            columns,
-            rest: body,
-            begun: body,
-            line: header.lines + 1,
-            colours: Colours::default(),
-        }
-    }
-
     /// The point of the next line that is not blank, and its label.
     fn next_point(&mut self) -> Result<Option<([f32; 4], u8)>, PcdError> {
         while self.is_at_end_of_line() {
@@ -91,16 +87,15 @@ impl<'a> Lines<'a> {
         }
         self.begun = self.rest;
         let (mut point, mut label) = ([0.0; 4], 0);
-        for (index, field) in self.header.fields.iter().enumerate() {
-            let column = self.columns.get(index).copied().unwrap_or(Column::Ignored);
+        for (index, (field, &column)) in self.header.fields.iter().zip(self.columns).enumerate() {
             for _ in 0..field.count {
                 if self.is_at_end_of_line() {
                     return Err(self.wrong_count());
                 }
                 match column {
                     // Not parsed: a field that is not read need not be a number.
-                    Column::Ignored => drop(self.token()),
-                    Column::Component(component) => {
+                    AsciiColumn::Ignored => drop(self.token()),
+                    AsciiColumn::Component(component) => {
                         let value = self.float(index)?;
                         if let Some(place) = point.get_mut(component) {
                             *place = value;
@@ -149,7 +144,7 @@ impl<'a> Lines<'a> {
         clippy::cast_sign_loss,
         reason = "the low 32 bits are the colour"
     )]
-    fn colour(&mut self, column: Column, field: usize) -> Result<(f32, u8), PcdError> {
+    fn colour(&mut self, column: AsciiColumn, field: usize) -> Result<(f32, u8), PcdError> {
         let key = short_token(self.rest);
         if let Some((key, len)) = key
             && let Some(colour) = self.colours.find(key)
@@ -159,7 +154,7 @@ impl<'a> Lines<'a> {
         }
         let token = self.token();
         let colour = match column {
-            Column::FloatColour => unusual(token).map(|value| {
+            AsciiColumn::FloatColour => unusual(token).map(|value| {
                 let (red, green) = unpack_rgb(value.to_bits());
                 // The bits of a printed NaN are lost, and the intensity with them.
                 (if value.is_nan() { f32::NAN } else { red }, green)
@@ -215,19 +210,19 @@ impl<'a> Lines<'a> {
     }
 }
 
-fn columns(header: &Header) -> Vec<Column> {
+fn columns(header: &PcdHeader) -> Vec<AsciiColumn> {
     let fields = header.fields.iter().enumerate();
     let columns = fields.map(|(index, field)| match header.intensity {
-        IntensitySource::Value(intensity) if intensity == index => Column::Component(3),
+        IntensitySource::Value(intensity) if intensity == index => AsciiColumn::Component(3),
         IntensitySource::Red(colour) if colour == index && field.kind == ScalarKind::Float => {
-            Column::FloatColour
+            AsciiColumn::FloatColour
         }
-        IntensitySource::Red(colour) if colour == index => Column::IntegerColour,
+        IntensitySource::Red(colour) if colour == index => AsciiColumn::IntegerColour,
         _ => header
             .xyz
             .iter()
             .position(|&xyz| xyz == index)
-            .map_or(Column::Ignored, Column::Component),
+            .map_or(AsciiColumn::Ignored, AsciiColumn::Component),
     });
     columns.collect()
 }
@@ -275,7 +270,7 @@ impl Colours {
 
 #[cfg(test)]
 mod tests {
-    use crate::pcd::{Place, decode};
+    use crate::pcd::{PcdPlace, decode};
 
     fn file(fields: &str, types: &str, lines: &[&str]) -> Vec<u8> {
         let columns = fields.split(' ').count();
@@ -380,7 +375,7 @@ mod tests {
         );
         assert_eq!(
             (cloud.dropped, cloud.first_dropped),
-            (2, Some(Place::Line(12)))
+            (2, Some(PcdPlace::Line(12)))
         );
     }
 

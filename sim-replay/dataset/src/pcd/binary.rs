@@ -4,20 +4,20 @@
 //! least", except for the unpacked one, which determines the positions of fields.
 
 use super::MAX_BYTES;
-use super::header::{Field, Header, IntensitySource};
+use super::header::{IntensitySource, PcdField, PcdHeader};
 use super::{PcdCloud, PcdError, lzf, unpack_rgb};
 use crate::scalar::ScalarKind;
 
 /// Position of a field's numbers: that of point `i` at `first + i * step`.
 #[derive(Debug, Clone, Copy)]
-struct Column<'a> {
-    field: &'a Field,
+struct BinaryColumn<'a> {
+    field: &'a PcdField,
     first: usize,
     step: usize,
 }
 
 /// Points one after another.
-pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
+pub(super) fn decode(header: &PcdHeader, body: &[u8]) -> Result<PcdCloud, PcdError> {
     let (points, stride) = (header.points, header.stride());
     let expected = points.checked_mul(stride);
     if expected.is_none_or(|expected| body.len() < expected) {
@@ -27,7 +27,7 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
         );
         return Err(PcdError::of("POINTS", reason));
     }
-    Ok(gather(header, body, |(field, first)| Column {
+    Ok(gather(header, body, |(field, first)| BinaryColumn {
         field,
         first,
         step: stride,
@@ -35,7 +35,7 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
 }
 
 /// Two lengths, then LZF; once unpacked, fields one after another, each for all points.
-pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
+pub(super) fn decode_compressed(header: &PcdHeader, body: &[u8]) -> Result<PcdCloud, PcdError> {
     let Some((lengths, packed)) = body.split_first_chunk::<8>() else {
         let found = body.len();
         let reason = format!("{found} bytes after the header, expected two lengths");
@@ -69,7 +69,7 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
     }
     let unpacked = lzf::decompress(packed, unpacked_len)
         .map_err(|error| PcdError::of("DATA", error.to_string()))?;
-    Ok(gather(header, &unpacked, |(field, first)| Column {
+    Ok(gather(header, &unpacked, |(field, first)| BinaryColumn {
         field,
         // A field begins behind the numbers of all points of those before it.
         first: first * points,
@@ -82,7 +82,7 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
     clippy::indexing_slicing,
     reason = "the header's indices are of its fields"
 )]
-fn field_at(header: &Header, index: usize) -> (&Field, usize) {
+fn field_at(header: &PcdHeader, index: usize) -> (&PcdField, usize) {
     let before = header.fields[..index].iter();
     let before = before.map(|field| field.size * field.count).sum();
     (&header.fields[index], before)
@@ -91,9 +91,9 @@ fn field_at(header: &Header, index: usize) -> (&Field, usize) {
 /// `column` gives the place of a field from the bytes of a point before it. `data` holds every number that it points
 /// at: its length has been checked.
 fn gather(
-    header: &Header,
+    header: &PcdHeader,
     data: &[u8],
-    column: impl Fn((&Field, usize)) -> Column<'_>,
+    column: impl Fn((&PcdField, usize)) -> BinaryColumn<'_>,
 ) -> PcdCloud {
     let mut points = vec![[0.0; 4]; header.points];
     for (component, index) in header.xyz.into_iter().enumerate() {
@@ -116,7 +116,7 @@ fn gather(
     PcdCloud::of_finite(points, labels)
 }
 
-impl Column<'_> {
+impl BinaryColumn<'_> {
     /// Sets one component of all points. Integers beyond 2^24 and doubles are rounded.
     #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
     #[expect(clippy::indexing_slicing, reason = "a component is 0 to 3")]
@@ -165,7 +165,7 @@ impl Column<'_> {
 pub(crate) mod tests {
     use protocol::PointCloud;
 
-    use crate::pcd::{Place, decode, lzf};
+    use crate::pcd::{PcdPlace, decode, lzf};
 
     fn header(
         fields: &str,
@@ -264,7 +264,7 @@ pub(crate) mod tests {
         let cloud = decode(&file).unwrap();
         assert_eq!(
             (cloud.points.len(), cloud.dropped, cloud.first_dropped),
-            (2, 1, Some(Place::Point(1)))
+            (2, 1, Some(PcdPlace::Point(1)))
         );
     }
 

@@ -45,7 +45,7 @@ impl Data {
 
 /// One field of a point.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Field {
+pub(super) struct PcdField {
     pub(super) name: String,
     /// `TYPE` F, I or U; any other is padding, accepted only for fields that are not read.
     pub(super) kind: ScalarKind,
@@ -68,8 +68,8 @@ pub(super) enum IntensitySource {
 
 /// A header whose parts are consistent.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Header {
-    pub(super) fields: Vec<Field>,
+pub(super) struct PcdHeader {
+    pub(super) fields: Vec<PcdField>,
     pub(super) points: usize,
     pub(super) data: Data,
     /// Indices of x, y and z in `fields`.
@@ -80,13 +80,13 @@ pub(super) struct Header {
 }
 
 /// The values of one header line and their position.
-struct Entry<'a> {
+struct HeaderEntry<'a> {
     key: &'static str,
     line: u64,
     values: Vec<&'a str>,
 }
 
-impl<'a> Entry<'a> {
+impl<'a> HeaderEntry<'a> {
     fn error(&self, reason: String) -> PcdError {
         PcdError::at(self.line, self.key, reason)
     }
@@ -102,13 +102,13 @@ impl<'a> Entry<'a> {
 
 /// The header lines, unchecked.
 #[derive(Default)]
-struct Entries<'a>(Vec<Entry<'a>>);
+struct Entries<'a>(Vec<HeaderEntry<'a>>);
 
 /// The keys of header lines.
 const KEYS: &str = "VERSION FIELDS SIZE TYPE COUNT WIDTH HEIGHT VIEWPOINT POINTS DATA";
 const VERSIONS: [&str; 6] = ["0.7", ".7", "0.6", ".6", "0.5", ".5"];
 
-impl Header {
+impl PcdHeader {
     /// Splits a file into its header and the rest.
     pub(super) fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), PcdError> {
         let mut entries = Entries::default();
@@ -189,7 +189,7 @@ impl Header {
             IntensitySource::None => None,
         };
         for index in self.xyz.into_iter().chain(intensity) {
-            let Field {
+            let PcdField {
                 name, kind, size, ..
             } = &self.fields[index];
             let (kinds, sizes) = (entries.get("TYPE")?, entries.get("SIZE")?);
@@ -254,16 +254,16 @@ impl<'a> Entries<'a> {
             return Err(PcdError::at(line, key, "is given a second time"));
         }
         let values = words.collect();
-        self.0.push(Entry { key, line, values });
+        self.0.push(HeaderEntry { key, line, values });
         Ok(())
     }
 
-    fn get(&self, key: &str) -> Result<&Entry<'a>, PcdError> {
+    fn get(&self, key: &str) -> Result<&HeaderEntry<'a>, PcdError> {
         self.find(key)
             .ok_or_else(|| PcdError::of(key, "missing in the header"))
     }
 
-    fn find(&self, key: &str) -> Option<&Entry<'a>> {
+    fn find(&self, key: &str) -> Option<&HeaderEntry<'a>> {
         self.0.iter().find(|entry| entry.key == key)
     }
 
@@ -279,7 +279,7 @@ impl<'a> Entries<'a> {
     }
 
     /// One value for each field, or an error with both counts.
-    fn per_field(&self, key: &str, fields: usize) -> Result<&Entry<'a>, PcdError> {
+    fn per_field(&self, key: &str, fields: usize) -> Result<&HeaderEntry<'a>, PcdError> {
         let entry = self.get(key)?;
         match entry.values.len() {
             found if found == fields => Ok(entry),
@@ -291,7 +291,7 @@ impl<'a> Entries<'a> {
         clippy::indexing_slicing,
         reason = "as many sizes, types and counts as names"
     )]
-    fn fields(&self) -> Result<Vec<Field>, PcdError> {
+    fn fields(&self) -> Result<Vec<PcdField>, PcdError> {
         let names = self.get("FIELDS")?;
         let fields = names.values.len();
         if !(1..=MAX_FIELDS).contains(&fields) {
@@ -299,12 +299,10 @@ impl<'a> Entries<'a> {
         }
         let sizes = self.per_field("SIZE", fields)?;
         let kinds = self.per_field("TYPE", fields)?;
-        let counts = match self.has("COUNT") {
-            true => Some(self.per_field("COUNT", fields)?),
-            false => None,
-        };
+        let counts = self.has("COUNT").then(|| self.per_field("COUNT", fields));
+        let counts = counts.transpose()?;
         let fields = names.values.iter().enumerate().map(|(index, name)| {
-            Ok(Field {
+            Ok(PcdField {
                 name: (*name).to_owned(),
                 kind: number_kind(kinds.values[index]),
                 size: number_of(name, sizes, index, 1..=MAX_SIZE)?,
@@ -366,7 +364,7 @@ fn number_kind(kind: &str) -> ScalarKind {
 #[expect(clippy::indexing_slicing, reason = "as many sizes and counts as names")]
 fn number_of(
     name: &str,
-    entry: &Entry<'_>,
+    entry: &HeaderEntry<'_>,
     index: usize,
     range: RangeInclusive<usize>,
 ) -> Result<usize, PcdError> {
@@ -381,7 +379,7 @@ fn number_of(
 }
 
 /// The only coordinate of that name, which must hold one number.
-fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, PcdError> {
+fn find_coordinate(fields: &[PcdField], name: &str, line: u64) -> Result<usize, PcdError> {
     let mut found = fields
         .iter()
         .enumerate()
@@ -401,7 +399,7 @@ fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, Pcd
 }
 
 /// The first field of the most preferred name that holds one number.
-fn find_number(fields: &[Field], names: &[&str]) -> Option<usize> {
+fn find_number(fields: &[PcdField], names: &[&str]) -> Option<usize> {
     names.iter().find_map(|name| {
         fields
             .iter()

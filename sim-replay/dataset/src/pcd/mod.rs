@@ -28,7 +28,7 @@ use serde::Serialize;
 pub use encode::{Encoding, IntensityField, encode};
 
 use crate::error::shown;
-use header::{Data, Header};
+use header::{Data, PcdHeader};
 pub use protocol::IntensityKind;
 
 /// Largest point file that is read, bytes, compressed or not: a sweep of a 128-channel LiDAR has some 10 MB.
@@ -46,7 +46,7 @@ pub struct PcdCloud {
     /// Number of points left out because a number is NaN or infinite.
     pub dropped: usize,
     /// Position of the first of these.
-    pub first_dropped: Option<Place>,
+    pub first_dropped: Option<PcdPlace>,
     /// Source of the intensities; `None` if the file has none, and all are 0.
     pub intensity: Option<IntensityOrigin>,
     /// Form of the file, for example `PCD` or `5 floats per point: x y z intensity ring`; empty if it is unknown.
@@ -66,7 +66,7 @@ pub struct IntensityOrigin {
 
 /// Position in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Place {
+pub enum PcdPlace {
     /// A line, from 1.
     Line(u64),
     /// A point, from 0.
@@ -122,7 +122,7 @@ pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
 
 /// [`decode`] with the red byte of a colour as stored: 0 to 255.
 pub(crate) fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
-    let (header, body) = Header::parse(bytes)?;
+    let (header, body) = PcdHeader::parse(bytes)?;
     let cloud = match header.data {
         Data::Ascii => ascii::decode(&header, body),
         Data::Binary => binary::decode(&header, body),
@@ -175,7 +175,7 @@ impl PcdCloud {
         }
         Self {
             dropped: all - points.len(),
-            first_dropped: first.map(|point| Place::Point(point as u64)),
+            first_dropped: first.map(|point| PcdPlace::Point(point as u64)),
             points: PointCloud { xyzi: points },
             labels: labels.iter().any(|&label| label != 0).then_some(labels),
             ..Self::default()

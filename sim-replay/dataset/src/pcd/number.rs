@@ -164,14 +164,10 @@ pub(super) fn unusual(token: &[u8]) -> Option<f32> {
         return Some(number);
     }
     let text = text.trim_start_matches(['-', '+']).to_ascii_lowercase();
-    let is_nan = text.starts_with("nan(")
-        || ["1.#qnan", "1.#snan", "1.#ind"]
-            .iter()
-            .any(|nan| text.starts_with(nan));
-    match (is_nan, text.starts_with("1.#inf")) {
-        (true, _) => Some(f32::NAN),
-        (_, true) => Some(f32::INFINITY),
-        _ => None,
+    let mut nans = ["nan(", "1.#qnan", "1.#snan", "1.#ind"].iter();
+    match nans.any(|nan| text.starts_with(nan)) {
+        true => Some(f32::NAN),
+        false => text.starts_with("1.#inf").then_some(f32::INFINITY),
     }
 }
 

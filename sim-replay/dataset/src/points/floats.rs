@@ -28,18 +28,15 @@ const EQUAL: f64 = 0.15;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum FloatForm {
     /// x, y, z, intensity.
-    Four,
+    Four = 4,
     /// x, y, z, intensity, and the laser index or another value.
-    Five,
+    Five = 5,
 }
 
 impl FloatForm {
     /// Numbers per point.
     pub(super) fn numbers(self) -> usize {
-        match self {
-            Self::Four => 4,
-            Self::Five => 5,
-        }
+        self as usize
     }
 
     fn name(self) -> &'static str {

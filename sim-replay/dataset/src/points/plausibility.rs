@@ -25,10 +25,21 @@ pub struct Plausibility {
 }
 
 impl Plausibility {
-    /// Counts of one sweep.
+    /// Counts of one sweep, whose points are finite.
     pub fn of(cloud: &PointCloud) -> Self {
-        let mut counted = Self::default();
-        counted.add(cloud);
+        let mut counted = Self {
+            points: cloud.len(),
+            ..Self::default()
+        };
+        for &[x, y, z, _] in &cloud.xyzi {
+            // Infinite where the square is too large for a float.
+            counted.beyond_range += usize::from(x * x + y * y + z * z > RANGE_M * RANGE_M);
+            counted.at_origin += usize::from([x, y, z] == [0.0; 3]);
+            counted.tiny += [x, y, z]
+                .into_iter()
+                .filter(|&value| value != 0.0 && value.abs() < TINY)
+                .count();
+        }
         counted
     }
 
@@ -40,20 +51,6 @@ impl Plausibility {
             0 => "the sweep has no point".to_owned(),
             _ => format!("none of the {points} points is a return within {RANGE_M} m"),
         })
-    }
-
-    /// Counts the points of a sweep, which are finite.
-    pub fn add(&mut self, cloud: &PointCloud) {
-        for &[x, y, z, _] in &cloud.xyzi {
-            // Infinite where the square is too large for a float.
-            self.beyond_range += usize::from(x * x + y * y + z * z > RANGE_M * RANGE_M);
-            self.at_origin += usize::from([x, y, z] == [0.0; 3]);
-            self.tiny += [x, y, z]
-                .into_iter()
-                .filter(|&value| value != 0.0 && value.abs() < TINY)
-                .count();
-        }
-        self.points += cloud.len();
     }
 
     /// Adds the counts of another sweep.

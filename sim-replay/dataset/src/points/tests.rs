@@ -5,7 +5,7 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
-use crate::pcd::Place;
+use crate::pcd::PcdPlace;
 
 fn id() -> CavId {
     CavId::new("0").unwrap()
@@ -74,7 +74,7 @@ fn a_cut_file_and_a_nan_are_named() {
     let cloud = read(SweepStorage::ByName, &bytes);
     assert_eq!(
         (cloud.points.len(), cloud.dropped, cloud.first_dropped),
-        (1, 1, Some(Place::Point(1)))
+        (1, 1, Some(PcdPlace::Point(1)))
     );
 }
 

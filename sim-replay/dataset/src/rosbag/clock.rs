@@ -1,7 +1,7 @@
 //! Clock of a topic: the longest part of a bag within which its stamps increase.
 
 /// A part of the messages of a topic.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct SteadyPart {
     /// Indices of the messages that belong together, with increasing stamps.
     pub(super) kept: Vec<usize>,
@@ -42,12 +42,8 @@ pub(super) fn longest_steady(stamps: &[u64]) -> SteadyPart {
     }
     let total: usize = parts.iter().map(Vec::len).sum();
     // `max_by_key` takes the last of equals: reversed, that is the first part.
-    let longest = (0..parts.len())
-        .rev()
-        .max_by_key(|&part| parts.get(part).map_or(0, Vec::len));
-    let Some(longest) = longest else {
-        return SteadyPart::default();
-    };
+    let lens = parts.iter().map(Vec::len).enumerate().rev();
+    let longest = lens.max_by_key(|(_, len)| *len).map_or(0, |(part, _)| part);
     let before = longest.checked_sub(1).and_then(|part| parts.get(part));
     let after = longest.checked_add(1).and_then(|part| parts.get(part));
     let bounds = (

@@ -7,7 +7,7 @@ use nalgebra::Isometry3;
 use protocol::text::excerpt;
 use ros2::{PoseType, RosType, Transform, read_header};
 
-use super::scan::{Message, Place, Scan, Topic};
+use super::scan::{BagMessage, BagTopic, MessagePlace, Scan};
 use super::transforms::is_map;
 use crate::faults::Faults;
 use crate::{ReadError, poses};
@@ -25,7 +25,7 @@ pub(super) struct CloudStamp {
     pub(super) nanos: u64,
     pub(super) frame: String,
     pub(super) bytes: usize,
-    pub(super) place: Place,
+    pub(super) place: MessagePlace,
 }
 
 /// A pose of one frame in another.
@@ -42,9 +42,9 @@ pub(super) struct PoseStamp {
 
 /// Everything that sweeps and poses are made of.
 #[derive(Debug, Default)]
-pub(super) struct Contents {
+pub(super) struct BagContents {
     path: PathBuf,
-    topics: Vec<Topic>,
+    topics: Vec<BagTopic>,
     /// By topic, in the order in which they were recorded.
     pub(super) clouds: BTreeMap<String, Vec<CloudStamp>>,
     /// Odometry and poses, by topic, likewise.
@@ -58,12 +58,12 @@ pub(super) struct Contents {
 }
 
 /// True for topics of clouds and of poses.
-fn is_used(topic: &Topic) -> bool {
+fn is_used(topic: &BagTopic) -> bool {
     let name = &topic.type_name;
     *name == RosType::PointCloud2.name() || PoseType::of_name(name).is_some()
 }
 
-impl Contents {
+impl BagContents {
     /// Contents of the bag at `path`, before the scan.
     pub(super) fn of(path: &Path) -> Self {
         Self {
@@ -142,8 +142,8 @@ impl Contents {
     }
 }
 
-impl Scan for Contents {
-    fn declare(&mut self, topic: &Topic) -> bool {
+impl Scan for BagContents {
+    fn declare(&mut self, topic: &BagTopic) -> bool {
         // MCAP declares a topic with each message: its fault is reported once.
         if !self.topics.contains(topic) {
             self.topics.push(topic.clone());
@@ -155,7 +155,7 @@ impl Scan for Contents {
         topic.is_cdr() && is_used(topic)
     }
 
-    fn take(&mut self, message: Message<'_>) {
+    fn take(&mut self, message: BagMessage<'_>) {
         let (topic, recorded_nanos) = (&message.topic.name, message.recorded_nanos);
         let data = match message.data {
             Ok(data) => data,

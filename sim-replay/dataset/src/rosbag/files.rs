@@ -8,7 +8,7 @@ use support::bounded_file;
 use tempfile::TempPath;
 
 use crate::files::list;
-use crate::yaml::{self, Field};
+use crate::yaml::{self, YamlField};
 use crate::{ReadError, Result};
 
 /// Name of the file that describes a bag in its folder.
@@ -24,7 +24,7 @@ const HEAD_BYTES: u64 = 4096;
 
 /// Storage of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum BagKind {
     /// MCAP.
     Mcap,
     /// SQLite 3.
@@ -33,7 +33,7 @@ pub(super) enum Kind {
     Ros1,
 }
 
-impl Kind {
+impl BagKind {
     /// The storage of a file, compressed or not, by the ending of its name.
     pub(super) fn of(path: &Path) -> Option<Self> {
         let name = path.file_name()?.to_str()?;
@@ -53,7 +53,7 @@ impl Kind {
 /// True for a file of a bag, and for a folder with one.
 pub(crate) fn is_bag(path: &Path) -> bool {
     if path.is_file() {
-        return Kind::of(path).is_some();
+        return BagKind::of(path).is_some();
     }
     is_described(path) || !in_folder(path).is_empty()
 }
@@ -75,7 +75,7 @@ fn is_described(dir: &Path) -> bool {
 fn in_folder(dir: &Path) -> Vec<PathBuf> {
     let names = list(dir).map(|listing| listing.files).unwrap_or_default();
     let paths = names.iter().map(|name| dir.join(name));
-    paths.filter(|path| Kind::of(path).is_some()).collect()
+    paths.filter(|path| BagKind::of(path).is_some()).collect()
 }
 
 /// The files of the bag at a path, in order. Those that its description lists and that do not exist, and the reverse, are
@@ -126,7 +126,7 @@ pub(super) fn files_of(path: &Path, problems: &mut Vec<ReadError>) -> Result<Vec
 fn listed(dir: &Path) -> Result<Vec<PathBuf>> {
     let path = dir.join(METADATA);
     let node = yaml::read(&path)?;
-    let root = Field::root(&path, &node);
+    let root = YamlField::root(&path, &node);
     let names = root
         .required(INFORMATION)?
         .required("relative_file_paths")?;

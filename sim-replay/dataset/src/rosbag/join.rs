@@ -7,11 +7,11 @@ use std::path::Path;
 use nalgebra::Isometry3;
 use protocol::Pose;
 
-use super::contents::Contents;
-use super::pose_source::{MAX_GAP_NANOS, PoseSource, PoseSources};
-use super::scan::Place;
+use super::contents::BagContents;
+use super::pose_source::{MAX_GAP_NANOS, PoseChain, PoseSources};
+use super::scan::MessagePlace;
 use super::sweeps::SweepTopic;
-use crate::trajectory::NoPose;
+use crate::trajectory::Unposed;
 use crate::{ReadError, Result};
 
 /// Numbers of messages of two topics of clouds count as equal up to this share: a recorder begins between them.
@@ -31,13 +31,13 @@ pub(super) struct Joined {
 pub(super) struct JoinedSweep {
     /// Stamp of its header.
     pub(super) nanos: u64,
-    pub(super) place: Place,
+    pub(super) place: MessagePlace,
     /// `None` in a bag without poses.
     pub(super) world_from_lidar: Option<Pose>,
 }
 
 /// Sweeps of a topic, and the poses that a source gives them.
-struct Attempt {
+struct JoinAttempt {
     sweeps: SweepTopic,
     sources: PoseSources,
     /// Index of the source, and its pose at each sweep.
@@ -45,7 +45,7 @@ struct Attempt {
 }
 
 /// Pose of each sweep.
-type SweepPoses = Vec<Result<Isometry3<f64>, NoPose>>;
+type SweepPoses = Vec<Result<Isometry3<f64>, Unposed>>;
 
 /// Joins the sweeps of one topic and the poses of one source, both chosen by what the bag holds. Sweeps without a pose are
 /// left out and counted; if no sweep has one, all are kept without.
@@ -54,12 +54,12 @@ type SweepPoses = Vec<Result<Isometry3<f64>, NoPose>>;
 /// [`ReadError`] with the bag's topics if no sweep is in it.
 pub(super) fn join(
     path: &Path,
-    contents: &Contents,
+    contents: &BagContents,
     problems: &mut Vec<ReadError>,
 ) -> Result<Joined> {
     let mut first = None;
     for sweeps in topics(path, contents) {
-        let attempt = Attempt::of(path, contents, sweeps);
+        let attempt = JoinAttempt::of(path, contents, sweeps);
         if attempt.chosen.is_some() {
             return Ok(attempt.finish(path, contents, problems));
         }
@@ -78,7 +78,7 @@ pub(super) fn join(
 
 /// Topics of sweeps, those with most messages first, of equally many those with most bytes. Clouds in the world's frame
 /// are no sweeps.
-fn topics(path: &Path, contents: &Contents) -> Vec<SweepTopic> {
+fn topics(path: &Path, contents: &BagContents) -> Vec<SweepTopic> {
     let all = contents.clouds.iter();
     let mut topics: Vec<SweepTopic> = all
         .map(|(topic, clouds)| SweepTopic::new(path, topic, clouds))
@@ -94,9 +94,9 @@ fn topics(path: &Path, contents: &Contents) -> Vec<SweepTopic> {
     topics
 }
 
-impl Attempt {
+impl JoinAttempt {
     /// Chooses the source: of those that give poses to at least half as many sweeps as any other, the first by rank.
-    fn of(path: &Path, contents: &Contents, sweeps: SweepTopic) -> Self {
+    fn of(path: &Path, contents: &BagContents, sweeps: SweepTopic) -> Self {
         let sources = PoseSources::of(path, contents, &sweeps);
         let all = sources.sources.iter().map(|source| {
             let sweeps = sweeps.sweeps.iter();
@@ -118,7 +118,7 @@ impl Attempt {
         }
     }
 
-    fn finish(self, path: &Path, contents: &Contents, problems: &mut Vec<ReadError>) -> Joined {
+    fn finish(self, path: &Path, contents: &BagContents, problems: &mut Vec<ReadError>) -> Joined {
         let (sweeps, sources, chosen) = (self.sweeps, self.sources, self.chosen);
         let source = chosen
             .as_ref()
@@ -156,10 +156,10 @@ impl Attempt {
 
 /// Numbers of sweeps that are joined and left out.
 fn text(
-    contents: &Contents,
+    contents: &BagContents,
     sweeps: &SweepTopic,
     sources: &PoseSources,
-    chosen: Option<&PoseSource>,
+    chosen: Option<&PoseChain>,
 ) -> String {
     let of_sweeps = format!("{} ({})", sweeps.topic, sweeps.frame);
     let others = sources
@@ -221,22 +221,22 @@ fn span_text(span: Option<(u64, u64)>) -> String {
 /// Sweeps that the chosen source gives no pose, by reason.
 fn without_pose<'a>(
     poses: &'a SweepPoses,
-    source: &'a PoseSource,
+    source: &'a PoseChain,
     topic: &'a str,
 ) -> impl Iterator<Item = String> + 'a {
-    [NoPose::Outside, NoPose::Gap]
+    [Unposed::Outside, Unposed::Gap]
         .into_iter()
         .filter_map(move |reason| {
             let count = poses.iter().filter(|pose| **pose == Err(reason)).count();
             let place = match (reason, source.span) {
-                (NoPose::Outside, Some((first, last))) => format!(
+                (Unposed::Outside, Some((first, last))) => format!(
                     "are not within the poses of {}, {:.3} s to {:.3} s",
                     source.name,
                     seconds(first),
                     seconds(last)
                 ),
-                (NoPose::Outside, None) => format!("are not within the poses of {}", source.name),
-                (NoPose::Gap, _) => format!(
+                (Unposed::Outside, None) => format!("are not within the poses of {}", source.name),
+                (Unposed::Gap, _) => format!(
                     "are in gaps of more than {} s between the poses of {}",
                     seconds(MAX_GAP_NANOS),
                     source.name

@@ -27,11 +27,11 @@ use ros2::{SweepLimits, read_point_cloud};
 
 pub(super) use self::files::is_bag;
 
-use self::contents::Contents;
+use self::contents::BagContents;
 use self::join::{JoinedSweep, join};
 use self::storage::Storage;
 use super::files::name_below;
-use super::layout::{LayoutRow, Reader};
+use super::layout::{LayoutReader, LayoutRow};
 use super::points::{IntensityScale, Sweeps, divisor_of_first};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, single_vehicle};
 use crate::frame::Frame;
@@ -45,7 +45,7 @@ pub(crate) static ROSBAG: LayoutRow = LayoutRow {
     files: "a folder with metadata.yaml of rosbag2, or a file <name>.mcap or .db3 (.zstd): sensor_msgs/PointCloud2 with \
             nav_msgs/Odometry, tf2_msgs/TFMessage, geometry_msgs/PoseStamped or PoseWithCovarianceStamped",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence {
+    reader: Some(LayoutReader::Sequence {
         is_one: is_bag,
         open,
     }),
@@ -76,7 +76,7 @@ fn open(
     problems: &mut Vec<ReadError>,
 ) -> Result<Scenario> {
     let files = files::files_of(path, problems)?;
-    let mut contents = Contents::of(path);
+    let mut contents = BagContents::of(path);
     let storage = Storage::open(&files, &mut contents, problems)?;
     contents.finish(problems);
     let joined = join(path, &contents, problems)?;

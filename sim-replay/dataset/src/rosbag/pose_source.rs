@@ -6,11 +6,11 @@ use std::path::Path;
 
 use nalgebra::Isometry3;
 
-use super::contents::{Contents, PoseStamp};
-use super::sweeps::{SweepTopic, most_frequent};
-use super::transforms::{Motion, Route, Transforms, is_map};
+use super::contents::{BagContents, PoseStamp};
+use super::sweeps::{STRAY, SweepTopic, most_frequent};
+use super::transforms::{FrameRoute, Motion, Transforms, is_map};
 use crate::ReadError;
-use crate::trajectory::{NoPose, Trajectory};
+use crate::trajectory::{Trajectory, Unposed};
 
 /// Largest time between two poses over which they are interpolated, nanoseconds: that of poses at 1 Hz and their jitter.
 pub(super) const MAX_GAP_NANOS: u64 = 1_250_000_000;
@@ -19,7 +19,7 @@ const BODIES: [&str; 2] = ["base_link", "base_footprint"];
 
 /// A source of poses of the LiDAR.
 #[derive(Debug)]
-pub(super) struct PoseSource {
+pub(super) struct PoseChain {
     /// Topic and frames, for messages.
     pub(super) name: String,
     world: String,
@@ -32,16 +32,16 @@ pub(super) struct PoseSource {
     /// `world_from_child`; `None` where all of the way is transforms.
     world_from_child: Option<Trajectory>,
     /// From child, or world, to the LiDAR.
-    route: Route,
+    route: FrameRoute,
 }
 
-impl PoseSource {
+impl PoseChain {
     /// `world_from_lidar` at a time, nanoseconds.
-    pub(super) fn at(&self, transforms: &Transforms, nanos: u64) -> Result<Isometry3<f64>, NoPose> {
+    pub(super) fn at(&self, transforms: &Transforms, time: u64) -> Result<Isometry3<f64>, Unposed> {
         // At the time of the sweep too: joints between body and LiDAR may move.
-        let rest = transforms.along(&self.route, nanos)?;
+        let rest = transforms.along(&self.route, time)?;
         Ok(match &self.world_from_child {
-            Some(poses) => poses.at(nanos)? * rest,
+            Some(poses) => poses.at(time)? * rest,
             None => rest,
         })
     }
@@ -57,7 +57,7 @@ impl PoseSource {
 #[derive(Debug, Default)]
 pub(super) struct PoseSources {
     pub(super) transforms: Transforms,
-    pub(super) sources: Vec<PoseSource>,
+    pub(super) sources: Vec<PoseChain>,
     /// Topics that cannot, with the reason.
     pub(super) unusable: Vec<String>,
     /// Poses that were left out.
@@ -66,18 +66,19 @@ pub(super) struct PoseSources {
 
 impl PoseSources {
     /// Sources of the poses of the LiDAR that recorded `sweeps`.
-    pub(super) fn of(path: &Path, contents: &Contents, sweeps: &SweepTopic) -> Self {
+    pub(super) fn of(path: &Path, contents: &BagContents, sweeps: &SweepTopic) -> Self {
         let mut sources = Self::default();
         sources.add_fixed(path, &contents.fixed);
         sources.add_moving(path, &contents.moving, sweeps);
-        let chains = sources.transforms.worlds_of(&sweeps.frame);
-        let chains: Vec<PoseSource> = chains
+        let frame = &sweeps.frame;
+        let chains = sources.transforms.worlds_of(frame);
+        let chains: Vec<PoseChain> = chains
             .into_iter()
             .map(|(world, route)| {
                 // A chain has no more poses than its sparsest trajectory.
                 let sparsest = sources.transforms.sparsest(&route);
-                PoseSource {
-                    name: format!("transforms ({} in {world})", sweeps.frame),
+                PoseChain {
+                    name: format!("transforms ({frame} in {world})"),
                     world: world.to_owned(),
                     is_named: true,
                     poses: sparsest.map_or(0, Trajectory::len),
@@ -88,10 +89,7 @@ impl PoseSources {
             })
             .collect();
         if chains.is_empty() && !contents.moving.is_empty() {
-            let reason = format!(
-                "transforms: none leads from {} to a map or odometry",
-                sweeps.frame
-            );
+            let reason = format!("transforms: none leads from {frame} to a map or odometry");
             sources.unusable.push(reason);
         }
         sources.sources = chains;
@@ -111,13 +109,10 @@ impl PoseSources {
             let Some(child) = pose.child.as_deref() else {
                 continue;
             };
-            let frames = (pose.parent.as_str(), child);
-            let before = last.insert(frames, pose.parent_from_child);
+            let parent = pose.parent.as_str();
+            let before = last.insert((parent, child), pose.parent_from_child);
             if before.is_some_and(|before| !is_same(&before, &pose.parent_from_child)) {
-                let reason = format!(
-                    "tf_static: {child} in {} changes: the last is used",
-                    pose.parent
-                );
+                let reason = format!("tf_static: {child} in {parent} changes: the last is used");
                 self.problems.push(ReadError::malformed(path, reason));
             }
         }
@@ -130,10 +125,8 @@ impl PoseSources {
         let mut by_frames: BTreeMap<(&str, &str), Vec<&PoseStamp>> = BTreeMap::new();
         for pose in moving {
             if let Some(child) = pose.child.as_deref() {
-                by_frames
-                    .entry((&pose.parent, child))
-                    .or_default()
-                    .push(pose);
+                let poses = by_frames.entry((&pose.parent, child));
+                poses.or_default().push(pose);
             }
         }
         for ((parent, child), poses) in by_frames {
@@ -149,7 +142,7 @@ impl PoseSources {
         path: &Path,
         (topic, poses): (&str, &[PoseStamp]),
         sweeps: &SweepTopic,
-    ) -> Result<PoseSource, String> {
+    ) -> Result<PoseChain, String> {
         let world = most_frequent(poses.iter().map(|pose| pose.parent.as_str()));
         let child = most_frequent(poses.iter().map(|pose| pose.child.as_deref().unwrap_or("")));
         let of_frames = poses
@@ -176,7 +169,7 @@ impl PoseSources {
             format!("no transform between {child} and {frame}, the frame of the sweeps")
         })?;
         let trajectory = self.trajectory(path, topic, &of_frames, sweeps);
-        Ok(PoseSource {
+        Ok(PoseChain {
             name: format!("{topic} ({child} in {world}{unnamed})"),
             world,
             is_named,
@@ -213,18 +206,10 @@ impl PoseSources {
         // Publishers repeat what has not changed.
         timed.dedup_by(|next, last| next.0 == last.0 && is_same(&next.1, &last.1));
         let (trajectory, out_of_order) = Trajectory::new(timed, MAX_GAP_NANOS);
-        for (count, reason) in [
-            (unstamped, "have the stamp 0"),
-            (
-                out_of_order.len(),
-                "have a stamp that is not between those around it",
-            ),
-        ] {
+        for (count, reason) in [(unstamped, "have the stamp 0"), (out_of_order.len(), STRAY)] {
             if count > 0 {
-                let reason = format!(
-                    "{name}: {count} of {} poses {reason}: left out",
-                    poses.len()
-                );
+                let all = poses.len();
+                let reason = format!("{name}: {count} of {all} poses {reason}: left out");
                 self.problems.push(ReadError::malformed(path, reason));
             }
         }

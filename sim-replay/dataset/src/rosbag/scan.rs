@@ -7,7 +7,7 @@ const CDR: &str = "cdr";
 
 /// A topic of a bag.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Topic {
+pub(super) struct BagTopic {
     pub(super) name: String,
     /// `sensor_msgs/msg/PointCloud2` for example.
     pub(super) type_name: String,
@@ -15,7 +15,7 @@ pub(super) struct Topic {
     pub(super) encoding: String,
 }
 
-impl Topic {
+impl BagTopic {
     /// True if its messages are in the encoding of ROS 2.
     pub(super) fn is_cdr(&self) -> bool {
         self.encoding == CDR
@@ -23,18 +23,18 @@ impl Topic {
 }
 
 /// A message while a bag is scanned.
-pub(super) struct Message<'a> {
-    pub(super) topic: &'a Topic,
+pub(super) struct BagMessage<'a> {
+    pub(super) topic: &'a BagTopic,
     /// Time at which it was recorded, nanoseconds.
     pub(super) recorded_nanos: u64,
     /// Its bytes in CDR, or the reason why it cannot be unpacked.
     pub(super) data: Result<Cow<'a, [u8]>, String>,
-    pub(super) place: Place,
+    pub(super) place: MessagePlace,
 }
 
 /// Position of a message in a bag.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct MessagePlace {
     /// Index of the file.
     pub(super) file: usize,
     pub(super) at: At,
@@ -43,7 +43,7 @@ pub(super) struct Place {
 /// Position of a message in its file.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum At {
-    Mcap(recording::Place),
+    Mcap(recording::McapPlace),
     /// Number of the row in the table of messages.
     Row(i64),
 }
@@ -51,9 +51,9 @@ pub(super) enum At {
 /// Receives what a scan finds.
 pub(super) trait Scan {
     /// Takes note of a topic; true if its messages are wanted.
-    fn declare(&mut self, topic: &Topic) -> bool;
+    fn declare(&mut self, topic: &BagTopic) -> bool;
     /// Takes a message of a wanted topic.
-    fn take(&mut self, message: Message<'_>);
+    fn take(&mut self, message: BagMessage<'_>);
     /// Drops the positions in a file that could not be read to its end: the next file gets its index.
     fn forget(&mut self, file: usize);
 }

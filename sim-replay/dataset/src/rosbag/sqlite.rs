@@ -7,7 +7,7 @@ use rusqlite::{Connection, OpenFlags, Result, Row};
 use support::bounded_file;
 
 use super::files::unpacked_message;
-use super::scan::{At, Message, Place, Scan, Topic};
+use super::scan::{At, BagMessage, BagTopic, MessagePlace, Scan};
 use crate::ReadError;
 
 /// An open database.
@@ -54,14 +54,14 @@ fn fault(name: &Path, error: &rusqlite::Error) -> ReadError {
 }
 
 /// Number and description of each topic.
-fn topics(connection: &Connection) -> Result<Vec<(i64, Topic)>> {
+fn topics(connection: &Connection) -> Result<Vec<(i64, BagTopic)>> {
     let mut statement =
         connection.prepare("SELECT id, name, type, serialization_format FROM topics")?;
     statement.query_map([], topic)?.collect()
 }
 
-fn topic(row: &Row<'_>) -> Result<(i64, Topic)> {
-    let topic = Topic {
+fn topic(row: &Row<'_>) -> Result<(i64, BagTopic)> {
+    let topic = BagTopic {
         name: row.get(1)?,
         type_name: row.get(2)?,
         encoding: row.get(3)?,
@@ -71,7 +71,7 @@ fn topic(row: &Row<'_>) -> Result<(i64, Topic)> {
 
 fn messages(
     connection: &Connection,
-    (id, topic): (i64, &Topic),
+    (id, topic): (i64, &BagTopic),
     file: usize,
     scan: &mut dyn Scan,
 ) -> Result<()> {
@@ -81,12 +81,12 @@ fn messages(
     while let Some(row) = rows.next()? {
         let recorded_nanos: i64 = row.get(1)?;
         let data = row.get_ref(2)?.as_blob()?;
-        scan.take(Message {
+        scan.take(BagMessage {
             topic,
             // SQLite has signed numbers only. A negative time counts as 0.
             recorded_nanos: u64::try_from(recorded_nanos).unwrap_or(0),
             data: unpacked_message(data).map_err(|error| error.to_string()),
-            place: Place {
+            place: MessagePlace {
                 file,
                 at: At::Row(row.get(0)?),
             },

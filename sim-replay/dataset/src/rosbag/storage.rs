@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use recording::McapFile;
 use tempfile::TempPath;
 
-use super::files::{Kind, unpacked, unpacked_message};
-use super::scan::{At, Message, Place, Scan, Topic};
+use super::files::{BagKind, unpacked, unpacked_message};
+use super::scan::{At, BagMessage, BagTopic, MessagePlace, Scan};
 use super::sqlite::SqliteFile;
 use crate::recorded::as_read_error;
 use crate::{ReadError, Result};
@@ -61,14 +61,14 @@ impl Storage {
     }
 
     /// The file of a message.
-    pub(super) fn path(&self, place: Place) -> &Path {
+    pub(super) fn path(&self, place: MessagePlace) -> &Path {
         self.0
             .get(place.file)
             .map_or(Path::new(""), |file| &file.path)
     }
 
     /// The bytes of a message in CDR.
-    pub(super) fn read(&self, place: Place) -> Result<Vec<u8>> {
+    pub(super) fn read(&self, place: MessagePlace) -> Result<Vec<u8>> {
         let path = self.path(place);
         let data = match (self.0.get(place.file).map(|file| &file.form), place.at) {
             (Some(Form::Mcap(file)), At::Mcap(at)) => file.read(at).map_err(as_read_error)?,
@@ -91,15 +91,15 @@ impl BagFile {
         scan: &mut dyn Scan,
         problems: &mut Vec<ReadError>,
     ) -> Result<Self> {
-        let kind = Kind::of(path);
-        if kind == Some(Kind::Ros1) {
+        let kind = BagKind::of(path);
+        if kind == Some(BagKind::Ros1) {
             let reason = "a bag of ROS 1: `rosbags-convert --src FILE.bag --dst FOLDER` makes one of ROS 2 of it";
             return Err(ReadError::malformed(path, reason));
         }
         let unpacked = unpacked(path)?;
         let paths = (path, unpacked.as_deref().unwrap_or(path));
         let form = match kind {
-            Some(Kind::Sqlite) => Form::Sqlite(SqliteFile::scan(paths, index, scan, problems)?),
+            Some(BagKind::Sqlite) => Form::Sqlite(SqliteFile::scan(paths, index, scan, problems)?),
             _ => Form::Mcap(scan_mcap(paths, index, scan, problems)?),
         };
         Ok(Self {
@@ -119,7 +119,7 @@ fn scan_mcap(
     let mcap = McapFile::open(path, &mut |message, at| {
         let channel = &message.channel;
         let schema = channel.schema.as_ref();
-        let topic = Topic {
+        let topic = BagTopic {
             name: channel.topic.clone(),
             type_name: schema.map_or(String::new(), |schema| schema.name.clone()),
             encoding: channel.message_encoding.clone(),
@@ -127,11 +127,11 @@ fn scan_mcap(
         let is_wanted = scan.declare(&topic);
         if is_wanted {
             let at = At::Mcap(at);
-            scan.take(Message {
+            scan.take(BagMessage {
                 topic: &topic,
                 recorded_nanos: message.log_time,
                 data: unpacked_message(&message.data).map_err(|error| error.to_string()),
-                place: Place { file, at },
+                place: MessagePlace { file, at },
             });
         }
         is_wanted

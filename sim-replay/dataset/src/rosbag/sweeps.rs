@@ -7,6 +7,9 @@ use super::clock::longest_steady;
 use super::contents::CloudStamp;
 use crate::ReadError;
 
+/// What is reported of messages that are out of order.
+pub(super) const STRAY: &str = "have a stamp that is not between those around it";
+
 /// Sweeps of a topic, with increasing stamps.
 #[derive(Debug)]
 pub(super) struct SweepTopic {
@@ -32,13 +35,12 @@ impl SweepTopic {
         let stamps: Vec<u64> = of_frame.iter().map(|cloud| cloud.nanos).collect();
         let steady = longest_steady(&stamps);
         let other_frame = format!("are not in frame {frame}, as most are");
-        let stray = "have a stamp that is not between those around it";
         let other_part = "are before or after the clock of their stamps was set back";
         let mut problems = Vec::new();
         for (count, reason) in [
             (unstamped.len(), "have the stamp 0"),
             (others.len(), other_frame.as_str()),
-            (steady.strays, stray),
+            (steady.strays, STRAY),
             (steady.of_other_parts, other_part),
         ] {
             if count > 0 {

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use nalgebra::Isometry3;
 
-use crate::trajectory::{NoPose, Trajectory};
+use crate::trajectory::{Trajectory, Unposed};
 
 /// Frames whose coordinates do not drift, by the last part of their names (REP-105, and those of mapping programs).
 const MAP_FRAMES: [&str; 6] = ["map", "world", "earth", "utm", "enu", "global"];
@@ -32,10 +32,10 @@ pub(super) enum Motion {
 
 /// Transforms from one frame to another, in the order in which they are multiplied.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Route(Vec<Step>);
+pub(super) struct FrameRoute(Vec<RouteStep>);
 
 #[derive(Debug, Clone, Copy)]
-struct Step {
+struct RouteStep {
     edge: usize,
     /// True from parent to child.
     is_down: bool,
@@ -61,28 +61,28 @@ impl Transforms {
     }
 
     /// The shortest way from the body of a robot to a frame on it: joints may move, the body itself does not.
-    pub(super) fn route_down(&self, body: &str, frame: &str) -> Option<Route> {
+    pub(super) fn route_down(&self, body: &str, frame: &str) -> Option<FrameRoute> {
         let route = self.route(body, frame)?;
         let mut steps = route.0.iter();
         let is_held = steps.all(|step| step.is_down || !self.is_moving(*step));
         is_held.then_some(route)
     }
 
-    fn is_moving(&self, step: Step) -> bool {
+    fn is_moving(&self, step: RouteStep) -> bool {
         let edge = self.edges.get(step.edge);
         edge.is_some_and(|edge| matches!(edge.motion, Motion::Moving(_)))
     }
 
     /// The shortest way from `target` to `source`; `None` if they are not connected.
-    pub(super) fn route(&self, target: &str, source: &str) -> Option<Route> {
-        let mut reached: BTreeMap<&str, Option<(&str, Step)>> = BTreeMap::from([(target, None)]);
+    pub(super) fn route(&self, target: &str, source: &str) -> Option<FrameRoute> {
+        let mut reached = BTreeMap::<&str, Option<(&str, RouteStep)>>::from([(target, None)]);
         // Breadth first, over transforms in both directions: the first way found is the shortest.
         let mut open = VecDeque::from([target]);
         while let Some(frame) = open.pop_front().filter(|frame| *frame != source) {
             for (edge, Edge { parent, child, .. }) in self.edges.iter().enumerate() {
                 for (from, to, is_down) in [(parent, child, true), (child, parent, false)] {
                     if from == frame && !reached.contains_key(to.as_str()) {
-                        reached.insert(to, Some((frame, Step { edge, is_down })));
+                        reached.insert(to, Some((frame, RouteStep { edge, is_down })));
                         open.push_back(to);
                     }
                 }
@@ -95,17 +95,17 @@ impl Transforms {
             at = reached.get(before)?;
         }
         steps.reverse();
-        Some(Route(steps))
+        Some(FrameRoute(steps))
     }
 
     /// `target_from_source` along a route, at a time in nanoseconds.
-    pub(super) fn along(&self, route: &Route, nanos: u64) -> Result<Isometry3<f64>, NoPose> {
+    pub(super) fn along(&self, route: &FrameRoute, nanos: u64) -> Result<Isometry3<f64>, Unposed> {
         let mut target_from_source = Isometry3::identity();
         for step in &route.0 {
             let parent_from_child = match self.edges.get(step.edge).map(|edge| &edge.motion) {
                 Some(Motion::Fixed(pose)) => *pose,
                 Some(Motion::Moving(poses)) => poses.at(nanos)?,
-                None => return Err(NoPose::Outside),
+                None => return Err(Unposed::Outside),
             };
             // On the right: the route leads from the target to the source.
             target_from_source *= match step.is_down {
@@ -117,7 +117,7 @@ impl Transforms {
     }
 
     /// The trajectory along a route that has the fewest poses.
-    pub(super) fn sparsest(&self, route: &Route) -> Option<&Trajectory> {
+    pub(super) fn sparsest(&self, route: &FrameRoute) -> Option<&Trajectory> {
         let edges = route.0.iter().filter_map(|step| self.edges.get(step.edge));
         let moving = edges.filter_map(|edge| match &edge.motion {
             Motion::Moving(poses) => Some(poses),
@@ -128,7 +128,7 @@ impl Transforms {
 
     /// The frames in which `frame` moves and that may serve as the world: those of maps and odometry, and the topmost.
     /// A frame that is fixed to one of these adds nothing.
-    pub(super) fn worlds_of(&self, frame: &str) -> Vec<(&str, Route)> {
+    pub(super) fn worlds_of(&self, frame: &str) -> Vec<(&str, FrameRoute)> {
         let moving = self
             .edges
             .iter()
@@ -145,7 +145,7 @@ impl Transforms {
             .collect()
     }
 
-    fn begins_moving(&self, route: &Route) -> bool {
+    fn begins_moving(&self, route: &FrameRoute) -> bool {
         let first = route.0.first();
         first.is_some_and(|step| step.is_down && self.is_moving(*step))
     }
@@ -196,7 +196,7 @@ mod tests {
         assert_eq!(at("lidar", "map", 5), Ok(-12.5));
         assert_eq!(at("wheel", "lidar", 10), Ok(1.5 - 9.0));
         assert_eq!(at("lidar", "lidar", 99), Ok(0.0));
-        assert_eq!(at("odom", "lidar", 11), Err(NoPose::Outside));
+        assert_eq!(at("odom", "lidar", 11), Err(Unposed::Outside));
         assert!(transforms.route("map", "camera").is_none());
     }
 

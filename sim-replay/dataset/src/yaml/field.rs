@@ -1,12 +1,12 @@
 //! A YAML node with its position: typed access for readers, with errors that give file, line and field.
 
-use super::node::{Node, Value};
+use super::node::{Value, YamlNode};
 use crate::{ReadError, Result};
 
 /// A node with its position in the document.
-pub(crate) type Field<'a> = crate::field::Field<'a, Node>;
+pub(crate) type YamlField<'a> = crate::field::Field<'a, YamlNode>;
 
-impl<'a> Field<'a> {
+impl<'a> YamlField<'a> {
     /// Kind and content in few words, for messages.
     pub(crate) fn found(&self) -> String {
         self.node.value.kind()

@@ -12,8 +12,8 @@ mod tree;
 
 use std::path::Path;
 
-pub(super) use field::Field;
-pub(super) use node::{Node, Value};
+pub(super) use field::YamlField;
+pub(super) use node::{Value, YamlNode};
 
 use tree::Unsound;
 
@@ -24,12 +24,12 @@ use super::{ReadError, Result};
 const MAX_BYTES: u64 = 16 << 20;
 
 /// Reads and parses a file.
-pub(super) fn read(path: &Path) -> Result<Node> {
+pub(super) fn read(path: &Path) -> Result<YamlNode> {
     parse(path, &files::read_limited(path, MAX_BYTES)?)
 }
 
 /// Parses a document; `path` is for messages.
-pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Node> {
+pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<YamlNode> {
     let malformed =
         |line: u64, reason: String| ReadError::malformed_at(path, Some(line), None, reason);
     let text = std::str::from_utf8(bytes).map_err(|error| {
@@ -49,7 +49,7 @@ mod tests {
 
     use super::*;
 
-    fn parsed(text: &str) -> Node {
+    fn parsed(text: &str) -> YamlNode {
         parse(Path::new("a.yaml"), text.as_bytes()).unwrap()
     }
 
@@ -60,7 +60,7 @@ mod tests {
     #[test]
     fn numbers_come_in_every_spelling() {
         let node = parsed("a: [1, 2.5, 1e-06, 1.0e-06, -3, .5, '7', +8, 1., 0x10]");
-        let field = Field::root(Path::new("a.yaml"), &node)
+        let field = YamlField::root(Path::new("a.yaml"), &node)
             .required("a")
             .unwrap();
         assert_eq!(
@@ -74,7 +74,7 @@ mod tests {
         let node = parsed(
             "vehicles:\n  4335: &a\n    speed: 1\n    color: 1, 2\n  4336: *a\nunknown: {x: [~]}\n",
         );
-        let root = Field::root(Path::new("a.yaml"), &node);
+        let root = YamlField::root(Path::new("a.yaml"), &node);
         let vehicles = root.required("vehicles").unwrap().entries().unwrap();
         assert_eq!(
             vehicles.iter().map(|(key, _)| *key).collect::<Vec<_>>(),
@@ -91,7 +91,7 @@ mod tests {
         let node = parsed(
             "a: !!python/tuple\n- 1\n- !!binary |\n  Yg==\n- !!python/name:numpy.ndarray ''\n",
         );
-        let root = Field::root(Path::new("a.yaml"), &node);
+        let root = YamlField::root(Path::new("a.yaml"), &node);
         let tuple = root.required("a").unwrap();
         assert_eq!(tuple.node.tag.as_deref(), Some("python/tuple"));
         let items = tuple.items().unwrap();
@@ -107,7 +107,7 @@ mod tests {
         let node = parsed(
             "lidar_pose: [1, 2, 3]\nvehicles:\n  7:\n    extent:\n    - 1\n    - .nan\n    - x\n",
         );
-        let root = Field::root(Path::new("a.yaml"), &node);
+        let root = YamlField::root(Path::new("a.yaml"), &node);
         let pose = root.required("lidar_pose").unwrap();
         assert_eq!(
             message(pose.numbers::<6>()),
@@ -163,7 +163,7 @@ mod tests {
     fn the_last_of_two_equal_keys_counts_as_in_python() {
         let node = parsed("a: 1\na: 2\n");
         assert_eq!(
-            Field::root(Path::new("a.yaml"), &node)
+            YamlField::root(Path::new("a.yaml"), &node)
                 .required("a")
                 .unwrap()
                 .integer()
@@ -175,7 +175,7 @@ mod tests {
     #[test]
     fn merged_maps_give_missing_entries() {
         let node = parsed("base: &b {x: 1, y: 2}\na:\n  <<: *b\n  x: 3\n");
-        let a = Field::root(Path::new("a.yaml"), &node)
+        let a = YamlField::root(Path::new("a.yaml"), &node)
             .required("a")
             .unwrap();
         let value = |key: &str| a.required(key).unwrap().integer().unwrap();
@@ -209,7 +209,7 @@ mod tests {
         #[test]
         fn numbers_are_read_back_bit_exactly(values in prop::array::uniform6(prop::num::f64::NORMAL)) {
             let node = parsed(&format!("a: {values:?}\nb: [{}]\n", values.map(|value| format!("{value:e}")).join(", ")));
-            let root = Field::root(Path::new("a.yaml"), &node);
+            let root = YamlField::root(Path::new("a.yaml"), &node);
             for key in ["a", "b"] {
                 prop_assert_eq!(root.required(key).unwrap().numbers::<6>().unwrap(), values);
             }

@@ -2,7 +2,7 @@
 
 /// A node of a document.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Node {
+pub(crate) struct YamlNode {
     /// The line where it begins, from 1.
     pub(crate) line: u64,
     /// Its explicit tag without YAML's own prefix, for example `python/tuple` for `!!python/tuple`.
@@ -18,9 +18,9 @@ pub(crate) enum Value {
     Integer(i64),
     Float(f64),
     Text(String),
-    List(Vec<Node>),
+    List(Vec<YamlNode>),
     /// Entries in the order of the file; keys as written.
-    Map(Vec<(String, Node)>),
+    Map(Vec<(String, YamlNode)>),
 }
 
 impl Value {

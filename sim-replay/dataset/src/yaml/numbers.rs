@@ -1,11 +1,11 @@
 //! Numbers of a YAML document: plain, in lists, or in NumPy's pickled arrays and scalars, which may stand for any number.
 
-use super::field::Field;
+use super::field::YamlField;
 use super::node::Value;
 use super::numpy_tags::{self, NumpyArray};
 use crate::Result;
 
-impl Field<'_> {
+impl YamlField<'_> {
     /// A finite number, in any notation.
     pub(crate) fn number(&self) -> Result<f64> {
         if numpy_tags::is_python(self.node) && !matches!(self.node.value, Value::Text(_)) {
@@ -76,8 +76,7 @@ impl Field<'_> {
         };
         let rows = self.items()?;
         let rows = rows.iter().map(Self::row).collect::<Result<Vec<_>>>()?;
-        let inner = rows.first().map(|row| row.shape.clone());
-        let inner = inner.unwrap_or_default();
+        let inner = rows.first().map_or_else(Vec::new, |row| row.shape.clone());
         if rows.iter().any(|row| row.shape != inner) {
             return Err(self.error("rows of different lengths"));
         }

@@ -4,17 +4,12 @@ use super::Value;
 
 /// The value of a plain (unquoted) scalar.
 pub(super) fn plain(text: &str) -> Value {
-    let known = match text.as_bytes().first() {
-        None => Some(Value::Null),
-        Some(b'0'..=b'9' | b'+' | b'-' | b'.') => number(text),
-        Some(b'~' | b'n' | b'N') => {
-            matches!(text, "~" | "null" | "Null" | "NULL").then_some(Value::Null)
-        }
-        Some(b't' | b'T') => matches!(text, "true" | "True" | "TRUE").then_some(Value::Bool(true)),
-        Some(b'f' | b'F') => {
-            matches!(text, "false" | "False" | "FALSE").then_some(Value::Bool(false))
-        }
-        Some(_) => None,
+    let known = match text.as_bytes() {
+        [b'0'..=b'9' | b'+' | b'-' | b'.', ..] => number(text),
+        b"" | b"~" | b"null" | b"Null" | b"NULL" => Some(Value::Null),
+        b"true" | b"True" | b"TRUE" => Some(Value::Bool(true)),
+        b"false" | b"False" | b"FALSE" => Some(Value::Bool(false)),
+        _ => None,
     };
     known.unwrap_or_else(|| Value::Text(text.to_owned()))
 }

@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet};
 
 use granit_parser::{Event, Parser, ScalarStyle, StrInput, Tag};
 
-use super::node::{Node, Value};
+use super::node::{Value, YamlNode};
 use super::{numpy_tags, scalar};
 
 /// Deepest nesting.
@@ -25,14 +25,14 @@ pub(super) struct Unsound {
 }
 
 /// Builds the tree of a text with at most one document.
-pub(super) fn build(text: &str) -> Result<Node, Unsound> {
+pub(super) fn build(text: &str) -> Result<YamlNode, Unsound> {
     let mut options = granit_parser::options! {
         flow_nesting_limit: MAX_DEPTH,
         block_nesting_limit: MAX_DEPTH,
     };
     options.set_emit_comments(false);
     let parser = Parser::new_from_str_with_options(text, options);
-    Builder {
+    TreeBuilder {
         parser,
         line: 1,
         anchors: HashMap::new(),
@@ -42,18 +42,18 @@ pub(super) fn build(text: &str) -> Result<Node, Unsound> {
     .document()
 }
 
-struct Builder<'t> {
+struct TreeBuilder<'t> {
     parser: Parser<'t, StrInput<'t>>,
     /// The line of the last event, from 1.
     line: u64,
     /// Targets of aliases, with their numbers of nodes.
-    anchors: HashMap<usize, (Node, usize)>,
+    anchors: HashMap<usize, (YamlNode, usize)>,
     nodes: usize,
     aliased: usize,
 }
 
-impl<'t> Builder<'t> {
-    fn document(mut self) -> Result<Node, Unsound> {
+impl<'t> TreeBuilder<'t> {
+    fn document(mut self) -> Result<YamlNode, Unsound> {
         let mut root = None;
         loop {
             match self.next()? {
@@ -65,7 +65,7 @@ impl<'t> Builder<'t> {
                 event => root = Some(self.node(event, 0)?),
             }
         }
-        Ok(root.unwrap_or(Node {
+        Ok(root.unwrap_or(YamlNode {
             line: 1,
             tag: None,
             value: Value::Null,
@@ -94,7 +94,7 @@ impl<'t> Builder<'t> {
     }
 
     /// The node that begins with an event.
-    fn node(&mut self, event: Event<'t>, depth: usize) -> Result<Node, Unsound> {
+    fn node(&mut self, event: Event<'t>, depth: usize) -> Result<YamlNode, Unsound> {
         self.nodes += 1;
         if self.nodes > MAX_NODES {
             return Err(self.unsound(format!("more than {MAX_NODES} nodes")));
@@ -130,7 +130,7 @@ impl<'t> Builder<'t> {
             Event::Alias(anchor) => return self.alias(anchor, line),
             _ => return Err(self.unsound("expected a scalar, a list or a map")),
         };
-        let node = Node { line, tag, value };
+        let node = YamlNode { line, tag, value };
         if anchor > 0 {
             let size = size(&node);
             // The copy that is kept for aliases costs as much as one of them.
@@ -178,11 +178,11 @@ impl<'t> Builder<'t> {
         Ok(Value::Map(entries))
     }
 
-    fn alias(&mut self, anchor: usize, line: u64) -> Result<Node, Unsound> {
+    fn alias(&mut self, anchor: usize, line: u64) -> Result<YamlNode, Unsound> {
         let size = self.anchors.get(&anchor).map(|(_, size)| *size);
         self.count_aliased(size.unwrap_or(0))?;
         match self.anchors.get(&anchor) {
-            Some((node, _)) => Ok(Node {
+            Some((node, _)) => Ok(YamlNode {
                 line,
                 ..node.clone()
             }),
@@ -210,7 +210,7 @@ fn tag_text(tag: &Tag) -> Box<str> {
     }
 }
 
-fn size(node: &Node) -> usize {
+fn size(node: &YamlNode) -> usize {
     match &node.value {
         Value::List(items) => 1 + items.iter().map(size).sum::<usize>(),
         Value::Map(entries) => 1 + entries.iter().map(|(_, node)| size(node)).sum::<usize>(),

@@ -37,7 +37,7 @@ fn emulator(config: &LinkConfig) -> LinkEmulator {
     LinkEmulator::new(config.clone(), Path::new("."), 5).unwrap()
 }
 
-fn all(config: &LinkConfig, packets: impl IntoIterator<Item = Packet>) -> Vec<Outcome> {
+fn all(config: &LinkConfig, packets: impl IntoIterator<Item = Packet>) -> Vec<PacketOutcome> {
     let mut emulator = emulator(config);
     packets
         .into_iter()
@@ -45,7 +45,7 @@ fn all(config: &LinkConfig, packets: impl IntoIterator<Item = Packet>) -> Vec<Ou
     emulator.advance(u64::MAX / 4)
 }
 
-fn times_ms(outcomes: &[Outcome]) -> Vec<(u64, u64, Delivery)> {
+fn times_ms(outcomes: &[PacketOutcome]) -> Vec<(u64, u64, Delivery)> {
     outcomes
         .iter()
         .map(|outcome| {
@@ -235,8 +235,9 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
         (0..2000).map(|k| packet("a", k, 132_500, k * 100 * MS)),
     );
     let frames = |count: u64| {
-        let late =
-            |outcome: &&Outcome| outcome.nanos - outcome.packet.submitted_nanos == count * 100 * MS;
+        let late = |outcome: &&PacketOutcome| {
+            outcome.nanos - outcome.packet.submitted_nanos == count * 100 * MS
+        };
         outcomes.iter().filter(late).count()
     };
     assert_eq!(frames(0) + frames(1), 2000);
@@ -319,7 +320,7 @@ fn a_link_is_independent_of_other_links() {
         duplicate: 0.1,
         ..shaped(27.0)
     };
-    let of_a = |outcomes: Vec<Outcome>| -> Vec<Outcome> {
+    let of_a = |outcomes: Vec<PacketOutcome>| -> Vec<PacketOutcome> {
         outcomes
             .into_iter()
             .filter(|outcome| outcome.packet.from.as_str() == "a")

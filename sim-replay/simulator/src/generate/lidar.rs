@@ -2,7 +2,7 @@
 
 use std::f32::consts::{PI, TAU};
 
-use super::raycast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
+use super::raycast::{Caster, Course, GROUND, MISS, RayBody, RayPattern, Surface};
 use super::weather::{Echo, Weather};
 use support::random::SplitMix64;
 
@@ -80,9 +80,9 @@ impl Lidar {
     /// The same arguments give the same points, bit for bit.
     pub fn sweep(
         &mut self,
-        sensor: &Sweep,
+        sensor: &Course,
         ground: &dyn Surface,
-        bodies: &[Body<'_>],
+        bodies: &[RayBody<'_>],
         weather: Weather,
         seed: u64,
     ) -> LidarSweep<'_> {
@@ -94,8 +94,8 @@ impl Lidar {
     /// [`Self::sweep`].
     pub fn again(
         &mut self,
-        sensor: &Sweep,
-        bodies: &[Body<'_>],
+        sensor: &Course,
+        bodies: &[RayBody<'_>],
         weather: Weather,
         seed: u64,
     ) -> LidarSweep<'_> {
@@ -135,7 +135,7 @@ impl Lidar {
 fn measure(
     depth_m: f32,
     hit: u32,
-    bodies: &[Body<'_>],
+    bodies: &[RayBody<'_>],
     weather: Weather,
     random: &mut SplitMix64,
 ) -> Option<(f32, f32, u32)> {
@@ -158,37 +158,32 @@ fn measure(
     Some((range_m + (NOISE_M * random.normal()) as f32, intensity, hit))
 }
 
-/// The point of a pose at which a sweep is given, relative to the vehicle's own origin.
-pub(crate) fn lidar_motion(vehicle: &Sweep) -> Sweep {
-    vehicle.mounted(LIDAR_MOUNT_M)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::generate::raycast::{BodyShape, Bounds, Part, Placement, Plane};
+    use crate::generate::raycast::{Bounds, Convex, Placement, Plane, SolidShape};
 
     #[test]
     fn a_pole_stands_straight_while_the_sensor_drives_past() {
-        let pole = BodyShape::new(
-            vec![Part::Cylinder {
+        let pole = SolidShape::new(
+            vec![Convex::Cylinder {
                 center_m: [0.0, 0.0, 2.0],
                 radius_m: 0.15,
                 half_height_m: 2.0,
             }],
             0.5,
         );
-        let place = |x: f64, y: f64| Body {
+        let place = |x: f64, y: f64| RayBody {
             shape: &pole,
-            motion: Sweep::still(Placement::level([x, y, 0.0], 0.0)),
+            motion: Course::still(Placement::level([x, y, 0.0], 0.0)),
         };
         let bodies = [place(8.0, 6.0), place(-7.0, 5.0), place(3.0, -9.0)];
         // 30 m/s and 60 degrees a second.
-        let vehicle = Sweep {
+        let vehicle = Course {
             start: Placement::level([0.0, 0.0, 0.0], 0.0),
             end: Placement::level([1.5, 0.0, 0.0], 3f64.to_radians()),
         };
-        let sensor = lidar_motion(&vehicle);
+        let sensor = vehicle.mounted(LIDAR_MOUNT_M);
         let mut lidar = Lidar::default();
         let sweep = lidar.sweep(&sensor, &Plane(0.0), &bodies, Weather::Sunny, 3);
         let world_from_lidar = sensor.end.isometry();
@@ -217,18 +212,18 @@ mod tests {
 
     #[test]
     fn noise_and_losses_have_the_stated_shares() {
-        let shell = BodyShape::new(
-            vec![Part::Box(Bounds::centered(
+        let shell = SolidShape::new(
+            vec![Convex::Box(Bounds::centered(
                 [0.0, 0.0, 0.0],
                 [0.5, 200.0, 200.0],
             ))],
             0.5,
         );
-        let wall = |x: f64| Body {
+        let wall = |x: f64| RayBody {
             shape: &shell,
-            motion: Sweep::still(Placement::level([x, 0.0, 0.0], 0.0)),
+            motion: Course::still(Placement::level([x, 0.0, 0.0], 0.0)),
         };
-        let sensor = Sweep::still(Placement::level([0.0; 3], 0.0));
+        let sensor = Course::still(Placement::level([0.0; 3], 0.0));
         let mut lidar = Lidar::default();
         let near = [wall(20.5)];
         let sweep = lidar.sweep(&sensor, &Plane(-500.0), &near, Weather::Sunny, 1);
@@ -257,7 +252,7 @@ mod tests {
     #[test]
     fn the_same_seed_gives_the_same_points() {
         let mut lidar = Lidar::default();
-        let sensor = Sweep::still(Placement::level([0.0, 0.0, 1.95], 0.0));
+        let sensor = Course::still(Placement::level([0.0, 0.0, 1.95], 0.0));
         let once = lidar
             .sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 5)
             .points

@@ -84,16 +84,11 @@ impl SynthOptions {
             weather: Weather::Sunny,
             copies: Vec::new(),
             cameras: None,
-            frames: Self::default_frames(subset),
+            frames: if subset == Subset::V2vdet { 60 } else { 2000 },
             period_s: 0.1,
             force: false,
             threads: 1,
         }
-    }
-
-    /// Default number of frames of a scenario.
-    pub fn default_frames(subset: Subset) -> usize {
-        if subset == Subset::V2vdet { 60 } else { 2000 }
     }
 
     /// Size of the images as text.

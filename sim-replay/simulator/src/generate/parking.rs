@@ -37,15 +37,16 @@ pub(crate) fn park(map_model: &MapModel, lanes: &LaneIndex, seed: u64) -> Vec<Pa
         if !random.chance(occupancy) {
             continue;
         }
-        let Some(vehicle) = fitting(spot, &mut random) else {
+        let mut draws = (0..8).map(|_| Vehicle::random_parked(&mut random));
+        let Some(vehicle) = draws.find(|vehicle| {
+            vehicle.size_m[0] + 0.3 < spot.length_m && vehicle.size_m[1] < spot.width_m
+        }) else {
             continue;
         };
-        let placement = place(spot, &vehicle, &mut random);
-        let id = FIRST_ID + number as i64;
         let candidate = ParkedVehicle {
-            id,
+            id: FIRST_ID + number as i64,
+            placement: place(spot, &vehicle, &mut random),
             vehicle,
-            placement,
         };
         let rectangle = candidate.rectangle();
         let room = rectangle.grown(0.1);
@@ -57,12 +58,6 @@ pub(crate) fn park(map_model: &MapModel, lanes: &LaneIndex, seed: u64) -> Vec<Pa
         parked.push(candidate);
     }
     parked
-}
-
-fn fitting(spot: &ParkingSpot, random: &mut SplitMix64) -> Option<Vehicle> {
-    (0..8)
-        .map(|_| Vehicle::random_parked(random))
-        .find(|vehicle| vehicle.size_m[0] + 0.3 < spot.length_m && vehicle.size_m[1] < spot.width_m)
 }
 
 fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Placement {

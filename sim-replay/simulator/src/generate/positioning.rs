@@ -1,6 +1,6 @@
 //! GNSS and IMU of an agent, and the filter that estimates its pose from them.
 
-use super::raycast::{Placement, Sweep, wrapped};
+use super::raycast::{Course, Placement, wrapped};
 use super::traffic::STEP_S;
 use support::random::SplitMix64;
 
@@ -68,7 +68,7 @@ impl Positioning {
     }
 
     /// The next fix of a vehicle at the end of `motion`, one step of the traffic, and `elapsed_s` after the last fix.
-    pub(crate) fn fix(&mut self, motion: &Sweep, speed_mps: f64, elapsed_s: f64) -> Fix {
+    pub(crate) fn fix(&mut self, motion: &Course, speed_mps: f64, elapsed_s: f64) -> Fix {
         let truth = &motion.end;
         let planar_m = LATITUDE_DEG * METRES_PER_DEG;
         let deviations = [planar_m, planar_m, ALTITUDE_M];
@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     /// Last step before a time of a drive at 10 m/s, 60 m from the origin.
-    fn on_a_circle(time_s: f64) -> Sweep {
+    fn on_a_circle(time_s: f64) -> Course {
         let at = |time_s: f64| {
             let angle = time_s * 10.0 / 60.0;
             Placement::level(
@@ -127,7 +127,7 @@ mod tests {
                 wrapped(angle),
             )
         };
-        Sweep {
+        Course {
             start: at(time_s - STEP_S),
             end: at(time_s),
         }
@@ -197,7 +197,7 @@ mod tests {
     #[test]
     fn a_vehicle_that_stands_has_a_yaw_rate_of_noise_and_bias_alone() {
         let mut positioning = Positioning::new(9);
-        let still = Sweep::still(Placement::level([5.0, 6.0, 0.0], 3.0));
+        let still = Course::still(Placement::level([5.0, 6.0, 0.0], 3.0));
         let rates = (0..50).map(|_| {
             positioning
                 .fix(&still, 0.0, 0.1)

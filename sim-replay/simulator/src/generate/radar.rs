@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 
-use super::raycast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
+use super::raycast::{Caster, Course, GROUND, MISS, RayBody, RayPattern, Surface};
 use support::random::SplitMix64;
 
 /// Radial velocities between plus and minus this fill the red channel, metres per second.
@@ -58,19 +58,19 @@ impl Radar {
     )]
     pub fn returns(
         &mut self,
-        vehicle: &Sweep,
+        vehicle: &Course,
         half_length_m: f64,
         reference_m: [f64; 3],
         sweep_s: f64,
         ground: &dyn Surface,
-        bodies: &[Body<'_>],
+        bodies: &[RayBody<'_>],
         seed: u64,
     ) -> &[[f32; 4]] {
         let mount_m = [half_length_m + 0.05, 0.0, HEIGHT_M];
         let moved = vehicle.mounted(mount_m);
         // Of the mount and not of the vehicle's centre: a turn moves the front sideways.
         let own_velocity = (moved.end.position_m - moved.start.position_m) / sweep_s;
-        let sensor = Sweep::still(moved.end);
+        let sensor = Course::still(moved.end);
         self.caster.cast(&sensor, ground, bodies);
         self.points.clear();
         let mut random = SplitMix64::new(seed);
@@ -108,7 +108,7 @@ impl Radar {
     }
 }
 
-fn velocity_mps(motion: &Sweep, sweep_s: f64) -> Vector3<f64> {
+fn velocity_mps(motion: &Course, sweep_s: f64) -> Vector3<f64> {
     (motion.end.position_m - motion.start.position_m) / sweep_s
 }
 
@@ -125,31 +125,31 @@ pub fn red_to_velocity(red: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::generate::raycast::{BodyShape, Bounds, Part, Placement, Plane};
+    use crate::generate::raycast::{Bounds, Convex, Placement, Plane, SolidShape};
 
     #[test]
     fn velocities_are_relative_and_along_the_ray() {
-        let block = BodyShape::new(
-            vec![Part::Box(Bounds::centered(
+        let block = SolidShape::new(
+            vec![Convex::Box(Bounds::centered(
                 [0.0, 0.0, 1.0],
                 [1.0, 1.0, 1.0],
             ))],
             0.5,
         );
-        let drive = |from: [f64; 3], to: [f64; 3]| Sweep {
+        let drive = |from: [f64; 3], to: [f64; 3]| Course {
             start: Placement::level(from, 0.0),
             end: Placement::level(to, 0.0),
         };
         let own = drive([-0.5, 0.0, 0.0], [0.0, 0.0, 0.0]);
         // One comes towards us at 5 m/s, one stands beside the road.
         let bodies = [
-            Body {
+            RayBody {
                 shape: &block,
                 motion: drive([40.25, 0.0, 0.0], [40.0, 0.0, 0.0]),
             },
-            Body {
+            RayBody {
                 shape: &block,
-                motion: Sweep::still(Placement::level([20.0, 20.0, 0.0], 0.0)),
+                motion: Course::still(Placement::level([20.0, 20.0, 0.0], 0.0)),
             },
         ];
         let mut radar = Radar::default();

@@ -2,7 +2,7 @@
 
 use super::error::SynthError;
 use super::parking::{ParkedVehicle, park};
-use super::raycast::{Placement, Sweep};
+use super::raycast::{Course, Placement};
 use super::traffic::{Rectangle, STEP_S, Traffic, TrafficOptions};
 use super::vehicle::Vehicle;
 use super::world::World;
@@ -37,7 +37,7 @@ pub(crate) struct SceneSpec {
 
 /// One scene.
 #[derive(Debug)]
-pub(crate) struct Recording {
+pub(crate) struct SceneRecording {
     /// Moving vehicles, by index.
     pub(crate) vehicles: Vec<Vehicle>,
     pub(crate) parked: Vec<ParkedVehicle>,
@@ -60,7 +60,7 @@ pub(crate) struct RecordedFrame {
 pub(crate) struct Moving {
     pub(crate) vehicle: usize,
     pub(crate) id: i64,
-    pub(crate) motion: Sweep,
+    pub(crate) motion: Course,
     pub(crate) speed_mps: f64,
 }
 
@@ -73,15 +73,13 @@ impl RecordedFrame {
     }
 }
 
-/// Quality, vehicles, frames and agents of one attempt.
-type Attempt = (f64, Vec<Vehicle>, Vec<RecordedFrame>, Vec<usize>);
-
 /// Simulates a scene; tries others of the same seed if too few vehicles stay near the ego.
-pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
+pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<SceneRecording, SynthError> {
     // Labels of the streams: 1 parked vehicles, 2 traffic, 3 choice of agents, and 4 positioning in `scenes`.
     let seed = derive_seed(spec.seed, &[1]);
     let parked = park(world.map_model, &world.lane_index, seed);
-    let mut best: Option<Attempt> = None;
+    // Quality, vehicles, frames and agents of the best attempt.
+    let mut best: Option<(f64, Vec<Vehicle>, _, _)> = None;
     for attempt in 0..ATTEMPTS {
         let seed = derive_seed(spec.seed, &[2, attempt]);
         let (vehicles, frames) = simulate(world, spec, &parked, seed)?;
@@ -111,7 +109,7 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, S
             range_m: COMM_RANGE_M,
         });
     }
-    Ok(Recording {
+    Ok(SceneRecording {
         vehicles,
         parked,
         frames,
@@ -236,7 +234,7 @@ mod tests {
     #[test]
     fn a_stand_is_as_long_as_the_place_is_the_same() {
         let frame = |tick: u64, x_m: f64| {
-            let motion = Sweep::still(Placement::level([x_m, 0.0, 0.0], 0.0));
+            let motion = Course::still(Placement::level([x_m, 0.0, 0.0], 0.0));
             RecordedFrame {
                 tick,
                 moving: vec![Moving {

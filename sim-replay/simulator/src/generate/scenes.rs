@@ -16,8 +16,8 @@ use super::layout::{
 };
 use super::options::{Subset, SynthOptions};
 use super::positioning::Positioning;
-use super::recording::{Recording, SceneSpec, record};
-use super::sensing::{Agent, Bench, STEP_NANOS, Scene, capture_nanos};
+use super::recording::{SceneRecording, SceneSpec, record};
+use super::sensing::{Bench, STEP_NANOS, SensingAgent, SynthScene, capture_nanos};
 use super::world::World;
 use crate::generate::Result;
 use crate::map::{self, Finding, MapModel, RoadMapSource};
@@ -73,7 +73,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
         // Numbers alternate between the maps. All scenes of one map go together, so that it is built once.
         for number in (place..options.scenes).step_by(places) {
             let before = total.scenarios as u64 * 1000;
-            let scene = Scene {
+            let scene = SynthScene {
                 options,
                 world: &world,
                 spec: spec(options, &map_model, number),
@@ -127,7 +127,7 @@ pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<()> {
     Ok(())
 }
 
-impl Scene<'_, '_> {
+impl SynthScene<'_, '_> {
     fn write(
         &self,
         writer: &mut dyn SceneWriter,
@@ -143,7 +143,7 @@ impl Scene<'_, '_> {
         Ok(summary)
     }
 
-    fn header(&self, recording: &Recording, agents: &[Agent]) -> SceneHeader {
+    fn header(&self, recording: &SceneRecording, agents: &[SensingAgent]) -> SceneHeader {
         let agents = agents.iter().map(|agent| SceneAgent {
             id: agent.cav.clone(),
             is_roadside: false,
@@ -157,7 +157,7 @@ impl Scene<'_, '_> {
         }
     }
 
-    fn agents(&self, recording: &Recording) -> Result<Vec<Agent>> {
+    fn agents(&self, recording: &SceneRecording) -> Result<Vec<SensingAgent>> {
         let mut agents = Vec::new();
         for &vehicle in &recording.agents {
             // Agents are chosen among those that are present from the first frame to the last.
@@ -173,7 +173,7 @@ impl Scene<'_, '_> {
                 layout: self.options.layout.name(),
                 reason: error.to_string(),
             })?;
-            agents.push(Agent {
+            agents.push(SensingAgent {
                 vehicle,
                 id,
                 cav,
@@ -187,8 +187,8 @@ impl Scene<'_, '_> {
     /// and their order change nothing.
     fn write_moments(
         &self,
-        recording: &Recording,
-        agents: &[Agent],
+        recording: &SceneRecording,
+        agents: &[SensingAgent],
         (writer, omitted): (&dyn SceneWriter, &Omissions),
         progress: &(dyn Fn(u64) + Sync),
     ) -> Result<Summary> {

@@ -5,12 +5,12 @@ use protocol::{Camera, CavId, Handedness, PointCloud, Pose};
 
 use super::camera::{self, CameraRig, GroundPaint, ImageSize, Surroundings};
 use super::layout::{AgentFrame, BoxAnchor, Moment, SceneLayout, Simulated, SweepVariant};
-use super::lidar::{LIDAR_MOUNT_M, Lidar, lidar_motion};
+use super::lidar::{LIDAR_MOUNT_M, Lidar};
 use super::options::SynthOptions;
 use super::positioning::Fix;
 use super::radar::{Radar, velocity_to_red};
-use super::raycast::{Body, Placement, Sweep};
-use super::recording::{Moving, RecordedFrame, Recording, SceneSpec};
+use super::raycast::{Course, Placement, RayBody};
+use super::recording::{Moving, RecordedFrame, SceneRecording, SceneSpec};
 use super::traffic::STEP_S;
 use super::vehicle::{Vehicle, VehicleKind};
 use super::world::World;
@@ -32,14 +32,14 @@ struct Annotation<'a> {
 }
 
 /// One scenario to be written.
-pub(super) struct Scene<'a, 't> {
+pub(super) struct SynthScene<'a, 't> {
     pub(super) options: &'a SynthOptions,
     pub(super) world: &'a World<'t>,
     pub(super) spec: SceneSpec,
 }
 
 /// One agent over the whole scene.
-pub(super) struct Agent {
+pub(super) struct SensingAgent {
     /// Index among the recording's vehicles.
     pub(super) vehicle: usize,
     pub(super) id: i64,
@@ -72,12 +72,12 @@ impl<'w> Bench<'w> {
     }
 }
 
-impl Scene<'_, '_> {
+impl SynthScene<'_, '_> {
     /// The frames of all agents at a capture time.
     pub(super) fn moment(
         &self,
-        recording: &Recording,
-        agents: &[Agent],
+        recording: &SceneRecording,
+        agents: &[SensingAgent],
         index: usize,
         bench: &mut Bench<'_>,
     ) -> Moment {
@@ -93,8 +93,8 @@ impl Scene<'_, '_> {
 
     fn agent_frame(
         &self,
-        recording: &Recording,
-        (place, agent): (usize, &Agent),
+        recording: &SceneRecording,
+        (place, agent): (usize, &SensingAgent),
         (index, own): (usize, &Moving),
         bench: &mut Bench<'_>,
     ) -> AgentFrame {
@@ -144,12 +144,12 @@ impl Scene<'_, '_> {
 
     fn lidar_sweeps(
         &self,
-        vehicle: &Sweep,
-        bodies: &[Body<'_>],
+        vehicle: &Course,
+        bodies: &[RayBody<'_>],
         bench: &mut Bench<'_>,
         noise: &dyn Fn(u64) -> u64,
     ) -> (PointCloud, Vec<SweepVariant>, Vec<u32>) {
-        let sensor = lidar_motion(vehicle);
+        let sensor = vehicle.mounted(LIDAR_MOUNT_M);
         let (ground, weather) = (&*self.world.ground, self.options.weather);
         let sweep = bench
             .lidar
@@ -173,7 +173,7 @@ impl Scene<'_, '_> {
     fn images(
         &self,
         vehicle: &Placement,
-        bodies: &[Body<'_>],
+        bodies: &[RayBody<'_>],
         seen: &[Annotation<'_>],
         bench: &mut Bench<'_>,
         noise: u64,
@@ -203,9 +203,9 @@ impl Scene<'_, '_> {
     /// The radar's points; the fourth value is the radial velocity as stored in the red channel.
     fn radar_points(
         &self,
-        vehicle: &Sweep,
+        vehicle: &Course,
         half_length_m: f64,
-        bodies: &[Body<'_>],
+        bodies: &[RayBody<'_>],
         bench: &mut Bench<'_>,
         noise: u64,
     ) -> PointCloud {
@@ -265,10 +265,10 @@ fn class(kind: VehicleKind) -> ObjectClass {
 
 /// All vehicles within sensor range except the sensor's own, as bodies and as annotations.
 fn vehicles_around<'a>(
-    recording: &'a Recording,
+    recording: &'a SceneRecording,
     frame: &'a RecordedFrame,
     own: usize,
-) -> (Vec<Body<'a>>, Vec<Annotation<'a>>) {
+) -> (Vec<RayBody<'a>>, Vec<Annotation<'a>>) {
     let here = frame.of(own).map(|moving| moving.motion.end.position_m);
     let here = here.unwrap_or_default();
     let moving = frame.moving.iter();
@@ -278,7 +278,7 @@ fn vehicles_around<'a>(
         (vehicle, moving.motion, moving.id, moving.speed_mps)
     });
     let parked = recording.parked.iter().map(|parked| {
-        let motion = Sweep::still(parked.placement);
+        let motion = Course::still(parked.placement);
         (&parked.vehicle, motion, parked.id, 0.0)
     });
     // Positions are centres: the margin covers half of the longest vehicle.
@@ -293,7 +293,7 @@ fn vehicles_around<'a>(
             speed_mps,
         };
         let shape = &vehicle.shape;
-        (Body { shape, motion }, annotation)
+        (RayBody { shape, motion }, annotation)
     });
     all.unzip()
 }

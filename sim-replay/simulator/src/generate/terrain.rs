@@ -5,7 +5,7 @@
 
 use nalgebra::Vector3;
 
-use super::raycast::{BodyShape, Bounds, GROUND, Part, Surface, SurfaceRays};
+use super::raycast::{Bounds, Convex, GROUND, SolidShape, Surface, SurfaceRays};
 use crate::map::{HeightGrid, Triangle};
 
 /// Length of the pieces of the strip under a column, metres.
@@ -204,7 +204,7 @@ impl Surface for TerrainSurface {
         let origin = [rays.origin.x - x, rays.origin.y - y].map(|metres| metres / cell_m);
         // The ground is cast before all bodies, so the depths still are the range of the sensor.
         let range_m = depth.iter().copied().fold(0.0, f32::max);
-        let mut strip = Strip::new(self, rays, origin, f64::from(range_m));
+        let mut strip = GroundStrip::new(self, rays, origin, f64::from(range_m));
         for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
             let direction: Vector3<f64> = (rays.forward * *cos + rays.up * *sin).cast();
             let slope = [direction.x / cell_m, direction.y / cell_m];
@@ -225,7 +225,7 @@ impl Surface for TerrainSurface {
 }
 
 /// The ground under a column, up to the distance at which its lower rays are known to be clear.
-struct Strip<'a> {
+struct GroundStrip<'a> {
     surface: &'a TerrainSurface,
     origin: [f64; 2],
     /// Cells for each metre along the strip.
@@ -238,7 +238,7 @@ struct Strip<'a> {
     is_narrow: bool,
 }
 
-impl<'a> Strip<'a> {
+impl<'a> GroundStrip<'a> {
     fn new(
         surface: &'a TerrainSurface,
         rays: &SurfaceRays<'_>,
@@ -295,7 +295,7 @@ impl<'a> Strip<'a> {
 /// A piece of road above the terrain as a thin slab below its triangle, and its centre in the world, metres.
 ///
 /// Returns nothing for a triangle without extent.
-pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
+pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(SolidShape, [f64; 3])> {
     let center: [f64; 3] =
         std::array::from_fn(|axis| triangle.iter().map(|corner| corner[axis]).sum::<f64>() / 3.0);
     let local = triangle.map(|corner| Vector3::from(corner) - Vector3::from(center));
@@ -320,7 +320,7 @@ pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
     let mut bounds = a.union(&b).union(&c);
     // Below a steep face the slab reaches a little deeper than its thickness.
     bounds.min_m[2] -= DECK_M / (normal.z as f32).max(0.2);
-    let shape = BodyShape::new(vec![Part::Hull { planes, bounds }], 0.25);
+    let shape = SolidShape::new(vec![Convex::Hull { planes, bounds }], 0.25);
     Some((shape, center))
 }
 
@@ -332,7 +332,7 @@ fn plane(normal: &Vector3<f64>, point: &Vector3<f64>) -> [f32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::generate::raycast::{Body, Caster, Placement, Plane, RayPattern, Sweep};
+    use crate::generate::raycast::{Caster, Course, Placement, Plane, RayBody, RayPattern};
     use support::random::SplitMix64;
 
     fn hills(seed: u64) -> HeightGrid {
@@ -461,9 +461,9 @@ mod tests {
         let shapes = square.map(|triangle| deck_shape(&triangle).unwrap());
         let bodies = [0, 1].map(|index: usize| {
             let (shape, center) = &shapes[index];
-            Body {
+            RayBody {
                 shape,
-                motion: Sweep::still(Placement::level(*center, 0.0)),
+                motion: Course::still(Placement::level(*center, 0.0)),
             }
         });
         let pattern = RayPattern {
@@ -478,7 +478,7 @@ mod tests {
         };
         let mut caster = Caster::new(pattern.clone());
         for (height, deck_z) in [(9.0, 5.0), (2.0, 5.0 - f64::from(DECK_M))] {
-            let sensor = Sweep::still(Placement::level([0.0, 0.0, height], 0.0));
+            let sensor = Course::still(Placement::level([0.0, 0.0, height], 0.0));
             let image = caster.cast(&sensor, &Plane(-50.0), &bodies);
             for channel in 0..31 {
                 let elevation = f64::from(pattern.elevation_rad(channel));

@@ -2,7 +2,7 @@
 
 use std::f32::consts::PI;
 
-use super::raycast::{BodyShape, Bounds, Part};
+use super::raycast::{Bounds, Convex, SolidShape};
 use support::random::SplitMix64;
 
 /// Kinds of road vehicles.
@@ -34,48 +34,31 @@ pub struct Vehicle {
     /// Full length, width and height of the tight outer box, metres.
     pub size_m: [f64; 3],
     /// Its form.
-    pub shape: BodyShape,
+    pub shape: SolidShape,
 }
 
 /// Mean sizes of a kind, the largest deviation of an instance (share), and the frequencies of driving and parking.
-struct Stock {
-    kind: VehicleKind,
-    size_m: [f64; 3],
-    spread: [f64; 3],
-    driving: f64,
-    parked: f64,
-}
+struct Stock(VehicleKind, [f64; 3], [f64; 3], [f64; 2]);
 
 /// Sizes after the vehicles of CARLA. All stay under 2.9 m, so that a box stands within -3..1 m of a LiDAR at 1.95 m.
 /// Trucks and buses are rare: the clean-up of detections in OpenCOOD's protocol drops boxes longer than 6 m.
 const STOCK: [Stock; 7] = {
     use VehicleKind::{Bus, Hatchback, Pickup, Sedan, Suv, Truck, Van};
     [
-        stock(Sedan, [4.65, 1.95, 1.48], [0.07, 0.05, 0.04], [0.36, 0.38]),
-        stock(
+        Stock(Sedan, [4.65, 1.95, 1.48], [0.07, 0.05, 0.04], [0.36, 0.38]),
+        Stock(
             Hatchback,
             [3.95, 1.85, 1.52],
             [0.08, 0.05, 0.04],
             [0.21, 0.26],
         ),
-        stock(Suv, [4.65, 2.05, 1.75], [0.07, 0.04, 0.06], [0.25, 0.24]),
-        stock(Pickup, [5.30, 2.05, 1.88], [0.05, 0.04, 0.04], [0.05; 2]),
-        stock(Van, [5.15, 2.05, 2.15], [0.08, 0.04, 0.12], [0.085, 0.07]),
-        stock(Truck, [7.10, 2.40, 2.65], [0.12, 0.03, 0.05], [0.03, 0.0]),
-        stock(Bus, [10.2, 2.50, 2.82], [0.10, 0.02, 0.015], [0.015, 0.0]),
+        Stock(Suv, [4.65, 2.05, 1.75], [0.07, 0.04, 0.06], [0.25, 0.24]),
+        Stock(Pickup, [5.30, 2.05, 1.88], [0.05, 0.04, 0.04], [0.05; 2]),
+        Stock(Van, [5.15, 2.05, 2.15], [0.08, 0.04, 0.12], [0.085, 0.07]),
+        Stock(Truck, [7.10, 2.40, 2.65], [0.12, 0.03, 0.05], [0.03, 0.0]),
+        Stock(Bus, [10.2, 2.50, 2.82], [0.10, 0.02, 0.015], [0.015, 0.0]),
     ]
 };
-
-const fn stock(kind: VehicleKind, size_m: [f64; 3], spread: [f64; 3], shares: [f64; 2]) -> Stock {
-    let [driving, parked] = shares;
-    Stock {
-        kind,
-        size_m,
-        spread,
-        driving,
-        parked,
-    }
-}
 
 impl VehicleKind {
     /// True for cars with a low roof, on which a LiDAR is mounted.
@@ -87,19 +70,21 @@ impl VehicleKind {
 impl Vehicle {
     /// A random vehicle with the frequencies of moving traffic.
     pub fn random_driving(random: &mut SplitMix64) -> Self {
-        Self::random(random, |stock| stock.driving)
+        Self::random(random, |Stock(.., [driving, _])| *driving)
     }
 
     /// A random vehicle with the frequencies of parked vehicles.
     pub(crate) fn random_parked(random: &mut SplitMix64) -> Self {
-        Self::random(random, |stock| stock.parked)
+        Self::random(random, |Stock(.., [_, parked])| *parked)
     }
 
     /// A vehicle that may carry the sensors: one low enough for a LiDAR on its roof.
     pub(crate) fn random_connected(random: &mut SplitMix64) -> Self {
-        Self::random(random, |stock| match stock.kind.is_low() {
-            true => stock.driving,
-            false => 0.0,
+        Self::random(random, |Stock(kind, .., [driving, _])| {
+            match kind.is_low() {
+                true => *driving,
+                false => 0.0,
+            }
         })
     }
 
@@ -110,11 +95,11 @@ impl Vehicle {
             draw < 0.0
         });
         // Rounding may leave a rest after the last weight.
-        let stock = chosen.unwrap_or(&STOCK[0]);
+        let Stock(kind, size_m, spread, _) = chosen.unwrap_or(&STOCK[0]);
         let size_m = std::array::from_fn(|axis| {
-            stock.size_m[axis] * (1.0 + stock.spread[axis] * random.between(-1.0, 1.0))
+            size_m[axis] * (1.0 + spread[axis] * random.between(-1.0, 1.0))
         });
-        Self::new(stock.kind, size_m, random)
+        Self::new(*kind, size_m, random)
     }
 
     /// A vehicle of given outer sizes; proportions vary from one to the next.
@@ -122,89 +107,73 @@ impl Vehicle {
         let [length, width, height] = size_m.map(|size| size as f32);
         let mut vary =
             |value: f32, share: f32| value * (1.0 + share * random.between(-1.0, 1.0) as f32);
-        let form = Form {
+        let form = OuterBox {
             half: 0.5 * length,
             side: 0.5 * width,
             height,
         };
         let parts = match kind {
-            VehicleKind::Sedan => form.car(&Profile {
-                belt: vary(0.62, 0.04),
-                bonnet: vary(0.24, 0.1),
-                boot: vary(0.06, 0.2),
-                cabin: [vary(-0.42, 0.05), vary(0.19, 0.1)],
-                roof: [vary(-0.25, 0.1), vary(0.03, 0.3)],
-            }),
-            VehicleKind::Hatchback => form.car(&Profile {
-                belt: vary(0.61, 0.04),
-                bonnet: vary(0.2, 0.1),
-                boot: 0.02,
-                cabin: [-0.49, vary(0.25, 0.08)],
-                roof: [vary(-0.40, 0.06), vary(0.08, 0.2)],
-            }),
-            VehicleKind::Suv => form.car(&Profile {
-                belt: vary(0.60, 0.04),
-                bonnet: vary(0.18, 0.1),
-                boot: 0.02,
-                cabin: [-0.49, vary(0.22, 0.08)],
-                roof: [vary(-0.43, 0.04), vary(0.09, 0.2)],
-            }),
-            VehicleKind::Pickup => form.car(&Profile {
-                belt: vary(0.58, 0.04),
-                bonnet: vary(0.12, 0.2),
-                boot: 0.01,
-                cabin: [vary(-0.1, 0.2), vary(0.22, 0.06)],
-                roof: [vary(-0.06, 0.2), vary(0.13, 0.1)],
-            }),
-            VehicleKind::Van => form.car(&Profile {
-                belt: vary(0.52, 0.04),
-                bonnet: vary(0.1, 0.2),
-                boot: 0.01,
-                cabin: [-0.5, vary(0.38, 0.05)],
-                roof: [-0.48, vary(0.27, 0.06)],
-            }),
+            VehicleKind::Sedan => form.car(
+                vary(0.62, 0.04),
+                [vary(0.24, 0.1), vary(0.06, 0.2)],
+                [vary(-0.42, 0.05), vary(0.19, 0.1)],
+                [vary(-0.25, 0.1), vary(0.03, 0.3)],
+            ),
+            VehicleKind::Hatchback => form.car(
+                vary(0.61, 0.04),
+                [vary(0.2, 0.1), 0.02],
+                [-0.49, vary(0.25, 0.08)],
+                [vary(-0.40, 0.06), vary(0.08, 0.2)],
+            ),
+            VehicleKind::Suv => form.car(
+                vary(0.60, 0.04),
+                [vary(0.18, 0.1), 0.02],
+                [-0.49, vary(0.22, 0.08)],
+                [vary(-0.43, 0.04), vary(0.09, 0.2)],
+            ),
+            VehicleKind::Pickup => form.car(
+                vary(0.58, 0.04),
+                [vary(0.12, 0.2), 0.01],
+                [vary(-0.1, 0.2), vary(0.22, 0.06)],
+                [vary(-0.06, 0.2), vary(0.13, 0.1)],
+            ),
+            VehicleKind::Van => form.car(
+                vary(0.52, 0.04),
+                [vary(0.1, 0.2), 0.01],
+                [-0.5, vary(0.38, 0.05)],
+                [-0.48, vary(0.27, 0.06)],
+            ),
             VehicleKind::Truck => form.truck(vary(0.24, 0.1), vary(0.84, 0.06)),
             VehicleKind::Bus => form.bus(),
         };
         Self {
             kind,
             size_m,
-            shape: BodyShape::new(parts, vary(0.5, 0.5)),
+            shape: SolidShape::new(parts, vary(0.5, 0.5)),
         }
     }
 }
 
 /// Outer box of a vehicle, metres.
-struct Form {
+struct OuterBox {
     half: f32,
     side: f32,
     height: f32,
 }
 
-/// The outline of a car from the side, in shares of its height (belt) and length (all others).
-struct Profile {
-    /// Height of the lower edge of the windows.
-    belt: f32,
-    /// Drop of the bonnet towards the nose.
-    bonnet: f32,
-    /// Drop of the tail.
-    boot: f32,
-    /// Rear and front of the cabin at the belt.
-    cabin: [f32; 2],
-    /// Rear and front of the roof.
-    roof: [f32; 2],
-}
-
-impl Form {
-    fn car(&self, profile: &Profile) -> Vec<Part> {
+impl OuterBox {
+    /// By its outline from the side, in shares of the height (`belt`) and the length (all others): lower edge of the
+    /// windows, drops of the bonnet towards the nose and of the tail, rear and front of the cabin at the belt and of
+    /// the roof.
+    fn car(&self, belt: f32, drops: [f32; 2], cabin: [f32; 2], roof: [f32; 2]) -> Vec<Convex> {
         let Self { half, side, height } = *self;
         let length = 2.0 * half;
-        let (floor, bumper, belt) = (0.14 * height, 0.40 * height, profile.belt * height);
+        let (floor, bumper, belt) = (0.14 * height, 0.40 * height, belt * height);
         let below = [0.05 - half, half - 0.08, side - 0.07];
         let widest = [-half, half, side];
-        let [boot, bonnet] = [profile.boot, profile.bonnet].map(|share| share * length);
-        let [rear, front] = profile.cabin.map(|place| place * length);
-        let [roof_rear, roof_front] = profile.roof.map(|place| place * length);
+        let [bonnet, boot] = drops.map(|share| share * length);
+        let [rear, front] = cabin.map(|place| place * length);
+        let [roof_rear, roof_front] = roof.map(|place| place * length);
         let shoulder = [boot - half, half - bonnet, side - 0.05];
         let cabin = [rear, front, side - 0.07];
         let roof = [roof_rear, roof_front, side - 0.26];
@@ -218,7 +187,7 @@ impl Form {
     }
 
     /// `cab` is the share of the length before the cargo, `cab_height` of the height.
-    fn truck(&self, cab: f32, cab_height: f32) -> Vec<Part> {
+    fn truck(&self, cab: f32, cab_height: f32) -> Vec<Convex> {
         let Self { half, side, height } = *self;
         let length = 2.0 * half;
         let front = half - cab * length;
@@ -235,7 +204,7 @@ impl Form {
         parts
     }
 
-    fn bus(&self) -> Vec<Part> {
+    fn bus(&self) -> Vec<Convex> {
         let Self { half, side, height } = *self;
         let (below, widest) = ([-half, half, side - 0.03], [-half, half, side]);
         let roof = [0.1 - half, half - 0.25, side - 0.12];
@@ -247,7 +216,7 @@ impl Form {
         parts
     }
 
-    fn wheels(&self, radius: f32, front: f32, rear: f32) -> Vec<Part> {
+    fn wheels(&self, radius: f32, front: f32, rear: f32) -> Vec<Convex> {
         [(front, 1.0), (front, -1.0), (rear, 1.0), (rear, -1.0)]
             .map(|(x, side)| wheel([x, side * (self.side - 0.14), radius], radius, 0.12))
             .into()
@@ -259,7 +228,7 @@ fn frustum(
     [bottom, top]: [f32; 2],
     [rear0, front0, side0]: [f32; 3],
     [rear1, front1, side1]: [f32; 3],
-) -> Part {
+) -> Convex {
     let rise = top - bottom;
     // Faces through (at0, bottom) and (at1, top), with their normals towards growing `at`.
     // The rear is a front seen backwards: its `at` grows towards negative x.
@@ -281,11 +250,11 @@ fn frustum(
         min_m: [rear0.min(rear1), -side, bottom],
         max_m: [front0.max(front1), side, top],
     };
-    Part::Hull { planes, bounds }
+    Convex::Hull { planes, bounds }
 }
 
 /// An upright octagon that stands on the ground.
-fn wheel(center: [f32; 3], radius: f32, half_width: f32) -> Part {
+fn wheel(center: [f32; 3], radius: f32, half_width: f32) -> Convex {
     // Four faces are perpendicular to x or z, so the octagon reaches exactly to its bounds.
     let rim = (0..8).map(|face| {
         let (sin, cos) = (face as f32 * PI / 4.0).sin_cos();
@@ -295,7 +264,7 @@ fn wheel(center: [f32; 3], radius: f32, half_width: f32) -> Part {
         [0.0, 1.0, 0.0, center[1] + half_width],
         [0.0, -1.0, 0.0, half_width - center[1]],
     ];
-    Part::Hull {
+    Convex::Hull {
         planes: rim.chain(sides).collect(),
         bounds: Bounds::centered(center, [radius, half_width, radius]),
     }
@@ -315,11 +284,10 @@ mod tests {
     #[test]
     fn every_kind_occurs_and_fills_its_box() {
         let fleet = fleet();
-        for stock in &STOCK {
+        for Stock(kind, ..) in &STOCK {
             assert!(
-                fleet.iter().any(|vehicle| vehicle.kind == stock.kind),
-                "{:?}",
-                stock.kind
+                fleet.iter().any(|vehicle| vehicle.kind == *kind),
+                "{kind:?}"
             );
         }
         for vehicle in &fleet {
@@ -347,7 +315,7 @@ mod tests {
 
     #[test]
     fn a_frustum_is_bounded_by_its_rectangles() {
-        let Part::Hull { planes, .. } = frustum([0.5, 1.5], [-2.0, 2.0, 1.0], [-1.0, 0.5, 0.7])
+        let Convex::Hull { planes, .. } = frustum([0.5, 1.5], [-2.0, 2.0, 1.0], [-1.0, 0.5, 0.7])
         else {
             panic!("a frustum is a hull");
         };

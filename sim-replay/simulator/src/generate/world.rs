@@ -1,6 +1,6 @@
 //! Scene geometry for ray casting and driving.
 
-use super::raycast::{Body, BodyShape, Bounds, Part, Placement, Plane, Surface, Sweep};
+use super::raycast::{Bounds, Convex, Course, Placement, Plane, RayBody, SolidShape, Surface};
 use super::terrain::{TerrainSurface, deck_shape};
 use super::traffic::Roads;
 use crate::map::{LaneIndex, MapModel, Shape, Solid, Terrain};
@@ -11,12 +11,12 @@ pub(crate) struct World<'t> {
     pub(crate) roads: Roads<'t>,
     pub(crate) lane_index: LaneIndex,
     pub(crate) ground: Box<dyn Surface + Send + Sync>,
-    standing: Vec<Standing>,
+    standing: Vec<StaticObject>,
 }
 
 /// A static object.
-struct Standing {
-    shape: BodyShape,
+struct StaticObject {
+    shape: SolidShape,
     placement: Placement,
     /// Radius of the circle around it, seen from above, metres.
     radius_m: f64,
@@ -29,9 +29,9 @@ impl<'t> World<'t> {
         let decks = decks.map(|(shape, center_m)| (shape, Placement::level(center_m, 0.0)));
         let solids = map_model.solids.iter().map(|solid| {
             let placement = Placement::level(solid.center_m, solid.yaw_rad);
-            (BodyShape::from(solid), placement)
+            (SolidShape::from(solid), placement)
         });
-        let standing = solids.chain(decks).map(|(shape, placement)| Standing {
+        let standing = solids.chain(decks).map(|(shape, placement)| StaticObject {
             radius_m: shape.bounds.radius_m(),
             shape,
             placement,
@@ -50,15 +50,15 @@ impl<'t> World<'t> {
         &self,
         [x_m, y_m]: [f64; 2],
         radius_m: f64,
-    ) -> impl Iterator<Item = Body<'_>> {
+    ) -> impl Iterator<Item = RayBody<'_>> {
         self.standing.iter().filter_map(move |standing| {
             let position = standing.placement.position_m;
             let (dx, dy) = (position.x - x_m, position.y - y_m);
             let reach = radius_m + standing.radius_m;
             let is_near = dx * dx + dy * dy < reach * reach;
-            is_near.then(|| Body {
+            is_near.then(|| RayBody {
                 shape: &standing.shape,
-                motion: Sweep::still(standing.placement),
+                motion: Course::still(standing.placement),
             })
         })
     }
@@ -72,21 +72,21 @@ pub fn ground_surface(map_model: &MapModel) -> Box<dyn Surface + Send + Sync> {
     }
 }
 
-impl From<&Solid> for BodyShape {
+impl From<&Solid> for SolidShape {
     fn from(solid: &Solid) -> Self {
         let part = match solid.shape {
             Shape::Box { half_m } => {
-                Part::Box(Bounds::centered([0.0; 3], half_m.map(|half| half as f32)))
+                Convex::Box(Bounds::centered([0.0; 3], half_m.map(|half| half as f32)))
             }
             Shape::Cylinder {
                 radius_m,
                 half_height_m,
-            } => Part::Cylinder {
+            } => Convex::Cylinder {
                 center_m: [0.0; 3],
                 radius_m: radius_m as f32,
                 half_height_m: half_height_m as f32,
             },
-            Shape::Ellipsoid { radii_m } => Part::Ellipsoid {
+            Shape::Ellipsoid { radii_m } => Convex::Ellipsoid {
                 center_m: [0.0; 3],
                 radii_m: radii_m.map(|radius| radius as f32),
             },

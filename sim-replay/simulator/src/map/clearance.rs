@@ -1,6 +1,6 @@
 //! Clearance check: finds solids that reach into the space of a lane.
 
-use super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
+use super::convex::{CellIndex, PlanRectangle, Quad, bounds, overlap};
 use super::curve::Pose2;
 use super::{LaneId, MapModel, Shape, Solid};
 
@@ -12,17 +12,13 @@ const SURFACE_M: f64 = 0.02;
 const CELL_M: f64 = 10.0;
 
 /// Outline of a solid seen from above.
-pub(crate) fn outline(solid: &Solid) -> Rectangle {
+pub(crate) fn outline(solid: &Solid) -> PlanRectangle {
     let half_m = solid.shape.half_footprint_m();
     // A round outline needs no turning.
     let is_round = matches!(solid.shape, Shape::Cylinder { .. });
     let [x, y, _] = solid.center_m;
     let yaw_rad = if is_round { 0.0 } else { solid.yaw_rad };
-    Rectangle {
-        center_m: [x, y],
-        half_m,
-        yaw_rad,
-    }
+    PlanRectangle::around(Pose2::new(x, y, yaw_rad), half_m)
 }
 
 impl MapModel {
@@ -48,7 +44,7 @@ impl MapModel {
                 // Two centimetres of tolerance at the edges: lanes are sampled.
                 let half_m = [dx.hypot(dy) / 2.0, (width / 2.0 - 0.02).max(0.01)];
                 let middle = Pose2::new(x, y, dy.atan2(dx));
-                let piece = Rectangle::around(middle, half_m).corners();
+                let piece = PlanRectangle::around(middle, half_m).corners();
                 index.any(bounds(piece), |number| {
                     let solid = &self.solids[number as usize];
                     let clear = solid.bottom_m() > from[2] + LANE_HEADROOM_M

@@ -6,18 +6,18 @@
 //! `a` is the root of the lateral offset at t = 1, found by Newton's method (Bertolazzi and Frego, "G1 fitting with
 //! clothoids", 2015).
 
-use super::curve::{Curve, CurveShape, Pose2};
+use super::curve::{CurveShape, PlanCurve, Pose2};
 use super::lane::wrap_angle;
 
 /// The clothoid from `from` to `to`, beginning `s_m` along its road; a line or an arc where one fits.
 ///
 /// Meant for turns of at most about 120 degrees against the chord at either end; beyond that the curve may loop.
-pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
+pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> PlanCurve {
     let distance = from.distance_m(&to);
     let chord = (to.y - from.y).atan2(to.x - from.x);
     let [phi0, phi1] = [from, to].map(|pose| wrap_angle(pose.heading_rad - chord));
     if phi0.abs() < 1e-9 && phi1.abs() < 1e-9 {
-        return Curve::new(s_m, from, distance, CurveShape::Line);
+        return PlanCurve::new(s_m, from, distance, CurveShape::Line);
     }
     let delta = phi1 - phi0;
     // The root for small angles, where sin x = x.
@@ -38,7 +38,7 @@ pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
     } else {
         CurveShape::Spiral { start, end }
     };
-    Curve::new(s_m, from, length_m, shape)
+    PlanCurve::new(s_m, from, length_m, shape)
 }
 
 /// Integrals over 0..1 of sin(heading), of its derivative by `a`, and of cos(heading); composite Simpson.

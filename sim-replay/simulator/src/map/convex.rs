@@ -7,13 +7,13 @@ pub(crate) type Quad = [[f64; 2]; 4];
 
 /// A rectangle seen from above.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Rectangle {
+pub(crate) struct PlanRectangle {
     pub center_m: [f64; 2],
     pub half_m: [f64; 2],
     pub yaw_rad: f64,
 }
 
-impl Rectangle {
+impl PlanRectangle {
     /// The rectangle in the middle of which a pose lies, along its heading.
     pub(crate) fn around(pose: Pose2, half_m: [f64; 2]) -> Self {
         Self {
@@ -34,24 +34,15 @@ impl Rectangle {
 
     /// The same rectangle, larger by `margin_m` on every side.
     pub(crate) fn grown(&self, margin_m: f64) -> Self {
-        Self {
-            half_m: self.half_m.map(|half| half + margin_m),
-            ..*self
-        }
-    }
-
-    /// The position `u` along and `v` across, from the centre.
-    pub(crate) fn at(&self, u: f64, v: f64) -> [f64; 2] {
-        let (sin, cos) = self.yaw_rad.sin_cos();
-        [
-            self.center_m[0] + u * cos - v * sin,
-            self.center_m[1] + u * sin + v * cos,
-        ]
+        let half_m = self.half_m.map(|half| half + margin_m);
+        Self { half_m, ..*self }
     }
 
     pub(crate) fn corners(&self) -> Quad {
-        let [x, y] = self.half_m;
-        [[-x, -y], [x, -y], [x, y], [-x, y]].map(|[u, v]| self.at(u, v))
+        let (sin, cos) = self.yaw_rad.sin_cos();
+        let ([x, y], [u, v]) = (self.center_m, self.half_m);
+        [[-u, -v], [u, -v], [u, v], [-u, v]]
+            .map(|[u, v]| [x + u * cos - v * sin, y + u * sin + v * cos])
     }
 }
 
@@ -153,7 +144,7 @@ mod tests {
     #[test]
     fn turned_squares_overlap_only_when_they_do() {
         let square = |x: f64, yaw_rad| {
-            Rectangle {
+            PlanRectangle {
                 center_m: [x, 0.0],
                 half_m: [1.0, 1.0],
                 yaw_rad,

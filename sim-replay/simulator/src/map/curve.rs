@@ -56,7 +56,7 @@ pub enum CurveShape {
 
 /// One element of a reference line.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Curve {
+pub struct PlanCurve {
     /// Distance of its start along the road, metres.
     pub s_m: f64,
     /// Place and heading of its start.
@@ -94,7 +94,7 @@ impl Pose2 {
     }
 }
 
-impl Curve {
+impl PlanCurve {
     /// A curve from its place along the road, its start and its shape.
     pub(crate) fn new(s_m: f64, start: Pose2, length_m: f64, shape: CurveShape) -> Self {
         Self {
@@ -186,8 +186,8 @@ mod tests {
 
     use super::*;
 
-    fn curve(shape: CurveShape, length_m: f64) -> Curve {
-        Curve {
+    fn curve(shape: CurveShape, length_m: f64) -> PlanCurve {
+        PlanCurve {
             s_m: 0.0,
             start: Pose2::new(0.0, 0.0, 0.0),
             length_m,
@@ -246,7 +246,7 @@ mod tests {
             CurveShape::Poly3([0.0, 0.0, 0.01, -0.0001]),
         ];
         for shape in shapes {
-            let curve = Curve {
+            let curve = PlanCurve {
                 s_m: 0.0,
                 start: Pose2::new(5.0, -3.0, 2.0),
                 length_m: 40.0,

@@ -43,10 +43,8 @@ pub struct HeightGrid {
 impl Ground {
     /// Level ground without decks.
     pub fn plane(z_m: f64) -> Self {
-        Self {
-            terrain: Terrain::Plane { z_m },
-            decks: Vec::new(),
-        }
+        let (terrain, decks) = (Terrain::Plane { z_m }, Vec::new());
+        Self { terrain, decks }
     }
 
     /// Height of the terrain (not of decks) at `x`, `y`, metres.

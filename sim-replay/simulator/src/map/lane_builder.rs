@@ -3,7 +3,7 @@
 use super::conflicts;
 use super::lane::{JunctionId, Lane, LaneGraph, LaneId, Turn, wrap_angle};
 use super::lane_links::{LinkCounts, Linker};
-use super::lane_table::{LaneTable, Origin};
+use super::lane_table::{LaneOrigin, LaneTable};
 use super::road::{LaneKind, Road, RoadNetwork};
 
 /// Distance between the points taken from the curves before they are spread evenly, metres.
@@ -25,7 +25,7 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
         for section in 0..road.sections.len() {
             let mut ids = Vec::new();
             for lane_id in road.sections[section].lane_ids() {
-                let origin = Origin {
+                let origin = LaneOrigin {
                     road: road_index,
                     section,
                     lane: lane_id,
@@ -53,7 +53,7 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
     (graph, counts)
 }
 
-fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
+fn build_lane(road: &Road, origin: LaneOrigin, id: LaneId) -> Option<Lane> {
     let section = &road.sections[origin.section];
     let source = section.lane(origin.lane)?;
     if source.kind != LaneKind::Driving {
@@ -87,7 +87,7 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
 
 /// The middle of a lane in driving direction, with widths, slopes across and length; `None` for a lane of no or of
 /// absurd length.
-fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<Lane> {
+fn center_line(road: &Road, origin: LaneOrigin, from: f64, to: f64) -> Option<Lane> {
     let along = road.leads_along(origin.section, origin.lane);
     let fine = ((to - from) / FINE_STEP_M).ceil().max(1.0) as usize;
     let mut samples: Vec<([f64; 3], [f64; 2])> = (0..=fine)

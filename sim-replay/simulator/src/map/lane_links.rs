@@ -4,7 +4,7 @@ use std::fmt;
 
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
-use super::lane_table::{LaneTable, Origin};
+use super::lane_table::{LaneOrigin, LaneTable};
 use super::road::{Connection, Contact, RoadLink, RoadNetwork};
 
 /// A link whose lanes are farther apart than this is refused, metres.
@@ -30,7 +30,7 @@ pub struct LinkCounts {
 /// Sections and lanes of the roads that the lanes of a graph were made from.
 pub(super) struct Linker<'a> {
     pub(super) network: &'a RoadNetwork,
-    pub(super) origins: &'a [Origin],
+    pub(super) origins: &'a [LaneOrigin],
     pub(super) table: &'a LaneTable,
 }
 
@@ -100,7 +100,7 @@ impl Linker<'_> {
     }
 
     /// The lane of the same id in the road's next section, where neither is linked to any lane and both are one.
-    fn same_lane_on(&self, graph: &LaneGraph, origin: Origin) -> Option<LaneId> {
+    fn same_lane_on(&self, graph: &LaneGraph, origin: LaneOrigin) -> Option<LaneId> {
         let road = &self.network.roads[origin.road];
         let forward = road.leads_along(origin.section, origin.lane);
         let section = origin.next_section(forward)?;
@@ -118,7 +118,7 @@ impl Linker<'_> {
     }
 
     /// Lanes that the map's links name as continuing the lane of `origin`.
-    fn candidates(&self, origin: Origin) -> Vec<LaneId> {
+    fn candidates(&self, origin: LaneOrigin) -> Vec<LaneId> {
         let road = &self.network.roads[origin.road];
         let Some(lane) = road.sections[origin.section].lane(origin.lane) else {
             return Vec::new();
@@ -154,7 +154,7 @@ impl Linker<'_> {
     }
 
     /// Lanes that the connections of a junction name for the lane of `origin`, which leads into it at `end` of its road.
-    fn through_junction(&self, place: usize, origin: Origin, end: Contact) -> Vec<LaneId> {
+    fn through_junction(&self, place: usize, origin: LaneOrigin, end: Contact) -> Vec<LaneId> {
         let junction = &self.network.junctions[place];
         let mut lanes = Vec::new();
         let connections = junction.connections.iter();
@@ -188,7 +188,7 @@ impl Linker<'_> {
 }
 
 /// The lane onto which a connection without links leads: that of the same id.
-fn same_id(connection: &Connection, origin: Origin) -> Option<i32> {
+fn same_id(connection: &Connection, origin: LaneOrigin) -> Option<i32> {
     connection.lane_links.is_empty().then_some(origin.lane)
 }
 

@@ -30,10 +30,8 @@ impl LaneIndex {
     pub(crate) fn new(graph: &LaneGraph) -> Self {
         let points = graph.lanes.iter().flat_map(|lane| &lane.centerline);
         let extent_m = bounds(points.map(|&[x, y, _]| [x, y]));
-        let mut index = Self {
-            points: Vec::new(),
-            cells: CellIndex::new(extent_m, CELL_M),
-        };
+        let (points, cells) = (Vec::new(), CellIndex::new(extent_m, CELL_M));
+        let mut index = Self { points, cells };
         // By lane and point within a cell, so that ties are decided the same way each time.
         for lane in &graph.lanes {
             for (place, &[x, y, _]) in lane.centerline.iter().enumerate() {

@@ -35,13 +35,13 @@ impl LaneTable {
 
 /// Origin of a lane of the graph in the road network.
 #[derive(Clone, Copy)]
-pub(super) struct Origin {
+pub(super) struct LaneOrigin {
     pub(super) road: usize,
     pub(super) section: usize,
     pub(super) lane: i32,
 }
 
-impl Origin {
+impl LaneOrigin {
     /// The section that follows along the road, or against it.
     pub(super) fn next_section(self, forward: bool) -> Option<usize> {
         let step = if forward { 1 } else { -1 };

@@ -35,12 +35,12 @@ pub(crate) use ground::Triangle;
 pub use ground::{Ground, HeightGrid, Terrain};
 pub use lane::{JunctionId, Lane, LaneGraph, LaneId, Turn};
 pub(crate) use lane_queries::LaneIndex;
-use layout::Layout;
+use layout::RoadLayout;
 pub use opendrive::OpenDriveError;
 use road::RoadNetwork;
 pub use solid::{Shape, Solid, SolidKind};
 use std::path::{Path, PathBuf};
-use surface::Surface;
+use surface::RoadSurface;
 
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
@@ -116,7 +116,7 @@ pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, FileErro
             let Map { network, lanes } = read_map(path)?;
             check_extent(path, &network, &lanes)?;
             let islands = Vec::new();
-            Layout { network, islands }
+            RoadLayout { network, islands }
         }
     };
     Ok(place_roadside(source.name(), &layout, map_seed))
@@ -165,9 +165,9 @@ pub fn read_map(path: &Path) -> Result<Map, FileError> {
     Ok(Map { network, lanes })
 }
 
-fn place_roadside(name: String, layout: &Layout, map_seed: u64) -> MapModel {
+fn place_roadside(name: String, layout: &RoadLayout, map_seed: u64) -> MapModel {
     let (lanes, _) = lane_builder::lane_graph(&layout.network);
-    let surface = Surface::new(&layout.network);
+    let surface = RoadSurface::new(&layout.network);
     let ground = terrain::ground(&surface, map_seed);
     let (solids, parking) = roadside::place_roadside(layout, &surface, &ground, map_seed);
     MapModel {

@@ -12,9 +12,8 @@ pub struct Profile {
 impl Profile {
     /// The same value everywhere.
     pub fn constant(value: f64) -> Self {
-        Self {
-            records: vec![(0.0, [value, 0.0, 0.0, 0.0])],
-        }
+        let records = vec![(0.0, [value, 0.0, 0.0, 0.0])];
+        Self { records }
     }
 
     /// The cubic that leads from one value and slope to another over `length` from `start` on.
@@ -32,9 +31,8 @@ impl Profile {
 
     /// That cubic alone, from 0 on.
     pub(crate) fn between(length: f64, from: [f64; 2], to: [f64; 2]) -> Self {
-        Self {
-            records: vec![Self::hermite(0.0, length, from, to)],
-        }
+        let records = vec![Self::hermite(0.0, length, from, to)];
+        Self { records }
     }
 
     /// Value at `s`; the first cubic also holds before its start, and an empty profile is 0.

@@ -3,7 +3,7 @@
 //! Places along a road are `s` along its reference line, places across it `t`, positive to the left; both in metres.
 //! Lane ids count outwards from the reference line, positive to the left, negative to the right.
 
-use super::curve::{Curve, Pose2};
+use super::curve::{PlanCurve, Pose2};
 use super::finding::Finding;
 use super::lateral::LateralProfile;
 use super::profile::Profile;
@@ -40,7 +40,7 @@ pub struct Road {
     /// Link at its end.
     pub successor: Option<RoadLink>,
     /// Elements of the reference line, by rising `s`; at least one.
-    pub plan_view: Vec<Curve>,
+    pub plan_view: Vec<PlanCurve>,
     /// Height along the road.
     pub elevation: Profile,
     /// Superelevation, crossfall and shape.

@@ -1,6 +1,6 @@
 //! Road surfaces: quadrilaterals across every road, by use.
 
-use super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
+use super::convex::{CellIndex, PlanRectangle, Quad, bounds, overlap};
 use super::curve::Pose2;
 use super::road::{LaneKind, Road, RoadNetwork};
 
@@ -54,7 +54,7 @@ pub(crate) struct Patch {
 
 /// All roads' cross-sections and patches.
 #[derive(Debug, Clone)]
-pub(crate) struct Surface {
+pub(crate) struct RoadSurface {
     /// Cross-sections by road.
     pub roads: Vec<Vec<CrossSection>>,
     pub patches: Vec<Patch>,
@@ -140,7 +140,7 @@ pub(super) fn middle(a: [f64; 2], b: [f64; 2]) -> [f64; 2] {
     [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0]
 }
 
-impl Surface {
+impl RoadSurface {
     pub(crate) fn new(network: &RoadNetwork) -> Self {
         let roads: Vec<Vec<CrossSection>> = network.roads.iter().map(cross_sections).collect();
         let most_pieces = most_pieces(network);
@@ -192,9 +192,9 @@ impl Surface {
         }
     }
 
-    /// True if `test` is true for any patch that overlaps `rectangle`.
-    pub(crate) fn any(&self, rectangle: &Rectangle, mut test: impl FnMut(&Patch) -> bool) -> bool {
-        let corners = rectangle.corners();
+    /// True if `test` is true for any patch that overlaps `area`.
+    pub(crate) fn any(&self, area: &PlanRectangle, mut test: impl FnMut(&Patch) -> bool) -> bool {
+        let corners = area.corners();
         self.index.any(bounds(corners), |number| {
             let patch = &self.patches[number as usize];
             overlap(&corners, &patch.quad) && test(patch)
@@ -205,7 +205,7 @@ impl Surface {
     /// its surface, or wholly below it. Pavements count only if `pavements` is set.
     pub(crate) fn is_clear(
         &self,
-        rectangle: &Rectangle,
+        rectangle: &PlanRectangle,
         [bottom_m, top_m]: [f64; 2],
         headroom_m: f64,
         pavements: bool,
@@ -335,7 +335,7 @@ mod tests {
 
     #[test]
     fn wide_surfaces_askew_get_larger_cells() {
-        let surface = Surface::new(&super::super::layout::town1(1).network);
+        let surface = RoadSurface::new(&super::super::layout::town1(1).network);
         assert_eq!(cell_m(&surface.patches, CELL_M), CELL_M);
         let (right, left) = ([0.0, 0.0], [9_000.0, 9_000.0]);
         let wide = Patch {
@@ -355,7 +355,7 @@ mod tests {
     #[test]
     fn patches_follow_a_street_and_leave_headroom() {
         let layout = super::super::layout::town1(1);
-        let surface = Surface::new(&layout.network);
+        let surface = RoadSurface::new(&layout.network);
         let road = layout
             .network
             .roads
@@ -364,7 +364,7 @@ mod tests {
             .unwrap();
         let cut = surface.roads[road][5];
         let above = |t: f64, z: [f64; 2]| {
-            let rectangle = Rectangle {
+            let rectangle = PlanRectangle {
                 center_m: cut.at(t),
                 half_m: [0.2, 0.2],
                 yaw_rad: 0.0,

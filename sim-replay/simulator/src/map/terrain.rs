@@ -1,10 +1,10 @@
 //! Terrain from roads: level or shaped to meet every road, with hills away from them, and decks where a road passes
 //! above.
 
-use super::convex::{Quad, Rectangle, bounds, overlap, range};
+use super::convex::{PlanRectangle, Quad, bounds, overlap, range};
 use super::ground::{Ground, HeightGrid, Terrain, Triangle};
 use super::noise::hills_m;
-use super::surface::{Patch, Surface, cell_m, middle};
+use super::surface::{Patch, RoadSurface, cell_m, middle};
 
 /// Distance between terrain nodes, metres; larger on maps that would need more than [`MAX_NODES`], or have very wide
 /// surfaces.
@@ -29,7 +29,7 @@ const OPENING_M: f64 = 8.0;
 const SMOOTHING: usize = 12;
 
 /// The ground under and between the roads.
-pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
+pub(crate) fn ground(surface: &RoadSurface, seed: u64) -> Ground {
     let heights = surface.patches.iter().flat_map(|patch| patch.z_m);
     let [low, high] = range(heights);
     if high - low < LEVEL_M {
@@ -40,13 +40,11 @@ pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
     fill_level(&mut grid.heights_m, &fixed, grid.columns, grid.rows);
     raise_hills(&mut grid, &fixed, seed);
     let decks = decks(&grid, surface);
-    Ground {
-        terrain: Terrain::Grid(grid),
-        decks,
-    }
+    let terrain = Terrain::Grid(grid);
+    Ground { terrain, decks }
 }
 
-fn empty_grid(surface: &Surface) -> HeightGrid {
+fn empty_grid(surface: &RoadSurface) -> HeightGrid {
     let [low, high] = surface.bounds_m;
     let extent = [0, 1].map(|axis| high[axis] - low[axis] + 2.0 * MARGIN_M);
     let least_m = CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt());
@@ -64,7 +62,7 @@ fn empty_grid(surface: &Surface) -> HeightGrid {
 
 /// Sets every node within a cell of a road to the height of the nearest road there, or of the lowest where roads pass
 /// above each other; returns which are set.
-fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
+fn fix_under_roads(grid: &mut HeightGrid, surface: &RoadSurface) -> Vec<bool> {
     let nodes = grid.heights_m.len();
     let (mut nearest_m, mut lowest_m) = (vec![f32::INFINITY; nodes], vec![f32::INFINITY; nodes]);
     for patch in &surface.patches {
@@ -89,7 +87,7 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
 }
 
 /// Clears nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
-fn open_under_bridges(grid: &mut HeightGrid, surface: &Surface) {
+fn open_under_bridges(grid: &mut HeightGrid, surface: &RoadSurface) {
     for patch in &surface.patches {
         let level = patch.top_m as f32;
         for (place, _) in nodes_within(grid, &patch.quad, OPENING_M) {
@@ -112,7 +110,7 @@ fn nodes_within(grid: &HeightGrid, quad: &Quad, reach_m: f64) -> Vec<(usize, [f6
     for row in rows {
         for column in columns.clone() {
             let node = grid.place_m(column, row);
-            if overlap(&Rectangle::square(node, reach_m).corners(), quad) {
+            if overlap(&PlanRectangle::square(node, reach_m).corners(), quad) {
                 nodes.push((row * grid.columns + column, node));
             }
         }
@@ -221,13 +219,8 @@ fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
 
 /// Shortens a node's distance to those over its neighbours at lower (`sign` -1) or higher (1) columns and rows.
 fn relax(distances: &mut [f32], [columns, rows]: [usize; 2], [column, row]: [usize; 2], sign: i64) {
-    const DIAGONAL: f32 = std::f32::consts::SQRT_2;
-    let steps = [
-        (1, 0, 1.0),
-        (0, 1, 1.0),
-        (1, 1, DIAGONAL),
-        (-1, 1, DIAGONAL),
-    ];
+    use std::f32::consts::SQRT_2;
+    let steps = [(1, 0, 1.0), (0, 1, 1.0), (1, 1, SQRT_2), (-1, 1, SQRT_2)];
     for (dx, dy, cost) in steps {
         let (x, y) = (column as i64 + sign * dx, row as i64 + sign * dy);
         if x >= 0 && y >= 0 && x < columns as i64 && y < rows as i64 {
@@ -239,7 +232,7 @@ fn relax(distances: &mut [f32], [columns, rows]: [usize; 2], [column, row]: [usi
 }
 
 /// Triangles of the road surfaces that lie above the terrain.
-fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
+fn decks(grid: &HeightGrid, surface: &RoadSurface) -> Vec<Triangle> {
     let mut triangles = Vec::new();
     for patch in surface.patches.iter().filter(|patch| is_deck(patch, grid)) {
         let [a, b, c, d]: [[f64; 3]; 4] = std::array::from_fn(|corner| {
@@ -272,7 +265,7 @@ mod tests {
 
     #[test]
     fn level_roads_lie_on_a_plane() {
-        let surface = Surface::new(&super::super::layout::town1(2).network);
+        let surface = RoadSurface::new(&super::super::layout::town1(2).network);
         assert_eq!(ground(&surface, 2), Ground::plane(0.0));
     }
 
@@ -303,7 +296,7 @@ mod tests {
 
     #[test]
     fn wide_roads_askew_get_a_coarser_terrain() {
-        let mut surface = Surface::new(&super::super::layout::town1(2).network);
+        let mut surface = RoadSurface::new(&super::super::layout::town1(2).network);
         assert_eq!(empty_grid(&surface).cell_m, CELL_M);
         let (right, left) = ([0.0, 0.0], [3_000.0, 3_000.0]);
         surface.patches = vec![

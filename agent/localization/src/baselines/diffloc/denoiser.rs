@@ -3,7 +3,7 @@
 use tch::{Kind, Tensor, nn};
 
 use super::transformer::{NORM_EPS, TransformerLayer};
-use crate::baselines::layers::LayerNorm;
+use crate::baselines::layers::TokenNorm;
 use crate::baselines::place_classes::POSE;
 use crate::pgc::dense::Dense;
 use perception::tensor_values::tensor;
@@ -32,7 +32,7 @@ const UNSEEN: f64 = -1e9;
 pub struct PoseDenoiser {
     inward: Dense,
     layers: Vec<TransformerLayer>,
-    norm: LayerNorm,
+    norm: TokenNorm,
     outward: [Dense; 2],
     /// `[HARMONICS]`.
     frequencies: Tensor,
@@ -63,11 +63,10 @@ impl PoseDenoiser {
             inward: Dense::new(&(path / "inward"), inputs, WIDTH, 0.7),
             layers: (0..LAYERS)
                 .map(|number| {
-                    let path = path / "layers" / number;
-                    TransformerLayer::new(&path, WIDTH, EXPANSION, 0.0)
+                    TransformerLayer::new(&(path / "layers" / number), WIDTH, EXPANSION, 0.0)
                 })
                 .collect(),
-            norm: LayerNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
+            norm: TokenNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
             outward: [
                 Dense::new(&(path / "outward" / 0), WIDTH, LAST, 1.0),
                 Dense::new(&(path / "outward" / 1), LAST, POSE, 0.1),
@@ -93,9 +92,7 @@ impl PoseDenoiser {
         let on = (Kind::Float, poses.device());
         // 0 between sweeps that see each other, [`UNSEEN`] elsewhere.
         let single = Tensor::f_eye(frames, on)?.f_neg()?.f_add_scalar(1.0)?;
-        let single = single
-            .f_mul_scalar(UNSEEN)?
-            .f_view([1, 1, frames, frames])?;
+        let single = (single.f_mul_scalar(UNSEEN)?).f_view([1, 1, frames, frames])?;
         let (mask, age) = match windows {
             Windows::Single => (single, Tensor::f_ones([1, 1, 1], on)?),
             Windows::Joint(joint) => {
@@ -122,10 +119,7 @@ impl PoseDenoiser {
 
     /// A pose with sine and cosine of its multiples.
     fn embed_poses(&self, poses: &Tensor) -> tch::Result<Tensor> {
-        let angles = poses
-            .f_unsqueeze(3)?
-            .f_mul(&self.frequencies)?
-            .f_flatten(2, 3)?;
+        let angles = (poses.f_unsqueeze(3)?.f_mul(&self.frequencies)?).f_flatten(2, 3)?;
         Tensor::f_cat(&[poses, &angles.f_sin()?, &angles.f_cos()?], 2)
     }
 

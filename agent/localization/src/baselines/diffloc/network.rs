@@ -11,7 +11,7 @@ use tch::{Kind, Tensor, no_grad};
 use super::denoiser::{FEATURES, PoseDenoiser, Windows};
 use super::noise_schedule::NoiseSchedule;
 use super::transformer::{NORM_EPS, TransformerLayer};
-use crate::baselines::layers::LayerNorm;
+use crate::baselines::layers::TokenNorm;
 use crate::baselines::place_classes::{POSE, PlaceClasses, PlaceHead};
 use crate::baselines::regressed_pose::{PoseRegressor, RegressPose};
 use crate::baselines::tokens::TOKENS;
@@ -39,7 +39,7 @@ pub struct DiffLoc {
     inward: Dense,
     positions: Tensor,
     layers: Vec<TransformerLayer>,
-    norm: LayerNorm,
+    norm: TokenNorm,
     mask: Dense,
     outward: Dense,
     sweep_norm: Norm,
@@ -124,7 +124,6 @@ impl RegressPose for DiffLoc {
     fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> tch::Result<Self> {
         let (mean, stdev) = (0.0, 0.02);
         let (size, random) = ([TOKENS, TOKEN_WIDTH], Init::Randn { mean, stdev });
-        let all = TOKENS * TOKEN_WIDTH;
         Ok(Self {
             inward: Dense::new(&(path / "inward"), channels, TOKEN_WIDTH, 0.7),
             positions: path.var("positions", &size, random),
@@ -135,9 +134,9 @@ impl RegressPose for DiffLoc {
                     TransformerLayer::new(&path, TOKEN_WIDTH, EXPANSION, drop_path)
                 })
                 .collect(),
-            norm: LayerNorm::new(&(path / "norm"), TOKEN_WIDTH, NORM_EPS),
+            norm: TokenNorm::new(&(path / "norm"), TOKEN_WIDTH, NORM_EPS),
             mask: Dense::new(&(path / "mask"), TOKEN_WIDTH, 1, 0.1),
-            outward: Dense::new(&(path / "outward"), all, FEATURES, 0.7),
+            outward: Dense::new(&(path / "outward"), TOKENS * TOKEN_WIDTH, FEATURES, 0.7),
             sweep_norm: Norm::with_defaults(&(path / "sweep_norm"), FEATURES),
             head: PlaceHead::new(&(path / "head"), FEATURES, classes),
             denoiser: PoseDenoiser::new(&(path / "denoiser"))?,

@@ -85,12 +85,8 @@ impl NoiseSchedule {
         let mut poses = noise.shallow_clone();
         for (place, &step) in steps.iter().enumerate() {
             let kept = self.kept[step];
-            let predicted = predict(&noisy, step as i64)?;
-            let noise = predicted * (1.0 - kept).sqrt();
-            poses = noisy
-                .f_mul_scalar(kept.sqrt())?
-                .f_sub(&noise)?
-                .f_clamp(-LIMIT, LIMIT)?;
+            let noise = predict(&noisy, step as i64)? * (1.0 - kept).sqrt();
+            poses = (noisy.f_mul_scalar(kept.sqrt())?.f_sub(&noise)?).f_clamp(-LIMIT, LIMIT)?;
             if let Some(&next) = steps.get(place + 1) {
                 // The noise that leads from these poses to where they came from.
                 let noise = noisy.f_sub(&(&poses * kept.sqrt()))? / (1.0 - kept).sqrt();

@@ -2,7 +2,7 @@
 
 use tch::{Kind, Tensor, nn};
 
-use crate::baselines::layers::LayerNorm;
+use crate::baselines::layers::TokenNorm;
 use crate::pgc::dense::Dense;
 
 /// Added to variances.
@@ -18,10 +18,10 @@ const BRANCH_GAIN: f64 = 0.2;
 /// One layer of `width` channels.
 #[derive(Debug)]
 pub(super) struct TransformerLayer {
-    before_attention: LayerNorm,
+    before_attention: TokenNorm,
     qkv: Dense,
     outward: Dense,
-    before_perceptron: LayerNorm,
+    before_perceptron: TokenNorm,
     up: Dense,
     down: Dense,
     drop_path: f64,
@@ -33,10 +33,10 @@ impl TransformerLayer {
     pub(super) fn new(path: &nn::Path<'_>, width: i64, expansion: i64, drop_path: f64) -> Self {
         let hidden = expansion * width;
         Self {
-            before_attention: LayerNorm::new(&(path / "norm1"), width, NORM_EPS),
+            before_attention: TokenNorm::new(&(path / "norm1"), width, NORM_EPS),
             qkv: Dense::new(&(path / "qkv"), width, 3 * width, LINEAR_GAIN),
             outward: Dense::new(&(path / "outward"), width, width, BRANCH_GAIN),
-            before_perceptron: LayerNorm::new(&(path / "norm2"), width, NORM_EPS),
+            before_perceptron: TokenNorm::new(&(path / "norm2"), width, NORM_EPS),
             up: Dense::new(&(path / "up"), width, hidden, LINEAR_GAIN),
             down: Dense::new(&(path / "down"), hidden, width, BRANCH_GAIN),
             drop_path,
@@ -60,15 +60,11 @@ impl TransformerLayer {
 
     fn attend(&self, x: &Tensor, mask: Option<&Tensor>) -> tch::Result<Tensor> {
         let (batch, tokens, width) = x.size3()?;
-        let size = [batch, tokens, 3, HEADS, width / HEADS];
-        let parts = self
-            .qkv
-            .forward(x)?
-            .f_view(size)?
+        let parts = (self.qkv.forward(x)?)
+            .f_view([batch, tokens, 3, HEADS, width / HEADS])?
             .f_permute([2, 0, 3, 1, 4])?;
-        let query = parts.f_select(0, 0)?;
-        let key = parts.f_select(0, 1)?;
-        let value = parts.f_select(0, 2)?;
+        let [query, key, value] = [0, 1, 2].map(|part| parts.f_select(0, part));
+        let (query, key, value) = (query?, key?, value?);
         let found = match mask {
             None => {
                 let none = None::<Tensor>;
@@ -78,9 +74,7 @@ impl TransformerLayer {
             }
             Some(mask) => {
                 let scale = 1.0 / ((width / HEADS) as f64).sqrt();
-                let logits = query
-                    .f_matmul(&key.f_transpose(2, 3)?)?
-                    .f_mul_scalar(scale)?;
+                let logits = (query.f_matmul(&key.f_transpose(2, 3)?)?).f_mul_scalar(scale)?;
                 let shares = logits.f_add(mask)?.f_softmax(3, Kind::Float)?;
                 shares.f_matmul(&value)?
             }
@@ -95,8 +89,7 @@ impl TransformerLayer {
             return Ok(branch);
         }
         let keep = 1.0 - self.drop_path;
-        let drawn = Tensor::f_rand([branch.size()[0], 1, 1], (Kind::Float, branch.device()))?;
-        let kept = drawn
+        let kept = Tensor::f_rand([branch.size()[0], 1, 1], (Kind::Float, branch.device()))?
             .f_lt(keep)?
             .f_to_kind(branch.kind())?
             .f_div_scalar(keep)?;

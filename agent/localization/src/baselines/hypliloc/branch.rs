@@ -35,9 +35,7 @@ impl Branch {
     /// `[S, SWEEP]` features of tokens `[S, T, WIDTH]`, single precision.
     pub(super) fn features(&self, tokens: &Tensor, train: bool) -> tch::Result<Tensor> {
         let features = self.outward.forward(&tokens.f_flatten(1, 2)?)?;
-        self.norm
-            .forward(&features.f_to_kind(Kind::Float)?, train)
-            .f_relu()
+        (self.norm.forward(&features.f_to_kind(Kind::Float)?, train)).f_relu()
     }
 
     /// `[S, K]` logits of the classes of features `[S, SWEEP]`.

@@ -7,13 +7,13 @@ use super::graph_attention::{GraphAttention, Space};
 
 /// Graph attention in both spaces, summed with learnt weights.
 #[derive(Debug)]
-pub(super) struct Fusion {
+pub(super) struct BranchFusion {
     euclidean: GraphAttention,
     poincare: GraphAttention,
     weights: Tensor,
 }
 
-impl Fusion {
+impl BranchFusion {
     /// Builds the layers below `path`.
     pub(super) fn new(path: &nn::Path<'_>) -> Self {
         Self {
@@ -37,7 +37,6 @@ impl Fusion {
 
 /// Tokens of length 1.
 pub(super) fn normalise(tokens: &Tensor) -> tch::Result<Tensor> {
-    let squares = tokens.f_square()?;
-    let squares = squares.f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
+    let squares = (tokens.f_square()?).f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
     tokens.f_div(&squares.f_add_scalar(1e-12)?.f_sqrt()?)
 }

@@ -4,7 +4,7 @@ use tch::nn::{self, Init};
 use tch::{Kind, Tensor, no_grad};
 
 use super::branch::Branch;
-use super::fusion::{Fusion, normalise};
+use super::fusion::{BranchFusion, normalise};
 use super::graph_attention::{GraphAttention, Space};
 use super::panorama::{CircularLayer, panorama};
 use super::token_layer::{TokenLayer, WIDTH};
@@ -22,12 +22,12 @@ pub struct HypLiLoc {
     positions: Tensor,
     attention: GraphAttention,
     panorama: [CircularLayer; 2],
-    first: Fusion,
+    first: BranchFusion,
     /// Block of the tokens of points.
     point_block: (TokenLayer, GraphAttention, TokenLayer),
     /// Block of the columns of the panorama.
     panorama_block: CircularLayer,
-    second: Fusion,
+    second: BranchFusion,
     /// From points, panorama and fusion, the result.
     pub branches: [Branch; 3],
     /// `[3, 2]`: logarithms of the variances of position and heading of each branch, the weights of their losses.
@@ -73,8 +73,7 @@ impl RegressPose for HypLiLoc {
     fn build(path: &nn::Path<'_>, channels: i64, classes: i64) -> tch::Result<Self> {
         let (block, branches) = (path / "point_block", path / "branches");
         let mut log_variances = path.var("log_variances", &[3, 2], Init::Const(0.0));
-        let start = Tensor::from_slice(&Self::START);
-        no_grad(|| log_variances.f_copy_(&start))?;
+        no_grad(|| log_variances.f_copy_(&Tensor::from_slice(&Self::START)))?;
         let (mean, stdev) = (0.0, 0.1);
         Ok(Self {
             inward: TokenLayer::new(&(path / "inward"), channels),
@@ -84,14 +83,14 @@ impl RegressPose for HypLiLoc {
                 CircularLayer::new(&(path / "panorama0"), RINGS * channels),
                 CircularLayer::new(&(path / "panorama1"), WIDTH),
             ],
-            first: Fusion::new(&(path / "first_fusion")),
+            first: BranchFusion::new(&(path / "first_fusion")),
             point_block: (
                 TokenLayer::new(&(&block / 0), WIDTH),
                 GraphAttention::with_metric(&(&block / 1), Space::Euclidean),
                 TokenLayer::new(&(&block / 2), WIDTH),
             ),
             panorama_block: CircularLayer::new(&(path / "panorama_block"), WIDTH),
-            second: Fusion::new(&(path / "second_fusion")),
+            second: BranchFusion::new(&(path / "second_fusion")),
             branches: [
                 Branch::new(&(&branches / "points"), TOKENS, classes),
                 Branch::new(&(&branches / "panorama"), SECTORS, classes),

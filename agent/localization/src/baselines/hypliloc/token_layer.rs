@@ -2,7 +2,7 @@
 
 use tch::{Tensor, nn};
 
-use crate::baselines::layers::LayerNorm;
+use crate::baselines::layers::TokenNorm;
 use crate::pgc::dense::Dense;
 
 /// Channels of a token.
@@ -14,7 +14,7 @@ const NORM_EPS: f64 = 1e-5;
 #[derive(Debug)]
 pub(super) struct TokenLayer {
     dense: Dense,
-    norm: LayerNorm,
+    norm: TokenNorm,
 }
 
 impl TokenLayer {
@@ -22,7 +22,7 @@ impl TokenLayer {
     pub(super) fn new(path: &nn::Path<'_>, inputs: i64) -> Self {
         Self {
             dense: Dense::new(path, inputs, WIDTH, 1.0),
-            norm: LayerNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
+            norm: TokenNorm::new(&(path / "norm"), WIDTH, NORM_EPS),
         }
     }
 
@@ -37,8 +37,6 @@ impl TokenLayer {
         tokens: &Tensor,
         step: impl FnOnce(Tensor) -> tch::Result<Tensor>,
     ) -> tch::Result<Tensor> {
-        self.norm
-            .forward(&step(self.dense.forward(tokens)?)?)?
-            .f_relu()
+        (self.norm.forward(&step(self.dense.forward(tokens)?)?)?).f_relu()
     }
 }

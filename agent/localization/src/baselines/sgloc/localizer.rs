@@ -40,9 +40,8 @@ impl SgLocLocalizer {
     /// [`LocalizerError`] when the file is missing, truncated or of another kind, or its tensors are not those of its
     /// configuration.
     pub fn load(path: &Path, device: Device, solver: PoseSolver) -> Result<Self, LocalizerError> {
-        let weights = Weights::load(path)?;
         Ok(Self {
-            network: weights
+            network: Weights::load(path)?
                 .network(Self::KIND, device, |path, config| SgLoc::new(path, &config))?,
             solver,
             device,

@@ -27,9 +27,7 @@ pub(super) struct BackboneEncoder {
 impl BackboneEncoder {
     /// True for the weights of a detector; their files need not name a kind.
     pub(super) fn is_in(weights: &Weights) -> bool {
-        weights
-            .metadata(KIND_KEY)
-            .is_none_or(|kind| kind == "detector")
+        (weights.metadata(KIND_KEY)).is_none_or(|kind| kind == "detector")
     }
 
     /// The encoder of a detector's weights.
@@ -58,10 +56,7 @@ impl BackboneEncoder {
         let rows = ranges(sweeps.iter().map(|sweep| sweep.cells().len()));
         let (mut cells, mut of_sweeps) = (Vec::new(), Vec::new());
         for sweep in sweeps {
-            let encoded = self
-                .detector
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
+            let encoded = (self.detector.lock().unwrap_or_else(PoisonError::into_inner))
                 .encode(&sweep.cloud)?;
             let features = self.features(sweep, &encoded.levels)?;
             cells.push(features.cells);
@@ -87,12 +82,11 @@ impl BackboneEncoder {
                 .map(|(level, places)| level.of_cells(&tensor(places, &[-1], map.device())?));
             let mut parts: Vec<Tensor> = own.collect::<Result<_, _>>()?;
             let places = tensor(places, &[-1], map.device())?;
-            let channels = map.size()[1];
             for window in self.format.windows() {
                 // Padding is not counted: the counts of both passes multiply, so the mean of means is exact.
                 let means = mean_over(&map, window, false)?
                     .f_permute([0, 2, 3, 1])?
-                    .f_reshape([-1, channels])?;
+                    .f_reshape([-1, map.size()[1]])?;
                 parts.push(means.f_index_select(0, &places)?);
             }
             let mean = map.f_mean_dim([2_i64, 3].as_slice(), false, Kind::Float)?;

@@ -4,7 +4,7 @@ use perception::crop::Crop;
 use perception::model_config::{DetectorConfig, YAxis};
 use protocol::PointCloud;
 
-use crate::pgc::voxelise::{Cell, CellPoints};
+use crate::pgc::voxelise::{CellPoints, SweepCell};
 
 /// Edges of the surroundings of a cell, whose mean features are added to its own, metres; as those of the scene encoder.
 const CONTEXT_M: [f64; 2] = [20.0, 60.0];
@@ -35,7 +35,7 @@ struct LevelGrid {
 /// Occupied cells of one sweep.
 #[derive(Debug, Clone)]
 pub struct BevCells {
-    cells: Vec<Cell>,
+    cells: Vec<SweepCell>,
     /// For each level the number of the cell that contains each of [`Self::cells`], `y * width + x`.
     pub(super) places: Vec<Vec<i64>>,
     /// Points in the detector's area.
@@ -133,7 +133,7 @@ impl BevCells {
         }
         let occupied = (columns.iter().enumerate()).filter(|(_, column)| column.count > 0);
         let cells = occupied.map(|(number, column)| (number, column.cell()));
-        let (numbers, cells): (Vec<usize>, Vec<Cell>) = cells.unzip();
+        let (numbers, cells): (Vec<usize>, Vec<SweepCell>) = cells.unzip();
         let places = format.levels.iter().map(|grid| {
             // Strides are whole numbers: the cells of a level are whole blocks of those of the finest.
             let steps =
@@ -153,7 +153,7 @@ impl BevCells {
     }
 
     /// The cells, row after row.
-    pub fn cells(&self) -> &[Cell] {
+    pub fn cells(&self) -> &[SweepCell] {
         &self.cells
     }
 }

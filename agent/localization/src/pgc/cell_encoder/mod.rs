@@ -20,19 +20,19 @@ use super::encoder_config::SceneEncoderConfig;
 use super::error::{LocalizerError, Result};
 use super::scene_encoder::{SceneEncoder, SceneFeatures};
 use super::voxel_batch::VoxelBatch;
-use super::voxelise::{Cell, SweepVoxels};
+use super::voxelise::{SweepCell, SweepVoxels};
 use backbone::BackboneEncoder;
 
 /// An encoder and the device that it computes on.
 #[derive(Debug)]
 pub struct CellEncoder {
-    network: Network,
+    network: CellNetwork,
     format: SweepFormat,
     device: Device,
 }
 
 #[derive(Debug)]
-enum Network {
+enum CellNetwork {
     Sparse(Box<SceneEncoder>),
     Backbone(Box<BackboneEncoder>),
 }
@@ -80,7 +80,7 @@ impl CellEncoder {
             let encoder = Box::new(BackboneEncoder::of_detector(&weights, device)?);
             let encoder = Self {
                 format: SweepFormat::Bev(encoder.format.clone()),
-                network: Network::Backbone(encoder),
+                network: CellNetwork::Backbone(encoder),
                 device,
             };
             return Ok((encoder, sha256));
@@ -101,7 +101,7 @@ impl CellEncoder {
     pub fn sparse(encoder: SceneEncoder, device: Device) -> Self {
         Self {
             format: SweepFormat::Voxels(encoder.config().clone()),
-            network: Network::Sparse(Box::new(encoder)),
+            network: CellNetwork::Sparse(Box::new(encoder)),
             device,
         }
     }
@@ -118,12 +118,12 @@ impl CellEncoder {
     /// [`LocalizerError`] when a sweep has another format, or the tensor library fails.
     pub fn encode(&self, sweeps: &[&PreparedSweep], kind: Kind) -> Result<EncodedCells> {
         match &self.network {
-            Network::Sparse(encoder) => {
+            CellNetwork::Sparse(encoder) => {
                 let batch = self.batch(encoder, sweeps)?;
                 let (features, rows) = (encoder.encode(&batch, kind)?, batch.cell_rows);
                 Ok(EncodedCells { features, rows })
             }
-            Network::Backbone(encoder) => {
+            CellNetwork::Backbone(encoder) => {
                 let cells: Result<Vec<_>, _> = sweeps.iter().map(|sweep| sweep.bev()).collect();
                 encoder.encode(&cells?)
             }
@@ -138,7 +138,7 @@ impl CellEncoder {
         levels: Option<&[BackboneLevel]>,
     ) -> Result<SceneFeatures> {
         match (&self.network, levels) {
-            (Network::Backbone(encoder), Some(levels)) if encoder.takes(levels) => {
+            (CellNetwork::Backbone(encoder), Some(levels)) if encoder.takes(levels) => {
                 encoder.features(sweep.bev()?, levels)
             }
             _ => Ok(self.encode(&[sweep], Kind::Float)?.features),
@@ -147,7 +147,7 @@ impl CellEncoder {
 
     /// True if it takes the levels of a detector's backbone.
     pub(super) fn takes_levels(&self) -> bool {
-        matches!(self.network, Network::Backbone(_))
+        matches!(self.network, CellNetwork::Backbone(_))
     }
 
     /// Computes in integers from here on, if its scales are stored with the head: a detector has its own.
@@ -156,8 +156,8 @@ impl CellEncoder {
     /// [`QuantiseError`] names the activation whose scale is missing.
     pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
         match &mut self.network {
-            Network::Sparse(encoder) => encoder.quantise(scales),
-            Network::Backbone(_) => Ok(()),
+            CellNetwork::Sparse(encoder) => encoder.quantise(scales),
+            CellNetwork::Backbone(_) => Ok(()),
         }
     }
 
@@ -166,7 +166,7 @@ impl CellEncoder {
     /// # Errors
     /// As [`Self::encode`].
     pub fn observe(&self, sweep: &PreparedSweep, search: &mut ScaleSearch) -> Result<()> {
-        if let Network::Sparse(encoder) = &self.network {
+        if let CellNetwork::Sparse(encoder) = &self.network {
             encoder.observe(&self.batch(encoder, &[sweep])?, search)?;
         }
         Ok(())
@@ -226,7 +226,7 @@ impl SweepFormat {
 
 impl PreparedSweep {
     /// The cells, in the order of the encoder's rows.
-    pub fn cells(&self) -> &[Cell] {
+    pub fn cells(&self) -> &[SweepCell] {
         match self {
             Self::Voxels(voxels) => voxels.cells(),
             Self::Bev(cells) => cells.cells(),

@@ -92,17 +92,14 @@ impl ConfidenceModel {
     /// # Errors
     /// [`FitError`] when there are too few sweeps, or the share of `rejection` is out of range.
     pub fn fit(sweeps: &[Labelled], rejection: Rejection) -> Result<(Self, FitReport), FitError> {
-        let all = sweeps;
-        let sweeps = sweeps.iter().filter(|sweep| sweep.error_m.is_finite());
-        let sweeps: Vec<_> = sweeps.collect();
-        if sweeps.len() < MIN_SWEEPS {
-            return Err(FitError::TooFew(sweeps.len()));
+        let usable: Vec<_> = (sweeps.iter().filter(|sweep| sweep.error_m.is_finite())).collect();
+        if usable.len() < MIN_SWEEPS {
+            return Err(FitError::TooFew(usable.len()));
         }
         // Bounded from below: the logarithm of an error of 0 would make the sums infinite.
-        let targets = (sweeps.iter()).map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln());
+        let targets = (usable.iter()).map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln());
         let targets: Vec<f64> = targets.collect();
-        let rows = sweeps.iter().map(|sweep| features(&sweep.evidence));
-        let rows: Vec<[f64; FEATURES]> = rows.collect();
+        let rows: Vec<_> = (usable.iter().map(|sweep| features(&sweep.evidence))).collect();
         let (bias, weights) = non_negative_regression(&rows, &targets);
         let mut model = Self {
             bias,
@@ -111,11 +108,10 @@ impl ConfidenceModel {
             reject_below: 0.0,
         };
         // The weights are fitted first: sigma is a function of the log error that they predict.
-        let samples = sweeps
-            .iter()
+        let samples = (usable.iter())
             .map(|sweep| (model.log_error(&sweep.evidence), observed(sweep.error_m)));
         model.sigma = MonotoneMap::fit(samples.collect(), GROUPS.0, GROUPS.1);
-        let report = model.choose_threshold(all, rejection)?;
+        let report = model.choose_threshold(sweeps, rejection)?;
         Ok((model, report))
     }
 

@@ -5,6 +5,7 @@
 //! by 1 mm at most in voxels of half a metre.
 
 use std::collections::HashMap;
+use std::error::Error;
 use std::path::Path;
 
 use nalgebra::Vector3;
@@ -136,7 +137,7 @@ impl SurfelMap {
     }
 }
 
-fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>, String> {
+fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>, Box<dyn Error>> {
     let kinds = [
         ("voxels", Dtype::I16),
         ("centres", Dtype::U8),
@@ -144,19 +145,16 @@ fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>,
     ];
     let mut tensors = Vec::new();
     for ((name, dtype), data) in kinds.into_iter().zip(columns) {
-        let view = TensorView::new(dtype, vec![count, 3], data);
-        tensors.push((name, view.map_err(|error| error.to_string())?));
+        tensors.push((name, TensorView::new(dtype, vec![count, 3], data)?));
     }
-    let config = serde_json::to_string(config).map_err(|error| error.to_string())?;
     let metadata = HashMap::from([
         (KIND_KEY.to_owned(), KIND.to_owned()),
-        (CONFIG_KEY.to_owned(), config),
+        (CONFIG_KEY.to_owned(), serde_json::to_string(config)?),
     ]);
-    let bytes = serialize(tensors, Some(metadata)).map_err(|error| error.to_string())?;
-    with_header(&bytes, |_| ()).map_err(|error| error.to_string())
+    Ok(with_header(&serialize(tensors, Some(metadata))?, |_| ())?)
 }
 
-fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
+fn decode(bytes: &[u8]) -> Result<SurfelMap, Box<dyn Error>> {
     let read = SafeTensors::read_metadata(bytes)
         .and_then(|(_, header)| Ok((header, SafeTensors::deserialize(bytes)?)));
     let (header, file) = read.map_err(|error| {
@@ -166,12 +164,9 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
     let metadata = header.metadata().clone().unwrap_or_default();
     let kind = metadata.get(KIND_KEY).map(String::as_str);
     if kind != Some(KIND) {
-        return Err(format!(
-            "a file of kind {kind:?}, needed is one of kind {KIND:?}"
-        ));
+        return Err(format!("a file of kind {kind:?}, needed is one of kind {KIND:?}").into());
     }
-    let config = metadata.get(CONFIG_KEY).map_or("", String::as_str);
-    let config: Config = serde_json::from_str(config)
+    let config: Config = serde_json::from_str(metadata.get(CONFIG_KEY).map_or("", String::as_str))
         .map_err(|error| format!("metadata {CONFIG_KEY:?}: {error}"))?;
     config.check()?;
     let voxels = column(&file, "voxels", Dtype::I16)?;
@@ -179,9 +174,9 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
     let normals = column(&file, "normals", Dtype::I8)?;
     let counts = [voxels.len() / 2, centres.len(), normals.len()].map(|values| values / 3);
     if counts.iter().any(|count| *count != counts[0]) {
-        return Err(format!(
-            "{counts:?} voxels, centres and normals, must be as many of each"
-        ));
+        return Err(
+            format!("{counts:?} voxels, centres and normals, must be as many of each").into(),
+        );
     }
     let planes = (0..counts[0]).map(|row| {
         let first = 3 * row;
@@ -197,14 +192,10 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, String> {
         let normal = normal.try_normalize(0.5).unwrap_or_else(Vector3::z);
         (voxel, Surfel { centre_m, normal })
     });
-    let scale: Option<CovarianceScale> = match metadata.get(COVARIANCE_KEY) {
-        Some(text) => serde_json::from_str(text)
-            .map(Some)
-            .map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?,
-        None => None,
-    };
-    let checked = scale.as_ref().map_or(Ok(()), CovarianceScale::check);
-    checked.map_err(|error| error.to_string())?;
+    let scale = (metadata.get(COVARIANCE_KEY)).map(|text| serde_json::from_str(text));
+    let scale: Option<CovarianceScale> =
+        (scale.transpose()).map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?;
+    scale.as_ref().map_or(Ok(()), CovarianceScale::check)?;
     Ok(SurfelMap {
         target: IcpTarget {
             levels: vec![Surfels::of_planes(config.voxel_m, planes)],
@@ -241,9 +232,7 @@ pub fn check_voxel(voxel_m: f64) -> Result<(), FieldError> {
 
 /// Bytes of a tensor `[N, 3]`.
 fn column<'a>(file: &SafeTensors<'a>, name: &str, dtype: Dtype) -> Result<&'a [u8], String> {
-    let view = file
-        .tensor(name)
-        .map_err(|error| format!("tensor {name:?}: {error}"))?;
+    let view = (file.tensor(name)).map_err(|error| format!("tensor {name:?}: {error}"))?;
     match view.dtype() == dtype && matches!(view.shape(), [_, 3]) {
         true => Ok(view.data()),
         false => Err(format!(

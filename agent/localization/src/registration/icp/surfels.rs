@@ -33,14 +33,14 @@ struct KeptPlane {
 
 /// Sums over the points of a voxel.
 #[derive(Debug, Clone, Copy, Default)]
-struct Moments {
+struct PointSums {
     count: f64,
     sum: Vector3<f64>,
     /// Sum of `p p^T`.
     outer: Matrix3<f64>,
 }
 
-impl Moments {
+impl PointSums {
     fn add(&mut self, point: &Vector3<f64>) {
         self.count += 1.0;
         self.sum += point;
@@ -78,7 +78,7 @@ impl Moments {
 pub(super) struct Surfels {
     pub(super) voxel_m: f64,
     sites: Sites,
-    moments: Vec<Moments>,
+    moments: Vec<PointSums>,
     /// By row of `sites`; made by [`Self::fit`].
     planes: Vec<Option<KeptPlane>>,
     /// Voxels with a plane.
@@ -99,7 +99,7 @@ impl Surfels {
             return;
         };
         let row = self.sites.add(voxel) as usize;
-        self.moments.resize(self.sites.len(), Moments::default());
+        self.moments.resize(self.sites.len(), PointSums::default());
         self.moments[row].add(point_m);
     }
 
@@ -108,7 +108,7 @@ impl Surfels {
     pub(super) fn fit(&mut self) {
         let voxels = self.sites.coords().iter().zip(&self.moments);
         let planes = voxels.map(|(coord, own)| {
-            let mut around = Moments::default();
+            let mut around = PointSums::default();
             for offset in 0..27 {
                 let shifted = [
                     coord[0] + offset % 3 - 1,
@@ -140,8 +140,7 @@ impl Surfels {
         for (voxel, plane) in planes {
             // A voxel has one plane: the first.
             if surfels.sites.add(voxel) as usize == surfels.planes.len() {
-                let kept = surfels.kept(voxel, &plane);
-                surfels.planes.push(Some(kept));
+                surfels.planes.push(Some(surfels.kept(voxel, &plane)));
             }
         }
         surfels.count = surfels.planes.len();
@@ -150,8 +149,7 @@ impl Surfels {
 
     /// Voxels with their planes, in order of first appearance.
     pub(super) fn planes(&self) -> impl Iterator<Item = ([i32; 3], Surfel)> {
-        let voxels = self.sites.coords().iter().copied();
-        voxels
+        (self.sites.coords().iter().copied())
             .zip(&self.planes)
             .filter_map(|(voxel, kept)| Some((voxel, self.plane(voxel, kept.as_ref()?))))
     }

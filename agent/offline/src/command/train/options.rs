@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use agent_offline::{Error, TrainingBar};
 use anyhow::Context;
-use perception::train::{Observe, Progress, RunConfig, TrainingOptions};
+use perception::train::{Observe, RunConfig, TrainingEvent, TrainingOptions};
 
 use support::cli::BadInput;
 
 /// Sweeps of one scene, to learn from.
 #[derive(Debug, clap::Args)]
-pub(crate) struct SceneSweeps {
+pub(crate) struct SceneOptions {
     /// Folders of sweeps, all of the same scene.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     pub(crate) dataset: Vec<PathBuf>,
@@ -53,7 +53,7 @@ pub(crate) fn with_bar<T>(
 ) -> anyhow::Result<(T, Vec<f64>)> {
     let mut latest = Vec::new();
     let trained = train(&mut |progress| {
-        if let Progress::Stepped(report) = progress {
+        if let TrainingEvent::Stepped(report) = progress {
             latest.clone_from(&report.means);
         }
         bar.show_progress(progress);

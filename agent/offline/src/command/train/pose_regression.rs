@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use agent_offline::training::{PoseRegressionConfig, PoseRegressionSummary};
 use agent_offline::{Error, TrainingBar};
-use perception::train::{AdamWConfig, ModelCard, Observe, RunConfig, Schedule, TrainingOptions};
+use perception::train::{ModelCard, Observe, RateSchedule, TrainingOptions};
 
-use super::options::{SceneSweeps, bad, check_folders, run_config, with_bar};
+use super::options::{SceneOptions, bad, check_folders, run_config, with_bar};
 
 /// Decoupled weight decay: sweeps are few beside the parameters.
 const WEIGHT_DECAY: f64 = 0.05;
@@ -16,7 +16,7 @@ const MAX_GRADIENT_NORM: f64 = 1.0;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
-    sweeps: SceneSweeps,
+    sweeps: SceneOptions,
     /// Folders of sweeps of the same scene that are localized every 1000 steps.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
@@ -73,23 +73,17 @@ impl Args {
             )));
         }
         check_folders(self.sweeps.dataset.iter().chain(&self.validation))?;
-        let run = run_config(&self.options, self.batch, self.lr)?;
-        let optimizer = AdamWConfig {
-            weight_decay: WEIGHT_DECAY,
-            max_gradient_norm: MAX_GRADIENT_NORM,
-            ..run.optimizer
-        };
+        let mut run = run_config(&self.options, self.batch, self.lr)?;
+        run.optimizer.weight_decay = WEIGHT_DECAY;
+        run.optimizer.max_gradient_norm = MAX_GRADIENT_NORM;
+        run.schedule = RateSchedule::HeldRate;
         Ok(PoseRegressionConfig {
             scenes: self.sweeps.dataset.clone(),
             validation: self.validation.clone(),
             scene_name: self.sweeps.scene_name.clone(),
             encoder: self.encoder.clone(),
             turn_rad: turn_deg.to_radians(),
-            run: RunConfig {
-                optimizer,
-                schedule: Schedule::HeldRate,
-                ..run
-            },
+            run,
         })
     }
 }

@@ -9,14 +9,14 @@ use agent_offline::training::{
 };
 use perception::train::{ModelCard, TrainingOptions};
 
-use super::options::{SceneSweeps, bad, check_folders, run_config, with_bar};
+use super::options::{SceneOptions, bad, check_folders, run_config, with_bar};
 
 /// Train the head of one scene on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors
 /// and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
-    sweeps: SceneSweeps,
+    sweeps: SceneOptions,
     /// Folders of other sweeps of the scene to validate on.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,

@@ -6,13 +6,13 @@ use agent_offline::TrainingBar;
 use agent_offline::training::{SgLocTrainConfig, train_sgloc};
 use perception::train::{ModelCard, TrainingOptions};
 
-use super::options::{SceneSweeps, check_folders, run_config, with_bar};
+use super::options::{SceneOptions, check_folders, run_config, with_bar};
 
 /// Train SGLoc's head on one scene, on a frozen encoder; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
-    sweeps: SceneSweeps,
+    sweeps: SceneOptions,
     /// Weights of the frozen encoder, output of `agent train encoder`.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,

@@ -15,7 +15,9 @@ use localization::baselines::place_classes::PlaceClasses;
 use localization::baselines::tokens::SECTORS;
 use localization::baselines::{PoseRegressor, PoseRegressorConfig};
 use localization::pgc::SceneEncoder;
-use perception::train::{Curve, Observe, Progress, RunConfig, SaveEvery, Task, Trained, Trainer};
+use perception::train::{
+    Curve, Observe, RunConfig, SaveEvery, Task, Trained, Trainer, TrainingEvent,
+};
 use tch::nn::VarStore;
 use tch::{Kind, TchError, Tensor};
 
@@ -107,7 +109,7 @@ fn train<N: PoseLoss>(
         [] => None,
         folders => Some(read(folders)?.0),
     };
-    observe(&Progress::Read(data.clone()));
+    observe(&TrainingEvent::Read(data.clone()));
     let count = sweeps.world_from_sensor.len();
     let network_config = PoseRegressorConfig {
         scene_name: config.scene_name.clone(),
@@ -128,7 +130,7 @@ fn train<N: PoseLoss>(
     drop(sweeps);
     // The time of the training begins here: reading and encoding do not count.
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
-    let mut training = Training {
+    let mut training = PoseTraining {
         run,
         sectors: (config.turn_rad / std::f64::consts::TAU * SECTORS as f64).round() as i64,
         observe,
@@ -159,7 +161,7 @@ fn centres(poses: &Tensor, seed: u64) -> Result<Vec<[f64; 5]>, TchError> {
 }
 
 /// A training in progress.
-struct Training<'a, N> {
+struct PoseTraining<'a, N> {
     run: &'a RunConfig,
     /// Largest turn.
     sectors: i64,
@@ -177,7 +179,7 @@ struct Training<'a, N> {
     validated: Option<RegressionAccuracy>,
 }
 
-impl<N: PoseLoss> Task for Training<'_, N> {
+impl<N: PoseLoss> Task for PoseTraining<'_, N> {
     type Error = Error;
     /// Between reports nothing waits for the device but the optimizer.
     const REPORT_EVERY: u64 = 50;
@@ -231,7 +233,7 @@ impl<N: PoseLoss> Task for Training<'_, N> {
         if let (true, Some(cache)) = (is_saved_next, &self.validation) {
             let found = accuracy(&self.network, &cache.sweeps, kind)?;
             let text = format!("{:.0} s: validation {found}", trainer.seconds());
-            (self.observe)(&Progress::Validated(text));
+            (self.observe)(&TrainingEvent::Validated(text));
             self.validated = Some(found);
         }
         let validated = self.validated;

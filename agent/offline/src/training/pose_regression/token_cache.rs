@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use dataset::frame::Object;
 use localization::baselines::tokens::{RINGS, SECTORS, TOKENS, TokenProjection, pool, token_of};
-use localization::pgc::{Cell, SceneEncoder, SceneEncoderConfig, SweepVoxels, VoxelBatch};
+use localization::pgc::{SceneEncoder, SceneEncoderConfig, SweepCell, SweepVoxels, VoxelBatch};
 use nalgebra::{Isometry3, Point3, Vector3};
 use perception::tensor_values::tensor;
-use perception::train::{Observe, Prefetch, Progress, RunConfig};
+use perception::train::{Observe, Prefetch, RunConfig, TrainingEvent};
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::Error;
@@ -101,7 +101,7 @@ impl PooledSweeps {
                 poses.push(sweep.world_from_sensor);
             }
             let done = (done + BATCH as usize).min(total);
-            observe(&Progress::Encoding(done, total));
+            observe(&TrainingEvent::Encoding(done, total));
         }
         if parts.is_empty() {
             return Err(Error::NoSweeps(Vec::new(), String::new()));
@@ -171,7 +171,7 @@ impl Prepared {
 
 /// 1 for each token of which at most half of the cells that stand out lie in annotated boxes, else 0.
 fn static_tokens(
-    cells: &[Cell],
+    cells: &[SweepCell],
     objects: &[Object],
     world_from_sensor: &Isometry3<f64>,
 ) -> [f32; TOKENS as usize] {
@@ -278,8 +278,8 @@ mod tests {
 
     use super::*;
 
-    fn cell([x, y, z]: [f64; 3]) -> Cell {
-        Cell {
+    fn cell([x, y, z]: [f64; 3]) -> SweepCell {
+        SweepCell {
             centroid_m: [x as f32, y as f32, z as f32],
             extent_m: 1.0,
             points: 5,

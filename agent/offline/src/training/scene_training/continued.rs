@@ -5,6 +5,7 @@ use std::path::Path;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::training::FeatureCache;
+use crate::training::kmeans::nearest;
 use crate::{Error, Result};
 use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
 use perception::weights::Weights;
@@ -40,17 +41,17 @@ pub(super) fn classes_of_sweeps(head: &SceneHead, cache: &FeatureCache) -> Resul
         }
     }
     let trusted = sums.iter().enumerate().filter(|(_, sum)| sum[3] > 0.0);
-    let middles: Vec<(usize, [f64; 3])> = trusted
-        .map(|(class, sum)| (class, std::array::from_fn(|axis| sum[axis] / sum[3])))
-        .collect();
+    let (classes, middles): (Vec<usize>, Vec<[f64; 3]>) = trusted
+        .map(|(class, sum)| (class, [0, 1, 2].map(|axis| sum[axis] / sum[3])))
+        .unzip();
     if middles.is_empty() {
         return Err(Error::Input(format!(
             "the head of {:?} recognises none of the sweeps: are they of another scene?",
             head.config().scene_name
         )));
     }
-    let classes = positions.iter().map(|position| nearest(&middles, position));
-    Ok(classes.collect())
+    let nearest = positions.iter().map(|place| nearest(&middles, place));
+    Ok(nearest.map(|index| classes[index]).collect())
 }
 
 /// Class of each sweep as the head sees it, and the median L1 error of some of its cells under it, metres.
@@ -79,15 +80,4 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
         error.f_median()?.f_double_value(&[])
     });
     Ok((classes, errors.collect::<Result<_, TchError>>()?))
-}
-
-fn nearest(middles: &[(usize, [f64; 3])], position: &[f64; 3]) -> usize {
-    let nearest = middles.iter().min_by(|one, other| {
-        let [one_m2, other_m2] = [one, other].map(|(_, middle)| {
-            let squares = (0..3).map(|axis| (middle[axis] - position[axis]).powi(2));
-            squares.sum::<f64>()
-        });
-        one_m2.total_cmp(&other_m2)
-    });
-    nearest.map_or(0, |(class, _)| *class)
 }

@@ -6,15 +6,7 @@ use super::config::SceneTrainConfig;
 use crate::Error;
 use crate::training::{FeatureCache, SweepAugmentation, SweepList};
 use localization::pgc::{CellEncoder, SweepFormat};
-use perception::train::{DataListing, Observe, Progress};
-
-/// Sweeps of a scene.
-pub(crate) struct SceneSweeps {
-    /// Sweeps that the head is trained on.
-    pub(crate) training: Arc<SweepList>,
-    /// Sweeps that it is validated on.
-    pub(crate) validation: Option<Arc<SweepList>>,
-}
+use perception::train::{DataListing, Observe, TrainingEvent};
 
 /// Features of the sweeps of a scene.
 pub(super) struct Features {
@@ -27,30 +19,30 @@ pub(super) struct Features {
 }
 
 impl Features {
-    /// Reads and encodes sweeps.
+    /// Reads and encodes the sweeps that the head is trained on, and those that it is validated on.
     pub(super) fn compute(
         config: &SceneTrainConfig,
-        sweeps: &SceneSweeps,
+        training: &Arc<SweepList>,
+        validation: Option<&Arc<SweepList>>,
         observe: &mut Observe<'_>,
     ) -> Result<Self, Error> {
         let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, observe)?;
-            observe(&Progress::Read(list.data()));
+            observe(&TrainingEvent::Read(list.data()));
             Ok::<_, Error>(cache)
         };
-        let training = encode(&sweeps.training, config.augmentation)?;
+        let encoded = encode(training, config.augmentation)?;
         let unchanged = SweepAugmentation {
             copies: 1,
             ..config.augmentation
         };
-        let validation = sweeps.validation.as_ref();
         Ok(Self {
-            training,
+            training: encoded,
             validation: validation.map(|list| encode(list, unchanged)).transpose()?,
             format: encoder.format().clone(),
             encoder_sha256,
-            data: sweeps.training.data(),
+            data: training.data(),
         })
     }
 }

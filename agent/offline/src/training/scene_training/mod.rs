@@ -22,7 +22,6 @@ pub use self::config::{SceneSummary, SceneTrainConfig};
 use self::cell_order::CellOrder;
 use self::classifier::train_classifier;
 use self::features::Features;
-pub(crate) use self::features::SceneSweeps;
 use self::losses::{centre_loss, weighted_loss};
 use super::feature_cache::FeatureCache;
 use super::kmeans::kmeans;
@@ -32,7 +31,7 @@ use super::sweep_store::SweepList;
 use crate::{Error, Result};
 use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
 use perception::train::{
-    Curve, DataListing, Length, Means, Observe, Progress, SaveEvery, Task, Trainer,
+    Curve, DataListing, Length, Means, Observe, SaveEvery, Task, Trainer, TrainingEvent,
 };
 
 /// Weight of a unit of cross entropy over the centres, metres.
@@ -50,32 +49,32 @@ const MAX_CELLS: usize = 1024;
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
 pub fn train_scene(config: &SceneTrainConfig, observe: &mut Observe<'_>) -> Result<SceneSummary> {
-    let sweeps = SceneSweeps {
-        training: Arc::new(SweepList::open(&config.scenes)?),
-        validation: match config.validation.as_slice() {
-            [] => None,
-            folders => {
-                let mut list = SweepList::open(folders)?;
-                list.thin_out(config.validation_sweeps);
-                Some(Arc::new(list))
-            }
-        },
+    let training = Arc::new(SweepList::open(&config.scenes)?);
+    let validation = match config.validation.as_slice() {
+        [] => None,
+        folders => {
+            let mut list = SweepList::open(folders)?;
+            list.thin_out(config.validation_sweeps);
+            Some(Arc::new(list))
+        }
     };
-    train_scene_on(config, &sweeps, observe)
+    train_scene_on(config, &training, validation.as_ref(), observe)
 }
 
 /// The same on lists of sweeps in place of the folders of `config`.
 pub(crate) fn train_scene_on(
     config: &SceneTrainConfig,
-    sweeps: &SceneSweeps,
+    training: &Arc<SweepList>,
+    validation: Option<&Arc<SweepList>>,
     observe: &mut Observe<'_>,
 ) -> Result<SceneSummary> {
-    let (mut training, mut trainer) = Training::prepare(config, sweeps, observe)?;
+    let prepared = SceneTraining::prepare(config, training, validation, observe)?;
+    let (mut training, mut trainer) = prepared;
     trainer.run(&mut training, SaveEvery::Time(config.validate_every))?;
     training.finish(&trainer)
 }
 
-struct Training<'a> {
+struct SceneTraining<'a> {
     config: &'a SceneTrainConfig,
     observe: &'a mut Observe<'a>,
     head_config: SceneHeadConfig,
@@ -100,17 +99,18 @@ struct Training<'a> {
     preparing_seconds: f64,
 }
 
-impl<'a> Training<'a> {
+impl<'a> SceneTraining<'a> {
     fn prepare(
         config: &'a SceneTrainConfig,
-        sweeps: &SceneSweeps,
+        training: &Arc<SweepList>,
+        validation: Option<&Arc<SweepList>>,
         observe: &'a mut Observe<'_>,
     ) -> Result<(Self, Trainer)> {
         let started = Instant::now();
         let run = &config.run;
         // Seeds the tensor library: before the first variable is made.
         run.start()?;
-        let features = Features::compute(config, sweeps, observe)?;
+        let features = Features::compute(config, training, validation, observe)?;
         let load =
             |init: &PathBuf| continued::load(init, &config.encoder, &features.encoder_sha256);
         let stored = config.init.as_ref().map(load).transpose()?;
@@ -142,7 +142,7 @@ impl<'a> Training<'a> {
         if !run.resume {
             let (classes, limit) = (&class_of_sweep, classifier_time(run.length));
             let share = train_classifier(&head, &variables, &cache, classes, run.seed, limit)?;
-            observe(&Progress::Note(format!(
+            observe(&TrainingEvent::Note(format!(
                 "{:.1} % of the training sweeps are assigned to their cluster",
                 100.0 * share
             )));
@@ -194,7 +194,7 @@ impl<'a> Training<'a> {
     }
 }
 
-impl Task for Training<'_> {
+impl Task for SceneTraining<'_> {
     type Error = Error;
     const REPORT_EVERY: u64 = 20;
 
@@ -289,7 +289,8 @@ impl Task for Training<'_> {
             let poses = [found.pose_p50_m, found.pose_p50_deg];
             let shares = [found.success_3m, found.success_1m];
             row.extend([&[found.cell_p50_m], &poses[..], &shares].concat());
-            (self.observe)(&Progress::Validated(format!("{seconds:.0} s: {found}")));
+            let text = format!("{seconds:.0} s: {found}");
+            (self.observe)(&TrainingEvent::Validated(text));
             self.accuracy = Some(found);
         }
         Ok(self.curve.numbers(&row)?)

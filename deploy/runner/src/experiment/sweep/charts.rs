@@ -130,7 +130,7 @@ fn chart(
     iou: usize,
 ) -> Option<Chart> {
     // Along bytes, the cells of all values of a codec form one line.
-    let mut series: Vec<(String, Points)> = Vec::new();
+    let mut series: Vec<(String, GroupedPoints)> = Vec::new();
     for run in runs {
         let precision = run.cell.metrics.ap_global.values()[iou];
         let (Some(x), Some(y)) = ((dimension.value)(run), precision) else {
@@ -147,7 +147,7 @@ fn chart(
             series.len() - 1
         });
         // Runs that differ in nothing but their seed share a key and become one point.
-        let key = (dimension.text)(point).map_or(Key::Value(x.to_bits()), Key::Text);
+        let key = (dimension.text)(point).unwrap_or_else(|| x.to_bits().to_string());
         series[known].1.entry(key).or_default().push((x, y));
     }
     let series = series.into_iter().map(|(name, points)| line(name, points));
@@ -173,17 +173,10 @@ fn chart(
     })
 }
 
-/// Points of a line, grouped for the mean over seeds.
-type Points = BTreeMap<Key, Vec<(f64, f64)>>;
+/// Points of a line, grouped for the mean over seeds: by their label, or else by the bits of their x.
+type GroupedPoints = BTreeMap<String, Vec<(f64, f64)>>;
 
-/// Group of the mean over seeds.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-enum Key {
-    Value(u64),
-    Text(String),
-}
-
-fn line(name: String, points: Points) -> Series {
+fn line(name: String, points: GroupedPoints) -> Series {
     let means = points.values().map(|values| {
         let (xs, ys) = (values.iter().map(|it| it.0), values.iter().map(|it| it.1));
         let count = values.len() as f64;
@@ -221,12 +214,9 @@ mod tests {
     #[test]
     fn lines_are_means_over_seeds_in_order() {
         let points = [(100.0, 0.6), (0.0, 0.9), (100.0, 0.8)];
-        let mut by_key: BTreeMap<Key, Vec<(f64, f64)>> = BTreeMap::new();
+        let mut by_key = GroupedPoints::new();
         for (x, y) in points {
-            by_key
-                .entry(Key::Text(format!("{x}")))
-                .or_default()
-                .push((x, y));
+            by_key.entry(format!("{x}")).or_default().push((x, y));
         }
         let line = line("max".into(), by_key);
         assert_eq!(line.points[0], (0.0, 0.9));

@@ -77,10 +77,7 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
     let grid = &experiment.grid;
     let codec = CodecSpec {
         dtype: experiment.dtype,
-        keep: None,
-        zstd_level: None,
-        fit: None,
-        boxes: None,
+        ..CodecSpec::default()
     };
     let first = grid
         .codec
@@ -100,39 +97,35 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
             seed: 0,
         });
         let plain = plain.collect();
-        points.extend(spread(plain, codecs, |point, codec| point.codec = codec));
+        points.extend(spread(plain, codecs, |point| &mut point.codec));
     }
-    let points = spread(points, &grid.latency_ms, |point, ms| {
-        point.latency_ms = Some(ms)
+    let points = spread(points, &grid.latency_ms, |point| &mut point.latency_ms);
+    let points = spread(points, &grid.jitter_ms, |point| &mut point.jitter_ms);
+    let mut points = spread(points, &grid.bandwidth_mbps, |point| {
+        &mut point.bandwidth_mbps
     });
-    let points = spread(points, &grid.jitter_ms, |point, ms| {
-        point.jitter_ms = Some(ms)
-    });
-    let points = spread(points, &grid.bandwidth_mbps, |point, mbps| {
+    for point in &mut points {
         // JSON has no infinity, so an unlimited rate is an absent one.
-        point.bandwidth_mbps = Some(mbps).filter(|mbps| mbps.is_finite());
-    });
-    let points = spread(points, &grid.loss, |point, share| point.loss = Some(share));
-    let points = spread(points, &grid.pose_noise, |point, noise| {
-        point.pose_noise = Some(noise)
-    });
-    let points = spread(points, &grid.vehicles, |point, vehicles| {
-        point.vehicles = Some(vehicles)
-    });
-    spread(points, &grid.seed, |point, seed| point.seed = seed)
+        point.bandwidth_mbps = point.bandwidth_mbps.filter(|mbps| mbps.is_finite());
+    }
+    let points = spread(points, &grid.loss, |point| &mut point.loss);
+    let points = spread(points, &grid.pose_noise, |point| &mut point.pose_noise);
+    let points = spread(points, &grid.vehicles, |point| &mut point.vehicles);
+    spread(points, &grid.seed, |point| &mut point.seed)
 }
 
-fn spread<T: Copy>(
+/// Each point with every value of an axis in turn in the field `place`.
+fn spread<T: Copy, V: From<T>>(
     points: Vec<Point>,
     values: &Option<Vec<T>>,
-    set: impl Fn(&mut Point, T),
+    place: impl Fn(&mut Point) -> &mut V,
 ) -> Vec<Point> {
     let Some(values) = values else { return points };
     let mut spread = Vec::with_capacity(points.len() * values.len());
     for point in points {
         for &value in values {
             let mut point = point.clone();
-            set(&mut point, value);
+            *place(&mut point) = value.into();
             spread.push(point);
         }
     }
@@ -199,13 +192,7 @@ impl Point {
 
     /// Encoding of feature maps of `channels` on `grid`.
     fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
-        let CodecSpec {
-            dtype,
-            keep,
-            zstd_level,
-            fit: _,
-            boxes: _,
-        } = self.codec;
+        let CodecSpec { dtype, keep, .. } = self.codec;
         let cells = grid.cells() as u64;
         // All cells need no budget, and a mask would only cost bytes.
         let budget_bytes = keep.filter(|keep| *keep < 1.0).map(|keep| {
@@ -218,7 +205,7 @@ impl Point {
             dtype,
             gate: None,
             budget_bytes,
-            zstd_level,
+            zstd_level: self.codec.zstd_level,
         }
     }
 

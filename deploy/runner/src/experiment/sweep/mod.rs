@@ -74,7 +74,7 @@ pub struct Run {
 
 /// Reads, prepares and runs an experiment.
 #[derive(Debug)]
-pub struct Sweep {
+pub struct ExperimentSweep {
     file: PathBuf,
     experiment: Experiment,
     points: Vec<Point>,
@@ -82,7 +82,7 @@ pub struct Sweep {
     out: PathBuf,
 }
 
-impl Sweep {
+impl ExperimentSweep {
     /// Reads an experiment, generates its data if requested, and checks the one against the other.
     ///
     /// # Errors

@@ -22,13 +22,13 @@ pub(super) const DONE: &str = "done";
 pub(super) const FAILED: &str = "failed";
 
 /// Number and identity of a run.
-type Request<'r> = (usize, &'r CellKey);
+type CellRequest<'r> = (usize, &'r CellKey);
 
 /// Computes these runs with `jobs` processes; calls `on_frame` and `on_done` for each frame and run.
 pub(super) fn run(
     file: &Path,
     out: &Path,
-    missing: &[Request<'_>],
+    missing: &[CellRequest<'_>],
     jobs: usize,
     on_frame: &(dyn Fn() + Sync),
     on_done: &(dyn Fn() + Sync),
@@ -52,7 +52,7 @@ pub(super) fn run(
 fn serve<'r>(
     file: &Path,
     out: &Path,
-    queue: &Mutex<impl Iterator<Item = Request<'r>>>,
+    queue: &Mutex<impl Iterator<Item = CellRequest<'r>>>,
     failure: &Mutex<Option<anyhow::Error>>,
     on_frame: &dyn Fn(),
     on_done: &dyn Fn(),

@@ -66,7 +66,7 @@ pub fn run(
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
     check_scenes(experiment, data.chosen(experiment.scenarios)).map_err(BadInput::of)?;
-    let run = Run {
+    let run = TableRun {
         experiment,
         cells,
         data,
@@ -92,14 +92,14 @@ pub fn run(
     Ok(filled)
 }
 
-struct Run<'a> {
+struct TableRun<'a> {
     experiment: &'a Experiment,
     cells: PathBuf,
     data: OpenedData,
 }
 
 /// Place of a cell in the tables.
-struct Place<'a> {
+struct CellPlace<'a> {
     table: &'a Table,
     row: &'a Row,
     column: &'a Column,
@@ -107,15 +107,15 @@ struct Place<'a> {
     weights: PathBuf,
 }
 
-impl Run<'_> {
+impl TableRun<'_> {
     /// Every cell: by table, row, column and training.
-    fn places(&self) -> Result<Vec<Place<'_>>> {
+    fn places(&self) -> Result<Vec<CellPlace<'_>>> {
         let mut places = Vec::new();
         for table in &self.experiment.tables {
             for row in &table.rows {
                 for column in &table.columns {
                     let trainings = self.experiment.trainings_of(row)?.into_iter();
-                    places.extend(trainings.map(|weights| Place {
+                    places.extend(trainings.map(|weights| CellPlace {
                         table,
                         row,
                         column,
@@ -146,7 +146,7 @@ impl Run<'_> {
         })
     }
 
-    fn cell(&self, place: &Place<'_>, observer: &mut dyn TableObserver) -> Result<Cell> {
+    fn cell(&self, place: &CellPlace<'_>, observer: &mut dyn TableObserver) -> Result<Cell> {
         let trial = self.trial(place)?;
         let key = trial.key(&self.data, place.row.method)?;
         let known = Cell::read(&key, &self.cells)?;
@@ -160,7 +160,7 @@ impl Run<'_> {
         Ok(cell)
     }
 
-    fn trial(&self, place: &Place<'_>) -> Result<Trial> {
+    fn trial(&self, place: &CellPlace<'_>) -> Result<Trial> {
         let (row, column) = (place.row, place.column);
         let mut trial = self.experiment.trial()?;
         trial.scenarios = place.table.scenarios.or(trial.scenarios);

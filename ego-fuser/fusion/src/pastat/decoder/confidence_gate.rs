@@ -8,13 +8,13 @@ use crate::pastat::config::PastatConfig;
 
 /// Predicts the weight of a neighbour's newest map, token by token: 1 before training, 0 to 2 after.
 #[derive(Debug)]
-pub(super) struct ConfidenceGate {
+pub(super) struct TokenGate {
     hidden: nn::Linear,
     out: nn::Linear,
     patch: i64,
 }
 
-impl ConfidenceGate {
+impl TokenGate {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         let dim = config.dim;
         Self {

@@ -6,7 +6,7 @@ mod confidence_gate;
 use tch::nn::{self, Module};
 use tch::{Kind, TchError, Tensor};
 
-use self::confidence_gate::ConfidenceGate;
+use self::confidence_gate::TokenGate;
 use super::config::PastatConfig;
 use super::patches::{Tokens, channels_last};
 use super::spatial_alignment::FineMaps;
@@ -17,7 +17,7 @@ use crate::layers::ZERO;
 /// map, of which the maximum is taken, and as an additive change of that; neutral before training.
 #[derive(Debug)]
 pub(super) struct Decoder {
-    gate: ConfidenceGate,
+    gate: TokenGate,
     norm: nn::LayerNorm,
     cells: nn::Linear,
     channels: i64,
@@ -28,7 +28,7 @@ impl Decoder {
     /// Its variables are `gate.*` and `decoder.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         let (channels, dim, patch) = (config.channels, config.dim, config.patch);
-        let gate = ConfidenceGate::new(&(path / "gate"), config);
+        let gate = TokenGate::new(&(path / "gate"), config);
         let path = path / "decoder";
         Self {
             gate,

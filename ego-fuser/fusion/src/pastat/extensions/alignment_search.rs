@@ -49,7 +49,7 @@ pub(crate) fn displacements(
 ) -> Result<Displacements> {
     let count = pairs.ego_from_cav.len() as i64;
     let nowhere = Tensor::f_zeros([count, 3], (Kind::Float, pairs.shown.device()))?;
-    let config = network.search();
+    let config = network.config.alignment_search;
     if is_training {
         let searched = config.map(|config| offsets(pairs, area, config, true));
         return network.displacements(pairs, &searched.unwrap_or(Ok(nowhere))?, area);

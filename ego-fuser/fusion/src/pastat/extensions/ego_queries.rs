@@ -60,7 +60,7 @@ impl Others {
                 .chunks_exact(size)
                 .zip(gathered.chunks_exact_mut(size))
             {
-                let mut weights: Vec<Row> = entries
+                let mut weights: Vec<StripRow> = entries
                     .iter()
                     .zip(&normal)
                     .map(|(entry, normal)| strip.score(asked, entry, normal))
@@ -74,12 +74,12 @@ impl Others {
 }
 
 /// A number for each cell of a strip.
-type Row = [f32; STRIP];
+type StripRow = [f32; STRIP];
 
 /// Offset and factor of the layer norm for the tokens of a strip.
 struct Normal {
-    mean: Row,
-    scale: Row,
+    mean: StripRow,
+    scale: StripRow,
 }
 
 /// Some consecutive cells.
@@ -116,7 +116,7 @@ impl Strip<'_> {
         Normal { mean, scale }
     }
 
-    fn score(&self, asked: &[f32], entry: &[f32], Normal { mean, scale }: &Normal) -> Row {
+    fn score(&self, asked: &[f32], entry: &[f32], Normal { mean, scale }: &Normal) -> StripRow {
         let mut score = [0.0; STRIP];
         for (asked, row) in self.rows(asked).zip(self.rows(entry)) {
             for (((score, asked), value), mean) in score.iter_mut().zip(asked).zip(row).zip(mean) {
@@ -133,7 +133,7 @@ impl Strip<'_> {
     }
 
     /// Scores of the entries to their weights.
-    fn softmax(&self, scores: &mut [Row]) {
+    fn softmax(&self, scores: &mut [StripRow]) {
         for cell in 0..self.count {
             let is_any = (0..scores.len()).any(|entry| self.is_valid(entry, cell));
             for (entry, scores) in scores.iter_mut().enumerate() {
@@ -161,16 +161,13 @@ impl Strip<'_> {
         }
     }
 
-    fn mean(&self, entries: &[&[f32]], normal: &[Normal], weights: &[Row], gathered: &mut [f32]) {
+    fn mean(&self, entries: &[&[f32]], normal: &[Normal], weights: &[StripRow], out: &mut [f32]) {
         let cells = self.first..self.first + self.count;
         for ((entry, Normal { mean, scale }), weight) in entries.iter().zip(normal).zip(weights) {
             // A normalised token is (value - mean) * scale, so the scale goes into the weight.
             let mut share = *weight;
             (share.iter_mut().zip(scale)).for_each(|(share, scale)| *share *= scale);
-            for (sums, row) in gathered
-                .chunks_exact_mut(self.of.cells)
-                .zip(self.rows(entry))
-            {
+            for (sums, row) in out.chunks_exact_mut(self.of.cells).zip(self.rows(entry)) {
                 for (((sum, value), mean), share) in sums[cells.clone()]
                     .iter_mut()
                     .zip(row)

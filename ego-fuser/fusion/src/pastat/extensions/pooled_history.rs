@@ -11,8 +11,6 @@ use crate::warp::WarpedMaps;
 /// Maps pooled to cells of `cells` by `cells`; a pooled cell is valid where any of its cells is.
 pub(crate) fn pooled(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
     let WarpedMaps { features, mask } = maps;
-    Ok(WarpedMaps {
-        features: larger_cells(features, cells)?,
-        mask: larger_cells(mask, cells)?.f_ceil()?,
-    })
+    let mask = larger_cells(mask, cells)?.f_ceil()?;
+    Ok(WarpedMaps::new(larger_cells(features, cells)?, mask))
 }

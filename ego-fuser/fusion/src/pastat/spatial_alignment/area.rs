@@ -25,10 +25,7 @@ impl Area {
     /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells
     /// away.
     pub(crate) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
-        let half_m = [
-            width as f64 * grid.cell_m / 2.0,
-            height as f64 * grid.cell_m / 2.0,
-        ];
+        let half_m = [width, height].map(|cells| cells as f64 * grid.cell_m / 2.0);
         Self {
             middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]],
             half_m,

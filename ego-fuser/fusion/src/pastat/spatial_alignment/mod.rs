@@ -75,7 +75,7 @@ impl SpatialAlignment {
             return Ok((fine, tokens, None));
         };
         let (_, height, width) = own.size3()?;
-        let area = Area::new(grid, [height, width], network.radius());
+        let area = Area::new(grid, [height, width], network.config.radius);
         let Displacements { deltas, fit, .. } =
             self.compare(network, coarse, &confidences.of_maps, &area, is_training)?;
         let tokens = moved_tokens(&tokens, &deltas, &coarse.origins, &area)?;
@@ -112,10 +112,8 @@ impl SpatialAlignment {
         }
         if let Some(earlier) = &coarse.earlier {
             // Means of reduced maps are reduced means of maps.
-            let (ego, area) = (
-                pooled(&ego, self.earlier_cells)?,
-                area.with_cells_of(self.earlier_cells),
-            );
+            let ego = pooled(&ego, self.earlier_cells)?;
+            let area = area.with_cells_of(self.earlier_cells);
             let pairs = network.pairs(
                 [&ego, &network.reduced(earlier)?],
                 &confidences.f_narrow(0, agents, poses.len() as i64 - agents)?,

@@ -5,6 +5,7 @@ use tch::{TchError, Tensor};
 use super::area::resample;
 use crate::f64_tensor::{self, are_numbers, numbers};
 use crate::full_resolution::{CellSamples, FullResolutionMap};
+use crate::layers::unseen;
 use crate::warp::WarpedMaps;
 
 /// Maps on the ego's grid. Maps with corrected poses are resampled from the maps as received: a second resampling would
@@ -81,9 +82,7 @@ impl NeighbourMaps {
         }
         let WarpedMaps { features, mask } = &self.maps;
         // A map contributes nothing out of its reach.
-        let reach = mask
-            .f_zeros_like()?
-            .f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
+        let reach = unseen(mask)?;
         let mut maximum = own.shallow_clone();
         for index in 0..self.count()? {
             let [map, weight, reach] = [features, weight, &reach].map(|tensor| tensor.f_get(index));

@@ -12,7 +12,7 @@ use super::pairs::{Displacements, Pairs};
 use crate::f64_tensor::{pointwise, sum_over_first};
 use crate::layers::{ZERO, around};
 use crate::pastat::confidence_embedding::CONFIDENCES;
-use crate::pastat::config::{FsaConfig, SearchConfig};
+use crate::pastat::config::FsaConfig;
 use crate::warp::WarpedMaps;
 
 /// Prevents division by the weight of a map that matches nowhere.
@@ -27,7 +27,7 @@ const ARM_M: f64 = 5.0;
 /// connected layers.
 #[derive(Debug)]
 pub(crate) struct AlignmentNetwork {
-    config: FsaConfig,
+    pub(crate) config: FsaConfig,
     matching: [nn::Conv2D; 2],
     /// Logarithm of the sharpness of the softmax over shifts.
     sharpness: Tensor,
@@ -58,22 +58,10 @@ impl AlignmentNetwork {
         }
     }
 
-    /// Largest offset between compared cells, cells.
-    pub(crate) fn radius(&self) -> i64 {
-        self.config.radius
-    }
-
-    /// The search for maps with a large offset; absent: none.
-    pub(crate) fn search(&self) -> Option<SearchConfig> {
-        self.config.alignment_search
-    }
-
     /// The reduced channels in which maps are compared.
     pub(crate) fn reduced(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<WarpedMaps> {
-        Ok(WarpedMaps {
-            features: pointwise(&self.matching[0], features)?,
-            mask: mask.shallow_clone(),
-        })
+        let features = pointwise(&self.matching[0], features)?;
+        Ok(WarpedMaps::new(features, mask.shallow_clone()))
     }
 
     /// `K` maps and the ego's, all [reduced](Self::reduced), prepared for comparison.

@@ -3,7 +3,7 @@
 use tch::nn::{self, Init, Module};
 use tch::{Kind, Result, Tensor};
 
-use super::window_loops::{Windows, attend};
+use super::window_loops::{TokenWindows, attend};
 use crate::f64_tensor::{are_numbers, numbers};
 use crate::layers::BARE;
 use crate::pastat::extensions::ego_queries::Others;
@@ -13,7 +13,7 @@ const MASKED: f64 = -1e9;
 
 /// Multi-head self-attention over agents and time at each cell (the MSA of Eq. 8).
 #[derive(Debug)]
-pub(super) struct AgentAttention {
+pub(super) struct AgentTimeAttention {
     query: nn::Linear,
     key: nn::Linear,
     value: nn::Linear,
@@ -24,7 +24,7 @@ pub(super) struct AgentAttention {
     heads: i64,
 }
 
-impl AgentAttention {
+impl AgentTimeAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64) -> Self {
         let identity = Tensor::eye(heads, (Kind::Float, path.device()));
         Self {
@@ -98,7 +98,7 @@ impl AgentAttention {
 
 /// Attention among the tokens of a window, with windows of several sizes, each with its share of the heads.
 #[derive(Debug)]
-pub(super) struct WindowAttention {
+pub(super) struct MultiWindowAttention {
     query_key_value: nn::Linear,
     out: nn::Linear,
     sizes: Vec<WindowSize>,
@@ -115,7 +115,7 @@ struct WindowSize {
     places: Vec<i64>,
 }
 
-impl WindowAttention {
+impl MultiWindowAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64, edges: &[i64]) -> Self {
         let heads = heads / edges.len() as i64;
         let sizes = edges.iter().enumerate().map(|(index, &edge)| WindowSize {
@@ -151,7 +151,7 @@ impl WindowAttention {
             let (projected, mut seen) = (numbers(&projected)?, vec![0.0; tokens.numel()]);
             let all = [height, width, dim, share, share / self.heads].map(|size| size as usize);
             for (index, size) in self.sizes.iter().enumerate() {
-                let windows = Windows {
+                let windows = TokenWindows {
                     size: [all[0], all[1]],
                     edge: size.edge as usize,
                     channels: [all[2], index * all[3], all[4]],
@@ -239,7 +239,7 @@ mod tests {
     #[test]
     fn what_the_ego_gathers_is_what_one_row_learns() {
         let variables = VarStore::new(Device::Cpu);
-        let attention = AgentAttention::new(&variables.root(), 12, 2);
+        let attention = AgentTimeAttention::new(&variables.root(), 12, 2);
         let norm = nn::layer_norm(
             variables.root() / "norm",
             vec![12],
@@ -266,8 +266,8 @@ mod tests {
     #[test]
     fn hidden_tokens_are_not_attended_to() {
         let variables = VarStore::new(Device::Cpu);
-        let agents = AgentAttention::new(&(variables.root() / "a"), 8, 2);
-        let windows = WindowAttention::new(&(variables.root() / "w"), 8, 2, &[2, 4]);
+        let agents = AgentTimeAttention::new(&(variables.root() / "a"), 8, 2);
+        let windows = MultiWindowAttention::new(&(variables.root() / "w"), 8, 2, &[2, 4]);
         let tokens = Tensor::randn([2, 4, 8, 8], FLOAT);
         let valid = Tensor::ones([2, 4, 8], FLOAT);
         let _ = valid.get(1).fill_(0.0);
@@ -301,7 +301,7 @@ mod tests {
     fn numbers_and_tensors_attend_alike() {
         let variables = VarStore::new(Device::Cpu);
         // Windows of 9 tokens are no whole number of vectors.
-        let windows = WindowAttention::new(&variables.root(), 12, 2, &[3, 6]);
+        let windows = MultiWindowAttention::new(&variables.root(), 12, 2, &[3, 6]);
         redraw(&variables, &["weight", "bias"], 0.8);
         let tokens = uniform(1, &[1, 12, 18, 12]) * 3.0;
         let valid = Tensor::ones([1, 12, 18], FLOAT);
@@ -313,7 +313,7 @@ mod tests {
     #[test]
     fn tokens_of_other_windows_do_not_matter() {
         let variables = VarStore::new(Device::Cpu);
-        let windows = WindowAttention::new(&variables.root(), 8, 2, &[2, 4]);
+        let windows = MultiWindowAttention::new(&variables.root(), 8, 2, &[2, 4]);
         let tokens = Tensor::randn([1, 4, 8, 8], FLOAT);
         let changed = tokens.copy();
         let _ = changed.narrow(2, 4, 4).fill_(3.0);

@@ -3,28 +3,28 @@
 use tch::nn::{self, Module};
 use tch::{Result, Tensor};
 
-use super::attention::{AgentAttention, WindowAttention};
+use super::attention::{AgentTimeAttention, MultiWindowAttention};
 use crate::pastat::config::PastatConfig;
 use crate::pastat::extensions::ego_queries::Others;
 
 /// One block: over agents and time at each cell, across cells within windows, then cell by cell.
 #[derive(Debug)]
-pub(super) struct Block {
+pub(super) struct PastatBlock {
     norms: [nn::LayerNorm; 3],
-    agents: AgentAttention,
-    windows: WindowAttention,
+    agents: AgentTimeAttention,
+    windows: MultiWindowAttention,
     mlp: [nn::Linear; 2],
 }
 
-impl Block {
+impl PastatBlock {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         let (dim, heads) = (config.dim, config.heads);
         let wide = config.mlp_ratio * dim;
         Self {
             norms: ["norm_agents", "norm_windows", "norm_mlp"]
                 .map(|name| nn::layer_norm(path / name, vec![dim], nn::LayerNormConfig::default())),
-            agents: AgentAttention::new(&(path / "agents"), dim, heads),
-            windows: WindowAttention::new(&(path / "windows"), dim, heads, &config.windows),
+            agents: AgentTimeAttention::new(&(path / "agents"), dim, heads),
+            windows: MultiWindowAttention::new(&(path / "windows"), dim, heads, &config.windows),
             mlp: [("mlp0", dim, wide), ("mlp1", wide, dim)].map(|(name, from, to)| {
                 nn::linear(path / name, from, to, nn::LinearConfig::default())
             }),

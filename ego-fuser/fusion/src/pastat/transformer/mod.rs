@@ -10,7 +10,7 @@ mod window_loops;
 
 use tch::{Device, TchError, Tensor, nn};
 
-use self::block::Block;
+use self::block::PastatBlock;
 use super::config::PastatConfig;
 use super::extensions::ego_queries::Others;
 use super::patches::{Tokens, channels_last};
@@ -18,7 +18,7 @@ use super::patches::{Tokens, channels_last};
 /// The blocks of the transformer.
 #[derive(Debug)]
 pub(super) struct Transformer {
-    blocks: Vec<Block>,
+    blocks: Vec<PastatBlock>,
 }
 
 impl Transformer {
@@ -26,7 +26,7 @@ impl Transformer {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         Self {
             blocks: (0..config.depth)
-                .map(|index| Block::new(&(path / "blocks" / index), config))
+                .map(|index| PastatBlock::new(&(path / "blocks" / index), config))
                 .collect(),
         }
     }

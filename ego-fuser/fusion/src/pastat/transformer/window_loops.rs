@@ -6,7 +6,7 @@ use multiversion::multiversion;
 use crate::vector_loops::{LANES, exponentials};
 
 /// Windows of one size on the tokens of a map.
-pub(super) struct Windows {
+pub(super) struct TokenWindows {
     /// Rows and columns of tokens, multiples of `edge`.
     pub(super) size: [usize; 2],
     /// Tokens along each edge of a window.
@@ -20,8 +20,8 @@ pub(super) struct Windows {
 /// Attention within windows: from queries, keys and values of all tokens, `[h, w, 3 * D]`, to the channels of these heads
 /// of `out` `[h, w, D]`.
 #[multiversion(targets("x86_64+avx2+fma"))]
-pub(super) fn attend(windows: &Windows, projected: &[f32], out: &mut [f32]) {
-    let &Windows {
+pub(super) fn attend(windows: &TokenWindows, projected: &[f32], out: &mut [f32]) {
+    let &TokenWindows {
         size: [height, width],
         edge,
         channels: [dim, first, each],

@@ -6,11 +6,11 @@ use std::fmt::Write as _;
 use serde::Serialize;
 use support::statistics::{mean, median};
 
-use super::{AlignmentError, PairOutcome};
+use super::{PairError, PairOutcome};
 
 /// One method over all pairs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Row {
+pub struct MethodRow {
     /// Name of the method.
     pub method: String,
     /// Pairs of ego and neighbour, counted at every tick.
@@ -41,14 +41,14 @@ pub struct Row {
 
 /// Collects outcomes of one method.
 #[derive(Debug, Clone, Default)]
-pub struct Tally {
+pub struct PairTally {
     seconds: f64,
     bytes: f64,
-    errors: Vec<AlignmentError>,
+    errors: Vec<PairError>,
     reasons: BTreeMap<&'static str, usize>,
 }
 
-impl Tally {
+impl PairTally {
     /// Counts one pair.
     pub fn add(&mut self, outcome: &PairOutcome) {
         self.seconds += outcome.time.as_secs_f64();
@@ -60,7 +60,7 @@ impl Tally {
     }
 
     /// The row; shares of nothing are zero.
-    pub fn row(&self, method: &str) -> Row {
+    pub fn row(&self, method: &str) -> MethodRow {
         let failed: usize = self.reasons.values().sum();
         let pairs = failed + self.errors.len();
         let divisor = pairs.max(1) as f64;
@@ -71,7 +71,7 @@ impl Tally {
         let bytes_mean = self.bytes / divisor;
         let metres: Vec<f64> = self.errors.iter().map(|error| error.metres).collect();
         let degrees: Vec<f64> = self.errors.iter().map(|error| error.degrees).collect();
-        Row {
+        MethodRow {
             method: method.to_owned(),
             pairs,
             time_s: self.seconds / divisor,
@@ -91,7 +91,7 @@ impl Tally {
 }
 
 /// The rows as a markdown table.
-pub fn markdown(rows: &[Row]) -> String {
+pub fn markdown(rows: &[MethodRow]) -> String {
     let mut text = String::from(
         "| method | time, s | bytes, log2 | under 3 m, % | under 1 m, % | mean / median, m | mean / median, deg | no alignment, % | pairs |\n\
          | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n",
@@ -126,7 +126,7 @@ mod tests {
     use super::*;
 
     fn outcome(result: Result<(f64, f64), NotAligned>) -> PairOutcome {
-        let result = result.map(|(metres, degrees)| AlignmentError { metres, degrees });
+        let result = result.map(|(metres, degrees)| PairError { metres, degrees });
         PairOutcome {
             method: 0,
             bytes: 64,
@@ -137,7 +137,7 @@ mod tests {
 
     #[test]
     fn a_pair_without_alignment_is_no_success() {
-        let mut tally = Tally::default();
+        let mut tally = PairTally::default();
         for result in [
             Ok((0.5, 1.0)),
             Ok((2.0, 0.2)),
@@ -159,7 +159,7 @@ mod tests {
             (row.mean_m.unwrap() - 32.5 / 3.0).abs() < 1e-12 && (row.time_s - 0.02).abs() < 1e-12
         );
         assert_eq!(row.reasons, BTreeMap::from([("no_pose", 1)]));
-        let text = markdown(&[row, Tally::default().row("nothing")]);
+        let text = markdown(&[row, PairTally::default().row("nothing")]);
         assert_eq!(text.lines().count(), 4);
         assert!(
             text.contains("| poses | 0.0200 | 6.00 | 50.00 | 25.00 | 10.83 / 2.00 |"),

@@ -92,7 +92,7 @@ pub struct EstimatedTimes {
 
 /// Durations of stages, milliseconds.
 #[derive(Debug, Default)]
-struct Samples {
+struct StageDurations {
     pose: Vec<f64>,
     observe: Vec<f64>,
     map: Vec<f64>,
@@ -103,7 +103,7 @@ struct Samples {
     motion: EgoMotion,
 }
 
-impl Samples {
+impl StageDurations {
     fn add(&mut self, process: usize, timings: &[StageTiming]) {
         for timing in timings {
             let stages = &mut self.stages[process];
@@ -163,9 +163,8 @@ impl Evaluator {
         };
         let stages = samples.stages.map(|stages| {
             let stages = stages.into_iter();
-            stages
-                .map(|(stage, sample)| (stage, late_median(&sample)))
-                .collect()
+            let medians = stages.map(|(stage, sample)| (stage, late_median(&sample)));
+            medians.collect()
         });
         Ok(EstimatedTimes { steps, stages })
     }
@@ -176,7 +175,7 @@ impl Evaluator {
         scenario: &Scenario,
         vehicles: usize,
         is_needed: &dyn Fn(usize) -> bool,
-    ) -> Result<Samples, EvaluateError> {
+    ) -> Result<StageDurations, EvaluateError> {
         let stream = self.ego.method().own_content().stream();
         let mut participants = (0..scenario.agents.len().min(MEASURED_VEHICLES))
             .map(|place| {
@@ -184,7 +183,7 @@ impl Evaluator {
                 self.participant(&self.setup.agents, scenario, (place, place), needed)
             })
             .collect::<Result<Vec<_>, EvaluateError>>()?;
-        let mut samples = Samples::default();
+        let mut samples = StageDurations::default();
         // Maps of an earlier run are no history of these ticks.
         self.ego.forget();
         for tick in (0..scenario.ticks.len()).take_while(|tick| is_needed(*tick)) {

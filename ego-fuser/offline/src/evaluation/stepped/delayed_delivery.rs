@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use bus::process_id;
-use link::{Delivery, LinkEmulator, Outcome, Packet};
+use link::{Delivery, LinkEmulator, Packet, PacketOutcome};
 use protocol::{
     Account, CavId, DropReason, HEADER_LEN, Ledger, ProcessId, RateReason, Role, Stream, Topic,
 };
@@ -157,12 +157,10 @@ impl DelayedDelivery {
             self.link.submit(packet);
         }
         let outcomes = self.link.advance(nanos).into_iter();
-        outcomes
-            .filter_map(|outcome| self.settle(outcome))
-            .collect()
+        outcomes.filter_map(|it| self.settle(it)).collect()
     }
 
-    fn settle(&mut self, outcome: Outcome) -> Option<Envelope> {
+    fn settle(&mut self, outcome: PacketOutcome) -> Option<Envelope> {
         let packet = outcome.packet;
         let topic = Topic::stream(&packet.from, packet.stream);
         let account = Account::towards(topic, &self.receiver);

@@ -18,7 +18,7 @@ use bus::{
 use dataset::frame::Frame;
 use protocol::{CavId, Lidar, Limits, Role, Stream, Topic, WireError, wire};
 
-use super::super::sent::{Answer, Sent};
+use super::super::sent::{Replies, Sent};
 
 /// Timeout of all vehicles together for a tick: for a busy machine, but not for one that has lost a process.
 const TIMEOUT: Duration = Duration::from_secs(120);
@@ -51,7 +51,7 @@ pub enum RemoteError {
 }
 
 /// Publishers of a vehicle's sweeps.
-struct Sensors {
+struct SweepPublishers {
     gnss: Publisher,
     imu: Publisher,
     lidar: Publisher,
@@ -60,7 +60,7 @@ struct Sensors {
 /// All vehicles of a run in simulation time, each a process.
 pub struct RemotePool {
     inbox: Arc<Inbox>,
-    sensors: BTreeMap<CavId, Sensors>,
+    sensors: BTreeMap<CavId, SweepPublishers>,
     /// Streams of each vehicle beside its pose, in the order of sending.
     streams: BTreeMap<CavId, Vec<Stream>>,
     _subscriptions: Vec<Subscription>,
@@ -94,7 +94,7 @@ impl RemotePool {
         let here = bus.identity().process.clone();
         for (cav, streams) in vehicles {
             let options = PublisherOptions::SENSOR.lossless(1);
-            let publishers = Sensors {
+            let publishers = SweepPublishers {
                 gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), options)?,
                 imu: bus.publisher(Topic::stream(cav, Stream::Imu), options)?,
                 lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), options)?,
@@ -124,12 +124,12 @@ impl RemotePool {
     pub(in super::super) fn finish(self) {
         self.sensors
             .into_values()
-            .flat_map(|Sensors { gnss, imu, lidar }| [gnss, imu, lidar])
+            .flat_map(|SweepPublishers { gnss, imu, lidar }| [gnss, imu, lidar])
             .for_each(Publisher::finish);
     }
 
     /// True while messages of a vehicle are missing in its answer.
-    fn awaits(&self, cav: &CavId, answer: &Answer) -> bool {
+    fn awaits(&self, cav: &CavId, answer: &Replies) -> bool {
         let streams = self.streams.get(cav);
         !answer.is_complete(streams.map_or(&[], Vec::as_slice))
     }
@@ -137,7 +137,7 @@ impl RemotePool {
     /// Sends the sweeps of a tick and waits for all answers, in the same order.
     pub(super) fn request(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
         for frame in frames {
-            let Some(Sensors { gnss, imu, lidar }) = self.sensors.get(&frame.cav) else {
+            let Some(SweepPublishers { gnss, imu, lidar }) = self.sensors.get(&frame.cav) else {
                 continue;
             };
             // As in this process: the measurement is the recorded pose, without error.
@@ -149,8 +149,8 @@ impl RemotePool {
             lidar.submit(frame.capture_nanos, Lidar { points });
         }
         let deadline = Instant::now() + TIMEOUT;
-        let answers = frames.iter().map(|frame| (&frame.cav, Answer::default()));
-        let mut answers: BTreeMap<&CavId, Answer> = answers.collect();
+        let answers = frames.iter().map(|frame| (&frame.cav, Replies::default()));
+        let mut answers: BTreeMap<&CavId, Replies> = answers.collect();
         while answers.iter().any(|(cav, answer)| self.awaits(cav, answer)) {
             match self.inbox.take(Some(deadline)) {
                 Pop::Item(topic, Event::Message(arrival)) => {

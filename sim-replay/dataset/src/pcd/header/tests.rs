@@ -6,12 +6,12 @@ const SOUND: &str = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nT
 fn error_after(from: &str, to: &str) -> String {
     let text = SOUND.replace(from, to);
     assert_ne!(text, SOUND, "{from}");
-    Header::parse(text.as_bytes()).unwrap_err().to_string()
+    PcdHeader::parse(text.as_bytes()).unwrap_err().to_string()
 }
 
 #[test]
 fn a_sound_header_is_taken_apart() {
-    let (header, body) = Header::parse(format!("{SOUND}rest").as_bytes())
+    let (header, body) = PcdHeader::parse(format!("{SOUND}rest").as_bytes())
         .map(|(h, b)| (h, b.to_vec()))
         .unwrap();
     assert_eq!(
@@ -142,7 +142,7 @@ fn absurd_counts_are_refused() {
         .replace("WIDTH 2", "WIDTH 99999999999")
         .replace("POINTS 2", "POINTS 99999999999");
     assert!(
-        Header::parse(absurd.as_bytes())
+        PcdHeader::parse(absurd.as_bytes())
             .unwrap_err()
             .reason
             .contains("at most 10000000")
@@ -150,16 +150,16 @@ fn absurd_counts_are_refused() {
     let wrapping = SOUND
         .replace("WIDTH 2", "WIDTH 9223372036854775808")
         .replace("HEIGHT 1", "HEIGHT 2");
-    assert!(Header::parse(wrapping.replace("POINTS 2", "POINTS 0").as_bytes()).is_err());
+    assert!(PcdHeader::parse(wrapping.replace("POINTS 2", "POINTS 0").as_bytes()).is_err());
 }
 
 #[test]
 fn carriage_returns_are_whitespace() {
-    assert!(Header::parse(SOUND.replace('\n', "\r\n").as_bytes()).is_ok());
+    assert!(PcdHeader::parse(SOUND.replace('\n', "\r\n").as_bytes()).is_ok());
 }
 
-fn parsed(text: &str) -> Header {
-    Header::parse(text.as_bytes())
+fn parsed(text: &str) -> PcdHeader {
+    PcdHeader::parse(text.as_bytes())
         .unwrap_or_else(|error| panic!("{error}:\n{text}"))
         .0
 }
@@ -189,7 +189,7 @@ fn missing_entries_follow_from_the_rest() {
         "VIEWPOINT 0 0 0 1 0 0 0\n",
     ] {
         assert_eq!(
-            Header {
+            PcdHeader {
                 lines: 11,
                 ..parsed(&SOUND.replace(missing, ""))
             },
@@ -206,7 +206,9 @@ fn missing_entries_follow_from_the_rest() {
         .replace("POINTS 2", "POINTS 6");
     assert_eq!(parsed(&rows).points, 6);
     let neither = SOUND.replace("WIDTH 2\n", "").replace("POINTS 2\n", "");
-    let message = Header::parse(neither.as_bytes()).unwrap_err().to_string();
+    let message = PcdHeader::parse(neither.as_bytes())
+        .unwrap_err()
+        .to_string();
     assert_eq!(message, "POINTS: missing in the header, and WIDTH too");
 }
 
@@ -230,7 +232,7 @@ fn spelling_and_comments_do_not_matter() {
     assert_eq!(parsed(&lower.collect::<String>()), sound);
     let commented = SOUND.replace("WIDTH", "# \u{4e2d}\n\n#\nWIDTH");
     assert_eq!(
-        Header {
+        PcdHeader {
             lines: 11,
             ..parsed(&commented)
         },
@@ -238,7 +240,7 @@ fn spelling_and_comments_do_not_matter() {
     );
     let mut latin = b"# caf\xe9\n".to_vec();
     latin.extend(SOUND.as_bytes());
-    assert_eq!(Header::parse(&latin).unwrap().0.lines, 12);
+    assert_eq!(PcdHeader::parse(&latin).unwrap().0.lines, 12);
 }
 
 #[test]

@@ -236,5 +236,5 @@ fn lines_may_be_blank_and_numbers_spelled_as_c_does() {
         (cloud.points.xyzi, cloud.dropped),
         (vec![[1.0, 2.0, 3.0, 4.0]; 3], 3)
     );
-    assert_eq!(cloud.first_dropped, Some(Place::Line(9)));
+    assert_eq!(cloud.first_dropped, Some(PcdPlace::Line(9)));
 }

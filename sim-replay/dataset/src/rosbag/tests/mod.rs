@@ -8,8 +8,8 @@ use std::path::Path;
 use support::file_digests::FileDigests;
 
 use self::bag::{Bag, S, T0, describe, drive, drive_at, x_at};
-use super::contents::Contents;
-use super::scan::{Message, Scan, Topic};
+use super::contents::BagContents;
+use super::scan::{BagMessage, BagTopic, Scan};
 use super::storage::Storage;
 use crate::{Dataset, LoadOptions};
 
@@ -194,14 +194,14 @@ fn files_that_a_description_lacks_or_lists_in_vain_are_named() {
 }
 
 /// A scan during which a file is cut off.
-struct Cutting<'a>(Contents, &'a Path);
+struct Cutting<'a>(BagContents, &'a Path);
 
 impl Scan for Cutting<'_> {
-    fn declare(&mut self, topic: &Topic) -> bool {
+    fn declare(&mut self, topic: &BagTopic) -> bool {
         self.0.declare(topic)
     }
 
-    fn take(&mut self, message: Message<'_>) {
+    fn take(&mut self, message: BagMessage<'_>) {
         let file = fs::File::options().write(true).open(self.1).unwrap();
         file.set_len(8).unwrap();
         self.0.take(message);
@@ -217,7 +217,7 @@ fn sweeps_of_a_file_that_fails_midway_are_not_looked_for_in_the_next() {
     let folder = tempfile::tempdir().unwrap();
     let paths = ["a_0.mcap", "a_1.mcap"].map(|name| folder.path().join(name));
     paths.iter().for_each(|path| drive().mcap(path));
-    let mut scan = Cutting(Contents::of(folder.path()), &paths[0]);
+    let mut scan = Cutting(BagContents::of(folder.path()), &paths[0]);
     let mut problems = Vec::new();
     let storage = Storage::open(&paths, &mut scan, &mut problems).unwrap();
     assert_eq!((storage.paths().len(), problems.len()), (1, 1));

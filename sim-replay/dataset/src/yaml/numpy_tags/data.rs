@@ -3,14 +3,14 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use super::super::field::Field;
+use super::super::field::YamlField;
 use super::super::node::Value;
 use super::{APPLY, args, expect_tag, items};
 use crate::Result;
 use crate::scalar::{Scalar, ScalarKind};
 
 /// `dtype('f8', False, True)` with a state whose second item is the byte order.
-pub(super) fn read_dtype(field: &Field<'_>) -> Result<Scalar> {
+pub(super) fn read_dtype(field: &YamlField<'_>) -> Result<Scalar> {
     expect_tag(field, "python/object/apply:numpy.dtype")?;
     let [name, ..] = items::<3>(&field.required("args")?)?;
     let (kind, size) = match name.text()? {
@@ -48,7 +48,7 @@ pub(super) fn read_dtype(field: &Field<'_>) -> Result<Scalar> {
 }
 
 /// Bytes in base64, on their own or as the one argument of `bytearray`.
-pub(super) fn binary(field: &Field<'_>) -> Result<Vec<u8>> {
+pub(super) fn binary(field: &YamlField<'_>) -> Result<Vec<u8>> {
     let tag = field.node.tag.as_deref();
     let function = tag.and_then(|tag| tag.strip_prefix(APPLY));
     if function == Some("builtins.bytearray") && !matches!(field.node.value, Value::Text(_)) {
@@ -58,7 +58,7 @@ pub(super) fn binary(field: &Field<'_>) -> Result<Vec<u8>> {
     base64(field)
 }
 
-fn base64(field: &Field<'_>) -> Result<Vec<u8>> {
+fn base64(field: &YamlField<'_>) -> Result<Vec<u8>> {
     expect_tag(field, "binary")?;
     // The lines of a block are part of the text.
     let text: String = field.text()?.split_ascii_whitespace().collect();
@@ -68,7 +68,7 @@ fn base64(field: &Field<'_>) -> Result<Vec<u8>> {
 }
 
 /// Exactly `count` numbers.
-pub(super) fn numbers(field: &Field<'_>, dtype: Scalar, count: usize) -> Result<Vec<f64>> {
+pub(super) fn numbers(field: &YamlField<'_>, dtype: Scalar, count: usize) -> Result<Vec<f64>> {
     let bytes = binary(field)?;
     let (found, size) = (bytes.len(), dtype.size);
     if count.checked_mul(size) != Some(found) {

@@ -9,8 +9,8 @@ mod data;
 
 use std::path::Path;
 
-use super::field::Field;
-use super::node::{Node, Value};
+use super::field::YamlField;
+use super::node::{Value, YamlNode};
 use crate::Result;
 use data::{binary, numbers, read_dtype};
 
@@ -35,26 +35,26 @@ impl NumpyArray {
 }
 
 /// True if the node carries a tag of Python's.
-pub(crate) fn is_python(node: &Node) -> bool {
+pub(crate) fn is_python(node: &YamlNode) -> bool {
     let tag = node.tag.as_deref();
     tag.is_some_and(|tag| tag.starts_with("python/"))
 }
 
 /// True if the node is a pickled call, and not a tuple or list of Python's.
-pub(crate) fn is_call(node: &Node) -> bool {
+pub(crate) fn is_call(node: &YamlNode) -> bool {
     let tag = node.tag.as_deref();
     tag.is_some_and(|tag| tag.starts_with(APPLY))
 }
 
 /// The text of a key that is a NumPy scalar; `None` if it is none.
-pub(crate) fn key_text(node: &Node) -> Option<String> {
-    scalar(&Field::root(Path::new(""), node))
+pub(crate) fn key_text(node: &YamlNode) -> Option<String> {
+    scalar(&YamlField::root(Path::new(""), node))
         .ok()
         .map(|number| number.to_string())
 }
 
 /// Reads `_reconstruct`, `_frombuffer` and `scalar(dtype, data)`, an array without dimensions.
-pub(crate) fn array(field: &Field<'_>) -> Result<NumpyArray> {
+pub(crate) fn array(field: &YamlField<'_>) -> Result<NumpyArray> {
     match function(field) {
         Some("multiarray._reconstruct") => reconstruct(field),
         Some("numeric._frombuffer") => from_buffer(field),
@@ -73,7 +73,7 @@ pub(crate) fn array(field: &Field<'_>) -> Result<NumpyArray> {
 }
 
 /// Reads `scalar(dtype, data)` or an array with one number; it must be finite.
-pub(crate) fn scalar(field: &Field<'_>) -> Result<f64> {
+pub(crate) fn scalar(field: &YamlField<'_>) -> Result<f64> {
     let NumpyArray { shape, values } = array(field)?;
     match values[..] {
         [value] if value.is_finite() => Ok(value),
@@ -83,21 +83,20 @@ pub(crate) fn scalar(field: &Field<'_>) -> Result<f64> {
 }
 
 /// Module and name of the function of NumPy that a node calls.
-fn function<'a>(field: &Field<'a>) -> Option<&'a str> {
+fn function<'a>(field: &YamlField<'a>) -> Option<&'a str> {
     let call = field.node.tag.as_deref()?.strip_prefix(APPLY)?;
     let mut packages = PACKAGES.iter();
     packages.find_map(|package| call.strip_prefix(package)?.strip_prefix('.'))
 }
 
 /// `_reconstruct(ndarray, (0,), b'b')` with its state `(1, shape, dtype, is_fortran, data)`.
-fn reconstruct(field: &Field<'_>) -> Result<NumpyArray> {
+fn reconstruct(field: &YamlField<'_>) -> Result<NumpyArray> {
     let parts = field.entries()?;
     if parts.len() != 2 {
         return Err(field.error(format!("{} parts, expected args and state", parts.len())));
     }
     check_args(&field.required("args")?)?;
-    let state_field = field.required("state")?;
-    let [version, shape, dtype, is_fortran, data] = tuple::<5>(&state_field)?;
+    let [version, shape, dtype, is_fortran, data] = tuple::<5>(&field.required("state")?)?;
     let number = integer(&version)?;
     if number != 1 {
         return Err(version.error(format!("pickle version {number}, expected 1")));
@@ -114,7 +113,7 @@ fn reconstruct(field: &Field<'_>) -> Result<NumpyArray> {
 }
 
 /// `_frombuffer(data, dtype, shape, order)`.
-fn from_buffer(field: &Field<'_>) -> Result<NumpyArray> {
+fn from_buffer(field: &YamlField<'_>) -> Result<NumpyArray> {
     let [data, dtype, shape, order] = items::<4>(&args(field)?)?;
     let shape = read_shape(&shape)?;
     let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
@@ -126,7 +125,7 @@ fn from_buffer(field: &Field<'_>) -> Result<NumpyArray> {
 }
 
 /// Arguments of a call without state are its items, or the entry `args`.
-fn args<'a>(field: &Field<'a>) -> Result<Field<'a>> {
+fn args<'a>(field: &YamlField<'a>) -> Result<YamlField<'a>> {
     if matches!(field.node.value, Value::Map(_)) {
         field.required("args")
     } else {
@@ -134,7 +133,7 @@ fn args<'a>(field: &Field<'a>) -> Result<Field<'a>> {
     }
 }
 
-fn expect_tag(field: &Field<'_>, expected: &str) -> Result<()> {
+fn expect_tag(field: &YamlField<'_>, expected: &str) -> Result<()> {
     match field.node.tag.as_deref() {
         Some(tag) if tag == expected => Ok(()),
         tag => Err(field.error(format!("tag {}, expected !!{expected}", shown(tag)))),
@@ -142,7 +141,7 @@ fn expect_tag(field: &Field<'_>, expected: &str) -> Result<()> {
 }
 
 /// Only a plain integer: what NumPy writes beside its numbers.
-fn integer(field: &Field<'_>) -> Result<i64> {
+fn integer(field: &YamlField<'_>) -> Result<i64> {
     match field.node.value {
         Value::Integer(value) => Ok(value),
         _ => Err(field.expected("an integer")),
@@ -155,7 +154,7 @@ fn shown(tag: Option<&str>) -> String {
     })
 }
 
-fn items<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N]> {
+fn items<'a, const N: usize>(field: &YamlField<'a>) -> Result<[YamlField<'a>; N]> {
     let items = field.items()?;
     let found = items.len();
     items
@@ -163,13 +162,13 @@ fn items<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N]> {
         .map_err(|_| field.error(format!("{found} items, expected {N}")))
 }
 
-fn tuple<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N]> {
+fn tuple<'a, const N: usize>(field: &YamlField<'a>) -> Result<[YamlField<'a>; N]> {
     expect_tag(field, "python/tuple")?;
     items(field)
 }
 
 /// `args` of `_reconstruct` are always the same: an empty array to be filled by the state.
-fn check_args(args: &Field<'_>) -> Result<()> {
+fn check_args(args: &YamlField<'_>) -> Result<()> {
     let [class, shape, code] = items::<3>(args)?;
     expect_tag(&class, "python/name:numpy.ndarray")?;
     let [zero] = tuple::<1>(&shape)?;
@@ -182,7 +181,7 @@ fn check_args(args: &Field<'_>) -> Result<()> {
     }
 }
 
-fn read_shape(field: &Field<'_>) -> Result<Vec<usize>> {
+fn read_shape(field: &YamlField<'_>) -> Result<Vec<usize>> {
     expect_tag(field, "python/tuple")?;
     let items = field.items()?;
     let sizes = items.iter().map(|item| {

@@ -59,10 +59,10 @@ const NUMBERS: [f64; 16] = [
     0.0, -1.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 1e-300,
 ];
 
-fn with_field<T>(text: &str, key: &str, read: impl Fn(&Field<'_>) -> Result<T>) -> Result<T> {
+fn with_field<T>(text: &str, key: &str, read: impl Fn(&YamlField<'_>) -> Result<T>) -> Result<T> {
     let path = Path::new("000000.yaml");
     let node = yaml::parse(path, text.as_bytes())?;
-    read(&Field::root(path, &node).required(key)?)
+    read(&YamlField::root(path, &node).required(key)?)
 }
 
 fn read(text: &str) -> Result<NumpyArray> {

@@ -17,7 +17,7 @@ pub(super) use ground_paint::GroundPaint;
 pub(super) use paint::{Paint, of_shape, of_vehicle};
 
 use super::lidar::LIDAR_MOUNT_M;
-use super::raycast::{Body, Caster, Placement, RayPattern, Surface, Sweep};
+use super::raycast::{Caster, Course, Placement, RayBody, RayPattern, Surface};
 use super::weather::Weather;
 use shading::Shader;
 
@@ -85,7 +85,7 @@ pub(super) struct CameraRig {
 /// Surroundings of a vehicle as its cameras see them.
 pub(super) struct Surroundings<'a> {
     pub(super) ground: &'a dyn Surface,
-    pub(super) bodies: &'a [Body<'a>],
+    pub(super) bodies: &'a [RayBody<'a>],
     /// Paint of each body.
     pub(super) paints: &'a [Paint],
     pub(super) weather: Weather,
@@ -177,11 +177,11 @@ impl MountedCamera {
         ground_paint: &mut GroundPaint<'_>,
         seed: u64,
     ) -> Vec<u8> {
-        let sensor = Sweep::still(vehicle.mounted(self.position_m.into()));
+        let sensor = Course::still(vehicle.mounted(self.position_m.into()));
         // At the end of the sweep, the capture time, everything stands where it is then.
         let mut bodies = surroundings.bodies.to_vec();
         for body in &mut bodies {
-            body.motion = Sweep::still(body.motion.end);
+            body.motion = Course::still(body.motion.end);
         }
         self.caster.cast(&sensor, surroundings.ground, &bodies);
         let shader = Shader::new(&self.caster, &sensor, surroundings);

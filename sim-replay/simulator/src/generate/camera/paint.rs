@@ -1,6 +1,6 @@
 //! Paint of what cameras see.
 
-use crate::generate::raycast::{BodyShape, Part};
+use crate::generate::raycast::{Convex, SolidShape};
 use support::random::SplitMix64;
 
 /// Colour of a surface in white light, 0..1 red, green, blue.
@@ -50,10 +50,10 @@ pub(crate) fn of_vehicle(id: i64) -> Paint {
 }
 
 /// Paint of a static object by its form; `place` tells neighbours apart.
-pub(crate) fn of_shape(shape: &BodyShape, place: u64) -> Paint {
+pub(crate) fn of_shape(shape: &SolidShape, place: u64) -> Paint {
     match shape.parts.first() {
-        Some(Part::Ellipsoid { .. }) => Paint::Plain(LEAVES),
-        Some(Part::Cylinder { .. }) => Paint::Plain(TRUNK),
+        Some(Convex::Ellipsoid { .. }) => Paint::Plain(LEAVES),
+        Some(Convex::Cylinder { .. }) => Paint::Plain(TRUNK),
         _ => {
             let colour = WALLS[SplitMix64::new(place).below(WALLS.len())];
             let height_m = shape.bounds.max_m[2] - shape.bounds.min_m[2];

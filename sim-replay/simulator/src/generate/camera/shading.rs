@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::Surroundings;
 use super::ground_paint::GroundPaint;
 use super::paint::{Colour, Paint, SNOW, mix};
-use crate::generate::raycast::{Caster, ColumnPose, GROUND, MISS, RangeImage, Sweep};
+use crate::generate::raycast::{Caster, ColumnPose, Course, GROUND, MISS, RangeImage};
 use crate::generate::weather::Weather;
 use support::random::SplitMix64;
 
@@ -36,7 +36,7 @@ pub(super) struct Shader<'a> {
 }
 
 impl<'a> Shader<'a> {
-    pub(super) fn new(caster: &'a Caster, sensor: &Sweep, surroundings: &Surroundings<'a>) -> Self {
+    pub(super) fn new(caster: &'a Caster, sensor: &Course, around: &Surroundings<'a>) -> Self {
         Self {
             image: &caster.image,
             channels: caster.pattern.channels,
@@ -44,8 +44,8 @@ impl<'a> Shader<'a> {
             elevations: caster.elevations().collect(),
             world_from_sensor: sensor.end.rotation().cast(),
             origin_m: sensor.end.position_m,
-            paints: surroundings.paints,
-            weather: surroundings.weather,
+            paints: around.paints,
+            weather: around.weather,
         }
     }
 

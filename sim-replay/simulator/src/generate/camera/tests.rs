@@ -1,7 +1,7 @@
 use nalgebra::Point3;
 
 use super::*;
-use crate::generate::raycast::{BodyShape, Bounds, Part, Plane};
+use crate::generate::raycast::{Bounds, Convex, Plane, SolidShape};
 use crate::generate::world::World;
 use crate::map::{RoadMapSource, build};
 
@@ -10,9 +10,9 @@ const SIZE: ImageSize = ImageSize {
     height_px: 80,
 };
 
-fn block() -> BodyShape {
-    BodyShape::new(
-        vec![Part::Box(Bounds::centered(
+fn block() -> SolidShape {
+    SolidShape::new(
+        vec![Convex::Box(Bounds::centered(
             [0.0, 0.0, 0.75],
             [2.0, 0.9, 0.75],
         ))],
@@ -30,9 +30,9 @@ fn a_box_is_where_the_calibration_projects_it_in_every_camera() {
     for (number, yaw_deg) in [0.0f64, -100.0, 100.0, 180.0].into_iter().enumerate() {
         let ahead = vehicle.isometry() * Isometry3::rotation(Vector3::z() * yaw_deg.to_radians());
         let place = ahead * Point3::new(14.0, 1.0, 0.0);
-        let bodies = [Body {
+        let bodies = [RayBody {
             shape: &shape,
-            motion: Sweep::still(Placement::level(place.coords.into(), 0.4)),
+            motion: Course::still(Placement::level(place.coords.into(), 0.4)),
         }];
         let surroundings = Surroundings {
             ground: &Plane(0.0),

@@ -9,16 +9,16 @@ use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
 use crate::generate::error::SynthError;
 
 /// Writes the files of one frame of one agent.
-type WriteFrame = fn(&FrameFiles<'_>, &AgentFrame) -> Result<(), SynthError>;
+type WriteFrame = fn(&TickFiles<'_>, &AgentFrame) -> Result<(), SynthError>;
 
 /// The files of one frame, which differ in what follows the number of the tick.
-pub(super) struct FrameFiles<'a> {
+pub(super) struct TickFiles<'a> {
     folder: &'a Path,
     tick: u64,
     pub(super) is_roadside: bool,
 }
 
-impl FrameFiles<'_> {
+impl TickFiles<'_> {
     pub(super) fn write(&self, suffix: &str, bytes: impl AsRef<[u8]>) -> Result<(), SynthError> {
         let name = format!("{:06}{suffix}", self.tick);
         write_file(&self.folder.join(name), bytes)
@@ -79,7 +79,7 @@ impl SceneWriter for AgentFolderWriter {
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         moment.frames.iter().try_for_each(|frame| {
             let (folder, is_roadside) = &self.agents[frame.agent];
-            let files = FrameFiles {
+            let files = TickFiles {
                 folder,
                 tick: self.ticks[moment.index],
                 is_roadside: *is_roadside,

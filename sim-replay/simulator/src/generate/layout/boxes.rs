@@ -1,7 +1,7 @@
 //! Boxes and intensities in formats that several layouts share.
 
 use nalgebra::{Isometry3, Point3};
-use protocol::{Box3d, PointCloud};
+use protocol::Box3d;
 
 use super::AgentFrame;
 use dataset::frame::{Object, ObjectClass};
@@ -45,15 +45,6 @@ pub(super) fn float_bytes<const N: usize>(
     let mut bytes = Vec::with_capacity(rows.len() * N * size_of::<f32>());
     bytes.extend(rows.flatten().flat_map(f32::to_le_bytes));
     bytes
-}
-
-/// The cloud with intensities of 0 to 255.
-pub(super) fn with_byte_intensities(points: &PointCloud) -> PointCloud {
-    let points = points.xyzi.iter();
-    let scaled = points.map(|&[x, y, z, intensity]| [x, y, z, of_255(intensity)]);
-    PointCloud {
-        xyzi: scaled.collect(),
-    }
 }
 
 /// The object as an upright box in the frame of a LiDAR.

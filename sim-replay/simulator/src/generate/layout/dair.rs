@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use nalgebra::Isometry3;
-use protocol::{Box3d, Pose};
+use protocol::{Box3d, PointCloud, Pose};
 use serde_json::{Value, json};
 
-use super::boxes::{upright_in, with_byte_intensities};
+use super::boxes::{of_255, upright_in};
 use super::dair_json::{cooperative_type, side_type, transform, upright_label, world_label};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
 use super::{AgentFrame, DAY_MICROS, Moment, Omissions, SceneHeader, SceneWriter, locked};
@@ -27,10 +27,11 @@ const FIRST_UNIT_FRAME: usize = 500_000;
 const EPOCH_MICROS: u64 = 1_626_155_000_000_000;
 
 /// Variant of the layout, which has its name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::IntoStaticStr)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, strum::IntoStaticStr)]
 #[strum(serialize_all = "lowercase")]
 pub(super) enum Edition {
     /// Pairs by paths, cooperative labels in the world.
+    #[default]
     Dair,
     /// Pairs by numbers of frames and sequences, cooperative labels in the frame of the vehicle's LiDAR, with track
     /// ids.
@@ -38,7 +39,7 @@ pub(super) enum Edition {
 }
 
 /// One of the two agents.
-struct Side {
+struct DairSide {
     folder: &'static str,
     labels: &'static str,
     calibrations: &'static [&'static str],
@@ -46,13 +47,13 @@ struct Side {
     first_number: usize,
 }
 
-const VEHICLE: Side = Side {
+const VEHICLE: DairSide = DairSide {
     folder: "vehicle-side",
     labels: "lidar",
     calibrations: &["lidar_to_novatel", "novatel_to_world"],
     first_number: 0,
 };
-const UNIT: Side = Side {
+const UNIT: DairSide = DairSide {
     folder: "infrastructure-side",
     labels: "virtuallidar",
     calibrations: &["virtuallidar_to_world"],
@@ -62,7 +63,7 @@ const UNIT: Side = Side {
 const COOPERATIVE: &str = "cooperative";
 
 /// The writer.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Dair {
     root: PathBuf,
     edition: Edition,
@@ -81,11 +82,7 @@ impl Dair {
         Self {
             root: root.to_owned(),
             edition,
-            scene: 0,
-            first_frame: 0,
-            unit: 0,
-            capture_nanos: Vec::new(),
-            rows: Mutex::default(),
+            ..Self::default()
         }
     }
 
@@ -118,13 +115,16 @@ impl Dair {
     /// The sweep and the labels of one side.
     fn write_side(
         &self,
-        side: &Side,
+        side: &DairSide,
         id: &str,
         frame: &AgentFrame,
         omitted: &Omissions,
     ) -> Result<(), SynthError> {
-        let points = with_byte_intensities(&frame.frame.points);
-        let cloud = pcd::encode(&points, Encoding::Binary, IntensityField::Intensity);
+        let points = frame.frame.points.xyzi.iter();
+        let scaled = points.map(|&[x, y, z, intensity]| [x, y, z, of_255(intensity)]);
+        let xyzi = scaled.collect();
+        let (points, intensity) = (PointCloud { xyzi }, IntensityField::Intensity);
+        let cloud = pcd::encode(&points, Encoding::Binary, intensity);
         let path = format!("{}/velodyne/{id}.pcd", side.folder);
         write_file(&self.root.join(path), cloud)?;
         let mut labels = Vec::new();
@@ -278,7 +278,7 @@ impl Dair {
     }
 
     /// The row of one side.
-    fn side_row(&self, side: &Side, id: &str, micros: u64) -> Value {
+    fn side_row(&self, side: &DairSide, id: &str, micros: u64) -> Value {
         let [first, last] = [0, self.capture_nanos.len() - 1]
             .map(|frame| format!("{:06}", side.first_number + self.first_frame + frame));
         let mut row = json!({

@@ -9,7 +9,7 @@ use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
 use super::boxes::float_bytes;
 use super::disk::{make_folder, write_file};
-use super::sequences::{Sequence, Style};
+use super::sequences::{SequenceStyle, WrittenSequence};
 use crate::generate::error::SynthError;
 
 /// The camera's axes (x right, y down, z forward) in those of the LiDAR, at the same place.
@@ -29,7 +29,7 @@ pub(super) fn camera_from_lidar() -> Isometry3<f64> {
 }
 
 /// The style.
-pub(super) static STYLE: Style = Style {
+pub(super) static STYLE: SequenceStyle = SequenceStyle {
     epoch_micros: 0,
     folder: |sequence| format!("sequences/{sequence:02}"),
     sweeps_folder: "velodyne",
@@ -38,28 +38,24 @@ pub(super) static STYLE: Style = Style {
     write_poses,
 };
 
-fn write_poses(root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
+fn write_poses(root: &Path, sequence: &WrittenSequence<'_>) -> Result<(), SynthError> {
     let folder = root.join(&sequence.folder);
     write_file(&folder.join("calib.txt"), CALIBRATION)?;
-    write_file(&folder.join("times.txt"), times(sequence.capture_nanos))?;
+    // Seconds from the first moment, one a line.
+    let first = sequence.capture_nanos.first().copied().unwrap_or(0);
+    let nanos = sequence.capture_nanos.iter();
+    let seconds = nanos.map(|nanos| (nanos - first) as f64 / 1e9);
+    let times: String = seconds.map(|seconds| format!("{seconds:e}\n")).collect();
+    write_file(&folder.join("times.txt"), times)?;
     let poses = root.join("poses");
     make_folder(&poses)?;
     let file = poses.join(format!("{:02}.txt", sequence.number));
     write_file(&file, pose_lines(sequence))
 }
 
-/// Seconds from the first moment, one a line.
-fn times(capture_nanos: &[u64]) -> String {
-    let first = capture_nanos.first().copied().unwrap_or(0);
-    let seconds = capture_nanos
-        .iter()
-        .map(|nanos| (nanos - first) as f64 / 1e9);
-    seconds.map(|seconds| format!("{seconds:e}\n")).collect()
-}
-
 /// One line per capture time, since the line number is the scan number; where there is no pose, the previous one is
 /// repeated.
-fn pose_lines(sequence: &Sequence<'_>) -> String {
+fn pose_lines(sequence: &WrittenSequence<'_>) -> String {
     let camera_from_lidar = camera_from_lidar();
     let Some(first) = sequence.sweeps.first() else {
         return String::new();

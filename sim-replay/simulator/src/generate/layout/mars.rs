@@ -1,32 +1,27 @@
 //! Open MARS, multiagent subset, in the tables of nuScenes: channel names end with the names of vehicles.
 
-use serde_json::{Map, Value, json};
+use serde_json::{Map, json};
 
-use super::SceneHeader;
 use super::boxes::of_255;
-use super::nuscenes::Style;
+use super::nuscenes::TableStyle;
 
 /// The style.
-pub(super) static STYLE: Style = Style {
+pub(super) static STYLE: TableStyle = TableStyle {
     version: "v1.0",
-    channels,
+    channels: |scene| {
+        let agents = scene.agents.iter();
+        let channels = agents.map(|agent| format!("LIDAR_FRONT_CENTER_{}", agent.id));
+        channels.collect()
+    },
     file_name: |_, _, micros| format!("{micros}.pcd.bin"),
     // A sensor's bytes, as floats.
     intensity: of_255,
-    scene_fields,
+    scene_fields: |scene| {
+        let vehicles: Vec<&str> = scene.agents.iter().map(|agent| agent.id.as_str()).collect();
+        Map::from_iter([
+            ("vehicle_list".to_owned(), json!(vehicles)),
+            ("intersection".to_owned(), json!(0)),
+            ("err_max".to_owned(), json!(0.0)),
+        ])
+    },
 };
-
-fn channels(scene: &SceneHeader) -> Vec<String> {
-    let agents = scene.agents.iter();
-    let channels = agents.map(|agent| format!("LIDAR_FRONT_CENTER_{}", agent.id));
-    channels.collect()
-}
-
-fn scene_fields(scene: &SceneHeader) -> Map<String, Value> {
-    let vehicles: Vec<&str> = scene.agents.iter().map(|agent| agent.id.as_str()).collect();
-    Map::from_iter([
-        ("vehicle_list".to_owned(), json!(vehicles)),
-        ("intersection".to_owned(), json!(0)),
-        ("err_max".to_owned(), json!(0.0)),
-    ])
-}

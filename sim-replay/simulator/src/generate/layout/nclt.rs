@@ -7,7 +7,7 @@ use std::path::Path;
 use super::Omissions;
 use super::boxes::{byte, ring};
 use super::disk::{make_folder, write_file};
-use super::sequences::{Sequence, Style, date, pose_z_down, z_down};
+use super::sequences::{SequenceStyle, WrittenSequence, date, pose_z_down, z_down};
 use crate::generate::error::SynthError;
 
 /// Resolution of a coordinate, metres, and the least coordinate.
@@ -15,7 +15,7 @@ const STEP_M: f64 = 0.005;
 const LEAST_M: f64 = -100.0;
 
 /// The style.
-pub(super) static STYLE: Style = Style {
+pub(super) static STYLE: SequenceStyle = SequenceStyle {
     epoch_micros: 1_326_030_000_000_000,
     folder: day,
     sweeps_folder: "velodyne_sync",
@@ -47,7 +47,7 @@ fn points(points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8> {
     bytes
 }
 
-fn write_poses(root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
+fn write_poses(root: &Path, sequence: &WrittenSequence<'_>) -> Result<(), SynthError> {
     let folder = root.join("ground_truth");
     make_folder(&folder)?;
     let rows = sequence.sweeps.iter().map(|sweep| {

@@ -9,8 +9,8 @@ use serde_json::{Map, Value};
 
 use super::boxes::{float_bytes, points_in, ring};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
-use super::nuscenes_tables::{AnnotationRecord, Sample, SceneTables, SweepRecord, Tables};
-use super::{AgentFrame, DAY_MICROS, Moment, Omissions, SceneHeader, SceneWriter, locked};
+use super::nuscenes_tables::{AnnotationRecord, SampleRecord, SceneTables, SweepRecord, TableSet};
+use super::{DAY_MICROS, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::generate::error::SynthError;
 
 /// Time stamps of the first scene start here, microseconds.
@@ -20,7 +20,7 @@ const SWEEPS: &str = "sweeps";
 
 /// Differences between data sets with these tables.
 #[derive(Debug)]
-pub(super) struct Style {
+pub(super) struct TableStyle {
     /// The folder of the tables.
     pub(super) version: &'static str,
     /// The channel of each agent's LiDAR.
@@ -37,17 +37,17 @@ pub(super) struct Style {
 #[derive(Debug)]
 pub(super) struct NuScenes {
     root: PathBuf,
-    style: &'static Style,
+    style: &'static TableStyle,
     /// Number of the scene that is being written.
     number: usize,
     scene: SceneHeader,
     channels: Vec<String>,
-    samples: Mutex<Vec<Sample>>,
-    tables: Tables,
+    samples: Mutex<Vec<SampleRecord>>,
+    tables: TableSet,
 }
 
 impl NuScenes {
-    pub(super) fn new(root: &Path, style: &'static Style) -> Self {
+    pub(super) fn new(root: &Path, style: &'static TableStyle) -> Self {
         Self {
             root: root.to_owned(),
             style,
@@ -55,16 +55,8 @@ impl NuScenes {
             scene: SceneHeader::default(),
             channels: Vec::new(),
             samples: Mutex::default(),
-            tables: Tables::default(),
+            tables: TableSet::default(),
         }
-    }
-
-    fn sweep_bytes(&self, frame: &AgentFrame) -> Vec<u8> {
-        float_bytes(frame.frame.points.xyzi.iter().map(|&point| {
-            let [x, y, z, intensity] = point;
-            let intensity = (self.style.intensity)(intensity);
-            [x, y, z, intensity, f32::from(ring(point))]
-        }))
     }
 }
 
@@ -90,7 +82,12 @@ impl SceneWriter for NuScenes {
         let mut sweeps = Vec::with_capacity(moment.frames.len());
         for frame in &moment.frames {
             let file = format!("{SWEEPS}/{}/{name}", self.channels[frame.agent]);
-            write_file(&self.root.join(&file), self.sweep_bytes(frame))?;
+            let points = float_bytes(frame.frame.points.xyzi.iter().map(|&point| {
+                let [x, y, z, intensity] = point;
+                let intensity = (self.style.intensity)(intensity);
+                [x, y, z, intensity, f32::from(ring(point))]
+            }));
+            write_file(&self.root.join(&file), points)?;
             sweeps.push(SweepRecord {
                 agent: frame.agent,
                 file,
@@ -106,7 +103,7 @@ impl SceneWriter for NuScenes {
             }
         });
         let annotations = annotations.collect();
-        locked(&self.samples).push(Sample {
+        locked(&self.samples).push(SampleRecord {
             moment: moment.index,
             micros,
             sweeps,

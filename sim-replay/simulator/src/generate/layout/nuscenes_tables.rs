@@ -44,7 +44,7 @@ pub(super) struct AnnotationRecord {
 
 /// A moment that was written.
 #[derive(Debug)]
-pub(super) struct Sample {
+pub(super) struct SampleRecord {
     pub(super) moment: usize,
     pub(super) micros: u64,
     pub(super) sweeps: Vec<SweepRecord>,
@@ -61,16 +61,24 @@ pub(super) struct SceneTables<'a> {
     /// Further fields of the row of scenes.
     pub(super) fields: Map<String, Value>,
     /// Samples by rising capture time.
-    pub(super) samples: &'a [Sample],
+    pub(super) samples: &'a [SampleRecord],
 }
 
 /// All tables, by name.
 #[derive(Debug, Default)]
-pub(super) struct Tables(BTreeMap<&'static str, Vec<Value>>);
+pub(super) struct TableSet(BTreeMap<&'static str, Vec<Value>>);
 
-impl Tables {
+impl TableSet {
     fn push(&mut self, table: &'static str, row: Value) {
         self.0.entry(table).or_default().push(row);
+    }
+
+    /// Adds a row, unless there is one with its token.
+    fn push_once(&mut self, table: &'static str, row: Value) {
+        let rows = self.0.entry(table).or_default();
+        if !rows.iter().any(|other| other["token"] == row["token"]) {
+            rows.push(row);
+        }
     }
 
     /// All tables, empty ones included.
@@ -130,7 +138,7 @@ impl Tables {
                 let mut sweeps = sample.sweeps.iter();
                 Some((sample, sweeps.find(|sweep| sweep.agent == agent)?, token))
             });
-            let chain: Vec<(&Sample, &SweepRecord, &String)> = chain.collect();
+            let chain: Vec<(&SampleRecord, &SweepRecord, &String)> = chain.collect();
             let Some((_, first, _)) = chain.first() else {
                 continue;
             };
@@ -170,11 +178,8 @@ impl Tables {
     ) -> (String, Isometry3<f64>) {
         // A sensor is one row, also if several scenes use it.
         let sensor = token(&["sensor", channel]);
-        let sensors = self.0.entry("sensor").or_default();
-        if !sensors.iter().any(|row| row["token"] == sensor.as_str()) {
-            let row = json!({ "token": sensor, "channel": channel, "modality": "lidar" });
-            self.push("sensor", row);
-        }
+        let row = json!({ "token": sensor, "channel": channel, "modality": "lidar" });
+        self.push_once("sensor", row);
         let world_from_vehicle = first.world_from_vehicle.map(|pose| pose.isometry());
         let world_from_vehicle = world_from_vehicle.unwrap_or(first.world_from_lidar);
         let vehicle_from_lidar = world_from_vehicle.inv_mul(&first.world_from_lidar);
@@ -203,7 +208,10 @@ impl Tables {
             let moments = chain.iter().map(|(sample, ..)| sample.moment.to_string());
             let tokens = moments.map(|moment| scene_token(scene, "annotation", &[&id, &moment]));
             let tokens: Vec<String> = tokens.collect();
-            let category = self.category(chain[0].2.object.class);
+            let name = category_name(chain[0].2.object.class);
+            let category = token(&["category", name]);
+            let row = json!({ "token": category, "name": name, "description": "" });
+            self.push_once("category", row);
             let row = json!({
                 "token": instance, "category_token": category, "nbr_annotations": tokens.len(),
                 "first_annotation_token": tokens.first(), "last_annotation_token": tokens.last(),
@@ -225,17 +233,6 @@ impl Tables {
                 self.push("sample_annotation", row);
             }
         }
-    }
-
-    /// The token of a category's row; the row is added if it is missing.
-    fn category(&mut self, class: ObjectClass) -> String {
-        let name = category_name(class);
-        let token = token(&["category", name]);
-        let rows = self.0.entry("category").or_default();
-        if !rows.iter().any(|row| row["token"] == token.as_str()) {
-            rows.push(json!({ "token": token, "name": name, "description": "" }));
-        }
-        token
     }
 }
 
@@ -287,7 +284,7 @@ mod tests {
         }
     }
 
-    fn sample(moment: usize, objects: Vec<Object>) -> Sample {
+    fn sample(moment: usize, objects: Vec<Object>) -> SampleRecord {
         let sweep = SweepRecord {
             agent: 0,
             file: format!("sweeps/TOP/{moment}.pcd.bin"),
@@ -301,7 +298,7 @@ mod tests {
                 lidar_points: 3,
             })
             .collect();
-        Sample {
+        SampleRecord {
             moment,
             micros: 100_000 * moment as u64,
             sweeps: vec![sweep],
@@ -317,7 +314,7 @@ mod tests {
             sample(2, vec![]),
         ];
         let channels = ["TOP".to_owned(), "absent".to_owned()];
-        let mut tables = Tables::default();
+        let mut tables = TableSet::default();
         tables.add(SceneTables {
             number: 0,
             name: "a",

@@ -5,9 +5,9 @@
 use std::fmt::{Debug, Write as _};
 
 use dataset::camera_files::body_from_optical;
-use protocol::{Camera, EgoMotion, PointCloud, Pose};
+use protocol::{Camera, PointCloud, Pose};
 
-use super::agent_folders::FrameFiles;
+use super::agent_folders::TickFiles;
 use super::boxes::real_type;
 use super::yaml_text::{ObjectEntry, write_list, write_speed, write_vehicles};
 use super::{AgentFrame, BoxAnchor};
@@ -17,7 +17,7 @@ use dataset::carla_pose::{CarlaPose, mirrored_point};
 use dataset::frame::{Object, ObjectClass};
 use dataset::pcd::{self, Encoding, IntensityField};
 
-pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
+pub(super) fn write_files(files: &TickFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
     let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);
     files.write(".pcd", points)?;
     for copy in &frame.variants {
@@ -47,9 +47,11 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
         write_camera(yaml, *number, camera, frame.world_from_lidar.as_ref())?;
     }
     write_speed(yaml, frame)?;
-    match &agent.simulated {
-        Some(simulated) => write_receivers(yaml, &simulated.fix)?,
-        None => write_motion(yaml, &frame.motion())?,
+    match (&agent.simulated, frame.motion().yaw_rate_rad_s) {
+        (Some(simulated), _) => write_receivers(yaml, &simulated.fix)?,
+        // Of the motion of a recorded frame, `ego_speed` alone holds the speed.
+        (None, Some(rate)) => writeln!(yaml, "imu:\n  yaw_rate_degps: {}", -rate.to_degrees())?,
+        (None, None) => {}
     }
     let poses = [
         ("lidar_pose", frame.world_from_lidar),
@@ -123,14 +125,6 @@ fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {
         "imu:\n  heading_deg: {heading}\n  speed_mps: {}\n  yaw_rate_degps: {rate}",
         fix.speed_mps
     )
-}
-
-/// The motion of a recorded frame, if its yaw rate is recorded: `ego_speed` alone holds the speed.
-fn write_motion(yaml: &mut String, motion: &EgoMotion) -> std::fmt::Result {
-    match motion.yaw_rate_rad_s {
-        Some(rate) => writeln!(yaml, "imu:\n  yaw_rate_degps: {}", -rate.to_degrees()),
-        None => Ok(()),
-    }
 }
 
 fn write_object(yaml: &mut String, object: &Object, anchor: &BoxAnchor) -> std::fmt::Result {

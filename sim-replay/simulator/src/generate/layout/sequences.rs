@@ -11,7 +11,7 @@ use crate::generate::error::SynthError;
 
 /// Differences between these layouts.
 #[derive(Debug)]
-pub(super) struct Style {
+pub(super) struct SequenceStyle {
     /// Time stamps of the first scene start here, microseconds.
     pub(super) epoch_micros: u64,
     /// The folder of a sequence below the root, by its number.
@@ -23,12 +23,12 @@ pub(super) struct Style {
     /// The bytes of a sweep.
     pub(super) points: fn(&[[f32; 4]], &Omissions) -> Vec<u8>,
     /// Writes the data common to all sweeps of a sequence, below the root.
-    pub(super) write_poses: fn(&Path, &Sequence<'_>) -> Result<(), SynthError>,
+    pub(super) write_poses: fn(&Path, &WrittenSequence<'_>) -> Result<(), SynthError>,
 }
 
 /// A sequence whose sweeps are written.
 #[derive(Debug)]
-pub(super) struct Sequence<'a> {
+pub(super) struct WrittenSequence<'a> {
     /// Its folder below the root.
     pub(super) folder: String,
     pub(super) number: usize,
@@ -50,7 +50,7 @@ pub(super) struct SweepPose {
 #[derive(Debug)]
 pub(super) struct Sequences {
     root: PathBuf,
-    style: &'static Style,
+    style: &'static SequenceStyle,
     /// Number of the scene that is being written, and of its first sequence.
     scene: usize,
     first_sequence: usize,
@@ -61,7 +61,7 @@ pub(super) struct Sequences {
 }
 
 impl Sequences {
-    pub(super) fn new(root: &Path, style: &'static Style) -> Self {
+    pub(super) fn new(root: &Path, style: &'static SequenceStyle) -> Self {
         Self {
             root: root.to_owned(),
             style,
@@ -119,7 +119,7 @@ impl SceneWriter for Sequences {
             let number = self.first_sequence;
             let own = sweeps.iter().filter(|(of, _)| *of == agent);
             let own: Vec<SweepPose> = own.map(|(_, sweep)| *sweep).collect();
-            let sequence = Sequence {
+            let sequence = WrittenSequence {
                 folder: (self.style.folder)(number),
                 number,
                 capture_nanos: &self.capture_nanos,

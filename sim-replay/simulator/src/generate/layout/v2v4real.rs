@@ -8,7 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use protocol::Pose;
 
 use super::AgentFrame;
-use super::agent_folders::FrameFiles;
+use super::agent_folders::TickFiles;
 use super::boxes::real_type;
 use super::yaml_text::{ObjectEntry, keyed_poses, write_speed, write_vehicles};
 use crate::generate::error::SynthError;
@@ -49,7 +49,7 @@ const MATRIX_HEAD: &str = "!!python/object/apply:numpy.core.multiarray._reconstr
 /// Characters in a line of base64, as PyYAML breaks them.
 const BASE64_LINE: usize = 76;
 
-pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
+pub(super) fn write_files(files: &TickFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
     let points = &frame.frame.points;
     let points = pcd::encode(points, Encoding::Binary, IntensityField::Intensity);
     files.write(".pcd", points)?;

@@ -3,13 +3,13 @@
 use protocol::Pose;
 
 use super::AgentFrame;
-use super::agent_folders::FrameFiles;
+use super::agent_folders::TickFiles;
 use super::boxes::{float_bytes, real_type};
 use super::yaml_text::{ObjectEntry, keyed_poses, write_list, write_speed, write_vehicles};
 use crate::generate::error::SynthError;
 use dataset::carla_pose::CarlaPose;
 
-pub(super) fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
+pub(super) fn write_files(files: &TickFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
     let points = float_bytes(frame.frame.points.xyzi.iter().copied());
     files.write(".bin", points)?;
     files.write_yaml(frame, |yaml| write_frame(yaml, frame))

@@ -90,17 +90,18 @@ pub(super) fn write_vehicles(
 fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
     match &frame.simulated {
         Some(simulated) => simulated.anchors.clone(),
-        None => frame.frame.objects.iter().map(bottom_anchor).collect(),
-    }
-}
-
-fn bottom_anchor(object: &Object) -> BoxAnchor {
-    let pose = object.world_from_object;
-    let up = pose.isometry().rotation * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
-    let center_offset_m: [f64; 3] = up.into();
-    BoxAnchor {
-        location_m: std::array::from_fn(|axis| pose.translation_m[axis] - center_offset_m[axis]),
-        center_offset_m,
+        None => {
+            let bottoms = frame.frame.objects.iter().map(|object| {
+                let pose = object.world_from_object;
+                let up = pose.isometry().rotation * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
+                let location_m = Vector3::from(pose.translation_m) - up;
+                BoxAnchor {
+                    location_m: location_m.into(),
+                    center_offset_m: up.into(),
+                }
+            });
+            bottoms.collect()
+        }
     }
 }
 

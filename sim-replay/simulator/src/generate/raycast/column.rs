@@ -2,9 +2,9 @@
 
 use std::f32::consts::TAU;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 
-use super::placement::Sweep;
+use super::placement::Course;
 
 /// Rays of a sensor in one sweep: columns at even azimuths, each with the same even elevations.
 ///
@@ -104,7 +104,7 @@ impl ColumnPose {
     pub(super) fn new(
         pattern: &RayPattern,
         column: usize,
-        sensor: &Sweep,
+        sensor: &Course,
         anchor: &Vector3<f64>,
     ) -> Self {
         let time = pattern.time(column);
@@ -123,23 +123,5 @@ impl ColumnPose {
     #[inline]
     pub(crate) fn point_m(&self, (cos, sin): (f32, f32), range_m: f32) -> [f32; 3] {
         (self.origin + (self.forward * cos + self.up * sin) * range_m).into()
-    }
-
-    /// The column in the frame of a body at `body_position` (relative to the anchor) turned by `body_from_world`.
-    #[inline]
-    pub(super) fn in_body<'a>(
-        &self,
-        body_from_world: &Matrix3<f32>,
-        body_position: &Vector3<f32>,
-        cos: &'a [f32],
-        sin: &'a [f32],
-    ) -> ColumnRays<'a> {
-        ColumnRays {
-            origin: (body_from_world * (self.origin - body_position)).into(),
-            forward: (body_from_world * self.forward).into(),
-            up: (body_from_world * self.up).into(),
-            cos,
-            sin,
-        }
     }
 }

@@ -6,8 +6,8 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::column::RayPattern;
-use super::placement::Sweep;
-use super::{Body, Bounds};
+use super::placement::Course;
+use super::{Bounds, RayBody};
 
 /// Closer than this, metres, a body may be seen in every direction.
 const TOUCHING_M: f32 = 0.3;
@@ -16,7 +16,7 @@ const BEND_M: f32 = 0.05;
 
 /// The columns and channels which can hit a body, a superset of those which do.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Footprint {
+pub(super) struct RaySpan {
     /// First column; may be below 0, or the range may exceed the last column, if the pattern covers a full turn.
     pub(super) first_column: i64,
     pub(super) columns: usize,
@@ -31,7 +31,7 @@ pub(super) struct SensorFrames {
 }
 
 impl SensorFrames {
-    pub(super) fn new(sensor: &Sweep) -> Self {
+    pub(super) fn new(sensor: &Course) -> Self {
         Self {
             ends: [&sensor.start, &sensor.end]
                 .map(|end| (end.rotation().transpose(), end.position_m)),
@@ -42,7 +42,7 @@ impl SensorFrames {
     ///
     /// Bounded by the corners of the body's box at both ends of the sweep: between them the motion is straight up to
     /// [`BEND_M`], so the body stays in their convex hull.
-    pub(super) fn footprint(&self, pattern: &RayPattern, body: &Body<'_>) -> Option<Footprint> {
+    pub(super) fn footprint(&self, pattern: &RayPattern, body: &RayBody<'_>) -> Option<RaySpan> {
         if self.is_surely_out_of_range(pattern.range_m, body) {
             return None;
         }
@@ -55,7 +55,7 @@ impl SensorFrames {
         }
         // Next to the sensor the azimuths have no bounds.
         if nearest_m < TOUCHING_M {
-            return Some(Footprint {
+            return Some(RaySpan {
                 first_column: 0,
                 columns: pattern.columns,
                 channels: 0..pattern.channels,
@@ -64,7 +64,7 @@ impl SensorFrames {
         }
         let channels = channels(pattern, &corners, nearest_m)?;
         let (first_column, columns) = columns(pattern, &flat, &center, nearest_m)?;
-        Some(Footprint {
+        Some(RaySpan {
             first_column,
             columns,
             channels,
@@ -73,7 +73,7 @@ impl SensorFrames {
     }
 
     /// Cheap early test: most bodies of a scene are too far away.
-    fn is_surely_out_of_range(&self, range_m: f32, body: &Body<'_>) -> bool {
+    fn is_surely_out_of_range(&self, range_m: f32, body: &RayBody<'_>) -> bool {
         let Bounds { min_m, max_m } = &body.shape.bounds;
         let [near_x, near_y] = [0, 1].map(|axis: usize| min_m[axis].abs().max(max_m[axis].abs()));
         // Both ends may be a sweep's motion apart; the margin is conservative.
@@ -82,7 +82,7 @@ impl SensorFrames {
         offset.x * offset.x + offset.y * offset.y > reach_m * reach_m
     }
 
-    fn corners(&self, bounds: &Bounds, motion: &Sweep) -> [Vector3<f32>; 16] {
+    fn corners(&self, bounds: &Bounds, motion: &Course) -> [Vector3<f32>; 16] {
         let ends = [&motion.start, &motion.end];
         let poses = [0, 1].map(|end| {
             let (sensor_from_world, sensor_position) = &self.ends[end];
@@ -99,7 +99,7 @@ impl SensorFrames {
     }
 
     /// A lower bound of the horizontal distance: the best of a few lines that separate the sensor from the corners.
-    fn nearest(&self, motion: &Sweep, flat: &[Vector2<f32>; 16], center: &Vector2<f32>) -> f32 {
+    fn nearest(&self, motion: &Course, flat: &[Vector2<f32>; 16], center: &Vector2<f32>) -> f32 {
         let axes: Matrix3<f32> = (self.ends[1].0 * motion.end.rotation()).cast();
         let closest = flat
             .iter()

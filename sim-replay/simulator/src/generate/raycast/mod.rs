@@ -14,13 +14,13 @@ mod placement;
 mod tests;
 
 pub(crate) use column::{ColumnPose, RayPattern};
-pub use part::{Bounds, Part};
-pub use placement::{Placement, Sweep, wrapped};
+pub use part::{Bounds, Convex};
+pub use placement::{Course, Placement, wrapped};
 
 use nalgebra::{Matrix3, Vector3};
 
 use column::ColumnRays;
-use footprint::{Footprint, SensorFrames};
+use footprint::{RaySpan, SensorFrames};
 use part::greater;
 
 /// [`RangeImage::hits`] of a ray without a hit.
@@ -30,22 +30,22 @@ pub(crate) const GROUND: u32 = u32::MAX - 1;
 
 /// Geometry of a body: convex parts in its own frame.
 #[derive(Debug, Clone, PartialEq)]
-pub struct BodyShape {
+pub struct SolidShape {
     /// The parts; they may overlap.
-    pub parts: Vec<Part>,
+    pub parts: Vec<Convex>,
     /// The box around all parts.
     pub bounds: Bounds,
     /// Reflectance, 0..1.
     pub reflectivity: f32,
 }
 
-impl BodyShape {
+impl SolidShape {
     /// A shape of at least one part.
     ///
     /// # Panics
     /// If `parts` is empty: a body without extent is an error of the caller.
-    pub fn new(parts: Vec<Part>, reflectivity: f32) -> Self {
-        let bounds = parts.iter().map(Part::bounds).reduce(|a, b| a.union(&b));
+    pub fn new(parts: Vec<Convex>, reflectivity: f32) -> Self {
+        let bounds = parts.iter().map(Convex::bounds).reduce(|a, b| a.union(&b));
         let bounds = bounds.expect("a body has parts");
         Self {
             parts,
@@ -57,14 +57,14 @@ impl BodyShape {
 
 /// A shape and its motion during one sweep.
 #[derive(Debug, Clone, Copy)]
-pub struct Body<'a> {
+pub struct RayBody<'a> {
     /// Its form.
-    pub shape: &'a BodyShape,
+    pub shape: &'a SolidShape,
     /// `world_from_body` over the sweep.
-    pub motion: Sweep,
+    pub motion: Course,
 }
 
-impl Body<'_> {
+impl RayBody<'_> {
     /// `body_from_world`, the turning part, at a time of the sweep, and the position relative to `anchor`.
     fn frame(&self, time: f32, anchor: &Vector3<f64>) -> (Matrix3<f32>, Vector3<f32>) {
         let placement = self.motion.at(f64::from(time));
@@ -129,7 +129,7 @@ pub(crate) struct Caster {
     cos: Vec<f32>,
     sin: Vec<f32>,
     columns: Vec<ColumnPose>,
-    order: Vec<(Footprint, usize)>,
+    order: Vec<(RaySpan, usize)>,
     /// The last sweep, as [`Caster::cast`] returned it.
     pub(crate) image: RangeImage,
 }
@@ -151,9 +151,9 @@ impl Caster {
     /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are transparent.
     pub(crate) fn cast(
         &mut self,
-        sensor: &Sweep,
+        sensor: &Course,
         ground: &dyn Surface,
-        bodies: &[Body<'_>],
+        bodies: &[RayBody<'_>],
     ) -> &RangeImage {
         let anchor = sensor.end.position_m;
         let (pattern, channels) = (&self.pattern, self.pattern.channels);
@@ -198,7 +198,7 @@ impl Caster {
     }
 
     /// The columns of the last sweep in the frame of the sensor at the sweep's end, where de-skewed points lie.
-    pub(crate) fn columns_at_end(&self, sensor: &Sweep) -> impl Iterator<Item = ColumnPose> {
+    pub(crate) fn columns_at_end(&self, sensor: &Course) -> impl Iterator<Item = ColumnPose> {
         let end_from_world: Matrix3<f32> = sensor.end.rotation().transpose().cast();
         self.columns.iter().map(move |pose| ColumnPose {
             origin: end_from_world * pose.origin,
@@ -213,27 +213,33 @@ impl Caster {
         self.cos.iter().copied().zip(self.sin.iter().copied())
     }
 
-    fn cast_body(&mut self, body: &Body<'_>, footprint: &Footprint, id: u32, anchor: Vector3<f64>) {
+    fn cast_body(&mut self, body: &RayBody<'_>, span: &RaySpan, id: u32, anchor: Vector3<f64>) {
         let count = self.pattern.columns as i64;
-        let channels = footprint.channels.clone();
+        let channels = span.channels.clone();
         let (cos, sin) = (&self.cos[channels.clone()], &self.sin[channels.clone()]);
         // Most bodies stand still: one frame serves all columns.
         let still = body.motion.is_still().then(|| body.frame(1.0, &anchor));
-        for column in footprint.first_column..footprint.first_column + footprint.columns as i64 {
-            // A footprint may reach over the seam of a full turn.
+        for column in span.first_column..span.first_column + span.columns as i64 {
+            // A span may reach over the seam of a full turn.
             let column = column.rem_euclid(count) as usize;
             let offset = column * self.pattern.channels;
             let range = offset + channels.start..offset + channels.end;
             let depths = &mut self.image.depths_m[range.clone()];
             // All rays of the column already end nearer, so the body is hidden here.
-            if depths.iter().fold(0.0, |far, &depth| greater(depth, far)) < footprint.nearest_m {
+            if depths.iter().fold(0.0, |far, &depth| greater(depth, far)) < span.nearest_m {
                 continue;
             }
             let hits = &mut self.image.hits[range];
             let pose = &self.columns[column];
             let (body_from_world, position) =
                 still.unwrap_or_else(|| body.frame(pose.time, &anchor));
-            let rays: ColumnRays<'_> = pose.in_body(&body_from_world, &position, cos, sin);
+            let rays = ColumnRays {
+                origin: (body_from_world * (pose.origin - position)).into(),
+                forward: (body_from_world * pose.forward).into(),
+                up: (body_from_world * pose.up).into(),
+                cos,
+                sin,
+            };
             for part in &body.shape.parts {
                 part.cast(&rays, depths, hits, id);
             }

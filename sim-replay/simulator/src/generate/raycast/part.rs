@@ -7,7 +7,7 @@ const PARALLEL: f32 = 1e-20;
 
 /// A convex solid in the frame of its body, metres.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Part {
+pub enum Convex {
     /// Half-spaces `n . x <= d` as `[nx, ny, nz, d]`, which together bound a solid, and the box around it.
     Hull {
         /// The half-spaces; normals of length one.
@@ -90,7 +90,7 @@ impl Bounds {
     }
 }
 
-impl Part {
+impl Convex {
     /// The box around the part.
     pub fn bounds(&self) -> Bounds {
         match self {

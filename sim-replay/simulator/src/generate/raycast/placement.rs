@@ -57,16 +57,16 @@ impl Placement {
     }
 }
 
-/// A motion over one sweep: straight and even from start to end.
+/// The course of a body or a sensor over one sweep: straight and even from start to end.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sweep {
+pub struct Course {
     /// At the sweep's start.
     pub start: Placement,
     /// At the sweep's end.
     pub end: Placement,
 }
 
-impl Sweep {
+impl Course {
     /// No motion.
     pub fn still(placement: Placement) -> Self {
         Self {
@@ -147,12 +147,12 @@ mod tests {
     fn a_sweep_turns_the_short_way_round() {
         let start = Placement::level([0.0; 3], 3.1);
         let end = Placement::level([1.0, 0.0, 0.0], -3.1);
-        let middle = Sweep { start, end }.at(0.5);
+        let middle = Course { start, end }.at(0.5);
         assert!(
             (wrapped(middle.yaw_rad - PI)).abs() < 1e-9
                 && (middle.position_m.x - 0.5).abs() < 1e-12
         );
-        assert_eq!(Sweep { start, end }.at(1.0).yaw_rad, -3.1);
+        assert_eq!(Course { start, end }.at(1.0).yaw_rad, -3.1);
     }
 
     #[test]

@@ -33,18 +33,18 @@ fn fan() -> RayPattern {
     }
 }
 
-fn random_part(random: &mut SplitMix64) -> Part {
+fn random_part(random: &mut SplitMix64) -> Convex {
     let mut size = |low: f64, high: f64| random.between(low, high) as f32;
     let center = [size(-1.0, 1.0), size(-1.0, 1.0), size(-1.0, 1.0)];
     let half = [size(0.1, 6.0), size(0.1, 3.0), size(0.1, 4.0)];
     match random.below(4) {
-        0 => Part::Box(Bounds::centered(center, half)),
-        1 => Part::Cylinder {
+        0 => Convex::Box(Bounds::centered(center, half)),
+        1 => Convex::Cylinder {
             center_m: center,
             radius_m: half[0] * 0.2,
             half_height_m: half[2],
         },
-        2 => Part::Ellipsoid {
+        2 => Convex::Ellipsoid {
             center_m: center,
             radii_m: half,
         },
@@ -61,12 +61,12 @@ fn random_part(random: &mut SplitMix64) -> Part {
             let (s, c) = 0.7f32.sin_cos();
             planes.push([s, 0.0, c, s * center[0] + c * center[2] + 0.5 * half[2]]);
             planes.push([0.0, s, c, s * center[1] + c * center[2] + 0.5 * half[2]]);
-            Part::Hull { planes, bounds }
+            Convex::Hull { planes, bounds }
         }
     }
 }
 
-fn random_motion(random: &mut SplitMix64, reach_m: f64) -> Sweep {
+fn random_motion(random: &mut SplitMix64, reach_m: f64) -> Course {
     let position = [
         random.between(-reach_m, reach_m),
         random.between(-reach_m, reach_m),
@@ -77,16 +77,16 @@ fn random_motion(random: &mut SplitMix64, reach_m: f64) -> Sweep {
         ..Placement::level(position, random.between(-PI, PI))
     };
     if random.chance(0.4) {
-        return Sweep::still(start);
+        return Course::still(start);
     }
     let mut end = start;
     end.position_m += Vector3::new(random.between(-1.5, 1.5), random.between(-1.5, 1.5), 0.0);
     end.yaw_rad = wrapped(end.yaw_rad + random.between(-0.04, 0.04));
-    Sweep { start, end }
+    Course { start, end }
 }
 
 /// Entry of a ray into a part, by clipping the ray at each half-space or by the quadratic formula.
-fn enter(part: &Part, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
+fn enter(part: &Convex, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
     let clip = |planes: &[[f64; 4]]| {
         let (mut near, mut far) = (f64::MIN, f64::MAX);
         for p in planes {
@@ -120,12 +120,12 @@ fn enter(part: &Part, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
         (room >= 0.0).then(|| ((-b - room.sqrt()) / a, (-b + room.sqrt()) / a))
     };
     match part {
-        Part::Box(bounds) => clip(&slabs(bounds, &[0, 1, 2])).map(|(near, _)| near),
-        Part::Hull { planes, .. } => {
+        Convex::Box(bounds) => clip(&slabs(bounds, &[0, 1, 2])).map(|(near, _)| near),
+        Convex::Hull { planes, .. } => {
             let planes: Vec<[f64; 4]> = planes.iter().map(|p| p.map(f64::from)).collect();
             clip(&planes).map(|(near, _)| near)
         }
-        Part::Cylinder {
+        Convex::Cylinder {
             center_m, radius_m, ..
         } => {
             let c = center_m.map(f64::from);
@@ -139,7 +139,7 @@ fn enter(part: &Part, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
             let (bottom, top) = clip(&slabs(&part.bounds(), &[2]))?;
             (near.max(bottom) <= far.min(top)).then(|| near.max(bottom))
         }
-        Part::Ellipsoid { center_m, radii_m } => {
+        Convex::Ellipsoid { center_m, radii_m } => {
             let r: Vector3<f64> = Vector3::from(*radii_m).cast();
             let o = (o.coords - Vector3::from(*center_m).cast::<f64>()).component_div(&r);
             let d = d.component_div(&r);
@@ -150,9 +150,9 @@ fn enter(part: &Part, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
 
 fn brute_force(
     pattern: &RayPattern,
-    sensor: &Sweep,
+    sensor: &Course,
     ground: f64,
-    bodies: &[Body<'_>],
+    bodies: &[RayBody<'_>],
 ) -> RangeImage {
     let mut image = RangeImage::default();
     for column in 0..pattern.columns {
@@ -199,9 +199,9 @@ fn check_against_brute_force(
     let (mut rays, mut on_bodies, mut silhouettes) = (0, 0, 0);
     for seed in seeds {
         let mut random = SplitMix64::new(seed);
-        let shapes: Vec<BodyShape> = (0..60)
+        let shapes: Vec<SolidShape> = (0..60)
             .map(|_| {
-                BodyShape::new(
+                SolidShape::new(
                     (0..=random.below(3))
                         .map(|_| random_part(&mut random))
                         .collect(),
@@ -209,9 +209,9 @@ fn check_against_brute_force(
                 )
             })
             .collect();
-        let bodies: Vec<Body<'_>> = shapes
+        let bodies: Vec<RayBody<'_>> = shapes
             .iter()
-            .map(|shape| Body {
+            .map(|shape| RayBody {
                 shape,
                 motion: random_motion(&mut random, reach_m),
             })
@@ -221,7 +221,7 @@ fn check_against_brute_force(
         let offset = Vector3::new(4_000.0, -7_000.0, sensor_z);
         sensor.start.position_m += offset;
         sensor.end.position_m += offset;
-        let bodies: Vec<Body<'_>> = bodies
+        let bodies: Vec<RayBody<'_>> = bodies
             .into_iter()
             .map(|mut body| {
                 body.motion.start.position_m += offset;
@@ -263,27 +263,27 @@ fn a_fan_equals_brute_force() {
 
 #[test]
 fn bodies_around_the_sensor_do_not_hide_the_rest() {
-    let shell = BodyShape::new(
-        vec![Part::Box(Bounds::centered([0.0; 3], [3.0, 1.0, 2.0]))],
+    let shell = SolidShape::new(
+        vec![Convex::Box(Bounds::centered([0.0; 3], [3.0, 1.0, 2.0]))],
         1.0,
     );
-    let wall = BodyShape::new(
-        vec![Part::Box(Bounds::centered([0.0; 3], [0.5, 40.0, 8.0]))],
+    let wall = SolidShape::new(
+        vec![Convex::Box(Bounds::centered([0.0; 3], [0.5, 40.0, 8.0]))],
         1.0,
     );
     let bodies = [
-        Body {
+        RayBody {
             shape: &shell,
-            motion: Sweep::still(Placement::level([0.0; 3], 0.0)),
+            motion: Course::still(Placement::level([0.0; 3], 0.0)),
         },
-        Body {
+        RayBody {
             shape: &wall,
-            motion: Sweep::still(Placement::level([20.5, 0.0, 0.0], 0.0)),
+            motion: Course::still(Placement::level([20.5, 0.0, 0.0], 0.0)),
         },
     ];
     let mut caster = Caster::new(spinning());
     let image = caster.cast(
-        &Sweep::still(Placement::level([0.0, 0.0, 1.9], 0.0)),
+        &Course::still(Placement::level([0.0, 0.0, 1.9], 0.0)),
         &Plane(0.0),
         &bodies,
     );

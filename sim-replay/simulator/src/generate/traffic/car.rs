@@ -4,7 +4,7 @@ use super::driver::{Driver, Obstacle};
 use super::path::Path;
 use super::rectangle::Rectangle;
 use super::roads::Roads;
-use crate::generate::raycast::{Placement, Sweep};
+use crate::generate::raycast::{Course, Placement};
 use crate::generate::vehicle::Vehicle;
 use crate::map::{Lane, LaneId};
 
@@ -24,7 +24,7 @@ pub(crate) struct Car {
     /// State of the lane-change model.
     pub(crate) lane_change: LaneChangeState,
     /// The motion of the last step.
-    pub(crate) motion: Sweep,
+    pub(crate) motion: Course,
     /// True if it is part of the scene.
     pub(crate) is_present: bool,
     /// Duration of the current stop, seconds.

@@ -37,17 +37,6 @@ const LENGTH_SHARE: f64 = 0.04;
 /// Narrower lanes are not changed to, metres.
 const LEAST_WIDTH_M: f64 = 2.6;
 
-/// Reason of a change.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Reason {
-    /// The lane ends and the other one continues.
-    LaneEnds,
-    /// A slower vehicle is ahead.
-    HeldUp,
-    /// Random change, or exploration.
-    Random,
-}
-
 impl Traffic<'_> {
     /// Begins the changes that are wanted, possible and safe. Needs the list of occupants, and keeps it up to date.
     pub(super) fn change_lanes(&mut self, near: &mut Vec<u32>) {
@@ -118,25 +107,20 @@ impl Traffic<'_> {
         if car.path.is_changing() || car.speed_mps < LEAST_SPEED_MPS {
             return None;
         }
+        let own = car.path.lane();
+        let is_held_up = car.lane_change.held_up_s > FOLLOWING_S;
         [Side::Left, Side::Right].into_iter().find_map(|side| {
-            let reason = self.reason(car, side)?;
+            let other = side.of(self.roads.graph.lane(own))?;
+            let must_leave = !self.roads.is_endless(own) && self.roads.is_endless(other);
+            let is_random = car.lane_change.random_change == Some(side);
+            if !must_leave && !is_held_up && !is_random {
+                return None;
+            }
             let path = path_beside(car, side, self.roads)?;
             // Only overtaking must pay off; a lane that ends has to be left.
-            let gains = reason != Reason::HeldUp || self.gain_mps2(index, &path) > GAIN_MPS2;
-            (gains && self.is_safe(index, &path, near)).then_some(path)
+            let is_worth = must_leave || !is_held_up || self.gain_mps2(index, &path) > GAIN_MPS2;
+            (is_worth && self.is_safe(index, &path, near)).then_some(path)
         })
-    }
-
-    fn reason(&self, car: &Car, side: Side) -> Option<Reason> {
-        let own = car.path.lane();
-        let other = side.of(self.roads.graph.lane(own))?;
-        if !self.roads.is_endless(own) && self.roads.is_endless(other) {
-            return Some(Reason::LaneEnds);
-        }
-        if car.lane_change.held_up_s > FOLLOWING_S {
-            return Some(Reason::HeldUp);
-        }
-        (car.lane_change.random_change == Some(side)).then_some(Reason::Random)
     }
 
     /// Gain in acceleration on another path, metres per second squared.

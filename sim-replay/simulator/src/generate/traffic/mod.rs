@@ -24,7 +24,7 @@ pub(crate) use roads::Roads;
 use explorer::Explorer;
 use junction::RightOfWay;
 
-use super::raycast::Sweep;
+use super::raycast::Course;
 use crate::map::LaneId;
 use support::random::SplitMix64;
 
@@ -108,13 +108,13 @@ impl<'t> Traffic<'t> {
         if is_free {
             car.path
                 .advance(self.roads.graph, distance_m, car.vehicle.size_m[0]);
-            car.motion = Sweep {
+            car.motion = Course {
                 start,
                 end: if speed_mps == 0.0 { start } else { end },
             };
             car.speed_mps = speed_mps;
         } else {
-            car.motion = Sweep::still(start);
+            car.motion = Course::still(start);
             car.speed_mps = 0.0;
         }
         car.standing_s += STEP_S;

@@ -8,7 +8,7 @@ use super::path::Path;
 use super::rectangle::{NeighbourIndex, Rectangle};
 use super::roads::{Roads, Spawn};
 use super::{STEP_S, Traffic, TrafficOptions};
-use crate::generate::raycast::Sweep;
+use crate::generate::raycast::Course;
 use crate::generate::vehicle::Vehicle;
 use support::random::SplitMix64;
 
@@ -121,7 +121,7 @@ impl<'t> Traffic<'t> {
             speed_mps,
             leader: None,
             lane_change,
-            motion: Sweep::still(placement),
+            motion: Course::still(placement),
             is_present: true,
             standing_s: 0.0,
             held: Vec::new(),
@@ -197,7 +197,7 @@ impl<'t> Traffic<'t> {
         let car = &mut self.cars[index];
         car.id = self.next_id;
         car.path = Path::new(spawn.lane, spawn.s_m);
-        car.motion = Sweep::still(car.placement_after(self.roads, 0.0));
+        car.motion = Course::still(car.placement_after(self.roads, 0.0));
         car.speed_mps = 0.6 * car.driver.pace * speed;
         car.leader = None;
         car.is_present = true;

@@ -1,7 +1,7 @@
 //! Road network builder: adds roads and junctions and links them.
 
 use super::super::clothoid;
-use super::super::curve::{Curve, Pose2};
+use super::super::curve::{PlanCurve, Pose2};
 use super::super::profile::Profile;
 use super::super::road::{
     Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork,
@@ -30,17 +30,13 @@ pub(super) struct LaneEnd {
 
 impl RoadEnd {
     pub(super) fn start(road: usize) -> Self {
-        Self {
-            road,
-            contact: Contact::Start,
-        }
+        let contact = Contact::Start;
+        Self { road, contact }
     }
 
     pub(super) fn end(road: usize) -> Self {
-        Self {
-            road,
-            contact: Contact::End,
-        }
+        let contact = Contact::End;
+        Self { road, contact }
     }
 
     pub(super) fn lane(self, lane: i32) -> LaneEnd {
@@ -75,8 +71,8 @@ impl CrossProfile {
 }
 
 /// A line of clothoids through `poses`.
-pub(super) fn path(poses: &[Pose2]) -> Vec<Curve> {
-    let mut curves: Vec<Curve> = Vec::new();
+pub(super) fn path(poses: &[Pose2]) -> Vec<PlanCurve> {
+    let mut curves: Vec<PlanCurve> = Vec::new();
     for pair in poses.windows(2) {
         curves.push(clothoid::between(pair[0], pair[1], path_length_m(&curves)));
     }
@@ -84,7 +80,7 @@ pub(super) fn path(poses: &[Pose2]) -> Vec<Curve> {
 }
 
 /// Length of a line of curves, metres.
-pub(super) fn path_length_m(curves: &[Curve]) -> f64 {
+pub(super) fn path_length_m(curves: &[PlanCurve]) -> f64 {
     curves
         .last()
         .map_or(0.0, |curve| curve.s_m + curve.length_m)
@@ -94,7 +90,7 @@ impl Builder {
     /// Adds a road; its links follow when its ends are joined.
     pub(super) fn road(
         &mut self,
-        plan_view: Vec<Curve>,
+        plan_view: Vec<PlanCurve>,
         elevation: Profile,
         profile: &CrossProfile,
         limit_mps: f64,
@@ -104,11 +100,8 @@ impl Builder {
                 .map(|&(kind, width)| RoadLane::new(kind, Profile::constant(width)))
                 .collect()
         });
-        let section = LaneSection {
-            s_m: 0.0,
-            left,
-            right,
-        };
+        let s_m = 0.0;
+        let section = LaneSection { s_m, left, right };
         self.push(plan_view, elevation, section, limit_mps)
     }
 
@@ -227,7 +220,7 @@ impl Builder {
 
     fn push(
         &mut self,
-        plan_view: Vec<Curve>,
+        plan_view: Vec<PlanCurve>,
         elevation: Profile,
         section: LaneSection,
         limit_mps: f64,

@@ -5,7 +5,7 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
-use super::streets::{Node, StreetGraph};
+use super::streets::{StreetGraph, StreetNode};
 
 /// Parameters of a grid of streets.
 pub(super) struct GridPlan {
@@ -86,11 +86,8 @@ fn full_grid(
         let [low, high] = [0, 1].map(|end| common[end] + calm * (own[end] - common[end]));
         for &row in &rows {
             let [dx, dy] = [(); 2].map(|()| rng.random_range(-jitter..jitter));
-            graph.nodes.push(Node {
-                x: x + dx,
-                y: low + row * (high - low) + dy,
-                port: None,
-            });
+            let (x, y, port) = (x + dx, low + row * (high - low) + dy, None);
+            graph.nodes.push(StreetNode { x, y, port });
         }
     }
     for column in 0..plan.columns_m.len() {
@@ -113,11 +110,8 @@ fn attach(graph: &mut StreetGraph, port: Pose2) {
     let distances = nodes.map(|node| (node.x - port.x).hypot(node.y - port.y));
     let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
     let nearest = nearest.map_or(0, |(node, _)| node);
-    graph.nodes.push(Node {
-        x: port.x,
-        y: port.y,
-        port: Some(port),
-    });
+    let (Pose2 { x, y, .. }, port) = (port, Some(port));
+    graph.nodes.push(StreetNode { x, y, port });
     graph.edges.push([nearest, graph.nodes.len() - 1]);
 }
 

@@ -15,7 +15,7 @@ pub(super) use town1::lay_out as town1;
 pub(super) use town4::lay_out as town4;
 
 /// A road network with the parts of its shape that belong to no road.
-pub(super) struct Layout {
+pub(super) struct RoadLayout {
     /// Roads and junctions.
     pub network: RoadNetwork,
     /// Middles of roundabouts: x, y and the radius free of traffic, metres.

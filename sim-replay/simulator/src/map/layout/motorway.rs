@@ -59,15 +59,12 @@ impl Motorway {
             let ends = [a, b].map(|s| [self.ring.height_m(s), self.ring.slope(s) * scale]);
             Profile::hermite(curves[step].s_m, length, ends[0], ends[1])
         });
-        let elevation = Profile {
-            records: records.collect(),
-        };
+        let records = records.collect();
+        let elevation = Profile { records };
         let mut right = vec![(LaneKind::Driving, LANE_M); self.lanes];
         right.push((LaneKind::Shoulder, 2.5));
-        let profile = CrossProfile {
-            left: vec![(LaneKind::Shoulder, 0.75)],
-            right,
-        };
+        let left = vec![(LaneKind::Shoulder, 0.75)];
+        let profile = CrossProfile { left, right };
         builder.road(curves, elevation, &profile, LIMIT_MPS)
     }
 
@@ -117,10 +114,9 @@ impl Motorway {
     pub(super) fn ramp(builder: &mut Builder, from: RampEnd, to: RampEnd) -> usize {
         let curves = path(&[from.0, to.0]);
         let elevation = Profile::between(curves[0].length_m, from.1, to.1);
-        let profile = CrossProfile {
-            left: vec![(LaneKind::Shoulder, 0.4)],
-            right: vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)],
-        };
+        let left = vec![(LaneKind::Shoulder, 0.4)];
+        let right = vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)];
+        let profile = CrossProfile { left, right };
         builder.road(curves, elevation, &profile, RAMP_LIMIT_MPS)
     }
 

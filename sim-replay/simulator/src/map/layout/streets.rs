@@ -23,7 +23,7 @@ const LEAST_STREET_M: f64 = 12.0;
 
 /// A place where streets meet, turn or end.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Node {
+pub(super) struct StreetNode {
     pub x: f64,
     pub y: f64,
     /// Set where the one street of this node ends at a road that is already laid out: the pose there, facing outwards,
@@ -34,7 +34,7 @@ pub(super) struct Node {
 /// Places and the streets between them.
 #[derive(Debug, Clone, Default)]
 pub(super) struct StreetGraph {
-    pub nodes: Vec<Node>,
+    pub nodes: Vec<StreetNode>,
     pub edges: Vec<[usize; 2]>,
 }
 
@@ -95,13 +95,13 @@ impl StreetGraph {
     }
 }
 
-/// Lays out the streets of `graph`. Returns the road ends at ports, as (node, end).
+/// Lays out the streets of `graph`. Returns the road ends at ports, by rising node.
 pub(super) fn lay_out(
     builder: &mut Builder,
     graph: &StreetGraph,
     limit_mps: f64,
     rng: &mut ChaCha8Rng,
-) -> Vec<(usize, RoadEnd)> {
+) -> Vec<RoadEnd> {
     let chains = chains(graph, rng);
     let radii = junction_radii(graph, &chains);
     // Road ends by node, in the order of the chains.
@@ -113,10 +113,10 @@ pub(super) fn lay_out(
         ends[first].push(RoadEnd::start(road));
         ends[last].push(RoadEnd::end(road));
     }
-    let mut ports = Vec::new();
+    let mut ports: Vec<RoadEnd> = Vec::new();
     for (node, ends) in ends.iter().enumerate() {
         if graph.nodes[node].port.is_some() {
-            ports.extend(ends.iter().map(|&end| (node, end)));
+            ports.extend(ends);
         } else if ends.len() > 1 {
             let junction = builder.junction();
             join(builder, junction, ends, limit_mps);
@@ -181,11 +181,7 @@ fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
 /// Lanes of one street: a lane each way, with or without parking, verge and broad pavements.
 fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
     let has_verge = rng.random_bool(0.3);
-    let verge_m = if has_verge {
-        rng.random_range(1.2..2.4)
-    } else {
-        0.0
-    };
+    let verge_m = has_verge.then(|| rng.random_range(1.2..2.4));
     let sidewalk_m = rng.random_range(1.6..3.4);
     let [left, right] = [(); 2].map(|()| {
         let mut lanes = vec![(LaneKind::Driving, 3.5)];
@@ -193,9 +189,7 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
             true => (LaneKind::Parking, 2.3),
             false => (LaneKind::Shoulder, 0.5),
         });
-        if verge_m > 0.0 {
-            lanes.push((LaneKind::Other, verge_m));
-        }
+        lanes.extend(verge_m.map(|verge_m| (LaneKind::Other, verge_m)));
         lanes.push((LaneKind::Sidewalk, sidewalk_m));
         lanes
     });
@@ -241,7 +235,7 @@ fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
             .distance_m(before, corner)
             .min(graph.distance_m(corner, after));
         let reach = (0.4 * shorter_m).min(22.0);
-        let Node { x, y, .. } = graph.nodes[corner];
+        let StreetNode { x, y, .. } = graph.nodes[corner];
         poses.push(Pose2::new(x, y, graph.angle(before, corner)).moved(-reach, 0.0, 0.0));
         poses.push(Pose2::new(x, y, graph.angle(corner, after)).moved(reach, 0.0, 0.0));
     }

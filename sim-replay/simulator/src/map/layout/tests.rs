@@ -2,7 +2,7 @@ use super::super::lane::{LaneGraph, wrap_angle};
 use super::super::lane_builder::lane_graph;
 use super::*;
 
-fn road_m(layout: &Layout, in_junctions: bool) -> f64 {
+fn road_m(layout: &RoadLayout, in_junctions: bool) -> f64 {
     let roads = layout
         .network
         .roads
@@ -12,7 +12,7 @@ fn road_m(layout: &Layout, in_junctions: bool) -> f64 {
 }
 
 /// Reference lines are smooth, elevations meet, no link was refused, no lane ends.
-fn check(name: &str, layout: &Layout) -> LaneGraph {
+fn check(name: &str, layout: &RoadLayout) -> LaneGraph {
     for road in &layout.network.roads {
         for pair in road.plan_view.windows(2) {
             assert!(

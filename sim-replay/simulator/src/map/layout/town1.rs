@@ -5,13 +5,13 @@ use rand_chacha::ChaCha8Rng;
 
 use super::builder::Builder;
 use super::grid::{GridPlan, grid, spread};
-use super::{Layout, streets};
+use super::{RoadLayout, streets};
 
 /// Speed limit: 25 mph, as in CARLA's Town01.
 const LIMIT_MPS: f64 = 11.176;
 
 /// Lays out the map of a seed.
-pub(crate) fn lay_out(seed: u64) -> Layout {
+pub(crate) fn lay_out(seed: u64) -> RoadLayout {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let width = rng.random_range(385.0..415.0);
     let height = rng.random_range(325.0..355.0);
@@ -36,8 +36,6 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
     });
     let mut builder = Builder::default();
     streets::lay_out(&mut builder, &graph, LIMIT_MPS, &mut rng);
-    Layout {
-        network: builder.network,
-        islands: Vec::new(),
-    }
+    let (network, islands) = (builder.network, Vec::new());
+    RoadLayout { network, islands }
 }

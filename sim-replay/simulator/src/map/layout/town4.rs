@@ -13,7 +13,7 @@ use super::grid::{GridPlan, grid, spread};
 use super::motorway::{Motorway, RAMP_ZONE_M};
 use super::ring::Ring;
 use super::roundabout::Roundabout;
-use super::{Layout, streets};
+use super::{RoadLayout, streets};
 
 /// Distance along the ring from the interchange's middle to where its ramps begin and end, metres.
 const RAMP_FROM_MIDDLE_M: f64 = 235.0;
@@ -26,7 +26,7 @@ const TOWN_LIMIT_MPS: f64 = 13.41;
 const LINK_LIMIT_MPS: f64 = 15.65;
 
 /// Lays out the map of a seed.
-pub(crate) fn lay_out(seed: u64) -> Layout {
+pub(crate) fn lay_out(seed: u64) -> RoadLayout {
     // Other random numbers than those of town1 for the same seed.
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x7465_776e_3474_6f77);
     let mut builder = Builder::default();
@@ -57,10 +57,9 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
         (-FRAC_PI_2, RoadEnd::end(off_outside)),
     ];
     outside.join(&mut builder, &arms);
-    Layout {
-        network: builder.network,
-        islands: vec![inside.island(), outside.island()],
-    }
+    let islands = vec![inside.island(), outside.island()];
+    let network = builder.network;
+    RoadLayout { network, islands }
 }
 
 /// One roundabout inside the ring's right-hand lobe and one outside, on a line across the motorway at its far end.
@@ -157,7 +156,7 @@ fn map_model(
         jitter_m: 4.0,
     };
     let graph = grid(&plan, Some(port), rng, |x| inside_lobe_m(motorway, x));
-    streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0].1
+    streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0]
 }
 
 /// Lowest and highest y at `x` inside the right-hand lobe, clear of the motorway.
@@ -182,5 +181,5 @@ fn works(builder: &mut Builder, outside: &Roundabout, rng: &mut ChaCha8Rng) -> R
     let graph = grid(&plan, Some(port), rng, |x| {
         [y - height / 2.0, y + height / 2.0].map(|y| y + shear * (x - west))
     });
-    streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0].1
+    streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0]
 }

@@ -28,12 +28,12 @@ pub(super) fn read_object(element: Element) -> Result<RoadObject> {
         label,
         s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
         t_m: element.number("t", -1e4, 1e4)?,
-        z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
-        heading_rad: element.number_or("hdg", 0.0, -1e4, 1e4)?,
+        z_offset_m: element.number_or_0("zOffset", -1e4, 1e4)?,
+        heading_rad: element.number_or_0("hdg", -1e4, 1e4)?,
         size_m: [
-            element.number_or("length", 0.0, 0.0, 1e4)?,
-            element.number_or("width", 0.0, 0.0, 1e4)?,
-            element.number_or("height", 0.0, 0.0, 1e4)?,
+            element.number_or_0("length", 0.0, 1e4)?,
+            element.number_or_0("width", 0.0, 1e4)?,
+            element.number_or_0("height", 0.0, 1e4)?,
         ],
     })
 }
@@ -49,9 +49,9 @@ pub(super) fn read_signal(element: Element) -> Result<RoadSignal> {
         dynamic: element.optional_text("dynamic") == Some("yes"),
         s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
         t_m: element.number("t", -1e4, 1e4)?,
-        z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
-        heading_rad: flip + element.number_or("hOffset", 0.0, -1e4, 1e4)?,
-        height_m: element.number_or("height", 0.0, 0.0, 100.0)?,
+        z_offset_m: element.number_or_0("zOffset", -1e4, 1e4)?,
+        heading_rad: flip + element.number_or_0("hOffset", -1e4, 1e4)?,
+        height_m: element.number_or_0("height", 0.0, 100.0)?,
     })
 }
 

@@ -86,25 +86,22 @@ fn note_overlaps(element: Element, width: &Profile, length_m: f64, log: &mut Fin
 
 /// A profile over places counted from `start_m` on.
 fn shifted(profile: &Profile, start_m: f64) -> Profile {
-    let after = profile
-        .records
-        .partition_point(|&(start, _)| start <= start_m);
-    let records = profile.records.iter().skip(after.saturating_sub(1));
+    let records = &profile.records;
+    let after = records.partition_point(|&(start, _)| start <= start_m);
+    let records = records.iter().skip(after.saturating_sub(1));
     let records = records.map(|&(start, coefficients)| match start < start_m {
         true => (0.0, moved(coefficients, start_m - start)),
         false => (start - start_m, coefficients),
     });
-    Profile {
-        records: records.collect(),
-    }
+    let records = records.collect();
+    Profile { records }
 }
 
 fn times(profile: &Profile, factor: f64) -> Profile {
     let records = profile.records.iter();
     let records = records.map(|&(start, cubic)| (start, cubic.map(|c| factor * c)));
-    Profile {
-        records: records.collect(),
-    }
+    let records = records.collect();
+    Profile { records }
 }
 
 /// Sum of two profiles: a record wherever either has one.
@@ -122,9 +119,8 @@ fn sum(a: &Profile, b: &Profile) -> Profile {
         });
         (place, [a0 + b0, a1 + b1, a2 + b2, a3 + b3])
     });
-    Profile {
-        records: records.collect(),
-    }
+    let records = records.collect();
+    Profile { records }
 }
 
 /// The same cubic of a variable that begins `by` later.

@@ -202,18 +202,11 @@ impl<'a, 'input> Element<'a, 'input> {
         }
     }
 
-    /// A finite number within bounds, or the default where the attribute is missing.
-    pub(super) fn number_or(
-        &self,
-        attribute: &'static str,
-        default: f64,
-        low: f64,
-        high: f64,
-    ) -> Result<f64> {
-        if self.node.has_attribute(attribute) {
-            self.number(attribute, low, high)
-        } else {
-            Ok(default)
+    /// A finite number within bounds, or 0 where the attribute is missing.
+    pub(super) fn number_or_0(&self, attribute: &'static str, low: f64, high: f64) -> Result<f64> {
+        match self.node.has_attribute(attribute) {
+            true => self.number(attribute, low, high),
+            false => Ok(0.0),
         }
     }
 

@@ -41,11 +41,9 @@ pub(super) fn read_sections(
             length_m: end_m - s_m,
             lane_offset,
         };
-        let section = LaneSection {
-            s_m,
-            left: read_side(element, "left", 1, &stretch, log)?,
-            right: read_side(element, "right", -1, &stretch, log)?,
-        };
+        let left = read_side(element, "left", 1, &stretch, log)?;
+        let right = read_side(element, "right", -1, &stretch, log)?;
+        let section = LaneSection { s_m, left, right };
         check_widths(element, &section, end_m - s_m)?;
         sections.push(section);
     }
@@ -157,7 +155,7 @@ fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
 /// Reports the heights of lanes over the road (kerbs), which are not built.
 fn note_heights(element: Element, log: &mut FindingLog) {
     let heights = children(element, "height").flat_map(|record| {
-        ["inner", "outer"].map(|name| record.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0))
+        ["inner", "outer"].map(|name| record.number_or_0(name, -1e3, 1e3).unwrap_or(0.0))
     });
     let highest_m = heights.map(f64::abs).fold(0.0, f64::max);
     if highest_m > 0.0 {

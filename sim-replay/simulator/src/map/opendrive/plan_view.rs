@@ -1,6 +1,6 @@
 //! `<planView>`: the elements of a road's reference line.
 
-use super::super::curve::{Curve, CurveShape, Pose2};
+use super::super::curve::{CurveShape, PlanCurve, Pose2};
 use super::super::finding::FindingLog;
 use super::element::{Element, MAX_COORDINATE_M, MAX_LENGTH_M, Result, children};
 
@@ -19,9 +19,9 @@ const JOINT_TOLERANCE_M: f64 = 2.0;
 const SHORT_M: f64 = 1.0;
 
 /// Reads a reference line; also returns the length of its road: that of the elements where the road's own differs.
-pub(super) fn read(road: Element, log: &mut FindingLog) -> Result<(Vec<Curve>, f64)> {
+pub(super) fn read(road: Element, log: &mut FindingLog) -> Result<(Vec<PlanCurve>, f64)> {
     let plan_view = road.required("planView")?;
-    let mut curves: Vec<Curve> = Vec::new();
+    let mut curves: Vec<PlanCurve> = Vec::new();
     for element in children(plan_view, "geometry") {
         let curve = read_curve(element, log)?;
         if let Some(before) = curves.last() {
@@ -60,7 +60,7 @@ fn road_length_m(road: Element, total_m: f64, log: &mut FindingLog) -> f64 {
     total_m
 }
 
-fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
+fn read_curve(element: Element, log: &mut FindingLog) -> Result<PlanCurve> {
     let x = element.number("x", -MAX_COORDINATE_M, MAX_COORDINATE_M)?;
     let y = element.number("y", -MAX_COORDINATE_M, MAX_COORDINATE_M)?;
     let start = Pose2::new(x, y, element.number("hdg", -1e4, 1e4)?);
@@ -69,7 +69,7 @@ fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
     let Some(kind) = element.elements().find(|child| child.name() != "userData") else {
         return Err(element.error_element("has no shape"));
     };
-    let line = Curve::new(s_m, start, length_m, CurveShape::Line);
+    let line = PlanCurve::new(s_m, start, length_m, CurveShape::Line);
     let shape = match kind.name() {
         "line" => return Ok(line),
         "arc" => match curvatures(kind, ["curvature"], length_m, log)? {
@@ -89,7 +89,7 @@ fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
             )));
         }
     };
-    checked(element, Curve { shape, ..line }, log)
+    checked(element, PlanCurve { shape, ..line }, log)
 }
 
 /// Curvatures of an element; `None` where one is tighter than any road bends: the element becomes a straight
@@ -118,12 +118,12 @@ fn curvatures<const N: usize>(
 fn read_param_poly3(
     element: Element,
     kind: Element,
-    line: Curve,
+    line: PlanCurve,
     log: &mut FindingLog,
-) -> Result<Curve> {
+) -> Result<PlanCurve> {
     let u = kind.cubic(["aU", "bU", "cU", "dU"])?;
     let v = kind.cubic(["aV", "bV", "cV", "dV"])?;
-    let [by_length, by_share] = [false, true].map(|normalized| Curve {
+    let [by_length, by_share] = [false, true].map(|normalized| PlanCurve {
         shape: CurveShape::ParamPoly3 { u, v, normalized },
         ..line
     });
@@ -144,7 +144,7 @@ fn read_param_poly3(
 }
 
 /// The curve, if it is about as long as its element; a short one that is not becomes a straight line.
-fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve> {
+fn checked(element: Element, curve: PlanCurve, log: &mut FindingLog) -> Result<PlanCurve> {
     if keeps_its_length(&curve) {
         return Ok(curve);
     }
@@ -154,25 +154,23 @@ fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve
         return Err(error);
     }
     error.note(log, "built as a straight line");
-    Ok(Curve {
-        shape: CurveShape::Line,
-        ..curve
-    })
+    let shape = CurveShape::Line;
+    Ok(PlanCurve { shape, ..curve })
 }
 
 /// True if a curve is as long as its element up to a factor of two.
-fn fits(curve: &Curve) -> bool {
+fn fits(curve: &PlanCurve) -> bool {
     let measured_m: f64 = tenths_m(curve).sum();
     measured_m > 0.5 * curve.length_m && measured_m < 2.0 * curve.length_m
 }
 
 /// True if no tenth of a curve is longer than twice its nominal length, which arbitrary polynomials may exceed.
-fn keeps_its_length(curve: &Curve) -> bool {
+fn keeps_its_length(curve: &PlanCurve) -> bool {
     tenths_m(curve).all(|chord_m| chord_m <= 0.2 * curve.length_m + 0.1)
 }
 
 /// Distances between the ends of each tenth of a curve, metres.
-fn tenths_m(curve: &Curve) -> impl Iterator<Item = f64> {
+fn tenths_m(curve: &PlanCurve) -> impl Iterator<Item = f64> {
     (0..10).map(move |tenth: u32| {
         let [from, to] =
             [tenth, tenth + 1].map(|tenth| curve.at(curve.length_m * f64::from(tenth) / 10.0));

@@ -74,12 +74,9 @@ fn note_unread(road: Element, log: &mut FindingLog) {
             "link" | "type" | "planView" | "elevationProfile" | "lateralProfile" | "lanes"
             | "objects" | "signals" | "railroad" | "userData" | "dataQuality" => {}
             "surface" => {
-                let surfaces = element
-                    .elements()
-                    .filter(|surface| surface.name() != "userData");
-                surfaces.for_each(|surface| {
+                for surface in element.elements().filter(|one| one.name() != "userData") {
                     surface.note_value(log, "file", "left out: the road is built without it");
-                });
+                }
             }
             _ => element.note(log, "is not supported", "left out"),
         }

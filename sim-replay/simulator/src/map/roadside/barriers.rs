@@ -8,7 +8,7 @@ use super::super::lane::wrap_angle;
 use super::super::road::{LaneKind, Road};
 use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind};
-use super::frontage::{Side, Zone, sides};
+use super::frontage::{RoadSide, Zone, sides};
 use super::parts::{PartFootprint, wall};
 use super::site::{Site, outline};
 
@@ -21,7 +21,7 @@ const POST_M: f64 = 4.0;
 
 /// Kinds of barriers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Barrier {
+enum BarrierKind {
     /// A rail on posts.
     Steel,
     /// A low wall.
@@ -33,10 +33,10 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     for side in sides(site.network) {
         let (share, barrier) = match side.zone {
             Zone::Street => continue,
-            Zone::Motorway if side.median && rng.random_bool(0.5) => (1.0, Barrier::Concrete),
-            Zone::Motorway if side.median => (1.0, Barrier::Steel),
-            Zone::Motorway => (0.9, Barrier::Steel),
-            Zone::Rural => (0.55, Barrier::Steel),
+            Zone::Motorway if side.median && rng.random_bool(0.5) => (1.0, BarrierKind::Concrete),
+            Zone::Motorway if side.median => (1.0, BarrierKind::Steel),
+            Zone::Motorway => (0.9, BarrierKind::Steel),
+            Zone::Rural => (0.55, BarrierKind::Steel),
         };
         along_side(site, &side, share, barrier, rng);
     }
@@ -45,7 +45,13 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn along_side(site: &mut Site, side: &Side, share: f64, barrier: Barrier, rng: &mut ChaCha8Rng) {
+fn along_side(
+    site: &mut Site,
+    side: &RoadSide,
+    share: f64,
+    barrier: BarrierKind,
+    rng: &mut ChaCha8Rng,
+) {
     let mut s = 0.0;
     while s < side.length_m - 1.0 {
         let stretch = rng.random_range(40.0..160.0f64);
@@ -77,7 +83,7 @@ fn between_directions(site: &mut Site, road: usize) {
         if let [Some(from), Some(to)] = ends
             && (to[0] - from[0]).hypot(to[1] - from[1]) > 0.5
         {
-            parts.extend(piece(from, to, Barrier::Concrete));
+            parts.extend(piece(from, to, BarrierKind::Concrete));
         }
     }
     // Inside a junction only where no lane leads across.
@@ -132,12 +138,12 @@ fn pieces(from: f64, to: f64, heading_rad: impl Fn(f64) -> f64) -> Vec<[f64; 2]>
     pieces
 }
 
-fn piece(from: [f64; 3], to: [f64; 3], barrier: Barrier) -> Vec<Solid> {
+fn piece(from: [f64; 3], to: [f64; 3], barrier: BarrierKind) -> Vec<Solid> {
     let (a, b) = ([from[0], from[1]], [to[0], to[1]]);
     let z = from[2].min(to[2]);
     let rise = (to[2] - from[2]).abs();
     let kind = SolidKind::Barrier;
-    if barrier == Barrier::Concrete {
+    if barrier == BarrierKind::Concrete {
         return vec![wall(kind, a, b, [z - 0.2, z + rise + 0.85], 0.4, 0.5)];
     }
     let mut parts = vec![wall(kind, a, b, [z + 0.42, z + rise + 0.76], 0.1, 0.6)];

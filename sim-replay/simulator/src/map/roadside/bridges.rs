@@ -1,6 +1,6 @@
 //! Under and beside roads that do not lie on the ground: slabs, parapets, pillars, retaining walls, tunnels.
 
-use super::super::convex::Rectangle;
+use super::super::convex::PlanRectangle;
 use super::super::curve::Pose2;
 
 use super::super::road::RoadStructure;
@@ -141,7 +141,7 @@ fn retaining_walls(site: &mut Site, road: usize) {
             let [a, b] = [from, to].map(|cut| cut.at(cut.paved_m[side] + sign * 0.5));
             let [x, y] = [0, 1].map(|axis| (a[axis] + b[axis]) / 2.0);
             let middle = Pose2::new(x, y, from.pose.heading_rad);
-            let around = Rectangle::around(middle, [1.0, 1.0]);
+            let around = PlanRectangle::around(middle, [1.0, 1.0]);
             let mut above = f64::INFINITY;
             site.surface.any(&around, |patch| {
                 let z = patch.low_m();

@@ -91,15 +91,15 @@ impl Draft {
 
     /// A box whose lower side is at `at[2]`.
     fn block_at(&mut self, at: [f64; 3], size: [f64; 3]) {
-        let (kind, reflectivity) = (SolidKind::Building, self.reflectivity);
-        let part = self.foot.cuboid(kind, at, size, reflectivity);
+        let (foot, kind) = (self.foot, SolidKind::Building);
+        let part = foot.cuboid(kind, at, size, self.reflectivity);
         self.parts.push(part);
     }
 
     fn cylinder(&mut self, at: [f64; 3], size: [f64; 2]) {
         let (foot, kind) = (self.foot, SolidKind::Building);
-        self.parts
-            .push(foot.cylinder(kind, at, size, self.reflectivity));
+        let part = foot.cylinder(kind, at, size, self.reflectivity);
+        self.parts.push(part);
     }
 
     /// A gabled roof as steps, its ridge along `u` or along `v`.

@@ -23,7 +23,7 @@ pub(super) enum Zone {
 
 /// One side of a road outside junctions.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Side {
+pub(super) struct RoadSide {
     pub road: usize,
     /// 1 for the left side, -1 for the right.
     pub sign: f64,
@@ -36,7 +36,7 @@ pub(super) struct Side {
 }
 
 /// Both sides of every road outside junctions.
-pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
+pub(super) fn sides(network: &RoadNetwork) -> Vec<RoadSide> {
     let mut sides = Vec::new();
     let roads = network.roads.iter().enumerate();
     for (index, road) in roads.filter(|(_, road)| road.junction.is_none()) {
@@ -47,7 +47,7 @@ pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
             // A side without lanes borders the traffic of the other side.
             let along = (sign < 0.0) == (has_lanes != road.left_hand);
             let median = !has_lanes && zone == Zone::Motorway;
-            sides.push(Side {
+            sides.push(RoadSide {
                 road: index,
                 sign,
                 zone,
@@ -60,7 +60,7 @@ pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
     sides
 }
 
-impl Side {
+impl RoadSide {
     /// The pose `out_m` beyond the paved area, `s_m` along the road (also a little before its start or behind its end),
     /// looking along the road.
     pub(super) fn beyond_paved(&self, site: &Site, s_m: f64, out_m: f64) -> Pose2 {

@@ -3,7 +3,7 @@
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::super::convex::Rectangle;
+use super::super::convex::PlanRectangle;
 use super::super::curve::Pose2;
 use super::buildings::Style;
 use super::lots;
@@ -36,7 +36,7 @@ pub(super) fn place_islands(site: &mut Site, islands: &[[f64; 3]], rng: &mut Cha
             plant(site, pose, species, rng.random_range(0.5..0.8), rng);
         }
         // No houses here.
-        let island = Rectangle::square([x, y], radius * 0.7);
+        let island = PlanRectangle::square([x, y], radius * 0.7);
         site.take(&island, [foot.z_m - 1.0, foot.z_m + 40.0]);
     }
 }
@@ -53,10 +53,8 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
         let pose = Pose2::new(x, y, rng.random_range(-3.1..3.1));
         let (choice, species) = (rng.random_range(0..10), Species::random(rng));
         let size = rng.random_range(0.8..1.5);
-        if !site
-            .surface
-            .any(&Rectangle::square([x, y], REACH_M), |_| true)
-        {
+        let around = PlanRectangle::square([x, y], REACH_M);
+        if !site.surface.any(&around, |_| true) {
             continue;
         }
         match choice {

@@ -5,7 +5,7 @@ use std::f64::consts::FRAC_PI_2;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::super::convex::Rectangle;
+use super::super::convex::PlanRectangle;
 use super::super::curve::Pose2;
 use super::super::{ParkingSpot, SolidKind};
 use super::buildings::{Lot, Style, build};
@@ -62,8 +62,8 @@ pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
 }
 
 /// Outline of a lot.
-pub(super) fn outline(lot: &Lot) -> Rectangle {
-    Rectangle::around(lot.foot.pose, [lot.width_m / 2.0, lot.depth_m / 2.0])
+pub(super) fn outline(lot: &Lot) -> PlanRectangle {
+    PlanRectangle::around(lot.foot.pose, [lot.width_m / 2.0, lot.depth_m / 2.0])
 }
 
 /// A lot of this width and depth around a pose, if the terrain rises less than `slope_m` there and nothing stands
@@ -75,7 +75,7 @@ pub(super) fn free_lot(
     slope_m: f64,
     room_m: f64,
 ) -> Option<Lot> {
-    let rectangle = Rectangle::around(pose, [width_m / 2.0, depth_m / 2.0]);
+    let rectangle = PlanRectangle::around(pose, [width_m / 2.0, depth_m / 2.0]);
     let [low, high] = site.ground_range_m(&rectangle);
     let z_m = [low - 1.5, low + LOT_HEIGHT_M];
     let is_free = high - low < slope_m && site.is_free(&rectangle.grown(room_m), z_m, true);

@@ -20,15 +20,15 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
 use super::ground::Ground;
-use super::layout::Layout;
-use super::surface::Surface;
+use super::layout::RoadLayout;
+use super::surface::RoadSurface;
 use super::{ParkingSpot, Solid};
 use site::Site;
 
 /// Solids and parking spots of the map of a seed.
 pub(super) fn place_roadside(
-    layout: &Layout,
-    surface: &Surface,
+    layout: &RoadLayout,
+    surface: &RoadSurface,
     ground: &Ground,
     seed: u64,
 ) -> (Vec<Solid>, Vec<ParkingSpot>) {

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::super::{Solid, SolidKind};
 use super::buildings::Style;
-use super::frontage::{Side, Zone, sides};
+use super::frontage::{RoadSide, Zone, sides};
 use super::lots;
 use super::parts::{PartFootprint, wall};
 use super::site::{HEADROOM_M, Site};
@@ -25,7 +25,7 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
 }
 
 /// Gantries and footbridges over the carriageway.
-fn across(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn across(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(15.0..180.0);
     while s < side.length_m - 10.0 {
         if rng.random_bool(0.65) {
@@ -37,7 +37,7 @@ fn across(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+fn gantry(site: &mut Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) {
     let cut = site.cut_at(side.road, s);
     let [low, high] = [cut.carriageway_m[0] - 0.9, cut.carriageway_m[1] + 0.9];
     let clear = rng.random_range(5.4..6.4);
@@ -63,7 +63,7 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
 }
 
 /// A bridge for walkers from this side to the other side of the carriageway: deck, rails, stairs towers.
-fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+fn footbridge(site: &mut Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) {
     let cut = site.cut_at(side.road, s);
     let [low, high] = [cut.carriageway_m[0] - 1.6, cut.carriageway_m[1] + 1.6];
     let z = cut.range_m()[1] + rng.random_range(5.3..6.2);
@@ -88,7 +88,7 @@ fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     site.try_place(&parts, 0.0, true);
 }
 
-fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn noise_walls(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(0.0..80.0);
     while s < side.length_m {
         let (length, out) = (rng.random_range(50.0..170.0f64), rng.random_range(2.5..7.0));
@@ -116,7 +116,7 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 /// Posts, panels, emergency telephones and cabinets at the edge.
-fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn markers(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..40.0);
     while s < side.length_m - 2.0 {
         let pose = side.beyond_kerb(site, s, rng.random_range(1.1..1.9));
@@ -147,7 +147,7 @@ fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 /// Trees in groups and rows, halls, masts and tanks behind the barrier.
-fn behind(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn behind(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(0.0..15.0);
     while s < side.length_m {
         match rng.random_range(0..16) {
@@ -175,7 +175,7 @@ fn behind(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+fn large(site: &mut Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) {
     use Style::{Block, Hall, Tanks, Tower};
     let style = [Hall, Hall, Block, Tanks, Tower][rng.random_range(0..5)];
     let size = style.lot_m(rng);
@@ -187,7 +187,7 @@ fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
 }
 
 /// A mast for power lines or radio: legs and arms.
-fn mast(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+fn mast(site: &mut Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) {
     let pose = side.beyond_paved(site, s, rng.random_range(8.0..30.0));
     let foot = site.foot(pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)));
     let (height, spread) = (rng.random_range(14.0..28.0), rng.random_range(0.9..2.2));

@@ -4,9 +4,9 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::ParkingSpot;
-use super::super::convex::Rectangle;
+use super::super::convex::PlanRectangle;
 use super::super::road::LaneKind;
-use super::frontage::{Side, Zone, sides};
+use super::frontage::{RoadSide, Zone, sides};
 use super::site::Site;
 
 /// Length and width of a spot, metres.
@@ -17,12 +17,12 @@ const CORNER_M: f64 = 6.0;
 /// Spots in parking lanes; where a street has none, bays behind the pavement in groups.
 pub(super) fn place_along_kerbs(site: &mut Site, rng: &mut ChaCha8Rng) {
     for side in sides(site.network) {
-        if side.zone != Zone::Street
-            || site.network.roads[side.road].length_m < 2.0 * CORNER_M + SPOT_M[0]
-        {
+        if side.zone != Zone::Street || side.length_m < 2.0 * CORNER_M + SPOT_M[0] {
             continue;
         }
-        if has_parking_lane(site, &side) {
+        let section = &site.network.roads[side.road].sections[0];
+        let mut lanes = section.side(side.sign > 0.0).iter();
+        if lanes.any(|lane| lane.kind == LaneKind::Parking) {
             in_lane(site, &side, rng);
         } else {
             in_bays(site, &side, rng);
@@ -30,13 +30,7 @@ pub(super) fn place_along_kerbs(site: &mut Site, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn has_parking_lane(site: &Site, side: &Side) -> bool {
-    let section = &site.network.roads[side.road].sections[0];
-    let lanes = section.side(side.sign > 0.0);
-    lanes.iter().any(|lane| lane.kind == LaneKind::Parking)
-}
-
-fn in_lane(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn in_lane(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = CORNER_M + rng.random_range(0.0..3.0);
     while s + SPOT_M[0] + CORNER_M < side.length_m {
         // Driveways and crossings interrupt the row.
@@ -50,7 +44,7 @@ fn in_lane(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn in_bays(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn in_bays(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = CORNER_M + rng.random_range(0.0..20.0);
     while s + SPOT_M[0] + CORNER_M < side.length_m {
         for _ in 0..rng.random_range(3..=8) {
@@ -61,7 +55,7 @@ fn in_bays(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             let out_m = side.pavement_m(site, middle) + SPOT_M[1] / 2.0 + 0.2;
             let pose = side.beyond_kerb(site, middle, out_m);
             let half_m = [SPOT_M[0] / 2.0, SPOT_M[1] / 2.0 + 0.1];
-            let rectangle = Rectangle::around(pose, half_m);
+            let rectangle = PlanRectangle::around(pose, half_m);
             let road = side.road_m(site, middle);
             let [low, high] = site.ground_range_m(&rectangle);
             let z_m = [road - 0.5, road + 3.5];
@@ -76,7 +70,7 @@ fn in_bays(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 /// A spot with its middle `out_m` beyond the kerb, in the direction of traffic on its side.
-fn push_spot(site: &mut Site, side: &Side, s_m: f64, out_m: f64) {
+fn push_spot(site: &mut Site, side: &RoadSide, s_m: f64, out_m: f64) {
     let pose = side.beyond_kerb(site, s_m, out_m);
     // In a parking lane the spot lies on the road, which may be a deck.
     let (z, bank_rad) = match out_m < 0.0 {

@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::curve::Pose2;
 use super::super::{Solid, SolidKind};
 use super::buildings::{Lot, Style};
-use super::frontage::{Side, Zone, sides};
+use super::frontage::{RoadSide, Zone, sides};
 use super::lots::{self, LOT_HEIGHT_M};
 use super::parts::{PartFootprint, wall};
 use super::site::Site;
@@ -47,7 +47,7 @@ fn character(rng: &mut ChaCha8Rng) -> (Vec<Style>, f64, f64) {
     (styles, rng.random_range(set_back_m), gap_m)
 }
 
-fn along_street(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn along_street(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let (styles, least_set_back, gap) = character(rng);
     let mut s = -CORNER_M;
     while s < side.length_m + CORNER_M {
@@ -72,7 +72,7 @@ fn along_street(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn along_country_road(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn along_country_road(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(0.0..20.0);
     while s < side.length_m {
         let set_back = rng.random_range(4.0..14.0);
@@ -99,7 +99,7 @@ fn along_country_road(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 /// The lot `width` x `depth` from `s` on, `set_back` behind the paved area, if it is free and level enough.
-fn free_lot(site: &Site, side: &Side, s: f64, size: [f64; 2], set_back: f64) -> Option<Lot> {
+fn free_lot(site: &Site, side: &RoadSide, s: f64, size: [f64; 2], set_back: f64) -> Option<Lot> {
     let middle = s + size[0] / 2.0;
     // On a bend the front's middle and its ends lie at different distances; the free test settles it.
     let pose = side.beyond_paved(site, middle, set_back + size[1] / 2.0);
@@ -111,7 +111,7 @@ fn free_lot(site: &Site, side: &Side, s: f64, size: [f64; 2], set_back: f64) -> 
 /// Places a building, with a garden in front and trees behind; returns the end of the lot along the street.
 fn building(
     site: &mut Site,
-    side: &Side,
+    side: &RoadSide,
     s: f64,
     size: [f64; 2],
     set_back: f64,
@@ -164,7 +164,7 @@ fn front(site: &mut Site, lot: &Lot, set_back: f64, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn parking_lot(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f64> {
+fn parking_lot(site: &mut Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) -> Option<f64> {
     let width = rng.random_range(14.0..30.0);
     let lot = free_lot(site, side, s, [width, lots::DEPTH_M], 0.3)?;
     let outline = lots::outline(&lot);
@@ -178,7 +178,7 @@ fn parking_lot(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Op
 }
 
 /// A small park: trees, benches, a monument.
-fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f64> {
+fn green(site: &mut Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) -> Option<f64> {
     let (width, depth) = (rng.random_range(14.0..32.0), rng.random_range(12.0..22.0));
     let lot = free_lot(site, side, s, [width, depth], 1.0)?;
     for _ in 0..rng.random_range(3..=9) {
@@ -225,7 +225,7 @@ pub(super) fn monument(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> 
 }
 
 /// A fence along a field; returns its end.
-fn fence(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> f64 {
+fn fence(site: &mut Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) -> f64 {
     let (length, out) = (rng.random_range(15.0..45.0), rng.random_range(2.0..4.0));
     let height = rng.random_range(0.8..1.5);
     let hedge = rng.random_bool(0.4);

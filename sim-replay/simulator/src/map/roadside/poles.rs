@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::curve::Pose2;
 use super::super::road::RoadLink;
 use super::super::{Solid, SolidKind};
-use super::frontage::{Side, Zone, sides};
+use super::frontage::{RoadSide, Zone, sides};
 use super::parts::PartFootprint;
 use super::site::Site;
 
@@ -110,7 +110,7 @@ fn sign(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> {
 
 fn lamps(
     site: &mut Site,
-    side: &Side,
+    side: &RoadSide,
     rhythm_m: Range<f64>,
     height_m: Range<f64>,
     rng: &mut ChaCha8Rng,
@@ -138,7 +138,7 @@ fn lamps(
 }
 
 /// A traffic light where this side's traffic enters a junction, for most junctions.
-fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn traffic_light(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let road = &site.network.roads[side.road];
     let (link, s) = if side.along {
         (road.successor, side.length_m - 0.6)
@@ -168,7 +168,7 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     site.try_place(&parts, 0.02, false);
 }
 
-fn signs(site: &mut Site, side: &Side, distance_m: Range<f64>, rng: &mut ChaCha8Rng) {
+fn signs(site: &mut Site, side: &RoadSide, distance_m: Range<f64>, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..distance_m.end);
     while s < side.length_m - 2.0 {
         let is_street = side.zone == Zone::Street;
@@ -181,7 +181,7 @@ fn signs(site: &mut Site, side: &Side, distance_m: Range<f64>, rng: &mut ChaCha8
 }
 
 /// Bins, hydrants, cabinets, bollards, benches, shelters and kiosks.
-fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+fn small_things(site: &mut Site, side: &RoadSide, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..20.0);
     while s < side.length_m - 3.0 {
         let pavement = side.pavement_m(site, s);
@@ -206,7 +206,7 @@ fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 /// A bus shelter: back, one side and roof.
-fn shelter(site: &Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+fn shelter(site: &Site, side: &RoadSide, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let cut = site.cut_at(side.road, s);
     let depth = side.pavement_m(site, cut.s_m).clamp(1.2, 1.7);
     let foot = site.foot(side.facing(side.beyond_kerb(site, s, 0.5 + depth / 2.0)));
@@ -223,7 +223,7 @@ fn shelter(site: &Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid>
     ]
 }
 
-fn kiosk(site: &Site, side: &Side, s: f64, pavement: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+fn kiosk(site: &Site, side: &RoadSide, s: f64, pavement: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let foot = site.foot(side.facing(side.beyond_kerb(site, s, pavement + 1.3)));
     let kind = SolidKind::StreetFurniture;
     let width = rng.random_range(2.2..3.6);

@@ -1,11 +1,11 @@
 //! Ground plan of a scene: outlines that are occupied, and solids that have been placed.
 
 pub(super) use super::super::clearance::outline;
-use super::super::convex::{CellIndex, Rectangle, bounds, overlap, range};
+use super::super::convex::{CellIndex, PlanRectangle, bounds, overlap, range};
 use super::super::curve::Pose2;
 use super::super::ground::Ground;
 use super::super::road::RoadNetwork;
-use super::super::surface::{CrossSection, Surface};
+use super::super::surface::{CrossSection, RoadSurface};
 use super::super::{ParkingSpot, Solid};
 use super::parts::PartFootprint;
 
@@ -19,7 +19,7 @@ const MAX_JUNCTION_M: f64 = 70.0;
 /// A scene under construction.
 pub(super) struct Site<'a> {
     pub network: &'a RoadNetwork,
-    pub surface: &'a Surface,
+    pub surface: &'a RoadSurface,
     pub ground: &'a Ground,
     pub solids: Vec<Solid>,
     pub parking: Vec<ParkingSpot>,
@@ -29,7 +29,11 @@ pub(super) struct Site<'a> {
 }
 
 impl<'a> Site<'a> {
-    pub(super) fn new(network: &'a RoadNetwork, surface: &'a Surface, ground: &'a Ground) -> Self {
+    pub(super) fn new(
+        network: &'a RoadNetwork,
+        surface: &'a RoadSurface,
+        ground: &'a Ground,
+    ) -> Self {
         let mut site = Self {
             network,
             surface,
@@ -45,10 +49,10 @@ impl<'a> Site<'a> {
         site
     }
 
-    /// True if a rectangle is free of roads and of everything placed, between two heights.
-    pub(super) fn is_free(&self, rectangle: &Rectangle, z_m: [f64; 2], pavements: bool) -> bool {
-        let (outline, [bottom_m, top_m]) = (rectangle.corners(), z_m);
-        self.surface.is_clear(rectangle, z_m, HEADROOM_M, pavements)
+    /// True if an area is free of roads and of everything placed, between two heights.
+    pub(super) fn is_free(&self, area: &PlanRectangle, z_m: [f64; 2], pavements: bool) -> bool {
+        let (outline, [bottom_m, top_m]) = (area.corners(), z_m);
+        self.surface.is_clear(area, z_m, HEADROOM_M, pavements)
             && !self.index.any(bounds(outline), |number| {
                 let (other, [low, high]) = &self.taken[number as usize];
                 bottom_m < *high && top_m > *low && overlap(&outline, other)
@@ -56,7 +60,7 @@ impl<'a> Site<'a> {
     }
 
     /// Takes a rectangle between two heights.
-    pub(super) fn take(&mut self, rectangle: &Rectangle, z_m: [f64; 2]) {
+    pub(super) fn take(&mut self, rectangle: &PlanRectangle, z_m: [f64; 2]) {
         self.take_outline(rectangle.corners().to_vec(), z_m);
     }
 
@@ -86,7 +90,7 @@ impl<'a> Site<'a> {
     }
 
     /// Lowest and highest terrain under the corners and the middle of a rectangle, metres.
-    pub(super) fn ground_range_m(&self, rectangle: &Rectangle) -> [f64; 2] {
+    pub(super) fn ground_range_m(&self, rectangle: &PlanRectangle) -> [f64; 2] {
         let corners = rectangle.corners().into_iter();
         let places = corners.chain([rectangle.center_m]);
         range(places.map(|place| self.ground_m(place)))

@@ -1,4 +1,4 @@
-use super::super::convex::{Rectangle, overlap};
+use super::super::convex::{PlanRectangle, overlap};
 use super::super::{RoadMapSource, SolidKind, build};
 use super::site::outline;
 
@@ -27,7 +27,7 @@ fn parking_spots_are_free() {
         for spot in &map_model.parking {
             let [x, y, z] = spot.center_m;
             // A car's outline within the spot, up to the height of a van.
-            let car = Rectangle {
+            let car = PlanRectangle {
                 center_m: [x, y],
                 half_m: [2.2, 0.85],
                 yaw_rad: spot.yaw_rad,

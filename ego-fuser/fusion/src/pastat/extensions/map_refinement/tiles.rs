@@ -84,10 +84,8 @@ impl Tiles {
     /// `[K, 1, EDGE + 2, EDGE + 2]`, `u8`: 1 on the map and 0 beyond its edges, where the second convolution is padded.
     pub(super) fn hidden_mask(&self) -> Result<Tensor, TchError> {
         let edge = EDGE + 2 * HIDDEN_MARGIN;
-        let masks = self
-            .cells(HIDDEN_MARGIN)
-            .map(|cell| u8::from(cell.is_some()));
-        let masks: Vec<u8> = masks.collect();
+        let cells = self.cells(HIDDEN_MARGIN);
+        let masks: Vec<u8> = cells.map(|cell| u8::from(cell.is_some())).collect();
         Tensor::f_from_slice(&masks)?.f_view([-1, 1, edge, edge])
     }
 

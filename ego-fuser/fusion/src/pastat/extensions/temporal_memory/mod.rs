@@ -14,7 +14,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::{self, Init, Module};
 use tch::{Device, Kind, Result, Tensor};
 
-use self::selection::{AROUND, Selection};
+use self::selection::{AROUND, BlendedCells};
 use super::LEAST_LIKELY;
 use crate::f64_tensor::are_numbers;
 use crate::full_resolution::{CellSamples, FullResolutionMap};
@@ -80,12 +80,8 @@ impl TemporalMemory {
         }
         let likely = classes.likely(&fused)?;
         let grid = &aligned.grid;
-        self.forward(
-            [&fused, &fine.own],
-            &Earlier { maps, grid },
-            context,
-            &likely,
-        )
+        let past = Earlier { maps, grid };
+        self.forward([&fused, &fine.own], &past, context, &likely)
     }
 
     /// The earlier maps that take part, each with its time step and its sender's corrected pose.
@@ -156,12 +152,11 @@ impl TemporalMemory {
     ) -> Result<Tensor> {
         let (_, channels, height, width) = now.size4()?;
         // Where a gradient flows, or on a GPU, only the share limits the number of cells.
-        let least = if are_numbers(now) {
-            LEAST_LIKELY
-        } else {
-            f32::NEG_INFINITY
+        let least = match are_numbers(now) {
+            true => LEAST_LIKELY,
+            false => f32::NEG_INFINITY,
         };
-        let selection = Selection::most_likely(likely, self.patch, self.share, least)?;
+        let selection = BlendedCells::most_likely(likely, self.patch, self.share, least)?;
         let at = Places::of(&selection, width, now.device())?;
         let mut cells = channels_last(now)?.f_flatten(0, 2)?;
         let own = channels_last(&own.f_unsqueeze(0)?)?
@@ -173,9 +168,8 @@ impl TemporalMemory {
         let now = shown.f_index_select(0, &at.middle)?;
         let gate = self.gate(0, &own, &known, &at)?;
         let mut change = gate * (own.f_index_select(0, &at.middle)? - &now);
-        for (step, CellSamples { features, mask }) in
-            FullResolutionMap::seen(&past.maps, &selection.near, past.grid)?
-        {
+        let seen = FullResolutionMap::seen(&past.maps, &selection.near, past.grid)?;
+        for (step, CellSamples { features, mask }) in seen {
             let gate = self.gate(1 + step, &features, &known, &at)?;
             let apart = features.f_index_select(0, &at.middle)? - &now;
             // Cells without valid data in any map get no blending.
@@ -202,9 +196,8 @@ impl TemporalMemory {
 
     /// Features of the tokens, on the cells of some `patches`: `[P, hidden]`.
     fn token_features(&self, ego: &Tensor, patches: &Tensor) -> Result<Tensor> {
-        let features = self
-            .token
-            .forward(&ego.f_flatten(0, 2)?.f_index_select(0, patches)?);
+        let tokens = ego.f_flatten(0, 2)?.f_index_select(0, patches)?;
+        let features = self.token.forward(&tokens);
         let (patches, hidden) = features.size2()?;
         let each = self.patch * self.patch;
         features
@@ -235,7 +228,7 @@ fn settled(origins: &Origins, corrections: &Tensor, first: usize) -> Result<Vec<
         .collect())
 }
 
-/// [`Selection`] cells as indices.
+/// [`BlendedCells`] cells as indices.
 struct Places {
     /// `[K]`, of patches.
     patches: Tensor,
@@ -250,7 +243,7 @@ struct Places {
 }
 
 impl Places {
-    fn of(selection: &Selection, width: i64, device: Device) -> Result<Self> {
+    fn of(selection: &BlendedCells, width: i64, device: Device) -> Result<Self> {
         let near = selection.near.iter();
         let near: Vec<i64> = near
             .map(|&[row, column]| row as i64 * width + column as i64)
@@ -301,10 +294,7 @@ fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<T
     let results = shown
         .f_linear(&weight, None::<&Tensor>)?
         .f_view([-1, hidden])?;
-    let Around {
-        results: rows,
-        first,
-    } = around;
+    let (rows, first) = (&around.results, &around.first);
     let unweighted = None::<&Tensor>;
     let (sums, ..) =
         Tensor::f_embedding_bag(&results, rows, first, false, SUM, false, unweighted, false)?;
@@ -338,7 +328,7 @@ mod tests {
             .squeeze_dim(0)
             .transpose(0, 1);
         let likely = uniform(5, &[1, 1, 4, 6]);
-        let selection = Selection::most_likely(&likely, 2, 0.5, 0.0).unwrap();
+        let selection = BlendedCells::most_likely(&likely, 2, 0.5, 0.0).unwrap();
         let of = |places: &[i64]| Tensor::from_slice(places);
         let near: Vec<i64> = selection
             .near

@@ -12,7 +12,7 @@ const MARGIN_CELLS: i64 = 2;
 
 /// The cells of a few patches, patch by patch and row by row, and their neighbours.
 #[derive(Debug)]
-pub(super) struct Selection {
+pub(super) struct BlendedCells {
     /// `K`: their patches, counted row by row.
     pub(super) patches: Vec<i64>,
     /// `P`: the cells of those, counted row by row.
@@ -23,21 +23,17 @@ pub(super) struct Selection {
     pub(super) around: Vec<i64>,
 }
 
-impl Selection {
+impl BlendedCells {
     /// Up to a `share` of all patches of `patch` cells along each edge, at least one: those with the highest likelihood
     /// of a vehicle in or close to them by `likely` `[1, 1, H, W]`, and `least`. H and W are multiples of `patch`.
     pub(super) fn most_likely(likely: &Tensor, patch: i64, share: f64, least: f32) -> Result<Self> {
         let (_, _, height, width) = likely.size4()?;
-        let window = patch + 2 * MARGIN_CELLS;
-        let margin = [MARGIN_CELLS; 2];
-        let by_patch =
-            likely.f_max_pool2d([window, window], [patch, patch], margin, [1, 1], false)?;
+        let (window, margin) = ([patch + 2 * MARGIN_CELLS; 2], [MARGIN_CELLS; 2]);
+        let by_patch = likely.f_max_pool2d(window, [patch; 2], margin, [1, 1], false)?;
         let by_patch = numbers(&by_patch.f_to_kind(Kind::Float)?)?;
-        Ok(Self::of(
-            &largest(&by_patch, share, least, 1),
-            patch as usize,
-            [height as usize, width as usize],
-        ))
+        let chosen = largest(&by_patch, share, least, 1);
+        let size = [height, width].map(|cells| cells as usize);
+        Ok(Self::of(&chosen, patch as usize, size))
     }
 
     fn of(patches: &[usize], patch: usize, size: [usize; 2]) -> Self {
@@ -99,7 +95,7 @@ mod tests {
         let _ = likely.get(0).get(0).get(7).get(11).fill_(1.0);
         // Four cells along each edge: within two cells of it lie the patches in rows 1 and 2, columns 2 and 3.
         let all = f32::NEG_INFINITY;
-        let selection = Selection::most_likely(&likely, 4, 4.0 / 24.0, all).unwrap();
+        let selection = BlendedCells::most_likely(&likely, 4, 4.0 / 24.0, all).unwrap();
         assert_eq!(selection.patches, [8, 9, 14, 15]);
         assert_eq!(
             (selection.cells.len(), selection.around.len()),
@@ -124,7 +120,7 @@ mod tests {
 
     #[test]
     fn beyond_the_edges_is_nothing() {
-        let selection = Selection::of(&[0, 5], 2, [4, 6]);
+        let selection = BlendedCells::of(&[0, 5], 2, [4, 6]);
         assert_eq!(selection.near.len(), 3 * 3 + 3 * 3);
         let beyond = selection.near.len() as i64;
         assert_eq!(
@@ -142,7 +138,7 @@ mod tests {
         let likely = Tensor::full([1, 1, 4, 4], f64::NAN, (Kind::Float, Device::Cpu));
         for (share, count) in [(0.0, 1), (0.3, 2), (1.0, 4), (9.0, 4), (f64::NAN, 1)] {
             assert_eq!(
-                Selection::most_likely(&likely, 2, share, f32::NEG_INFINITY)
+                BlendedCells::most_likely(&likely, 2, share, f32::NEG_INFINITY)
                     .unwrap()
                     .patches
                     .len(),

@@ -1,6 +1,6 @@
 //! Roads that are not level across: surface, lanes, ground.
 
-use super::super::super::layout::Layout;
+use super::super::super::layout::RoadLayout;
 use super::super::super::road::Road;
 use super::super::super::{LaneGraph, place_roadside};
 use super::*;
@@ -106,7 +106,7 @@ fn the_ground_meets_the_banked_surface() {
     let network = banked();
     let map_model = place_roadside(
         "banked".into(),
-        &Layout {
+        &RoadLayout {
             network: network.clone(),
             islands: Vec::new(),
         },

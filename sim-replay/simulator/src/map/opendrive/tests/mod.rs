@@ -287,7 +287,7 @@ fn build_all(network: &RoadNetwork) {
         assert!(lane.banks_rad.is_empty() || lane.banks_rad.len() == lane.centerline.len());
         assert!(lane.banks_rad.iter().all(|bank| bank.is_finite()));
     }
-    let surface = super::super::surface::Surface::new(network);
+    let surface = super::super::surface::RoadSurface::new(network);
     assert!(
         surface
             .patches
