@@ -25,11 +25,19 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, FileError> {
 /// # Errors
 /// [`FileError`].
 pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, FileError> {
-    serde_saphyr::from_str(text).map_err(|error| {
+    let mut field = None;
+    // Only with the names of the fields on the way: `T` is compiled for one deserializer.
+    let parsed = serde_saphyr::with_deserializer_from_str(text, |deserializer| {
+        serde_path_to_error::deserialize(deserializer).map_err(|error| {
+            field = Some(error.path().to_string());
+            error.into_inner()
+        })
+    });
+    parsed.map_err(|error| {
         // A file that is no YAML may begin like one with an unknown field.
         let (error, field) = match serde_saphyr::from_str::<IgnoredAny>(text) {
             Err(no_yaml) => (no_yaml, None),
-            Ok(_) => (error, field_of_error::<T>(text)),
+            Ok(_) => (error, field.filter(|field| field != ".")),
         };
         let fields = match &field {
             // The hint about kinds of files concerns fields of the top level only.
@@ -58,18 +66,6 @@ fn reason(error: &serde_saphyr::Error) -> String {
 fn fields_of(text: &str) -> Vec<String> {
     serde_saphyr::from_str::<BTreeMap<String, IgnoredAny>>(text)
         .map_or_else(|_| Vec::new(), |fields| fields.into_keys().collect())
-}
-
-/// Field at which a text stops being a `T`, for example `scene.rate`; `None` for the whole document.
-fn field_of_error<T: DeserializeOwned>(text: &str) -> Option<String> {
-    let mut field = None;
-    let parsed: Result<T, _> = serde_saphyr::with_deserializer_from_str(text, |deserializer| {
-        serde_path_to_error::deserialize(deserializer).map_err(|error| {
-            field = Some(error.path().to_string());
-            error.into_inner()
-        })
-    });
-    field.filter(|field| parsed.is_err() && field != ".")
 }
 
 #[cfg(test)]
