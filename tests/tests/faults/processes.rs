@@ -50,7 +50,7 @@ fn a_fleet_that_lasts_opens_nothing_more_and_more() {
     let folder = tempfile::tempdir().unwrap();
     let soak = soak(folder.path(), Duration::from_secs(12), |_, _| {});
     assert!(
-        soak.balances && soak.frames > 20 && soak.memory.len() == 8,
+        soak.balances && soak.frames > 20 && soak.memory.len() == 9,
         "{soak:?}"
     );
     for (name, [before, after, threads_before, threads_after]) in &soak.handles {
