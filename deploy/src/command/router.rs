@@ -53,7 +53,7 @@ pub(crate) struct Arguments {
     /// Write the same settings as a configuration for `zenohd -c FILE`, and do not run.
     #[arg(long, value_name = "FILE")]
     zenohd: Option<PathBuf>,
-    /// File for the numbers of refused requests, in JSON (--keys); a router that is started again adds to it.
+    /// File for the numbers of refused requests, in JSON (--keys); a restarted router adds to it.
     #[arg(long, value_name = "FILE", requires = "keys")]
     refusals: Option<PathBuf>,
     /// End when standard input ends: for a supervisor that holds the other end of the pipe.

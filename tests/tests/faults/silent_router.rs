@@ -218,7 +218,7 @@ fn an_outage_of_a_router_elsewhere_is_the_cause_of_the_gap() {
 }
 
 #[test]
-fn a_suspended_run_reports_the_pause_in_which_its_fleet_went_on() {
+fn a_suspended_run_reports_the_pause_and_scores_what_was_sent_meanwhile() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 3, "loop: true, rate: 0.5", "");
