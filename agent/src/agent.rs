@@ -157,7 +157,10 @@ impl Agent {
         let began = Instant::now();
         let input = pose_input(&self.cav, input, self.levels(&sweep));
         let pose = self.pose_source.estimate(&input);
-        let pose = (self.attack.as_ref()).map_or(pose, |attack| attack.pose(pose));
+        let pose = self
+            .attack
+            .as_ref()
+            .map_or(pose, |attack| attack.pose(pose));
         (pose, self.pose_stages("pose", began), sweep)
     }
 
@@ -174,7 +177,10 @@ impl Agent {
             return self.perceive_map(&map);
         }
         let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
-        let encoded = (sweep.encoded.take()).map_or_else(|| detector.encode_sweep(cloud), Ok)?;
+        let encoded = sweep
+            .encoded
+            .take()
+            .map_or_else(|| detector.encode_sweep(cloud), Ok)?;
         let mut perception = self.perceive_map(&encoded.features)?;
         // The encoder ran first, here or for the pose: its times belong to the sweep.
         perception.times = [encoded.times.as_slice(), &perception.times].concat();
@@ -227,7 +233,9 @@ impl Agent {
         pose: PoseEstimate,
         detections: Vec<Detection>,
     ) -> Boxes {
-        let objects = (self.object_tracker).objects(capture_nanos, &pose, detections);
+        let objects = self
+            .object_tracker
+            .objects(capture_nanos, &pose, detections);
         let boxes = Boxes::new(pose, &objects);
         match &self.attack {
             Some(attack) => attack.boxes(boxes),

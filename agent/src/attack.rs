@@ -182,7 +182,10 @@ impl Attack {
             Falsification::Invented | Falsification::Flood => {
                 let confidence = &mut falsified.confidence;
                 invent(&mut falsified.features, confidence, &self.places);
-                let invented = (self.places.iter()).map(|&place| vehicle(place, INVENTED_SCORE));
+                let invented = self
+                    .places
+                    .iter()
+                    .map(|&place| vehicle(place, INVENTED_SCORE));
                 falsified.detections.extend(invented);
             }
         }

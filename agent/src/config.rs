@@ -346,7 +346,8 @@ impl ProcessConfig for AgentConfig {
         }
         self.settings.validate()?;
         // Against the streams as they are sent: boxes may stand in for maps.
-        (self.settings).check_attack(&self.options().of_loop.publish)?;
+        self.settings
+            .check_attack(&self.options().of_loop.publish)?;
         self.bus.validate()
     }
 }

@@ -190,13 +190,15 @@ impl<'a> AgentNode<'a> {
                     })
                 })
             }
-            Stream::Gnss => {
-                (inbox.decode(arrival, limits)).map(|gnss| LoopInput::Gnss(capture_nanos, gnss))
-            }
+            Stream::Gnss => inbox
+                .decode(arrival, limits)
+                .map(|gnss| LoopInput::Gnss(capture_nanos, gnss)),
             Stream::Imu => (inbox.decode(arrival, limits))
                 .map(|motion| LoopInput::Motion(capture_nanos, motion)),
             // Only paces are left of what the node subscribes to.
-            _ => (inbox.decode(arrival, limits)).map(|pace| LoopInput::Pace(cav.clone(), pace)),
+            _ => inbox
+                .decode(arrival, limits)
+                .map(|pace| LoopInput::Pace(cav.clone(), pace)),
         };
         let stats = self.bus.stats();
         if *stream == Stream::Lidar

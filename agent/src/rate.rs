@@ -103,7 +103,9 @@ impl RateControl {
         turn: Option<&Turn>,
     ) -> Result<Option<ByteLimit>, WireError> {
         let config = self.config;
-        let size = (config.message_bytes).map(|bytes| (bytes, LimitedBy::MessageSize));
+        let size = config
+            .message_bytes
+            .map(|bytes| (bytes, LimitedBy::MessageSize));
         let on_air_nanos = self.nanos_since_last(capture_nanos);
         let rate = config.bytes_per_second;
         let rate = rate.map(|rate| (bytes_within(rate, on_air_nanos), LimitedBy::ByteRate));

@@ -75,7 +75,10 @@ impl<S> SweepPairing<S> {
     /// Adds a sweep. Returns the one that it replaces.
     pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now_nanos: u64) -> Option<S> {
         // The wait goes on: with a period shorter than the time-out, none would ever be over if each sweep began anew.
-        let since = (self.waiting.as_ref()).map_or(now_nanos, |(_, _, since)| *since);
+        let since = self
+            .waiting
+            .as_ref()
+            .map_or(now_nanos, |(_, _, since)| *since);
         let superseded = self.waiting.replace((capture_nanos, sweep, since));
         superseded.map(|(_, sweep, _)| sweep)
     }
@@ -144,7 +147,9 @@ impl<T> CaptureBuffer<T> {
     /// Removes the measurements of later sweeps.
     fn take_later(&mut self, capture_nanos: u64) -> BTreeMap<u64, T> {
         // No capture time is later than the largest one.
-        (capture_nanos.checked_add(1)).map_or_else(BTreeMap::new, |next| self.0.split_off(&next))
+        capture_nanos
+            .checked_add(1)
+            .map_or_else(BTreeMap::new, |next| self.0.split_off(&next))
     }
 }
 

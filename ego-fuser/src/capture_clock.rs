@@ -97,7 +97,11 @@ impl CaptureClocks {
         for (cav, clock) in &mut self.neighbours {
             while let Some(sweep) = clock.pending.front().copied() {
                 // Interpolation needs an own sweep of this time or later, which a later report brings.
-                if (self.own.back()).is_none_or(|own| own.arrived_nanos < sweep.arrived_nanos) {
+                if self
+                    .own
+                    .back()
+                    .is_none_or(|own| own.arrived_nanos < sweep.arrived_nanos)
+                {
                     break;
                 }
                 clock.pending.pop_front();

@@ -93,7 +93,10 @@ impl Reconciliation {
 impl fmt::Display for Discrepancy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counts = &self.counts;
-        let to = (self.to.as_ref()).map_or(String::new(), |to| format!(" to {to}"));
+        let to = self
+            .to
+            .as_ref()
+            .map_or(String::new(), |to| format!(" to {to}"));
         let (verb, count) = match self.missing {
             missing @ 1.. => ("not accounted for", missing.unsigned_abs()),
             missing => ("received but never sent", missing.unsigned_abs()),

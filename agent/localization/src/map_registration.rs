@@ -84,7 +84,9 @@ impl Localize for MapRegistration {
         let mut times = stopwatch();
         let source = IcpSource::of_sweep(&sweep.cloud.xyzi, &self.config);
         // Step: near the prediction. Where the map confirms it, the networks are not needed.
-        let near = (sweep.predicted).and_then(|start| self.registered(&source, &start));
+        let near = sweep
+            .predicted
+            .and_then(|start| self.registered(&source, &start));
         let registering = times.lap(REGISTER);
         if let Some(found) = near {
             return Ok(Localization::new(&Ok(found), times));

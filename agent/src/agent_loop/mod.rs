@@ -394,7 +394,7 @@ impl AgentLoop {
             }
             Err(error) => {
                 self.report.failed += 1;
-                (self.report.failure).get_or_insert_with(|| error.to_string());
+                self.report.failure.get_or_insert_with(|| error.to_string());
                 let reason = match error.is_of_frame() {
                     true => DropReason::NotFinite,
                     false => DropReason::Shape,

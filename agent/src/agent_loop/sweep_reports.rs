@@ -61,7 +61,11 @@ impl SweepReports {
     /// Adds a sweep to the next report, which is due at once if it is one of the first.
     pub(super) fn note(&mut self, capture_nanos: u64, arrived_nanos: u64) {
         // The clock of the scene was set back.
-        if (self.sweeps.back()).is_some_and(|(newest, _)| capture_nanos < *newest) {
+        if self
+            .sweeps
+            .back()
+            .is_some_and(|(newest, _)| capture_nanos < *newest)
+        {
             self.sweeps.clear();
         }
         self.sweeps.push_back((capture_nanos, arrived_nanos));
@@ -82,10 +86,13 @@ impl SweepReports {
         // Without a description as well, or the loop would be woken again at once.
         self.next_nanos = now_nanos.saturating_add(PERIOD_NANOS);
         let newest = self.sweeps.back().map_or(0, |(capture, _)| *capture);
-        let sweeps = (self.sweeps.drain(..)).map(|(capture, arrived_nanos)| SweepArrival {
-            before_nanos: newest.saturating_sub(capture),
-            arrived_nanos,
-        });
+        let sweeps = self
+            .sweeps
+            .drain(..)
+            .map(|(capture, arrived_nanos)| SweepArrival {
+                before_nanos: newest.saturating_sub(capture),
+                arrived_nanos,
+            });
         let mut descriptor = self.description.clone()?;
         descriptor.sweeps = sweeps.collect();
         Some((newest, descriptor))

@@ -81,7 +81,8 @@ impl InputReplay {
     fn take_in(&mut self, input: LoopInput, now_nanos: u64) {
         for output in self.agent_loop.handle(input, now_nanos) {
             if let LoopOutput::Publish(message) = output {
-                (self.unsent).insert((message.stream, message.number), message);
+                self.unsent
+                    .insert((message.stream, message.number), message);
             }
         }
     }
@@ -95,7 +96,8 @@ impl InputReplay {
             format!("the run published message {number} of {stream}, the replay does not")
         })?;
         // Earlier ones were superseded in the queue.
-        (self.unsent).retain(|&(of, number), _| of != stream || number > turn.number);
+        self.unsent
+            .retain(|&(of, number), _| of != stream || number > turn.number);
         let encoded = self.encoder.encode(message, stamp, Some(&turn));
         let bytes = encoded.as_ref().ok().map(|(encoded, _)| encoded);
         Ok(Published::new(stream, turn, stamp, bytes))

@@ -63,7 +63,12 @@ pub(super) fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
 
 fn load(config: &AgentConfig) -> anyhow::Result<Agent> {
     let inference = config.models.inference()?;
-    let pose_source = (config.settings.pose.clone().with_networks()?).build(inference)?;
+    let pose_source = config
+        .settings
+        .pose
+        .clone()
+        .with_networks()?
+        .build(inference)?;
     if config.gives_poses_only() {
         return Ok(Agent::without_detector(config.cav.clone(), pose_source));
     }

@@ -26,7 +26,8 @@ impl Arguments {
     /// Prints the state of the run.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         if let Some((name, router)) = self.run.remote() {
-            let status = RemoteStatus::observe(&self.run.bus(name, router)?, OBSERVED)?;
+            let bus = self.run.bus(name, router)?;
+            let status = RemoteStatus::observe(&bus, OBSERVED)?;
             return self.print(&status, &status.table(), &status.run, &status.troubles());
         }
         let status = RunStatus::read(&self.run.folder()?).map_err(BadInput::of)?;

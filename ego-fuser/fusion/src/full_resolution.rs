@@ -51,7 +51,10 @@ impl FullResolutionMap {
         let (_, channels, height, width) = map.size4()?;
         Ok(match are_numbers(map) {
             true => Self::Numbers {
-                cells: (map.f_permute([0, 2, 3, 1])?.f_contiguous()?).f_view([-1, channels])?,
+                cells: map
+                    .f_permute([0, 2, 3, 1])?
+                    .f_contiguous()?
+                    .f_view([-1, channels])?,
                 size: [height, width].map(|cells| cells as usize),
                 sent: numbers(&sent)?.into(),
             },

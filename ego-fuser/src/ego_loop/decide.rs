@@ -70,8 +70,8 @@ impl EgoLoop {
         self.members.iter().all(|cav| {
             let is_other = self.models.is_other(cav);
             // Its feature maps came before the ego's next sweep lately.
-            let frames = self.without_map.get(cav);
-            let is_in_time = frames.is_some_and(|frames| *frames < SILENT_AFTER);
+            let without_map = self.without_map.get(cav);
+            let is_in_time = without_map.is_some_and(|frames| *frames < SILENT_AFTER);
             // Boxes end the wait for maps that are of another network, or not in time.
             let boxes_do =
                 self.reads_boxes && self.box_senders.contains(cav) && (is_other || !is_in_time);

@@ -136,7 +136,7 @@ impl EgoLoop {
         let stream = ego.method().own_content().stream();
         // The objects in the area in which the ego detects are tracked.
         let [x_low, y_low, _, x_high, y_high, _] = ego.detector().config().lidar_range_m;
-        let tracker = TrackerConfig {
+        let tracker_config = TrackerConfig {
             area_m: [x_low, y_low, x_high, y_high],
             ..TrackerConfig::default()
         };
@@ -157,7 +157,7 @@ impl EgoLoop {
             clock_offsets_s: BTreeMap::new(),
             frames: VecDeque::new(),
             pace: PaceKeeper::new(options.sets_pace),
-            tracker: options.tracks.then(|| Tracker::new(tracker)),
+            tracker: options.tracks.then(|| Tracker::new(tracker_config)),
             own_nanos: None,
             ended: BTreeSet::new(),
             ends_nanos: None,

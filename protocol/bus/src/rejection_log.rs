@@ -18,7 +18,7 @@ const MAX_REJECTIONS: usize = 1024;
 /// Name of peers that are not authenticated.
 const UNAUTHORISED: &str = "unauthorised";
 
-/// RouterRejection of a message or of a connection by a router.
+/// Rejection of a message or of a connection by a router.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct RouterRejection {
     /// Common name of the certificate, or the session's id without one; `UNAUTHORISED` for peers not admitted.

@@ -117,10 +117,10 @@ fn read_twist(
 ) -> Result<EgoMotion, MotionError> {
     let [speed_mps, _, _] = message.f64s(speed_field)?;
     let [_, _, z] = message.f64s(yaw_rate_field)?;
-    let (most, fastest_turn) = (EgoMotion::MAX_SPEED_MPS, EgoMotion::MAX_YAW_RATE_RAD_S);
+    let (max_speed, max_yaw_rate) = (EgoMotion::MAX_SPEED_MPS, EgoMotion::MAX_YAW_RATE_RAD_S);
     Ok(EgoMotion {
-        speed_mps: Some(within(speed_field, speed_mps, most)?),
-        yaw_rate_rad_s: Some(within(yaw_rate_field, z, fastest_turn)?),
+        speed_mps: Some(within(speed_field, speed_mps, max_speed)?),
+        yaw_rate_rad_s: Some(within(yaw_rate_field, z, max_yaw_rate)?),
     })
 }
 
@@ -129,8 +129,10 @@ fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, Moti
     // Row-major 6 x 6: x is the first variance, the rotation about z the last.
     // NaN is not below the bound.
     let [speed_variance, .., yaw_rate_variance] = covariance;
-    let speed_mps = (motion.speed_mps).filter(|_| *speed_variance < UNMEASURED);
-    let yaw_rate_rad_s = (motion.yaw_rate_rad_s).filter(|_| *yaw_rate_variance < UNMEASURED);
+    let speed_mps = motion.speed_mps.filter(|_| *speed_variance < UNMEASURED);
+    let yaw_rate_rad_s = motion
+        .yaw_rate_rad_s
+        .filter(|_| *yaw_rate_variance < UNMEASURED);
     if speed_mps.is_none() && yaw_rate_rad_s.is_none() {
         let (field, found) = ("twist.covariance[0]", *speed_variance);
         return Err(MotionError::Unmeasured { field, found });

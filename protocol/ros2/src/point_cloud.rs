@@ -115,7 +115,9 @@ pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<RosSweep, P
         capture_nanos,
         frame_id: frame_id.into(),
         points: PointCloud::default(),
-        intensity: (columns.intensity).map(|(name, _, kind)| (name.to_owned(), kind)),
+        intensity: columns
+            .intensity
+            .map(|(name, _, kind)| (name.to_owned(), kind)),
         without_return: 0,
         too_far: 0,
     };
@@ -272,7 +274,9 @@ fn column<'a>(
         offset,
         datatype,
         count,
-    }) = (fields.iter()).find(|field| field.name.eq_ignore_ascii_case(name))
+    }) = fields
+        .iter()
+        .find(|field| field.name.eq_ignore_ascii_case(name))
     else {
         return Ok(None);
     };

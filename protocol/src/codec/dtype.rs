@@ -100,10 +100,7 @@ pub(super) fn append(
     Ok(())
 }
 
-#[expect(
-    clippy::indexing_slicing,
-    reason = "a chunk has at most BLOCK values, and its positions are below its length"
-)]
+#[expect(clippy::indexing_slicing, reason = "a chunk has at most BLOCK values")]
 fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<()> {
     let max = f32::from(f16::MAX);
     let mut block = [f16::ZERO; BLOCK];

@@ -123,7 +123,7 @@ impl ConfidenceGate {
     /// # Errors
     /// [`WireError::Value`] when the window has an even width, is too wide, or its sigma is not positive.
     pub(super) fn cells(&self, confidence: &[f32], grid: &BevGrid) -> Result<Vec<u32>, WireError> {
-        let smoothed = (self.smoothing).map(|window| window.smooth(confidence, grid));
+        let smoothed = self.smoothing.map(|window| window.smooth(confidence, grid));
         let smoothed = smoothed.transpose()?;
         let values = smoothed.as_deref().unwrap_or(confidence);
         let passing = (0u32..)

@@ -109,7 +109,8 @@ impl Payload for Camera {
         check_within("height_px", metadata.height_px.into(), 1.0, MAX_EDGE_PX)?;
         let (pinhole, pose) = (&metadata.pinhole, &metadata.lidar_from_camera);
         pinhole.iter().try_for_each(Pinhole::check_values)?;
-        (pose.iter()).try_for_each(|pose| check_pose("lidar_from_camera", pose))?;
+        pose.iter()
+            .try_for_each(|pose| check_pose("lidar_from_camera", pose))?;
         let max = limits.max_body_bytes;
         Ok(BodyShape::Bytes { min: 1, max })
     }

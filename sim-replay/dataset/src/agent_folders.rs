@@ -136,8 +136,11 @@ impl ScenarioFolder {
         let listed = agents_in(dir, problems)?;
         // Bare floats are used only where no agent has a PCD: a scenario has one kind of sweeps.
         let mut suffixes = [PCD, BIN].into_iter();
-        let suffix = suffixes
-            .find(|suffix| (listed.iter()).any(|(_, listing)| holds_pairs(listing, suffix)));
+        let suffix = suffixes.find(|suffix| {
+            listed
+                .iter()
+                .any(|(_, listing)| holds_pairs(listing, suffix))
+        });
         let suffix = suffix.unwrap_or(PCD);
         let mut by_agent = BTreeMap::new();
         for (id, listing) in &listed {

@@ -73,7 +73,9 @@ pub(super) fn unknown(dir: &Path, field: &str, found: &str) -> Problem {
 /// The finding about the type of an object in a list of labels, if that is unknown.
 pub(super) fn unknown_label(path: &Path, kind: &str) -> Option<Problem> {
     let (dir, shown) = (path.parent().unwrap_or(path), excerpt(kind, 40));
-    (of_name(kind).is_none()).then(|| unknown(dir, "type", &format!("{shown:?}")))
+    of_name(kind)
+        .is_none()
+        .then(|| unknown(dir, "type", &format!("{shown:?}")))
 }
 
 /// Names with dots: nuScenes' categories and CARLA's blueprints.

@@ -110,7 +110,9 @@ pub(super) fn open(
             problems.push(ReadError::malformed(dir, reason));
         }
     }
-    let join = (poses.as_ref()).map(|_| format!("{} poses by time", stamps.len()));
+    let join = poses
+        .as_ref()
+        .map(|_| format!("{} poses by time", stamps.len()));
     let poses = poses.unwrap_or_default();
     let clouds = stamps.into_iter().map(|(micros, stem)| {
         let file = points_dir.join(format!("{stem}.bin"));

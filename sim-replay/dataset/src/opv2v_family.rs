@@ -90,13 +90,13 @@ fn agent_folder_scenario(
     let moments = folder.ticks(options.period_nanos, problems);
     let (agents, missing) = (folder.agents.clone(), folder.missing.clone());
     let name = files::name_below(root, &folder.dir);
-    let variants = (folder.by_agent.values()).flat_map(|agent| &agent.variants);
+    let variants = folder.by_agent.values().flat_map(|agent| &agent.variants);
     let variants: BTreeSet<String> = variants.cloned().collect();
     let has_radar = folder.by_agent.values().any(|agent| agent.has_radar);
     let (cameras, source): (_, Arc<dyn FrameSource>) = match layout == Layout::V2V4REAL {
         true => (BTreeSet::new(), Arc::new(V2v4Real { folder, sweeps })),
         false => {
-            let cameras = (folder.by_agent.values()).flat_map(|agent| &agent.cameras);
+            let cameras = folder.by_agent.values().flat_map(|agent| &agent.cameras);
             let cameras = cameras.copied().collect();
             let source = Opv2v {
                 folder,

@@ -258,12 +258,14 @@ fn nclt_raw(bytes: &[u8]) -> Result<PcdCloud, String> {
     const OFFSET_M: f64 = -100.0;
     check_whole_points(bytes.len(), 8)?;
     let (points, _) = bytes.as_chunks::<8>();
-    let points = (points.iter()).map(|&[x0, x1, y0, y1, z0, z1, intensity, _laser]| {
-        let [x, y, z] = [[x0, x1], [y0, y1], [z0, z1]]
-            // In double precision, rounded once: steps of 5 mm are no binary fractions.
-            .map(|bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32);
-        [x, y, z, f32::from(intensity)]
-    });
+    let points = points
+        .iter()
+        .map(|&[x0, x1, y0, y1, z0, z1, intensity, _laser]| {
+            let [x, y, z] = [[x0, x1], [y0, y1], [z0, z1]]
+                // In double precision, rounded once: steps of 5 mm are no binary fractions.
+                .map(|bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32);
+            [x, y, z, f32::from(intensity)]
+        });
     let origin = IntensityOrigin::stored("7th byte", IntensityKind::Byte);
     let form = "8 bytes per point, as NCLT records them";
     Ok(PcdCloud::of_points(points.collect(), Some(origin), form))

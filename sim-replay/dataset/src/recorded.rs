@@ -174,8 +174,10 @@ impl Recorded {
         let (mut ticks, mut missing) = (Vec::new(), Vec::new());
         for capture_nanos in captures {
             let stem = capture_nanos.to_string();
-            let lacking =
-                (self.agents.iter()).filter(|cav| !self.has(cav, capture_nanos, Stream::Lidar));
+            let lacking = self
+                .agents
+                .iter()
+                .filter(|cav| !self.has(cav, capture_nanos, Stream::Lidar));
             let lacking: Vec<&CavId> = lacking.collect();
             missing.extend(lacking.iter().map(|cav| MissingFrame::new(cav, &stem)));
             // The ego is the first of both lists: without its sweep there is no tick.
@@ -188,10 +190,13 @@ impl Recorded {
 
     /// Numbers of the cameras that have images.
     fn cameras(&self) -> Vec<u8> {
-        let numbers = (self.sensors.keys()).filter_map(|(_, _, stream)| match stream {
-            Stream::Camera(number) => Some(*number),
-            _ => None,
-        });
+        let numbers = self
+            .sensors
+            .keys()
+            .filter_map(|(_, _, stream)| match stream {
+                Stream::Camera(number) => Some(*number),
+                _ => None,
+            });
         numbers.collect::<BTreeSet<u8>>().into_iter().collect()
     }
 

@@ -57,8 +57,9 @@ fn check_scenario(scenario: &mut Scenario) -> Vec<ReadError> {
 
 /// Medians of the speeds that disagree, if those are most of the stretches in which the agent moves.
 fn contradiction(stretches: &[Speeds]) -> Option<Speeds> {
-    let moving =
-        (stretches.iter()).filter(|speeds| speeds.recorded.max(speeds.of_poses) >= LEAST_MPS);
+    let moving = stretches
+        .iter()
+        .filter(|speeds| speeds.recorded.max(speeds.of_poses) >= LEAST_MPS);
     let (recorded, of_poses): (Vec<f64>, Vec<f64>) = (moving.clone())
         .filter(|speeds| !speeds.agree())
         .map(|speeds| (speeds.recorded, speeds.of_poses))

@@ -1,4 +1,4 @@
-//! Randomness per message: depends on the message and the purpose only, not on earlier decisions.
+//! Purposes of random draws: a draw depends on the message and the purpose only, not on earlier decisions.
 
 use support::random::derive_seed;
 

@@ -114,7 +114,9 @@ impl PolarRetrieval {
 }
 
 fn normalised(descriptor: &Tensor) -> tch::Result<Tensor> {
-    let length = (descriptor.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+    let length = descriptor
+        .f_square()?
+        .f_sum_dim_intlist(1_i64, true, Kind::Float)?;
     descriptor.f_div(&length.f_sqrt()?.f_clamp_min(1e-6)?)
 }
 

@@ -152,8 +152,9 @@ impl<N: RegressPose> Localize for PoseRegressor<N> {
         };
         let tokens = tokens.f_unsqueeze(0)?;
         let found = no_grad(|| self.network.poses(&tokens, &self.places, Kind::Float))?;
-        let pose =
-            (values(&found)?.first_chunk()).and_then(|&of| upright(of, self.config.origin_m));
+        let pose = values(&found)?
+            .first_chunk()
+            .and_then(|&of| upright(of, self.config.origin_m));
         times.lap(REGRESS);
         Ok(localization(pose, times))
     }

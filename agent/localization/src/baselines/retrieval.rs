@@ -44,9 +44,11 @@ impl SweepDatabase {
             scale: scale.collect(),
             mean,
             descriptors: Vec::new(),
-            world_from_sensor: (sweeps.iter().map(|sweep| sweep.world_from_sensor)).collect(),
+            world_from_sensor: sweeps.iter().map(|sweep| sweep.world_from_sensor).collect(),
         };
-        let normalised = (sweeps.iter()).flat_map(|sweep| database.normalise(&sweep.descriptor));
+        let normalised = sweeps
+            .iter()
+            .flat_map(|sweep| database.normalise(&sweep.descriptor));
         database.descriptors = normalised.collect();
         Some(database)
     }
@@ -59,7 +61,7 @@ impl SweepDatabase {
             let squares = stored.iter().zip(&wanted).map(|(a, b)| (a - b).powi(2));
             squares.sum::<f32>()
         });
-        let nearest = (squared.enumerate()).min_by(|(_, a), (_, b)| a.total_cmp(b));
+        let nearest = squared.enumerate().min_by(|(_, a), (_, b)| a.total_cmp(b));
         nearest.map_or_else(Isometry3::identity, |(row, _)| self.world_from_sensor[row])
     }
 

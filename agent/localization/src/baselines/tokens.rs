@@ -112,14 +112,18 @@ impl TokenProjection {
         let features = pooled.f_index_select(0, &rows)?.f_narrow(1, 0, channels)?;
         let features = features.f_to_kind(Kind::Double)?;
         let mean = features.f_mean_dim(0_i64, false, Kind::Double)?;
-        let deviation = (features.f_std_dim(0_i64, false, false)?).f_clamp_min(LEAST)?;
+        let deviation = features
+            .f_std_dim(0_i64, false, false)?
+            .f_clamp_min(LEAST)?;
         let normal = (features - &mean).f_div(&deviation)?;
         let covariance = normal.f_tr()?.f_matmul(&normal)? / (rows.size()[0].max(1) as f64);
         let (variances, vectors) = covariance.f_linalg_eigh("L")?;
         let least = LEAST * variances.f_max()?.f_double_value(&[])?.max(LEAST);
         // Eigenvalues ascend: the last components are the principal ones.
         let first = channels - components;
-        let variances = (variances.f_narrow(0, first, components)?).f_clamp_min(least)?;
+        let variances = variances
+            .f_narrow(0, first, components)?
+            .f_clamp_min(least)?;
         let vectors = vectors.f_narrow(1, first, components)?;
         // Whitening: one product standardises the channels, turns them and scales the components to 1.
         let basis = (vectors.f_div(&deviation.f_view([-1, 1])?)?).f_div(&variances.f_sqrt()?)?;
@@ -138,7 +142,10 @@ impl TokenProjection {
         let pooled = pooled.f_to_kind(Kind::Float)?;
         let channels = self.basis.size()[0];
         let geometry = pooled.f_narrow(-1, channels, GEOMETRY)?;
-        let is_occupied = (geometry.f_narrow(-1, 0, 1)?.f_gt(0.0)?).f_to_kind(Kind::Float)?;
+        let is_occupied = geometry
+            .f_narrow(-1, 0, 1)?
+            .f_gt(0.0)?
+            .f_to_kind(Kind::Float)?;
         let centred = pooled.f_narrow(-1, 0, channels)?.f_sub(&self.mean)?;
         let components = centred.f_matmul(&self.basis)?.f_mul(&is_occupied)?;
         Tensor::f_cat(&[components, geometry], -1)

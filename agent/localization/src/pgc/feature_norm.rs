@@ -26,8 +26,10 @@ impl FeatureNorm {
         let features = features.f_to_kind(Kind::Float)?;
         let deviation = features.f_std_dim(0_i64, false, false)?;
         no_grad(|| {
-            (self.mean).f_copy_(&features.f_mean_dim(0_i64, false, Kind::Float)?)?;
-            (self.scale).f_copy_(&deviation.f_clamp_min(LEAST_DEVIATION)?.f_reciprocal()?)
+            self.mean
+                .f_copy_(&features.f_mean_dim(0_i64, false, Kind::Float)?)?;
+            self.scale
+                .f_copy_(&deviation.f_clamp_min(LEAST_DEVIATION)?.f_reciprocal()?)
         })
     }
 

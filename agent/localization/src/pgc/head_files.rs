@@ -50,8 +50,9 @@ fn released_file(head: &Path, kind: &str, prefix: &str, trained: &str) -> Result
     let folders = weights_folders();
     let name = head.display();
     let names = [prefix, ""].map(|prefix| format!("{prefix}{name}.{ENDING}"));
-    let mut files =
-        (folders.iter()).flat_map(|folder| names.iter().map(move |name| folder.join(name)));
+    let mut files = folders
+        .iter()
+        .flat_map(|folder| names.iter().map(move |name| folder.join(name)));
     files.find(|file| file.is_file()).ok_or_else(|| {
         let stems = (folders.iter().flat_map(|folder| files_in(folder)))
             .filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix(prefix)?.to_owned()));
@@ -102,7 +103,11 @@ fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>> {
     let weights = Weights::load(head)?;
     weights.check_kind(SceneHead::KIND)?;
     let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;
-    let folders = (head.parent().map(Path::to_owned).into_iter()).chain(weights_folders());
+    let folders = head
+        .parent()
+        .map(Path::to_owned)
+        .into_iter()
+        .chain(weights_folders());
     let mut files: Vec<_> = folders.flat_map(|folder| files_in(&folder)).collect();
     files.retain(|file| file != head);
     // Files with an encoder's name first: each one is read and hashed until the digest fits.
@@ -118,7 +123,9 @@ fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>> {
 
 /// The released encoder, for a new head.
 pub fn released_encoder() -> Option<PathBuf> {
-    let mut files = (weights_folders().into_iter()).map(|folder| folder.join(ENCODER_FILE));
+    let mut files = weights_folders()
+        .into_iter()
+        .map(|folder| folder.join(ENCODER_FILE));
     files.find(|file| file.is_file())
 }
 

@@ -90,7 +90,9 @@ impl Localizer {
             })?;
         // The head's file has the scales of both networks.
         if let Some(scales) = weights.activation_scales()? {
-            let quantised = (network.quantise(&scales)).and_then(|()| scene_head.quantise(&scales));
+            let quantised = network
+                .quantise(&scales)
+                .and_then(|()| scene_head.quantise(&scales));
             quantised.map_err(|error| weights.quantise_error(error))?;
         }
         let localizer = Self {

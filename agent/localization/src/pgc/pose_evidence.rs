@@ -138,7 +138,9 @@ fn mean_sigma(cells: &[u32], epsilon_m: &[f32]) -> f64 {
 
 /// Mean over some cells; 0 for none.
 fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f64 {
-    let known = (cells.iter()).filter_map(|&cell| epsilon_m.get(cell as usize));
+    let known = cells
+        .iter()
+        .filter_map(|&cell| epsilon_m.get(cell as usize));
     known.map(|&epsilon| value(epsilon)).sum::<f64>() / cells.len().max(1) as f64
 }
 
@@ -159,7 +161,10 @@ pub(super) fn std_of(
         return second.std;
     }
     let pairs = coordinates.correspondences();
-    let inliers = (registration.inliers.iter()).filter_map(|&cell| pairs.get(cell as usize));
+    let inliers = registration
+        .inliers
+        .iter()
+        .filter_map(|&cell| pairs.get(cell as usize));
     let weighted = inliers.map(|pair| (pair, f64::from(pair.weight)));
     PoseStd::of(&registration.target_from_source, weighted)
 }

@@ -86,7 +86,9 @@ impl PoseSearch<'_> {
         let start = &coarse.target_from_source;
         let refined = refine(self.head, self.refinement_cells, start, is_wide, self.kind)?;
         let solved = Ok(self.solver.judge(coordinates, coarse, refined.as_ref()));
-        let last = (refined.as_ref()).map_or(coarse, |refined| &refined.registration);
+        let last = refined
+            .as_ref()
+            .map_or(coarse, |refined| &refined.registration);
         times.lap(REFINE);
         Ok(Attempt {
             solved,

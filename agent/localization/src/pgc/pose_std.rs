@@ -42,7 +42,9 @@ impl PoseStd {
                 - Vector3::from(pair.target_m.map(f64::from));
             // d(residual) = dt + dw x arm, for a small rotation dw about the sensor.
             let mut jacobian = SMatrix::<f64, 3, 6>::identity();
-            (jacobian.fixed_columns_mut::<3>(3)).copy_from(&-arm.cross_matrix());
+            jacobian
+                .fixed_columns_mut::<3>(3)
+                .copy_from(&-arm.cross_matrix());
             information += jacobian.transpose() * jacobian * weight;
             let gradient = jacobian.transpose() * residual * weight;
             gradients += gradient * gradient.transpose();

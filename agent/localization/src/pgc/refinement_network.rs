@@ -118,7 +118,9 @@ impl Refiner {
         // The whole window stays on the grid: a cell beyond the edge gets the outermost one.
         let [column, row] = [(0, columns), (1, rows)].map(|(axis, size): (usize, i64)| {
             let steps = (assumed_m.f_select(1, axis as i64)? - low_m[axis]) / spacing_m;
-            (steps.f_round()?).f_clamp(reach as f64, (size - 1 - reach) as f64)
+            steps
+                .f_round()?
+                .f_clamp(reach as f64, (size - 1 - reach) as f64)
         });
         let (column, row) = (column?, row?);
         let middle = [&column * spacing_m + low_m[0], &row * spacing_m + low_m[1]];

@@ -35,11 +35,13 @@ impl SceneCoordinates {
 
     /// Correspondences for the solver, weighted by Eq. 6.
     pub fn correspondences(&self) -> Vec<Correspondence> {
-        let pairs = (self.cells()).map(|(source_m, target_m, epsilon_m)| Correspondence {
-            source_m,
-            target_m,
-            weight: sigma(epsilon_m),
-        });
+        let pairs = self
+            .cells()
+            .map(|(source_m, target_m, epsilon_m)| Correspondence {
+                source_m,
+                target_m,
+                weight: sigma(epsilon_m),
+            });
         pairs.collect()
     }
 }

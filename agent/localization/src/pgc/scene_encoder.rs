@@ -59,7 +59,9 @@ impl SceneEncoder {
             .map(|to| SparseConv::new(&(&levels / to), widths[to - 1], widths[to]))
             .collect();
         let (before_last, fine) = (widths[widths.len() - 2], path / "fine");
-        let fine = (config.fine_cells).then(|| ResidualGroup::new(&fine, before_last, before_last));
+        let fine = config
+            .fine_cells
+            .then(|| ResidualGroup::new(&fine, before_last, before_last));
         let mut coarse = Vec::new();
         let mut channels = widths[widths.len() - 1];
         for (group, &width) in config.residual_widths.iter().enumerate() {
@@ -159,7 +161,10 @@ impl SceneEncoder {
             down.push(conv.int8(LayerFormat::hidden(input, output))?);
             (before, input) = (input, output);
         }
-        let fine = (self.fine.as_ref()).map(|group| group.int8(before, FINE, scales));
+        let fine = self
+            .fine
+            .as_ref()
+            .map(|group| group.int8(before, FINE, scales));
         let fine = fine.transpose()?;
         let last = input;
         let mut coarse = Vec::with_capacity(self.coarse.len());
@@ -199,7 +204,9 @@ impl SceneEncoder {
             }
         }
         let sweeps = batch.coarse_rows.iter().map(|rows| {
-            let own = (local.coarse).f_narrow(0, rows.start, rows.end - rows.start)?;
+            let own = local
+                .coarse
+                .f_narrow(0, rows.start, rows.end - rows.start)?;
             let own = own.f_to_kind(Kind::Float)?;
             // The mean of no rows is NaN, and their maximum an error.
             if own.size()[0] == 0 {

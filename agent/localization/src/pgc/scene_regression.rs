@@ -101,7 +101,8 @@ impl SceneHead {
     /// # Errors
     /// Those of the tensor library.
     pub fn classify(&self, sweeps: &Tensor, train: bool) -> tch::Result<Tensor> {
-        (self.classifier).forward(&self.sweep_norm.forward(sweeps)?, train)
+        self.classifier
+            .forward(&self.sweep_norm.forward(sweeps)?, train)
     }
 
     /// World coordinates of `[N, cell_channels]` normalised features, given the logits `[N, classes]` of the sweep of
@@ -126,13 +127,17 @@ impl SceneHead {
         let input = self.input(cells, logits)?;
         let inward = self.inward.forward(&input.f_to_kind(kind)?)?.f_relu()?;
         let hidden = match &self.int8 {
-            Some(blocks) => (blocks.iter()).try_fold(inward, |x, block| block.forward(&x))?,
+            Some(blocks) => blocks
+                .iter()
+                .try_fold(inward, |x, block| block.forward(&x))?,
             None => self.hidden(inward, &mut |_, _| Ok(()))?,
         };
         // Half precision would round positions beyond 256 m to quarters of a metre.
         let output = self.outward.forward(&hidden)?.f_to_kind(Kind::Float)?;
         let centres = self.config.centres;
-        let log_shares = (output.f_narrow(1, 0, centres)?).f_log_softmax(1, Kind::Float)?;
+        let log_shares = output
+            .f_narrow(1, 0, centres)?
+            .f_log_softmax(1, Kind::Float)?;
         let offset = output.f_narrow(1, centres, 3)? * OFFSET_SCALE_M;
         let epsilon_m = output.f_narrow(1, centres + 3, 1)?.f_squeeze_dim(1)?;
         let regression = Regression {
@@ -198,7 +203,9 @@ impl SceneHead {
 
     /// `[N, cell_channels + classes]`: features of cells beside the normalised logits of their sweeps.
     fn input(&self, cells: &Tensor, logits: &Tensor) -> tch::Result<Tensor> {
-        let squares = (logits.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+        let squares = logits
+            .f_square()?
+            .f_sum_dim_intlist(1_i64, true, Kind::Float)?;
         // To length 1: the regressor sees which classes are likely, not how large the logits are.
         let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
         Tensor::f_cat(&[cells, &(logits / norm)], 1)

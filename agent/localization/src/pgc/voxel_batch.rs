@@ -39,12 +39,16 @@ impl VoxelBatch {
         config: &SceneEncoderConfig,
         device: Device,
     ) -> tch::Result<Self> {
-        let input: Vec<f32> = (sweeps.iter().flat_map(|sweep| &sweep.input).copied()).collect();
+        let input: Vec<f32> = sweeps
+            .iter()
+            .flat_map(|sweep| &sweep.input)
+            .copied()
+            .collect();
         let down = (0..config.levels() - 1)
             .map(|level| Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.down[level]), device))
             .collect::<Result<_, _>>()?;
         let fine = sweeps.iter().filter_map(|sweep| sweep.fine.as_ref());
-        let fine = (config.fine_cells).then(|| Rulebook::stacked(fine, device));
+        let fine = config.fine_cells.then(|| Rulebook::stacked(fine, device));
         let edge = i64::from(plane_edge(config));
         let coarse_rows = ranges(sweeps.iter().map(|sweep| sweep.columns.len()));
         let planes = (0..sweeps.len() as i64).map(|sweep| sweep * edge * edge);

@@ -105,7 +105,9 @@ impl SweepVoxels {
             let (halved, parents) = sites.halved();
             down.push(Rulebook::strided(&sites, &halved));
             if level <= cell_level {
-                (cell_of_point.iter_mut()).for_each(|row| *row = parents[*row as usize]);
+                cell_of_point
+                    .iter_mut()
+                    .for_each(|row| *row = parents[*row as usize]);
             } else {
                 fine = Some(Rulebook::submanifold(&sites));
                 coarse_of_cell = parents;

@@ -144,7 +144,8 @@ impl MotionGate {
     fn accept(&mut self, pose: TimedPose) {
         self.elsewhere.clear();
         self.accepted.push_back(pose);
-        (self.accepted).retain(|kept| seconds(kept, &pose) <= SPEED_WINDOW_S);
+        self.accepted
+            .retain(|kept| seconds(kept, &pose) <= SPEED_WINDOW_S);
     }
 
     /// True if a pose is recent enough to check a later one against.

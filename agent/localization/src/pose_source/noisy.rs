@@ -136,7 +136,8 @@ pub enum NoiseMode {
 
 impl NoiseMode {
     fn name(self) -> String {
-        (self.to_possible_value()).map_or_else(String::new, |mode| mode.get_name().into())
+        self.to_possible_value()
+            .map_or_else(String::new, |mode| mode.get_name().into())
     }
 
     /// True if the ego's pose has no error, as in OpenCOOD's code: with one offset on all vehicles the relative poses

@@ -103,7 +103,8 @@ impl PoseTable {
             true => CsvText::headless(),
             false => CsvText::new(HEADER),
         };
-        (rows.iter()).for_each(|row| text.row(fields(last_part(scenario), row)));
+        rows.iter()
+            .for_each(|row| text.row(fields(last_part(scenario), row)));
         let file = OpenOptions::new().create(true).append(true).open(path);
         (file.and_then(|mut file| file.write_all(text.finish().as_bytes()))).at(path)
     }
@@ -235,7 +236,10 @@ fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
 fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {
     let reason = serde_json::from_value::<NoPoseReason>(row.field(11).into());
     let reason = reason.map_err(|_| row.wrong(11, "a reason for no pose"))?;
-    let inliers = (row.field(12).parse::<u32>()).map_err(|_| row.wrong(12, "a count"))?;
+    let inliers = row
+        .field(12)
+        .parse::<u32>()
+        .map_err(|_| row.wrong(12, "a count"))?;
     Ok(PoseEstimate::no_pose(reason, inliers))
 }
 

@@ -12,7 +12,9 @@ pub struct RecordedPose;
 
 impl PoseSource for RecordedPose {
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
-        (input.measured).map_or(NO_SOURCE, |pose| PoseEstimate::new(*pose, 1.0))
+        input
+            .measured
+            .map_or(NO_SOURCE, |pose| PoseEstimate::new(*pose, 1.0))
     }
 }
 

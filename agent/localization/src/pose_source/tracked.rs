@@ -256,7 +256,9 @@ impl TrackedPose {
     /// True if the sweep is measured without the prediction.
     fn is_global_due(&self, capture_nanos: u64) -> bool {
         // In floating point: the difference is negative after a restart of the scene, which is not recent.
-        let since_s = (self.global_nanos).map(|nanos| (capture_nanos as f64 - nanos as f64) * 1e-9);
+        let since_s = self
+            .global_nanos
+            .map(|nanos| (capture_nanos as f64 - nanos as f64) * 1e-9);
         let recent_s = 0.0..self.config.global_period_s;
         // A prediction that a measurement contradicts is no place to search near.
         self.tracker.is_contradicted()

@@ -33,9 +33,12 @@ impl Bits {
     ) -> Self {
         let chunks = entries.chunks(size.max(1)).flat_map(|row| row.chunks(64));
         let words = chunks.map(|entries| {
-            (entries.iter().enumerate()).fold(0_u64, |word, (bit, &entry)| {
-                word | u64::from(condition(entry)) << bit
-            })
+            entries
+                .iter()
+                .enumerate()
+                .fold(0_u64, |word, (bit, &entry)| {
+                    word | u64::from(condition(entry)) << bit
+                })
         });
         Self {
             words: words.collect(),

@@ -110,7 +110,9 @@ mod tests {
 
     fn fit(pairs: &[(Vector3<f64>, Vector3<f64>, f64)]) -> Result<Isometry3<f64>, Degenerate> {
         let mut moments = PairMoments::default();
-        (pairs.iter()).for_each(|(a, b, weight)| moments.add(a, b, *weight));
+        pairs
+            .iter()
+            .for_each(|(a, b, weight)| moments.add(a, b, *weight));
         moments.fit()
     }
 

@@ -223,7 +223,10 @@ impl RansacSearch<'_> {
             .and_then(|optimised| Some((self.gain(&optimised, &gain)?, optimised)))
             .filter(|(optimised, _)| optimised.total > gain.total);
         let candidate = optimised.unwrap_or((gain, *motion));
-        let better = (self.best.as_ref()).is_none_or(|(best, _)| candidate.0.total > best.total);
+        let better = self
+            .best
+            .as_ref()
+            .is_none_or(|(best, _)| candidate.0.total > best.total);
         if better {
             self.best = Some(candidate);
         }
@@ -232,7 +235,9 @@ impl RansacSearch<'_> {
 
     fn inliers(&self) -> usize {
         let threshold_m = self.config.inlier_threshold_m;
-        let near = (self.best).map(|(_, motion)| self.pairs.near(&motion, threshold_m));
+        let near = self
+            .best
+            .map(|(_, motion)| self.pairs.near(&motion, threshold_m));
         near.unwrap_or_default().len()
     }
 }

@@ -245,7 +245,7 @@ fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfi
 /// Indices in descending order of value; equal values keep their order.
 fn descending<T: PartialOrd>(values: &[T]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..values.len()).collect();
-    order.sort_by(|&a, &b| (values[b].partial_cmp(&values[a])).unwrap_or(Ordering::Equal));
+    order.sort_by(|&a, &b| values[b].partial_cmp(&values[a]).unwrap_or(Ordering::Equal));
     order
 }
 
@@ -285,7 +285,9 @@ impl PairPoints {
         config: &Sc2PcrConfig,
     ) -> Option<(Isometry3<f64>, usize)> {
         let size = sets.first()?.len();
-        let matrices = (sets.iter()).flat_map(|set| self.soft_compatibility(set, config));
+        let matrices = sets
+            .iter()
+            .flat_map(|set| self.soft_compatibility(set, config));
         let matrices: Vec<f32> = matrices.collect();
         let weights = leading_eigenvectors(&matrices, size, config.power_iterations);
         let mut best: Option<(Isometry3<f64>, usize)> = None;
@@ -328,10 +330,14 @@ impl PairPoints {
 
     fn inliers(&self, motion: &Isometry3<f64>, threshold_m: f64) -> usize {
         let rotation = motion.rotation.to_rotation_matrix();
-        let near = (self.source.iter().zip(&self.target)).filter(|(source, target)| {
-            let moved = rotation * vector(source) + motion.translation.vector;
-            (moved - vector(target)).norm() < threshold_m
-        });
+        let near = self
+            .source
+            .iter()
+            .zip(&self.target)
+            .filter(|(source, target)| {
+                let moved = rotation * vector(source) + motion.translation.vector;
+                (moved - vector(target)).norm() < threshold_m
+            });
         near.count()
     }
 }

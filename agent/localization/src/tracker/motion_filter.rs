@@ -208,7 +208,9 @@ impl MotionFilter {
     /// Squared Mahalanobis distance between a pose of the same time and the state: x, y and yaw.
     pub(super) fn distance_squared(&self, measurement: &PoseMeasurement) -> f64 {
         let (off, spread) = self.innovation(measurement);
-        (spread.cholesky()).map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
+        spread
+            .cholesky()
+            .map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
     }
 
     /// Uses a pose of the same time.

@@ -276,7 +276,9 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let bins = calibration(&judged);
     let published = sweeps.iter().filter_map(EvaluatedSweep::published_error);
     let [kept, rejected] = [("published", false), ("rejected", true)].map(|(name, is_rejected)| {
-        let poses = (judged.iter()).filter(|pose| pose.found.is_rejected == is_rejected);
+        let poses = judged
+            .iter()
+            .filter(|pose| pose.found.is_rejected == is_rejected);
         // The axis is logarithmic: errors beyond its ends are drawn there.
         let points = poses.map(|pose| (pose.found.sigma, pose.error_m.clamp(0.01, 1000.0)));
         series(name, points.collect(), Mark::Dots)

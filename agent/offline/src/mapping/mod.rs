@@ -189,7 +189,7 @@ impl MapMaking<'_> {
         let known: Vec<(usize, usize, Vector3<f64>)> = (positions.iter().enumerate())
             .filter_map(|(index, &(drive, position))| Some((index, drive, position?)))
             .collect();
-        // Drive by drive: the step from the end of one to the start of the next is no part of a path.
+        // Drive by drive, as the list has them: the step from the end of one to the start of the next is no part of a path.
         for drive in known.chunk_by(|(_, one, _), (_, next, _)| one == next) {
             let path: Vec<Vector3<f64>> = drive.iter().map(|(.., position)| *position).collect();
             for (&(index, ..), is_held_out) in drive.iter().zip(held_out::held_out(&path)) {

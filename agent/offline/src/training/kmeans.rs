@@ -63,7 +63,7 @@ fn spread<const N: usize>(points: &[[f64; N]], count: usize, seed: u64) -> Vec<[
 /// Index of the centre nearest to a point.
 pub(crate) fn nearest<const N: usize>(centres: &[[f64; N]], point: &[f64; N]) -> usize {
     let distances = centres.iter().map(|centre| square(centre, point));
-    let least = (distances.enumerate()).min_by(|a, b| a.1.total_cmp(&b.1));
+    let least = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
     least.map_or(0, |(index, _)| index)
 }
 

@@ -44,7 +44,7 @@ impl PointPillars {
             compute: Kind::Float,
             encoder: PillarEncoder::new(&(path / "pillar_vfe"), config.pillar_channels),
             backbone: BevBackbone::new(&(path / "backbone"), config),
-            shrink: (config.shrink.as_ref()).map(|shrink| {
+            shrink: config.shrink.as_ref().map(|shrink| {
                 Shrink::new(&(path / "shrink_conv"), config.backbone_channels(), shrink)
             }),
             compressor: (config.compress_ratio)

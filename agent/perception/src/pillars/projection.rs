@@ -46,7 +46,10 @@ impl PillarProjection {
         let lanes = |block: usize, value: &dyn Fn(&[f32]) -> f32| -> [f32; LANES] {
             std::array::from_fn(|lane| {
                 let channel = block * LANES + lane;
-                (weight.chunks_exact(POINT_FEATURES).nth(channel)).map_or(0.0, value)
+                weight
+                    .chunks_exact(POINT_FEATURES)
+                    .nth(channel)
+                    .map_or(0.0, value)
             })
         };
         let axes = |value: fn(&[f32], usize) -> f32| -> Vec<[[f32; LANES]; 3]> {

@@ -64,7 +64,9 @@ impl AdamW {
     /// Optimizer before its first step.
     pub fn new(variables: &VarStore, config: AdamWConfig) -> Self {
         let named: BTreeMap<String, Tensor> = variables.variables().into_iter().collect();
-        let trained = (named.into_iter()).filter(|(_, variable)| variable.requires_grad());
+        let trained = named
+            .into_iter()
+            .filter(|(_, variable)| variable.requires_grad());
         let entries = trained.map(|(name, variable)| TrainedVariable {
             name,
             mean: no_grad(|| variable.zeros_like()),

@@ -44,7 +44,7 @@ const CAV_COLOURS: [RGBColor; 6] = [
 ];
 
 /// The plan view: metres in the ego's LiDAR frame, x to the right and y up.
-type Sheet<'a> = DrawingArea<BitMapBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+type PlanView<'a> = DrawingArea<BitMapBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 /// Point cloud of one CAV.
 #[derive(Debug, Clone)]
@@ -139,7 +139,7 @@ impl Picture<'_> {
     }
 
     /// A line every 10 m.
-    fn draw_grid(&self, plane: &Sheet<'_>) -> Result<()> {
+    fn draw_grid(&self, plane: &PlanView<'_>) -> Result<()> {
         for x in tens(self.x_m) {
             plane.draw(&PathElement::new(self.y_m.map(|y| (x, y)), GRID))?;
         }
@@ -149,7 +149,12 @@ impl Picture<'_> {
         Ok(())
     }
 
-    fn draw_points(&self, view: &CavView<'_>, colour: RGBColor, plane: &Sheet<'_>) -> Result<()> {
+    fn draw_points(
+        &self,
+        view: &CavView<'_>,
+        colour: RGBColor,
+        plane: &PlanView<'_>,
+    ) -> Result<()> {
         let ego_from_cav = view.ego_from_cav.isometry();
         for &[x, y, z, _] in view.xyzi {
             let point =
@@ -164,7 +169,7 @@ impl Picture<'_> {
     }
 
     /// The outline, with a stroke from the centre to the front.
-    fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &Sheet<'_>) -> Result<()> {
+    fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &PlanView<'_>) -> Result<()> {
         let corners = shape.corners();
         let mut places = corners.iter();
         if !places.all(|[x, y, _]| self.is_near(*x, *y, BOX_MARGIN_M)) {
@@ -198,7 +203,7 @@ impl Picture<'_> {
         labelled
     }
 
-    fn draw_score(&self, found: &Box3d, score: f32, plane: &Sheet<'_>) -> Result<()> {
+    fn draw_score(&self, found: &Box3d, score: f32, plane: &PlanView<'_>) -> Result<()> {
         let [x, y, _] = found.center_m;
         if !self.is_near(x, y, 0.0) {
             return Ok(());
@@ -208,7 +213,12 @@ impl Picture<'_> {
         Ok(plane.draw(&(EmptyElement::at((x, y)) + text))?)
     }
 
-    fn draw_position(&self, view: &CavView<'_>, colour: RGBColor, plane: &Sheet<'_>) -> Result<()> {
+    fn draw_position(
+        &self,
+        view: &CavView<'_>,
+        colour: RGBColor,
+        plane: &PlanView<'_>,
+    ) -> Result<()> {
         let [x, y, _] = view.ego_from_cav.translation_m;
         if !self.is_near(x, y, 0.0) {
             return Ok(());

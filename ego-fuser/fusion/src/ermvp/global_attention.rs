@@ -98,7 +98,7 @@ impl GlobalHalf {
         let key_value = key_value.f_view([windows, -1, 2 * channels])?;
         let parts = key_value.f_split(channels, 2)?;
         let [key, value] = [0, 1].map(|part: usize| parts[part].f_unflatten(-1, by_head));
-        let bias = (self.offsets).masked_bias(count, slots, Partition::Window)?;
+        let bias = self.offsets.masked_bias(count, slots, Partition::Window)?;
         let seen = attend(&query, &key?, &value?, Some(&bias))?;
         let seen = dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(&groups)?;
         let x = map + Partition::Window.map(&seen, [height, width], self.window)?;

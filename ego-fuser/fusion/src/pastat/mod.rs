@@ -113,7 +113,9 @@ impl Pastat {
             maps.is_training,
         )?; // FSA
         let of_maps = [&confidences.of_tokens, &fit];
-        let tokens = (self.temporal_encoding).encode(aligned, of_maps, &coarse.origins.age_secs)?; // Eq. 10-12
+        let tokens = self
+            .temporal_encoding
+            .encode(aligned, of_maps, &coarse.origins.age_secs)?; // Eq. 10-12
         let context = self.transformer.forward(&tokens)?; // Eq. 8, 9
         let mut fused = self.decoder.maximum(&fine, &tokens, &context)?;
         if let Some(memory) = &self.temporal_memory {

@@ -161,8 +161,9 @@ impl MotionSearch<'_> {
     /// The best fit to the inliers of a motion.
     fn refined(&self, motion: Isometry3<f64>) -> Isometry3<f64> {
         let matches = self.matches(&motion);
-        let pairs =
-            (matches.iter()).map(|&(object, index)| (self.boxes[index], self.objects[object]));
+        let pairs = matches
+            .iter()
+            .map(|&(object, index)| (self.boxes[index], self.objects[object]));
         planar_fit::fit(&pairs).unwrap_or(motion)
     }
 }

@@ -45,7 +45,9 @@ impl Block {
         train: bool,
     ) -> tch::Result<Tensor> {
         let normed = self.agent_norm.forward(x)?;
-        let seen = (self.agents).forward(&normed, unseen, types, queries, train)?;
+        let seen = self
+            .agents
+            .forward(&normed, unseen, types, queries, train)?;
         (x.f_narrow(0, 0, queries as i64)? + seen).f_contiguous()
     }
 

@@ -97,7 +97,9 @@ impl Fusion for V2xVit {
         let unseen = unseen.map(|unseen| order.tokens(&unseen)?.f_squeeze_dim(2));
         let unseen = unseen.transpose()?;
         let types = vec![VEHICLE; maps.metadata.len()];
-        let fused = (self.encoder).forward(&tokens, unseen.as_ref(), &types, maps.is_training)?;
+        let fused = self
+            .encoder
+            .forward(&tokens, unseen.as_ref(), &types, maps.is_training)?;
         let [height, width] = padding.size();
         let fused = order.maps(&fused.f_unsqueeze(0)?, height, width)?;
         Ok(padding.crop(&fused.f_get(0)?)?.into())

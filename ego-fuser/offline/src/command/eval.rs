@@ -67,9 +67,10 @@ impl Arguments {
                 [] => vec![None],
                 methods => methods.iter().copied().map(Some).collect(),
             };
-            let rows = methods.into_iter();
-            let rows = rows.map(|method| self.evaluate(method, &data, &mut left_out));
-            let rows = rows.collect::<Result<Vec<_>>>()?;
+            let mut rows = Vec::new();
+            for method in methods {
+                rows.push(self.evaluate(method, &data, &mut left_out)?);
+            }
             (rows, weights.detector_config()?.lidar_range_m)
         };
         if self.json {

@@ -288,7 +288,9 @@ impl SampleBuilder {
         let mut clouds = Vec::with_capacity(entries.len());
         for (entry, change) in entries.iter().zip(changes) {
             let tick = entry.tick;
-            let points = (self.scenes).points(TickRef { scenario, tick }, entry.agent)?;
+            let points = self
+                .scenes
+                .points(TickRef { scenario, tick }, entry.agent)?;
             // Hits on the vehicle that carries the LiDAR are removed before any rotation.
             let mut points = self.crop.without_own_body(&points);
             change.points(&mut points.xyzi);
@@ -352,7 +354,9 @@ impl SampleBuilder {
             min_corners: 8,
             classes: self.config.classes,
         };
-        let views = annotators.iter().filter_map(|&of| frames[of].as_ref());
+        let views = annotators
+            .iter()
+            .filter_map(|&agent| frames[agent].as_ref());
         let mut truth = GroundTruth::of_tick(&views.collect::<Vec<_>>(), 0, &rule);
         for object in truth.objects.iter_mut().chain(&mut truth.ignored) {
             object.box3d = ego_view.box3d(&object.box3d);

@@ -62,7 +62,9 @@ impl SamplePoses {
         let (cav, nanos, real) = (&frame.cav, frame.capture_nanos, frame.world_from_lidar);
         let found = match self.tables.as_slice() {
             [] => real.map(|pose| PoseEstimate::new(pose, 1.0)),
-            tables => (tables.iter()).find_map(|table| table.get(scenario, cav, nanos).copied()),
+            tables => tables
+                .iter()
+                .find_map(|table| table.get(scenario, cav, nanos).copied()),
         };
         found.ok_or_else(|| without_pose(scenario, frame))
     }

@@ -201,7 +201,9 @@ fn by_line(clouds: &Keys, rows: usize) -> Option<Join> {
     };
     let (first, last) = (*numbers.first()?, *numbers.last()?);
     let is_of_rows = first <= 1 && (last + 1).checked_sub(first) == Some(rows as u64);
-    let places = (numbers.iter()).map(|number| usize::try_from(number - first).ok());
+    let places = numbers
+        .iter()
+        .map(|number| usize::try_from(number - first).ok());
     is_of_rows.then(|| Join::new("number of the row", places))
 }
 

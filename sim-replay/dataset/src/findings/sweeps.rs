@@ -84,7 +84,9 @@ impl SweepReport {
         Some(Self {
             form: first.form,
             intensity: first.intensity.clone(),
-            min_intensity: (ranges.clone()).fold(f32::INFINITY, |least, [min, ..]| least.min(min)),
+            min_intensity: ranges
+                .clone()
+                .fold(f32::INFINITY, |least, [min, ..]| least.min(min)),
             median_intensity: median(&medians)?,
             max_intensity: ranges.fold(f32::NEG_INFINITY, |most, [.., max]| most.max(max)),
         })

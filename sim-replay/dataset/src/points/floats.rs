@@ -96,7 +96,9 @@ impl FloatForm {
             .map(|step| (step, column_entropy(&numbers, step)))
             .collect();
         // Multiples of the right number are as good as it: the first within `EQUAL` of the best is right.
-        let least = (others.iter()).fold(entropy - MUCH_LESS, |least, other| least.min(other.1));
+        let least = others
+            .iter()
+            .fold(entropy - MUCH_LESS, |least, other| least.min(other.1));
         let mut right = (others.iter())
             .filter(|(_, other)| *other < entropy - MUCH_LESS && *other <= least + EQUAL);
         Some(match right.next() {

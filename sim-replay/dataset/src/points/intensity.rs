@@ -154,7 +154,10 @@ impl LiveIntensities {
         field: Option<(String, IntensityKind)>,
     ) -> Option<String> {
         // As stored: taken before the division below.
-        let largest = (points.xyzi.iter()).fold(0.0, |largest: f32, point| largest.max(point[3]));
+        let largest = points
+            .xyzi
+            .iter()
+            .fold(0.0, |largest: f32, point| largest.max(point[3]));
         let finding = match field {
             None => Some(NO_INTENSITY.to_owned()),
             Some((name, kind)) => {

@@ -8,7 +8,7 @@ use nalgebra::Isometry3;
 use protocol::Pose;
 
 use super::contents::BagContents;
-use super::pose_source::{MAX_GAP_NANOS, PoseChain, PoseSources};
+use super::pose_source::{LidarPoseSource, MAX_GAP_NANOS, PoseSources};
 use super::scan::MessagePlace;
 use super::sweeps::SweepTopic;
 use crate::trajectory::Unposed;
@@ -159,7 +159,7 @@ fn text(
     contents: &BagContents,
     sweeps: &SweepTopic,
     sources: &PoseSources,
-    chosen: Option<&PoseChain>,
+    chosen: Option<&LidarPoseSource>,
 ) -> String {
     let of_sweeps = format!("{} ({})", sweeps.topic, sweeps.frame);
     let others = sources
@@ -221,7 +221,7 @@ fn span_text(span: Option<(u64, u64)>) -> String {
 /// Sweeps that the chosen source gives no pose, by reason.
 fn without_pose<'a>(
     poses: &'a SweepPoses,
-    source: &'a PoseChain,
+    source: &'a LidarPoseSource,
     topic: &'a str,
 ) -> impl Iterator<Item = String> + 'a {
     [Unposed::Outside, Unposed::Gap]

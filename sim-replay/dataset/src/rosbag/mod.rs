@@ -114,7 +114,9 @@ impl Bag {
         Ok(PcdCloud {
             points: read.points,
             dropped: read.without_return + read.too_far,
-            intensity: (read.intensity).map(|(name, kind)| IntensityOrigin::stored(&name, kind)),
+            intensity: read
+                .intensity
+                .map(|(name, kind)| IntensityOrigin::stored(&name, kind)),
             form: "PointCloud2",
             ..PcdCloud::default()
         })

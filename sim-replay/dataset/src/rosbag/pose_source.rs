@@ -19,7 +19,7 @@ const BODIES: [&str; 2] = ["base_link", "base_footprint"];
 
 /// A source of poses of the LiDAR.
 #[derive(Debug)]
-pub(super) struct PoseChain {
+pub(super) struct LidarPoseSource {
     /// Topic and frames, for messages.
     pub(super) name: String,
     world: String,
@@ -35,7 +35,7 @@ pub(super) struct PoseChain {
     route: FrameRoute,
 }
 
-impl PoseChain {
+impl LidarPoseSource {
     /// `world_from_lidar` at a time, nanoseconds.
     pub(super) fn at(&self, transforms: &Transforms, time: u64) -> Result<Isometry3<f64>, Unposed> {
         // At the time of the sweep too: joints between body and LiDAR may move.
@@ -57,7 +57,7 @@ impl PoseChain {
 #[derive(Debug, Default)]
 pub(super) struct PoseSources {
     pub(super) transforms: Transforms,
-    pub(super) sources: Vec<PoseChain>,
+    pub(super) sources: Vec<LidarPoseSource>,
     /// Topics that cannot, with the reason.
     pub(super) unusable: Vec<String>,
     /// Poses that were left out.
@@ -72,12 +72,12 @@ impl PoseSources {
         sources.add_moving(path, &contents.moving, sweeps);
         let frame = &sweeps.frame;
         let chains = sources.transforms.worlds_of(frame);
-        let chains: Vec<PoseChain> = chains
+        let chains: Vec<LidarPoseSource> = chains
             .into_iter()
             .map(|(world, route)| {
                 // A chain has no more poses than its sparsest trajectory.
                 let sparsest = sources.transforms.sparsest(&route);
-                PoseChain {
+                LidarPoseSource {
                     name: format!("transforms ({frame} in {world})"),
                     world: world.to_owned(),
                     is_named: true,
@@ -142,7 +142,7 @@ impl PoseSources {
         path: &Path,
         (topic, poses): (&str, &[PoseStamp]),
         sweeps: &SweepTopic,
-    ) -> Result<PoseChain, String> {
+    ) -> Result<LidarPoseSource, String> {
         let world = most_frequent(poses.iter().map(|pose| pose.parent.as_str()));
         let child = most_frequent(poses.iter().map(|pose| pose.child.as_deref().unwrap_or("")));
         let of_frames = poses
@@ -169,7 +169,7 @@ impl PoseSources {
             format!("no transform between {child} and {frame}, the frame of the sweeps")
         })?;
         let trajectory = self.trajectory(path, topic, &of_frames, sweeps);
-        Ok(PoseChain {
+        Ok(LidarPoseSource {
             name: format!("{topic} ({child} in {world}{unnamed})"),
             world,
             is_named,

@@ -92,7 +92,9 @@ impl PoseDenoiser {
         let on = (Kind::Float, poses.device());
         // 0 between sweeps that see each other, [`UNSEEN`] elsewhere.
         let single = Tensor::f_eye(frames, on)?.f_neg()?.f_add_scalar(1.0)?;
-        let single = (single.f_mul_scalar(UNSEEN)?).f_view([1, 1, frames, frames])?;
+        let single = single
+            .f_mul_scalar(UNSEEN)?
+            .f_view([1, 1, frames, frames])?;
         let (mask, age) = match windows {
             Windows::Single => (single, Tensor::f_ones([1, 1, 1], on)?),
             Windows::Joint(joint) => {
@@ -119,7 +121,10 @@ impl PoseDenoiser {
 
     /// A pose with sine and cosine of its multiples.
     fn embed_poses(&self, poses: &Tensor) -> tch::Result<Tensor> {
-        let angles = (poses.f_unsqueeze(3)?.f_mul(&self.frequencies)?).f_flatten(2, 3)?;
+        let angles = poses
+            .f_unsqueeze(3)?
+            .f_mul(&self.frequencies)?
+            .f_flatten(2, 3)?;
         Tensor::f_cat(&[poses, &angles.f_sin()?, &angles.f_cos()?], 2)
     }
 

@@ -110,10 +110,11 @@ impl DiffLoc {
         let start = tensor::<f32>(&noise.collect::<Vec<_>>(), &[POSE], device)?;
         let start = start.f_expand([count, frames, POSE], false)?;
         no_grad(|| {
-            (self.schedule).denoise(&start, DENOISING_STEPS, |noisy, step| {
-                let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
-                self.denoiser.forward(noisy, &steps, features, windows)
-            })
+            self.schedule
+                .denoise(&start, DENOISING_STEPS, |noisy, step| {
+                    let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
+                    self.denoiser.forward(noisy, &steps, features, windows)
+                })
         })
     }
 }

@@ -50,7 +50,9 @@ impl HypLiLoc {
         let columns = layers.try_fold(panorama(&tokens)?, |x, layer| layer.forward(&x))?;
         let columns = columns.f_to_kind(Kind::Float)?;
 
-        let fused = (self.first).forward(&normalise(&points)?, &normalise(&columns)?)?;
+        let fused = self
+            .first
+            .forward(&normalise(&points)?, &normalise(&columns)?)?;
         let (inward, attention, outward) = &self.point_block;
         let of_points = inward.forward(&fused.f_narrow(1, 0, TOKENS)?)?;
         let of_points = outward.forward(&attention.forward(&of_points)?)?;

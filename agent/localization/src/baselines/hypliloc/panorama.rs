@@ -28,6 +28,7 @@ impl CircularLayer {
     pub(super) fn forward(&self, columns: &Tensor) -> tch::Result<Tensor> {
         // The first column and the last are neighbours: a roll has no edge to pad.
         let (before, after) = (columns.f_roll(1, 1)?, columns.f_roll(-1, 1)?);
-        (self.0).forward(&Tensor::f_cat(&[&before, columns, &after], 2)?)
+        self.0
+            .forward(&Tensor::f_cat(&[&before, columns, &after], 2)?)
     }
 }

@@ -58,7 +58,11 @@ impl SgLocLocalizer {
         let SweepCells { features, sensor_m } = SweepCells::pick(sweep.cells(), features, &chosen)?;
         let places = tensor(sensor_m.as_flattened(), &[-1, 3], self.device)?;
         let world = no_grad(|| {
-            values(&(self.network).coordinates(&features, &places, Kind::Float, false)?)
+            values(
+                &self
+                    .network
+                    .coordinates(&features, &places, Kind::Float, false)?,
+            )
         })?;
         Ok(SceneCoordinates {
             // Weight 1 for every cell (Eq. 6), so that the plain confidence is the inlier ratio.

@@ -66,7 +66,8 @@ impl SgLoc {
         kind: Kind,
         train: bool,
     ) -> tch::Result<Tensor> {
-        (self.head).forward(&self.norm.forward(cells)?.f_to_kind(kind)?, sensor_m, train)
+        self.head
+            .forward(&self.norm.forward(cells)?.f_to_kind(kind)?, sensor_m, train)
     }
 
     /// Sets the normalisation from features `[N, cell_channels]`; without it they enter unchanged.

@@ -27,7 +27,9 @@ pub(super) struct BackboneEncoder {
 impl BackboneEncoder {
     /// True for the weights of a detector; their files need not name a kind.
     pub(super) fn is_in(weights: &Weights) -> bool {
-        (weights.metadata(KIND_KEY)).is_none_or(|kind| kind == "detector")
+        weights
+            .metadata(KIND_KEY)
+            .is_none_or(|kind| kind == "detector")
     }
 
     /// The encoder of a detector's weights.

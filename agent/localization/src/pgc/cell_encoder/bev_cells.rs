@@ -131,7 +131,10 @@ impl BevCells {
             // The row follows the network's y axis. The points of the cell stay in the sensor frame.
             columns[row * width + column].add([x, y, z]);
         }
-        let occupied = (columns.iter().enumerate()).filter(|(_, column)| column.count > 0);
+        let occupied = columns
+            .iter()
+            .enumerate()
+            .filter(|(_, column)| column.count > 0);
         let cells = occupied.map(|(number, column)| (number, column.cell()));
         let (numbers, cells): (Vec<usize>, Vec<SweepCell>) = cells.unzip();
         let places = format.levels.iter().map(|grid| {

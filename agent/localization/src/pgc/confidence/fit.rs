@@ -97,7 +97,9 @@ impl ConfidenceModel {
             return Err(FitError::TooFew(usable.len()));
         }
         // Bounded from below: the logarithm of an error of 0 would make the sums infinite.
-        let targets = (usable.iter()).map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln());
+        let targets = usable
+            .iter()
+            .map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln());
         let targets: Vec<f64> = targets.collect();
         let rows: Vec<_> = (usable.iter().map(|sweep| features(&sweep.evidence))).collect();
         let (bias, weights) = non_negative_regression(&rows, &targets);
@@ -140,7 +142,9 @@ impl ConfidenceModel {
         let accepted = sigmas.iter().filter(|(sigma, _)| *sigma >= below);
         let wrong = accepted.clone().filter(|(_, is_good)| !is_good).count();
         let bad = sigmas.iter().filter(|(_, is_good)| !is_good).count();
-        let good_rejected = (sigmas.iter()).filter(|(sigma, is_good)| *is_good && *sigma < below);
+        let good_rejected = sigmas
+            .iter()
+            .filter(|(sigma, is_good)| *is_good && *sigma < below);
         Ok(FitReport {
             sweeps: sigmas.len(),
             bad,
@@ -191,7 +195,7 @@ fn threshold_of_risk(sigmas: &[(f64, bool)], max_wrong: f64) -> f64 {
 /// Ridge regression with weights that are not negative, on standardised features, by coordinate descent.
 fn non_negative_regression(rows: &[[f64; FEATURES]], targets: &[f64]) -> (f64, [f64; FEATURES]) {
     let count = rows.len() as f64;
-    let rows = (rows.iter()).map(|row| SVector::<f64, FEATURES>::from(*row));
+    let rows = rows.iter().map(|row| SVector::<f64, FEATURES>::from(*row));
     let mean = rows.clone().sum::<SVector<f64, FEATURES>>() / count;
     let target_mean = targets.iter().sum::<f64>() / count;
     let mut square = SMatrix::<f64, FEATURES, FEATURES>::zeros();

@@ -90,7 +90,10 @@ impl ConfidenceModel {
     /// Expected natural logarithm of the error in metres.
     fn log_error(&self, evidence: &PoseEvidence) -> f64 {
         let features = features(evidence);
-        let terms = (features.iter().zip(&self.weights)).map(|(feature, weight)| feature * weight);
+        let terms = features
+            .iter()
+            .zip(&self.weights)
+            .map(|(feature, weight)| feature * weight);
         self.bias + terms.sum::<f64>()
     }
 

@@ -18,8 +18,10 @@ const LEAD: f64 = 10.0;
 
 /// Logits `[1, classes]` of at most `most` parts in turn, given those of the classifier.
 pub(crate) fn logits_by_part(logits: &Tensor, most: usize) -> tch::Result<Vec<Tensor>> {
-    let (probabilities, order) =
-        (logits.f_softmax(1, Kind::Float)?.f_reshape([-1])?).f_sort(0, true)?;
+    let (probabilities, order) = logits
+        .f_softmax(1, Kind::Float)?
+        .f_reshape([-1])?
+        .f_sort(0, true)?;
     let probabilities: Vec<f64> = Vec::try_from(&probabilities.f_to_kind(Kind::Double)?)?;
     let (highest, mut lowered) = (logits.f_max()?, logits.shallow_clone());
     let (mut parts, mut total) = (Vec::new(), 0.0);

@@ -159,7 +159,9 @@ fn within(
     xyzi: &[[f32; 4]],
     [nearest_m, farthest_m]: [f64; 2],
 ) -> impl Iterator<Item = Vector3<f64>> {
-    let points = (xyzi.iter()).map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
+    let points = xyzi
+        .iter()
+        .map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
     points.filter(move |point: &Vector3<f64>| (nearest_m..=farthest_m).contains(&point.norm()))
 }
 

@@ -192,9 +192,12 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, Box<dyn Error>> {
         let normal = normal.try_normalize(0.5).unwrap_or_else(Vector3::z);
         (voxel, Surfel { centre_m, normal })
     });
-    let scale = (metadata.get(COVARIANCE_KEY)).map(|text| serde_json::from_str(text));
-    let scale: Option<CovarianceScale> =
-        (scale.transpose()).map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?;
+    let scale = metadata
+        .get(COVARIANCE_KEY)
+        .map(|text| serde_json::from_str(text));
+    let scale: Option<CovarianceScale> = scale
+        .transpose()
+        .map_err(|error| format!("metadata {COVARIANCE_KEY:?}: {error}"))?;
     scale.as_ref().map_or(Ok(()), CovarianceScale::check)?;
     Ok(SurfelMap {
         target: IcpTarget {
@@ -232,7 +235,9 @@ pub fn check_voxel(voxel_m: f64) -> Result<(), FieldError> {
 
 /// Bytes of a tensor `[N, 3]`.
 fn column<'a>(file: &SafeTensors<'a>, name: &str, dtype: Dtype) -> Result<&'a [u8], String> {
-    let view = (file.tensor(name)).map_err(|error| format!("tensor {name:?}: {error}"))?;
+    let view = file
+        .tensor(name)
+        .map_err(|error| format!("tensor {name:?}: {error}"))?;
     match view.dtype() == dtype && matches!(view.shape(), [_, 3]) {
         true => Ok(view.data()),
         false => Err(format!(

@@ -149,8 +149,9 @@ impl<'a> SceneTraining<'a> {
         }
         // After the classifier: where a checkpoint is resumed, it replaces all variables.
         let trainer = Trainer::begin(run, &variables, None, started)?;
-        let redundancy =
-            (config.redundancy).map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
+        let redundancy = config
+            .redundancy
+            .map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
         let header = "step,seconds,error_m,epsilon_m,cell_p50_m,pose_p50_m,pose_p50_deg,success_3m,success_1m";
         let training = Self {
             config,

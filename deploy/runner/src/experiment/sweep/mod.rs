@@ -298,7 +298,9 @@ impl ExperimentSweep {
         let points = points.iter().map(|&index| &self.points[index]);
         let mut files = Vec::new();
         for point in points.filter(|point| point.method.exchange() != Exchange::Points) {
-            let file = (self.experiment).weights_of(point.method, point.codec.boxes)?;
+            let file = self
+                .experiment
+                .weights_of(point.method, point.codec.boxes)?;
             if !files.contains(&file) {
                 files.push(file);
             }

@@ -101,7 +101,9 @@ impl Strip<'_> {
         let channels = self.of.dim as f32;
         let (mut mean, mut scale) = ([0.0; STRIP], [0.0; STRIP]);
         for row in self.rows(entry) {
-            (mean.iter_mut().zip(row)).for_each(|(sum, value)| *sum += value);
+            mean.iter_mut()
+                .zip(row)
+                .for_each(|(sum, value)| *sum += value);
         }
         mean.iter_mut().for_each(|sum| *sum /= channels);
         // Squares of deviations in a second pass: a difference of large sums would lose digits in f32.
@@ -124,7 +126,10 @@ impl Strip<'_> {
             }
         }
         // The scale is the same for all channels, so the sum is scaled and not each term.
-        (score.iter_mut().zip(scale)).for_each(|(score, scale)| *score *= scale);
+        score
+            .iter_mut()
+            .zip(scale)
+            .for_each(|(score, scale)| *score *= scale);
         score
     }
 
@@ -147,7 +152,9 @@ impl Strip<'_> {
         }
         let mut most = [f32::NEG_INFINITY; STRIP];
         for scores in scores.iter() {
-            (most.iter_mut().zip(scores)).for_each(|(most, score)| *most = most.max(*score));
+            most.iter_mut()
+                .zip(scores)
+                .for_each(|(most, score)| *most = most.max(*score));
         }
         let mut total = [0.0; STRIP];
         for scores in scores.iter_mut() {
@@ -157,7 +164,10 @@ impl Strip<'_> {
             }
         }
         for scores in scores.iter_mut() {
-            (scores.iter_mut().zip(&total)).for_each(|(score, total)| *score /= total);
+            scores
+                .iter_mut()
+                .zip(&total)
+                .for_each(|(score, total)| *score /= total);
         }
     }
 
@@ -166,7 +176,10 @@ impl Strip<'_> {
         for ((entry, Normal { mean, scale }), weight) in entries.iter().zip(normal).zip(weights) {
             // A normalised token is (value - mean) * scale, so the scale goes into the weight.
             let mut share = *weight;
-            (share.iter_mut().zip(scale)).for_each(|(share, scale)| *share *= scale);
+            share
+                .iter_mut()
+                .zip(scale)
+                .for_each(|(share, scale)| *share *= scale);
             for (sums, row) in out.chunks_exact_mut(self.of.cells).zip(self.rows(entry)) {
                 for (((sum, value), mean), share) in sums[cells.clone()]
                     .iter_mut()

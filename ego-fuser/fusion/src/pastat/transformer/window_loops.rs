@@ -56,7 +56,10 @@ pub(super) fn attend(windows: &TokenWindows, projected: &[f32], out: &mut [f32])
                 let query = &projected[place(token) * 3 * dim + channel..][..each];
                 for (scores, keys) in scores.chunks_exact_mut(LANES).zip(keys.chunks_exact(each)) {
                     let sums = products(query, keys);
-                    (scores.iter_mut().zip(sums)).for_each(|(score, sum)| *score += sum * scale);
+                    scores
+                        .iter_mut()
+                        .zip(sums)
+                        .for_each(|(score, sum)| *score += sum * scale);
                 }
                 let share = exponentials(&mut scores).recip();
                 let out = &mut out[place(token) * dim + channel..][..each];
@@ -65,7 +68,9 @@ pub(super) fn attend(windows: &TokenWindows, projected: &[f32], out: &mut [f32])
                     .zip(values.chunks_exact(length * LANES))
                 {
                     let sums = products(&scores, values);
-                    (out.iter_mut().zip(sums)).for_each(|(out, sum)| *out = sum * share);
+                    out.iter_mut()
+                        .zip(sums)
+                        .for_each(|(out, sum)| *out = sum * share);
                 }
             }
         }

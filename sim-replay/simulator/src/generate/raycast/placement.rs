@@ -149,8 +149,7 @@ mod tests {
         let end = Placement::level([1.0, 0.0, 0.0], -3.1);
         let middle = Course { start, end }.at(0.5);
         assert!(
-            (wrapped(middle.yaw_rad - PI)).abs() < 1e-9
-                && (middle.position_m.x - 0.5).abs() < 1e-12
+            wrapped(middle.yaw_rad - PI).abs() < 1e-9 && (middle.position_m.x - 0.5).abs() < 1e-12
         );
         assert_eq!(Course { start, end }.at(1.0).yaw_rad, -3.1);
     }

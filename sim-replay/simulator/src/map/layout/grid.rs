@@ -110,8 +110,11 @@ fn attach(graph: &mut StreetGraph, port: Pose2) {
     let distances = nodes.map(|node| (node.x - port.x).hypot(node.y - port.y));
     let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
     let nearest = nearest.map_or(0, |(node, _)| node);
-    let (Pose2 { x, y, .. }, port) = (port, Some(port));
-    graph.nodes.push(StreetNode { x, y, port });
+    graph.nodes.push(StreetNode {
+        x: port.x,
+        y: port.y,
+        port: Some(port),
+    });
     graph.edges.push([nearest, graph.nodes.len() - 1]);
 }
 

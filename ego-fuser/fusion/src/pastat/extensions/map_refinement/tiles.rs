@@ -60,7 +60,8 @@ impl Tiles {
     /// `[K, C, EDGE + 4, EDGE + 4]`; zeros beyond the edges of the map.
     pub(super) fn cut(&self, cells: &Tensor) -> Result<Tensor, TchError> {
         let mut samples = Samples::default();
-        (self.cells(MARGIN)).for_each(|cell| samples.add_cell(cell.map(|cell| cell as usize)));
+        self.cells(MARGIN)
+            .for_each(|cell| samples.add_cell(cell.map(|cell| cell as usize)));
         let edge = EDGE + 2 * MARGIN;
         let tiles = samples
             .read(cells)?
