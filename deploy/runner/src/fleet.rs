@@ -244,7 +244,7 @@ impl Fleet {
 
     /// Executables of a fleet.
     pub fn programs(programs: &Path) -> Vec<PathBuf> {
-        let names = ["agent", "ego-fuser", "sim-replay", RUNNER];
+        let names = ["agent", "ego-fuser", "sim-replay", "v2vloc", RUNNER];
         names.map(|name| programs.join(name)).into()
     }
 

@@ -8,15 +8,15 @@ use anyhow::Context;
 use bus::shutdown::Stop;
 use bus::{
     BusOptions, Endpoint, RejectionLog, RouterProbe, RouterRejection, STOP_LIMIT, SharedMemory,
-    open,
+    open, process_usage,
 };
 use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::{Session, Wait};
 
 use crate::operate::network::from_here;
-use crate::operate::refusals::{self, RefusalCount};
 use crate::operate::router_panic;
+use crate::operate::router_report::RouterReport;
 use crate::operate::router_watch;
 use crate::operate::security::guarded;
 use support::cli::Outcome;
@@ -53,9 +53,9 @@ pub(crate) struct Arguments {
     /// Write the same settings as a configuration for `zenohd -c FILE`, and do not run.
     #[arg(long, value_name = "FILE")]
     zenohd: Option<PathBuf>,
-    /// File for the numbers of refused requests, in JSON (--keys); a restarted router adds to it.
-    #[arg(long, value_name = "FILE", requires = "keys")]
-    refusals: Option<PathBuf>,
+    /// File for CPU time, memory and refused requests, in JSON, every 5 s and at the end; a restarted router adds to it.
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
     /// End when standard input ends: for a supervisor that holds the other end of the pipe.
     #[arg(long)]
     supervised: bool,
@@ -90,25 +90,23 @@ impl Arguments {
         let session = open(&options)?;
         let endpoint = options.endpoint();
         output::note(format_args!("routing at {endpoint} (Ctrl-C ends it)"));
-        let mut refused = self.refused(&options)?;
+        let mut reporter = self.reporter(&options)?;
         let mut report_at = Instant::now() + REPORT_ROUND;
         let mut probe = self.probe(&session, &options);
         let failure = loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
-            // Also at the end, or refusals since the last report would be lost.
-            if let Some(refused) = refused
-                .as_mut()
-                .filter(|_| ended || Instant::now() > report_at)
-            {
-                report_at = Instant::now() + REPORT_ROUND;
-                refused.report(&session);
-            }
             let silence = probe.as_mut().map(|probe| probe.silence(Instant::now()));
             if let Some(panic) = router_panic::first() {
                 break Some(panic.to_owned());
             } else if let Some(silence) = silence.filter(|silence| *silence > router_watch::LIMIT) {
                 break Some(router_watch::in_words(silence));
-            } else if ended {
+            }
+            // Also at the end, or what came since the last report would be lost.
+            if ended || Instant::now() > report_at {
+                report_at = Instant::now() + REPORT_ROUND;
+                reporter.report(&session);
+            }
+            if ended {
                 break None;
             }
         };
@@ -124,20 +122,17 @@ impl Arguments {
         Ok(Outcome::Done)
     }
 
-    /// The refusals so far of a router with keys.
-    fn refused(&self, options: &BusOptions) -> anyhow::Result<Option<Refused>> {
-        if options.guard.is_none() {
-            return Ok(None);
-        }
-        let before = self.refusals.as_ref().map(|file| {
-            let counts = refusals::read(file).with_context(|| file.display().to_string())?;
-            anyhow::Ok((file.clone(), counts))
+    fn reporter(&self, options: &BusOptions) -> anyhow::Result<Reporter> {
+        let file = self.report.as_ref().map(|file| {
+            let before = RouterReport::read(file).with_context(|| file.display().to_string())?;
+            anyhow::Ok((file.clone(), before))
         });
-        Ok(Some(Refused {
-            log: RejectionLog::of(options.endpoint()),
-            reported: BTreeMap::new(),
-            before: before.transpose()?,
-        }))
+        let guard = options.guard.as_ref();
+        Ok(Reporter {
+            log: guard.map(|_| RejectionLog::of(options.endpoint())),
+            refused: BTreeMap::new(),
+            file: file.transpose()?,
+        })
     }
 
     /// A second session that has to receive what the router's own publishes; `None`, with a warning, if the router cannot
@@ -171,33 +166,34 @@ impl Arguments {
     }
 }
 
-/// Refused requests of a router.
-struct Refused {
-    log: RejectionLog,
-    reported: BTreeMap<RouterRejection, u64>,
-    /// File for the counts, and what the routers before wrote into it.
-    before: Option<(PathBuf, Vec<RefusalCount>)>,
+/// Reporter of a router.
+struct Reporter {
+    /// Absent without keys, where nothing is refused.
+    log: Option<RejectionLog>,
+    /// Refused requests so far.
+    refused: BTreeMap<RouterRejection, u64>,
+    /// File, and the report of the routers before.
+    file: Option<(PathBuf, RouterReport)>,
 }
 
-impl Refused {
-    /// Logs and writes what was refused since the last report.
+impl Reporter {
+    /// Logs what was refused since the report before, and writes the file.
     fn report(&mut self, router: &Session) {
-        self.log.update(router);
-        let counts = self.log.counts();
-        if counts == self.reported {
-            return;
-        }
-        for (refusal, count) in &counts {
-            if self.reported.get(refusal) != Some(count) {
-                let (peer, reason, what) = (&refusal.peer, &refusal.reason, &refusal.message);
-                tracing::warn!(peer, reason, what, count, "refused");
+        if let Some(log) = &mut self.log {
+            log.update(router);
+            let counts = log.counts();
+            for (refusal, count) in &counts {
+                if self.refused.get(refusal) != Some(count) {
+                    let (peer, reason, what) = (&refusal.peer, &refusal.reason, &refusal.message);
+                    tracing::warn!(peer, reason, what, count, "refused");
+                }
             }
+            self.refused = counts;
         }
-        if let Some((file, before)) = &self.before
-            && let Err(error) = refusals::write(file, before, &counts)
+        if let Some((file, before)) = &self.file
+            && let Err(error) = before.plus(&process_usage(), &self.refused).write(file)
         {
             tracing::warn!("{}: {error}", file.display());
         }
-        self.reported = counts;
     }
 }

@@ -5,13 +5,14 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::mem;
 use std::time::{Duration, Instant};
 
 use bus::ROUTER;
 use serde::{Deserialize, Serialize};
 
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
-use crate::score::Progress;
+use crate::score::{Progress, SCORER};
 
 /// Time without a report after which a process is shown as silent.
 const SILENT: Duration = Duration::from_millis(1500);
@@ -90,6 +91,7 @@ pub(crate) struct Health {
     /// Longest silence after a start.
     start: Duration,
     looked: Instant,
+    router_was_gone: bool,
 }
 
 impl Health {
@@ -100,6 +102,7 @@ impl Health {
             hang,
             start,
             looked: Instant::now(),
+            router_was_gone: false,
         }
     }
 
@@ -140,20 +143,22 @@ impl Health {
         }
     }
 
-    /// Updates the states from the times of the last reports; returns the hung processes, each with a description.
+    /// Updates the states from the times of the last reports, which do not arrive while the router is gone; returns the hung processes, each with a description.
     pub(crate) fn look(
         &mut self,
         last_reports: &BTreeMap<String, Instant>,
+        router_is_gone: bool,
         now: Instant,
     ) -> Vec<(String, String)> {
-        let was_stopped = now.saturating_duration_since(self.looked) > OWN_PAUSE;
+        let is_back = mem::replace(&mut self.router_was_gone, router_is_gone) && !router_is_gone;
+        let was_stopped = is_back || now.saturating_duration_since(self.looked) > OWN_PAUSE;
         self.looked = now;
-        // The reports of this program come over the same bus. Without any report at all, the network is down, and no
-        // process counts as hung.
-        let mut ages = last_reports
-            .values()
-            .map(|at| now.saturating_duration_since(*at));
-        let network_is_up = last_reports.is_empty() || ages.any(|age| age <= SILENT);
+        // Without a report of any other process the network is down, and no process counts as hung. Its own reports this
+        // program receives without a router too.
+        let mut others = last_reports.iter().filter(|(name, _)| *name != SCORER);
+        let network_is_up = !router_is_gone
+            && (others.clone().next().is_none()
+                || others.any(|(_, at)| now.saturating_duration_since(*at) <= SILENT));
         let mut hanging = Vec::new();
         for (name, noted) in &mut self.processes {
             if noted.status.pid.is_none() {
@@ -308,7 +313,7 @@ mod tests {
                 ("ego".to_owned(), at(report_ms)),
                 ("scorer".to_owned(), at(ms)),
             ]);
-            health.look(&last_reports, at(ms))
+            health.look(&last_reports, false, at(ms))
         };
         (from_ms..=to_ms).step_by(100).flat_map(look).collect()
     }
@@ -378,7 +383,7 @@ mod tests {
         assert!(
             (2100..30_000)
                 .step_by(100)
-                .all(|ms| health.look(&last_reports, at(ms)).is_empty())
+                .all(|ms| health.look(&last_reports, false, at(ms)).is_empty())
         );
         assert_eq!(
             health.statuses(&Progress::default(), at(30_000))[0].state,

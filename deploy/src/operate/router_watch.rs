@@ -9,6 +9,9 @@ use crate::score::ScorerNode;
 /// Longest time without a message through the router.
 pub(crate) const LIMIT: Duration = Duration::from_secs(2);
 
+/// Longest time until the clients of a replaced router are back: over QUIC they notice its end after 10 to 30 s.
+const RETURN_LIMIT: Duration = Duration::from_secs(30);
+
 /// A change of the state of the router or of the run.
 #[derive(Debug, PartialEq)]
 pub(crate) enum RouterFinding {
@@ -55,8 +58,8 @@ pub(crate) struct RouterWatch {
     probe: Option<RouterProbe>,
     /// True if the router is of this run, which can replace it.
     is_own: bool,
-    /// True if it was to be replaced in this outage.
-    is_replaced: bool,
+    /// When it was last replaced, or restarted after an end of its own.
+    replaced: Option<Instant>,
     looked: Option<Instant>,
     gone_since: Option<Instant>,
     outages: TimeSum,
@@ -89,6 +92,11 @@ impl RouterWatch {
         self.judge(silence.min(reported), scorer.router_lost_since(), now)
     }
 
+    /// Takes note of an end of the router, which is started again.
+    pub(crate) fn note_restart(&mut self) {
+        self.replaced = Some(Instant::now());
+    }
+
     /// Judges it by the time for which nothing has come through it, and since when there is no connection.
     fn judge(
         &mut self,
@@ -114,19 +122,25 @@ impl RouterWatch {
             }
             (Some(since), None) => {
                 let outage = now.saturating_duration_since(since);
-                (self.gone_since, self.is_replaced) = (None, false);
+                self.gone_since = None;
                 self.outages.add(outage);
                 let seconds = outage.as_secs_f64();
                 format!("the router is back after {seconds:.1} s")
             }
             // One that has ended is started again without a request.
-            (Some(_), Some(_)) if self.is_own && lost_since.is_none() && !self.is_replaced => {
-                self.is_replaced = true;
+            (Some(_), Some(_)) if self.is_own && lost_since.is_none() && !self.is_new(now) => {
+                self.replaced = Some(now);
                 return Some(RouterFinding::Hung(in_words(silence)));
             }
             _ => return None,
         };
         Some(RouterFinding::Line(line))
+    }
+
+    /// True if not all clients of the last router need to be back.
+    fn is_new(&self, now: Instant) -> bool {
+        let age = self.replaced.map(|at| now.saturating_duration_since(at));
+        age.is_some_and(|age| age < RETURN_LIMIT)
     }
 
     /// Time since which the router is gone.
@@ -195,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn a_router_of_the_run_that_is_silent_is_replaced_once_in_an_outage() {
+    fn a_router_of_the_run_that_is_silent_is_replaced_and_has_time_then() {
         let mut watch = RouterWatch::new(None, true);
         let mut now = Instant::now();
         assert_eq!(watch.judge(LIMIT, None, now), None);
@@ -206,12 +220,21 @@ mod tests {
             let found = watch.judge(LIMIT + 2 * BEAT, None, now);
             let reason = "nothing came through it for 2.2 s".to_owned();
             assert_eq!(found, Some(RouterFinding::Hung(reason)));
-            assert_eq!(watch.judge(2 * LIMIT, None, now), None, "once");
+            now += BEAT;
+            assert_eq!(watch.judge(2 * LIMIT, None, now), None, "it is new");
             assert!(line(watch.judge(BEAT, None, now)).contains("back"));
+            now += RETURN_LIMIT;
+            watch.looked = Some(now);
         }
-        // One that has ended is restarted in any case.
-        assert!(line(watch.judge(BEAT, Some(now), now)).contains("gone"));
-        assert_eq!(watch.judge(2 * LIMIT, Some(now), now), None);
+    }
+
+    #[test]
+    fn a_router_that_ended_by_itself_is_not_replaced_once_more() {
+        let mut watch = RouterWatch::new(None, true);
+        watch.note_restart();
+        let now = Instant::now();
+        assert!(line(watch.judge(LIMIT + BEAT, None, now)).contains("gone"));
+        assert_eq!(watch.judge(2 * LIMIT, None, now + BEAT), None);
     }
 
     #[test]

@@ -78,7 +78,7 @@ pub enum Phase {
     Over,
     /// The supervisor has ended without a final status.
     Lost,
-    /// A signal has stopped the supervisor (Ctrl-Z), and the router of the run with it.
+    /// A signal has stopped the supervisor (Ctrl-Z); its fleet goes on.
     Suspended,
 }
 

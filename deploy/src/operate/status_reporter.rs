@@ -70,6 +70,9 @@ impl StatusReporter {
     /// Records an event; returns the failure of the process from now on, as text.
     pub fn note(&mut self, event: &ProcessEvent) -> Option<String> {
         self.health.note(event, Instant::now());
+        if event.name == ROUTER && matches!(event.what, ProcessEventKind::Crashed { .. }) {
+            self.router.note_restart();
+        }
         let failure = self.failures.note(event)?;
         self.health.fails(&event.name, failure);
         Some(failure.to_owned())
@@ -93,7 +96,7 @@ impl StatusReporter {
 
     /// True if messages of any process may have been lost while the router was gone or the run suspended.
     pub fn had_outages(&self) -> bool {
-        self.router.had_outages()
+        self.router.had_outages() || self.crashed().iter().any(|name| name == ROUTER)
     }
 
     /// Ends the watch of the router.
@@ -139,7 +142,9 @@ impl StatusReporter {
                 Some(RouterFinding::Line(line)) => display.print_line(&line),
                 None => {}
             }
-            for (name, why) in self.health.look(&progress.last_reports, Instant::now()) {
+            let is_gone = self.router.gone_s().is_some();
+            let reports = &progress.last_reports;
+            for (name, why) in self.health.look(reports, is_gone, Instant::now()) {
                 supervisor.replace(&name, &why);
             }
             self.write_status(Phase::Running, &progress);

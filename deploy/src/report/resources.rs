@@ -32,7 +32,7 @@ pub struct StageReport {
 /// CPU time and memory of a process, over all its instances.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ProcessResources {
-    /// Name of the process. `scorer` is `v2vloc` itself, with the router of the run.
+    /// Name of the process. `scorer` is `v2vloc up` itself.
     pub process: String,
     /// Number of instances: 1, and one for each restart.
     pub instances: usize,

@@ -89,7 +89,7 @@ impl RunReport {
         let mut table = TextTable::of(&["process"], &numbers);
         for process in &self.processes {
             let name = match (process.process.as_str(), process.instances) {
-                ("scorer", _) => "v2vloc (router, scorer)".to_owned(),
+                ("scorer", _) => "v2vloc (scorer)".to_owned(),
                 (name, 1) => name.to_owned(),
                 (name, several) => format!("{name}, started {several} times"),
             };

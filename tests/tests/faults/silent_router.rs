@@ -113,6 +113,21 @@ pub(super) fn assert_replaced(why: &str, spoil: impl FnOnce(&mut Up)) {
     let ledger = json(&up.folder.join("ledger.json"));
     assert!(ledger["balances"] == true, "{}", ledger["balance"]);
     written_cause(&up.folder);
+    let status = json(&up.folder.join("status.json"));
+    let router = status["processes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|process| process["name"] == "router")
+        .unwrap();
+    assert!(
+        router["restarts"] == 1 && router["state"] == "ended",
+        "{router}"
+    );
+    let report = json(&up.folder.join("report.json"));
+    let processes = report["processes"].as_array().unwrap();
+    let router = processes.iter().find(|one| one["process"] == "router");
+    assert!(router.unwrap()["cpu_s"].as_f64() > Some(0.0), "{report}");
 }
 
 #[test]

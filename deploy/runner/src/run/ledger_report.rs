@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use deploy::operate::refusals::RefusalCount;
+use deploy::operate::router_report::RefusalCount;
 use deploy::score::ProcessStats;
 use protocol::{Counts, Ledger, Reconciliation};
 use serde::Serialize;

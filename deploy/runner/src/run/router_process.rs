@@ -2,22 +2,24 @@
 
 use std::ffi::OsString;
 use std::path::PathBuf;
-use std::sync::mpsc::{Receiver, Sender};
+use std::sync::mpsc::{Sender, channel};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use bus::ROUTER;
 use bus::shutdown::Stop;
+use bus::{BusError, ROUTER, STOP_LIMIT};
 use deploy::operate::network::{Network, RouterEndpoint};
-use deploy::operate::refusals::{self, RefusalCount};
+use deploy::operate::router_report::RouterReport;
 use deploy::operate::supervise::{
     ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, Supervisor,
 };
+use support::sync::spawn;
 
-use crate::fleet::{Fleet, SessionContext};
+use crate::fleet::SessionContext;
 use crate::run::RunError;
 
-/// Longest time for the end of the router.
-const END_LIMIT: Duration = Duration::from_secs(2);
+/// Longest time for the end of the router, which takes [`STOP_LIMIT`] itself at most.
+const END_LIMIT: Duration = STOP_LIMIT.saturating_add(Duration::from_secs(1));
 
 /// The router of a run and the session of this process on it.
 pub(crate) struct Router {
@@ -29,30 +31,53 @@ pub(crate) struct Router {
 
 struct RouterProcess {
     supervisor: Supervisor,
-    refusals: PathBuf,
+    report: PathBuf,
+    /// Description of its end for good.
+    gave_up: Arc<OnceLock<String>>,
 }
 
 impl Router {
-    /// Starts a router at the endpoint of `context`, unless the scenario names one, and connects to it. Events of its
-    /// process go to `events`, whose other end is `happened`.
+    /// Starts a router at the endpoint of `context`, unless the scenario names one, and connects to it. It is restarted
+    /// at most `restarts` times; its events go to `events`.
     ///
     /// # Errors
-    /// [`RunError`] when the router does not start or does not answer.
+    /// [`RunError`] when the router does not start or does not answer, or `stop` is requested.
     pub(crate) fn start(
-        fleet: &Fleet,
+        network: &Network,
         context: &SessionContext<'_>,
-        (events, happened): (&Sender<ProcessEvent>, &Receiver<ProcessEvent>),
+        restarts: u32,
+        events: &Sender<ProcessEvent>,
         stop: &Stop,
     ) -> Result<Self, RunError> {
-        let (network, restarts) = (&fleet.scenario.network, fleet.scenario.timeouts.restarts);
+        // Ends the wait for a router: requested by the user, or by the end of the router for good.
+        let wait = Stop::new();
+        stop.on_request({
+            let wait = wait.clone();
+            move || wait.request()
+        });
         let process = match network.connect {
             Some(_) => None,
-            None => Some(RouterProcess::start(network, context, restarts, events)?),
+            None => {
+                let events = events.clone();
+                let process = RouterProcess::start(network, context, restarts, events, &wait)?;
+                Some(process)
+            }
         };
-        match RouterEndpoint::open(context.endpoint, context.keys, stop) {
+        match RouterEndpoint::open(context.endpoint, context.keys, &wait) {
             Ok(place) => Ok(Self { place, process }),
-            // The cause of a router of its own is in its log.
-            Err(error) => Err(gave_up(context, happened).unwrap_or(error.into())),
+            Err(error) => Err(match (process, error) {
+                (Some(process), BusError::Unreachable { .. } | BusError::Stopped { .. })
+                    if !stop.requested() =>
+                {
+                    RunError::Process {
+                        process: ROUTER.to_owned(),
+                        how: (process.gave_up.get().cloned())
+                            .unwrap_or_else(|| "does not answer".to_owned()),
+                        log: context.folder.log_of(ROUTER),
+                    }
+                }
+                (_, error) => error.into(),
+            }),
         }
     }
 
@@ -61,24 +86,24 @@ impl Router {
         self.process.as_ref().map(|process| &process.supervisor)
     }
 
-    /// Closes the session and ends the router. Returns the requests that it refused.
-    pub(crate) fn end(self) -> Vec<RefusalCount> {
+    /// Closes the session and ends the router. Returns its report, and true if it had to be killed; `None` where the
+    /// router runs elsewhere.
+    pub(crate) fn end(self) -> Option<(RouterReport, bool)> {
         if let Err(overdue) = self.place.close() {
             tracing::warn!("{overdue}");
         }
-        let Some(process) = self.process else {
-            return Vec::new();
-        };
-        process.supervisor.stop(END_LIMIT);
-        let refused = refusals::read(&process.refusals).unwrap_or_else(|error| {
-            tracing::warn!("{}: {error}", process.refusals.display());
-            Vec::new()
+        let process = self.process?;
+        let killed = !process.supervisor.stop(END_LIMIT).is_empty();
+        let report = RouterReport::read(&process.report).unwrap_or_else(|error| {
+            tracing::warn!("{}: {error}", process.report.display());
+            RouterReport::default()
         });
-        for RefusalCount { rejection, count } in &refused {
+        for refusal in &report.refused {
+            let (rejection, count) = (&refusal.rejection, refusal.count);
             let (peer, reason, what) = (&rejection.peer, &rejection.reason, &rejection.message);
             tracing::warn!(%peer, %reason, %what, count, "refused by the router");
         }
-        refused
+        Some((report, killed))
     }
 }
 
@@ -87,20 +112,21 @@ impl RouterProcess {
         network: &Network,
         context: &SessionContext<'_>,
         restarts: u32,
-        events: &Sender<ProcessEvent>,
+        events: Sender<ProcessEvent>,
+        wait: &Stop,
     ) -> Result<Self, SuperviseError> {
-        let refusals = context.folder.file("refusals.json");
+        let report = context.folder.file("router.json");
         let stall_limit_s = network.stall_limit_s.to_string();
         let words = ["router", "--supervised", "--stall-limit-s", &stall_limit_s];
         let mut args: Vec<OsString> = words.map(Into::into).into();
         args.extend(["--listen".into(), context.endpoint.as_str().into()]);
+        args.extend(["--report".into(), report.clone().into()]);
         if network.shared_memory_mib > 0 {
             args.push("--shared-memory".into());
         }
         if let Some(keys) = context.keys {
             args.extend(["--keys".into(), keys.of_process(ROUTER).into()]);
             args.extend(["--run".into(), context.run.as_str().into()]);
-            args.extend(["--refusals".into(), refusals.clone().into()]);
         }
         let spec = ProcessSpec {
             name: ROUTER.to_owned(),
@@ -109,23 +135,30 @@ impl RouterProcess {
             life: RestartPolicy::Service,
             metrics: None,
         };
+        let (own, happened) = channel();
         let log_dir = context.folder.log_dir();
-        let supervisor = Supervisor::start(vec![spec], &log_dir, restarts, events)?;
+        let supervisor = Supervisor::start(vec![spec], &log_dir, restarts, &own)?;
+        let gave_up = Arc::new(OnceLock::new());
+        // Ends with the supervisor.
+        let passing_on = spawn("router-events", {
+            let (gave_up, wait) = (Arc::clone(&gave_up), wait.clone());
+            move || {
+                for event in happened {
+                    if let ProcessEventKind::GaveUp { how, .. } = &event.what {
+                        let _ = gave_up.set(how.clone());
+                        wait.request();
+                    }
+                    if events.send(event).is_err() {
+                        break;
+                    }
+                }
+            }
+        });
+        passing_on.map_err(SuperviseError::Runtime)?;
         Ok(Self {
             supervisor,
-            refusals,
+            report,
+            gave_up,
         })
     }
-}
-
-/// The end for good of a process, if one has ended.
-fn gave_up(context: &SessionContext<'_>, happened: &Receiver<ProcessEvent>) -> Option<RunError> {
-    happened.try_iter().find_map(|event| match event.what {
-        ProcessEventKind::GaveUp { how, .. } => Some(RunError::Process {
-            log: context.folder.log_of(&event.name),
-            process: event.name,
-            how,
-        }),
-        _ => None,
-    })
 }

@@ -6,21 +6,23 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use bus::MetricsPeer;
 use bus::shutdown::Stop;
+use bus::{MetricsPeer, ROUTER};
 use dataset::findings;
 use deploy::operate::progress::Display;
-use deploy::operate::refusals::RefusalCount;
+use deploy::operate::router_report::{RefusalCount, RouterReport};
 use deploy::operate::run_folder::{RunFolder, SWEEP_LOG};
 use deploy::operate::status::Phase;
 use deploy::operate::status_reporter::{Ending, StatusReporter};
-use deploy::operate::supervise::{ProcessEvent, ProcessSpec, Supervisor};
+use deploy::operate::supervise::{ProcessEvent, ProcessEventKind, ProcessSpec, Supervisor};
 use deploy::operate::timeouts::Timeouts;
 use deploy::operate::{RECORDER, REPLAY};
 use deploy::report::{self, Capacity, RunReport};
 use deploy::score::metrics::Metrics;
-use deploy::score::{FrameScores, Progress, Scored, ScorerNode, TRACKS, offline_intervals};
-use protocol::{Ledger, Role, RunId};
+use deploy::score::{
+    FrameScores, ProcessStats, Progress, Scored, ScorerNode, TRACKS, offline_intervals,
+};
+use protocol::{Ledger, ProcessId, ProcessUsage, Role, RunId};
 use support::atomic_file;
 use support::output;
 use support::provenance::Provenance;
@@ -99,7 +101,9 @@ fn go(
         folder,
     };
     let (events, happened) = channel();
-    let router = Router::start(fleet, &context, (&events, &happened), &stop)?;
+    let network = &fleet.scenario.network;
+    let restarts = fleet.scenario.timeouts.restarts;
+    let router = Router::start(network, &context, restarts, &events, &stop)?;
     let context = SessionContext {
         endpoint: &router.place.endpoint,
         ..context
@@ -126,9 +130,15 @@ fn go(
     // Not returned at once on an error: scorer and router have to be ended first.
     let events = (&events, &happened);
     let watched = watch(fleet, &context, specs, &router, events, &scorer, &stop);
-    let scored = scorer.finish();
-    let refused = router.end();
-    let watched = watched?;
+    let mut scored = scorer.finish();
+    let mut refused = Vec::new();
+    let ended = router.end();
+    let mut watched = watched?;
+    if let Some((report, killed)) = ended {
+        scored.stats.push(router_stats(&report));
+        refused = report.refused;
+        watched.killed.extend(killed.then(|| ROUTER.to_owned()));
+    }
 
     // Also after a failure: the folder gets what was computed until then.
     let result = write(
@@ -145,6 +155,22 @@ fn go(
             let log = result.folder.log_of(&process);
             Err(RunError::Process { process, how, log })
         }
+    }
+}
+
+/// The router publishes no messages and no reports; its start, which is short, counts as playing.
+fn router_stats(report: &RouterReport) -> ProcessStats {
+    ProcessStats {
+        process: ProcessId::new(ROUTER).expect("lower-case letters"),
+        ledger: Ledger::default(),
+        stages: Vec::new(),
+        usage: ProcessUsage {
+            cpu_s: report.cpu_s,
+            resident_bytes: 0,
+            peak_resident_bytes: report.peak_resident_bytes,
+        },
+        cpu_before_s: 0.0,
+        traffic: Vec::new(),
     }
 }
 
@@ -211,11 +237,6 @@ fn watch(
     let processes = (&supervisor, router.supervisor());
     let ending = watch.follow(processes, happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
-    offline.extend(watch.crashed());
-    // Messages of any process may have been lost in that time.
-    if watch.had_outages() {
-        offline.extend(everyone);
-    }
     watch.end();
     watch.write_status(Phase::Ending, &scorer.progress());
     let [replay_until, drain_until, all_until] = deadlines(&fleet.scenario.timeouts, &ending);
@@ -231,8 +252,18 @@ fn watch(
     while let Ok(event) = happened.try_recv() {
         watch.note(&event);
     }
-    watch.write_status(Phase::Over, &scorer.progress());
+    // Messages of any process may have been lost in that time.
+    if watch.had_outages() {
+        offline.extend(everyone);
+    }
+    offline.extend(watch.crashed());
     offline.extend(killed.iter().cloned());
+    // The router of the run ends next, after the scorer.
+    watch.note(&ProcessEvent {
+        name: ROUTER.to_owned(),
+        what: ProcessEventKind::Done { data_lost: false },
+    });
+    watch.write_status(Phase::Over, &scorer.progress());
     Ok(Watched {
         ending,
         killed,

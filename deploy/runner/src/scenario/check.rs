@@ -4,7 +4,7 @@ use std::path::Path;
 
 use bus::Endpoint;
 use perception::compute_device::ComputeDevice;
-use protocol::config::{FieldError, above_zero};
+use protocol::config::{FieldError, above_zero, within};
 use support::file_error::{AtFile, FileError};
 
 use super::{Clock, Scenario};
@@ -37,7 +37,6 @@ impl Scenario {
         let (scene, network, timeouts) = (&self.scene, &self.network, &self.timeouts);
         for (field, number) in [
             ("scene.rate", scene.rate),
-            ("network.stall_limit_s", network.stall_limit_s),
             ("timeouts.ready_s", timeouts.ready_s),
             ("timeouts.drain_s", timeouts.drain_s),
             ("timeouts.stop_s", timeouts.stop_s),
@@ -45,6 +44,8 @@ impl Scenario {
         ] {
             above_zero(field, number)?;
         }
+        // As the router takes it.
+        within("network.stall_limit_s", network.stall_limit_s, 0.1, 3600.0)?;
         scene.validate()?;
         self.ego.validate()?;
         let needed = self.method.exchange().stream();
@@ -113,7 +114,8 @@ impl Scenario {
         }
         match &self.network.connect {
             Some(router) if self.clock == Clock::Stepped => {
-                let rule = "runs in simulation time are their own router when there is security";
+                let rule =
+                    "runs in simulation time have a router of their own when there is security";
                 Err(FieldError::new("network.connect", router, rule))
             }
             _ => Ok(()),
