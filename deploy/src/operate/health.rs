@@ -311,7 +311,7 @@ mod tests {
         let look = |ms| {
             let last_reports = BTreeMap::from([
                 ("ego".to_owned(), at(report_ms)),
-                ("scorer".to_owned(), at(ms)),
+                ("replay".to_owned(), at(ms)),
             ]);
             health.look(&last_reports, false, at(ms))
         };
@@ -376,19 +376,30 @@ mod tests {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
         let at = |ms| began + Duration::from_millis(ms);
-        let last_reports = BTreeMap::from([
-            ("ego".to_owned(), at(1900)),
-            ("scorer".to_owned(), at(2000)),
-        ]);
+        // The scorer receives its own reports without a network.
+        let reports =
+            |ms| BTreeMap::from([("ego".to_owned(), at(1900)), ("scorer".to_owned(), at(ms))]);
         assert!(
             (2100..30_000)
                 .step_by(100)
-                .all(|ms| health.look(&last_reports, false, at(ms)).is_empty())
+                .all(|ms| health.look(&reports(ms), false, at(ms)).is_empty())
         );
         assert_eq!(
             health.statuses(&Progress::default(), at(30_000))[0].state,
             State::Silent
         );
+    }
+
+    #[test]
+    fn processes_have_their_time_again_when_the_router_is_back() {
+        let (mut health, began) = watch();
+        assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
+        let at = |ms| began + Duration::from_millis(ms);
+        for ms in (2100..30_000).step_by(100) {
+            assert!(health.look(&BTreeMap::new(), true, at(ms)).is_empty());
+        }
+        assert!(look(&mut health, began, [30_000, 35_000, 1900]).is_empty());
+        assert_eq!(look(&mut health, began, [35_100, 35_100, 1900]).len(), 1);
     }
 
     #[test]

@@ -110,23 +110,7 @@ fn go(
     };
     let specs = fleet.processes(&context)?;
     check_free(&router.place, &fleet.scenario.network, run, &specs)?;
-    let (ego, agents) = (&fleet.ego, &fleet.agents);
-    let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
-    let [detections, truth, tracks] = LINES.map(|name| folder.file(name));
-    let tracks = fleet.scenario.ego.tracks.then_some(tracks);
-    let lines = [detections, truth];
-    let session = router.place.session.clone();
-    // The scorer subscribes before any process starts, so that it misses none of their messages.
-    let mut scorer = ScorerNode::start(session, run, agents, ego, board, lines, tracks)?;
-    if let Some(address) = fleet.scenario.network.metrics {
-        let peers = specs.iter().filter_map(|spec| {
-            Some(MetricsPeer {
-                process: spec.name.clone(),
-                address: spec.metrics?,
-            })
-        });
-        scorer.serve_metrics(address, peers.collect())?;
-    }
+    let scorer = start_scorer(fleet, &context, &router, &specs)?;
     // Not returned at once on an error: scorer and router have to be ended first.
     let events = (&events, &happened);
     let watched = watch(fleet, &context, specs, &router, events, &scorer, &stop);
@@ -156,6 +140,31 @@ fn go(
             Err(RunError::Process { process, how, log })
         }
     }
+}
+
+/// Starts the scorer before any process, so that it misses none of their messages.
+fn start_scorer(
+    fleet: &Fleet,
+    context: &SessionContext<'_>,
+    router: &Router,
+    specs: &[ProcessSpec],
+) -> Result<ScorerNode, RunError> {
+    let (ego, agents) = (&fleet.ego, &fleet.agents);
+    let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let [detections, truth, tracks] = LINES.map(|name| context.folder.file(name));
+    let tracks = fleet.scenario.ego.tracks.then_some(tracks);
+    let (session, lines) = (router.place.session.clone(), [detections, truth]);
+    let mut scorer = ScorerNode::start(session, context.run, agents, ego, board, lines, tracks)?;
+    if let Some(address) = fleet.scenario.network.metrics {
+        let peers = specs.iter().filter_map(|spec| {
+            Some(MetricsPeer {
+                process: spec.name.clone(),
+                address: spec.metrics?,
+            })
+        });
+        scorer.serve_metrics(address, peers.collect())?;
+    }
+    Ok(scorer)
 }
 
 /// The router publishes no messages and no reports; its start, which is short, counts as playing.
