@@ -90,7 +90,8 @@ fn a_run_that_answers_every_tick_reports_its_stages_and_resources() {
         "agent, slowest of 2",
         "backbone",
         "fuse",
-        "v2vloc (router, scorer)",
+        "router",
+        "v2vloc (scorer)",
         "bev",
     ] {
         assert!(text.contains(part), "{part} is not in\n{text}");
@@ -109,7 +110,7 @@ fn a_run_that_answers_every_tick_reports_its_stages_and_resources() {
     );
     assert!(pose["p50_ms"].as_f64() <= pose["p95_ms"].as_f64(), "{pose}");
     let processes = report["processes"].as_array().unwrap();
-    assert_eq!(processes.len(), 5, "{processes:?}");
+    assert_eq!(processes.len(), 6, "{processes:?}");
     for process in processes {
         let [all, playing] = ["cpu_s", "playing_cpu_s"].map(|time| process[time].as_f64().unwrap());
         let name = process["process"].as_str().unwrap();
