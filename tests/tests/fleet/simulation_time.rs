@@ -559,7 +559,11 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             "{method} {rest}"
         );
         let logs = fs::read_dir(many.folder.log_dir()).unwrap().count();
-        assert_eq!((logs, many.killed.len()), (4, 0), "a vehicle each, and a router");
+        assert_eq!(
+            (logs, many.killed.len()),
+            (4, 0),
+            "a vehicle each, and a router"
+        );
     }
     assert_ne!(with_boxes[0], with_boxes[1], "of another network");
 }
