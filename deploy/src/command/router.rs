@@ -90,7 +90,7 @@ impl Arguments {
         let session = open(&options)?;
         let endpoint = options.endpoint();
         output::note(format_args!("routing at {endpoint} (Ctrl-C ends it)"));
-        let mut reporter = self.reporter(&options)?;
+        let mut reporter = self.reporter(&options);
         let mut report_at = Instant::now() + REPORT_ROUND;
         let mut probe = self.probe(&session, &options);
         let failure = loop {
@@ -122,17 +122,21 @@ impl Arguments {
         Ok(Outcome::Done)
     }
 
-    fn reporter(&self, options: &BusOptions) -> anyhow::Result<Reporter> {
+    fn reporter(&self, options: &BusOptions) -> Reporter {
         let file = self.report.as_ref().map(|file| {
-            let before = RouterReport::read(file).with_context(|| file.display().to_string())?;
-            anyhow::Ok((file.clone(), before))
+            // A damaged report is no reason not to route.
+            let before = RouterReport::read(file).unwrap_or_else(|error| {
+                tracing::warn!("{}: {error}; the report begins anew", file.display());
+                RouterReport::default()
+            });
+            (file.clone(), before)
         });
         let guard = options.guard.as_ref();
-        Ok(Reporter {
+        Reporter {
             log: guard.map(|_| RejectionLog::of(options.endpoint())),
             refused: BTreeMap::new(),
-            file: file.transpose()?,
-        })
+            file,
+        }
     }
 
     /// A second session that has to receive what the router's own publishes; `None`, with a warning, if the router cannot

@@ -143,7 +143,8 @@ impl Health {
         }
     }
 
-    /// Updates the states from the times of the last reports, which do not arrive while the router is gone; returns the hung processes, each with a description.
+    /// Updates the states from the times of the last reports, which do not arrive while the router is gone; returns the
+    /// hung processes, each with a description.
     pub(crate) fn look(
         &mut self,
         last_reports: &BTreeMap<String, Instant>,

@@ -1,11 +1,13 @@
 //! Router endpoint of a run: of a router of its own, or of one that runs already.
 
 use std::io::ErrorKind;
-use std::net::{SocketAddr, TcpListener, UdpSocket};
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use bus::shutdown::{self, Overdue, Stop};
-use bus::{BusError, BusOptions, Endpoint, RouterProbe, open_unless, present, process_id};
+use bus::{
+    BusError, BusOptions, Endpoint, RouterProbe, free_address, open_unless, present, process_id,
+};
 use protocol::{Key, KeyExpr, Principal, ProcessId, Role, RunId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -153,15 +155,9 @@ pub(crate) fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
 /// A listening address that is free at this moment; port 0 is replaced by a free port.
 fn free_endpoint(listen: &str, has_keys: bool) -> Result<Endpoint, BusError> {
     let endpoint = Endpoint::new(listen)?;
-    let address = endpoint.address();
-    // Free for the protocol in use: QUIC takes a port of UDP.
-    let bound = match has_keys || endpoint.is_secured() {
-        true => UdpSocket::bind(address).and_then(|socket| socket.local_addr()),
-        false => TcpListener::bind(address).and_then(|listener| listener.local_addr()),
-    };
-    match (bound, listen.strip_suffix(":0")) {
+    match (free_address(&endpoint, has_keys), listen.strip_suffix(":0")) {
         // If another program takes the port in between, the router's log has the error.
-        (Ok(bound), Some(place)) => Endpoint::new(&format!("{place}:{}", bound.port())),
+        (Ok(free), Some(place)) => Endpoint::new(&format!("{place}:{}", free.port())),
         (Err(error), _) if error.kind() == ErrorKind::AddrInUse => {
             Err(BusError::PortInUse { endpoint })
         }
@@ -172,6 +168,8 @@ fn free_endpoint(listen: &str, has_keys: bool) -> Result<Endpoint, BusError> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::TcpListener;
+
     use super::*;
 
     #[test]

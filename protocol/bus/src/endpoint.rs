@@ -71,7 +71,7 @@ impl Endpoint {
     }
 
     /// `HOST:PORT`.
-    pub fn address(&self) -> &str {
+    pub(super) fn address(&self) -> &str {
         // Checked by the constructor.
         self.0.split_once('/').map_or("", |(_, address)| address)
     }

@@ -93,6 +93,6 @@ pub use publisher::{Overflow, Publisher, PublisherOptions, has_subscribers, unix
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
 pub use rejection_log::{RejectionLog, RouterRejection};
 pub use router_probe::RouterProbe;
-pub use session::{BusOptions, Role as SessionRole, SharedMemory, open, open_unless};
+pub use session::{BusOptions, Role as SessionRole, SharedMemory, free_address, open, open_unless};
 pub use shared_pool::check_room;
 pub use subscriber::{Arrival, Event, Inbox, Subscription};

@@ -1,6 +1,7 @@
 //! Session of zenoh: explicit endpoints, no discovery, every limit set explicitly.
 
-use std::net::{TcpListener, UdpSocket};
+use std::io;
+use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
@@ -300,14 +301,21 @@ pub(super) fn declare_subscriber(
     declared.map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
 }
 
-fn port_in_use(endpoint: &Endpoint) -> bool {
+/// Address at which a router can listen now, with keys over QUIC; port 0 is replaced by a free port.
+///
+/// # Errors
+/// The error of the system, for example [`io::ErrorKind::AddrInUse`].
+pub fn free_address(endpoint: &Endpoint, has_keys: bool) -> io::Result<SocketAddr> {
     let address = endpoint.address();
-    let bound = if endpoint.is_secured() {
-        UdpSocket::bind(address).map(drop)
-    } else {
-        TcpListener::bind(address).map(drop)
-    };
-    bound.is_err_and(|error| error.kind() == std::io::ErrorKind::AddrInUse)
+    // QUIC takes a port of UDP.
+    match has_keys || endpoint.is_secured() {
+        true => UdpSocket::bind(address)?.local_addr(),
+        false => TcpListener::bind(address)?.local_addr(),
+    }
+}
+
+fn port_in_use(endpoint: &Endpoint) -> bool {
+    free_address(endpoint, false).is_err_and(|error| error.kind() == io::ErrorKind::AddrInUse)
 }
 
 fn config(options: &BusOptions) -> Result<Config, BusError> {

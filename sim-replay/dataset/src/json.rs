@@ -95,7 +95,7 @@ impl<'a> JsonField<'a> {
         Ok(found.map(|value| self.child(key, value)))
     }
 
-    /// What `read` makes of an optional entry.
+    /// Value of an optional entry, read by `read`; `None` if the entry is missing or null.
     pub(super) fn optional_of<T>(
         &self,
         key: &str,

@@ -180,7 +180,7 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey,
     (survey, frame)
 }
 
-/// What was read; an error becomes a problem.
+/// Value of a result; its error is added to the problems.
 fn or_problem<T>(read: Result<T, ReadError>, problems: &mut Vec<Problem>) -> Option<T> {
     read.map_err(|error| problems.push(Problem::from(&error)))
         .ok()

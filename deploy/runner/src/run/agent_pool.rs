@@ -25,7 +25,7 @@ const NAME: &str = "stepped";
 const LEAVE_LIMIT: Duration = Duration::from_secs(2);
 
 /// Agent processes and their session.
-pub(crate) struct CrewProcesses {
+pub(crate) struct AgentProcesses {
     supervisor: Supervisor,
     bus: Bus,
     router: Router,
@@ -33,7 +33,7 @@ pub(crate) struct CrewProcesses {
     _keys: Option<RunKeys>,
 }
 
-impl CrewProcesses {
+impl AgentProcesses {
     /// Starts an agent for each vehicle and waits until all have joined.
     ///
     /// # Errors

@@ -71,8 +71,10 @@ impl Router {
                 {
                     RunError::Process {
                         process: ROUTER.to_owned(),
-                        how: (process.gave_up.get().cloned())
-                            .unwrap_or_else(|| "does not answer".to_owned()),
+                        how: process
+                            .gave_up
+                            .get()
+                            .map_or("does not answer".to_owned(), Clone::clone),
                         log: context.folder.log_of(ROUTER),
                     }
                 }

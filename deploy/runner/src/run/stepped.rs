@@ -19,7 +19,7 @@ use crate::evaluated_frame::{judge, metrics};
 use crate::fleet::Fleet;
 use crate::frame_lines::FrameLines;
 use crate::run::RunError;
-use crate::run::agent_pool::CrewProcesses;
+use crate::run::agent_pool::AgentProcesses;
 use crate::run::common::{RunOptions, RunResult, in_folder};
 use crate::run::ledger_report::LedgerReport;
 use crate::scenario::Scenario;
@@ -56,13 +56,13 @@ fn go(
 ) -> Result<RunResult, RunError> {
     let mut running = None;
     if { fleet.scenario.stepped }.is_some_and(|stepped| stepped.processes) {
-        let (processes, remote) = CrewProcesses::start(fleet, run, folder, &options.programs)?;
+        let (processes, remote) = AgentProcesses::start(fleet, run, folder, &options.programs)?;
         evaluator.set_processes(Some(remote));
         running = Some(processes);
     }
     let board = play(fleet, evaluator, folder)?;
     evaluator.set_processes(None);
-    let killed = running.map(CrewProcesses::end).unwrap_or_default();
+    let killed = running.map(AgentProcesses::end).unwrap_or_default();
     let result = write(fleet, evaluator, &board, (run, folder.clone()), options)?;
     Ok(RunResult { killed, ..result })
 }

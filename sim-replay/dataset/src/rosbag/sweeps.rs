@@ -7,7 +7,7 @@ use super::clock::longest_steady;
 use super::contents::CloudStamp;
 use crate::ReadError;
 
-/// What is reported of messages that are out of order.
+/// Finding about messages that are out of order.
 pub(super) const STRAY: &str = "have a stamp that is not between those around it";
 
 /// Sweeps of a topic, with increasing stamps.
