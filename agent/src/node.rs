@@ -159,15 +159,12 @@ impl<'a> AgentNode<'a> {
     }
 
     fn end(&mut self, topic: &Topic) {
-        match topic {
-            Topic::Stream {
-                stream: Stream::Lidar,
-                ..
-            } if !self.options.keeps_running => self.handle(LoopInput::Ended),
-            Topic::Stream {
-                cav,
-                stream: Stream::Pace,
-            } => self.handle(LoopInput::PaceEnded(cav.clone())),
+        let Topic::Stream { cav, stream } = topic else {
+            return;
+        };
+        match stream {
+            Stream::Lidar if !self.options.keeps_running => self.handle(LoopInput::Ended),
+            Stream::Pace => self.handle(LoopInput::PaceEnded(cav.clone())),
             _ => {}
         }
     }

@@ -171,19 +171,16 @@ impl QueueWatch {
             // A superseded map shows a blocked queue even if this one did not wait for long.
             self.allowed = if submissions > 1 || waited > period.mul_f64(BLOCKED_SHARE) {
                 let took = between(last.begun_nanos, turn.begun_nanos);
-                Some(self.backed_off(period, took).max(floor))
+                // At the throughput of the last message this share of it leaves in one period.
+                let sent_share = period.as_secs_f64() / took.as_secs_f64().max(1e-6);
+                let backed_off = BACK_OFF * self.last_bytes as f64 * sent_share.min(1.0);
+                Some(backed_off.max(floor))
             } else {
                 self.allowed.map(|bytes| bytes * GROWTH)
             };
         }
         self.allowed = self.allowed.filter(|bytes| *bytes < largest as f64);
         self.allowed.map_or(largest, |bytes| bytes as u64)
-    }
-
-    fn backed_off(&self, period: Duration, took: Duration) -> f64 {
-        // At the throughput of the last message this share of it leaves in one period.
-        let sent_share = period.as_secs_f64() / took.as_secs_f64().max(1e-6);
-        BACK_OFF * self.last_bytes as f64 * sent_share.min(1.0)
     }
 }
 

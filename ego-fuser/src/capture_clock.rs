@@ -92,19 +92,13 @@ impl CaptureClocks {
     /// Estimates anew and logs what changes. Returns the neighbours whose capture times are corrected otherwise than
     /// before: their waiting messages belong to other frames.
     pub fn update(&mut self) -> Vec<CavId> {
-        let pace = self.pace();
+        let (pace, newest) = (self.pace(), self.own.back());
         let mut changed = Vec::new();
         for (cav, clock) in &mut self.neighbours {
-            while let Some(sweep) = clock.pending.front().copied() {
-                // Interpolation needs an own sweep of this time or later, which a later report brings.
-                if self
-                    .own
-                    .back()
-                    .is_none_or(|own| own.arrived_nanos < sweep.arrived_nanos)
-                {
-                    break;
-                }
-                clock.pending.pop_front();
+            // Interpolation needs an own sweep of this time or later, which a later report brings.
+            while let Some(sweep) = clock.pending.pop_front_if(|sweep| {
+                newest.is_some_and(|own| own.arrived_nanos >= sweep.arrived_nanos)
+            }) {
                 if let Some(own_nanos) = own_capture(&self.own, sweep.arrived_nanos) {
                     let ahead = i128::from(sweep.capture_nanos) - own_nanos;
                     let ahead = ahead.clamp(i64::MIN.into(), i64::MAX.into());
@@ -180,13 +174,10 @@ impl NeighbourClock {
     fn judge(&mut self, cav: &CavId, pace: f64) -> bool {
         let mut sorted: Vec<i64> = self.samples.iter().map(|(_, ahead)| *ahead).collect();
         sorted.sort_unstable();
-        let quartiles = [1, 2, 3].map(|quarter| sorted.get(quarter * sorted.len() / 4).copied());
-        let [Some(low), Some(median), Some(high)] = quartiles else {
+        let (Some(&least), Some(&most)) = (sorted.first(), sorted.last()) else {
             return false;
         };
-        let [Some(&least), Some(&most)] = [sorted.first(), sorted.last()] else {
-            return false;
-        };
+        let [low, median, high] = [1, 2, 3].map(|quarter| sorted[quarter * sorted.len() / 4]);
         let [limit, unsteady] =
             [LIMIT_NANOS, UNSTEADY_NANOS].map(|nanos| (nanos as f64 * pace) as i64);
         // Arrivals are late on a busy machine, so that one sample that agrees is enough.

@@ -10,7 +10,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ego::Ego;
-use crate::pairing::PairingConfig;
 use fusion::method::Method;
 
 /// Configuration of `ego-fuser run`.
@@ -144,11 +143,6 @@ impl EgoSettings {
         within("ego.deadline_ms", self.deadline_ms, 0, 60_000)?;
         within("ego.max_age_ms", self.max_age_ms, 0, 600_000)?;
         self.inbox.validate()
-    }
-
-    /// Pairing of messages with a frame.
-    pub fn pairing(&self) -> PairingConfig {
-        PairingConfig::with_max_age_nanos(self.max_age_ms.saturating_mul(1_000_000))
     }
 }
 

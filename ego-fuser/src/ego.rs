@@ -20,13 +20,13 @@ use protocol::{
     CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming,
 };
 use support::stage_times::StageTimes;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Device, Kind, Tensor, no_grad};
 
 use self::box_correction::{boxes_in, corrected};
 use self::latency_compensation::{LatencyCompensation, probability_carried_right};
 use crate::misbehaviour::{Assessment, MisbehaviourDetector};
 use fusion::box_input::{PlacedBox, placed};
-use fusion::f64_tensor;
+use fusion::f64_tensor::{as_batch, one_after_another};
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
 use fusion::model::{FusionStage, StageError};
@@ -426,7 +426,7 @@ impl Ego {
         let on_grid = self.fusion.align_with(&newest, earlier, &metadata)?;
         stages.lap("align");
         let fused = self.fusion.fuse(&on_grid)?.map;
-        let fused = f64_tensor::as_batch(&fused)?;
+        let fused = as_batch(&fused)?;
         check_values("the fused feature map", &fused)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, &boxes, stages)?;
@@ -596,14 +596,6 @@ impl Ego {
     }
 }
 
-/// Maps `[1, ..]` as `[N, ..]`; a single one is not copied.
-fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
-    match maps {
-        [map] => Ok(map.shallow_clone()),
-        maps => Tensor::f_cat(maps, 0),
-    }
-}
-
 /// Views of a frame.
 struct ChosenViews<'a> {
     /// The ego's own, then one for each of `fused`.
@@ -618,17 +610,13 @@ impl ChosenViews<'_> {
     /// Leaves the marked of the fused neighbours out; one mark for each of them.
     fn leave_out(&mut self, is_out: &[bool], reason: DropReason) {
         debug_assert_eq!(self.fused.len(), is_out.len());
-        let mut kept = vec![self.aligned[0]];
-        let neighbours = self.fused.iter().zip(&self.aligned[1..]).zip(is_out);
-        for ((&index, aligned), is_out) in neighbours {
-            match is_out {
-                true => self.skipped.push((index, Skipped::Unusable(reason))),
-                false => kept.push(*aligned),
-            }
-        }
-        self.aligned = kept;
+        // The ego's own view stays.
+        let mut marks = [false].iter().chain(is_out);
+        self.aligned.retain(|_| marks.next() == Some(&false));
         let mut marks = is_out.iter();
-        self.fused.retain(|_| marks.next() == Some(&false));
+        let left_out = self.fused.extract_if(.., |_| marks.next() == Some(&true));
+        let skipped = left_out.map(|index| (index, Skipped::Unusable(reason)));
+        self.skipped.extend(skipped);
     }
 }
 

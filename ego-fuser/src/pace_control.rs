@@ -18,6 +18,9 @@ const TENTHS: u8 = 10;
 const MAX_STEP: u8 = 2;
 /// Longest mean interval, nanoseconds.
 const MAX_INTERVAL_NANOS: u64 = 1_000_000_000;
+/// Period at which the pace is repeated, nanoseconds: for agents that join late, and so that a slower ego of the fleet
+/// does not set the pace of one that keeps up.
+const REPEAT_NANOS: u64 = 1_000_000_000;
 /// First and longest time without an overloaded frame after which the share is raised, nanoseconds.
 const CALM_NANOS: [u64; 2] = [5_000_000_000, 80_000_000_000];
 
@@ -27,6 +30,8 @@ pub(crate) struct PaceControl {
     /// Shortest interval between two sweeps of the own agent so far, nanoseconds.
     period_nanos: Option<u64>,
     pace: Pace,
+    /// Time at which the pace was published, nanoseconds.
+    published_nanos: Option<u64>,
     last_nanos: Option<u64>,
     judged: VecDeque<PacedFrame>,
     /// Time of the last overloaded frame or change, nanoseconds.
@@ -49,6 +54,7 @@ impl PaceControl {
         Self {
             period_nanos: None,
             pace: Pace::EVERY_SWEEP,
+            published_nanos: None,
             last_nanos: None,
             judged: VecDeque::new(),
             quiet_since_nanos: 0,
@@ -105,6 +111,22 @@ impl PaceControl {
                 of: TENTHS,
             }
         };
+        self.published_nanos = Some(now_nanos);
+        let Pace { computed, of, .. } = self.pace;
+        tracing::info!(
+            capture_nanos,
+            "the pace of the fleet changes to {computed} of {of} sweeps"
+        );
+        Some(self.pace)
+    }
+
+    /// The pace, if it is time to publish it again.
+    pub(crate) fn repeat(&mut self, now_nanos: u64) -> Option<Pace> {
+        let since_nanos = *self.published_nanos.get_or_insert(now_nanos);
+        if now_nanos < since_nanos.saturating_add(REPEAT_NANOS) {
+            return None;
+        }
+        self.published_nanos = Some(now_nanos);
         Some(self.pace)
     }
 

@@ -93,18 +93,15 @@ impl Reconciliation {
 impl fmt::Display for Discrepancy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counts = &self.counts;
-        let to = self
-            .to
-            .as_ref()
-            .map_or(String::new(), |to| format!(" to {to}"));
+        let (topic, to) = (self.topic.clone(), self.to.clone());
+        let account = Account { topic, to };
         let (verb, count) = match self.missing {
             missing @ 1.. => ("not accounted for", missing.unsigned_abs()),
             missing => ("received but never sent", missing.unsigned_abs()),
         };
         write!(
             f,
-            "{}{to}: {count} {verb} (sent {}, received {}, dropped {}, in flight {})",
-            self.topic,
+            "{account}: {count} {verb} (sent {}, received {}, dropped {}, in flight {})",
             counts.sent,
             counts.received,
             counts.dropped_total(),

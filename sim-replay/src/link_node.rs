@@ -241,9 +241,7 @@ impl<'a> LinkNode<'a> {
         if self.vehicles.len() >= MAX_VEHICLES {
             let kept = self.kept.values().map(|arrival| &arrival.header.stamp.cav);
             let senders: BTreeSet<&CavId> = kept.collect();
-            let gone = place_to_free(&self.vehicles, &self.options.ego, |cav| {
-                senders.contains(cav)
-            });
+            let gone = place_to_free(&self.vehicles, &self.options.ego, &senders);
             let Some(gone) = gone.cloned() else {
                 if self.rejected.len() < MAX_REJECTED && self.rejected.insert(cav.clone()) {
                     tracing::warn!(%cav, "its messages are not forwarded: the link carries at most {MAX_VEHICLES} vehicles");
@@ -405,15 +403,16 @@ impl<'a> LinkNode<'a> {
     }
 }
 
-/// A vehicle that has left and has no message in flight; never the ego, whose position is needed.
+/// A vehicle that has left and is not among the `senders` of messages in flight; never the ego, whose position is
+/// needed.
 fn place_to_free<'v>(
     vehicles: &'v BTreeMap<CavId, LinkVehicle>,
     ego: &CavId,
-    has_kept: impl Fn(&CavId) -> bool,
+    senders: &BTreeSet<&CavId>,
 ) -> Option<&'v CavId> {
     vehicles
         .iter()
-        .find(|(cav, vehicle)| vehicle.has_left && *cav != ego && !has_kept(cav))
+        .find(|(cav, vehicle)| vehicle.has_left && *cav != ego && !senders.contains(*cav))
         .map(|(cav, _)| cav)
 }
 
@@ -435,7 +434,7 @@ mod tests {
             (0..4).map(|id| (cav(id), vehicle(id < 3))).collect();
         let [ego, on_its_way] = [cav(0), cav(1)];
         let free = |vehicles: &BTreeMap<_, _>| {
-            place_to_free(vehicles, &ego, |cav| *cav == on_its_way).cloned()
+            place_to_free(vehicles, &ego, &BTreeSet::from([&on_its_way])).cloned()
         };
         assert_eq!(free(&vehicles), Some(cav(2)));
         vehicles.remove(&cav(2));

@@ -7,7 +7,6 @@
 //! pose is registered to it first, and the localizer is asked only if that fails.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use nalgebra::{Isometry3, Matrix6};
 use perception::weights::FileError;
@@ -37,7 +36,7 @@ const LEAST_STD: [f64; 2] = [0.002, 1e-4];
 #[derive(Debug)]
 pub struct MapRegistration {
     localizer: Box<dyn Localize>,
-    map: Arc<SurfelMap>,
+    map: SurfelMap,
     config: IcpConfig,
 }
 
@@ -56,16 +55,11 @@ impl MapRegistration {
                 let problem = format_args!("a surfel map of {place:?}, the head is of {head:?}");
                 Err(FileError::new(map, problem))
             }
-            _ => Ok(Box::new(Self::new(localizer, Arc::new(surfels)))),
-        }
-    }
-
-    /// Poses of `localizer`, registered to `map`.
-    pub fn new(localizer: Box<dyn Localize>, map: Arc<SurfelMap>) -> Self {
-        Self {
-            localizer,
-            map,
-            config: SurfelMap::registration(),
+            _ => Ok(Box::new(Self {
+                localizer,
+                map: surfels,
+                config: SurfelMap::registration(),
+            })),
         }
     }
 

@@ -1,34 +1,12 @@
-//! Database of sweeps for retrieval, from drives with true poses.
+//! Descriptors and true poses of the sweeps of drives, for retrieval.
 
 use crate::{Error, Result};
-use std::path::Path;
+use std::path::PathBuf;
 
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
-use localization::baselines::{DescribedSweep, SweepDatabase};
-use localization::pgc::{Localizer, LocalizerError, stopwatch};
+use localization::pgc::LocalizerError;
 use nalgebra::Isometry3;
 use protocol::PointCloud;
-
-/// Describes every sweep of the drives by the features of a localizer's encoder, as [`described_sweeps`].
-///
-/// # Errors
-/// [`Error`] names the file.
-pub fn read_database(
-    folders: &[impl AsRef<Path>],
-    localizer: &Localizer,
-    left_out: &mut LeftOut,
-    progress: &mut dyn FnMut(usize, usize),
-) -> Result<SweepDatabase> {
-    let mut describe = |cloud: &PointCloud| localizer.sweep_features(cloud, &mut stopwatch());
-    let sweeps = described_sweeps(folders, &mut describe, left_out, progress)?;
-    let sweeps = sweeps.into_iter();
-    let sweeps = sweeps.map(|(descriptor, world_from_sensor)| DescribedSweep {
-        descriptor,
-        world_from_sensor,
-    });
-    let sweeps: Vec<_> = sweeps.collect();
-    SweepDatabase::new(&sweeps).ok_or_else(|| no_sweeps(folders, left_out))
-}
 
 /// Descriptor and pose of each sweep of the drives that `describe` gives a descriptor; `progress` gets the number of
 /// sweeps done and of all. Sweeps that cannot be read or have no pose are left out and counted in `left_out`.
@@ -36,12 +14,12 @@ pub fn read_database(
 /// # Errors
 /// [`Error`] names the file, or the folders where no sweep is described.
 pub fn described_sweeps<D, E: Into<LocalizerError>>(
-    folders: &[impl AsRef<Path>],
+    folders: &[PathBuf],
     describe: &mut dyn FnMut(&PointCloud) -> Result<Option<D>, E>,
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<(D, Isometry3<f64>)>> {
-    let datasets = folders.iter().map(|folder| dataset::open(folder.as_ref()));
+    let datasets = folders.iter().map(|folder| dataset::open(folder));
     let datasets: Vec<_> = datasets.collect::<Result<_, _>>()?;
     for dataset in &datasets {
         left_out.add_files(&dataset.problems);
@@ -63,14 +41,9 @@ pub fn described_sweeps<D, E: Into<LocalizerError>>(
         }
     }
     match sweeps.is_empty() {
-        true => Err(no_sweeps(folders, left_out)),
+        true => Err(Error::NoSweeps(folders.to_vec(), left_out.reasons())),
         false => Ok(sweeps),
     }
-}
-
-fn no_sweeps(folders: &[impl AsRef<Path>], left_out: &LeftOut) -> Error {
-    let folders = folders.iter().map(|folder| folder.as_ref().to_owned());
-    Error::NoSweeps(folders.collect(), left_out.reasons())
 }
 
 /// Agent and tick of all sweeps of a scenario, vehicle by vehicle, in the order of time.

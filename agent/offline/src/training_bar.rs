@@ -19,7 +19,6 @@ const PARTS: usize = 10;
 #[derive(Debug)]
 pub struct TrainingBar {
     bar: ProgressBar,
-    is_watched: bool,
     last_line: Cell<Option<Instant>>,
     encoding: Cell<Option<EncodingProgress>>,
     /// Length of the training.
@@ -42,10 +41,8 @@ struct EncodingProgress {
 impl TrainingBar {
     /// Bar for a training of this length, which is part of the estimate if sweeps have to be encoded first.
     pub fn of(length: Length) -> Self {
-        let bar = progress::percent_bar(PARTS);
         Self {
-            is_watched: !bar.is_hidden(),
-            bar,
+            bar: progress::percent_bar(PARTS),
             last_line: Cell::new(None),
             encoding: Cell::new(None),
             length,
@@ -115,7 +112,7 @@ impl TrainingBar {
     }
 
     fn show(&self, share_done: f64, remaining_s: Option<f64>, text: &str) {
-        if self.is_watched {
+        if !self.bar.is_hidden() {
             let position = share_done * 1000.0 * PARTS as f64;
             self.bar.set_position(position as u64);
             self.bar.set_message(text.to_owned());
@@ -132,9 +129,9 @@ impl TrainingBar {
 
     /// Prints a line that stays.
     pub fn print_line(&self, text: &str) {
-        match self.is_watched {
-            true => self.bar.println(text),
-            false => output::note(text),
+        match self.bar.is_hidden() {
+            true => output::note(text),
+            false => self.bar.println(text),
         }
     }
 

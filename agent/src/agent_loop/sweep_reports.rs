@@ -60,12 +60,9 @@ impl SweepReports {
 
     /// Adds a sweep to the next report, which is due at once if it is one of the first.
     pub(super) fn note(&mut self, capture_nanos: u64, arrived_nanos: u64) {
-        // The clock of the scene was set back.
-        if self
-            .sweeps
-            .back()
-            .is_some_and(|(newest, _)| capture_nanos < *newest)
-        {
+        let newest = self.sweeps.back();
+        if newest.is_some_and(|(newest, _)| capture_nanos < *newest) {
+            // The clock of the scene was set back.
             self.sweeps.clear();
         }
         self.sweeps.push_back((capture_nanos, arrived_nanos));

@@ -91,6 +91,8 @@ pub struct Tracker {
     tracks: Vec<TrackState>,
     begun: u64,
     last_nanos: Option<u64>,
+    /// Detections so far that were left out: a number is not finite, a size negative, the score not within 0..=1, or
+    /// there were more than [`TrackerConfig`] allows.
     left_out: u64,
 }
 
@@ -101,12 +103,6 @@ impl Tracker {
             config,
             ..Self::default()
         }
-    }
-
-    /// Number of detections so far that were left out: a number is not finite, a size negative, the score not within
-    /// 0..=1, or there were more than [`TrackerConfig`] allows.
-    pub fn left_out(&self) -> u64 {
-        self.left_out
     }
 
     /// Takes the result of an ego and returns its tracks, none without a usable pose. Where time does not advance the

@@ -12,17 +12,16 @@ use anyhow::{Context, Result, anyhow, bail, ensure};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::ground_truth::GroundTruthRule;
 use dataset::{self, OpenOptions, Problem, Scenario as Recorded, findings};
-use deploy::operate::keys::KeyFileError;
+use deploy::operate::keys::{KeyFileError, principals_of};
 use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
 use ego_fuser::ego::Ego;
 use fusion::Exchange;
 use link::{LinkConfig, LinkEmulator};
-use localization::pose_source::{PoseSourceConfig, PoseSourceError};
 use perception::inference::Inference;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
-use protocol::{CavId, Principal, Role, Stream};
+use protocol::{CavId, Stream};
 use sim_replay::config::SceneConfig;
 use support::file_digests::FileDigests;
 use support::provenance::Provenance;
@@ -72,6 +71,58 @@ fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<()> {
     Ok(())
 }
 
+/// Loads what the processes of a scenario load, so that faulty weights and links are refused before any starts; returns
+/// the configuration of the detector.
+fn load_models(scenario: &Scenario) -> Result<DetectorConfig> {
+    let weights = &scenario.models.weights;
+    let detector = Weights::load(weights)
+        .and_then(|weights| weights.detector_config())
+        .context("weights")?;
+    // As the ego-fuser does: weights of another method are refused.
+    Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
+    // Every vehicle loads the networks of its pose source for itself; errors are better reported once.
+    let poses = scenario.poses();
+    let mut networks = poses.iter().filter(|pose| pose.looks_at_sweeps());
+    let loaded = networks.try_for_each(|pose| pose.build(Inference::default()).map(drop));
+    loaded.context("localizer")?;
+    if let Some(link) = &scenario.link {
+        LinkEmulator::open(&link.model, link.seed)?;
+    }
+    Ok(detector)
+}
+
+/// Refuses vehicles that the recorded scenario does not have.
+fn check_vehicles(scenario: &Scenario, recorded: &Recorded) -> Result<()> {
+    let (scene, remote) = (&scenario.scene, &scenario.remote_agents);
+    let in_scene = scene.agents.iter().map(|cav| ("scene.agents", cav));
+    let egos = scenario.ego.id.iter().map(|cav| ("ego.id", cav));
+    let own = scenario.vehicles.keys().map(|cav| ("vehicles", cav));
+    let remote = remote.iter().map(|cav| ("remote_agents", cav));
+    let mut named = in_scene.chain(egos).chain(own).chain(remote);
+    if let Some((field, cav)) = named.find(|(_, cav)| !recorded.agents.contains(cav)) {
+        let (name, found) = (&recorded.name, texts(&recorded.agents));
+        bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
+    }
+    Ok(())
+}
+
+/// Refuses pose sources that need measured poses, of vehicles of which the recorded scenario has none.
+fn check_poses(scenario: &Scenario, recorded: &Recorded, agents: &[CavId]) -> Result<()> {
+    let (name, seek) = (&recorded.name, scenario.scene.seek);
+    for cav in agents {
+        let pose = scenario.settings_of(cav).pose;
+        let place = recorded.agents.iter().position(|known| known == cav);
+        ensure!(
+            !pose.needs_measured_pose()
+                || place.is_none_or(|place| recorded.has_poses(place, seek)),
+            "vehicle {cav}: pose is {}, but scenario {name} has no poses of it (no lidar_pose); choose pose: pgc, \
+             which finds them",
+            pose.name()
+        );
+    }
+    Ok(())
+}
+
 impl Fleet {
     /// Reads scene and weights.
     ///
@@ -81,19 +132,8 @@ impl Fleet {
         let mut scenario = scenario.clone();
         let weights = &scenario.models.weights;
         scenario.models.weights = weights_of(weights, scenario.method, scenario.sends_boxes())?;
-        let weights = &scenario.models.weights;
-        let detector = Weights::load(weights)
-            .and_then(|weights| weights.detector_config())
-            .context("weights")?;
-        // As the ego-fuser does: weights of another method are refused before any process starts.
-        Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
-        let loaded = scenario.poses().iter().try_for_each(load_networks);
-        loaded.context("localizer")?;
-        // Opened only to refuse a faulty link before any process starts.
-        if let Some(link) = &scenario.link {
-            LinkEmulator::open(&link.model, link.seed)?;
-        }
-        let scene = &mut scenario.scene;
+        let detector = load_models(&scenario)?;
+        let scene = &scenario.scene;
         let options = OpenOptions {
             intensity_scale: scene.intensity_scale,
             ..OpenOptions::default()
@@ -103,34 +143,12 @@ impl Fleet {
         let protocol = scenario.protocol.resolve(dataset.layout);
         let protocol = protocol.map_err(|error| anyhow!("protocol: {error}"))?;
         let recorded = scenario_of(&dataset.scenarios, scene)?;
-        let name = recorded.name.clone();
-        let names = scene.agents.iter().map(|cav| ("scene.agents", cav));
-        let names = names.chain(scenario.ego.id.iter().map(|cav| ("ego.id", cav)));
-        let names = names.chain(scenario.vehicles.keys().map(|cav| ("vehicles", cav)));
-        let remote = scenario.remote_agents.iter();
-        for (field, cav) in names.chain(remote.map(|cav| ("remote_agents", cav))) {
-            if !recorded.agents.contains(cav) {
-                let found = texts(&recorded.agents);
-                bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
-            }
-        }
+        check_vehicles(&scenario, recorded)?;
         // An empty list stands for all vehicles of the scenario.
         let mut agents = recorded.agents.clone();
         agents.retain(|cav| scene.agents.is_empty() || scene.agents.contains(cav));
         let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
-        for cav in &agents {
-            let pose = scenario.settings_of(cav).pose;
-            let place = recorded.agents.iter().position(|known| known == cav);
-            if pose.needs_measured_pose()
-                && place.is_some_and(|place| !recorded.has_poses(place, scenario.scene.seek))
-            {
-                bail!(
-                    "vehicle {cav}: pose is {}, but scenario {name} has no poses of it (no lidar_pose); choose pose: pgc, \
-                     which finds them",
-                    pose.name()
-                );
-            }
-        }
+        check_poses(&scenario, recorded, &agents)?;
         let scene = &mut scenario.scene;
         // No underflow: scenario_of has refused a seek beyond the last tick.
         let left = recorded.ticks.len() - scene.seek;
@@ -142,7 +160,7 @@ impl Fleet {
         };
         let findings = findings::sampled(std::slice::from_ref(recorded), scene.intensity_scale);
         // What the file left open is filled in, so that the scenario.yaml of the run is complete.
-        scene.scenario = Some(name);
+        scene.scenario = Some(recorded.name.clone());
         scene.agents.clone_from(&agents);
         scenario.ego.id = Some(ego.clone());
         Ok(Self {
@@ -189,20 +207,10 @@ impl Fleet {
         let settings = self.agents.iter().map(|cav| self.scenario.settings_of(cav));
         let mut names = settings.map(|settings| settings.pose.name());
         let first = names.next().unwrap_or("recorded");
-        if names.all(|name| name == first) {
-            first
-        } else {
-            "mixed"
+        match names.all(|name| name == first) {
+            true => first,
+            false => "mixed",
         }
-    }
-
-    /// Principal of every process that the run may have, for its keys.
-    pub(crate) fn parties(&self) -> Vec<Principal> {
-        use Role::{Agent, Ego, Link, Recorder, Replay, Ros2, Scorer, Viewer};
-        let agents = self.agents.iter().map(|cav| Principal::new(Agent, cav));
-        let egos = [Ego, Link].map(|role| Principal::new(role, &self.ego));
-        let others = [Replay, Scorer, Recorder, Viewer, Ros2].map(Principal::of_role);
-        agents.chain(egos).chain(others).collect()
     }
 
     /// Keys of a run of this fleet, if its scenario asks for security.
@@ -211,7 +219,11 @@ impl Fleet {
     /// [`KeyFileError`] when they cannot be made.
     pub fn keys(&self, folder: &RunFolder) -> Result<Option<RunKeys>, KeyFileError> {
         let security = self.scenario.security.as_ref();
-        let keys = security.map(|of| RunKeys::of(of, self.parties(), folder.path()));
+        let keys = security.map(|of| {
+            // Of every process that the run may have.
+            let principals = principals_of(&self.agents, std::slice::from_ref(&self.ego)).concat();
+            RunKeys::of(of, principals, folder.path())
+        });
         keys.transpose()
     }
 
@@ -293,12 +305,4 @@ fn scenario_of<'a>(scenarios: &'a [Recorded], scene: &SceneConfig) -> Result<&'a
 
 fn texts(agents: &[CavId]) -> Vec<String> {
     agents.iter().map(ToString::to_string).collect()
-}
-
-/// Loads the networks of a pose source. Every vehicle loads them for itself; errors are better reported once.
-fn load_networks(pose: &PoseSourceConfig) -> Result<(), PoseSourceError> {
-    match pose.looks_at_sweeps() {
-        true => pose.build(Inference::default()).map(drop),
-        false => Ok(()),
-    }
 }

@@ -84,16 +84,13 @@ impl FrameLines {
     ///
     /// # Errors
     /// The first of the operating system.
-    pub(crate) fn finish(mut self) -> io::Result<()> {
-        self.written
-            .and_then(|()| self.detections.flush())
-            .and_then(|()| self.truth.flush())
-            .and_then(|()| self.detections.get_ref().sync_all())
-            .and_then(|()| self.truth.get_ref().sync_all())
-            .and_then(|()| match self.tracks {
-                Some(mut tracks) => tracks.flush().and_then(|()| tracks.get_ref().sync_all()),
-                None => Ok(()),
-            })
+    pub(crate) fn finish(self) -> io::Result<()> {
+        self.written?;
+        for mut file in [self.detections, self.truth].into_iter().chain(self.tracks) {
+            file.flush()?;
+            file.get_ref().sync_all()?;
+        }
+        Ok(())
     }
 }
 

@@ -19,13 +19,6 @@ pub enum SchemaOf {
 }
 
 impl SchemaOf {
-    /// Every kind of file, with the path of its schema below `deploy`.
-    pub const ALL: [(Self, &'static str); 3] = [
-        (Self::Scenario, "scenarios/scenario.schema.json"),
-        (Self::Experiment, "experiments/experiment.schema.json"),
-        (Self::Link, "experiments/links/link.schema.json"),
-    ];
-
     /// The schema as indented JSON with a line end.
     pub fn json(self) -> String {
         let text = match self {

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use crate::operate::keys::{KeyFileError, KeyPlan, make};
-use protocol::{CavId, Principal, Role};
+use crate::operate::keys::{KeyFileError, KeyPlan, make, principals_of};
+use protocol::CavId;
 use serde_json::json;
 use support::output;
 
@@ -37,18 +37,10 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Writes the keys and lists the files.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        use Role::{Agent, Ego, Link, Recorder, Replay, Ros2, Scorer, Viewer};
-        let agents = self.agents.iter().map(|cav| Principal::new(Agent, cav));
-        let egos = self
-            .egos
-            .iter()
-            .flat_map(|cav| [Ego, Link].map(|role| Principal::new(role, cav)));
+        let [mut principals, mut others] = principals_of(&self.agents, &self.egos);
         // Vehicles that are added later join a fleet whose other processes have certificates already.
-        let others = [Replay, Scorer, Recorder, Viewer, Ros2].map(Principal::of_role);
-        let others = others
-            .into_iter()
-            .filter(|other| self.force || !self.out.join(other.to_string()).exists());
-        let principals = agents.chain(egos).chain(others).collect();
+        others.retain(|other| self.force || !self.out.join(other.to_string()).exists());
+        principals.extend(others);
         let mut plan = KeyPlan::new(&self.out, principals, self.days);
         plan.hosts.extend(self.hosts);
         plan.replace = self.force;

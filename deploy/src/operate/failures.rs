@@ -56,7 +56,8 @@ impl Failures {
     /// Description of each failure, after the name of its process.
     pub(crate) fn in_words(&self) -> Vec<String> {
         let failed = self.failed.iter();
-        { failed.map(|(name, text)| format!("{name}: {text}")) }.collect()
+        let lines = failed.map(|(name, text)| format!("{name}: {text}"));
+        lines.collect()
     }
 }
 

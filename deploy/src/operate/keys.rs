@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, UNIX_EPOCH};
 
 use bus::{AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, MEMBERS_FILE, ROUTER};
-use protocol::Principal;
+use protocol::{CavId, Principal, Role};
 use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
     Issuer, KeyPair, KeyUsagePurpose, SanType, date_time_ymd,
@@ -66,6 +66,17 @@ impl KeyPlan {
     fn certificate(&self, name: &str) -> PathBuf {
         self.folder.join(name).join(CERTIFICATE_FILE)
     }
+}
+
+/// Processes of a fleet that get keys: those of its vehicles, and those that are of no vehicle.
+pub fn principals_of(agents: &[CavId], egos: &[CavId]) -> [Vec<Principal>; 2] {
+    use Role::{Agent, Ego, Link, Recorder, Replay, Ros2, Scorer, Viewer};
+    let agents = agents.iter().map(|cav| (Agent, cav));
+    let egos = egos.iter().flat_map(|cav| [(Ego, cav), (Link, cav)]);
+    let processes = agents.chain(egos);
+    let of_vehicles = processes.map(|(role, cav)| Principal::new(role, cav));
+    let others = [Replay, Scorer, Recorder, Viewer, Ros2].map(Principal::of_role);
+    [of_vehicles.collect(), others.into()]
 }
 
 /// Reason why no keys could be made.

@@ -10,6 +10,7 @@ use serde::Serialize;
 use terminal::text_table::number;
 
 use crate::operate::status::{name_of, table_with_note};
+use crate::score::ms_between;
 
 /// Queued messages of a topic.
 const PLACES: usize = 64;
@@ -185,8 +186,7 @@ impl Seen {
                 let count = self.results.get(cav).map_or(0, |(count, _)| *count) + 1;
                 let (stamp, began) = (&header.stamp, self.ticks.get(&header.stamp.capture_nanos));
                 // Signed: the stamps may be of two clocks.
-                let latency_ms =
-                    began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
+                let latency_ms = began.map(|began| ms_between(*began, stamp.publish_nanos));
                 let ego = RemoteEgo {
                     ego: cav.clone(),
                     rate_hz: 0.0,

@@ -9,9 +9,10 @@ use protocol::RunId;
 use serde::Serialize;
 use support::atomic_file;
 use support::csv_file::CsvText;
+use support::file_error::FileError;
 use time::UtcDateTime;
 
-use crate::score::FrameRecord;
+use crate::score::{FrameRecord, ms_between};
 
 /// Reason why a run folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -20,21 +21,13 @@ pub enum RunFolderError {
     #[error("{} exists already: choose another --name, or remove it", .0.display())]
     Taken(PathBuf),
     /// A file or folder cannot be written.
-    #[error("cannot write {}: {source}", path.display())]
-    Write {
-        /// File or folder.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: io::Error,
-    },
+    #[error("cannot write {0}")]
+    Write(#[source] FileError),
 }
 
 /// The error of writing a file or folder at a path.
 fn at(path: &Path) -> impl FnOnce(io::Error) -> RunFolderError {
-    move |source| RunFolderError::Write {
-        path: path.to_owned(),
-        source,
-    }
+    move |error| RunFolderError::Write(FileError::new(path, error))
 }
 
 /// The recording of a run.
@@ -139,23 +132,10 @@ impl RunFolder {
             .map_err(|error| at(&self.file(name))(error.into()))?;
         self.write(name, &(text + "\n"))
     }
-
-    /// Writes `frames.csv`; `arrivals` holds the arrival time of each sweep at the ego's agent, by capture time, Unix
-    /// nanoseconds.
-    ///
-    /// # Errors
-    /// [`RunFolderError::Write`].
-    pub fn write_frames(
-        &self,
-        records: &[FrameRecord],
-        arrivals: &BTreeMap<u64, u64>,
-    ) -> Result<(), RunFolderError> {
-        self.write("frames.csv", &frames_csv(records, arrivals, None))
-    }
 }
 
-/// The table of ticks: a header line, then a line per tick, answered or not. With the scenario of each tick, that is the
-/// first column.
+/// `frames.csv`: a header line, then a line per tick, answered or not. `arrivals` holds the arrival time of each sweep at
+/// the ego's agent, by capture time, Unix nanoseconds. With the scenario of each tick, that is the first column.
 pub fn frames_csv(
     records: &[FrameRecord],
     arrivals: &BTreeMap<u64, u64>,
@@ -168,7 +148,8 @@ pub fn frames_csv(
     for (place, record) in records.iter().enumerate() {
         let scenario = scenarios.and_then(|all| all.get(place)).cloned();
         let arrival = arrivals.get(&record.capture_nanos);
-        let swept_ms = arrival.and_then(|arrival| record.stamps.since_began_ms(*arrival));
+        let times = record.stamps.began_nanos.zip(arrival);
+        let swept_ms = times.map(|(began, arrival)| ms_between(began, *arrival));
         let fields = COLUMNS.iter().map(|(_, field)| field(record, swept_ms));
         text.row(scenario.into_iter().chain(fields));
     }

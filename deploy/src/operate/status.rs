@@ -13,6 +13,7 @@ use support::file_error::{AtFile, FileError};
 use terminal::text_table::{Side, TextTable, number};
 
 use crate::operate::health::{ProcessStatus, State, Usage};
+use crate::operate::run_folder::plain;
 use crate::score::Progress;
 
 /// File name.
@@ -246,9 +247,7 @@ impl RunStatus {
                 number(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
                 number(neighbour.capture_offset_s.map(|seconds| seconds * 1e3), 1),
                 number(neighbour.trust, 2),
-                neighbour
-                    .misbehaviour
-                    .map_or(String::new(), |reason| reason.to_string()),
+                plain(neighbour.misbehaviour),
             ]);
         }
         table

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Instant;
 
 use bus::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use bus::shutdown::Stop;
@@ -74,6 +75,8 @@ struct LidarInput {
     stamps: StampCheck,
     intensities: LiveIntensities,
     log: RefusalLog,
+    /// Apart from `log`, whose kinds of reasons come from outside.
+    odd_stamps: RefusalLog,
     _subscription: RosSubscription,
 }
 
@@ -130,6 +133,7 @@ impl LidarInputs {
                 stamps: StampCheck::default(),
                 intensities: LiveIntensities::new(options.intensity_scale),
                 log: RefusalLog::of(topic.clone(), ros_type),
+                odd_stamps: RefusalLog::of(topic.clone(), ros_type),
                 _subscription: subscription,
             };
             inputs.insert(cav.clone(), input);
@@ -194,7 +198,7 @@ impl LidarInput {
             OddStamp::Ahead(_) => report.ahead_of_clock += 1,
             OddStamp::Back(_) => report.back_in_time += 1,
         }
-        if self.stamps.is_news(odd) {
+        if self.odd_stamps.is_due(&odd.to_string(), Instant::now()) {
             tracing::warn!("{}: {odd}", self.topic);
         }
     }

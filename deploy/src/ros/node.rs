@@ -127,15 +127,15 @@ struct RunFollower<'scope, 'env> {
     names: FrameNames,
     /// The fixed transforms as they were published last.
     fixed: Vec<u8>,
-    clock: SceneClock,
-    publishes_clock: bool,
+    /// Absent where `/clock` is not published.
+    clock: Option<SceneClock>,
     initial_pose: Option<InitialPose>,
     publishers: BTreeMap<RosTopic, RosPublisher>,
     sweeps: BTreeMap<CavId, Forwarding<'scope>>,
     /// Vehicles that have agents.
     agents: BTreeSet<CavId>,
-    published: BTreeMap<String, u64>,
-    left_out: u64,
+    /// What was published and left out so far.
+    report: NodeReport,
 }
 
 impl<'scope, 'env> RunFollower<'scope, 'env> {
@@ -160,14 +160,12 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
             frames,
             names,
             fixed: Vec::new(),
-            clock: SceneClock::default(),
-            publishes_clock,
+            clock: publishes_clock.then(SceneClock::default),
             initial_pose,
             publishers: BTreeMap::new(),
             sweeps: BTreeMap::new(),
             agents: BTreeSet::new(),
-            published: BTreeMap::new(),
-            left_out: 0,
+            report: NodeReport::default(),
         };
         let clock = publishes_clock.then_some(RosTopic::Clock);
         let initial_pose = node.initial_pose.is_some().then_some(RosTopic::InitialPose);
@@ -186,12 +184,8 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
         let ended = self.publish_all(subscriber, members);
         // Also after an error, as the scope waits for every thread that it has started.
         self.sweeps.into_values().for_each(Forwarding::end);
-        let left_out = self.left_out + subscriber.overwritten() + subscriber.undelivered();
-        ended.map(|()| NodeReport {
-            published: self.published,
-            left_out,
-            ..NodeReport::default()
-        })
+        self.report.left_out += subscriber.overwritten() + subscriber.undelivered();
+        ended.map(|()| self.report)
     }
 
     fn publish_all(
@@ -307,16 +301,17 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
             Ok((header, _)) if header.kind == Kind::Control => return Ok(()),
             Ok(decoded) => decoded,
             Err(error) => {
-                self.left_out += 1;
+                self.report.left_out += 1;
                 tracing::warn!("{}: left out: {error}", raw.key);
                 return Ok(());
             }
         };
         let capture_nanos = header.stamp.capture_nanos;
         if let Topic::Stream { cav, stream } = topic {
-            let time_nanos = self.clock.advance(cav, *stream, capture_nanos);
+            let clock = self.clock.as_mut();
+            let time_nanos = clock.and_then(|clock| clock.advance(cav, *stream, capture_nanos));
             // The clock before the message: nothing has a stamp in the future.
-            if let Some(nanos) = time_nanos.filter(|_| self.publishes_clock) {
+            if let Some(nanos) = time_nanos {
                 self.publish(RosTopic::Clock, ros2::clock(nanos))?;
             }
             let publisher = self.publishers.get(&RosTopic::InitialPose);
@@ -350,7 +345,7 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
     fn publish(&mut self, topic: RosTopic, cdr: Vec<u8>) -> Result<()> {
         self.declare(topic.clone())?;
         let name = topic.name(self.session.node().namespace.as_ref());
-        *self.published.entry(name.to_string()).or_default() += 1;
+        *self.report.published.entry(name.to_string()).or_default() += 1;
         let publisher = self.publishers.get_mut(&topic);
         publisher.map_or(Ok(()), |publisher| publisher.publish(cdr))
     }

@@ -1,4 +1,4 @@
-//! Log of messages that are left out, for each topic and kind of reason at most one line in ten seconds.
+//! Log of messages that are left out or odd, for each topic and kind of reason at most one line in ten seconds.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -38,7 +38,7 @@ impl RefusalLog {
     }
 
     /// True if no reason of this kind was logged in the period. Reasons that differ in numbers alone are of one kind.
-    fn is_due(&mut self, reason: &str, now: Instant) -> bool {
+    pub(super) fn is_due(&mut self, reason: &str, now: Instant) -> bool {
         let mut kind = reason.replace(|letter: char| letter.is_ascii_digit(), "");
         // Kinds beyond the limit share one place, so that texts from outside cannot fill the memory.
         if self.logged.len() >= MOST_KINDS && !self.logged.contains_key(&kind) {

@@ -1,20 +1,15 @@
 //! Check of a LiDAR's stamps: those of 0, ahead of this machine's clock, and going back.
 
-use std::time::{Duration, Instant};
-
 use super::time_series::seconds;
 
 /// Largest lead of a stamp over this machine's clock, nanoseconds: 0.1 s.
 const MAX_LEAD_NANOS: u64 = 100_000_000;
-/// Interval between two warnings of a kind.
-const PERIOD: Duration = Duration::from_secs(10);
 
 /// Stamps of one LiDAR.
 #[derive(Debug, Default)]
 pub(super) struct StampCheck {
     /// Stamp of the last sweep that was not left out, nanoseconds.
     pub(super) last_nanos: Option<u64>,
-    warned: [Option<Instant>; 2],
 }
 
 /// Reason why a sweep is left out: it has no time of its own.
@@ -59,25 +54,16 @@ impl StampCheck {
             _ => None,
         })
     }
-
-    /// True if no warning of the kind was given a short time ago.
-    pub(super) fn is_news(&mut self, odd: OddStamp) -> bool {
-        let [ahead, back] = &mut self.warned;
-        let warned = match odd {
-            OddStamp::Ahead(_) => ahead,
-            OddStamp::Back(_) => back,
-        };
-        let is_news = warned.is_none_or(|warned| warned.elapsed() > PERIOD);
-        if is_news {
-            *warned = Some(Instant::now());
-        }
-        is_news
-    }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
+    use ros2::RosType;
+
     use super::*;
+    use crate::ros::refusal_log::RefusalLog;
 
     const S: u64 = 1_000_000_000;
 
@@ -96,12 +82,16 @@ mod tests {
 
     #[test]
     fn a_warning_is_given_once_for_each_kind() {
-        let mut check = StampCheck::default();
+        let mut log = RefusalLog::of("/points".parse().unwrap(), RosType::PointCloud2);
+        let now = Instant::now();
         let kinds = [
             OddStamp::Ahead(1.0),
             OddStamp::Back(1.0),
             OddStamp::Ahead(2.0),
         ];
-        assert_eq!(kinds.map(|odd| check.is_news(odd)), [true, true, false]);
+        assert_eq!(
+            kinds.map(|odd| log.is_due(&odd.to_string(), now)),
+            [true, true, false]
+        );
     }
 }

@@ -25,5 +25,6 @@ pub(crate) use node::SCORER;
 pub use node::{ProcessStats, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use result_lines::ScenarioLine;
 pub use stage_stamps::StageStamps;
+pub(crate) use stage_stamps::ms_between;
 pub(crate) use true_boxes::ground_truth;
 pub use truth_line::TruthLine;

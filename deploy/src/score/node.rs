@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
-use std::thread::{self, JoinHandle};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
@@ -18,12 +18,13 @@ use protocol::{
     Truth,
 };
 use serde::Serialize;
-use support::sync::lock;
+use support::sync::{lock, spawn};
 use zenoh::Session;
 
 use super::FrameScores;
 use super::numbered_results::NumberedResults;
 use super::result_lines::ResultLines;
+use super::stage_stamps::ms_between;
 use crate::score::offline_intervals::OfflineIntervals;
 
 /// Name of the scorer in keys, ledgers and routes.
@@ -128,7 +129,10 @@ pub struct ScorerNode {
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
     thread: JoinHandle<(FrameScores, ScoreStats, [u64; 3])>,
-    connection: ScorerConnection,
+    bus: Bus,
+    offline: OfflineIntervals,
+    subscriptions: Vec<Subscription>,
+    presence: LivelinessToken,
 }
 
 impl ScorerNode {
@@ -185,20 +189,16 @@ impl ScorerNode {
             numbered_tracks: NumberedResults::default(),
             published: BTreeMap::new(),
         };
-        let thread = thread::Builder::new()
-            .name(SCORER.into())
-            .spawn(move || worker.run());
+        let thread = spawn(SCORER, move || worker.run());
         let thread = thread.map_err(io("the scorer's thread".into()))?;
         Ok(Self {
             inbox,
             progress,
             thread,
-            connection: ScorerConnection {
-                bus,
-                offline,
-                subscriptions,
-                presence,
-            },
+            bus,
+            offline,
+            subscriptions,
+            presence,
         })
     }
 
@@ -211,7 +211,7 @@ impl ScorerNode {
         address: SocketAddr,
         others: Vec<MetricsPeer>,
     ) -> Result<(), ScorerError> {
-        self.connection.bus.serve_metrics(address, others)?;
+        self.bus.serve_metrics(address, others)?;
         Ok(())
     }
 
@@ -222,12 +222,12 @@ impl ScorerNode {
 
     /// Time since which the scorer has had no connection to the router.
     pub fn router_lost_since(&self) -> Option<Instant> {
-        self.connection.bus.router_lost_since()
+        self.bus.router_lost_since()
     }
 
     /// Processes that were offline so far.
     pub fn absent(&self) -> BTreeSet<String> {
-        self.connection.offline.so_far()
+        self.offline.so_far()
     }
 
     /// Ends the scorer after every received message has been scored.
@@ -235,27 +235,13 @@ impl ScorerNode {
     /// # Panics
     /// When the scorer's own thread has panicked.
     pub fn finish(self) -> Scored {
-        let (scored, connection) = self.scored();
-        // The bus demands that all subscriptions are ended before it leaves.
-        drop((
-            connection.subscriptions,
-            connection.presence,
-            connection.offline,
-        ));
-        if let Err(overdue) = connection.bus.leave(LEAVE_LIMIT) {
-            tracing::warn!("{overdue}");
-        }
-        scored
-    }
-
-    fn scored(self) -> (Scored, ScorerConnection) {
         // A closed queue is still read to its end.
         self.inbox.close();
         let joined = self.thread.join();
         let (scores, stats, unwritten) =
             joined.expect("the scorer's thread has no reason to panic");
-        let own_stats = self.connection.bus.stats();
-        let process = &self.connection.bus.identity().process;
+        let own_stats = self.bus.stats();
+        let process = &self.bus.identity().process;
         let (own, others): (Vec<_>, Vec<_>) = stats
             .into_values()
             .partition(|stats| stats.process == *process);
@@ -274,16 +260,13 @@ impl ScorerNode {
             progress: lock(&self.progress).clone(),
             unwritten,
         };
-        (scored, self.connection)
+        // The bus demands that all subscriptions are ended before it leaves.
+        drop((self.subscriptions, self.presence, self.offline));
+        if let Err(overdue) = self.bus.leave(LEAVE_LIMIT) {
+            tracing::warn!("{overdue}");
+        }
+        scored
     }
-}
-
-/// Connection of a scorer: its bus, subscriptions and liveliness token.
-struct ScorerConnection {
-    bus: Bus,
-    offline: OfflineIntervals,
-    subscriptions: Vec<Subscription>,
-    presence: LivelinessToken,
 }
 
 /// Id of the scorer in place of a vehicle's.
@@ -379,7 +362,7 @@ impl ScorerWorker {
         self.numbered.result(report);
         self.write_results(false);
         let began = self.published.get(&stamp.capture_nanos);
-        let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
+        let latency_ms = began.map(|began| ms_between(*began, stamp.publish_nanos));
         let neighbours = result.neighbours.clone();
         let fused = result.fused.len();
         let wire_bytes = result.fused.iter().map(|neighbour| neighbour.wire_bytes);

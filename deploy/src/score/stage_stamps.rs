@@ -51,11 +51,6 @@ impl StageStamps {
             detected_ms: Some(detected),
         }
     }
-
-    /// Milliseconds from the publication of the tick to `nanos`.
-    pub(crate) fn since_began_ms(&self, nanos: u64) -> Option<f64> {
-        self.began_nanos.map(|began| ms_between(began, nanos))
-    }
 }
 
 /// Time at which a stage began that ended at `end_ms`; `None` without one.
@@ -64,7 +59,8 @@ fn before_stage(stages: &[StageTiming], name: &str, end_ms: Option<f64>) -> Opti
     Some(end_ms? - stage.nanos as f64 / 1e6)
 }
 
-fn ms_between(began_nanos: u64, nanos: u64) -> f64 {
+/// Milliseconds from one time to another.
+pub(crate) fn ms_between(began_nanos: u64, nanos: u64) -> f64 {
     // Signed: the two times may be of two clocks.
     (nanos as f64 - began_nanos as f64) / 1e6
 }

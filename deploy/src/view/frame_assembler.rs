@@ -18,6 +18,7 @@ use super::scene_frame::{
     ShownVehicle, decimate,
 };
 use super::trails::Trails;
+use crate::score::ms_between;
 
 /// Largest number of incomplete scene frames.
 const MOST_OPEN: usize = 16;
@@ -279,8 +280,7 @@ impl FrameAssembler {
             Stream::Pose => rank,
             _ => return,
         };
-        // Signed: sender and viewer may have two clocks.
-        let latency_ms = (seen.arrived_nanos as f64 - seen.header.stamp.publish_nanos as f64) / 1e6;
+        let latency_ms = ms_between(seen.header.stamp.publish_nanos, seen.arrived_nanos);
         let arrivals = &mut self.frame(at).arrivals;
         // Of equal rank the later message counts.
         if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
@@ -328,8 +328,7 @@ impl OpenFrame {
         let began = self.truth.as_ref().map(|(began, _)| *began);
         let done = self.result.as_ref().map(|(done, _)| *done);
         let posed = result.and_then(|result| Some(self.poses.get(&result.ego)?.0));
-        let [latency_ms, posed_ms] =
-            [done, posed].map(|nanos| Some((nanos? as f64 - began? as f64) / 1e6));
+        let [latency_ms, posed_ms] = [done, posed].map(|nanos| Some(ms_between(began?, nanos?)));
         let processes = ledgers.iter().map(|(process, (_, stages))| Process {
             process: process.clone(),
             stages: stages.clone(),
@@ -426,16 +425,17 @@ impl OpenFrame {
             objects.entry(object.id).or_insert(object);
         }
         let shown = objects.into_values().map(|object| ShownBox {
+            box3d: Box3d {
+                center_m: object.world_from_object.translation_m,
+                size_m: object.size_m,
+                heading_rad: object.world_from_object.yaw_rad(),
+            },
             id: Some(object.id),
             is_counted: judgement.found.contains_key(&object.id),
             found_score: judgement.found.get(&object.id).copied().flatten(),
             speed_mps: object.speed_mps,
             class: Some(object.class.clone()),
-            ..ShownBox::of(Box3d {
-                center_m: object.world_from_object.translation_m,
-                size_m: object.size_m,
-                heading_rad: object.world_from_object.yaw_rad(),
-            })
+            ..ShownBox::default()
         });
         shown.collect()
     }
@@ -478,9 +478,10 @@ impl OpenFrame {
             return Vec::new();
         };
         let shown = found.map(|detection| ShownBox {
+            box3d: detection.box3d.transformed(&world_from_cav),
             score: Some(detection.score),
             source: source.or(detection.source.as_ref()).cloned(),
-            ..ShownBox::of(detection.box3d.transformed(&world_from_cav))
+            ..ShownBox::default()
         });
         shown.collect()
     }

@@ -6,6 +6,8 @@ use protocol::{CavId, HEADER_LEN, Stream, Topic};
 use recording::Entry;
 use serde::Serialize;
 
+use crate::score::ms_between;
+
 /// Traffic of the link from one vehicle to an ego, for one scene frame.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct LinkTraffic {
@@ -22,9 +24,7 @@ pub(crate) struct LinkTraffic {
 
 /// Messages of all links to one ego.
 #[derive(Debug, Default)]
-pub(super) struct LinkSeries {
-    links: BTreeMap<CavId, LinkMessages>,
-}
+pub(super) struct LinkSeries(BTreeMap<CavId, LinkMessages>);
 
 #[derive(Debug, Default)]
 struct LinkMessages {
@@ -58,13 +58,13 @@ impl LinkSeries {
             if ![Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points].contains(&stream) {
                 continue;
             }
-            let link = series.links.entry(cav.clone()).or_default();
+            let link = series.0.entry(cav.clone()).or_default();
             let (stamp, bytes) = (&entry.header.stamp, bytes(entry));
             if is_sent {
                 *link.sent.entry(stamp.capture_nanos).or_default() += bytes;
             }
             if is_arrived {
-                let transit_ms = (entry.arrived_nanos as f64 - stamp.publish_nanos as f64) / 1e6;
+                let transit_ms = ms_between(stamp.publish_nanos, entry.arrived_nanos);
                 let longest = link.transit_ms.entry(stamp.capture_nanos);
                 let longest = longest.or_insert(transit_ms);
                 *longest = longest.max(transit_ms);
@@ -72,7 +72,7 @@ impl LinkSeries {
                 link.arrived.push((entry.arrived_nanos, bytes));
             }
         }
-        for link in series.links.values_mut() {
+        for link in series.0.values_mut() {
             accumulate(&mut link.published);
             accumulate(&mut link.arrived);
         }
@@ -81,7 +81,7 @@ impl LinkSeries {
 
     /// Traffic of every link for the frame of a capture time, whose tick was published at `began_nanos`.
     pub(super) fn at(&self, capture_nanos: u64, began_nanos: Option<u64>) -> Vec<LinkTraffic> {
-        let traffic = self.links.iter().map(|(from, link)| LinkTraffic {
+        let traffic = self.0.iter().map(|(from, link)| LinkTraffic {
             from: from.clone(),
             sent_bytes: link.sent.get(&capture_nanos).copied().unwrap_or(0),
             transit_ms: link.transit_ms.get(&capture_nanos).copied(),

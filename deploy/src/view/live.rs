@@ -12,11 +12,10 @@ use bytes::Bytes;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use futures_util::{Stream as Pieces, stream};
 use protocol::{
-    Camera, CavId, ImageFormat, Key, KeyExpr, Kind, ProcessId, RunId, Stats, Stream, Topic, Verb,
-    wire,
+    Camera, CavId, ImageFormat, KeyExpr, Kind, ProcessId, RunId, Stats, Stream, Topic, Verb, wire,
 };
 use serde::Serialize;
-use support::sync::lock;
+use support::sync::{lock, spawn};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 use zenoh::Wait;
@@ -115,18 +114,15 @@ impl LiveRun {
         });
         let listener = LiveListener {
             bus,
-            run: run.clone(),
             shared: Arc::clone(&shared),
             assembly: FrameAssembler::new(protocol, BTreeMap::new()),
             others: BTreeMap::new(),
         };
-        let thread = thread::Builder::new()
-            .name("view".into())
-            .spawn(move || listener.run())
-            .map_err(|cause| BusError::Thread {
-                what: "the view".into(),
-                cause,
-            })?;
+        let thread = spawn("view", move || listener.run());
+        let thread = thread.map_err(|cause| BusError::Thread {
+            what: "the view".into(),
+            cause,
+        })?;
         Ok(Self {
             run,
             shared,
@@ -226,7 +222,6 @@ impl Drop for LiveRun {
 /// State of the thread.
 struct LiveListener {
     bus: Bus,
-    run: RunId,
     shared: Arc<LiveState>,
     /// Scene frames of the first ego with results.
     assembly: FrameAssembler,
@@ -235,8 +230,9 @@ struct LiveListener {
 }
 
 /// Subscribes to previews, and to all else that is shown.
-fn subscribe(bus: &Bus, run: &RunId) -> Result<[PassiveSubscriber; 2], BusError> {
+fn subscribe(bus: &Bus) -> Result<[PassiveSubscriber; 2], BusError> {
     use Stream::{Boxes, Descriptor, Detections, Pose, Tracks};
+    let run = &bus.identity().run;
     let streams = [Pose, Boxes, Detections, Tracks, Descriptor];
     let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
     selectors.extend([
@@ -261,7 +257,7 @@ impl LiveListener {
                 continue;
             }
             let Some([previews, rest]) = &subscriptions else {
-                match subscribe(&self.bus, &self.run) {
+                match subscribe(&self.bus) {
                     Ok(opened) => subscriptions = Some(opened),
                     Err(error) => {
                         tracing::error!("nothing is shown: {error}");
@@ -298,7 +294,7 @@ impl LiveListener {
             return;
         }
         if cameras.is_none() {
-            *cameras = self.open(&[KeyExpr::cameras(&self.run)], "images");
+            *cameras = self.open(&[KeyExpr::cameras(&self.bus.identity().run)], "images");
         }
         let Some(cameras) = cameras else { return };
         while let Pop::Item(_, message) = cameras.take(Some(Instant::now())) {
@@ -321,10 +317,9 @@ impl LiveListener {
             return;
         }
         if maps.is_none() {
-            let keys = wanted
-                .iter()
-                .map(|cav| Key::stream(&self.run, cav, Stream::Bev));
-            let selectors: Vec<KeyExpr> = keys.map(|key| KeyExpr::one(&key)).collect();
+            let topics = wanted.iter().map(|cav| Topic::stream(cav, Stream::Bev));
+            let keys = topics.map(|topic| KeyExpr::one(&self.bus.key(topic)));
+            let selectors: Vec<KeyExpr> = keys.collect();
             let opened = self.open(&selectors, "feature maps");
             *maps = opened.map(|opened| (wanted, opened));
         }

@@ -21,6 +21,7 @@ use super::scene_frame::{SceneFrame, ShownTrack};
 use super::trails::Trails;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
 use crate::operate::status::RunStatus;
+use crate::score::ms_between;
 
 /// Reason why a run cannot be shown.
 #[derive(Debug, thiserror::Error)]
@@ -343,7 +344,7 @@ impl RecordedRun {
             let arrived = *self.arrivals.get(&moment.capture_nanos)?;
             Some((moment.began_nanos?, arrived))
         });
-        let swept_ms = times.map(|(began, arrived)| (arrived as f64 - began as f64) / 1e6);
+        let swept_ms = times.map(|(began, arrived)| ms_between(began, arrived));
         let summary = timeline.summaries.get(index);
         let egos = self
             .timelines
@@ -420,7 +421,7 @@ impl RecordedRun {
             summary.detected = result.detections.len();
             summary.fused = result.fused.len();
             if let Some((began, truth)) = &truth {
-                summary.latency_ms = Some((*done as f64 - *began as f64) / 1e6);
+                summary.latency_ms = Some(ms_between(*began, *done));
                 summary.ego_error_m = ego_error_m(&result.pose, truth, result);
                 let area = self.areas.get(&result.ego);
                 summary.judged =

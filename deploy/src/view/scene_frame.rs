@@ -195,20 +195,6 @@ pub struct MessageCounts {
 }
 
 impl SceneFrame {
-    /// Every vehicle with its points, metres in the frame of its LiDAR.
-    pub fn clouds(&self) -> impl Iterator<Item = (&ShownVehicle, Vec<[f32; 3]>)> {
-        let mut rest = self.points.as_slice();
-        self.vehicles.iter().map(move |vehicle| {
-            // A frame that is cut off has fewer points, and is no reason to panic.
-            let (points, behind) = rest.split_at((vehicle.points * POINT_BYTES).min(rest.len()));
-            rest = behind;
-            let points = points.chunks_exact(POINT_BYTES).map(|point| {
-                [0, 2, 4].map(|i| f32::from(i16::from_le_bytes([point[i], point[i + 1]])) / 100.0)
-            });
-            (vehicle, points.collect())
-        })
-    }
-
     /// The frame as sent to the page.
     ///
     /// # Panics
@@ -219,16 +205,6 @@ impl SceneFrame {
         bytes.extend(json);
         bytes.extend(&self.points);
         bytes
-    }
-}
-
-impl ShownBox {
-    /// A box of which nothing else is known.
-    pub(super) fn of(box3d: Box3d) -> Self {
-        Self {
-            box3d,
-            ..Self::default()
-        }
     }
 }
 

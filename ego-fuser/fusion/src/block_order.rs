@@ -41,15 +41,11 @@ impl BlockOrder {
         let shape = [&[count][..], &sizes, &[channels]].concat();
         // Row and column of a level side by side, the largest windows first: then each window is one run.
         let by_level = (0..levels).flat_map(|level| [1 + level, 1 + levels + level]);
-        let order: Vec<i64> = [0]
-            .into_iter()
-            .chain(by_level)
-            .chain([2 * levels + 1])
-            .collect();
+        let order = [0].into_iter().chain(by_level).chain([2 * levels + 1]);
         let channels_last = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         channels_last
             .f_view(shape.as_slice())?
-            .f_permute(order)?
+            .f_permute(order.collect::<Vec<i64>>())?
             .f_reshape([count, height * width, channels])
     }
 
@@ -83,11 +79,7 @@ impl BlockOrder {
             let corners = (0..steps)
                 .flat_map(|row| (0..steps).map(move |column| [row * covered, column * covered]));
             places = corners
-                .flat_map(|[row, column]| {
-                    places
-                        .iter()
-                        .map(move |place| [row + place[0], column + place[1]])
-                })
+                .flat_map(|[row, column]| places.iter().map(move |[y, x]| [row + y, column + x]))
                 .collect();
             covered = level;
         }

@@ -42,16 +42,6 @@ impl Default for CoAlignConfig {
     }
 }
 
-impl CoAlignConfig {
-    /// The fusion, which has no parameters.
-    pub(crate) fn fusion(&self) -> Where2comm {
-        Where2comm::new(&Where2commConfig {
-            aggregation: self.aggregation,
-            missing: self.missing,
-        })
-    }
-}
-
 impl FusionSettings for CoAlignConfig {
     const KIND: &'static str = "coalign";
 
@@ -60,7 +50,10 @@ impl FusionSettings for CoAlignConfig {
     }
 
     fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        Ok(Box::new(self.fusion()))
+        Ok(Box::new(Where2comm::new(&Where2commConfig {
+            aggregation: self.aggregation,
+            missing: self.missing,
+        })))
     }
 
     fn requirements(&self) -> Requirements {

@@ -37,8 +37,7 @@ impl FusionSettings for SwapFusionConfig {
 #[derive(Debug)]
 pub struct Cobevt {
     fusion: SwapFusion,
-    window: i64,
-    count_missing: bool,
+    config: SwapFusionConfig,
 }
 
 impl Cobevt {
@@ -50,8 +49,7 @@ impl Cobevt {
         config.validate()?;
         Ok(Self {
             fusion: SwapFusion::new(path, config, true),
-            window: config.window,
-            count_missing: config.count_missing,
+            config: config.clone(),
         })
     }
 }
@@ -59,6 +57,7 @@ impl Cobevt {
 impl Fusion for Cobevt {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let agents = maps.count()?;
+        let (window, count_missing) = (self.config.window, self.config.count_missing);
         let order = nearest_first(&maps.metadata).to_device(maps.warped.features.device());
         let WarpedMaps { features, mask } =
             maps.warped.each(|map| map.f_index_select(0, &order))?;
@@ -66,9 +65,9 @@ impl Fusion for Cobevt {
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let features = if sees_all { features } else { features * &mask };
         // For published weights: empty slots are maps of zeros that count in the mean at the end.
-        let missing = (self.fusion.slots() - agents).max(0);
-        let empty = if self.count_missing { missing } else { 0 };
-        let padding = Padding::to_multiples(&features, self.window)?;
+        let missing = (self.config.slots - agents).max(0);
+        let empty = if count_missing { missing } else { 0 };
+        let padding = Padding::to_multiples(&features, window)?;
         let features = padding.maps(&features, empty)?;
         let is_full = sees_all && empty == 0 && padding.is_empty();
         let reach = (!is_full).then(|| padding.mask(&mask, empty)?.f_squeeze_dim(1));
@@ -76,7 +75,7 @@ impl Fusion for Cobevt {
         let slots = Slots {
             asked: agents,
             reach: reach.as_ref(),
-            count_missing: self.count_missing,
+            count_missing,
         };
         let fused = self.fusion.forward(&features, slots, maps.is_training)?;
         Ok(padding.crop(&fused)?.into())

@@ -103,6 +103,14 @@ pub(crate) fn sum_over_first(tensor: &Tensor) -> Result<Tensor, TchError> {
     tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None)
 }
 
+/// The tensors one after another along the first dimension; a single one is not copied.
+pub fn one_after_another(tensors: &[Tensor]) -> Result<Tensor, TchError> {
+    match tensors {
+        [only] => Ok(only.shallow_clone()),
+        tensors => Tensor::f_cat(tensors, 0),
+    }
+}
+
 /// Column and row of each cell of a square relative to that in its middle, up to `radius` away, row by row.
 pub(crate) fn offsets_around(radius: i64) -> Vec<i64> {
     let side = -radius..=radius;

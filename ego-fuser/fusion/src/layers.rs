@@ -118,19 +118,21 @@ impl LayerNorm {
     }
 }
 
-/// Two linear layers with GELU between them: `net.0` and `net.3`.
+/// Two linear layers with GELU between them, with pre-norm and a residual: `norm`, `fn.net.0` and `fn.net.3`.
 #[derive(Debug)]
-pub(crate) struct FeedForward {
+pub(crate) struct FeedForwardBlock {
+    norm: LayerNorm,
     wide: Linear,
     back: Linear,
     dropout: f64,
 }
 
-impl FeedForward {
+impl FeedForwardBlock {
     /// From `channels` to `hidden` and back.
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
-        let net = path / "net";
+        let net = path / "fn" / "net";
         Self {
+            norm: LayerNorm::new(&(path / "norm"), channels),
             wide: Linear::new(&(&net / 0), channels, hidden, true),
             back: Linear::residual(&(&net / 3), hidden, channels, true),
             dropout,
@@ -142,33 +144,9 @@ impl FeedForward {
     /// # Errors
     /// [`TchError`] when the number of channels differs.
     pub(crate) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        let hidden = dropout(self.wide.forward(x)?.f_gelu("none")?, self.dropout, train)?;
-        dropout(self.back.forward(&hidden)?, self.dropout, train)
-    }
-}
-
-/// A feed-forward network with pre-norm and a residual: `norm` and `fn`.
-#[derive(Debug)]
-pub(crate) struct FeedForwardBlock {
-    norm: LayerNorm,
-    feed_forward: FeedForward,
-}
-
-impl FeedForwardBlock {
-    /// From `channels` to `hidden` and back.
-    pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
-        Self {
-            norm: LayerNorm::new(&(path / "norm"), channels),
-            feed_forward: FeedForward::new(&(path / "fn"), channels, hidden, dropout),
-        }
-    }
-
-    /// `[..., channels]` to the same.
-    ///
-    /// # Errors
-    /// [`TchError`] when the number of channels differs.
-    pub(crate) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        Ok(x + self.feed_forward.forward(&self.norm.forward(x)?, train)?)
+        let hidden = self.wide.forward(&self.norm.forward(x)?)?.f_gelu("none")?;
+        let hidden = dropout(hidden, self.dropout, train)?;
+        Ok(x + dropout(self.back.forward(&hidden)?, self.dropout, train)?)
     }
 }
 
@@ -292,7 +270,7 @@ mod tests {
     #[test]
     fn other_channels_are_an_error() {
         let variables = VarStore::new(Device::Cpu);
-        let layer = FeedForward::new(&variables.root(), 4, 8, 0.1);
+        let layer = FeedForwardBlock::new(&variables.root(), 4, 8, 0.1);
         assert!(
             layer
                 .forward(&Tensor::zeros([2, 5], (Kind::Float, Device::Cpu)), false)
@@ -300,7 +278,9 @@ mod tests {
         );
         let names: Vec<_> = variables.variables().into_keys().collect();
         assert!(
-            names.iter().all(|name| name.starts_with("net.")),
+            names
+                .iter()
+                .all(|name| name.starts_with("norm.") || name.starts_with("fn.net.")),
             "{names:?}"
         );
     }

@@ -35,6 +35,19 @@ where
     Some(Isometry3::from_parts(shift, rotation))
 }
 
+/// Matches by their distances, nearest first: each index occurs once on either side.
+pub fn one_to_one(mut near: Vec<(f64, (usize, usize))>) -> Vec<(usize, usize)> {
+    near.sort_by(|one, other| one.0.total_cmp(&other.0));
+    let mut matches: Vec<(usize, usize)> = Vec::with_capacity(near.len());
+    for (_, pair) in near {
+        let mut known = matches.iter();
+        if known.all(|known| known.0 != pair.0 && known.1 != pair.1) {
+            matches.push(pair);
+        }
+    }
+    matches
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -149,28 +149,41 @@ impl OffsetTable {
     }
 }
 
-/// Attention among the tokens of a group.
+/// Attention among the tokens of a group and a feed-forward network, over one partition, each with pre-norm and a
+/// residual.
 #[derive(Debug)]
-struct GroupAttention {
+pub(super) struct HalfBlock {
+    partition: Partition,
+    norm: LayerNorm,
     to_qkv: Linear,
     offsets: OffsetTable,
     out: Linear,
+    feed_forward: FeedForwardBlock,
     dropout: f64,
 }
 
-impl GroupAttention {
-    fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
-        let channels = config.channels;
+impl HalfBlock {
+    pub(super) fn new(
+        partition: Partition,
+        attention: &nn::Path<'_>,
+        feed: &nn::Path<'_>,
+        config: &SwapFusionConfig,
+    ) -> Self {
+        let (channels, hidden) = (config.channels, config.hidden);
+        let inner = attention / "fn";
         Self {
-            to_qkv: Linear::new(&(path / "to_qkv"), channels, 3 * channels, false),
-            offsets: OffsetTable::new(path, config),
-            out: Linear::residual(&(path / "to_out" / 0), channels, channels, false),
+            partition,
+            norm: LayerNorm::new(&(attention / "norm"), channels),
+            to_qkv: Linear::new(&(&inner / "to_qkv"), channels, 3 * channels, false),
+            offsets: OffsetTable::new(&inner, config),
+            out: Linear::residual(&(&inner / "to_out" / 0), channels, channels, false),
+            feed_forward: FeedForwardBlock::new(feed, channels, hidden, config.dropout),
             dropout: config.dropout,
         }
     }
 
-    /// `[G, S, P, C]` to the same, of which the first `asked` slots are attended to.
-    fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> tch::Result<Tensor> {
+    /// Attention alone: `[G, S, P, C]` to the same, of which the first `asked` slots are attended to.
+    fn attend(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> tch::Result<Tensor> {
         let &[_, slots, _, channels] = &x.size()[..] else {
             return Err(shape_error(x));
         };
@@ -193,36 +206,9 @@ impl GroupAttention {
         let seen = attend(&query?, &key?, &value?, Some(bias))?;
         dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(x)
     }
-}
-
-/// Attention and a feed-forward network over one partition, each with pre-norm and a residual.
-#[derive(Debug)]
-pub(super) struct HalfBlock {
-    partition: Partition,
-    norm: LayerNorm,
-    attention: GroupAttention,
-    feed_forward: FeedForwardBlock,
-}
-
-impl HalfBlock {
-    pub(super) fn new(
-        partition: Partition,
-        attention: &nn::Path<'_>,
-        feed: &nn::Path<'_>,
-        config: &SwapFusionConfig,
-    ) -> Self {
-        let (channels, hidden) = (config.channels, config.hidden);
-        Self {
-            partition,
-            norm: LayerNorm::new(&(attention / "norm"), channels),
-            attention: GroupAttention::new(&(attention / "fn"), config),
-            feed_forward: FeedForwardBlock::new(feed, channels, hidden, config.dropout),
-        }
-    }
 
     fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> tch::Result<Tensor> {
-        let normed = self.norm.forward(x)?;
-        let seen = self.attention.forward(&normed, asked, bias, train)?;
+        let seen = self.attend(&self.norm.forward(x)?, asked, bias, train)?;
         self.feed_forward.forward(&(x + seen), train)
     }
 
@@ -235,8 +221,8 @@ impl HalfBlock {
         train: bool,
     ) -> tch::Result<Tensor> {
         let x = self.partition.cut(map, window)?;
-        let offsets = &self.attention.offsets;
-        let bias = offsets.masked_bias(x.size()[1], slots, self.partition)?;
+        let (offsets, count) = (&self.offsets, x.size()[1]);
+        let bias = offsets.masked_bias(count, slots, self.partition)?;
         self.forward(&x, slots.asked, &bias, train)
     }
 }
@@ -305,7 +291,6 @@ pub struct SwapFusion {
     halves: Vec<HalfBlock>,
     head: MeanHead,
     window: i64,
-    slots: i64,
 }
 
 impl SwapFusion {
@@ -335,13 +320,7 @@ impl SwapFusion {
             halves,
             head: MeanHead::new(&(path / "mlp_head"), config.channels),
             window: config.window,
-            slots: config.slots,
         }
-    }
-
-    /// Number of agents that its table of offsets covers.
-    pub fn slots(&self) -> i64 {
-        self.slots
     }
 
     /// Fuses `[S, C, H, W]` into `[C, H, W]`. H and W are multiples of the window; the first slot reaches every cell.
@@ -418,8 +397,7 @@ impl SwapFusion {
             None => order.f_view([count, size[0], size[1], 1])?,
         };
         let order = half.partition.cut(&order, self.window)?.f_view([-1])?;
-        let offsets = &half.attention.offsets;
-        let bias = offsets.bias(count, slots.asked)?.f_unsqueeze(0)?;
+        let bias = half.offsets.bias(count, slots.asked)?.f_unsqueeze(0)?;
         let unseen = slots.unseen(half.partition, self.window)?;
         let step = (CHUNK / (count * cells)).max(1);
         let mut done = Vec::new();

@@ -40,10 +40,11 @@ const GATE: ConfidenceGate = ConfidenceGate {
 };
 
 /// Operation that fuses the features of a cell.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MapAggregation {
     /// Attention of the ego over all, without parameters.
+    #[default]
     Attention,
     /// Element-wise maximum.
     Max,
@@ -61,8 +62,8 @@ pub enum Missing {
     Zero,
 }
 
-/// Settings of [`Where2comm`].
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// Settings of [`Where2comm`]; by default attention over the agents that sent the cell.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Where2commConfig {
     /// Operation that fuses the features of a cell.
@@ -70,16 +71,6 @@ pub struct Where2commConfig {
     /// Value of cells that were not received.
     #[serde(default)]
     pub missing: Missing,
-}
-
-impl Default for Where2commConfig {
-    /// Attention over the agents that sent the cell.
-    fn default() -> Self {
-        Self {
-            aggregation: MapAggregation::Attention,
-            missing: Missing::Absent,
-        }
-    }
 }
 
 impl FusionSettings for Where2commConfig {

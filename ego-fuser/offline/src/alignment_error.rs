@@ -7,7 +7,7 @@ use std::f64::consts::TAU;
 
 use dataset::{LeftOut, LoadOptions, Scenario};
 use perception::detector::Detector;
-use perception::weights::{METHOD_KEY, Weights};
+use perception::weights::Weights;
 use protocol::{PointCloud, Pose};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -68,8 +68,7 @@ impl AlignmentMeter {
     /// # Errors
     /// [`EgoError`] names the file and what is wrong with it.
     pub fn load(weights: &Weights) -> Result<Self, EgoError> {
-        let method = weights.metadata(METHOD_KEY);
-        let method = method.unwrap_or(Method::NONE.name()).parse()?;
+        let method = Method::of_weights(weights, None)?;
         let detector = Detector::from_weights(weights, &weights.detector_config()?, Device::Cpu)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config(), Device::Cpu)?;
         Ok(Self { detector, fusion })

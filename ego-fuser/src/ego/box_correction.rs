@@ -38,7 +38,7 @@ pub(super) fn correct_by_boxes(
         })
         .collect();
     for (map, corrected) in metadata.iter_mut().zip(correct(&observers, config)) {
-        map.ego_from_cav = corrected.ego_from_agent;
+        map.ego_from_cav = corrected;
     }
     Ok(())
 }
@@ -55,7 +55,7 @@ pub(super) fn corrected(ego_from_cav: Pose, received: &[Detection], own: &[Detec
         ego_from_agent,
         boxes,
     });
-    let corrected = correct(&pair, &config)[1].ego_from_agent;
+    let corrected = correct(&pair, &config)[1];
     let before = matched_boxes(&ego_from_cav, received, own);
     match matched_boxes(&corrected, received, own) >= before + MORE_MATCHES {
         true => corrected,

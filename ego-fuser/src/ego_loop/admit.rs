@@ -134,7 +134,9 @@ impl EgoLoop {
             true => now_nanos.saturating_sub(message.reception.arrived_nanos),
             false => u64::MAX,
         };
-        if let Some(pace) = self.pace.judge(capture_nanos, waited_nanos, now_nanos) {
+        if self.options.sets_pace
+            && let Some(pace) = self.pace.judge(capture_nanos, waited_nanos, now_nanos)
+        {
             self.outputs.push(Output::Pace(pace));
         }
         self.frames.push_back(OwnFrame {

@@ -150,21 +150,20 @@ impl EgoLoop {
         (self.cav.clone(), self.stream)
     }
 
-    /// Report of the neighbours received for a frame.
+    /// States of the neighbours whose messages were received for a frame, one for each view.
     fn states(&self, beliefs: &[(usize, Assessment)], views: &[View]) -> Vec<NeighbourState> {
-        let reports = views.iter().enumerate().map(|(index, view)| {
-            let assessment = beliefs.iter().find(|(known, _)| *known == index);
-            let assessment = assessment.map(|(_, assessment)| assessment);
-            NeighbourState {
-                trust: assessment.map(|assessment| assessment.trust),
-                misbehaviour: assessment.and_then(|assessment| assessment.misbehaviour),
-                clock_offset_s: self.clock_offsets_s.get(&view.cav).copied(),
-                ..NeighbourState::new(view.cav.clone())
+        let mut states = Vec::with_capacity(views.len());
+        for (index, view) in views.iter().enumerate() {
+            let mut state = NeighbourState::new(view.cav.clone());
+            state.clock_offset_s = self.clock_offsets_s.get(&view.cav).copied();
+            if let Some((_, assessment)) = beliefs.iter().find(|(of, _)| *of == index) {
+                state.trust = Some(assessment.trust);
+                state.misbehaviour = assessment.misbehaviour;
             }
-        });
-        let mut reports: Vec<_> = reports.collect();
-        self.clocks.describe(&mut reports);
-        reports
+            states.push(state);
+        }
+        self.clocks.describe(&mut states);
+        states
     }
 
     /// The neighbours' messages for a frame, and the neighbours without one.
@@ -207,33 +206,35 @@ impl EgoLoop {
         choice
     }
 
-    /// Counts the views that are in the result as received, and describes them.
+    /// Counts the messages of the views at `fused` as received, and describes their neighbours.
     fn mark_used(&mut self, own: &View, fused: &[usize], choice: &Choice) -> Vec<FusedNeighbour> {
         self.report.fused += fused.len() as u64;
         let mut described: Vec<FusedNeighbour> = Vec::with_capacity(fused.len());
         for &index in fused {
             let (view, message) = (&choice.views[index], &choice.messages[index]);
-            self.report.fused_boxes += u64::from(message.stream != self.stream);
             if message.stream == self.stream {
                 let cav = view.cav.clone();
                 self.fused_nanos.insert(cav, view.capture_nanos);
+            } else {
+                self.report.fused_boxes += 1;
             }
             self.count(view, message, None);
+            let age_nanos = view.age_nanos(own);
             // A neighbour is one, also by two messages: its boxes are read beside its map.
-            let same = described.iter_mut().find(|same| same.cav == view.cav);
-            if let Some(same) = same {
-                same.age_nanos = same.age_nanos.max(view.age_nanos(own));
-                same.payload_bytes += message.payload_bytes;
-                same.wire_bytes += message.wire_bytes;
-                continue;
+            match described.iter_mut().find(|known| known.cav == view.cav) {
+                Some(known) => {
+                    known.age_nanos = known.age_nanos.max(age_nanos);
+                    known.payload_bytes += message.payload_bytes;
+                    known.wire_bytes += message.wire_bytes;
+                }
+                None => described.push(FusedNeighbour {
+                    cav: view.cav.clone(),
+                    age_nanos,
+                    confidence: view.pose.confidence(),
+                    payload_bytes: message.payload_bytes,
+                    wire_bytes: message.wire_bytes,
+                }),
             }
-            described.push(FusedNeighbour {
-                cav: view.cav.clone(),
-                age_nanos: view.age_nanos(own),
-                confidence: view.pose.confidence(),
-                payload_bytes: message.payload_bytes,
-                wire_bytes: message.wire_bytes,
-            });
         }
         described
     }

@@ -10,7 +10,6 @@
 mod admit;
 mod decide;
 mod input;
-mod pace_keeper;
 pub mod recorded;
 mod waits;
 
@@ -23,11 +22,11 @@ use serde::Serialize;
 use crate::capture_clock::CaptureClocks;
 use crate::config::EgoSettings;
 use crate::ego::Ego;
+use crate::pace_control::PaceControl;
 use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
 use crate::silence::Silence;
 use crate::view::View;
-use pace_keeper::PaceKeeper;
 use tracking::{Tracker, TrackerConfig};
 use waits::Waits;
 
@@ -55,9 +54,10 @@ pub struct LoopOptions {
 impl LoopOptions {
     /// Options in simulation time, with these limits.
     pub fn stepped(settings: &EgoSettings) -> Self {
+        let max_age_nanos = settings.max_age_ms.saturating_mul(1_000_000);
         Self {
             deadline_nanos: settings.deadline_ms.saturating_mul(1_000_000),
-            pairing: settings.pairing(),
+            pairing: PairingConfig::with_max_age_nanos(max_age_nanos),
             sets_pace: false,
             has_exact_arrivals: true,
             tracks: settings.tracks,
@@ -117,7 +117,7 @@ pub struct EgoLoop {
     /// System clock of a neighbour minus the ego's, seconds, as of its last message.
     clock_offsets_s: BTreeMap<CavId, f64>,
     frames: VecDeque<OwnFrame>,
-    pace: PaceKeeper,
+    pace: PaceControl,
     tracker: Option<Tracker>,
     /// Capture time of the ego's newest sweep, nanoseconds.
     own_nanos: Option<u64>,
@@ -156,7 +156,7 @@ impl EgoLoop {
             clocks: CaptureClocks::new(options.has_exact_arrivals),
             clock_offsets_s: BTreeMap::new(),
             frames: VecDeque::new(),
-            pace: PaceKeeper::new(options.sets_pace),
+            pace: PaceControl::new(),
             tracker: options.tracks.then(|| Tracker::new(tracker_config)),
             own_nanos: None,
             ended: BTreeSet::new(),

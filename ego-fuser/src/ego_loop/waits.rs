@@ -78,20 +78,17 @@ impl Waits {
     pub(super) fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         let Self { ego, stream, .. } = self;
         let late_before = now_nanos.saturating_sub(AFTER_NANOS);
-        let no_own = { self.own_nanos }
-            // An agent that publishes other streams is named for that instead.
-            .filter(|since| *since < late_before && !self.without.contains_key(ego))
-            .map(|since| (format!("no {stream} of agent {ego}"), since));
+        // An agent that publishes other streams is named for that instead.
+        let own_nanos = self.own_nanos.filter(|_| !self.without.contains_key(ego));
+        let no_own = own_nanos.filter(|since| *since < late_before);
+        let no_own = no_own.map(|since| (format!("no {stream} of agent {ego}"), since));
         let without = self.without.iter().map(|(cav, (published, since))| {
             let method = &self.method;
             let problem = format!("{method} needs {stream}, agent {cav} publishes {published}");
             (problem, *since)
         });
-        let gone = self
-            .gone
-            .iter()
-            .filter(|(_, since)| **since < late_before)
-            .map(|(cav, since)| (format!("vehicle {cav} is gone"), *since));
+        let gone = self.gone.iter().filter(|(_, since)| **since < late_before);
+        let gone = gone.map(|(cav, since)| (format!("vehicle {cav} is gone"), *since));
         no_own.into_iter().chain(without).chain(gone).collect()
     }
 }

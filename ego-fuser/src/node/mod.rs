@@ -14,9 +14,7 @@ use bus::{
     Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription, unix_nanos,
 };
 use protocol::message::{FrameReport, StageTiming};
-use protocol::{
-    Body, CavId, Detections, Encoded, Limits, Payload, Role, Stamp, Stream, Topic, wire,
-};
+use protocol::{Body, CavId, Detections, Encoded, Payload, Role, Stamp, Stream, Topic, wire};
 use serde::Serialize;
 
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
@@ -49,8 +47,6 @@ pub struct NodeOptions {
     pub over_link: bool,
     /// True to continue when the own agent has ended, for its next instance.
     pub keeps_running: bool,
-    /// Limits of received messages.
-    pub limits: Limits,
     /// Limits of the inbox, for each sender and in total.
     pub inbox: InboxLimits,
     /// File in which the inputs of the loop are recorded; `None`: they are not.
@@ -76,7 +72,6 @@ impl From<&EgoSettings> for NodeOptions {
             neighbours: None,
             over_link: false,
             keeps_running: false,
-            limits: Limits::DEFAULT,
             inbox: settings.inbox.limits(),
             inputs: None,
         }
@@ -245,7 +240,11 @@ impl<'a> EgoNode<'a> {
     fn receive(&mut self, stop: &Stop) -> Result<(), BusError> {
         let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() && !self.ego_loop.is_finished() {
-            self.look_round()?;
+            if let Some(neighbourhood) = &mut self.neighbourhood {
+                for change in neighbourhood.update(self.bus, &self.inbox)? {
+                    self.handle(change);
+                }
+            }
             match self.inbox.take(Some(self.next_moment())) {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
                 Pop::Item(topic, Event::End { .. }) => self.end(&topic),
@@ -270,16 +269,6 @@ impl<'a> EgoNode<'a> {
         {
             self.handle(Input::Ended(cav.clone()));
         }
-    }
-
-    fn look_round(&mut self) -> Result<(), BusError> {
-        let Some(neighbourhood) = &mut self.neighbourhood else {
-            return Ok(());
-        };
-        for change in neighbourhood.update(self.bus, &self.inbox)? {
-            self.handle(change);
-        }
-        Ok(())
     }
 
     /// Records an input without a message, hands it to the loop and carries out what that decides.

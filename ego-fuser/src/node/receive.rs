@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use bus::{Arrival, LINK_TRANSIT_S, NETWORK_TRANSIT_S};
 use protocol::message::Descriptor;
-use protocol::{CavId, Stream};
+use protocol::{CavId, Limits, Stream};
 
 use super::EgoNode;
 use crate::capture_clock::SweepTime;
@@ -29,7 +29,7 @@ impl EgoNode<'_> {
             transport,
             clock_offset_s: stats.measured_clock_offset_s(cav),
         };
-        let (header, limits) = (&arrival.header, &self.options.limits);
+        let (header, limits) = (&arrival.header, &Limits::DEFAULT);
         let ego_loop = &self.ego_loop;
         let decoded = ego_loop.decode(&reception, header, arrival.pieces(), limits);
         let message = match decoded {
@@ -53,8 +53,8 @@ impl EgoNode<'_> {
 
     /// Processes an agent's descriptor: its network, and the arrivals of its sweeps.
     fn admit_descriptor(&mut self, cav: &CavId, arrival: &Arrival) {
-        let limits = &self.options.limits;
-        let Some(descriptor) = self.inbox.decode::<Descriptor>(arrival, limits) else {
+        let descriptor = self.inbox.decode::<Descriptor>(arrival, &Limits::DEFAULT);
+        let Some(descriptor) = descriptor else {
             return;
         };
         let stats = self.bus.stats();

@@ -34,20 +34,17 @@ impl AccessControl {
         for member in &self.members {
             let name = member.to_string();
             let own = rules_of(&name, &member.rights(&self.runs));
-            let names = own.iter().map(|rule| rule["id"].clone());
-            let names = [json!(SUBSCRIBERS_RULE)].into_iter().chain(names);
-            let names: Vec<Value> = names.collect();
+            let mut names = vec![json!(SUBSCRIBERS_RULE)];
+            names.extend(own.iter().map(|rule| rule["id"].clone()));
             rules.extend(own);
-            subjects
-                .push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]}));
+            subjects.push(subject(&name));
             policies.push(json!({"id": name, "rules": names, "subjects": [name]}));
         }
         // The process of the router receives its own probes over a second session.
         let messages = ["declare_subscriber", "put"];
         let probes = rule(PROBE_KEY, &["ingress", "egress"], &messages, &[PROBE_KEY]);
         rules.push(probes);
-        subjects
-            .push(json!({"id": ROUTER, "cert_common_names": [ROUTER], "link_protocols": ["quic"]}));
+        subjects.push(subject(ROUTER));
         policies.push(json!({"id": ROUTER, "rules": [PROBE_KEY], "subjects": [ROUTER]}));
         json!({
             "enabled": true,
@@ -77,6 +74,11 @@ pub(super) fn size_limits() -> Value {
 }
 
 const SUBSCRIBERS_RULE: &str = "subscribers";
+
+/// The process whose certificate has this common name.
+fn subject(name: &str) -> Value {
+    json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]})
+}
 
 fn rule(id: &str, flows: &[&str], messages: &[&str], keys: &[&str]) -> Value {
     json!({

@@ -113,24 +113,6 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
         self.changed.notify_all();
     }
 
-    /// Takes all items at once, oldest first.
-    pub fn drain(&self) -> Vec<(K, T)> {
-        let mut state = lock(&self.state);
-        let drained = std::iter::from_fn(|| pop_oldest(&mut state.lanes)).collect();
-        self.changed.notify_all();
-        drained
-    }
-
-    /// Number of items.
-    pub fn len(&self) -> usize {
-        lock(&self.state).lanes.values().map(VecDeque::len).sum()
-    }
-
-    /// True if there is no item.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     /// Appends `item` to its lane; one of `capacity` items is waited for (`waits`), or gives up its oldest item.
     fn append(&self, key: K, item: T, capacity: usize, waits: bool) -> PushOutcome<T> {
         let mut state = lock(&self.state);
@@ -191,7 +173,9 @@ mod tests {
         assert_eq!(queue.push("a", 2), PushOutcome::Queued);
         assert_eq!(queue.push("b", 3), PushOutcome::Queued);
         assert_eq!(queue.push("a", 4), PushOutcome::Replaced(1));
-        assert_eq!(queue.drain(), [("a", 2), ("b", 3), ("a", 4)]);
+        for (lane, item) in [("a", 2), ("b", 3), ("a", 4)] {
+            assert_eq!(queue.take(None), Pop::Item(lane, item));
+        }
     }
 
     #[test]

@@ -96,8 +96,7 @@ impl Bus {
         let status = StatusPublisher::new();
         let status_thread = status.start(StatusSender {
             session: session.clone(),
-            run: identity.run.clone(),
-            cav: identity.cav.clone(),
+            identity: identity.clone(),
             epoch,
             stats: stats.clone(),
             sequence: 0,

@@ -42,7 +42,8 @@ pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, FileErro
         let fields = match &field {
             // The hint about kinds of files concerns fields of the top level only.
             Some(nested) if nested.contains('.') => Vec::new(),
-            _ => fields_of(text),
+            _ => serde_saphyr::from_str::<BTreeMap<String, IgnoredAny>>(text)
+                .map_or_else(|_| Vec::new(), |fields| fields.into_keys().collect()),
         };
         let reason = unknown_field::explained(reason(&error), &fields);
         let problem = field.map_or(reason.clone(), |field| format!("{field}: {reason}"));
@@ -60,12 +61,6 @@ fn reason(error: &serde_saphyr::Error) -> String {
     line.rsplit_once(" at line ")
         .map_or(line, |(reason, _)| reason)
         .to_owned()
-}
-
-/// Names of the fields on the top level of a text.
-fn fields_of(text: &str) -> Vec<String> {
-    serde_saphyr::from_str::<BTreeMap<String, IgnoredAny>>(text)
-        .map_or_else(|_| Vec::new(), |fields| fields.into_keys().collect())
 }
 
 #[cfg(test)]

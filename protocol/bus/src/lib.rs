@@ -84,7 +84,7 @@ pub use heartbeat::Heartbeat;
 pub use inbox_limits::InboxLimits;
 pub use liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
 pub use membership::Membership;
-pub use message_stats::{MessageStats, PeerSummary, SharedMemoryUse};
+pub use message_stats::{MessageStats, SharedMemoryUse};
 pub use metrics::MetricsPeer;
 pub use passive_subscriber::{PassiveSubscriber, RawMessage};
 pub use process_config::{Configured, ProcessConfig, minimal};

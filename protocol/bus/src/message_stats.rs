@@ -73,21 +73,12 @@ struct CounterState {
     is_full: bool,
 }
 
-#[derive(Debug, Default)]
-struct Peer {
-    clock: Option<ClockOffset>,
-    trust: Option<f64>,
-}
-
 /// State of a vehicle at this process.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PeerSummary {
-    /// The vehicle.
-    pub cav: CavId,
-    /// Its clock minus ours, seconds, minus the shortest transit time.
-    pub clock_offset_s: Option<f64>,
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Peer {
+    pub(super) clock: Option<ClockOffset>,
     /// Trust score, 0..1; only with misbehaviour detection.
-    pub trust: Option<f64>,
+    pub(super) trust: Option<f64>,
 }
 
 /// Upper bounds of the histogram's buckets, seconds.
@@ -282,14 +273,8 @@ impl MessageStats {
     }
 
     /// State of the vehicles that have sent messages.
-    pub fn peers(&self) -> Vec<PeerSummary> {
-        let state = self.lock();
-        let peers = state.peers.iter().map(|(cav, peer)| PeerSummary {
-            cav: cav.clone(),
-            clock_offset_s: peer.clock.as_ref().map(ClockOffset::seconds),
-            trust: peer.trust,
-        });
-        peers.collect()
+    pub(super) fn peers(&self) -> BTreeMap<CavId, Peer> {
+        self.lock().peers.clone()
     }
 
     /// Sets the problems of a kind, in place of those before: text, and time of the beginning. Each

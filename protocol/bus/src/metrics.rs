@@ -13,11 +13,11 @@ use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::metrics::{MetricType, TypedMetric};
 use prometheus_client::registry::{Registry, Unit};
 
-use protocol::Account;
+use protocol::{Account, CavId};
 
 pub use fleet::MetricsPeer;
 
-use super::{FrameStats, MessageStats, PeerSummary, process_usage};
+use super::{FrameStats, MessageStats, process_usage};
 use crate::web::{Answer, WebServer};
 
 /// Serves `stats`, and the series of `others`, at `http://<address>/metrics` until dropped; port 0: any free port.
@@ -152,8 +152,8 @@ fn topic_and_side(account: &Account) -> [(&'static str, String); 2] {
     [topic_label(account), ("side", side.to_owned())]
 }
 
-fn vehicle_label(peer: &PeerSummary) -> [(&'static str, String); 1] {
-    [("vehicle", peer.cav.to_string())]
+fn vehicle_label(cav: &CavId) -> [(&'static str, String); 1] {
+    [("vehicle", cav.to_string())]
 }
 
 #[derive(Debug)]
@@ -212,14 +212,14 @@ impl Collector for StatsCollector {
             "Clock of a vehicle minus ours, minus the shortest transit time",
         );
         let seconds = Some(&Unit::Seconds);
-        let series = peers
-            .iter()
-            .filter_map(|peer| Some((vehicle_label(peer), ConstGauge::new(peer.clock_offset_s?))));
+        let series = peers.iter().filter_map(|(cav, peer)| {
+            Some((vehicle_label(cav), ConstGauge::new(peer.clock?.seconds())))
+        });
         encode_series(&mut encoder, help, seconds, series)?;
         let help = ("trust", "Trust score of a vehicle, 0 to 1");
         let series = peers
             .iter()
-            .filter_map(|peer| Some((vehicle_label(peer), ConstGauge::new(peer.trust?))));
+            .filter_map(|(cav, peer)| Some((vehicle_label(cav), ConstGauge::new(peer.trust?))));
         encode_series(&mut encoder, help, None, series)?;
         let help = "Duration of a stage for one frame";
         let mut stages =
@@ -237,7 +237,7 @@ impl Collector for StatsCollector {
 mod tests {
     use std::time::Duration;
 
-    use protocol::{CavId, DropReason, ProcessId, Stream, Topic};
+    use protocol::{DropReason, ProcessId, Stream, Topic};
 
     use super::*;
 

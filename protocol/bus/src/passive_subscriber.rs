@@ -46,14 +46,8 @@ impl RawMessage {
         self.payload.to_bytes()
     }
 
-    /// Number of bytes.
-    pub fn len(&self) -> usize {
+    fn len(&self) -> usize {
         self.payload.len()
-    }
-
-    /// True if there are no bytes.
-    pub fn is_empty(&self) -> bool {
-        self.payload.is_empty()
     }
 }
 

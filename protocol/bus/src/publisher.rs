@@ -383,13 +383,18 @@ impl SendingThread {
     }
 
     fn stamp(&self, capture_nanos: u64) -> Stamp {
-        Stamp {
-            cav: self.cav.clone(),
-            epoch: self.epoch,
-            sequence: self.sequence,
-            capture_nanos,
-            publish_nanos: unix_nanos(),
-        }
+        stamp_now(&self.cav, self.epoch, self.sequence, capture_nanos)
+    }
+}
+
+/// Stamp of a message that is published now.
+pub(super) fn stamp_now(cav: &CavId, epoch: u64, sequence: u64, capture_nanos: u64) -> Stamp {
+    Stamp {
+        cav: cav.clone(),
+        epoch,
+        sequence,
+        capture_nanos,
+        publish_nanos: unix_nanos(),
     }
 }
 

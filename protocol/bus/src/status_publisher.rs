@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use protocol::{CavId, Control, Key, Payload, RunId, Stamp, Stats, Topic, wire};
+use protocol::{Control, Key, Payload, Stats, Topic, wire};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
@@ -17,9 +17,9 @@ use support::sync::{lock, spawn};
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::process_usage::process_usage;
-use super::publisher::{payload, unix_nanos};
+use super::publisher::{payload, stamp_now};
 use super::watchdog::Watchdog;
-use super::{BusError, MessageStats};
+use super::{BusError, Identity, MessageStats};
 
 /// Interval of the heartbeats, which carry ledger and confirmed routes; probes are answered in addition.
 const PERIOD: Duration = Duration::from_millis(500);
@@ -105,8 +105,7 @@ impl StatusPublisher {
 /// State of the status thread.
 pub(super) struct StatusSender {
     pub(super) session: Session,
-    pub(super) run: RunId,
-    pub(super) cav: CavId,
+    pub(super) identity: Identity,
     pub(super) epoch: u64,
     pub(super) stats: MessageStats,
     pub(super) sequence: u64,
@@ -121,7 +120,12 @@ impl StatusSender {
         loop {
             match shared.queue.take(Some(next)) {
                 Pop::Item((), StatusTask::Ready) => self.ready(shared),
-                Pop::Item((), StatusTask::Control(control, nanos)) => self.control(control, nanos),
+                Pop::Item((), StatusTask::Control(control, nanos)) => {
+                    if let Some(verb) = control.verb() {
+                        let key = Topic::Control(verb).in_run(&self.identity.run);
+                        self.put(&key, Priority::InteractiveHigh, nanos, control);
+                    }
+                }
                 Pop::TimedOut => {
                     // From now, not from the time due: no burst of heartbeats follows a stall.
                     next = Instant::now() + PERIOD;
@@ -145,8 +149,8 @@ impl StatusSender {
             if !mem::replace(&mut self.is_start_reported, true) {
                 self.stats();
             }
-            let process = self.stats.process().clone();
-            let key = Topic::Ready(process.clone()).in_run(&self.run);
+            let process = self.identity.process.clone();
+            let key = Topic::Ready(process.clone()).in_run(&self.identity.run);
             let ready = Control::Ready {
                 process,
                 subscribed,
@@ -155,16 +159,9 @@ impl StatusSender {
         }
     }
 
-    fn control(&mut self, control: Control, capture_nanos: u64) {
-        if let Some(verb) = control.verb() {
-            let key = Topic::Control(verb).in_run(&self.run);
-            self.put(&key, Priority::InteractiveHigh, capture_nanos, control);
-        }
-    }
-
     fn stats(&mut self) {
-        let process = self.stats.process().clone();
-        let key = Key::stats(&self.run, &process);
+        let process = self.identity.process.clone();
+        let key = Key::stats(&self.identity.run, &process);
         let stats = Stats {
             process,
             ledger: self.stats.ledger(),
@@ -177,13 +174,8 @@ impl StatusSender {
     }
 
     fn put<M: Payload>(&mut self, key: &Key, priority: Priority, capture_nanos: u64, message: M) {
-        let stamp = Stamp {
-            cav: self.cav.clone(),
-            epoch: self.epoch,
-            sequence: self.sequence,
-            capture_nanos,
-            publish_nanos: unix_nanos(),
-        };
+        let cav = &self.identity.cav;
+        let stamp = stamp_now(cav, self.epoch, self.sequence, capture_nanos);
         self.sequence += 1;
         let encoded = match wire::encode(&stamp, message) {
             Ok(encoded) => encoded,

@@ -90,11 +90,6 @@ pub struct Readers {
 }
 
 impl Readers {
-    /// Number of open connections.
-    pub fn open(&self) -> usize {
-        MAX_CONNECTIONS - self.places.available_permits()
-    }
-
     /// Number of readers that did not read, and of connections beyond the maximum.
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
@@ -315,6 +310,11 @@ mod tests {
         WebServer::start("127.0.0.1:0".parse().unwrap(), handler).unwrap()
     }
 
+    /// Number of open connections.
+    fn open(server: &WebServer) -> usize {
+        MAX_CONNECTIONS - server.readers.places.available_permits()
+    }
+
     fn wait_for(what: &str, condition: impl Fn() -> bool) {
         let deadline = Instant::now() + Duration::from_secs(60);
         while !condition() {
@@ -431,7 +431,7 @@ mod tests {
         let mut connection = TcpStream::connect(server.address()).unwrap();
         connection.write_all(b"GET / HTTP/1.1\r\n\r\n").unwrap();
         wait_for("the reader is dropped", || server.readers().dropped() == 1);
-        wait_for("its thread has ended", || server.readers().open() == 0);
+        wait_for("its thread has ended", || open(&server) == 0);
     }
 
     #[test]
@@ -441,9 +441,7 @@ mod tests {
             .map(|_| TcpStream::connect(server.address()).unwrap())
             .collect();
         wait_for("three are refused", || server.readers().dropped() == 3);
-        wait_for("idle connections are closed", || {
-            server.readers().open() == 0
-        });
+        wait_for("idle connections are closed", || open(&server) == 0);
         assert_eq!(server.readers().dropped(), 3, "and are no readers");
         drop(connections);
         assert!(fetch(server.address(), "/").is_ok());
@@ -466,7 +464,7 @@ mod tests {
         assert!(fetch(address, "/panic").unwrap().0.contains("500"));
         let mut waiting = TcpStream::connect(address).unwrap();
         waiting.write_all(b"GET /slow HTTP/1.1\r\n\r\n").unwrap();
-        wait_for("it is let in", || server.readers().open() == 1);
+        wait_for("it is let in", || open(&server) == 1);
         assert!(fetch(address, "/").unwrap().0.contains("200"));
         let began = Instant::now();
         drop(server);

@@ -31,15 +31,20 @@ pub(crate) fn pose(py: Python<'_>, pose: &Pose) -> PyResult<Matrix> {
     rows(py, matrix_rows(pose).into())
 }
 
-/// Transforms as `[N, 4, 4]`.
-pub(crate) fn poses(py: Python<'_>, poses: &[Pose]) -> PyResult<Py<PyArray3<f64>>> {
-    let values: Vec<[f64; 4]> = poses.iter().flat_map(matrix_rows).collect();
+/// Matrices as `[N, 4, 4]`.
+pub(crate) fn matrices<T: numpy::Element>(
+    py: Python<'_>,
+    matrices: impl ExactSizeIterator<Item = [[T; 4]; 4]>,
+) -> PyResult<Py<PyArray3<T>>> {
+    let shape = [matrices.len(), 4, 4];
+    let values: Vec<[T; 4]> = matrices.flatten().collect();
     Ok(PyArray1::from_vec(py, values.into_flattened())
-        .reshape([poses.len(), 4, 4])?
+        .reshape(shape)?
         .unbind())
 }
 
-fn matrix_rows(pose: &Pose) -> [[f64; 4]; 4] {
+/// Rows of a transform.
+pub(crate) fn matrix_rows(pose: &Pose) -> [[f64; 4]; 4] {
     let matrix = pose.isometry().to_homogeneous();
     std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{Dataset, Layout, LoadOptions};
 use pyo3::exceptions::PyIndexError;
-use pyo3::{Py, PyErr, PyRef, PyResult, Python, pyclass, pyfunction, pymethods};
+use pyo3::{Py, PyRef, PyResult, Python, pyclass, pyfunction, pymethods};
 
 use crate::error::error;
 use crate::frame::FleetFrame;
@@ -15,7 +15,16 @@ use crate::recording_frames::RecordingFrames;
 /// Frames of a data set or recording.
 #[pyclass(frozen, module = "v2vloc")]
 pub(crate) struct DataSet {
+    #[pyo3(get)]
     path: PathBuf,
+    #[pyo3(get)]
+    layout: &'static str,
+    #[pyo3(get)]
+    scenarios: Vec<String>,
+    #[pyo3(get)]
+    problems: Vec<String>,
+    /// Number of frames.
+    count: usize,
     options: LoadOptions,
     protocol: EvaluationProtocol,
     source: FrameSet,
@@ -30,7 +39,7 @@ impl DataSet {
     fn load(&self, index: usize) -> Option<FrameParts> {
         let dataset = match &self.source {
             FrameSet::Folder(dataset) => dataset,
-            FrameSet::Recording(recording) => return recording.load(index),
+            FrameSet::Recording(recording) => return recording.load(index, &self.protocol),
         };
         let mut tick = index;
         for scenario in &dataset.scenarios {
@@ -69,18 +78,11 @@ impl DataSet {
 #[pymethods]
 impl DataSet {
     fn __len__(&self) -> usize {
-        match &self.source {
-            FrameSet::Folder(dataset) => dataset
-                .scenarios
-                .iter()
-                .map(|scenario| scenario.ticks.len())
-                .sum(),
-            FrameSet::Recording(recording) => recording.frames.len(),
-        }
+        self.count
     }
 
     fn __getitem__(&self, py: Python<'_>, index: isize) -> PyResult<FleetFrame> {
-        let count = self.__len__();
+        let count = self.count;
         let wanted = if index < 0 {
             count.checked_add_signed(index)
         } else {
@@ -111,45 +113,10 @@ impl DataSet {
         ))
     }
 
-    #[getter]
-    fn path(&self) -> &PathBuf {
-        &self.path
-    }
-
-    #[getter]
-    fn layout(&self) -> &'static str {
-        match &self.source {
-            FrameSet::Folder(dataset) => dataset.layout.name(),
-            FrameSet::Recording(_) => Layout::RECORDING.name(),
-        }
-    }
-
-    #[getter]
-    fn scenarios(&self) -> Vec<String> {
-        match &self.source {
-            FrameSet::Folder(dataset) => dataset
-                .scenarios
-                .iter()
-                .map(|scenario| scenario.name.clone())
-                .collect(),
-            FrameSet::Recording(recording) => vec![recording.run.clone()],
-        }
-    }
-
-    #[getter]
-    fn problems(&self) -> Vec<String> {
-        match &self.source {
-            FrameSet::Folder(dataset) => dataset.problems.iter().map(ToString::to_string).collect(),
-            FrameSet::Recording(recording) => recording.problems(),
-        }
-    }
-
     fn __repr__(&self) -> String {
         format!(
             "DataSet({:?}, {}, {} frames)",
-            self.path,
-            self.layout(),
-            self.__len__()
+            self.path, self.layout, self.count
         )
     }
 }
@@ -191,24 +158,35 @@ pub(crate) fn read(
         cameras,
         ..LoadOptions::default()
     };
-    let opened: Result<_, PyErr> = py.detach(|| {
+    py.detach(|| -> PyResult<DataSet> {
         let protocols = ProtocolConfig::default();
         let of_recording = protocols.resolve(Layout::RECORDING).map_err(error)?;
-        let recording = dataset::recording_of(&path)
-            .map(|file| RecordingFrames::open(&file, &options, of_recording.clone()));
+        let recording =
+            dataset::recording_of(&path).map(|file| RecordingFrames::open(&file, &options));
         if let Some(Ok(recording)) = recording {
-            return Ok((FrameSet::Recording(Box::new(recording)), of_recording));
+            return Ok(DataSet {
+                path,
+                layout: Layout::RECORDING.name(),
+                scenarios: vec![recording.run.clone()],
+                problems: recording.problems(),
+                count: recording.frames.len(),
+                options,
+                protocol: of_recording,
+                source: FrameSet::Recording(Box::new(recording)),
+            });
         }
         // A recording that cannot be read gives the same error here.
         let dataset = dataset::open(&path).map_err(error)?;
-        let protocol = protocols.resolve(dataset.layout).map_err(error)?;
-        Ok((FrameSet::Folder(dataset), protocol))
-    });
-    let (source, protocol) = opened?;
-    Ok(DataSet {
-        path,
-        options,
-        protocol,
-        source,
+        let scenarios = &dataset.scenarios;
+        Ok(DataSet {
+            path,
+            layout: dataset.layout.name(),
+            scenarios: scenarios.iter().map(|one| one.name.clone()).collect(),
+            problems: dataset.problems.iter().map(ToString::to_string).collect(),
+            count: scenarios.iter().map(|one| one.ticks.len()).sum(),
+            options,
+            protocol: protocols.resolve(dataset.layout).map_err(error)?,
+            source: FrameSet::Folder(dataset),
+        })
     })
 }

@@ -49,8 +49,7 @@ impl DecodedMessage {
     /// Decodes a message that was published on a key.
     pub(crate) fn of_key(key: &Key, bytes: &[u8]) -> Result<Self, protocol::WireError> {
         if let Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } = &key.topic {
-            let header = wire::decode_header([bytes])?;
-            let message = decode_stream(cav, *stream, [bytes])?;
+            let (header, message) = decode_stream(cav, *stream, [bytes])?;
             return Self::new(header, message, bytes.len());
         }
         // Only a liveliness token has no kind here, and it carries no message.
@@ -75,9 +74,13 @@ impl DecodedMessage {
 }
 
 impl PyMessage {
-    pub(crate) fn new(py: Python<'_>, key: Option<String>, sent: DecodedMessage) -> PyResult<Self> {
-        let Header { kind, stamp, .. } = sent.header;
-        let payload = match sent.content {
+    pub(crate) fn new(
+        py: Python<'_>,
+        key: Option<String>,
+        decoded: DecodedMessage,
+    ) -> PyResult<Self> {
+        let Header { kind, stamp, .. } = decoded.header;
+        let payload = match decoded.content {
             DecodedContent::Bev(bev) => PyBev::new(py, bev)?.into_any(),
             DecodedContent::Other(message) => payload(py, &stamp.cav, message)?,
         };
@@ -89,7 +92,7 @@ impl PyMessage {
             sequence: stamp.sequence,
             capture_time_ns: stamp.capture_nanos,
             publish_time_ns: stamp.publish_nanos,
-            wire_bytes: sent.wire_bytes,
+            wire_bytes: decoded.wire_bytes,
             payload,
         })
     }
@@ -104,7 +107,7 @@ fn payload(py: Python<'_>, cav: &CavId, message: Message) -> PyResult<Py<PyAny>>
         Message::Detections(found) => PyDetections::of_ego(py, &found)?.into_any(),
         Message::Tracks(tracks) => PyTracks::new(py, &tracks)?.into_any(),
         Message::Camera(camera) => PyCamera::new(py, &camera)?.into_any(),
-        Message::Points(sent) => PyAgent::new(py, AgentParts::of_points(cav, sent))?
+        Message::Points(points) => PyAgent::new(py, AgentParts::of_points(cav, points))?
             .0
             .into_any(),
         Message::Truth(truth) => {
@@ -122,14 +125,14 @@ fn payload(py: Python<'_>, cav: &CavId, message: Message) -> PyResult<Py<PyAny>>
         Message::Gnss(gnss) => {
             let made = json::to_python(py, &gnss)?;
             let pose = arrays::pose(py, &gnss.world_from_lidar)?;
-            made.set_item("world_from_lidar", pose)?;
-            made.unbind()
+            made.bind(py).set_item("world_from_lidar", pose)?;
+            made
         }
-        Message::Imu(motion) => json::to_python(py, &motion)?.unbind(),
-        Message::Pace(pace) => json::to_python(py, &pace)?.unbind(),
-        Message::Descriptor(descriptor) => json::to_python(py, &descriptor)?.unbind(),
-        Message::Control(control) => json::to_python(py, &control)?.unbind(),
-        Message::Stats(stats) => json::to_python(py, &stats)?.unbind(),
+        Message::Imu(motion) => json::to_python(py, &motion)?,
+        Message::Pace(pace) => json::to_python(py, &pace)?,
+        Message::Descriptor(descriptor) => json::to_python(py, &descriptor)?,
+        Message::Control(control) => json::to_python(py, &control)?,
+        Message::Stats(stats) => json::to_python(py, &stats)?,
         // Decoded before, outside of Python's lock.
         Message::Bev(bev) => PyBev::new(py, DecodedBev::decode(bev).map_err(error)?)?.into_any(),
     })
@@ -151,26 +154,26 @@ impl PyMessage {
 #[pyfunction]
 pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<PyMessage> {
     // Every key has slashes, and no kind has one.
-    if !kind_or_key.contains('/') {
+    let is_key = kind_or_key.contains('/');
+    let decoded = if is_key {
+        let key = kind_or_key.parse::<Key>();
+        let key = key.map_err(|cause| error_of(kind_or_key, cause))?;
+        if key.topic.is_json() {
+            let problem = "messages of this key are JSON: use json.loads";
+            return Err(error_of(kind_or_key, problem));
+        }
+        py.detach(|| DecodedMessage::of_key(&key, data))
+    } else {
         let kind = kind_or_key.parse::<Kind>().map_err(|_| {
             let known = Kind::ALL.map(|kind| kind.to_string()).join(", ");
             error(format!(
                 "{kind_or_key:?} is no kind of message; there are {known}"
             ))
         })?;
-        let decoded = py.detach(|| DecodedMessage::of_kind(kind, data));
-        let decoded = decoded.map_err(|cause| error_of(kind_or_key, cause))?;
-        return PyMessage::new(py, None, decoded);
-    }
-    let key = kind_or_key.parse::<Key>();
-    let key = key.map_err(|cause| error_of(kind_or_key, cause))?;
-    if key.topic.is_json() {
-        let problem = "messages of this key are JSON: use json.loads";
-        return Err(error_of(kind_or_key, problem));
-    }
-    let decoded = py.detach(|| DecodedMessage::of_key(&key, data));
+        py.detach(|| DecodedMessage::of_kind(kind, data))
+    };
     let decoded = decoded.map_err(|cause| error_of(kind_or_key, cause))?;
-    PyMessage::new(py, Some(kind_or_key.to_owned()), decoded)
+    PyMessage::new(py, is_key.then(|| kind_or_key.to_owned()), decoded)
 }
 
 fn error_of(kind_or_key: &str, cause: impl std::fmt::Display) -> PyErr {

@@ -139,17 +139,6 @@ impl FleetFrame {
             protocol: parts.protocol,
         })
     }
-
-    fn rule(&self, protocol: Option<&str>) -> PyResult<EvaluationProtocol> {
-        let Some(name) = protocol else {
-            return Ok(self.protocol.clone());
-        };
-        EvaluationProtocol::preset(name).ok_or_else(|| {
-            let known = dataset::evaluation_protocol::PRESETS.map(|(name, _)| name);
-            let known = known.join(", ");
-            error(format!("unknown protocol {name:?}; there are {known}"))
-        })
-    }
 }
 
 #[pymethods]
@@ -163,7 +152,14 @@ impl FleetFrame {
         protocol: Option<&str>,
         area_m: Option<[f64; 6]>,
     ) -> PyResult<Py<Objects>> {
-        let protocol = self.rule(protocol)?;
+        let protocol = match protocol {
+            None => self.protocol.clone(),
+            Some(name) => EvaluationProtocol::preset(name).ok_or_else(|| {
+                let known = dataset::evaluation_protocol::PRESETS.map(|(name, _)| name);
+                let known = known.join(", ");
+                error(format!("unknown protocol {name:?}; there are {known}"))
+            })?,
+        };
         let rule = area_m.map_or(protocol.ground_truth, |area_m| protocol.rule_within(area_m));
         let ego = ego.or_else(|| self.ego.clone()).unwrap_or_default();
         let mut agents = self.truth.iter();

@@ -3,8 +3,8 @@
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use protocol::{
-    Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream, Topic,
-    Tracks, Truth, WireError, wire,
+    Boxes, CavId, Detections, Handedness, Header, Limits, Message, Pose, PoseEstimate, Stream,
+    Topic, Tracks, Truth, WireError, wire,
 };
 
 use crate::payload::DecodedBev;
@@ -66,7 +66,7 @@ impl FrameParts {
                 let (_, truth) = wire::decode::<Truth>(pieces, &Limits::DEFAULT)?;
                 self.add_truth(&truth);
             }
-            Topic::Stream { cav, stream } => match decode_stream(cav, *stream, pieces)? {
+            Topic::Stream { cav, stream } => match decode_stream(cav, *stream, pieces)?.1 {
                 Message::Detections(found)
                     if !self.detections.iter().any(|known| known.ego == found.ego) =>
                 {
@@ -135,10 +135,10 @@ impl AgentParts {
     }
 
     /// An agent with points that it shares.
-    pub(crate) fn of_points(cav: &CavId, sent: protocol::Points) -> Self {
+    pub(crate) fn of_points(cav: &CavId, shared: protocol::Points) -> Self {
         let mut parts = Self::empty(cav);
         (parts.recorded.points, parts.has_points, parts.pose) =
-            (sent.points, true, Some(sent.pose));
+            (shared.points, true, Some(shared.pose));
         parts
     }
 
@@ -189,11 +189,11 @@ pub(crate) fn decode_stream<'a>(
     cav: &CavId,
     stream: Stream,
     pieces: impl IntoIterator<Item = &'a [u8]>,
-) -> Result<Message, WireError> {
+) -> Result<(Header, Message), WireError> {
     let (header, message) = wire::decode_any(pieces, &Limits::DEFAULT)?;
     header.check_sender(cav)?;
     stream
         .kind()
         .map_or(Ok(()), |kind| header.check_kind(kind))?;
-    Ok(message)
+    Ok((header, message))
 }

@@ -33,10 +33,8 @@ const MOST_NAMED: usize = 100;
 #[pyclass(module = "v2vloc")]
 pub(crate) struct Listener {
     connection: Option<(Bus, PassiveSubscriber)>,
-    run: RunId,
     endpoint: Endpoint,
     timeout: Option<Duration>,
-    settle: Duration,
     frames: LiveFrames,
     last_message: Instant,
     /// The same without status messages.
@@ -64,7 +62,7 @@ impl Listener {
         let Some((bus, subscriber)) = &self.connection else {
             return Ok(ListenerStep::End);
         };
-        let has_ended = self.is_over && self.last_data.elapsed() >= self.settle;
+        let has_ended = self.is_over && self.last_data.elapsed() >= self.frames.settle;
         // After the end only what is queued is still handed out.
         let wait = if has_ended { Duration::ZERO } else { wait };
         match py.detach(|| subscriber.take(Some(Instant::now() + wait))) {
@@ -98,7 +96,7 @@ impl Listener {
         match self.timeout {
             Some(timeout) if silent >= timeout && self.messages == 0 => Err(error(format!(
                 "no message of run {:?} at {} within {:.1} s: `v2vloc status` lists runs",
-                self.run.as_str(),
+                self.frames.run,
                 self.endpoint,
                 timeout.as_secs_f64()
             ))),
@@ -112,22 +110,6 @@ impl Listener {
         self.undecodable += 1;
         if self.problems.len() < MOST_NAMED {
             self.problems.push(format!("{key}: {cause}"));
-        }
-    }
-
-    fn next_message(&mut self, py: Python<'_>) -> PyResult<Option<PyMessage>> {
-        loop {
-            let message = match self.step(py, POLL)? {
-                ListenerStep::Message(message) if !message.key.topic.is_json() => message,
-                ListenerStep::Message(_) | ListenerStep::Waiting => continue,
-                ListenerStep::End => return Ok(None),
-            };
-            match py.detach(|| DecodedMessage::of_key(&message.key, &message.bytes())) {
-                Ok(decoded) => {
-                    return PyMessage::new(py, Some(message.key.to_string()), decoded).map(Some);
-                }
-                Err(cause) => self.reject(&message.key, &cause),
-            }
         }
     }
 
@@ -199,7 +181,7 @@ impl Listener {
 
     #[getter]
     fn run(&self) -> &str {
-        self.run.as_str()
+        &self.frames.run
     }
 
     #[getter]
@@ -227,8 +209,7 @@ impl Listener {
         let state = self.connection.as_ref().map_or(", closed", |_| "");
         format!(
             "Listener(run={:?}, {} messages{state})",
-            self.run.as_str(),
-            self.messages
+            self.frames.run, self.messages
         )
     }
 }
@@ -248,7 +229,19 @@ impl MessageIterator {
     fn __next__(&self, py: Python<'_>) -> PyResult<Option<PyMessage>> {
         // An iterator on another thread may be inside: then this is an error of Python, not a deadlock.
         let mut listener: PyRefMut<'_, Listener> = self.listener.try_borrow_mut(py)?;
-        listener.next_message(py)
+        loop {
+            let message = match listener.step(py, POLL)? {
+                ListenerStep::Message(message) if !message.key.topic.is_json() => message,
+                ListenerStep::Message(_) | ListenerStep::Waiting => continue,
+                ListenerStep::End => return Ok(None),
+            };
+            match py.detach(|| DecodedMessage::of_key(&message.key, &message.bytes())) {
+                Ok(decoded) => {
+                    return PyMessage::new(py, Some(message.key.to_string()), decoded).map(Some);
+                }
+                Err(cause) => listener.reject(&message.key, &cause),
+            }
+        }
     }
 }
 
@@ -294,10 +287,8 @@ pub(crate) fn listen(
     Ok(Listener {
         connection: Some(connection),
         frames: LiveFrames::new(run.as_str(), settle, protocol),
-        run,
         endpoint,
         timeout,
-        settle,
         last_message: Instant::now(),
         last_data: Instant::now(),
         messages: 0,

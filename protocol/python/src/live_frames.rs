@@ -14,9 +14,10 @@ const MOST_PENDING: usize = 32;
 
 /// Frames by capture time. A frame is handed over a while after its last message, in the order of capture times.
 pub(crate) struct LiveFrames {
-    run: String,
+    pub(crate) run: String,
     protocol: EvaluationProtocol,
-    settle: Duration,
+    /// Time without a message after which a frame is complete.
+    pub(crate) settle: Duration,
     pending: BTreeMap<u64, Pending>,
     ready: VecDeque<FrameParts>,
     handed_over: Option<u64>,

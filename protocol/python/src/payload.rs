@@ -3,7 +3,7 @@
 use dataset::frame::{Frame, Object};
 use dataset::ground_truth::{GroundTruth, upright_box};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
-use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose};
+use protocol::{Box3d, Codec, DecodedFeatures, Detection};
 use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyList};
 use pyo3::{Py, PyAny, PyResult, Python, pyclass, pymethods};
 
@@ -109,9 +109,9 @@ impl PyBev {
         let grid = features.grid;
         let shape = [features.channels, grid.height, grid.width];
         let [channels, height, width] = shape.map(|size| size as usize);
-        let mask = sent
-            .map(|sent| PyArray1::from_vec(py, sent).reshape([height, width]))
-            .transpose()?;
+        let mask = optional(sent, |sent| {
+            PyArray1::from_vec(py, sent).reshape([height, width])
+        })?;
         let made = Self {
             features: PyArray1::from_vec(py, features.values)
                 .reshape([channels, height, width])?
@@ -167,9 +167,9 @@ impl PyDetections {
         let made = Self {
             method: Some(found.method.clone()),
             agent_frame: Some(found.agent_frame),
-            fused: json::to_python(py, &found.fused)?.unbind(),
-            skipped: json::to_python(py, &found.skipped)?.unbind(),
-            neighbours: json::to_python(py, &found.neighbours)?.unbind(),
+            fused: json::to_python(py, &found.fused)?,
+            skipped: json::to_python(py, &found.skipped)?,
+            neighbours: json::to_python(py, &found.neighbours)?,
             stages_ms: stages_ms.into_py_dict(py)?.unbind(),
             ..Self::of_list(py, found.ego.as_str(), &found.pose, &found.detections)?
         };
@@ -185,7 +185,7 @@ impl PyDetections {
         let found: Vec<Detection> = boxes.detections().cloned().collect();
         let tracks: Vec<_> = boxes.objects().iter().map(|object| object.track).collect();
         let made = Self {
-            tracks: json::to_python(py, &tracks)?.unbind(),
+            tracks: json::to_python(py, &tracks)?,
             ..Self::of_list(py, cav, &boxes.pose, &found)?
         };
         Py::new(py, made)
@@ -253,8 +253,7 @@ pub(crate) struct PyTracks {
 impl PyTracks {
     pub(crate) fn new(py: Python<'_>, found: &protocol::Tracks) -> PyResult<Py<Self>> {
         let tracks = &found.tracks;
-        let covariances: Vec<[f32; 4]> = tracks.iter().flat_map(|track| track.covariance).collect();
-        let covariances = PyArray1::from_vec(py, covariances.into_flattened());
+        let covariances = tracks.iter().map(|track| track.covariance);
         let velocities_mps = tracks.iter().map(|track| track.velocity_mps).collect();
         let made = Self {
             cav: found.ego.to_string(),
@@ -262,7 +261,7 @@ impl PyTracks {
             ids: column(py, tracks, |track| track.id),
             boxes: arrays::boxes(py, tracks.iter().map(|track| &track.box3d))?,
             velocities_mps: arrays::rows(py, velocities_mps)?,
-            covariances: covariances.reshape([tracks.len(), 4, 4])?.unbind(),
+            covariances: arrays::matrices(py, covariances)?,
             scores: column(py, tracks, |track| track.score),
             hits: column(py, tracks, |track| track.hits),
             ages_s: column(py, tracks, |track| track.age_s),
@@ -331,14 +330,12 @@ impl Objects {
         boxes: Option<&[Box3d]>,
         truth: Option<GroundTruth>,
     ) -> PyResult<Py<Self>> {
-        let boxes = boxes.map(|boxes| arrays::boxes(py, boxes.iter()));
-        let poses = objects.iter().map(|object| object.world_from_object);
-        let poses: Vec<Pose> = poses.collect();
+        let poses = objects.iter().map(|object| &object.world_from_object);
         let made = Self {
             ids: column(py, objects, |object| object.id),
             classes: PyList::new(py, objects.iter().map(|object| object.class.name()))?.unbind(),
-            boxes: boxes.transpose()?,
-            world_from_object: arrays::poses(py, &poses)?,
+            boxes: optional(boxes, |boxes| arrays::boxes(py, boxes.iter()))?,
+            world_from_object: arrays::matrices(py, poses.map(arrays::matrix_rows))?,
             sizes_m: arrays::rows(py, objects.iter().map(|object| object.size_m).collect())?,
             // NaN where unknown: an array of numbers has no `None`.
             speeds_mps: column(py, objects, |object| object.speed_mps.unwrap_or(f64::NAN)),
@@ -373,18 +370,18 @@ pub(crate) struct PyCamera {
 impl PyCamera {
     pub(crate) fn new(py: Python<'_>, camera: &protocol::Camera) -> PyResult<Py<Self>> {
         let metadata = &camera.metadata;
-        let intrinsics = metadata.pinhole.map(|pinhole| {
+        let intrinsics = optional(metadata.pinhole, |pinhole| {
             // Rows of the camera matrix, which maps (x / z, y / z, 1) to column and row.
             let first = [pinhole.fx_px, 0.0, pinhole.cx_px];
             let second = [0.0, pinhole.fy_px, pinhole.cy_px];
             arrays::rows(py, vec![first, second, [0.0, 0.0, 1.0]])
-        });
+        })?;
         let made = Self {
             image: PyBytes::new(py, &camera.image).unbind(),
             format: metadata.format.name().to_owned(),
             width_px: metadata.width_px,
             height_px: metadata.height_px,
-            intrinsics: intrinsics.transpose()?,
+            intrinsics,
             lidar_from_camera: optional(metadata.lidar_from_camera, |pose| {
                 arrays::pose(py, &pose)
             })?,

@@ -15,7 +15,6 @@ pub(crate) struct RecordingFrames {
     recording: Recording,
     /// Name of the recorded run.
     pub(crate) run: String,
-    protocol: EvaluationProtocol,
     /// Capture times and indices of their messages, in order.
     pub(crate) frames: Vec<(u64, Vec<usize>)>,
 }
@@ -24,7 +23,6 @@ impl RecordingFrames {
     pub(crate) fn open(
         path: &Path,
         options: &LoadOptions,
-        protocol: EvaluationProtocol,
     ) -> Result<Self, recording::RecordingError> {
         let recording = Recording::open(path)?;
         let mut frames: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
@@ -39,7 +37,6 @@ impl RecordingFrames {
         Ok(Self {
             recording,
             run,
-            protocol,
             frames: frames.into_iter().collect(),
         })
     }
@@ -51,9 +48,9 @@ impl RecordingFrames {
     }
 
     /// Reads the messages of a frame. One that cannot be read or decoded is left out and named.
-    pub(crate) fn load(&self, index: usize) -> Option<FrameParts> {
+    pub(crate) fn load(&self, index: usize, protocol: &EvaluationProtocol) -> Option<FrameParts> {
         let (capture_nanos, messages) = self.frames.get(index)?;
-        let mut parts = FrameParts::empty(&self.run, *capture_nanos, &self.protocol);
+        let mut parts = FrameParts::empty(&self.run, *capture_nanos, protocol);
         let entries = self.recording.entries();
         for entry in messages.iter().filter_map(|&index| entries.get(index)) {
             let bytes = self.recording.read(entry);

@@ -90,13 +90,9 @@ pub struct RosEndpoint {
 impl Node {
     /// Liveliness token of the node.
     pub fn token(&self) -> String {
-        format!(
-            // Node 0, endpoint 0, and NN for a node.
-            "{TOKEN_ROOT}/{}/{}/0/0/NN/{}",
-            self.domain_id,
-            self.zid,
-            self.identity()
-        )
+        let (domain, zid, identity) = (self.domain_id, &self.zid, self.identity());
+        // Node 0, endpoint 0, and NN for a node.
+        format!("{TOKEN_ROOT}/{domain}/{zid}/0/0/NN/{identity}")
     }
 
     /// The node as others see it.
@@ -123,6 +119,7 @@ impl Node {
     /// Liveliness token of one of its endpoints.
     pub fn endpoint_token(&self, endpoint: &RosEndpoint) -> String {
         let RosEndpoint { id, qos, .. } = endpoint;
+        let (domain, zid) = (self.domain_id, &self.zid);
         let kind = match endpoint.kind {
             EndpointKind::Publisher => "MP",
             EndpointKind::Subscription => "MS",
@@ -130,19 +127,13 @@ impl Node {
         let (identity, topic) = (self.identity(), mangled(endpoint.topic.as_str()));
         let name = endpoint.ros_type.dds_name();
         let hash = endpoint.ros_type.hash(self.distribution);
-        format!(
-            "{TOKEN_ROOT}/{}/{}/0/{id}/{kind}/{identity}/{topic}/{name}/{hash}/{qos}",
-            self.domain_id, self.zid
-        )
+        format!("{TOKEN_ROOT}/{domain}/{zid}/0/{id}/{kind}/{identity}/{topic}/{name}/{hash}/{qos}")
     }
 
     /// Key on which messages of a topic are published.
     pub fn key(&self, topic: &RosName, ros_type: RosType) -> String {
-        format!(
-            "{}/{}",
-            self.keys_of_any_hash(topic, ros_type),
-            ros_type.hash(self.distribution)
-        )
+        let keys = self.keys_of_any_hash(topic, ros_type);
+        format!("{keys}/{}", ros_type.hash(self.distribution))
     }
 
     /// Key expression of a topic's messages, whatever the hash: publishers of every distribution match.

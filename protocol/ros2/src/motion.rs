@@ -125,22 +125,19 @@ fn read_twist(
 }
 
 /// The values of `motion` that are measured by their variances.
-fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, MotionError> {
+fn measured(mut motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, MotionError> {
     // Row-major 6 x 6: x is the first variance, the rotation about z the last.
     // NaN is not below the bound.
     let [speed_variance, .., yaw_rate_variance] = covariance;
-    let speed_mps = motion.speed_mps.filter(|_| *speed_variance < UNMEASURED);
-    let yaw_rate_rad_s = motion
+    motion.speed_mps = motion.speed_mps.filter(|_| *speed_variance < UNMEASURED);
+    motion.yaw_rate_rad_s = motion
         .yaw_rate_rad_s
         .filter(|_| *yaw_rate_variance < UNMEASURED);
-    if speed_mps.is_none() && yaw_rate_rad_s.is_none() {
+    if motion.speed_mps.is_none() && motion.yaw_rate_rad_s.is_none() {
         let (field, found) = ("twist.covariance[0]", *speed_variance);
         return Err(MotionError::Unmeasured { field, found });
     }
-    Ok(EgoMotion {
-        speed_mps,
-        yaw_rate_rad_s,
-    })
+    Ok(motion)
 }
 
 fn within(field: &'static str, found: f64, limit: f64) -> Result<f64, MotionError> {

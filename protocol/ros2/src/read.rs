@@ -60,16 +60,17 @@ impl<'a> Reader<'a> {
         Ok(Self { cdr, len })
     }
 
-    /// Reads a value in either byte order; an error names `field`.
+    /// Reads a value in the byte order of the message, which is part of the type of a [`CdrReader`]: the same method is
+    /// given once for each order. An error names `field`.
     fn read<T>(
         &mut self,
         field: &'static str,
-        big: impl FnOnce(&mut CdrReader<'a, BigEndian>) -> re_cdr::Result<T>,
-        little: impl FnOnce(&mut CdrReader<'a, LittleEndian>) -> re_cdr::Result<T>,
+        if_big_endian: impl FnOnce(&mut CdrReader<'a, BigEndian>) -> re_cdr::Result<T>,
+        if_little_endian: impl FnOnce(&mut CdrReader<'a, LittleEndian>) -> re_cdr::Result<T>,
     ) -> Result<T, ReadError> {
         let (at, read) = match &mut self.cdr {
-            AnyCdr::BigEndian(cdr) => (cdr.position(), big(cdr)),
-            AnyCdr::LittleEndian(cdr) => (cdr.position(), little(cdr)),
+            AnyCdr::BigEndian(cdr) => (cdr.position(), if_big_endian(cdr)),
+            AnyCdr::LittleEndian(cdr) => (cdr.position(), if_little_endian(cdr)),
         };
         read.map_err(|cause| ReadError::Cdr {
             field,

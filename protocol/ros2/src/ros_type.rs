@@ -57,7 +57,7 @@ impl RosType {
     /// Type hash as distributions write it in keys: `RIHS01_...`.
     pub fn hash(self, distribution: Distribution) -> String {
         match distribution {
-            Distribution::Humble => Distribution::NO_HASH.into(),
+            Distribution::Humble => "TypeHashNotSupported".into(),
             Distribution::Jazzy => {
                 let own = self.definition();
                 type_hash(own, contained(own))

@@ -10,23 +10,16 @@ use super::definitions::Definition;
 
 /// Prefix of the first version of these hashes.
 const PREFIX: &str = "RIHS01_";
-/// Type ids of single values, from `type_description_interfaces/FieldType`.
-const TYPE_IDS: [(&str, u8); 15] = [
-    ("int8", 2),
+/// Type ids of the single values that the definitions have, from `type_description_interfaces/FieldType`.
+const TYPE_IDS: [(&str, u8); 8] = [
     ("uint8", 3),
-    ("int16", 4),
-    ("uint16", 5),
     ("int32", 6),
     ("uint32", 7),
-    ("int64", 8),
-    ("uint64", 9),
     ("float32", 10),
     ("float64", 11),
-    ("char", 13),
     ("bool", 15),
     ("byte", 16),
     ("string", 17),
-    ("wstring", 18),
 ];
 /// Type id of another message.
 const NESTED: u8 = 1;
@@ -42,11 +35,6 @@ pub enum Distribution {
     /// Jazzy and later.
     #[default]
     Jazzy,
-}
-
-impl Distribution {
-    /// Text in place of a hash where a distribution has none.
-    pub const NO_HASH: &str = "TypeHashNotSupported";
 }
 
 /// Hash of the type `own`, which contains the types `contained`, directly or not.

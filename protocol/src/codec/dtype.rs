@@ -89,11 +89,8 @@ pub(super) fn append(
         Dtype::I8 => {
             for (channel, scale) in values.chunks_exact(values.len() / scales.len()).zip(scales) {
                 let inverse = if *scale == 0.0 { 0.0 } else { scale.recip() };
-                bytes.extend(
-                    channel
-                        .iter()
-                        .map(|value| (value * inverse + ROUND).to_bits() as u8),
-                );
+                let rounded = channel.iter().map(|value| value * inverse + ROUND);
+                bytes.extend(rounded.map(|sum| sum.to_bits() as u8));
             }
         }
     }
@@ -145,24 +142,19 @@ pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -
             }
         }
         Dtype::I8 => {
-            let scales = read_scales(scales)?;
+            let mut factors = vec![0f32; scales.len() / 4];
+            cast_slice_mut(&mut factors).copy_from_slice(scales);
+            check_each("channel scale", &factors, [0.0, f32::MAX], |scale| {
+                scale.is_finite() && scale >= 0.0
+            })?;
             if selected > 0 {
-                for (channel, scale) in bytes.chunks_exact(selected).zip(scales) {
+                for (channel, scale) in bytes.chunks_exact(selected).zip(factors) {
                     values.extend(channel.iter().map(|byte| f32::from(*byte as i8) * scale));
                 }
             }
         }
     }
     Ok(values)
-}
-
-fn read_scales(bytes: &[u8]) -> Result<Vec<f32>> {
-    let mut scales = vec![0f32; bytes.len() / 4];
-    cast_slice_mut(&mut scales).copy_from_slice(bytes);
-    check_each("channel scale", &scales, [0.0, f32::MAX], |scale| {
-        scale.is_finite() && scale >= 0.0
-    })?;
-    Ok(scales)
 }
 
 #[cfg(test)]

@@ -66,25 +66,18 @@ impl FromStr for ConfidenceGate {
         let smoothing = match smoothing {
             None => Self::default().smoothing,
             Some("none") => None,
-            Some(window) => Some(window.parse()?),
+            Some(window) => {
+                let (kernel, sigma) = window
+                    .split_once(',')
+                    .ok_or_else(|| format!("{window:?} is not CELLS,SIGMA or none"))?;
+                let (kernel, sigma) = (number("window", kernel)?, number("sigma", sigma)?);
+                Some(Smoothing { kernel, sigma })
+            }
         };
         Ok(Self {
             threshold,
             smoothing,
         })
-    }
-}
-
-impl FromStr for Smoothing {
-    type Err = String;
-
-    /// `CELLS,SIGMA`.
-    fn from_str(text: &str) -> Result<Self, String> {
-        let (kernel, sigma) = text
-            .split_once(',')
-            .ok_or_else(|| format!("{text:?} is not CELLS,SIGMA or none"))?;
-        let (kernel, sigma) = (number("window", kernel)?, number("sigma", sigma)?);
-        Ok(Self { kernel, sigma })
     }
 }
 

@@ -215,7 +215,19 @@ fn encode_selected(
     let mut body = if is_sent_as_it_is {
         Body::Floats(values)
     } else {
-        Body::Bytes(unpacked_body(&grid, channels, &codec, &values, selected)?)
+        let layout = BodyLayout::new(&grid, channels, &codec, &Limits::SENDER)?;
+        // Scales, mask and values, concatenated.
+        let mut bytes = Vec::with_capacity(layout.len());
+        let scales = match codec.dtype {
+            Dtype::I8 => dtype::scales(&values, channels as usize),
+            Dtype::F32 | Dtype::F16 => Vec::new(),
+        };
+        bytes.extend_from_slice(bytemuck::cast_slice(&scales));
+        if let Some(selected) = selected {
+            selection::append_mask(&mut bytes, layout.cells, selected);
+        }
+        dtype::append(codec.dtype, &values, &scales, &mut bytes)?;
+        Body::Bytes(bytes)
     };
     if let Some(level) = zstd_level
         && let Some(packed) = compression::pack(body.as_bytes(), level)?
@@ -231,29 +243,6 @@ fn encode_selected(
         rate: None,
         body,
     })
-}
-
-/// Scales, mask and values, concatenated.
-fn unpacked_body(
-    grid: &BevGrid,
-    channels: u32,
-    codec: &Codec,
-    values: &[f32],
-    selected: Option<&[u32]>,
-) -> Result<Vec<u8>> {
-    let layout = BodyLayout::new(grid, channels, codec, &Limits::SENDER)?;
-    let mut bytes = Vec::with_capacity(layout.len());
-    let scales = if codec.dtype == Dtype::I8 {
-        dtype::scales(values, channels as usize)
-    } else {
-        Vec::new()
-    };
-    bytes.extend_from_slice(bytemuck::cast_slice(&scales));
-    if let Some(selected) = selected {
-        selection::append_mask(&mut bytes, layout.cells, selected);
-    }
-    dtype::append(codec.dtype, values, &scales, &mut bytes)?;
-    Ok(bytes)
 }
 
 impl EncodedFeatures {
@@ -303,31 +292,25 @@ impl EncodedFeatures {
     /// [`WireError`] when sizes exceed `limits`, the body does not match shape and codec, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
     pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures> {
-        let layout = BodyLayout::new(&self.grid, self.channels, &self.codec, limits)?;
-        let (values, sent) = match (self.body, self.codec) {
-            (
-                Body::Floats(values),
-                Codec {
-                    dtype: Dtype::F32,
-                    selection: Selection::Dense,
-                    compression: Compression::Raw,
-                },
-            ) => {
+        let codec = self.codec;
+        let layout = BodyLayout::new(&self.grid, self.channels, &codec, limits)?;
+        let (values, sent) = match (self.body, codec.compression, codec.dtype, codec.selection) {
+            (Body::Floats(values), Compression::Raw, Dtype::F32, Selection::Dense) => {
                 let expected = layout.values.len() as u64 / 4;
                 check_size("features", values.len() as u64, expected)?;
                 (values, None)
             }
-            (body, _) => {
-                let raw = unpack(body, self.codec.compression, layout.len())?;
+            (body, ..) => {
+                let raw = unpack(body, codec.compression, layout.len())?;
                 let [scales, mask, values] =
                     [layout.scales, layout.mask, layout.values].map(|range| {
                         let (expected, found) = (range.end as u64, raw.len() as u64);
                         let missing = WireError::shape("bytes of a feature map", expected, found);
                         raw.get(range).ok_or(missing)
                     });
-                let values = dtype::read(self.codec.dtype, scales?, values?, layout.selected)?;
+                let values = dtype::read(codec.dtype, scales?, values?, layout.selected)?;
                 check_values("feature", &values, limits.max_abs_value)?;
-                match self.codec.selection {
+                match codec.selection {
                     Selection::Dense => (values, None),
                     Selection::TopK { .. } => {
                         let (cells, channels) = (layout.cells, self.channels as usize);

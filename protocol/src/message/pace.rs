@@ -1,7 +1,5 @@
 //! Pace of an ego: the sweeps that it has time for.
 
-use std::time::Duration;
-
 use serde::{Deserialize, Serialize};
 
 use super::{check_limit, check_within, metadata_only};
@@ -54,16 +52,11 @@ impl Pace {
         (sweep * i128::from(self.computed)).checked_div_euclid(i128::from(self.of))
     }
 
-    /// Mean time between two computed sweeps; zero for every sweep.
-    pub fn mean_interval(&self) -> Duration {
-        let sweeps = u128::from(self.period_nanos) * u128::from(self.of);
-        let nanos = sweeps / u128::from(self.computed.max(1));
-        Duration::from_nanos(u64::try_from(nanos).unwrap_or(u64::MAX))
-    }
-
     fn check_values(&self, _: &Limits) -> Result<(), WireError> {
         check_within("computed", self.computed.into(), 1.0, self.of.into())?;
-        let found = u64::try_from(self.mean_interval().as_nanos()).unwrap_or(u64::MAX);
+        let sweeps_nanos = u128::from(self.period_nanos) * u128::from(self.of);
+        let mean_nanos = sweeps_nanos / u128::from(self.computed);
+        let found = u64::try_from(mean_nanos).unwrap_or(u64::MAX);
         check_limit("mean interval, nanoseconds", found, MAX_INTERVAL_NANOS)
     }
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use protocol::{EgoMotion, Handedness, InvalidPose, Pose};
 
-use super::yaml::{Value, YamlField};
+use super::yaml::{Value, YamlField, whole};
 use super::{Problem, ReadError, Result, classes};
 use crate::carla_pose::CarlaPose;
 use crate::frame::{Frame, Object, ObjectClass};
@@ -38,17 +38,8 @@ impl<'a> Annotations<'a> {
         }
     }
 
-    /// The field of the first of `keys` that is present; one that cannot be read is left out.
-    pub(super) fn optional<T>(
-        &mut self,
-        keys: &[&str],
-        read: impl Fn(&YamlField<'a>) -> Result<T>,
-    ) -> Option<T> {
-        let root = self.root.clone();
-        self.optional_of(&root, keys, read)
-    }
-
-    fn optional_of<T>(
+    /// The first of `keys` that is present in `parent`; one that cannot be read is left out.
+    fn optional<T>(
         &mut self,
         parent: &YamlField<'a>,
         keys: &[&str],
@@ -69,28 +60,29 @@ impl<'a> Annotations<'a> {
         frame: &mut Frame,
         pose: impl Fn(&YamlField<'a>) -> Result<Pose>,
     ) {
-        if let Some(imu) = self.root.optional("imu").ok().flatten() {
+        let root = self.root.clone();
+        if let Some(imu) = root.optional("imu").ok().flatten() {
             let counter_clockwise = match frame.source_handedness {
                 Handedness::Left => -1.0,
                 Handedness::Right => 1.0,
             };
-            frame.yaw_rate_rad_s = self.optional_of(&imu, &["yaw_rate_degps"], |field| {
+            frame.yaw_rate_rad_s = self.optional(&imu, &["yaw_rate_degps"], |field| {
                 let most_degps = EgoMotion::MAX_YAW_RATE_RAD_S.to_degrees();
                 let yaw_rate_degps = within(field, field.number()?, most_degps, "degrees/s")?;
                 Ok(counter_clockwise * yaw_rate_degps.to_radians())
             });
-            frame.speed_mps = self.optional_of(&imu, &["speed_mps"], |field| {
+            frame.speed_mps = self.optional(&imu, &["speed_mps"], |field| {
                 own_speed_mps(field, field.number()?)
             });
         }
         frame.speed_mps = frame.speed_mps.or_else(|| {
-            self.optional(&["ego_speed"], |field| {
+            self.optional(&root, &["ego_speed"], |field| {
                 own_speed_mps(field, speed_mps_of_kmh(field)?)
             })
         });
-        frame.world_from_vehicle = self.optional(&["true_ego_pos", "true_ego_pose"], &pose);
+        frame.world_from_vehicle = self.optional(&root, &["true_ego_pos", "true_ego_pose"], &pose);
         frame.gnss_world_from_vehicle =
-            self.optional(&["predicted_ego_pos", "predicted_ego_pose"], &pose);
+            self.optional(&root, &["predicted_ego_pos", "predicted_ego_pose"], &pose);
     }
 
     /// All valid objects. `id` gives the id of an object of the listed number, `pose` transforms its pose from the file
@@ -136,18 +128,15 @@ impl<'a> Annotations<'a> {
                 .map_err(|error| field.error(error.to_string()))?,
             size_m: size_m(field)?,
             class: self.class(field),
-            speed_mps: self.optional_of(field, &["speed"], speed_mps),
+            speed_mps: self.optional(field, &["speed"], speed_mps),
         })
     }
 
     /// The map of annotated objects: `vehicles`, or `objects` in relatives of the format.
     fn object_entries(&self) -> Result<Vec<(&'a str, YamlField<'a>)>> {
         let root = &self.root;
-        let key = if !root.has("vehicles") && root.has("objects") {
-            "objects"
-        } else {
-            "vehicles"
-        };
+        let mut keys = ["vehicles", "objects"].into_iter();
+        let key = keys.find(|key| root.has(key)).unwrap_or("vehicles");
         match root.optional(key)? {
             Some(field) if matches!(&field.node.value, Value::List(items) if items.is_empty()) => {
                 Ok(Vec::new())
@@ -182,19 +171,13 @@ impl<'a> Annotations<'a> {
     }
 
     fn left_out(&mut self, what: &str, error: ReadError) {
-        self.problems.push(Problem::from(
-            &error.with_consequence(&format!("the {what} is left out")),
-        ));
+        self.problems.push(Problem::left_out(what, error));
     }
 }
 
 /// Ids are integers; those that went through an array of floats have a point.
-#[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
 fn listed_id(key: &str, field: &YamlField<'_>) -> Result<i64> {
-    let id = key.parse().ok().or_else(|| {
-        let number: f64 = key.parse().ok()?;
-        (number.fract() == 0.0 && number.abs() < 1e15).then_some(number as i64)
-    });
+    let id = key.parse().ok().or_else(|| whole(key.parse().ok()?));
     id.ok_or_else(|| field.error(format!("{key:?} is no object id, expected an integer")))
 }
 

@@ -40,19 +40,11 @@ use crate::ground_truth::GroundTruth;
 use breakdown::PartMembers;
 use frame_overlaps::FrameOverlaps;
 
+pub use crate::evaluation_protocol::ApOrder as Ordering;
 pub use breakdown::Breakdown;
 
 /// Overlaps at which AP is reported.
 pub const THRESHOLDS: [f64; 3] = [0.3, 0.5, 0.7];
-
-/// Order of the list of detections.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ordering {
-    /// By score over all frames.
-    Global,
-    /// Frame after frame, by score inside each.
-    Frame,
-}
 
 /// Judgement of a detection at an overlap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -121,22 +121,6 @@ impl ReadError {
     pub fn is_absent(&self) -> bool {
         matches!(self, Self::Absent { .. })
     }
-
-    /// The line at fault, from 1.
-    pub fn line(&self) -> Option<u64> {
-        match self {
-            Self::Malformed { line, .. } => *line,
-            _ => None,
-        }
-    }
-
-    /// The field at fault.
-    pub fn field(&self) -> Option<&str> {
-        match self {
-            Self::Malformed { field, .. } => field.as_deref(),
-            _ => None,
-        }
-    }
 }
 
 /// A part of a message between two texts; nothing where it is missing.

@@ -39,10 +39,9 @@ pub struct EvaluationProtocol {
 }
 
 /// Kinds of agents of a scenario that take part.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(JsonSchema, clap::ValueEnum)]
 pub enum AgentKinds {
     /// Vehicles and roadside units.
     #[default]
@@ -54,10 +53,9 @@ pub enum AgentKinds {
 }
 
 /// Choice of the ego in a scenario.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(JsonSchema, clap::ValueEnum)]
 pub enum EgoKind {
     /// The first vehicle; the first roadside unit if there is no vehicle.
     #[default]
@@ -67,10 +65,9 @@ pub enum EgoKind {
 }
 
 /// Order of detections when precision and recall are summed up.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(JsonSchema, clap::ValueEnum)]
 pub enum ApOrder {
     /// By score over all frames.
     #[default]

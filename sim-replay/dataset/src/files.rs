@@ -125,13 +125,17 @@ pub(super) fn above(dir: &Path) -> impl Iterator<Item = PathBuf> {
 /// The name of a path below `root`, or the folder's own name where they are the same.
 pub(super) fn name_below(root: &Path, dir: &Path) -> String {
     let name = match dir.strip_prefix(root) {
-        Ok(below) if !below.as_os_str().is_empty() => below.to_owned(),
-        _ => {
-            let canonical = dir.canonicalize().unwrap_or_default();
-            canonical.file_name().map(PathBuf::from).unwrap_or_default()
-        }
+        Ok(below) if !below.as_os_str().is_empty() => below.to_string_lossy().into_owned(),
+        _ => own_name(dir),
     };
-    name.to_string_lossy().replace('\\', "/")
+    name.replace('\\', "/")
+}
+
+/// The folder's own name, where `.` or a link leads to it too.
+pub(super) fn own_name(dir: &Path) -> String {
+    let canonical = dir.canonicalize().unwrap_or_default();
+    let name = canonical.file_name().unwrap_or_default();
+    name.to_string_lossy().into_owned()
 }
 
 #[cfg(test)]

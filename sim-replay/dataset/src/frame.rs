@@ -36,13 +36,9 @@ pub enum ObjectClass {
 impl ObjectClass {
     /// Every class.
     pub const ALL: &'static [Self] = Self::VARIANTS;
-    /// Classes of motor vehicles with at least three wheels: the default targets of detection.
+    /// Classes of motor vehicles with at least three wheels: the default targets of detection. An object of unknown type
+    /// is not a vehicle.
     pub const VEHICLES: [Self; 4] = [Self::Car, Self::Van, Self::Truck, Self::Bus];
-
-    /// True for [`Self::VEHICLES`]. An object of unknown type is not a vehicle.
-    pub(crate) fn is_vehicle(self) -> bool {
-        Self::VEHICLES.contains(&self)
-    }
 
     /// Its name in files and options: `car`, `two_wheeler`.
     pub fn name(self) -> &'static str {
@@ -216,6 +212,5 @@ mod tests {
             assert_eq!(class.name().parse(), Ok(class));
             assert_eq!(serde_json::to_value(class).unwrap(), class.name());
         }
-        assert!(!ObjectClass::Other.is_vehicle() && !ObjectClass::TwoWheeler.is_vehicle());
     }
 }

@@ -42,9 +42,12 @@ fn is_number(stem: &str) -> bool {
     !stem.is_empty() && stem.bytes().all(|byte| byte.is_ascii_digit())
 }
 
-/// The stems of frames, and those of other files. Copies such as `000070 (1)` beside numbers are not frames; frames may
-/// have other names if most have.
-pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str>) {
+/// The stems of frames, and the names of other files with this ending. Copies such as `000070 (1)` beside numbers are
+/// not frames; frames may have other names if most have.
+pub(super) fn usual_stems<'a>(
+    all: BTreeSet<&'a str>,
+    ending: &str,
+) -> (BTreeSet<&'a str>, Vec<String>) {
     let (numbers, others): (BTreeSet<&str>, BTreeSet<&str>) =
         all.iter().partition(|stem| is_number(stem));
     let names = others.iter().filter(|stem| {
@@ -53,9 +56,10 @@ pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str
         !numbers.contains(&stem[..stem.len() - rest.len()])
     });
     if numbers.len() >= names.count() && !numbers.is_empty() {
-        (numbers, others)
+        let strays = others.iter().map(|stem| format!("{stem}{ending}"));
+        (numbers, strays.collect())
     } else {
-        (all, BTreeSet::new())
+        (all, Vec::new())
     }
 }
 
@@ -85,17 +89,12 @@ impl AgentFolder {
             // A name with an underscore is that of a variant, `<stem>_<variant>`, and no frame.
             listed.extend(sweeps.filter(|stem| !stem.contains('_')));
         }
-        let (yamls, strays) = usual_stems(listed);
-        let are_numbers = !yamls.is_empty() && yamls.iter().all(|stem| is_number(stem));
         let ending = if is_without_yaml { suffix } else { ".yaml" };
-        let mut strays: Vec<String> = strays
-            .into_iter()
-            .map(|stem| format!("{stem}{ending}"))
-            .collect();
-        let cameras = camera_files::numbers(&listing.files);
+        let (yamls, mut strays) = usual_stems(listed, ending);
+        let are_numbers = !yamls.is_empty() && yamls.iter().all(|stem| is_number(stem));
         let mut agent = Self {
             is_without_yaml,
-            cameras,
+            cameras: camera_files::numbers(&listing.files),
             ..Self::default()
         };
         let mut without_yaml = BTreeSet::new();

@@ -187,10 +187,7 @@ fn select<'a>(
     };
     let ego_from_world = world_from_ego.isometry().inverse();
     let annotations = annotations(frames_of_tick);
-    let contributors = match frames_of_tick
-        .iter()
-        .position(|frame| frame.cooperative_objects.is_some())
-    {
+    let contributors = match cooperative_holder(frames_of_tick) {
         // The list belongs to the tick, regardless of the agents in range.
         Some(holder) => vec![holder],
         None => contributors(frames_of_tick, ego_index, comm_range_m),
@@ -213,9 +210,7 @@ fn select<'a>(
 /// The objects that each frame of a tick contributes to the ground truth: those its agent lists. If a frame holds the
 /// cooperative annotation of the tick, it contributes that one, and the others nothing.
 pub fn annotations<'a>(frames_of_tick: &[&'a Frame]) -> Vec<&'a [Object]> {
-    let holder = frames_of_tick
-        .iter()
-        .position(|frame| frame.cooperative_objects.is_some());
+    let holder = cooperative_holder(frames_of_tick);
     let lists = frames_of_tick.iter().zip(0..);
     lists
         .map(|(frame, index)| match holder {
@@ -226,6 +221,12 @@ pub fn annotations<'a>(frames_of_tick: &[&'a Frame]) -> Vec<&'a [Object]> {
             Some(_) => &[],
         })
         .collect()
+}
+
+/// Index of the frame that holds the cooperative annotation of a tick.
+fn cooperative_holder(frames_of_tick: &[&Frame]) -> Option<usize> {
+    let mut frames = frames_of_tick.iter();
+    frames.position(|frame| frame.cooperative_objects.is_some())
 }
 
 /// Indices of the agents whose annotations count: the ego first, then those within range of it.

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::str::FromStr;
 
+use protocol::text::excerpt;
 use serde_json::Value;
 
 use super::{ReadError, Result, files};
@@ -194,7 +195,7 @@ fn kind(value: &Value) -> String {
         Value::Null => "nothing".into(),
         Value::Bool(value) => value.to_string(),
         Value::Number(number) => number.to_string(),
-        Value::String(text) => format!("the text {:?}", text.chars().take(40).collect::<String>()),
+        Value::String(text) => format!("the text {:?}", excerpt(text, 40)),
         Value::Array(items) => format!("a list of {}", items.len()),
         Value::Object(map) => format!("a map of {}", map.len()),
     }

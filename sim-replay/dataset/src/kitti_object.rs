@@ -51,19 +51,11 @@ fn is_split(dir: &Path) -> bool {
 }
 
 /// Opens a split.
-pub(super) fn open(
-    root: &Path,
-    dir: &Path,
-    options: &OpenOptions,
-    problems: &mut Vec<ReadError>,
-) -> Result<Scenario> {
+fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
     let velodyne = dir.join("velodyne");
     let listing = files::list(&velodyne)?;
-    let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").collect());
-    let strays: Vec<String> = strays
-        .into_iter()
-        .map(|stem| format!("{stem}.bin"))
-        .collect();
+    let stems = files::stems(&listing.files, ".bin").collect();
+    let (stems, strays) = usual_stems(stems, ".bin");
     problems.extend(named_once(&velodyne, &strays));
     let times = (0u64..).map(|index| options.period_nanos.saturating_mul(index));
     let ticks = stems.into_iter().zip(times);
@@ -77,8 +69,7 @@ pub(super) fn open(
         has_labels: dir.join("label_2").is_dir(),
         sweeps,
     });
-    let name = files::name_below(root, dir);
-    Ok(single_vehicle(name, Layout::KITTI_OBJECT, ticks, source))
+    Ok(single_vehicle(Layout::KITTI_OBJECT, ticks, source))
 }
 
 impl FrameSource for Split {
@@ -144,9 +135,7 @@ fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Objec
                 problems.extend(classes::unknown_label(path, kind));
                 objects.push(object);
             }
-            Err(error) => problems.push(Problem::from(
-                &error.with_consequence("the object is left out"),
-            )),
+            Err(error) => problems.push(Problem::left_out("object", error)),
         }
     }
     Ok((objects, problems))

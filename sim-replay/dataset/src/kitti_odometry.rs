@@ -28,17 +28,12 @@ pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
 };
 
 /// True for a folder with scans and a calibration file.
-pub(super) fn is_sequence(dir: &Path) -> bool {
+fn is_sequence(dir: &Path) -> bool {
     dir.join("calib.txt").is_file() && files::holds(&dir.join("velodyne"), ".bin")
 }
 
 /// Opens a sequence. Scans without time or pose are left out if others have them, and reported with their number.
-pub(super) fn open(
-    root: &Path,
-    dir: &Path,
-    options: &OpenOptions,
-    problems: &mut Vec<ReadError>,
-) -> Result<Scenario> {
+fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
     let velodyne = dir.join("velodyne");
     let mut scans = scans(&velodyne, problems)?;
     let times = sequence::or_without("times", times(dir, &scans, problems), problems);
@@ -63,13 +58,12 @@ pub(super) fn open(
     let mut clouds: Vec<(Tick, PathBuf, Option<Pose>)> = clouds.collect();
     // Names without leading zeros are listed in another order than their numbers.
     clouds.sort_by_key(|(tick, ..)| tick.capture_nanos);
-    let name = files::name_below(root, dir);
-    let storage = (SweepStorage::ByName, options);
+    let (layout, storage) = (Layout::KITTI_ODOMETRY, SweepStorage::ByName);
     let files = ["calib.txt", "times.txt"].map(|name| dir.join(name));
     let files = files.into_iter().chain(poses_path(dir)).collect();
     Ok(Scenario {
         joins,
-        ..sequence::scenario(name, Layout::KITTI_ODOMETRY, clouds, storage, files, false)
+        ..sequence::scenario(layout, clouds, storage, files, options)
     })
 }
 
@@ -409,7 +403,8 @@ mod tests {
                 .is_some()
         );
         let problems: Vec<String> = dataset.problems.iter().map(ToString::to_string).collect();
-        assert_eq!((problems.len(), dataset.problems[1].line()), (2, Some(1)));
+        let line = crate::Problem::from(&dataset.problems[1]).line;
+        assert_eq!((problems.len(), line), (2, Some(1)));
         assert!(
             problems[0].ends_with("\"000001 (1)\" is no scan number: the file is left out"),
             "{problems:?}"

@@ -67,18 +67,24 @@ pub(super) fn numbers<const N: usize>(
     field: Option<&str>,
     text: &str,
 ) -> Result<[f64; N]> {
-    let numbers = text.split_ascii_whitespace().map(|word| {
+    let (mut numbers, mut found) = ([0.0; N], 0_usize);
+    for word in text.split_ascii_whitespace() {
         let number = word.parse().ok().filter(|number: &f64| number.is_finite());
-        number.ok_or_else(|| {
+        let Some(number) = number else {
             let reason = format!("{:?} is no finite number", excerpt(word, 40));
-            malformed(path, line, field, reason)
-        })
-    });
-    let numbers = numbers.collect::<Result<Vec<f64>>>()?;
-    numbers.try_into().map_err(|numbers: Vec<f64>| {
-        let reason = format!("{} numbers, expected {N}", numbers.len());
-        malformed(path, line, field, reason)
-    })
+            return Err(malformed(path, line, field, reason));
+        };
+        // Numbers beyond the last are only counted.
+        if let Some(place) = numbers.get_mut(found) {
+            *place = number;
+        }
+        found += 1;
+    }
+    if found != N {
+        let reason = format!("{found} numbers, expected {N}");
+        return Err(malformed(path, line, field, reason));
+    }
+    Ok(numbers)
 }
 
 /// A rigid transform from a row-major 3x4 matrix.

@@ -38,8 +38,8 @@ pub(crate) enum LayoutReader {
     Sequence {
         /// True for the folder of a sequence.
         is_one: fn(&Path) -> bool,
-        /// Opens it; its name is relative to the first path.
-        open: fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
+        /// Opens it; the caller gives it its name.
+        open: fn(&Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
     },
 }
 

@@ -61,12 +61,8 @@ impl Layout {
 
 /// One line per layout: name, data sets in brackets, and the files that identify it.
 pub fn layouts_text() -> String {
-    text_of(&LAYOUTS)
-}
-
-pub(crate) fn text_of(layouts: &[&LayoutRow]) -> String {
     let mut text = String::new();
-    for row in layouts {
+    for row in &LAYOUTS {
         let (name, files) = (row.name, row.files);
         let data_sets = match row.data_sets {
             own if own == name => String::new(),

@@ -127,9 +127,8 @@ pub struct Tick {
 
 impl Tick {
     fn new(stem: impl Into<String>, capture_nanos: u64) -> Self {
-        let stem = stem.into();
         Self {
-            stem,
+            stem: stem.into(),
             capture_nanos,
         }
     }
@@ -390,12 +389,8 @@ fn single_vehicle_id() -> CavId {
     CavId::new("0").expect("a digit is an identifier")
 }
 
-/// A scenario of a layout with one unnamed vehicle.
-fn single_vehicle(
-    name: String,
-    layout: Layout,
-    ticks: Vec<Tick>,
-    source: Arc<dyn FrameSource>,
-) -> Scenario {
-    Scenario::new(name, layout, vec![single_vehicle_id()], ticks, source)
+/// A scenario of a layout with one unnamed vehicle. Its folder gives it its name when it is opened ([`open()`]).
+fn single_vehicle(layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
+    let agents = vec![single_vehicle_id()];
+    Scenario::new(String::new(), layout, agents, ticks, source)
 }

@@ -64,25 +64,15 @@ const PLAIN_POSES: &str = "velodyne_left_False.h5";
 const SCENES: [&str; 3] = ["NCLT", "Oxford", "QEOxford"];
 
 /// True if a folder is a sequence.
-pub(super) fn is_sequence(dir: &Path) -> bool {
+fn is_sequence(dir: &Path) -> bool {
     [CONVERTED, RAW]
         .iter()
         .any(|name| files::holds(&dir.join(name), ".bin"))
 }
 
 /// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
-pub(super) fn open(
-    root: &Path,
-    dir: &Path,
-    options: &OpenOptions,
-    problems: &mut Vec<ReadError>,
-) -> Result<Scenario> {
-    let storage = storage(dir);
-    let (points, layout) = match storage {
-        SweepStorage::NcltRaw => (RAW, Layout::NCLT),
-        SweepStorage::ByName => (CONVERTED, Layout::NCLT),
-        SweepStorage::Planar => (CONVERTED, Layout::OXFORD),
-    };
+fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
+    let (layout, storage, points) = variant(dir);
     let points_dir = dir.join(points);
     let mut stamps = BTreeMap::new();
     for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
@@ -119,21 +109,21 @@ pub(super) fn open(
         let tick = Tick::new(stem, micros.saturating_mul(1000));
         (tick, file, poses.get(&micros).copied())
     });
-    let (name, clouds) = (files::name_below(root, dir), clouds.collect());
-    let files = pose_files(dir);
+    let (clouds, files) = (clouds.collect(), pose_files(dir));
     Ok(Scenario {
         joins: join.into_iter().collect(),
-        ..sequence::scenario(name, layout, clouds, (storage, options), files, true)
+        ..sequence::scenario(layout, clouds, storage, files, options)
     })
 }
 
-/// NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and time and more.
-fn storage(dir: &Path) -> SweepStorage {
-    let is_nclt = dir.join(RAW).is_dir() || own_name(dir).len() == "2012-01-22".len();
+/// Layout, storage and folder of the points. NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and
+/// time and more.
+fn variant(dir: &Path) -> (Layout, SweepStorage, &'static str) {
+    let is_nclt = dir.join(RAW).is_dir() || files::own_name(dir).len() == "2012-01-22".len();
     match (is_nclt, files::holds(&dir.join(CONVERTED), ".bin")) {
-        (true, true) => SweepStorage::ByName,
-        (true, false) => SweepStorage::NcltRaw,
-        (false, _) => SweepStorage::Planar,
+        (true, true) => (Layout::NCLT, SweepStorage::ByName, CONVERTED),
+        (true, false) => (Layout::NCLT, SweepStorage::NcltRaw, RAW),
+        (false, _) => (Layout::OXFORD, SweepStorage::Planar, CONVERTED),
     }
 }
 
@@ -153,7 +143,7 @@ fn poses(
     } else if plain.is_file() {
         let scene = if is_nclt { "NCLT" } else { "Oxford" };
         (scene, hdf5_poses::read(&plain, RowOrder::Matrix, problems)?)
-    } else if is_nclt && let Some(path) = nclt_ground_truth::find(dir, &own_name(dir)) {
+    } else if is_nclt && let Some(path) = nclt_ground_truth::find(dir, &files::own_name(dir)) {
         let truth = nclt_ground_truth::read(&path, problems)?;
         let poses = (stamps.keys())
             .filter_map(|&micros| Some((micros, Pose::from(truth.at(micros).ok()?))));
@@ -189,7 +179,7 @@ fn middle_file(dir: &Path, scene: &str) -> Option<PathBuf> {
 /// Files that poses of a sequence may come from.
 fn pose_files(dir: &Path) -> Vec<PathBuf> {
     let mut files = vec![dir.join(ALIGNED_POSES), dir.join(PLAIN_POSES)];
-    files.extend(nclt_ground_truth::find(dir, &own_name(dir)));
+    files.extend(nclt_ground_truth::find(dir, &files::own_name(dir)));
     files.extend(SCENES.iter().filter_map(|scene| middle_file(dir, scene)));
     files
 }
@@ -206,15 +196,6 @@ fn first_row(path: &Path) -> Result<[f64; 3]> {
         rows.truncate(1);
     }
     numbers(path, line, None, &rows.join(" "))
-}
-
-fn own_name(dir: &Path) -> String {
-    // `.` or a link shows no day: the name of the folder behind it does.
-    let name = dir
-        .canonicalize()
-        .ok()
-        .and_then(|dir| Some(dir.file_name()?.to_string_lossy().into_owned()));
-    name.unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -57,50 +57,51 @@ fn open_among(layouts: &[&LayoutRow], dir: &Path, options: &OpenOptions) -> Resu
             return Ok(dataset);
         }
     }
-    let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
-    open_sequences(
+    let mut search = SequenceSearch {
         layouts,
-        dir,
-        (dir, SEQUENCE_DEPTH),
+        root: dir,
         options,
-        &mut scenarios,
-        &mut problems,
-    )?;
-    opened(dir, scenarios, problems)?.ok_or_else(|| unknown(dir))
+        scenarios: Vec::new(),
+        problems: Vec::new(),
+    };
+    search.open_below(dir, SEQUENCE_DEPTH)?;
+    opened(dir, search.scenarios, search.problems)?.ok_or_else(|| unknown(dir))
 }
 
-/// Opens the sequences of a single vehicle, at `dir` or below.
-fn open_sequences(
-    layouts: &[&LayoutRow],
-    root: &Path,
-    (dir, depth): (&Path, usize),
-    options: &OpenOptions,
-    scenarios: &mut Vec<Scenario>,
-    problems: &mut Vec<ReadError>,
-) -> Result<()> {
-    let reader = layouts.iter().find_map(|layout| match layout.reader {
-        Some(LayoutReader::Sequence { is_one, open }) if is_one(dir) => Some(open),
-        _ => None,
-    });
-    match reader.map(|open| open(root, dir, options, problems)) {
-        // One sequence that cannot be opened does not prevent opening the others.
-        Some(Ok(scenario)) => scenarios.push(scenario),
-        Some(Err(error)) => problems.push(error),
-        None if depth > 0 => {
-            for (folder, _) in files::list_below(dir, &files::list(dir)?, problems) {
-                open_sequences(
-                    layouts,
-                    root,
-                    (&folder, depth - 1),
-                    options,
-                    scenarios,
-                    problems,
-                )?;
+/// Search for the sequences of a single vehicle.
+struct SequenceSearch<'a> {
+    layouts: &'a [&'a LayoutRow],
+    root: &'a Path,
+    options: &'a OpenOptions,
+    /// Named by their paths below `root`.
+    scenarios: Vec<Scenario>,
+    problems: Vec<ReadError>,
+}
+
+impl SequenceSearch<'_> {
+    /// Opens the sequences in `dir` or up to `depth` folders below.
+    fn open_below(&mut self, dir: &Path, depth: usize) -> Result<()> {
+        let reader = self.layouts.iter().find_map(|layout| match layout.reader {
+            Some(LayoutReader::Sequence { is_one, open }) if is_one(dir) => Some(open),
+            _ => None,
+        });
+        match reader.map(|open| open(dir, self.options, &mut self.problems)) {
+            // One sequence that cannot be opened does not prevent opening the others.
+            Some(Ok(scenario)) => self.scenarios.push(Scenario {
+                name: files::name_below(self.root, dir),
+                ..scenario
+            }),
+            Some(Err(error)) => self.problems.push(error),
+            None if depth > 0 => {
+                let below = files::list_below(dir, &files::list(dir)?, &mut self.problems);
+                for (folder, _) in below {
+                    self.open_below(&folder, depth - 1)?;
+                }
             }
+            None => {}
         }
-        None => {}
+        Ok(())
     }
-    Ok(())
 }
 
 fn unknown(dir: &Path) -> ReadError {
@@ -148,7 +149,6 @@ mod tests {
     use super::super::{FrameSource, Layout, Tick, single_vehicle};
     use super::*;
     use crate::frame::Frame;
-    use crate::layouts::text_of;
     use crate::pcd::PcdCloud;
 
     /// All that a layout needs: a row, a reader and the source of its frames.
@@ -186,7 +186,6 @@ mod tests {
     }
 
     fn open_dummy(
-        root: &Path,
         dir: &Path,
         options: &OpenOptions,
         _: &mut Vec<ReadError>,
@@ -201,12 +200,8 @@ mod tests {
             capture_nanos: index * options.period_nanos,
         };
         let ticks = (0..count).map(tick).collect();
-        Ok(single_vehicle(
-            files::name_below(root, dir),
-            Layout(&DUMMY),
-            ticks,
-            Arc::new(Dummy(file)),
-        ))
+        let source = Arc::new(Dummy(file));
+        Ok(single_vehicle(Layout(&DUMMY), ticks, source))
     }
 
     #[test]
@@ -266,8 +261,5 @@ mod tests {
             1
         );
         assert_eq!(serde_json::to_string(&dataset.layout).unwrap(), "\"dummy\"");
-        assert!(
-            text_of(&layouts).contains("  dummy layout (none): dummy.txt with a number of ticks")
-        );
     }
 }

@@ -118,7 +118,9 @@ impl Opv2v {
 
     fn right_handed(&self, mut cloud: PcdCloud) -> PcdCloud {
         if self.handedness == Handedness::Left {
-            points::mirror_y(&mut cloud.points);
+            for [_, y, ..] in &mut cloud.points.xyzi {
+                *y = -*y;
+            }
         }
         cloud
     }

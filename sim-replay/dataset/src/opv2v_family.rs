@@ -93,18 +93,17 @@ fn agent_folder_scenario(
     let variants = folder.by_agent.values().flat_map(|agent| &agent.variants);
     let variants: BTreeSet<String> = variants.cloned().collect();
     let has_radar = folder.by_agent.values().any(|agent| agent.has_radar);
-    let (cameras, source): (_, Arc<dyn FrameSource>) = match layout == Layout::V2V4REAL {
-        true => (BTreeSet::new(), Arc::new(V2v4Real { folder, sweeps })),
-        false => {
-            let cameras = folder.by_agent.values().flat_map(|agent| &agent.cameras);
-            let cameras = cameras.copied().collect();
-            let source = Opv2v {
-                folder,
-                sweeps,
-                handedness,
-            };
-            (cameras, Arc::new(source))
-        }
+    let cameras = folder.by_agent.values().flat_map(|agent| &agent.cameras);
+    // Images of V2V4Real are not read.
+    let cameras = cameras.filter(|_| layout != Layout::V2V4REAL);
+    let cameras: BTreeSet<u8> = cameras.copied().collect();
+    let source: Arc<dyn FrameSource> = match layout == Layout::V2V4REAL {
+        true => Arc::new(V2v4Real { folder, sweeps }),
+        false => Arc::new(Opv2v {
+            folder,
+            sweeps,
+            handedness,
+        }),
     };
     Scenario {
         lidar_variants: variants.into_iter().collect(),

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use protocol::{CavId, PointCloud, intensity_divisor};
+use protocol::{CavId, intensity_divisor};
 
 pub(crate) use intensity::NO_INTENSITY;
 pub use intensity::{IntensityOption, IntensityScale, IntensityScaleError, LiveIntensities};
@@ -138,7 +138,7 @@ impl AgentSweeps {
     fn form(&self, path: &Path) -> Result<FloatForm> {
         let form = self.form.get_or_init(|| {
             let files = self.files.iter();
-            let files = files.filter(|path| matches!(FileKind::of(path), Ok(FileKind::Floats)));
+            let files = files.filter(|path| matches!(FileKind::of(path), Ok(FileKind::Bin)));
             let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
             let samples = samples.filter(|bytes| !bytes.is_empty()).take(SAMPLES);
             FloatForm::of(&samples.collect::<Vec<_>>())
@@ -154,7 +154,7 @@ impl AgentSweeps {
                 FileKind::Pcd => read_with(path, pcd::decode_stored),
                 FileKind::Ply => read_described(path, ply::decode),
                 FileKind::Npy => read_described(path, npy::decode),
-                FileKind::Floats => {
+                FileKind::Bin => {
                     let form = self.form(path)?;
                     read_described(path, |bytes| form.decode(bytes))
                 }
@@ -180,14 +180,12 @@ pub(super) fn divisor_of_first(clouds: impl Iterator<Item = PcdCloud>, path: &Pa
 }
 
 /// Format of a file, by the ending of its name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::EnumString)]
-#[strum(serialize_all = "snake_case")]
-pub(super) enum FileKind {
+enum FileKind {
     Pcd,
     Ply,
     Npy,
-    #[strum(serialize = "bin")]
-    Floats,
+    /// Bare floats.
+    Bin,
 }
 
 impl FileKind {
@@ -195,15 +193,19 @@ impl FileKind {
     ///
     /// # Errors
     /// The ending, if files with it are not read.
-    pub(super) fn of(path: &Path) -> Result<Self> {
-        let ending = (path.extension())
-            .map(|ending| ending.to_string_lossy().to_ascii_lowercase())
-            .unwrap_or_default();
-        ending.parse().map_err(|_| {
-            let reason =
-                format!("{ending:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin");
-            ReadError::malformed(path, reason)
-        })
+    fn of(path: &Path) -> Result<Self> {
+        let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
+        match &*ending.to_string_lossy() {
+            "pcd" => Ok(Self::Pcd),
+            "ply" => Ok(Self::Ply),
+            "npy" => Ok(Self::Npy),
+            "bin" => Ok(Self::Bin),
+            other => {
+                let reason =
+                    format!("{other:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin");
+                Err(ReadError::malformed(path, reason))
+            }
+        }
     }
 }
 
@@ -269,13 +271,6 @@ fn nclt_raw(bytes: &[u8]) -> Result<PcdCloud, String> {
     let origin = IntensityOrigin::stored("7th byte", IntensityKind::Byte);
     let form = "8 bytes per point, as NCLT records them";
     Ok(PcdCloud::of_points(points.collect(), Some(origin), form))
-}
-
-/// Negates y: left-handed points become right-handed ones.
-pub(super) fn mirror_y(cloud: &mut PointCloud) {
-    for [_, y, ..] in &mut cloud.xyzi {
-        *y = -*y;
-    }
 }
 
 fn check_whole_points(len: usize, point: usize) -> Result<(), String> {

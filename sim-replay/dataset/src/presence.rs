@@ -17,22 +17,6 @@ pub(super) struct AbsentFrames {
     moments: Option<Arc<Vec<Tick>>>,
 }
 
-impl AbsentFrames {
-    /// The missing frames of `agents` at `ticks`; other missing frames are ignored.
-    pub(super) fn new(agents: &[CavId], ticks: &[Tick], missing: &[MissingFrame]) -> Self {
-        let agents: HashMap<&CavId, usize> = agents.iter().zip(0..).collect();
-        let stems = ticks.iter().map(|tick| tick.stem.as_str());
-        let ticks: HashMap<&str, usize> = stems.zip(0..).collect();
-        let pairs = missing.iter().filter_map(|frame| {
-            Some((*agents.get(&frame.agent)?, *ticks.get(frame.stem.as_str())?))
-        });
-        Self {
-            pairs: Arc::new(pairs.collect()),
-            moments: None,
-        }
-    }
-}
-
 /// The frames of one tick that could be read.
 #[derive(Debug, Default)]
 pub struct LoadedTick {
@@ -53,7 +37,11 @@ impl Scenario {
     }
 
     /// The same among `moments`, or among its ticks where these are all.
-    fn with_ticks(self, moments: Option<Arc<Vec<Tick>>>, missing: Vec<MissingFrame>) -> Self {
+    pub(super) fn with_ticks(
+        self,
+        moments: Option<Arc<Vec<Tick>>>,
+        missing: Vec<MissingFrame>,
+    ) -> Self {
         let lacking: HashSet<&str> = (missing.iter())
             .filter(|frame| Some(&frame.agent) == self.agents.first())
             .map(|frame| frame.stem.as_str())
@@ -61,14 +49,18 @@ impl Scenario {
         let all = moments.as_deref().unwrap_or(&self.ticks).iter();
         let ticks = all.filter(|tick| !lacking.contains(tick.stem.as_str()));
         let ticks: Vec<Tick> = ticks.cloned().collect();
-        let absent_at = AbsentFrames {
-            moments,
-            ..AbsentFrames::new(&self.agents, &ticks, &missing)
-        };
+        let agents: HashMap<&CavId, usize> = self.agents.iter().zip(0..).collect();
+        let stems = ticks.iter().map(|tick| tick.stem.as_str());
+        let stems: HashMap<&str, usize> = stems.zip(0..).collect();
+        // Frames of other agents and at other times are ignored.
+        let pairs = missing.iter().filter_map(|frame| {
+            Some((*agents.get(&frame.agent)?, *stems.get(frame.stem.as_str())?))
+        });
+        let pairs = Arc::new(pairs.collect());
         Self {
+            absent_at: AbsentFrames { pairs, moments },
             ticks,
             missing,
-            absent_at,
             ..self
         }
     }

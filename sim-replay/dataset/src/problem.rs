@@ -30,6 +30,11 @@ impl Problem {
             message: format!("{path}: {reason}"),
         }
     }
+
+    /// A part of a frame, for example `object`, that cannot be read.
+    pub(crate) fn left_out(part: &str, error: ReadError) -> Self {
+        Self::from(&error.with_consequence(&format!("the {part} is left out")))
+    }
 }
 
 /// Largest number of faults that one error lists.
@@ -62,10 +67,14 @@ impl fmt::Display for Problem {
 
 impl From<&ReadError> for Problem {
     fn from(error: &ReadError) -> Self {
+        let (line, field) = match error {
+            ReadError::Malformed { line, field, .. } => (*line, field.clone()),
+            _ => (None, None),
+        };
         Self {
             path: error.path().unwrap_or(Path::new("")).display().to_string(),
-            line: error.line(),
-            field: error.field().map(str::to_owned),
+            line,
+            field,
             message: error.to_string(),
         }
     }

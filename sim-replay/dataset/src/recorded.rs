@@ -10,7 +10,6 @@ use protocol::{
 };
 
 use super::layout::{LayoutReader, LayoutRow};
-use super::presence::AbsentFrames;
 use super::{
     Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
 };
@@ -62,18 +61,16 @@ fn open(file: &Path, recording: Recording) -> Result<Dataset> {
     let name = name.to_string_lossy().into_owned();
     let source = Recorded::new(recording, &mut problems)?;
     let agents = source.agents.clone();
-    let (ticks, missing) = source.ticks();
+    let (ticks, missing) = source.sweep_times();
     let mut streams = source.sensors.keys().map(|(_, _, stream)| *stream);
     let scenario = Scenario {
-        absent_at: AbsentFrames::new(&agents, &ticks, &missing),
         cameras: source.cameras(),
         has_radar: streams.any(|stream| stream == Stream::Radar),
-        missing,
         ..Scenario::new(name, Layout::RECORDING, agents, ticks, Arc::new(source))
     };
     Ok(Dataset {
         layout: Layout::RECORDING,
-        scenarios: vec![scenario],
+        scenarios: vec![scenario.with_ticks(None, missing)],
         problems,
     })
 }
@@ -164,8 +161,8 @@ impl Recorded {
         agents
     }
 
-    /// The ticks at which the ego's sweep was recorded, and the missing sweeps at any capture time.
-    fn ticks(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
+    /// The capture times of all sweeps, and the sweeps that agents lack at them.
+    fn sweep_times(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
         let keys = self.sensors.keys();
         let sweeps = keys.filter(|(_, _, stream)| *stream == Stream::Lidar);
         let mut captures: Vec<u64> = sweeps.map(|(at, _, _)| *at).collect();
@@ -178,12 +175,8 @@ impl Recorded {
                 .agents
                 .iter()
                 .filter(|cav| !self.has(cav, capture_nanos, Stream::Lidar));
-            let lacking: Vec<&CavId> = lacking.collect();
-            missing.extend(lacking.iter().map(|cav| MissingFrame::new(cav, &stem)));
-            // The ego is the first of both lists: without its sweep there is no tick.
-            if lacking.first() != self.agents.first().as_ref() {
-                ticks.push(Tick::new(stem, capture_nanos));
-            }
+            missing.extend(lacking.map(|cav| MissingFrame::new(cav, &stem)));
+            ticks.push(Tick::new(stem, capture_nanos));
         }
         (ticks, missing)
     }

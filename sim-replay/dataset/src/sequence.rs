@@ -19,18 +19,18 @@ struct SequenceSource {
     sweeps: Sweeps,
     /// Files of poses, times and calibration, whether or not they exist.
     shared_files: Vec<PathBuf>,
+    /// True for the recordings of [`super::localization`]: their points are turned by half a turn about x.
     is_z_down: bool,
 }
 
 /// The scenario of `clouds` in order of time, each with its file and `world_from_lidar`. What neither names nor sweeps
-/// hold comes from `shared_files`. Points that are stored with z down are turned by half a turn about x.
+/// hold comes from `shared_files`.
 pub(super) fn scenario(
-    name: String,
     layout: Layout,
     clouds: Vec<(Tick, PathBuf, Option<Pose>)>,
-    (storage, options): (SweepStorage, &OpenOptions),
+    storage: SweepStorage,
     shared_files: Vec<PathBuf>,
-    is_z_down: bool,
+    options: &OpenOptions,
 ) -> Scenario {
     let files = clouds.iter().map(|(_, file, _)| file.clone());
     let sweeps = Sweeps::of_single_vehicle(storage, files, options);
@@ -42,9 +42,9 @@ pub(super) fn scenario(
         clouds: clouds.collect(),
         sweeps,
         shared_files,
-        is_z_down,
+        is_z_down: [Layout::NCLT, Layout::OXFORD].contains(&layout),
     };
-    single_vehicle(name, layout, ticks, Arc::new(source))
+    single_vehicle(layout, ticks, Arc::new(source))
 }
 
 /// Values that a file gives for all scans; if it cannot be read, a problem and nothing.

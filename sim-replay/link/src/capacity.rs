@@ -25,8 +25,6 @@ pub(super) enum ServiceCurve {
         all: Box<Self>,
         /// Offset into that curve, nanoseconds.
         offset_nanos: u64,
-        /// Work that could be done before it.
-        before: u128,
     },
 }
 
@@ -57,17 +55,12 @@ impl ServiceCurve {
             (config, Some(Trace::Opportunities(times))) => {
                 let offset_nanos = config.trace().map_or(0, TraceConfig::offset_nanos);
                 let all = Self::Opportunities(times.clone());
-                // The trace repeats, so its part before the offset cannot be cut off as in a CSV trace.
-                let before = all.done_by(offset_nanos);
                 if offset_nanos == 0 {
-                    all
-                } else {
-                    Self::Later {
-                        all: Box::new(all),
-                        offset_nanos,
-                        before,
-                    }
+                    return all;
                 }
+                // The trace repeats, so its part before the offset cannot be cut off as in a CSV trace.
+                let all = Box::new(all);
+                Self::Later { all, offset_nanos }
             }
             _ => Self::Unlimited,
         }
@@ -93,11 +86,9 @@ impl ServiceCurve {
                 let passed = times.partition_point(|&time| time <= rest) as u128;
                 (u128::from(rounds) * times.len() as u128 + passed) * work(OPPORTUNITY_BYTES)
             }
-            Self::Later {
-                all,
-                offset_nanos,
-                before,
-            } => all.done_by(nanos.saturating_add(*offset_nanos)) - before,
+            Self::Later { all, offset_nanos } => {
+                all.done_by(nanos.saturating_add(*offset_nanos)) - all.done_by(*offset_nanos)
+            }
         }
     }
 
@@ -114,11 +105,10 @@ impl ServiceCurve {
                 if left == 0 {
                     return Some(step.from_nanos);
                 }
-                // A last step with rate 0 never finishes the work: the division has no result.
-                let nanos = left.checked_div(u128::from(step.bits_per_s))?;
-                let whole = nanos * u128::from(step.bits_per_s) == left;
-                step.from_nanos
-                    .checked_add(u64::try_from(nanos + u128::from(!whole)).ok()?)
+                let rate = u128::from(step.bits_per_s);
+                // A last step with rate 0 never finishes the work.
+                let nanos = (rate > 0).then(|| left.div_ceil(rate))?;
+                step.from_nanos.checked_add(u64::try_from(nanos).ok()?)
             }
             Self::Opportunities(times) => {
                 // Index of the opportunity that completes the work. A partly used one serves the next packet.
@@ -128,14 +118,11 @@ impl ServiceCurve {
                 let began = u64::try_from(rounds).ok()?.checked_mul(*period)?;
                 began.checked_add(*time)
             }
-            Self::Later {
-                all,
-                offset_nanos,
-                before,
-            } => Some(
-                all.time_of(wanted.checked_add(*before)?)?
-                    .saturating_sub(*offset_nanos),
-            ),
+            Self::Later { all, offset_nanos } => {
+                let before = all.done_by(*offset_nanos);
+                let nanos = all.time_of(wanted.checked_add(before)?)?;
+                Some(nanos.saturating_sub(*offset_nanos))
+            }
         }
     }
 }
@@ -171,7 +158,7 @@ mod tests {
             let times = times.iter().map(|ms| ms * 1_000_000).collect();
             let opportunities = ServiceCurve::Opportunities(times);
             let (all, offset_nanos) = (Box::new(opportunities.clone()), 9 * constant);
-            let later = ServiceCurve::Later { before: all.done_by(offset_nanos), all, offset_nanos };
+            let later = ServiceCurve::Later { all, offset_nanos };
             for capacity in [steps(&rates), ServiceCurve::Constant(constant), opportunities, later] {
                 let Some(nanos) = capacity.time_of(work(bytes)) else {
                     prop_assert_eq!(rates.last(), Some(&0));

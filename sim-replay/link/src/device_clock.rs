@@ -33,23 +33,19 @@ impl DeviceClock {
 
     /// The time of the vehicle's clock at a time of a scene that began at `began_nanos`: at the beginning it differs by
     /// its offset. Never below 0.
-    pub fn shown_since(&self, began_nanos: u64, scene_nanos: u64) -> u64 {
-        let ahead_nanos = self.ahead_nanos(scene_nanos.saturating_sub(began_nanos));
-        let shown = i128::from(scene_nanos) + ahead_nanos;
-        u64::try_from(shown.max(0)).unwrap_or(u64::MAX)
-    }
-
-    /// Offset at a time after the beginning.
     #[expect(
         clippy::cast_possible_truncation,
         reason = "a cast from a float saturates"
     )]
-    fn ahead_nanos(&self, since_nanos: u64) -> i128 {
+    pub fn shown_since(&self, began_nanos: u64, scene_nanos: u64) -> u64 {
+        let since_nanos = scene_nanos.saturating_sub(began_nanos);
         // The step is at a time of the scene, not of the clock, which would reach it twice after a step back.
         let step = self.step.as_ref();
         let set = step.filter(|step| since_nanos as f64 >= step.at_s * 1e9);
         let offset_ms = self.offset_ms + set.map_or(0.0, |step| step.by_ms);
-        (offset_ms * 1e6 + self.drift_ppm * 1e-6 * since_nanos as f64).round() as i128
+        let ahead_nanos = offset_ms * 1e6 + self.drift_ppm * 1e-6 * since_nanos as f64;
+        let shown = i128::from(scene_nanos) + ahead_nanos.round() as i128;
+        u64::try_from(shown.max(0)).unwrap_or(u64::MAX)
     }
 }
 

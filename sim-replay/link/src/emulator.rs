@@ -6,7 +6,6 @@ use std::path::Path;
 use protocol::{CavId, DropReason, Stream};
 
 use super::capacity::ServiceCurve;
-use super::chance::{Purpose, label};
 use super::config::{CapacityConfig, LinkConfig, LinkError, Medium};
 use super::device_clock::DeviceClock;
 use super::loss::LossState;
@@ -56,6 +55,15 @@ pub struct LinkEmulator {
     now_nanos: u64,
     /// Number of the next outcome, which orders outcomes of the same time.
     next: u64,
+}
+
+/// Purpose of a random draw, which depends on the message and the purpose only, not on earlier decisions.
+#[derive(Debug, Clone, Copy)]
+enum Purpose {
+    Delay = 1,
+    Loss = 2,
+    Reorder = 3,
+    Duplicate = 4,
 }
 
 /// State of one direction between two vehicles.
@@ -173,11 +181,10 @@ impl LinkEmulator {
     /// Decides the result of a packet that has left its queue.
     fn settle(&mut self, left: Departure) {
         match left {
-            Departure::Dropped {
-                packet,
-                reason,
-                nanos,
-            } => self.schedule(nanos, packet, Delivery::Dropped(reason)),
+            // Queues drop on a submission only, which is now.
+            Departure::Dropped(packet, reason) => {
+                self.schedule(self.now_nanos, packet, Delivery::Dropped(reason))
+            }
             Departure::Sent {
                 packet,
                 start_nanos,
@@ -266,6 +273,11 @@ impl LinkEmulator {
         self.under_way.insert((nanos, self.next), outcome);
         self.next += 1;
     }
+}
+
+/// A number for a name that does not depend on the order in which names are listed.
+fn label(name: &str) -> u64 {
+    derive_seed(0, &name.bytes().map(u64::from).collect::<Vec<_>>())
 }
 
 impl LinkConfig {

@@ -33,7 +33,6 @@
 #![cfg_attr(not(test), deny(clippy::indexing_slicing))]
 
 mod capacity;
-mod chance;
 mod config;
 mod device_clock;
 mod emulator;

@@ -38,12 +38,8 @@ pub(super) enum Departure {
         start_nanos: u64,
         end_nanos: u64,
     },
-    /// The packet was dropped in the queue.
-    Dropped {
-        packet: Packet,
-        reason: DropReason,
-        nanos: u64,
-    },
+    /// The packet was dropped when another was submitted, or on its own submission.
+    Dropped(Packet, DropReason),
 }
 
 /// Parameters of a queue.
@@ -85,10 +81,10 @@ impl QueueServer {
                 break;
             };
             self.waiting_bytes -= oldest.bytes;
-            left.push(dropped(oldest, DropReason::LinkQueue, nanos));
+            left.push(Departure::Dropped(oldest, DropReason::LinkQueue));
         }
         if self.is_full_for(&packet, rules) {
-            left.push(dropped(packet, DropReason::LinkQueue, nanos));
+            left.push(Departure::Dropped(packet, DropReason::LinkQueue));
             return;
         }
         self.waiting_bytes += packet.bytes;
@@ -129,17 +125,16 @@ impl QueueServer {
 
     /// The same, with true for an urgent packet.
     fn next(&self, rules: &Rules) -> Option<(u64, bool)> {
-        let [urgent, usual] = [self.urgent.front(), self.sending.as_ref()].map(|sending| {
-            let sending = sending?;
+        let urgent = self.urgent.front().map(|sending| (sending, true));
+        let usual = self.sending.as_ref().map(|sending| (sending, false));
+        let ends = urgent.into_iter().chain(usual);
+        let ends = ends.filter_map(|(sending, is_urgent)| {
             // With a burst the work may have been available before the packet was submitted.
             let end_nanos = rules.capacity.time_of(sending.end)?;
-            Some(end_nanos.max(sending.start_nanos))
+            Some((end_nanos.max(sending.start_nanos), is_urgent))
         });
-        match (urgent, usual) {
-            (Some(urgent), Some(usual)) if usual < urgent => Some((usual, false)),
-            (Some(urgent), _) => Some((urgent, true)),
-            (None, usual) => usual.map(|nanos| (nanos, false)),
-        }
+        // Of two at the same time the first, which is the urgent one.
+        ends.min_by_key(|(nanos, _)| *nanos)
     }
 
     fn send(&mut self, packet: Packet, nanos: u64, rules: &Rules) {
@@ -179,16 +174,7 @@ impl QueueServer {
                 return;
             };
             self.waiting_bytes -= older.bytes;
-            let nanos = newer.submitted_nanos;
-            left.push(dropped(older, DropReason::Superseded, nanos));
+            left.push(Departure::Dropped(older, DropReason::Superseded));
         }
-    }
-}
-
-fn dropped(packet: Packet, reason: DropReason, nanos: u64) -> Departure {
-    Departure::Dropped {
-        packet,
-        reason,
-        nanos,
     }
 }

@@ -54,6 +54,12 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
     rest.is_some_and(<[u8]>::is_empty)
 }
 
+/// Opcode and length of the record that begins here, and what follows.
+pub(super) fn split_head(bytes: &[u8]) -> Option<(u8, u64, &[u8])> {
+    let (&[opcode, len @ ..], rest) = bytes.split_first_chunk::<RECORD_HEAD>()?;
+    Some((opcode, u64::from_le_bytes(len), rest))
+}
+
 /// The bytes behind `count` texts, which begin at `head`.
 fn behind(record: &[u8], head: usize, count: usize) -> Option<&[u8]> {
     let mut rest = record.get(head..)?;
@@ -95,8 +101,8 @@ fn chunk_fits(chunk: &[u8]) -> Option<()> {
     let (&len, rest) = rest.split_first_chunk()?;
     let mut records = rest.get(..usize::try_from(u64::from_le_bytes(len)).ok()?)?;
     while compression.is_empty() && !records.is_empty() {
-        let (&[_, len @ ..], rest) = records.split_first_chunk::<RECORD_HEAD>()?;
-        records = rest.get(usize::try_from(u64::from_le_bytes(len)).ok()?..)?;
+        let (_, len, rest) = split_head(records)?;
+        records = rest.get(usize::try_from(len).ok()?..)?;
     }
     Some(())
 }

@@ -70,7 +70,8 @@ impl<'a> Records<'a> {
             return Ok(Err("the file ends in the middle of a record".into()));
         }
         self.file.read_exact_at(&mut head, begin)?;
-        let (opcode, claimed) = split_head(head);
+        let [opcode, claimed @ ..] = head;
+        let claimed = u64::from_le_bytes(claimed);
         if !is_known(opcode) {
             return Ok(Err(format!(
                 "a record of kind {opcode:#04x} where none can be"
@@ -144,11 +145,6 @@ fn has_magic(file: &File, at: u64) -> io::Result<bool> {
     Ok(found == *mcap::MAGIC)
 }
 
-fn split_head(head: [u8; RECORD_HEAD]) -> (u8, u64) {
-    let [opcode, len @ ..] = head;
-    (opcode, u64::from_le_bytes(len))
-}
-
 /// True if records of this kind occur in the data section.
 fn is_known(opcode: u8) -> bool {
     matches!(
@@ -167,10 +163,9 @@ fn is_known(opcode: u8) -> bool {
 
 /// True if a record certainly begins here, `left` bytes before the end of the file.
 fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
-    let Some((&head, body)) = bytes.split_first_chunk::<RECORD_HEAD>() else {
+    let Some((opcode, len, body)) = lengths::split_head(bytes) else {
         return false;
     };
-    let (opcode, len) = split_head(head);
     if len > left - RECORD_HEAD as u64 {
         return false;
     }
@@ -191,12 +186,11 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
 
 /// True if the bytes after an apparent end of the data are those of a summary or footer.
 fn begins_summary(bytes: &[u8]) -> bool {
-    let Some((&head, _)) = bytes.split_first_chunk::<RECORD_HEAD>() else {
-        return false;
-    };
-    let (opcode, len) = split_head(head);
-    matches!(
-        opcode,
-        op::FOOTER | op::SCHEMA | op::CHANNEL | op::CHUNK_INDEX | op::STATISTICS
-    ) && len < 1 << 32
+    lengths::split_head(bytes).is_some_and(|(opcode, len, _)| {
+        let is_of_summary = matches!(
+            opcode,
+            op::FOOTER | op::SCHEMA | op::CHANNEL | op::CHUNK_INDEX | op::STATISTICS
+        );
+        is_of_summary && len < 1 << 32
+    })
 }

@@ -125,9 +125,7 @@ impl<S: Store> RecordingWriter<S> {
     /// # Errors
     /// [`RecordingError`] if the message, and with it its chunk, is not written.
     pub fn write(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> Result<()> {
-        self.check_open()?;
-        let added = self.add(key, arrived_nanos, payload);
-        self.checked(added)?;
+        self.attempt(|writer| writer.add(key, arrived_nanos, payload))?;
         if self.open.1 > CHUNK_BYTES {
             self.flush()?;
         }
@@ -187,10 +185,9 @@ impl<S: Store> RecordingWriter<S> {
         vehicles: &BTreeSet<CavId>,
         mount: &Mount,
     ) -> Result<()> {
-        self.check_open()?;
         let cdr = ros2::static_transforms(nanos, vehicles.iter(), mount);
-        let added = self.add_ros(nanos, 0, &RosMessage::new(RosTopic::TfStatic, cdr));
-        self.checked(added)
+        let message = RosMessage::new(RosTopic::TfStatic, cdr);
+        self.attempt(|writer| writer.add_ros(nanos, 0, &message))
     }
 
     /// Ends the open chunk: everything written so far survives a crash of this process.
@@ -198,9 +195,7 @@ impl<S: Store> RecordingWriter<S> {
     /// # Errors
     /// As [`Self::write`].
     pub fn flush(&mut self) -> Result<()> {
-        self.check_open()?;
-        let flushed = self.mcap.flush();
-        self.checked(flushed)?;
+        self.attempt(|writer| writer.mcap.flush())?;
         // After the flush has succeeded: messages of a chunk that was cut off do not count.
         self.whole_messages += std::mem::take(&mut self.open).0;
         Ok(())
@@ -218,8 +213,7 @@ impl<S: Store> RecordingWriter<S> {
     /// As [`Self::write`].
     pub fn finish(&mut self) -> Result<()> {
         self.flush()?;
-        let finished = self.mcap.finish();
-        self.checked(finished)?;
+        self.attempt(|writer| writer.mcap.finish().map(drop))?;
         self.ended = Some("it is complete".into());
         S::sync(&self.path).map_err(RecordingError::io(&self.path))
     }
@@ -289,18 +283,15 @@ impl<S: Store> RecordingWriter<S> {
         }
     }
 
-    fn check_open(&self) -> Result<()> {
-        match &self.ended {
-            None => Ok(()),
-            Some(reason) => Err(RecordingError::Ended {
+    /// Writes, unless an earlier write has failed; an error ends the recording.
+    fn attempt(&mut self, write: impl FnOnce(&mut Self) -> McapResult<()>) -> Result<()> {
+        if let Some(reason) = &self.ended {
+            return Err(RecordingError::Ended {
                 path: self.path.clone(),
                 reason: reason.clone(),
-            }),
+            });
         }
-    }
-
-    fn checked<T>(&mut self, written: McapResult<T>) -> Result<T> {
-        written.map_err(|error| {
+        write(self).map_err(|error| {
             let error = failure(&self.path, error);
             self.ended = Some(error.to_string());
             error

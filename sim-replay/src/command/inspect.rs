@@ -69,10 +69,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 /// As JSON, or as a table.
 fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> {
-    if json {
-        output::line(serde_json::to_string_pretty(report)?)?;
-    } else {
-        output::line(report)?;
-    }
-    Ok(())
+    let text = match json {
+        true => serde_json::to_string_pretty(report)?,
+        false => report.to_string(),
+    };
+    Ok(output::line(text)?)
 }

@@ -49,23 +49,17 @@ pub fn inspect(
         path: dir.display().to_string(),
         ..Report::default()
     };
-    let dataset = match dataset::open_with(dir, open) {
-        Ok(dataset) => dataset,
-        Err(error) => {
-            report.problems.push(Problem::from(&error));
-            return report;
-        }
+    let opened = dataset::open_with(dir, open);
+    let Some(dataset) = or_problem(opened, &mut report.problems) else {
+        return report;
     };
     report.layout = Some(dataset.layout);
-    let protocol = match protocol.resolve(dataset.layout) {
-        Ok(protocol) => protocol,
-        Err(reason) => {
-            report.problems.push(Problem::from(&ReadError::Layout {
-                path: dir.to_owned(),
-                reason,
-            }));
-            return report;
-        }
+    let protocol = protocol.resolve(dataset.layout).map_err(|reason| {
+        let path = dir.to_owned();
+        ReadError::Layout { path, reason }
+    });
+    let Some(protocol) = or_problem(protocol, &mut report.problems) else {
+        return report;
     };
     report.protocol = Some(protocol.clone());
     let mut problems: Vec<_> = dataset.problems.iter().map(Problem::from).collect();
@@ -142,13 +136,11 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
         surveys.map(Option::unwrap_or_default).unzip();
     let frames: Vec<&Frame> = frames.iter().flatten().collect();
     let objects = frames.iter().flat_map(|frame| &frame.objects);
-    let targets = objects
-        .filter(|object| rule.classes.contains(object.class))
-        .count();
+    let targets = objects.filter(|object| rule.classes.contains(object.class));
     let merged = merged_counts(scenario, tick, &frames, rule);
     TickFindings {
         agents,
-        targets,
+        targets: targets.count(),
         merged,
     }
 }
@@ -257,10 +249,8 @@ fn merged_counts(
 fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
     let times = scenario.ticks.iter().map(|tick| tick.capture_nanos);
     let times: Vec<u64> = times.collect();
-    let span = times
-        .last()
-        .zip(times.first())
-        .map_or(0, |(last, first)| last.saturating_sub(*first));
+    let ends = times.first().zip(times.last());
+    let span = ends.map_or(0, |(first, last)| last.saturating_sub(*first));
     let agents = scenario.agents.iter().enumerate().map(|(agent, id)| {
         let frames = findings.iter().map(|tick| &tick.agents[agent]);
         summarize_agent(id, &frames.collect::<Vec<_>>())

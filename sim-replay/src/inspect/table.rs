@@ -7,7 +7,7 @@ use protocol::Handedness;
 
 use super::{AgentReport, CountSummary, Report, ScenarioReport};
 use dataset::Layout;
-use terminal::text_table::{Side, TextTable};
+use terminal::text_table::TextTable;
 
 /// Problems that are printed; further ones are counted.
 const MAX_PROBLEMS: usize = 50;
@@ -20,9 +20,8 @@ impl fmt::Display for Report {
         let frames = count(frames, "frame");
         writeln!(f, "{}: {layout}, {scenarios}, {frames}", self.path)?;
         let agents = self.scenarios.iter().flat_map(|scenario| &scenario.agents);
-        let has_boxes = agents
-            .filter_map(|agent| agent.boxes)
-            .any(|boxes| boxes.max > 0);
+        let mut boxes = agents.filter_map(|agent| agent.boxes);
+        let has_boxes = boxes.any(|boxes| boxes.max > 0);
         if let Some(protocol) = self.protocol.as_ref().filter(|_| has_boxes) {
             writeln!(f, "{protocol}")?;
         }
@@ -125,16 +124,15 @@ fn write_missing(f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::
 }
 
 fn agents_table(agents: &[AgentReport]) -> TextTable {
-    let right = [
+    let numbers = [
         "points",
         "dropped",
         "boxes",
         "empty boxes",
         "radar",
         "metres",
-    ]
-    .map(|name| (name, Side::Right));
-    let mut table = TextTable::new([("agent", Side::Left)].into_iter().chain(right));
+    ];
+    let mut table = TextTable::of(&["agent"], &numbers);
     for agent in agents {
         table.row([
             agent.id.to_string(),

@@ -350,10 +350,11 @@ impl<'a> Replay<'a> {
 
     /// Publishes the frames that have passed the emulated link.
     fn deliver(&mut self) {
-        let links = self.sensor_link.iter_mut();
-        for sweep in links.flat_map(|link| link.arrived(Instant::now())) {
-            let (agent, nanos) = (sweep.agent, sweep.capture_nanos);
-            self.publisher.submit(agent, nanos, sweep.frame);
+        let link = self.sensor_link.as_mut();
+        let arrived = link.map(|link| link.arrived(Instant::now()));
+        for sweep in arrived.unwrap_or_default() {
+            self.publisher
+                .submit(sweep.agent, sweep.capture_nanos, sweep.frame);
         }
     }
 
@@ -400,7 +401,7 @@ impl<'a> Replay<'a> {
         let read: Vec<_> = frames.iter().flatten().collect();
         let agents = truth_of(&read);
         self.present = read.iter().map(|frame| frame.cav.clone()).collect();
-        if self.options.lockstep.is_empty() && self.options.rate > 0.0 {
+        if !self.options.is_paced() {
             self.report.lateness.add(due.elapsed());
         }
         for (agent, frame) in frames.into_iter().enumerate() {

@@ -13,26 +13,17 @@ const LOSSLESS_PLACES: usize = 16;
 /// Points of a preview: it must fit into one batch of zenoh.
 const PREVIEW_POINTS: usize = 4_000;
 
-/// The sensors of one vehicle.
-struct VehiclePublishers {
-    lidar: Publisher,
-    gnss: Publisher,
-    imu: Publisher,
-    radar: Option<Publisher>,
-    /// By number.
-    cameras: Vec<(u8, Publisher)>,
-    preview: Publisher,
-}
-
 /// All publishers of a replay.
 pub(super) struct SensorPublisher {
-    sensors: Vec<VehiclePublishers>,
+    /// By index of the vehicle among those that take part, and by stream.
+    sensors: Vec<((usize, Stream), Publisher)>,
     truth: Publisher,
     sent: Vec<TopicCount>,
 }
 
 impl SensorPublisher {
-    /// Publishers for `agents` and what is loaded of them, `cameras` among it. With `is_paced` the sender waits instead of replacing a sweep.
+    /// Opens the publishers of the truth and of the sensors of `agents`: radar and `cameras` only if `load` has them
+    /// read. With `is_paced` sensor messages wait for a place in their queue instead of replacing older ones.
     pub(super) fn open(
         bus: &Bus,
         agents: &[CavId],
@@ -40,46 +31,35 @@ impl SensorPublisher {
         cameras: &[u8],
         is_paced: bool,
     ) -> Result<Self, BusError> {
-        let [sweep, pose, radar, camera] = [
-            PublisherOptions::SENSOR,
-            PublisherOptions::POSE,
-            PublisherOptions::RADAR,
-            PublisherOptions::CAMERA,
-        ]
-        .map(|options| match is_paced {
-            true => options.lossless(LOSSLESS_PLACES),
-            false => options,
-        });
-        let sensors = agents.iter().map(|cav| {
-            Ok(VehiclePublishers {
-                // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
-                lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), sweep)?,
-                gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), pose)?,
-                imu: bus.publisher(Topic::stream(cav, Stream::Imu), pose)?,
-                radar: load
-                    .radar
-                    .then(|| bus.publisher(Topic::stream(cav, Stream::Radar), radar))
-                    .transpose()?,
-                cameras: cameras
-                    .iter()
-                    .filter(|_| load.cameras)
-                    .map(|&number| {
-                        let topic = Topic::stream(cav, Stream::Camera(number));
-                        Ok((number, bus.publisher(topic, camera)?))
-                    })
-                    .collect::<Result<_, BusError>>()?,
-                // Never paced: a slow viewer must not hold back the replay.
-                preview: bus.publisher(
-                    Topic::stream(cav, Stream::Preview),
-                    PublisherOptions::PREVIEW,
-                )?,
-            })
-        });
+        let always = [
+            (Stream::Lidar, PublisherOptions::SENSOR),
+            // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
+            (Stream::Gnss, PublisherOptions::POSE),
+            (Stream::Imu, PublisherOptions::POSE),
+            (Stream::Preview, PublisherOptions::PREVIEW),
+        ];
+        let radar = (Stream::Radar, PublisherOptions::RADAR);
+        let radar = load.radar.then_some(radar);
+        let cameras = cameras.iter().filter(|_| load.cameras);
+        let cameras = cameras.map(|&number| (Stream::Camera(number), PublisherOptions::CAMERA));
+        let streams: Vec<_> = always.into_iter().chain(radar).chain(cameras).collect();
         // Waits for a place even in a replay that is not paced: a tick without truth cannot be scored.
         let waiting = PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES);
         let truth = bus.publisher(Topic::Truth, waiting)?;
+        let mut sensors = Vec::new();
+        for (agent, cav) in agents.iter().enumerate() {
+            for &(stream, options) in &streams {
+                // Previews are never paced: a slow viewer must not hold back the replay.
+                let options = match is_paced && stream != Stream::Preview {
+                    true => options.lossless(LOSSLESS_PLACES),
+                    false => options,
+                };
+                let publisher = bus.publisher(Topic::stream(cav, stream), options)?;
+                sensors.push(((agent, stream), publisher));
+            }
+        }
         Ok(Self {
-            sensors: sensors.collect::<Result<_, _>>()?,
+            sensors,
             truth,
             sent: Vec::new(),
         })
@@ -87,61 +67,66 @@ impl SensorPublisher {
 
     /// Submits the data of one vehicle captured at `capture_nanos`.
     pub(super) fn submit(&mut self, agent: usize, capture_nanos: u64, frame: Frame) {
-        let Some(sensors) = self.sensors.get(agent) else {
-            return;
-        };
         if let Some(gnss) = frame.gnss() {
             // The pose is sent first: it is small, and the sweep cannot be used without it.
-            send(&mut self.sent, &sensors.gnss, capture_nanos, gnss);
+            self.send((agent, Stream::Gnss), capture_nanos, gnss);
         }
         // Empty where nothing is recorded: the agent need not wait for it.
-        send(&mut self.sent, &sensors.imu, capture_nanos, frame.motion());
+        self.send((agent, Stream::Imu), capture_nanos, frame.motion());
         // Not counted as sent, since zenoh may drop previews.
-        if sensors.preview.is_wanted() {
+        let preview = publisher_of(&self.sensors, (agent, Stream::Preview));
+        if let Some(preview) = preview.filter(|preview| preview.is_wanted()) {
             let points = frame.points.decimate(PREVIEW_POINTS);
-            sensors.preview.submit(capture_nanos, Lidar { points });
+            preview.submit(capture_nanos, Lidar { points });
         }
         let points = frame.points;
-        let sweep = Lidar { points };
-        send(&mut self.sent, &sensors.lidar, capture_nanos, sweep);
-        if let (Some(publisher), Some(points)) = (&sensors.radar, frame.radar) {
-            send(&mut self.sent, publisher, capture_nanos, Radar { points });
+        self.send((agent, Stream::Lidar), capture_nanos, Lidar { points });
+        if let Some(points) = frame.radar {
+            self.send((agent, Stream::Radar), capture_nanos, Radar { points });
         }
         for (number, image) in frame.cameras {
-            let mut cameras = sensors.cameras.iter();
-            if let Some((_, publisher)) = cameras.find(|(known, _)| *known == number) {
-                send(&mut self.sent, publisher, capture_nanos, image);
-            }
+            self.send((agent, Stream::Camera(number)), capture_nanos, image);
+        }
+    }
+
+    /// Submits a message of a vehicle's stream, if it is published, and counts it as sent.
+    fn send<M: Payload + Send + 'static>(
+        &mut self,
+        of: (usize, Stream),
+        capture_nanos: u64,
+        message: M,
+    ) {
+        if let Some(publisher) = publisher_of(&self.sensors, of) {
+            publisher.submit(capture_nanos, message);
+            count(&mut self.sent, publisher.topic());
         }
     }
 
     /// Submits the ground truth of one tick.
     pub(super) fn submit_truth(&mut self, capture_nanos: u64, truth: Truth) {
-        send(&mut self.sent, &self.truth, capture_nanos, truth);
+        self.truth.submit(capture_nanos, truth);
+        count(&mut self.sent, self.truth.topic());
     }
 
     /// Sends queued messages and ends every topic; returns the number of submitted messages by topic.
     pub(super) fn finish(self) -> Vec<TopicCount> {
-        for all in self.sensors {
-            let single = [Some(all.lidar), Some(all.gnss), Some(all.imu), all.radar];
-            let cameras = all.cameras.into_iter().map(|(_, camera)| camera);
-            let single = single.into_iter().flatten().chain([all.preview]);
-            single.chain(cameras).for_each(Publisher::finish);
+        for (_, publisher) in self.sensors {
+            publisher.finish();
         }
         self.truth.finish();
         self.sent
     }
 }
 
-/// Submits a message and counts it as sent.
-fn send<M: Payload + Send + 'static>(
-    sent: &mut Vec<TopicCount>,
-    publisher: &Publisher,
-    capture_nanos: u64,
-    message: M,
-) {
-    publisher.submit(capture_nanos, message);
-    let topic = publisher.topic();
+fn publisher_of(
+    sensors: &[((usize, Stream), Publisher)],
+    of: (usize, Stream),
+) -> Option<&Publisher> {
+    let found = sensors.iter().find(|(known, _)| *known == of);
+    found.map(|(_, publisher)| publisher)
+}
+
+fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
     match sent.iter_mut().find(|count| count.topic == *topic) {
         Some(count) => count.messages += 1,
         None => sent.push(TopicCount {

@@ -86,7 +86,8 @@ impl PlaceClasses {
 /// Layers from the features of a sweep to its class, and to what depends on the class.
 #[derive(Debug)]
 pub(super) struct PlaceHead {
-    logits: Dense,
+    /// Features `[N, width]` to logits `[N, K]`.
+    pub(super) logits: Dense,
     /// `[K, width]`.
     scale: Tensor,
     shift: Tensor,
@@ -101,11 +102,6 @@ impl PlaceHead {
             scale: path.var("scale", &size, Init::Const(1.0)),
             shift: path.var("shift", &size, Init::Const(0.0)),
         }
-    }
-
-    /// `[N, K]` logits of features `[N, width]`.
-    pub(super) fn classify(&self, features: &Tensor) -> tch::Result<Tensor> {
-        self.logits.forward(features)
     }
 
     /// The features scaled and shifted as `classes` `[N]` have learnt.

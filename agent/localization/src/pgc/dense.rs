@@ -1,8 +1,8 @@
 //! Dense layer: a linear map of features.
 
 use perception::int8::{Int8Linear, LayerFormat};
-use tch::Tensor;
 use tch::nn::{self, Init};
+use tch::{Kind, Tensor};
 
 /// `x W + b` in the precision of `x`.
 #[derive(Debug)]
@@ -35,16 +35,12 @@ impl Dense {
 
     /// The same in integers.
     pub(crate) fn int8(&self, format: LayerFormat) -> tch::Result<Int8Linear> {
-        int8_linear(&self.weight, Some(&self.bias), format)
+        Int8Linear::new(&self.weight, Some(&self.bias), format)
     }
 }
 
-/// A layer in integers.
-pub(super) fn int8_linear(
-    weight: &Tensor,
-    bias: Option<&Tensor>,
-    format: LayerFormat,
-) -> tch::Result<Int8Linear> {
-    // Stored `[C_in, C_out]`: integer layers take the transpose.
-    Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
+/// Features of length 1 along the last dimension.
+pub(crate) fn of_unit_length(x: &Tensor) -> tch::Result<Tensor> {
+    let squares = x.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
+    x.f_div(&squares.f_add_scalar(1e-12)?.f_sqrt()?)
 }

@@ -109,12 +109,6 @@ impl SceneEncoderConfig {
         self.voxel_m * f64::from(1 << (self.levels() - 1))
     }
 
-    /// Edge of the cells that scene coordinates are regressed for, metres.
-    pub fn cell_m(&self) -> f64 {
-        let share = if self.fine_cells { 0.5 } else { 1.0 };
-        share * self.coarse_cell_m()
-    }
-
     /// Channels of the last level.
     pub(crate) fn coarse_channels(&self) -> i64 {
         let last = self.residual_widths.last().or(self.widths.last());
@@ -197,11 +191,15 @@ mod tests {
     fn presets_match_their_names() {
         let full = SceneEncoderConfig::full(1.0);
         assert_eq!(
-            (full.cell_m(), full.cell_channels(), full.sweep_channels()),
+            (
+                full.coarse_cell_m(),
+                full.cell_channels(),
+                full.sweep_channels()
+            ),
             (2.0, 512, 1024)
         );
         let lean = SceneEncoderConfig::lean();
-        assert_eq!((lean.cell_m(), lean.coarse_cell_m()), (2.0, 4.0));
+        assert_eq!(lean.coarse_cell_m(), 4.0);
         assert_eq!((lean.local_channels(), lean.cell_channels()), (192, 448));
         assert!(full.validate().is_ok() && lean.validate().is_ok());
         assert_eq!(SceneEncoderConfig::preset("huge"), None);

@@ -49,7 +49,8 @@ pub struct Localizer {
     pub(super) solver: PoseSolver,
     /// Largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
     pub(crate) most_parts: usize,
-    pub(super) sha256: [String; 2],
+    /// Of the file, or of the encoder in a detector's file.
+    pub(super) encoder_sha256: String,
 }
 
 impl Localizer {
@@ -100,7 +101,7 @@ impl Localizer {
             head: scene_head,
             solver: PoseSolver::default(),
             most_parts: MOST_PARTS,
-            sha256: [encoder_sha256, weights.sha256().to_owned()],
+            encoder_sha256,
         };
         Ok((localizer, weights))
     }
@@ -124,11 +125,6 @@ impl Localizer {
             self.head.observe(&cells, &logits, search)
         })?;
         Ok(())
-    }
-
-    /// SHA-256 of encoder and head.
-    pub fn sha256(&self) -> &[String; 2] {
-        &self.sha256
     }
 
     /// The head's configuration: scene, origin.

@@ -35,7 +35,7 @@ pub(crate) mod voxel_batch;
 pub(crate) mod voxelise;
 pub mod wrong_place;
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, Translation3};
 use support::stage_times::StageTimes;
 use tch::{Kind, Tensor};
 
@@ -84,8 +84,7 @@ impl Localize for Localizer {
     }
 
     fn detector_encoder(&self) -> Option<&str> {
-        let [encoder, _] = &self.sha256;
-        self.encoder.takes_levels().then_some(encoder)
+        self.encoder.takes_levels().then_some(&self.encoder_sha256)
     }
 
     fn place(&self) -> Option<&str> {
@@ -139,16 +138,15 @@ impl Localizer {
         world_from_sensor: &Isometry3<f64>,
         times: &mut StageTimes,
     ) -> Result<Option<FoundPose>, LocalizerError> {
-        let origin_m = Vector3::from(self.head.config().origin_m);
-        let mut origin_from_sensor = *world_from_sensor;
+        let origin_m = self.head.config().origin_m;
         // Subtracted in double precision before positions become single.
-        origin_from_sensor.translation.vector -= origin_m;
+        let origin_from_sensor = Translation3::from(origin_m).inverse() * world_from_sensor;
         // The refinement hardly corrects height and tilt: a few scene coordinates do it first.
         let few = self.regress(encoded, levelling::CELLS, &self.classify(encoded)?, times)?;
         let start = levelling::level(&few, &origin_from_sensor);
         let cells = &encoded.refinement_cells;
         let refined = pose_refinement::refine(&self.head, cells, &start, false, Kind::Float)?;
         times.lap(REFINE);
-        Ok(refined.and_then(|refined| pose_solver::confirm(&refined, &start, &origin_m)))
+        Ok(refined.and_then(|refined| pose_solver::confirm(&refined, &start, origin_m)))
     }
 }

@@ -1,6 +1,6 @@
 //! Pose solver: from scene coordinates to a pose with its confidence, or to the reason why there is none.
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, Translation3};
 use protocol::{NoPoseReason, PoseEstimate};
 
 use super::confidence::Confidence;
@@ -136,11 +136,9 @@ impl PoseSolver {
         let evidence = PoseEvidence::gather(coordinates, registration, second);
         let sigma = self.confidence.sigma(&evidence);
         let last = second.map_or(registration, |second| &second.registration);
-        let mut world_from_sensor = last.target_from_source;
-        // Added in double precision: the coordinates are single and relative to the origin.
-        world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
         FoundPose {
-            world_from_sensor,
+            // Added in double precision: the coordinates are single and relative to the origin.
+            world_from_sensor: Translation3::from(coordinates.origin_m) * last.target_from_source,
             evidence,
             cell_covariance: std_of(coordinates, registration, second).covariance,
             is_registered: false,
@@ -163,14 +161,13 @@ const LEAST_ERROR_M: f64 = 0.04;
 pub(super) fn confirm(
     refined: &RefinedPose,
     start: &Isometry3<f64>,
-    origin_m: &Vector3<f64>,
+    origin_m: [f64; 3],
 ) -> Option<FoundPose> {
     (refined.registration.inlier_ratio >= CONFIRMING_RATIO).then(|| {
         let error_m = LEAST_ERROR_M.hypot(CORRELATION_FACTOR * refined.std.position_m);
-        let mut world_from_sensor = refined.registration.target_from_source;
-        world_from_sensor.translation.vector += origin_m;
+        let origin_from_sensor = refined.registration.target_from_source;
         FoundPose {
-            world_from_sensor,
+            world_from_sensor: Translation3::from(origin_m) * origin_from_sensor,
             evidence: PoseEvidence::of_refinement(refined, start),
             cell_covariance: refined.std.covariance,
             is_registered: false,
@@ -196,6 +193,8 @@ pub fn estimate(solved: &Solved) -> PoseEstimate {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+
     use super::*;
     use crate::pgc::confidence::ConfidenceModel;
     use crate::pgc::test_scene::SyntheticScene;

@@ -5,6 +5,7 @@
 //! gives the cell are the candidates, and the prediction is their mean by attention. Neither the paper nor LightLoc has
 //! this stage; the solver's 'final refinement' is run on its predictions.
 
+use perception::sparse::rows;
 use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
 use tch::{Kind, Tensor};
@@ -13,7 +14,6 @@ use super::dense::Dense;
 use super::error::LocalizerError;
 use super::head_config::RefinerConfig;
 use super::scene_coordinates::Regression;
-use super::scene_encoder::rows;
 
 /// Initial factor of the similarities; learnt from there on.
 const FIRST_SHARPNESS: f64 = 2.0;
@@ -88,11 +88,11 @@ impl Refiner {
 
         // Step: attention over the corners of the window, each with its learnt key.
         let window = self.window(assumed_m)?;
-        let keys = gather(&self.keys, &window.corners)?;
+        let keys = window.of_corners(&self.keys)?;
         let similarity = keys.f_bmm(&query.f_unsqueeze(2)?)?.f_squeeze_dim(2)? * &self.sharpness;
         let shares = similarity.f_softmax(1, Kind::Float)?.f_unsqueeze(1)?;
         let plane_m = shares.f_bmm(&window.places_m)?.f_squeeze_dim(1)?;
-        let heights = gather(&self.heights, &window.corners)?;
+        let heights = window.of_corners(&self.heights)?;
         let floor_m = shares.f_bmm(&heights)?.f_squeeze_dim(1)?;
         let above_m = self.height.forward(&hidden)?.f_to_kind(Kind::Float)?;
         // The spread of the attention weights and the largest of them indicate the error of the prediction.
@@ -152,10 +152,13 @@ struct RefinementWindow {
     middle_m: Tensor,
 }
 
-/// `[N, K, C]` rows of `[R, C]` by `[N, K]`.
-fn gather(of: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
-    let (count, corners) = index.size2()?;
-    rows(of, &index.f_reshape([-1])?)?.f_view([count, corners, of.size()[1]])
+impl RefinementWindow {
+    /// `[N, K, C]` values of the candidates, of the values `[corners, C]` of the whole key grid.
+    fn of_corners(&self, grid: &Tensor) -> tch::Result<Tensor> {
+        let (cells, candidates) = self.corners.size2()?;
+        let values = rows(grid, &self.corners.f_reshape([-1])?)?;
+        values.f_view([cells, candidates, grid.size()[1]])
+    }
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use tch::Tensor;
 use tch::nn::{self, Init};
 
-use super::dense::{Dense, int8_linear};
+use super::dense::Dense;
 use perception::int8::{ActivationScales, Int8Linear, LayerFormat, Quantisation, QuantiseError};
 use perception::sparse::{GatherIndex, Int8SparseConv, SparseConv};
 
@@ -72,7 +72,7 @@ impl ResidualGroup {
         let inward = scales.get(&activation(name, "inward"))?;
         let middle = scales.get(&activation(name, "middle"))?;
         let skip = self.skip.as_ref();
-        let skip = skip.map(|skip| int8_linear(skip, None, LayerFormat::last(input)));
+        let skip = skip.map(|skip| Int8Linear::new(skip, None, LayerFormat::last(input)));
         Ok(Int8ResidualGroup {
             input,
             inward: self.inward.int8(LayerFormat::hidden(input, inward))?,

@@ -10,7 +10,7 @@ use super::int8_levels::Int8Levels;
 use super::residual_group::{OnActivation, ResidualGroup};
 use super::voxel_batch::VoxelBatch;
 use perception::int8::{ActivationScales, LayerFormat, QuantiseError, ScaleSearch};
-use perception::sparse::SparseConv;
+use perception::sparse::{SparseConv, rows};
 use perception::weights::Weights;
 
 /// Output of the encoder for some sweeps.
@@ -261,12 +261,6 @@ fn level_activation(level: usize) -> String {
 
 fn coarse_activation(group: usize) -> String {
     format!("encoder.residual.{group}")
-}
-
-/// Rows of `x` by index; its gradient is fast because the index is expanded, not written out.
-pub(super) fn rows(x: &Tensor, index: &Tensor) -> tch::Result<Tensor> {
-    let index = index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?;
-    x.f_gather(0, &index, false)
 }
 
 /// Coarse features summed over height into the plane of each sweep.

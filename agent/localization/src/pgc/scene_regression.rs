@@ -3,7 +3,7 @@
 use tch::nn::{self, LinearConfig, Module};
 use tch::{Kind, Tensor};
 
-use super::dense::Dense;
+use super::dense::{Dense, of_unit_length};
 use super::error::LocalizerError;
 use super::feature_norm::FeatureNorm;
 use super::head_config::SceneHeadConfig;
@@ -203,12 +203,8 @@ impl SceneHead {
 
     /// `[N, cell_channels + classes]`: features of cells beside the normalised logits of their sweeps.
     fn input(&self, cells: &Tensor, logits: &Tensor) -> tch::Result<Tensor> {
-        let squares = logits
-            .f_square()?
-            .f_sum_dim_intlist(1_i64, true, Kind::Float)?;
-        // To length 1: the regressor sees which classes are likely, not how large the logits are.
-        let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
-        Tensor::f_cat(&[cells, &(logits / norm)], 1)
+        // The regressor sees which classes are likely, not how large the logits are.
+        Tensor::f_cat(&[cells, &of_unit_length(logits)?], 1)
     }
 
     /// `[centres, 3]`: reference points of the cells' offsets, metres relative to the origin.

@@ -133,11 +133,6 @@ impl SweepVoxels {
     pub fn cells(&self) -> &[SweepCell] {
         &self.cells
     }
-
-    /// Number of voxels.
-    pub fn voxels(&self) -> usize {
-        self.first.outputs()
-    }
 }
 
 /// Edge of the square of coarse cells that a sweep lies in.
@@ -222,7 +217,8 @@ mod tests {
                 sweep.cells().iter().map(|cell| cell.points).sum::<u32>(),
                 count
             );
-            let half = config.cell_m() as f32;
+            let share = if config.fine_cells { 0.5 } else { 1.0 };
+            let half = (share * config.coarse_cell_m()) as f32;
             assert!(
                 sweep
                     .cells()
@@ -238,7 +234,7 @@ mod tests {
             );
             assert_eq!(
                 sweep.input.len(),
-                sweep.voxels() * config.input.channels() as usize
+                sweep.first.outputs() * config.input.channels() as usize
             );
             let edge = plane_edge(&config);
             assert!(
@@ -263,6 +259,6 @@ mod tests {
     #[test]
     fn an_empty_sweep_has_no_voxels() {
         let sweep = SweepVoxels::new([], &SceneEncoderConfig::lean());
-        assert!(sweep.cells().is_empty() && sweep.voxels() == 0);
+        assert!(sweep.cells().is_empty() && sweep.first.outputs() == 0);
     }
 }

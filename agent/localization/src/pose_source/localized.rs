@@ -138,7 +138,7 @@ impl PoseSource for LocalizedPose {
     /// Ignores the measured pose.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();
-        let estimate = match self.localizer.localize(input.sweep()) {
+        let estimate = match self.localizer.localize(input.sweep(None)) {
             Ok(localization) => {
                 self.times = localization.times.into_timings();
                 localization.estimate
@@ -153,9 +153,8 @@ impl PoseSource for LocalizedPose {
         };
         // A jump is published, with less confidence: the accepted pose may be the wrong one.
         let pose = world_from_cav.isometry();
-        let verdict = self.motion_gate.judge(input.capture_nanos, &pose);
-        let factor = self.motion_gate.factor(verdict) as f32;
-        PoseEstimate::new(*world_from_cav, estimate.confidence() * factor)
+        let factor = self.motion_gate.judge(input.capture_nanos, pose);
+        PoseEstimate::new(*world_from_cav, estimate.confidence() * factor as f32)
     }
 
     fn detector_encoder(&self) -> Option<&str> {

@@ -18,6 +18,7 @@ mod tracked;
 
 use std::path::{Path, PathBuf};
 
+use nalgebra::Isometry3;
 use perception::detector::BackboneLevel;
 use perception::inference::Inference;
 use perception::weights::FileError;
@@ -57,12 +58,12 @@ pub struct PoseInput<'a> {
 }
 
 impl<'a> PoseInput<'a> {
-    /// Input of a localizer.
-    pub(crate) fn sweep(&self) -> LocalizerInput<'a> {
+    /// Input of a localizer, with the predicted pose if there is one.
+    pub(crate) fn sweep(&self, predicted: Option<Isometry3<f64>>) -> LocalizerInput<'a> {
         LocalizerInput {
             cloud: self.cloud,
             levels: self.levels,
-            predicted: None,
+            predicted,
         }
     }
 }

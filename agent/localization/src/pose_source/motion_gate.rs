@@ -53,17 +53,6 @@ impl Default for MotionGateConfig {
     }
 }
 
-/// Classification of a pose, given those before it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum MotionVerdict {
-    /// The pose can be reached from the last accepted one, or there is none.
-    Reachable,
-    /// The pose cannot be reached.
-    Jump,
-    /// The pose cannot be reached, but it is the last of several that agree with each other: they are accepted now.
-    NewPlace,
-}
-
 #[derive(Debug, Clone, Copy)]
 struct TimedPose {
     capture_nanos: u64,
@@ -71,7 +60,7 @@ struct TimedPose {
 }
 
 /// Recent poses of a vehicle.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct MotionGate {
     config: MotionGateConfig,
     /// Accepted poses of the last seconds, oldest first.
@@ -87,41 +76,28 @@ impl MotionGate {
     pub(crate) fn new(config: MotionGateConfig) -> Self {
         Self {
             config,
-            accepted: VecDeque::new(),
-            elsewhere: Vec::new(),
-            jumps: 0,
+            ..Self::default()
         }
     }
 
-    /// Factor on the confidence of a pose with this verdict.
-    pub(crate) fn factor(&self, verdict: MotionVerdict) -> f64 {
-        match verdict {
-            MotionVerdict::Jump => self.config.penalty,
-            MotionVerdict::Reachable | MotionVerdict::NewPlace => 1.0,
-        }
-    }
-
-    /// Classifies a pose and stores it.
-    pub(crate) fn judge(
-        &mut self,
-        capture_nanos: u64,
-        world_from_lidar: &Isometry3<f64>,
-    ) -> MotionVerdict {
+    /// Stores a pose. Returns the factor on its confidence: the penalty of a jump; 1 if it can be reached from the last
+    /// accepted one, if there is none, or if it is the last of several jumps that agree, which are accepted now.
+    pub(crate) fn judge(&mut self, capture_nanos: u64, world_from_lidar: Isometry3<f64>) -> f64 {
         let pose = TimedPose {
             capture_nanos,
-            world_from_lidar: *world_from_lidar,
+            world_from_lidar,
         };
         let last = self.accepted.back().copied();
         let Some(last) = last.filter(|last| self.remembers(last, &pose)) else {
             // There is no pose yet, or the scene restarted.
             self.accepted.clear();
             self.accept(pose);
-            return MotionVerdict::Reachable;
+            return 1.0;
         };
         // The speed is that of earlier poses, this one not among them: a jump must not explain itself.
         if self.can_reach(&last, &pose, self.speed_mps()) {
             self.accept(pose);
-            return MotionVerdict::Reachable;
+            return 1.0;
         }
         self.jumps += 1;
         // At any speed: the accepted poses, which would give it, are the ones in doubt.
@@ -134,11 +110,11 @@ impl MotionGate {
         }
         self.elsewhere.push(pose);
         if self.elsewhere.len() < self.config.agreeing {
-            return MotionVerdict::Jump;
+            return self.config.penalty;
         }
         // All of the row, so that a speed at the new place can follow from it.
         self.accepted = std::mem::take(&mut self.elsewhere).into();
-        MotionVerdict::NewPlace
+        1.0
     }
 
     fn accept(&mut self, pose: TimedPose) {
@@ -192,18 +168,21 @@ mod tests {
     use super::*;
 
     const TENTH_NANOS: u64 = 100_000_000;
+    /// Factors on the confidence.
+    const ACCEPTED: f64 = 1.0;
+    const JUMP: f64 = 0.2;
 
     fn at(x: f64, y: f64, yaw_deg: f64) -> Isometry3<f64> {
         Isometry3::new(Vector3::new(x, y, 2.0), Vector3::z() * yaw_deg.to_radians())
     }
 
-    /// Verdicts on poses a tenth of a second apart.
-    fn verdicts(motion_gate: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<MotionVerdict> {
+    /// Factors on the confidence of poses a tenth of a second apart.
+    fn factors(motion_gate: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<f64> {
         let capture = |step: usize| step as u64 * TENTH_NANOS;
         poses
             .iter()
             .enumerate()
-            .map(|(step, pose)| motion_gate.judge(capture(step), pose))
+            .map(|(step, pose)| motion_gate.judge(capture(step), *pose))
             .collect()
     }
 
@@ -227,9 +206,9 @@ mod tests {
             })
             .collect();
         assert!(
-            verdicts(&mut motion_gate, &drive)
+            factors(&mut motion_gate, &drive)
                 .iter()
-                .all(|&verdict| verdict == MotionVerdict::Reachable)
+                .all(|&factor| factor == ACCEPTED)
         );
         assert_eq!(motion_gate.jumps, 0);
     }
@@ -240,20 +219,16 @@ mod tests {
         let mut drive: Vec<_> = (0..12).map(|step| at(f64::from(step), 0.0, 0.0)).collect();
         drive[6] = at(6.0, 40.0, 0.0);
         drive[9] = at(9.0, 0.0, 180.0);
-        let verdicts = verdicts(&mut motion_gate, &drive);
-        for (step, verdict) in verdicts.into_iter().enumerate() {
+        let factors = factors(&mut motion_gate, &drive);
+        for (step, factor) in factors.into_iter().enumerate() {
             let expected = if step == 6 || step == 9 {
-                MotionVerdict::Jump
+                JUMP
             } else {
-                MotionVerdict::Reachable
+                ACCEPTED
             };
-            assert_eq!(verdict, expected, "step {step}");
+            assert_eq!(factor, expected, "step {step}");
         }
         assert_eq!(motion_gate.jumps, 2);
-        assert!(
-            motion_gate.factor(MotionVerdict::Jump) < 0.5
-                && motion_gate.factor(MotionVerdict::Reachable) == 1.0
-        );
     }
 
     #[test]
@@ -261,11 +236,11 @@ mod tests {
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         let mut drive = vec![at(500.0, 0.0, 0.0)];
         drive.extend((0..5).map(|step| at(f64::from(step), 0.0, 0.0)));
-        use MotionVerdict::{Jump, NewPlace, Reachable};
         assert_eq!(
-            verdicts(&mut motion_gate, &drive),
-            [Reachable, Jump, Jump, NewPlace, Reachable, Reachable]
+            factors(&mut motion_gate, &drive),
+            [ACCEPTED, JUMP, JUMP, ACCEPTED, ACCEPTED, ACCEPTED]
         );
+        assert_eq!(motion_gate.jumps, 3, "the third is at the new place");
     }
 
     #[test]
@@ -280,13 +255,13 @@ mod tests {
         });
         let drive: Vec<_> = std::iter::once(at(0.0, 0.0, 0.0)).chain(anywhere).collect();
         assert!(
-            verdicts(&mut motion_gate, &drive)[1..]
+            factors(&mut motion_gate, &drive)[1..]
                 .iter()
-                .all(|&verdict| verdict == MotionVerdict::Jump)
+                .all(|&factor| factor == JUMP)
         );
         assert_eq!(
-            motion_gate.judge(21 * TENTH_NANOS, &at(20.0, 0.0, 0.0)),
-            MotionVerdict::Reachable
+            motion_gate.judge(21 * TENTH_NANOS, at(20.0, 0.0, 0.0)),
+            ACCEPTED
         );
     }
 
@@ -294,28 +269,22 @@ mod tests {
     fn a_step_is_checked_against_the_speed_before_it() {
         let standing: Vec<_> = (0..10).map(|_| at(0.0, 0.0, 0.0)).collect();
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
-        verdicts(&mut motion_gate, &standing);
+        factors(&mut motion_gate, &standing);
         // A car at 50 m/s could be there, one that stood a moment ago cannot.
-        assert_eq!(
-            motion_gate.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)),
-            MotionVerdict::Jump
-        );
+        assert_eq!(motion_gate.judge(10 * TENTH_NANOS, at(5.0, 0.0, 0.0)), JUMP);
     }
 
     #[test]
     fn a_restarted_scene_or_a_long_gap_resets_the_gate() {
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         assert_eq!(
-            motion_gate.judge(90_000_000_000, &at(0.0, 0.0, 0.0)),
-            MotionVerdict::Reachable
+            motion_gate.judge(90_000_000_000, at(0.0, 0.0, 0.0)),
+            ACCEPTED
         );
+        assert_eq!(motion_gate.judge(0, at(900.0, 0.0, 0.0)), ACCEPTED);
         assert_eq!(
-            motion_gate.judge(0, &at(900.0, 0.0, 0.0)),
-            MotionVerdict::Reachable
-        );
-        assert_eq!(
-            motion_gate.judge(60_000_000_000, &at(0.0, 0.0, 90.0)),
-            MotionVerdict::Reachable
+            motion_gate.judge(60_000_000_000, at(0.0, 0.0, 90.0)),
+            ACCEPTED
         );
     }
 }

@@ -59,13 +59,6 @@ macro_rules! pose_sources {
                 }
             }
 
-            fn kind(&self) -> Kind {
-                match self {
-                    Self::Recorded => Kind::Recorded,
-                    $(Self::$variant(_) => Kind::$variant,)+
-                }
-            }
-
             fn of_kind(kind: Kind) -> Self {
                 match kind {
                     Kind::Recorded => Self::Recorded,
@@ -85,8 +78,9 @@ macro_rules! pose_sources {
             fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
                 // The source of a file keeps its values where the command line names the same one.
                 let requested = matches.get_one::<Kind>(options::CHOICE).copied();
-                if let Some(kind) = requested.filter(|kind| *kind != self.kind()) {
-                    *self = Self::of_kind(kind);
+                let requested = requested.map(Self::of_kind);
+                if let Some(source) = requested.filter(|source| source.name() != self.name()) {
+                    *self = source;
                 }
                 let own: Vec<Arg> = match self {
                     Self::Recorded => Vec::new(),

@@ -14,8 +14,10 @@ use serde::{Deserialize, Serialize};
 use super::settings::{PoseSettings, require_file};
 use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
 use crate::map_registration::MapRegistration;
-use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
-use crate::tracker::{Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits};
+use crate::pgc::{Localization, Localize, Localizer, LocalizerError};
+use crate::tracker::{
+    Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits, seconds,
+};
 
 /// Networks of PGC and settings of the tracker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -187,11 +189,8 @@ impl TrackedPose {
         if predicted.is_none() {
             self.global_nanos = Some(input.capture_nanos);
         }
-        let sweep = LocalizerInput {
-            predicted: predicted.map(|state| state.world_from_lidar),
-            ..input.sweep()
-        };
-        match self.localizer.localize(sweep) {
+        let predicted = predicted.map(|state| state.world_from_lidar);
+        match self.localizer.localize(input.sweep(predicted)) {
             Ok(localization) => {
                 self.times = localization.times.timings().to_vec();
                 Some(localization)
@@ -255,10 +254,8 @@ impl TrackedPose {
 
     /// True if the sweep is measured without the prediction.
     fn is_global_due(&self, capture_nanos: u64) -> bool {
-        // In floating point: the difference is negative after a restart of the scene, which is not recent.
-        let since_s = self
-            .global_nanos
-            .map(|nanos| (capture_nanos as f64 - nanos as f64) * 1e-9);
+        // Negative after a restart of the scene, which is not recent.
+        let since_s = self.global_nanos.map(|nanos| seconds(nanos, capture_nanos));
         let recent_s = 0.0..self.config.global_period_s;
         // A prediction that a measurement contradicts is no place to search near.
         self.tracker.is_contradicted()
@@ -337,7 +334,7 @@ mod tests {
     use protocol::{CavId, EgoMotion, PointCloud, Pose};
 
     use super::*;
-    use crate::pgc::stopwatch;
+    use crate::pgc::{LocalizerInput, stopwatch};
 
     /// A vehicle that drives at 10 m/s along x; every sweep holds its number of points.
     #[derive(Debug, Default)]

@@ -1,6 +1,6 @@
 //! Memory layout of correspondences for fast scoring of many motions.
 
-use nalgebra::{Isometry3, Matrix3, Vector3};
+use nalgebra::{Isometry3, Matrix3, Translation3, Vector3};
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
@@ -37,7 +37,8 @@ pub(super) struct PairColumns {
     source: [PairColumn; 3],
     target: [PairColumn; 3],
     weight: PairColumn,
-    count: usize,
+    /// Number of pairs, without the padding.
+    pub(super) count: usize,
     /// Subtracted from all targets, so that `f32` is precise enough anywhere on earth, metres.
     origin: Vector3<f64>,
 }
@@ -66,15 +67,9 @@ impl PairColumns {
         }
     }
 
-    pub(super) fn len(&self) -> usize {
-        self.count
-    }
-
     /// Converts a motion of this layout to the frames of the caller.
     pub(super) fn to_target_frame(&self, motion: &Isometry3<f64>) -> Isometry3<f64> {
-        let mut moved = *motion;
-        moved.translation.vector += self.origin;
-        moved
+        Translation3::from(self.origin) * motion
     }
 
     pub(super) fn source(&self, index: usize) -> Vector3<f64> {
@@ -144,12 +139,11 @@ impl PairColumns {
     fn squared_residuals(&self, model: &Model, block: usize) -> [f32; LANES] {
         let [x, y, z] = self.source.each_ref().map(|column| &column[block]);
         let mut squared = [0.0; LANES];
-        let rows = model.rotation.iter().zip(model.translation);
-        for ((row, shift), target) in rows.zip(&self.target) {
-            let target = &target[block];
+        for (axis, target) in self.target.iter().enumerate() {
+            let [a, b, c] = [0, 1, 2].map(|column| model.rotation[(axis, column)]);
+            let (shift, target) = (model.translation[axis], &target[block]);
             for lane in 0..LANES {
-                let difference =
-                    row[0] * x[lane] + row[1] * y[lane] + row[2] * z[lane] + shift - target[lane];
+                let difference = a * x[lane] + b * y[lane] + c * z[lane] + shift - target[lane];
                 squared[lane] += difference * difference;
             }
         }
@@ -164,18 +158,15 @@ fn at(columns: &[PairColumn; 3], index: usize) -> Vector3<f64> {
 
 /// A motion in single precision.
 struct Model {
-    rotation: [[f32; 3]; 3],
-    translation: [f32; 3],
+    rotation: Matrix3<f32>,
+    translation: Vector3<f32>,
 }
 
 impl Model {
     fn new(motion: &Isometry3<f64>) -> Self {
-        let rotation: Matrix3<f64> = motion.rotation.to_rotation_matrix().into_inner();
         Self {
-            rotation: std::array::from_fn(|row| {
-                std::array::from_fn(|column| rotation[(row, column)] as f32)
-            }),
-            translation: std::array::from_fn(|axis| motion.translation.vector[axis] as f32),
+            rotation: motion.rotation.to_rotation_matrix().into_inner().cast(),
+            translation: motion.translation.vector.cast(),
         }
     }
 }
@@ -198,7 +189,7 @@ mod tests {
         .drawn(3);
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let pairs = PairColumns::new(&problem.pairs, &mut random);
-        assert_eq!(pairs.len(), 1001);
+        assert_eq!(pairs.count, 1001);
         let mut local = problem.truth;
         local.translation.vector -= pairs.origin;
         let gain = pairs.gain(&local, 1.5, &Gain::default()).unwrap();
@@ -240,6 +231,6 @@ mod tests {
             [f32::NAN, f32::INFINITY, 0.0, -1.0].map(|weight| Correspondence { weight, ..good });
         let all = [&bad[..], &heavy[..], &[good]].concat();
         let mut random = ChaCha8Rng::seed_from_u64(1);
-        assert_eq!(PairColumns::new(&all, &mut random).len(), 1);
+        assert_eq!(PairColumns::new(&all, &mut random).count, 1);
     }
 }

@@ -202,7 +202,7 @@ impl RansacSearch<'_> {
             if gain.total > best_drawn.total {
                 best_drawn = gain;
                 if self.optimise(&motion, gain) {
-                    enough = self.config.draws_needed(self.inliers(), self.pairs.len());
+                    enough = self.config.draws_needed(self.inliers(), self.pairs.count);
                 }
             }
         }

@@ -30,7 +30,7 @@ pub(super) fn three_points(
     test: &SampleTest,
     random: &mut ChaCha8Rng,
 ) -> Option<Isometry3<f64>> {
-    let [a, b, c] = draw_distinct(pairs.len(), draw, random);
+    let [a, b, c] = draw_distinct(pairs.count, draw, random);
     let source = [a, b, c].map(|index| pairs.source(index));
     let target = [a, b, c].map(|index| pairs.target(index));
     // A rigid motion keeps lengths: samples with an outlier are rejected before anything is solved.
@@ -56,7 +56,7 @@ pub(super) fn two_points(
     test: &SampleTest,
     random: &mut ChaCha8Rng,
 ) -> Option<Isometry3<f64>> {
-    let [a, b] = draw_distinct(pairs.len(), draw, random);
+    let [a, b] = draw_distinct(pairs.count, draw, random);
     let source = [a, b].map(|index| pairs.source(index));
     let target = [a, b].map(|index| pairs.target(index));
     let [from, to] = [source[1] - source[0], target[1] - target[0]];

@@ -191,7 +191,7 @@ impl PoseTracker {
 }
 
 /// Time from one capture to a later one, seconds; negative if it is earlier.
-fn seconds(from_nanos: u64, to_nanos: u64) -> f64 {
+pub(crate) fn seconds(from_nanos: u64, to_nanos: u64) -> f64 {
     (to_nanos as f64 - from_nanos as f64) * 1e-9
 }
 

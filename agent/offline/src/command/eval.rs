@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use agent_offline::Error;
 use agent_offline::evaluation::{
-    Evaluated, EvaluatedSweep, LocalizationSummary, SweepSelection, evaluate, evaluate_nearest,
-    evaluate_source, reliability_charts, write_csv, write_error_table,
+    Evaluated, EvaluatedSweep, LocalizationSummary, SweepSelection, csv, error_table, evaluate,
+    evaluate_nearest, evaluate_source, reliability_charts,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::Context;
@@ -34,10 +34,12 @@ use perception::weights::{Weights, annotate};
 use protocol::config::Section;
 use serde::Serialize;
 use serde_json::json;
+use support::atomic_file;
 use support::output;
 use support::provenance::Provenance;
+use terminal::progress;
 
-use super::retrieval::{self, Bar, RetrievalBy};
+use super::retrieval::{self, RetrievalBy, shown_on};
 use super::scene_heads::{SceneHeadFile, by_head, surfel_map, with_files};
 use support::cli::{BadInput, Outcome};
 
@@ -362,8 +364,8 @@ impl Args {
             every: self.every as usize,
             sweeps: self.sweeps.map(|count| count as usize),
         };
-        let bar = Bar::start("sweeps");
-        let mut on_sweep = bar.advance();
+        let bar = progress::bar(0, "sweeps");
+        let mut on_sweep = shown_on(&bar);
         let evaluated = match subject {
             Subject::Localizer(mut localizer) => evaluate(&mut *localizer, &options, &mut on_sweep),
             Subject::Source(mut source) => evaluate_source(&mut *source, &options, &mut on_sweep),
@@ -449,10 +451,10 @@ impl Args {
 
     fn write(&self, sweeps: &[EvaluatedSweep]) -> anyhow::Result<()> {
         if let Some(path) = &self.csv {
-            write_csv(path, sweeps).with_context(|| writing(path))?;
+            atomic_file::write(path, csv(sweeps)).with_context(|| writing(path))?;
         }
         if let Some(path) = &self.error_table {
-            write_error_table(path, sweeps).with_context(|| writing(path))?;
+            atomic_file::write(path, error_table(sweeps)).with_context(|| writing(path))?;
         }
         if let Some(path) = &self.plot {
             figures::save_png(&reliability_charts(sweeps), path)?;
@@ -493,7 +495,8 @@ fn report_line(report: &FitReport) -> String {
     )
 }
 
-/// Report as text.
+/// Report as text: the numbers of all rows first, a dash for a missing one; then the rows, some only where there is
+/// something to report.
 fn table(summary: &LocalizationSummary) -> String {
     let (rejected, ms) = (&summary.rejected, &summary.ms);
     let [under_3m, under_1m] = [summary.success_3m, summary.success_1m].map(percent);
@@ -507,10 +510,8 @@ fn table(summary: &LocalizationSummary) -> String {
     let shares = [rejected.bad_share, rejected.good_share];
     let [bad_share, good_share] = shares.map(|share| share.map_or("-".into(), percent));
     let stages = ms.iter().filter(|(stage, _)| *stage != "total");
-    let stages: Vec<String> = stages
-        .map(|(stage, ms)| format!("{stage} {ms:.1}"))
-        .collect();
-    let lines = [
+    let stages = joined(stages.map(|(stage, ms)| format!("{stage} {ms:.1}")));
+    let mut rows = vec![
         format!(
             "sweeps     {}, {} without a pose {:?}",
             summary.sweeps, summary.no_pose, summary.outcomes
@@ -530,31 +531,32 @@ fn table(summary: &LocalizationSummary) -> String {
             rejected.poses, rejected.bad
         ),
         format!(
-            "time       {total_ms} ms median, {:.1} mean: {}",
-            summary.mean_ms,
-            stages.join(", ")
+            "time       {total_ms} ms median, {:.1} mean: {stages}",
+            summary.mean_ms
         ),
     ];
-    let beyond = (!summary.beyond_95.is_empty()).then(|| {
+    if !summary.beyond_95.is_empty() {
         let shares = summary.beyond_95.iter();
-        let shares: Vec<String> = shares
-            .map(|(axis, share)| format!("{axis} {}", percent(*share)))
-            .collect();
-        format!("covariance {} of the errors beyond 95 %", shares.join(", "))
-    });
-    let integrity = summary.integrity.map(|integrity| {
-        format!(
-            "integrity  {} of the errors exceed their bound of 95 % (median {:.2} m)",
-            percent(integrity.exceeded_share),
-            integrity.p50_bound_m
-        )
-    });
-    let bound = summary.bound.map(|bound| {
+        let shares = joined(shares.map(|(axis, share)| format!("{axis} {}", percent(*share))));
+        rows.push(format!("covariance {shares} of the errors beyond 95 %"));
+    }
+    if let Some(integrity) = summary.integrity {
+        let (share, p50_m) = (percent(integrity.exceeded_share), integrity.p50_bound_m);
+        rows.push(format!(
+            "integrity  {share} of the errors exceed their bound of 95 % (median {p50_m:.2} m)"
+        ));
+    }
+    if let Some(bound) = summary.bound {
         let (exceeded, poses, p50_m) = (bound.exceeded, bound.poses, bound.p50_bound_m);
-        format!("bound      {exceeded} of {poses} errors exceed their bound of one in 1,000 (median {p50_m:.2} m)")
-    });
-    let lines = lines.into_iter().chain(beyond).chain(integrity);
-    lines.chain(bound).map(|line| line + "\n").collect()
+        rows.push(format!(
+            "bound      {exceeded} of {poses} errors exceed their bound of one in 1,000 (median {p50_m:.2} m)"
+        ));
+    }
+    rows.join("\n") + "\n"
+}
+
+fn joined(parts: impl Iterator<Item = String>) -> String {
+    parts.collect::<Vec<_>>().join(", ")
 }
 
 fn numbers<const N: usize>(values: [Option<f64>; N], digits: usize) -> [String; N] {

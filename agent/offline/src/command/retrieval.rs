@@ -2,10 +2,13 @@
 
 use std::path::PathBuf;
 
-use agent_offline::sweep_database::{described_sweeps, read_database};
+use agent_offline::Error;
+use agent_offline::sweep_database::described_sweeps;
 use dataset::LeftOut;
 use indicatif::ProgressBar;
-use localization::baselines::{DescribePolar, PolarRetrieval, Retrieval};
+use localization::baselines::{
+    DescribePolar, DescribedSweep, PolarRetrieval, Retrieval, SweepDatabase,
+};
 use localization::pgc::{Localize, Localizer, LocalizerError, stopwatch};
 use nalgebra::Isometry3;
 use protocol::PointCloud;
@@ -24,17 +27,22 @@ pub(crate) enum RetrievalBy {
     Position,
 }
 
-/// Unit of the progress.
-const DESCRIBED: &str = "sweeps described";
-
 /// Retrieval by the encoder of a localizer.
 pub(crate) fn by_encoder(
     folders: &[PathBuf],
     localizer: Localizer,
     left_out: &mut LeftOut,
 ) -> Result<Box<dyn Localize>, BadInput> {
-    let bar = Bar::start(DESCRIBED);
-    let database = read_database(folders, &localizer, left_out, &mut bar.advance());
+    let sweeps = described(folders, left_out, |cloud| {
+        localizer.sweep_features(cloud, &mut stopwatch())
+    })?;
+    let sweeps = sweeps.into_iter();
+    let sweeps = sweeps.map(|(descriptor, world_from_sensor)| DescribedSweep {
+        descriptor,
+        world_from_sensor,
+    });
+    let database = SweepDatabase::new(&sweeps.collect::<Vec<_>>());
+    let database = database.ok_or_else(|| Error::NoSweeps(folders.to_vec(), left_out.reasons()));
     let database = database.map_err(BadInput::of)?;
     Ok(Box::new(Retrieval::new(localizer, database)))
 }
@@ -45,10 +53,9 @@ pub(crate) fn by_descriptor(
     descriptor: Box<dyn DescribePolar>,
     left_out: &mut LeftOut,
 ) -> Result<Box<dyn Localize>, BadInput> {
-    let bar = Bar::start(DESCRIBED);
-    let mut describe = |cloud: &PointCloud| descriptor.polar(cloud, &mut stopwatch());
-    let sweeps = described_sweeps(folders, &mut describe, left_out, &mut bar.advance());
-    let sweeps = sweeps.map_err(BadInput::of)?;
+    let sweeps = described(folders, left_out, |cloud| {
+        descriptor.polar(cloud, &mut stopwatch())
+    })?;
     let retrieval = PolarRetrieval::new(descriptor, sweeps).map_err(BadInput::of)?;
     Ok(Box::new(retrieval))
 }
@@ -58,31 +65,25 @@ pub(crate) fn positions(
     folders: &[PathBuf],
     left_out: &mut LeftOut,
 ) -> Result<Vec<Isometry3<f64>>, BadInput> {
-    let bar = Bar::start(DESCRIBED);
-    let mut describe = |_: &PointCloud| Ok::<_, LocalizerError>(Some(()));
-    let sweeps = described_sweeps(folders, &mut describe, left_out, &mut bar.advance());
-    let sweeps = sweeps.map_err(BadInput::of)?.into_iter();
-    Ok(sweeps.map(|((), pose)| pose).collect())
+    let sweeps = described(folders, left_out, |_| Ok::<_, LocalizerError>(Some(())))?;
+    Ok(sweeps.into_iter().map(|((), pose)| pose).collect())
 }
 
-/// Progress bar that ends with its scope.
-pub(super) struct Bar(ProgressBar);
-
-impl Bar {
-    pub(super) fn start(unit: &str) -> Self {
-        Self(progress::bar(0, unit))
-    }
-
-    pub(super) fn advance(&self) -> impl FnMut(usize, usize) + '_ {
-        |done, all| {
-            self.0.set_length(all as u64);
-            self.0.set_position(done as u64);
-        }
-    }
+/// What `describe` gives for each sweep of the drives, and its pose; with a bar of the progress.
+fn described<D, E: Into<LocalizerError>>(
+    folders: &[PathBuf],
+    left_out: &mut LeftOut,
+    mut describe: impl FnMut(&PointCloud) -> Result<Option<D>, E>,
+) -> Result<Vec<(D, Isometry3<f64>)>, BadInput> {
+    let bar = progress::bar(0, "sweeps described");
+    let sweeps = described_sweeps(folders, &mut describe, left_out, &mut shown_on(&bar));
+    sweeps.map_err(BadInput::of)
 }
 
-impl Drop for Bar {
-    fn drop(&mut self) {
-        self.0.finish_and_clear();
+/// Shows the number done and that of all on a bar; the bar is cleared when it is dropped.
+pub(super) fn shown_on(bar: &ProgressBar) -> impl FnMut(usize, usize) {
+    move |done, all| {
+        bar.set_length(all as u64);
+        bar.set_position(done as u64);
     }
 }

@@ -14,7 +14,7 @@ use protocol::{CavId, Pose, PoseError, PoseEstimate};
 pub use summary::{
     CalibrationBin, IntegritySummary, LocalizationSummary, RejectionSummary, reliability_charts,
 };
-pub use table::{write_csv, write_error_table};
+pub use table::{csv, error_table};
 
 use localization::covariance_scale::PoseSample;
 use localization::pgc::confidence::{Confidence, Labelled};

@@ -1,10 +1,6 @@
 //! Table of an evaluation: one row per sweep.
 
-use std::io;
-use std::path::Path;
-
 use protocol::Pose;
-use support::atomic_file;
 use support::csv_file::CsvText;
 
 use super::{EvaluatedSweep, outcome};
@@ -14,23 +10,8 @@ const HEADER: &str = "scenario,cav,frame,true_x_m,true_y_m,true_z_m,true_yaw_deg
     sigma,outcome,cells,inliers,inlier_ratio,rms_m,inlier_epsilon_m,median_epsilon_m,position_std_m,rotation_std_deg,\
     second_inlier_ratio,second_rms_m,second_epsilon_m,moved_m,residual_quartile_m,information_per_m2,worst_axis_std_m,ms";
 
-/// Writes one row per sweep; fields of sweeps without a pose are empty.
-///
-/// # Errors
-/// The system's, if the file cannot be written.
-pub fn write_csv(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
-    atomic_file::write(path, csv(sweeps))
-}
-
-/// Writes the errors of all sweeps as the table that the pose source `noisy` replays.
-///
-/// # Errors
-/// The system's, if the file cannot be written.
-pub fn write_error_table(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
-    atomic_file::write(path, error_table(sweeps))
-}
-
-fn csv(sweeps: &[EvaluatedSweep]) -> String {
+/// One row per sweep; fields of sweeps without a pose are empty.
+pub fn csv(sweeps: &[EvaluatedSweep]) -> String {
     let mut text = CsvText::new(HEADER);
     sweeps.iter().for_each(|sweep| text.row(row(sweep)));
     text.finish()
@@ -96,7 +77,8 @@ fn pose(pose: &Pose) -> [String; 4] {
     [x, y, z, pose.yaw_rad().to_degrees()].map(four)
 }
 
-fn error_table(sweeps: &[EvaluatedSweep]) -> String {
+/// The errors of all sweeps, as the table that the pose source `noisy` replays.
+pub fn error_table(sweeps: &[EvaluatedSweep]) -> String {
     let mut text = CsvText::new("x_m,y_m,z_m,yaw_deg,confidence");
     for sweep in sweeps {
         let estimate = &sweep.localization.estimate;
@@ -139,7 +121,7 @@ mod tests {
         let sweeps = evaluated(40);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("errors.csv");
-        write_error_table(&path, &sweeps).unwrap();
+        std::fs::write(&path, error_table(&sweeps)).unwrap();
         let table = ErrorTable::read(&path).unwrap();
         for (step, sweep) in sweeps.iter().enumerate() {
             match (table.row(0, step as u64), sweep.published_error()) {

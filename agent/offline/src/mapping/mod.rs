@@ -101,7 +101,8 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
     // Problems of the data set itself are in both.
     data.problems
         .extend(more.skip(sweeps.list.data().problems.len()));
-    data.without_pose += sweeps.without_pose;
+    // Those are in neither list.
+    data.without_pose += sweeps.list.len() - sweeps.training.len() - sweeps.held_out.len();
     let accuracy = (!checked.sweeps.is_empty())
         .then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
     Ok(PlaceReport {
@@ -124,14 +125,13 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
     })
 }
 
-/// Sweeps with poses.
+/// The sweeps of the drives; those with poses are trained on or held out.
 struct MapSweeps {
     list: SweepList,
     /// Drive and position of each sweep of the list, metres; `None` without a pose.
     positions: Vec<(usize, Option<Vector3<f64>>)>,
     training: Vec<usize>,
     held_out: Vec<usize>,
-    without_pose: usize,
 }
 
 impl MapSweeps {
@@ -202,13 +202,11 @@ impl MapMaking<'_> {
         if training.is_empty() {
             return Err(self.no_poses(&list));
         }
-        let without_pose = list.len() - training.len() - held.len();
         Ok(MapSweeps {
             list,
             positions,
             training,
             held_out: held,
-            without_pose,
         })
     }
 

@@ -7,6 +7,7 @@ use perception::tensor_values::tensor;
 use tch::nn::{self, Init, LinearConfig, Module};
 use tch::{Device, Kind, TchError, Tensor};
 
+use super::encoder_training::EncoderAccuracy;
 use super::pairs::Pair;
 use localization::pgc::{SceneEncoder, VoxelBatch};
 
@@ -27,17 +28,6 @@ const NEVER: f64 = -1e4;
 pub(super) struct Contrast {
     embedding: nn::Linear,
     offset: [nn::Linear; 2],
-}
-
-/// Loss of some pairs and its parts.
-#[derive(Debug)]
-pub(super) struct ContrastLoss {
-    /// Sum that is minimised.
-    pub(super) total: Tensor,
-    /// Share of cells whose most similar candidate is their match.
-    pub(super) top1: f64,
-    /// Mean L1 error of the predicted offset, metres.
-    pub(super) offset_m: f64,
 }
 
 impl Contrast {
@@ -62,14 +52,14 @@ impl Contrast {
         }
     }
 
-    /// Encodes all sweeps of `pairs` in one pass and computes the loss.
+    /// Encodes all sweeps of `pairs` in one pass; the loss, and the accuracy of their matching.
     pub(super) fn loss(
         &self,
         encoder: &SceneEncoder,
         pairs: &[Pair],
         kind: Kind,
         device: Device,
-    ) -> Result<ContrastLoss, TchError> {
+    ) -> Result<(Tensor, EncoderAccuracy), TchError> {
         let anchors = pairs.iter().map(|pair| &pair.anchor);
         let sides: Vec<_> = (anchors.chain(pairs.iter().map(|pair| &pair.partner))).collect();
         let sweeps: Vec<_> = sides.iter().map(|side| &side.sweep).collect();
@@ -98,11 +88,12 @@ impl Contrast {
         // Offsets are learnt between true matches only.
         let matched = partners.f_index_select(0, &matches)?;
         let offset = self.offset_error(&anchors, &matched, pairs, device)?;
-        Ok(ContrastLoss {
-            total: &contrast + &offset * OFFSET_WEIGHT,
+        let total = &contrast + &offset * OFFSET_WEIGHT;
+        let accuracy = EncoderAccuracy {
             top1: found.f_mean(Kind::Float)?.f_double_value(&[])?,
             offset_m: offset.f_double_value(&[])?,
-        })
+        };
+        Ok((total, accuracy))
     }
 
     fn embed(&self, x: &Tensor) -> Result<Tensor, TchError> {

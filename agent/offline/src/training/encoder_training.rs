@@ -147,9 +147,9 @@ impl Training<'_> {
     /// Loss, and its value with those of the accuracy.
     fn loss_of(&self, pairs: &[Pair]) -> Result<(Tensor, [f64; 3]), Error> {
         let (kind, device) = (self.config.run.precision.kind(), self.config.run.device);
-        let loss = self.contrast.loss(&self.encoder, pairs, kind, device)?;
-        let value = loss.total.f_double_value(&[])?;
-        Ok((loss.total, [value, loss.top1, loss.offset_m]))
+        let (loss, accuracy) = self.contrast.loss(&self.encoder, pairs, kind, device)?;
+        let value = loss.f_double_value(&[])?;
+        Ok((loss, [value, accuracy.top1, accuracy.offset_m]))
     }
 }
 

@@ -72,7 +72,7 @@ pub(crate) struct FeatureCache {
 
 impl FeatureCache {
     /// Encodes every sweep of `list` once per copy, on the device and in the precision of `run`; `observe` gets the
-    /// number of sweeps done and of all.
+    /// number of sweeps done and of all, and in the end the listing of the data.
     ///
     /// # Errors
     /// [`Error`] when a sweep cannot be read or encoded, or none has a pose.
@@ -112,7 +112,9 @@ impl FeatureCache {
             done = (done + BATCH as usize).min(total);
             observe(&TrainingEvent::Encoding(done, total));
         }
-        builder.finish(cells)
+        let cache = builder.finish(cells)?;
+        observe(&TrainingEvent::Read(list.data()));
+        Ok(cache)
     }
 
     /// Number of sweeps.

@@ -18,7 +18,6 @@ pub use encoder_training::{EncoderAccuracy, EncoderSummary, EncoderTrainConfig, 
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
 pub(crate) use kmeans::kmeans;
-pub use pairs::Pair;
 pub use pose_regression::{
     PoseRegressionConfig, PoseRegressionSummary, RegressionAccuracy, train_diffloc, train_hypliloc,
 };

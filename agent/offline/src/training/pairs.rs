@@ -72,7 +72,7 @@ impl PairMaker {
     /// Finds the overlapping sweeps of each sweep.
     ///
     /// # Errors
-    /// [`Error::NoPairs`] when no two sweeps overlap.
+    /// [`Error::Input`] when no two sweeps overlap.
     pub(crate) fn new(
         store: Arc<SweepStore>,
         config: SceneEncoderConfig,
@@ -104,8 +104,7 @@ impl PairMaker {
     /// Pair `number`.
     ///
     /// # Errors
-    /// [`Error::NoMatches`] when neighbouring sweeps have no matching cells, for example because they are
-    /// empty.
+    /// [`Error::Input`] when neighbouring sweeps have no matching cells, for example because they are empty.
     pub(crate) fn pair(&self, number: u64) -> Result<Pair, Error> {
         // A stream for each number: a pair does not depend on the thread that makes it.
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);

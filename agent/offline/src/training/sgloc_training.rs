@@ -11,9 +11,7 @@ use super::{CELLS, FeatureCache, SweepAugmentation, SweepList};
 use crate::Error;
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{CellEncoder, LocalizerError, SceneEncoder, SceneEncoderConfig};
-use perception::train::{
-    Means, Observe, RunConfig, SaveEvery, Task, Trained, Trainer, TrainingEvent,
-};
+use perception::train::{Means, Observe, RunConfig, SaveEvery, Task, Trained, Trainer};
 use perception::weights::Weights;
 
 /// Steps between two checkpoints.
@@ -47,7 +45,6 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
     let cache = FeatureCache::build(&list, &encoder, SweepAugmentation::NONE, run, observe)?;
-    observe(&TrainingEvent::Read(list.data()));
     let network_config = SgLocConfig {
         scene_name: config.scene_name.clone(),
         origin_m: cache.origin_m,

@@ -266,16 +266,14 @@ impl SweepStore {
     /// [`Error`] when a folder cannot be read or holds no sweep with a pose.
     pub(crate) fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, Error> {
         let list = Arc::new(SweepList::open(folders)?);
-        let count = list.len();
         let source = Arc::clone(&list);
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let mut reader = Prefetch::start(threads, 0, move |number: u64| {
-            // The threads also ask for numbers beyond the end.
-            let is_known = (number as usize) < count;
-            is_known.then(|| source.read(number as usize, range_m))?
+        let mut reader = Prefetch::start(threads, 0, move |number| {
+            // The threads also ask for sweeps beyond the end: there are none.
+            source.read(number as usize, range_m)
         });
-        let mut sweeps = Vec::with_capacity(count);
-        for _ in 0..count {
+        let mut sweeps = Vec::with_capacity(list.len());
+        for _ in 0..list.len() {
             sweeps.extend(reader.next_batch()?);
         }
         let data = list.data();

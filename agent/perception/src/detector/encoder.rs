@@ -26,7 +26,8 @@ enum Layers {
     Float {
         canvas: Vec<f32>,
         backbone: BevBackbone,
-        shrink: Option<Shrink>,
+        /// Without layers where there is none.
+        shrink: Shrink,
     },
     Int8 {
         canvas: Vec<u8>,
@@ -52,7 +53,7 @@ impl BevEncoder {
             layers: Layers::Float {
                 canvas,
                 backbone,
-                shrink,
+                shrink: shrink.unwrap_or_default(),
             },
         }
     }
@@ -65,7 +66,7 @@ impl BevEncoder {
         else {
             return Ok(self);
         };
-        let Some(backbone) = Int8Backbone::new(backbone, shrink.as_ref(), scales)? else {
+        let Some(backbone) = Int8Backbone::new(backbone, shrink, scales)? else {
             return Ok(self);
         };
         let canvas = vec![0; canvas_len(&self.pillar_grid, &self.projection)];
@@ -125,13 +126,7 @@ impl BevEncoder {
         match &self.layers {
             Layers::Float {
                 backbone, shrink, ..
-            } => {
-                let wide = backbone.upsampled(&maps, false);
-                match shrink {
-                    Some(shrink) => shrink.forward_contiguous(&wide),
-                    None => wide.f_contiguous(),
-                }
-            }
+            } => shrink.forward_contiguous(&backbone.upsampled(&maps, false)),
             Layers::Int8 { backbone, .. } => backbone.features(&maps),
         }
     }
@@ -141,7 +136,7 @@ impl BevEncoder {
         match &self.layers {
             Layers::Float {
                 backbone, shrink, ..
-            } => observe_backbone(backbone, shrink.as_ref(), canvas, search),
+            } => observe_backbone(backbone, shrink, canvas, search),
             Layers::Int8 { .. } => Ok(()),
         }
     }

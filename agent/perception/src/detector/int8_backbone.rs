@@ -32,10 +32,10 @@ impl Int8Backbone {
     /// [`QuantiseError`] names the activation whose scale is missing.
     pub(super) fn new(
         backbone: &BevBackbone,
-        shrink: Option<&Shrink>,
+        shrink: &Shrink,
         scales: &ActivationScales,
     ) -> Result<Option<Self>, QuantiseError> {
-        let shrink = shrink.and_then(|shrink| shrink.layers.split_last());
+        let shrink = shrink.layers.split_last();
         let (Some((levels, up)), Some((last, hidden))) = (backbone.plain_layers(), shrink) else {
             return Ok(None);
         };
@@ -105,12 +105,12 @@ fn shrink_activation(position: usize) -> String {
 /// `[1, C_pillar, H, W]`; nothing if they stay in floating point.
 pub(super) fn observe_backbone(
     backbone: &BevBackbone,
-    shrink: Option<&Shrink>,
+    shrink: &Shrink,
     canvas: &Tensor,
     search: &mut ScaleSearch,
 ) -> Result<(), TchError> {
     // The output of the last layer is `f32` and has no scale.
-    let shrink = shrink.and_then(|shrink| shrink.layers.split_last());
+    let shrink = shrink.layers.split_last();
     let (Some((levels, up)), Some((_, hidden))) = (backbone.plain_layers(), shrink) else {
         return Ok(());
     };

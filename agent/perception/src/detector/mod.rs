@@ -47,6 +47,7 @@ use crate::weights::Weights;
 #[derive(Debug)]
 pub struct Detector {
     config: DetectorConfig,
+    /// Of its weights file; empty if it was not read from one.
     sha256: String,
     encoder_sha256: String,
     device: Device,
@@ -150,11 +151,6 @@ impl Detector {
     /// True if it computes in 8-bit integers.
     pub fn is_quantised(&self) -> bool {
         self.encoder.is_quantised()
-    }
-
-    /// SHA-256 of its weights file; empty if it was not read from one.
-    pub fn sha256(&self) -> &str {
-        &self.sha256
     }
 
     /// [`encoder_sha256`] of its weights file; empty if it was not read from one.
@@ -797,10 +793,7 @@ mod tests {
         .into();
         let sha256 = weights::save(&path, &store, &metadata, Precision::Single).unwrap();
         let mut loaded = Detector::load(&path, Device::Cpu).unwrap();
-        assert_eq!(
-            (loaded.sha256(), loaded.config()),
-            (sha256.as_str(), &config())
-        );
+        assert_eq!((&loaded.sha256, loaded.config()), (&sha256, &config()));
         let mut original = Detector::from_network(pillars);
         assert!(
             loaded

@@ -6,6 +6,7 @@ use protocol::text::hex;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::error::QuantiseError;
 use super::scale::Quantisation;
 
 /// Metadata key of the scales in a weights file.
@@ -16,26 +17,19 @@ pub const SCALES_KEY: &str = "activation_scales";
 #[serde(transparent)]
 pub struct ActivationScales(pub(super) BTreeMap<String, Quantisation>);
 
-/// An activation whose scale is needed and missing.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no scale of activation {name:?}; there are those of {known:?}")]
-pub struct MissingScale {
-    /// Name of the activation.
-    name: String,
-    /// Names of those that are there.
-    known: Vec<String>,
-}
-
 impl ActivationScales {
     /// Quantisation of an activation.
     ///
     /// # Errors
-    /// [`MissingScale`] if it was not observed.
-    pub fn get(&self, name: &str) -> Result<Quantisation, MissingScale> {
-        self.0.get(name).copied().ok_or_else(|| MissingScale {
-            name: name.to_owned(),
-            known: self.0.keys().cloned().collect(),
-        })
+    /// [`QuantiseError::Scale`] if it was not observed.
+    pub fn get(&self, name: &str) -> Result<Quantisation, QuantiseError> {
+        self.0
+            .get(name)
+            .copied()
+            .ok_or_else(|| QuantiseError::Scale {
+                name: name.to_owned(),
+                known: self.0.keys().cloned().collect(),
+            })
     }
 
     /// SHA-256 over the scales of the activations whose name is `wanted`.

@@ -12,13 +12,15 @@ const USUAL_ROWS: i64 = 1024;
 pub struct Int8Linear(Int8Layer);
 
 impl Int8Linear {
-    /// Quantises a layer `[C_out, C_in]` with bias `[C_out]`.
+    /// Quantises a layer `[C_in, C_out]` with bias `[C_out]`.
     ///
     /// # Errors
     /// Those of the tensor library.
     pub fn new(weight: &Tensor, bias: Option<&Tensor>, format: LayerFormat) -> Result<Self> {
-        let inputs = weight.size2()?.1;
-        let layer = Int8Layer::new(weight, bias, format, |operators, quantised| {
+        let inputs = weight.size2()?.0;
+        // Integer layers take the transpose.
+        let weight = weight.f_tr()?.f_contiguous()?;
+        let layer = Int8Layer::new(&weight, bias, format, |operators, quantised| {
             let shape = IValue::IntList(vec![USUAL_ROWS, inputs]);
             let arguments = [IValue::Tensor(quantised.steps.shallow_clone()), shape];
             operators.call("pack_linear", &arguments)
@@ -53,7 +55,7 @@ mod tests {
         let weight = Tensor::randn([7, 24], (Kind::Float, Device::Cpu)) * 0.2;
         let bias = Tensor::randn([7], (Kind::Float, Device::Cpu));
         let linear = Int8Linear::new(
-            &weight,
+            &weight.tr(),
             Some(&bias),
             LayerFormat {
                 input,

@@ -19,7 +19,7 @@ mod scale;
 mod scale_search;
 mod weight;
 
-pub use activation_scales::{ActivationScales, MissingScale, SCALES_KEY};
+pub use activation_scales::{ActivationScales, SCALES_KEY};
 pub use convolution::{ConvGeometry, Int8Convolution};
 pub use error::QuantiseError;
 pub use layer::LayerFormat;

@@ -75,7 +75,8 @@ impl BevBackbone {
         match &self.blocks[level] {
             BackboneBlock::Plain(layers) => ConvLayer::through(layers, x, train),
             BackboneBlock::Residual(blocks) => {
-                ResidualBlock::through(blocks, x.shallow_clone(), train)
+                let x = x.shallow_clone();
+                blocks.iter().fold(x, |x, block| block.forward(&x, train))
             }
         }
     }

@@ -16,7 +16,8 @@ const NORM_MOMENTUM: f64 = 0.01;
 #[derive(Debug)]
 pub struct Norm {
     weight: Tensor,
-    bias: Tensor,
+    /// Learnt shift `[C]`.
+    pub(crate) bias: Tensor,
     running_mean: Tensor,
     running_var: Tensor,
     eps: f64,
@@ -62,11 +63,6 @@ impl Norm {
         let (mean, var) = (Some(&self.running_mean), Some(&self.running_var));
         let (momentum, eps) = (self.momentum, self.eps);
         x.batch_norm(weight, bias, mean, var, train, momentum, eps, true)
-    }
-
-    /// Learnt shift `[C]`.
-    pub fn bias(&self) -> &Tensor {
-        &self.bias
     }
 
     /// The norm with its running statistics as `x * scale + shift`, both `[C]`.

@@ -48,11 +48,6 @@ impl ResidualBlock {
         (self.second.forward(&self.first.forward(x, train), train) + beside).relu()
     }
 
-    /// Output of a chain of blocks.
-    pub fn through(chain: &[Self], x: Tensor, train: bool) -> Tensor {
-        chain.iter().fold(x, |x, block| block.forward(&x, train))
-    }
-
     /// The same for inference, norms folded in.
     pub(crate) fn folded(&self) -> Self {
         Self {

@@ -6,7 +6,7 @@ use crate::layers::convolution::{ConvLayer, Norm};
 use crate::model_config::ShrinkConfig;
 
 /// Reduces the concatenated backbone levels.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Shrink {
     pub(crate) layers: Vec<ConvLayer>,
 }

@@ -115,14 +115,14 @@ mod tests {
         tch::manual_seed(1);
         let network = VarStore::new(Device::Cpu);
         let encoder = PillarEncoder::new(&network.root(), 16);
-        let _ = tch::no_grad(|| encoder.norm.bias().shallow_clone().uniform_(-0.5, 0.5));
+        let _ = tch::no_grad(|| encoder.norm.bias.shallow_clone().uniform_(-0.5, 0.5));
         let batch = PillarBatch::new(&[&pillars(&config)], &PillarGrid::new(&config));
         assert_eq!(batch.counts.max().int64_value(&[]), 5);
         let weights = Tensor::randn([batch.counts.size()[0], 16], (Kind::Float, Device::Cpu));
         let mut results = Vec::new();
         for output in [encoder.forward(&batch, false), padded(&encoder, &batch, 5)] {
             let loss = (&output * &weights).sum(Kind::Float);
-            let inputs = [&encoder.linear, encoder.norm.bias()];
+            let inputs = [&encoder.linear, &encoder.norm.bias];
             let gradients = Tensor::run_backward(&[loss], &inputs, false, false);
             results.push((output, gradients));
         }

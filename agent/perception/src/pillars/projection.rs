@@ -40,33 +40,28 @@ impl PillarProjection {
             let tensor = tensor.contiguous().view([-1]);
             Vec::<f32>::try_from(&tensor).expect("contiguous f32 values on the CPU")
         });
-        let blocks = channels.div_ceil(LANES);
-        bias.resize(blocks * LANES, 0.0);
         // Inputs: 0-2 position, 3 intensity, 4-6 offset from the mean, 7-9 offset from the centre.
-        let lanes = |block: usize, value: &dyn Fn(&[f32]) -> f32| -> [f32; LANES] {
-            std::array::from_fn(|lane| {
-                let channel = block * LANES + lane;
-                weight
-                    .chunks_exact(POINT_FEATURES)
-                    .nth(channel)
-                    .map_or(0.0, value)
-            })
-        };
-        let axes = |value: fn(&[f32], usize) -> f32| -> Vec<[[f32; LANES]; 3]> {
-            (0..blocks)
-                .map(|block| std::array::from_fn(|axis| lanes(block, &|row| value(row, axis))))
-                .collect()
-        };
+        let mut weight = weight.as_chunks::<POINT_FEATURES>().0.to_vec();
+        let lanes = channels.next_multiple_of(LANES);
+        weight.resize(lanes, [0.0; POINT_FEATURES]);
+        bias.resize(lanes, 0.0);
+        let blocks = weight.as_chunks::<LANES>().0.iter();
         // x, y, z are in the position and in both offsets, so their three weights add up.
-        let position = axes(|row, axis| row[axis] + row[4 + axis] + row[7 + axis]);
+        let point = blocks.clone().map(|block| {
+            let [x, y, z] =
+                [0, 1, 2].map(|axis| block.map(|row| row[axis] + row[4 + axis] + row[7 + axis]));
+            [x, y, z, block.map(|row| row[3])]
+        });
+        // Point - mean = (point - centre) - (mean - centre): hence the sign.
+        let mean = blocks
+            .clone()
+            .map(|block| [4, 5, 6].map(|input| block.map(|row| -row[input])));
+        let center = blocks.map(|block| [0, 1, 2].map(|axis| block.map(|row| row[axis])));
         Self {
             channels,
-            point: (position.into_iter().enumerate())
-                .map(|(block, [x, y, z])| [x, y, z, lanes(block, &|row| row[3])])
-                .collect(),
-            // Point - mean = (point - centre) - (mean - centre): hence the sign.
-            mean: axes(|row, axis| -row[4 + axis]),
-            center: axes(|row, axis| row[axis]),
+            point: point.collect(),
+            mean: mean.collect(),
+            center: center.collect(),
             bias: bias.as_chunks().0.to_vec(),
         }
     }

@@ -40,19 +40,6 @@ impl Pillars {
             (points, coord)
         })
     }
-
-    /// The reference's layout: `[M, slots, 4]` row-major, unused slots zero.
-    ///
-    /// `slots` below the largest count cuts points off.
-    pub fn padded(&self, slots: usize) -> Vec<f32> {
-        let mut padded = Vec::with_capacity(self.len() * slots * 4);
-        for (points, _) in self.iter() {
-            let used = points.len().min(slots);
-            padded.extend(points[..used].iter().flatten());
-            padded.resize(padded.len() + (slots - used) * 4, 0.0);
-        }
-        padded
-    }
 }
 
 /// Sorts sweeps into pillars; reuses its tables between calls.
@@ -208,10 +195,8 @@ mod tests {
         assert_eq!(pillars.coords, [[0, 1, 3], [0, 0, 0]]);
         assert_eq!(pillars.counts, [2, 1]);
         assert_eq!(pillars.points, [points[0], points[2], points[1]]);
-        assert_eq!(
-            pillars.padded(2)[8..],
-            [0.5, 0.5, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0]
-        );
+        let second = pillars.iter().nth(1).unwrap();
+        assert_eq!(second, (&points[1..2], [0, 0, 0]));
     }
 
     #[test]

@@ -21,8 +21,7 @@ impl Int8SparseConv {
                 "{inputs} input channels, must be a multiple of {WORD_BYTES}"
             )));
         }
-        let weight = weight.f_tr()?.f_contiguous()?;
-        Ok(Self(Int8Linear::new(&weight, Some(bias), format)?))
+        Ok(Self(Int8Linear::new(weight, Some(bias), format)?))
     }
 
     /// `[N_in, C_in]`, `u8`, to `[N_out, C_out]`.

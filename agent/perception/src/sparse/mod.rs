@@ -13,5 +13,5 @@ mod sites;
 
 pub use conv::SparseConv;
 pub use int8_conv::Int8SparseConv;
-pub use rulebook::{GatherIndex, KERNEL_VOLUME, Rulebook};
+pub use rulebook::{GatherIndex, KERNEL_VOLUME, Rulebook, rows};
 pub use sites::Sites;

@@ -69,11 +69,6 @@ impl Rulebook {
         self.rows.len() / KERNEL_VOLUME
     }
 
-    /// Number of pairs of input and output, of all weights together.
-    pub fn pairs(&self) -> usize {
-        self.rows.iter().filter(|&&row| row != NONE).count()
-    }
-
     /// The rulebooks of several sweeps as one, their rows one after another, as a tensor.
     ///
     /// # Errors
@@ -116,20 +111,28 @@ impl GatherIndex {
     /// # Errors
     /// [`TchError::Shape`] when the rows are not those of the rulebook.
     pub(super) fn gather(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let (rows, channels) = x.size2()?;
-        if rows != self.inputs {
+        let (found, channels) = x.size2()?;
+        if found != self.inputs {
             return Err(TchError::Shape(format!(
-                "{rows} rows of features, the rulebook is of {}",
+                "{found} rows of features, the rulebook is of {}",
                 self.inputs
             )));
         }
         // A row of zeros stands for all missing neighbours.
         let zeros = x.f_new_zeros([1, channels], (x.kind(), x.device()))?;
         let padded = Tensor::f_cat(&[x, &zeros], 0)?;
-        // With an index that is expanded and not materialised, gather and its gradient copy whole rows.
-        let rows = self.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?;
-        padded.f_gather(0, &rows, false)
+        rows(&padded, &self.rows)
     }
+}
+
+/// Rows `[M, C]` of `x` `[N, C]` by an index `[M]`.
+///
+/// # Errors
+/// Those of the tensor library, for example when a row does not exist.
+pub fn rows(x: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
+    // With an index that is expanded and not materialised, gather and its gradient copy whole rows.
+    let index = index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?;
+    x.f_gather(0, &index, false)
 }
 
 fn offset(k: usize) -> [i32; 3] {
@@ -144,6 +147,11 @@ fn index([dx, dy, dz]: [i32; 3]) -> usize {
 mod tests {
     use super::*;
 
+    /// Number of pairs of input and output, of all weights together.
+    fn pairs(book: &Rulebook) -> usize {
+        book.rows.iter().filter(|&&row| row != NONE).count()
+    }
+
     #[test]
     fn offsets_and_indices_agree() {
         assert!((0..KERNEL_VOLUME).all(|k| index(offset(k)) == k));
@@ -152,7 +160,7 @@ mod tests {
     #[test]
     fn two_neighbours_are_inputs_of_each_other() {
         let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0], [0, 0, 1], [5, 5, 5]]).0);
-        assert_eq!((book.inputs, book.outputs(), book.pairs()), (3, 3, 5));
+        assert_eq!((book.inputs, book.outputs(), pairs(&book)), (3, 3, 5));
         assert_eq!(book.rows[index([0, 0, 1])], 1);
         assert_eq!(book.rows[KERNEL_VOLUME + index([0, 0, -1])], 0);
     }
@@ -166,6 +174,6 @@ mod tests {
         assert_eq!(book.rows[index([1, 0, 0])], 0);
         assert_eq!(book.rows[KERNEL_VOLUME + index([-1, 0, 0])], 0);
         assert_eq!(book.rows[KERNEL_VOLUME + index([0, 0, 0])], 1);
-        assert_eq!(book.pairs(), 3);
+        assert_eq!(pairs(&book), 3);
     }
 }

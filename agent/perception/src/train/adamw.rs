@@ -34,15 +34,6 @@ impl Default for AdamWConfig {
     }
 }
 
-/// Result of a step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum OptimizerStep {
-    /// Parameters were updated; the norm of the gradient before it was clipped.
-    Taken(f64),
-    /// The gradient was not finite, so nothing was updated.
-    Skipped,
-}
-
 /// Optimizer of the trainable variables of a network.
 #[derive(Debug)]
 pub struct AdamW {
@@ -88,17 +79,17 @@ impl AdamW {
         }
     }
 
-    /// Updates every variable by its gradient.
+    /// Updates every variable by its gradient; false, and nothing is updated, if the gradient is not finite.
     ///
     /// # Errors
     /// [`TchError`] from the tensor library.
-    pub fn step(&mut self, learning_rate: f64) -> Result<OptimizerStep, TchError> {
+    pub fn step(&mut self, learning_rate: f64) -> Result<bool, TchError> {
         no_grad(|| {
             let gradients = self.entries.iter().map(|entry| entry.variable.grad());
             let gradients: Vec<Tensor> = gradients.collect();
             let norm = global_norm(&gradients)?;
             if !norm.is_finite() {
-                return Ok(OptimizerStep::Skipped);
+                return Ok(false);
             }
             // The small term keeps a gradient of zero from a division by zero.
             let scale = (self.config.max_gradient_norm / (norm + 1e-6)).min(1.0);
@@ -128,7 +119,7 @@ impl AdamW {
                 let change = (&*mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
                 let _ = entry.variable.f_sub_(&change)?;
             }
-            Ok(OptimizerStep::Taken(norm))
+            Ok(true)
         })
     }
 
@@ -197,10 +188,7 @@ mod tests {
                 .square()
                 .sum(Kind::Float)
                 .backward();
-            assert!(matches!(
-                optimizer.step(0.1).unwrap(),
-                OptimizerStep::Taken(_)
-            ));
+            assert!(optimizer.step(0.1).unwrap());
         }
     }
 
@@ -244,7 +232,7 @@ mod tests {
         let (variables, point) = quadratic();
         let mut optimizer = AdamW::new(&variables, AdamWConfig::default());
         (&point * f64::NAN).sum(Kind::Float).backward();
-        assert_eq!(optimizer.step(0.1).unwrap(), OptimizerStep::Skipped);
+        assert!(!optimizer.step(0.1).unwrap());
         assert_eq!(Vec::<f32>::try_from(&point.detach()).unwrap(), [3.0, 3.0]);
     }
 }

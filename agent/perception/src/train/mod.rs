@@ -15,7 +15,7 @@ mod schedule;
 mod task;
 mod trainer;
 
-pub use adamw::{AdamW, AdamWConfig, OptimizerStep};
+pub use adamw::{AdamW, AdamWConfig};
 pub use card::ModelCard;
 pub use curve::Curve;
 pub use data_listing::DataListing;

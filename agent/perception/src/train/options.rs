@@ -134,14 +134,13 @@ impl TrainingOptions {
     }
 
     fn length(&self) -> Result<Length, OptionsError> {
-        match (self.steps, self.epochs, self.minutes) {
+        let seconds = self.minutes.map(|minutes| 60.0 * minutes);
+        // The conversion refuses NaN, infinity and negative numbers.
+        let time = seconds.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+        match (self.steps, self.epochs, time) {
             (Some(steps), _, _) if steps > 0 => Ok(Length::Steps(steps)),
             (_, Some(epochs), _) if epochs > 0.0 => Ok(Length::Epochs(epochs)),
-            // The conversion refuses NaN, infinity and negative numbers.
-            (_, _, Some(minutes)) => match Duration::try_from_secs_f64(60.0 * minutes) {
-                Ok(time) if !time.is_zero() => Ok(Length::Time(time)),
-                _ => Err(OptionsError::Length),
-            },
+            (_, _, Some(time)) if !time.is_zero() => Ok(Length::Time(time)),
             _ => Err(OptionsError::Length),
         }
     }

@@ -30,10 +30,7 @@ impl RateSchedule {
         match self {
             Self::OneCycle => one_cycle(peak, progress),
             Self::HeldRate if progress < HELD => peak * (progress / HELD_RISE).clamp(START, 1.0),
-            Self::HeldRate => {
-                let share = ((progress - HELD) / (1.0 - HELD)).min(1.0);
-                peak * (END + (1.0 - END) * (1.0 + (PI * share).cos()) / 2.0)
-            }
+            Self::HeldRate => peak * between(1.0, END, ((progress - HELD) / (1.0 - HELD)).min(1.0)),
         }
     }
 }
@@ -41,13 +38,16 @@ impl RateSchedule {
 /// The learning rate of one cycle up to `peak` when a share of the training is done, 0..1.
 pub fn one_cycle(peak: f64, progress: f64) -> f64 {
     let progress = progress.clamp(0.0, 1.0);
-    let between =
-        |from: f64, to: f64, share: f64| to + (from - to) * (1.0 + (PI * share).cos()) / 2.0;
     peak * if progress < RISE {
         between(START, 1.0, progress / RISE)
     } else {
         between(1.0, END, (progress - RISE) / (1.0 - RISE))
     }
+}
+
+/// From one number to another along half a cosine.
+fn between(from: f64, to: f64, share: f64) -> f64 {
+    to + (from - to) * (1.0 + (PI * share).cos()) / 2.0
 }
 
 #[cfg(test)]

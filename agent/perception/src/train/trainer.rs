@@ -11,7 +11,7 @@ use support::file_error::{AtFile, FileError};
 use tch::Tensor;
 use tch::nn::VarStore;
 
-use super::adamw::{AdamW, OptimizerStep};
+use super::adamw::AdamW;
 use super::checkpoint::{self, CHECKPOINT_FILE};
 use super::curve::Curve;
 use super::data_listing::DataListing;
@@ -48,16 +48,14 @@ impl CheckpointState {
             ("batch", self.batch.to_string(), requested.batch.to_string()),
             ("method", found, wanted),
         ];
-        let Some((field, found, asked)) =
-            fields.into_iter().find(|(_, found, asked)| found != asked)
-        else {
-            return Ok(());
-        };
-        Err(TrainingError::OtherTraining {
-            field,
-            found,
-            asked,
-        })
+        match fields.into_iter().find(|(_, found, asked)| found != asked) {
+            None => Ok(()),
+            Some((field, found, asked)) => Err(TrainingError::OtherTraining {
+                field,
+                found,
+                asked,
+            }),
+        }
     }
 }
 
@@ -179,7 +177,7 @@ impl Trainer {
     pub fn step(&mut self, loss: &Tensor, share_done: f64) -> Result<bool, TrainingError> {
         self.optimizer.zero_grad();
         loss.f_backward()?;
-        let taken = self.optimizer.step(self.learning_rate(share_done))? != OptimizerStep::Skipped;
+        let taken = self.optimizer.step(self.learning_rate(share_done))?;
         self.skipped = if taken { 0 } else { self.skipped + 1 };
         if self.skipped >= MAX_SKIPPED {
             return Err(TrainingError::Diverged(self.skipped));

@@ -3,14 +3,13 @@
 use std::path::Path;
 
 use protocol::text::hex;
-use safetensors::tensor::SafeTensors;
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 use support::file_error::{AtFile, FileError};
 use support::{atomic_file, bounded_file};
 
 use super::save::with_header;
-use super::{MAX_BYTES, incomplete};
+use super::{MAX_BYTES, parsed};
 
 /// Key of the header that contains the metadata.
 const METADATA: &str = "__metadata__";
@@ -23,7 +22,7 @@ const METADATA: &str = "__metadata__";
 pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, FileError> {
     let old = bounded_file::read(path, MAX_BYTES).at(path)?;
     // `with_header` relies on a valid length and header.
-    SafeTensors::deserialize(&old).map_err(|error| incomplete(path, old.len(), error))?;
+    parsed(&old).at(path)?;
     let new = with_header(&old, |entries| {
         let metadata = entries.entry(METADATA.to_owned());
         if let Value::Object(texts) = metadata.or_insert_with(|| Value::Object(Map::new())) {

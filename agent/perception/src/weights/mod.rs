@@ -6,13 +6,13 @@
 mod annotate;
 mod save;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use half::{bf16, f16};
 use protocol::text::hex;
-use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 use support::bounded_file;
@@ -72,9 +72,7 @@ impl Weights {
             return Err(FileError::new(path, "a folder, must be one weights file"));
         }
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-        let truncated = |error| incomplete(path, bytes.len(), error);
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(truncated)?;
-        let file = SafeTensors::deserialize(&bytes).map_err(truncated)?;
+        let (metadata, file) = parsed(&bytes).at(path)?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.iter() {
             if let Some(values) = read_values(path, name, &view)? {
@@ -82,7 +80,6 @@ impl Weights {
                 tensors.insert(name.to_owned(), Values { shape, values });
             }
         }
-        let metadata = header.metadata().clone().unwrap_or_default();
         Ok(Self {
             path: path.to_owned(),
             metadata: metadata.into_iter().collect(),
@@ -264,10 +261,18 @@ impl Weights {
     }
 }
 
-/// The error of a file of `size` bytes that is truncated or no safetensors file.
-fn incomplete(path: &Path, size: usize, error: SafeTensorError) -> FileError {
-    let problem = format_args!("not a complete safetensors file ({size} bytes): {error}");
-    FileError::new(path, problem)
+/// Metadata and tensors of a safetensors file.
+///
+/// # Errors
+/// A message if it is truncated or of another format.
+pub fn parsed(bytes: &[u8]) -> Result<(HashMap<String, String>, SafeTensors<'_>), String> {
+    let parts = SafeTensors::read_metadata(bytes)
+        .and_then(|(_, header)| Ok((header, SafeTensors::deserialize(bytes)?)));
+    let (header, tensors) = parts.map_err(|error| {
+        let size = bytes.len();
+        format!("not a complete safetensors file ({size} bytes): {error}")
+    })?;
+    Ok((header.metadata().clone().unwrap_or_default(), tensors))
 }
 
 /// The values of one tensor as `f32`; `None` for integers.

@@ -211,7 +211,7 @@ fn detections_that_are_none_are_counted_and_the_others_are_taken() {
     let tracks = tracker
         .update(1, &Pose::IDENTITY, None, &detections)
         .unwrap();
-    assert_eq!((tracks.len(), tracker.left_out()), (1, 2));
+    assert_eq!((tracks.len(), tracker.left_out), (1, 2));
 }
 
 #[test]
@@ -261,7 +261,7 @@ fn detections_beyond_the_largest_number_are_counted_and_those_of_the_highest_sco
     };
     let mut update = |tick: u64, offset| {
         let tracks = tracker.update(tick * TICK_NANOS, &Pose::IDENTITY, None, &frame(offset));
-        (tracks.unwrap(), tracker.left_out())
+        (tracks.unwrap(), tracker.left_out)
     };
     let (tracks, left_out) = update(1, 0.0);
     assert_eq!((tracks.len(), left_out), (30, 70));

@@ -174,8 +174,8 @@ fn numbers(field: &str, axis: &Option<Vec<f64>>, low: f64, high: f64) -> Result<
 
 /// Contradictory or impossible combinations of fields.
 fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
-    let (grid, ego, poses) = (&experiment.grid, &experiment.ego, &experiment.poses);
-    let exchanges = grid.method.iter().map(|method| method.exchange());
+    let (grid, poses) = (&experiment.grid, &experiment.poses);
+    let mut exchanges = grid.method.iter().map(|method| method.exchange());
     ensure!(
         experiment.weights.is_some(),
         "weights is left out: name a file, or a folder with one for each method"
@@ -188,6 +188,34 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
         experiment.noise_mode != NoiseMode::Replayed,
         "noise_mode is replayed, which needs a table: name it in poses instead"
     );
+    link_axes(experiment, link)?;
+    ensure!(
+        grid.pose_noise.is_none() || *poses == PoseSourceConfig::Recorded,
+        "grid.pose_noise is added to recorded poses, but poses is {}",
+        poses.name()
+    );
+    if grid.codec.is_some() && exchanges.clone().all(|it| it != Exchange::Features) {
+        let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
+        bail!(
+            "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
+            names.join(", ")
+        );
+    }
+    ensure!(
+        grid.vehicles.is_none() || exchanges.any(|it| it != Exchange::Nothing),
+        "grid.vehicles varies the transmitting vehicles, but grid.method is none: there are none"
+    );
+    let has_seeds = grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1);
+    ensure!(
+        !has_seeds || is_random(grid, link),
+        "grid.seed has several values, but nothing in the experiment is random"
+    );
+    Ok(())
+}
+
+/// Contradictions between the axes of a link, its own settings, and the times of the ego.
+fn link_axes(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
+    let (grid, ego) = (&experiment.grid, &experiment.ego);
     let has_latency = link.latency != LatencyModel::None;
     let has_capacity = link.capacity != CapacityConfig::Unlimited;
     let twice = if grid.latency_ms.is_some() && has_latency {
@@ -219,41 +247,22 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
             ego.max_age_ms
         );
     }
-    ensure!(
-        grid.pose_noise.is_none() || *poses == PoseSourceConfig::Recorded,
-        "grid.pose_noise is added to recorded poses, but poses is {}",
-        poses.name()
-    );
-    if grid.codec.is_some() && exchanges.clone().all(|it| it != Exchange::Features) {
-        let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
-        bail!(
-            "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
-            names.join(", ")
-        );
-    }
-    ensure!(
-        grid.vehicles.is_none() || exchanges.clone().any(|it| it != Exchange::Nothing),
-        "grid.vehicles varies the transmitting vehicles, but grid.method is none: there are none"
-    );
+    Ok(())
+}
+
+/// True if a seed makes a difference, by the axes of the grid or by the link.
+fn is_random(grid: &Grid, link: &LinkConfig) -> bool {
     let (mut loss, mut noise) = (grid.loss.iter().flatten(), grid.pose_noise.iter().flatten());
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
     // A loss of 0 or 1 is certain, whatever the seed.
     let loses = loss.any(|share| *share > 0.0 && *share < 1.0);
     let errs = noise.any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
-    let is_random = jitters || loses || errs || is_random(link);
-    ensure!(
-        is_random || grid.seed.as_ref().is_none_or(|seeds| seeds.len() <= 1),
-        "grid.seed has several values, but nothing in the experiment is random"
-    );
-    Ok(())
-}
-
-fn is_random(link: &LinkConfig) -> bool {
-    let latency = !matches!(
+    let is_steady = matches!(
         link.latency,
         LatencyModel::None | LatencyModel::ConstantMs(_) | LatencyModel::Trace
     );
-    latency || link.loss != LossModel::None || link.reorder.is_some() || link.duplicate > 0.0
+    let (has_loss, reorders) = (link.loss != LossModel::None, link.reorder.is_some());
+    jitters || loses || errs || !is_steady || has_loss || reorders || link.duplicate > 0.0
 }
 
 /// Checks each value of an axis: at least one, and no duplicates.

@@ -1,6 +1,5 @@
 //! `EXPERIMENT.yaml`: fixed settings, and what varies: the grid of a sweep, or the rows and columns of tables.
 
-use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use agent::attack::AttackConfig;
@@ -99,13 +98,6 @@ pub struct Generate {
     pub frames: usize,
     /// Smallest and largest number of vehicles of a scenario.
     pub vehicles: [usize; 2],
-}
-
-impl Generate {
-    /// Smallest to largest number of vehicles.
-    pub fn vehicles(&self) -> RangeInclusive<usize> {
-        self.vehicles[0]..=self.vehicles[1]
-    }
 }
 
 /// Axes of the grid: every value of each field with every value of the others. An absent axis is as in the link.

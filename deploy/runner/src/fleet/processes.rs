@@ -90,9 +90,12 @@ impl Fleet {
     /// A plan of the agents that this run starts, for further processes.
     fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Result<Planner<'a>, RunFolderError> {
         let wanted_mib = self.scenario.network.shared_memory_mib;
+        // At most: agents, ego and replay, and link and recorder where there are such.
+        let recorders = usize::from(self.scenario.record.is_some());
+        let processes = self.agents.len() + 2 + usize::from(self.is_over_link()) + recorders;
         let bus = BusConfig {
             connect: context.endpoint.clone(),
-            shared_memory_mib: pool_mib(wanted_mib, self.process_count()),
+            shared_memory_mib: pool_mib(wanted_mib, processes),
             supervised: true,
             ..BusConfig::default()
         };
@@ -110,12 +113,6 @@ impl Fleet {
             })?;
         }
         Ok(planner)
-    }
-
-    /// Processes that this run starts at most: agents, ego and replay, and link and recorder where there are such.
-    fn process_count(&self) -> usize {
-        let others = [self.is_over_link(), self.scenario.record.is_some()];
-        self.agents.len() + 2 + others.iter().filter(|is_there| **is_there).count()
     }
 
     fn agent_config(

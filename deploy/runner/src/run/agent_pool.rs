@@ -62,11 +62,9 @@ impl AgentProcesses {
         })?;
         // Before any process starts: receivers reject the messages of two fleets of one name.
         check_free(&router.place, &fleet.scenario.network, run, &specs)?;
-        let identity = Identity {
-            run: run.clone(),
-            process: ProcessId::new(NAME).expect("lower-case letters"),
-            cav: CavId::new(NAME).expect("lower-case letters"),
-        };
+        let process = ProcessId::new(NAME).expect("lower-case letters");
+        let cav = CavId::new(NAME).expect("lower-case letters");
+        let identity = Identity::new(run.clone(), process, cav);
         let bus = Bus::over(router.place.session.clone(), identity)?;
         // A restarted agent has lost its state, and the result would depend on the time of the crash.
         let supervisor = Supervisor::start(specs, &folder.log_dir(), 0, &events)?;

@@ -11,7 +11,7 @@ use bus::{MetricsPeer, ROUTER};
 use dataset::findings;
 use deploy::operate::progress::Display;
 use deploy::operate::router_report::{RefusalCount, RouterReport};
-use deploy::operate::run_folder::{RunFolder, SWEEP_LOG};
+use deploy::operate::run_folder::{RunFolder, SWEEP_LOG, frames_csv};
 use deploy::operate::status::Phase;
 use deploy::operate::status_reporter::{Ending, StatusReporter};
 use deploy::operate::supervise::{ProcessEvent, ProcessEventKind, ProcessSpec, Supervisor};
@@ -90,7 +90,9 @@ fn go(
     stop.on_signals().map_err(RunError::Signals)?;
     // Before anything else of the run takes the cores.
     let capacity = announce_capacity(fleet, &options.programs);
-    let fingerprint = fingerprint(fleet, &options.programs);
+    // Hashes programs, weights and scene during the run.
+    let (hashed, programs) = (fleet.clone(), options.programs.clone());
+    let fingerprint = std::thread::spawn(move || hashed.provenance(&programs));
 
     let keys = fleet.keys(folder)?;
     let context = SessionContext {
@@ -310,10 +312,20 @@ fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: 
     }
 }
 
-/// Hashes programs, weights and scene during the run.
-fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
-    let (fleet, programs) = (fleet.clone(), programs.to_owned());
-    std::thread::spawn(move || fleet.provenance(&programs))
+/// Syncs the files of lines: lines are appended without waiting for the disk, and only now have to be on it. Returns what
+/// is incomplete, as text; `missing` is the number of lines of each file that found no room.
+fn sync_lines(folder: &RunFolder, missing: [u64; 3]) -> Vec<String> {
+    let mut incomplete = Vec::new();
+    let files = LINES.map(|name| folder.file(name));
+    for (file, lines) in files.iter().zip(missing).filter(|(_, lines)| *lines > 0) {
+        incomplete.push(format!("{lines} lines are missing in {}", file.display()));
+    }
+    for file in &files {
+        if let Err(error) = atomic_file::sync(file) {
+            incomplete.push(format!("{}: {error}", file.display()));
+        }
+    }
+    incomplete
 }
 
 /// Writes the run folder; files that cannot be written are listed in the result, which is not lost with them.
@@ -331,17 +343,7 @@ fn write(
         progress,
         unwritten: lines,
     } = scored;
-    let mut unwritten = Vec::new();
-    for (name, lines) in LINES.iter().zip(lines).filter(|(_, lines)| *lines > 0) {
-        let file = folder.file(name);
-        unwritten.push(format!("{lines} lines are missing in {}", file.display()));
-    }
-    // Lines are appended without waiting for the disk. Only now do they have to be on it.
-    for file in LINES.map(|name| folder.file(name)) {
-        if let Err(error) = atomic_file::sync(&file) {
-            unwritten.push(format!("{}: {error}", file.display()));
-        }
-    }
+    let mut unwritten = sync_lines(&folder, lines);
     let mut sum = Ledger::default();
     let ledgers = stats.iter().map(|process| &process.ledger);
     ledgers.for_each(|ledger| sum.merge(ledger));
@@ -369,7 +371,8 @@ fn write(
         ..RunReport::new(run, &metrics, board.records(), &stats, capacity)
     };
     written.push(folder.write_json(report::FILE, &run_report));
-    written.push(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
+    let frames = frames_csv(board.records(), &swept(&folder.file(SWEEP_LOG)), None);
+    written.push(folder.write("frames.csv", &frames));
     let report = LedgerReport {
         refused,
         causes: watched.causes.clone(),

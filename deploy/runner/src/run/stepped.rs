@@ -3,15 +3,16 @@
 //! The run folder is that of a live run. Only `scenario.yaml` and `log/` depend on machine, load, time of day and
 //! number of processes.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use dataset::findings;
-use deploy::operate::run_folder::{RunFolder, RunFolderError};
+use deploy::operate::run_folder::{RunFolder, RunFolderError, frames_csv};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
 use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::RunId;
+use support::file_error::FileError;
 use support::provenance::Provenance;
 use terminal::progress;
 
@@ -75,10 +76,7 @@ fn play(
 ) -> Result<FrameScores, RunError> {
     let (rule, map_values) = (fleet.ground_truth_rule(), fleet.map_values());
     let mut board = FrameScores::new(fleet.ego.clone(), rule, map_values);
-    let unwritable = |source| RunFolderError::Write {
-        path: folder.path().to_owned(),
-        source,
-    };
+    let unwritable = |error| RunFolderError::Write(FileError::new(folder.path(), error));
     let mut lines = FrameLines::create(folder.path()).map_err(unwritable)?;
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let _ = evaluator.run(&fleet.recorded, &mut |frame: EvaluatedFrame| {
@@ -116,7 +114,8 @@ fn write(
     // Times of processes on the wall clock say nothing here, so none are reported.
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
-    folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
+    let frames = frames_csv(board.records(), &BTreeMap::new(), None);
+    folder.write("frames.csv", &frames)?;
     let ledger = LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0));
     folder.write_json("ledger.json", &ledger)?;
     let resolved = Scenario {

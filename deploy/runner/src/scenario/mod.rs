@@ -62,6 +62,7 @@ pub struct Scenario {
     pub agents: AgentSettings,
     /// Settings of single vehicles, by id; a field given here takes precedence over `agents`.
     #[serde(default)]
+    #[schemars(with = "BTreeMap<CavId, AgentSettings>")]
     pub vehicles: BTreeMap<CavId, AgentOverrides>,
     /// Vehicles whose agents are started on other hosts; the run waits for them.
     #[serde(default)]

@@ -1,7 +1,6 @@
 //! Settings of single vehicles that override those of all.
 
 use agent::config::AgentSettings;
-use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
@@ -18,21 +17,6 @@ impl<'de> Deserialize<'de> for AgentOverrides {
         serde_json::from_value::<AgentSettings>(Value::Object(fields.clone()))
             .map_err(D::Error::custom)?;
         Ok(Self(fields))
-    }
-}
-
-impl JsonSchema for AgentOverrides {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> std::borrow::Cow<'static, str> {
-        AgentSettings::schema_name()
-    }
-
-    /// Schema of the settings, with no field required.
-    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
-        generator.subschema_for::<AgentSettings>()
     }
 }
 

@@ -11,13 +11,20 @@ use sim_replay::config::{LinkProcessConfig, RecorderConfig, ReplayConfig};
 
 use super::*;
 
+/// Every kind of file, with the path of its schema below `deploy`.
+const ALL: [(SchemaOf, &str); 3] = [
+    (SchemaOf::Scenario, "scenarios/scenario.schema.json"),
+    (SchemaOf::Experiment, "experiments/experiment.schema.json"),
+    (SchemaOf::Link, "experiments/links/link.schema.json"),
+];
+
 fn deploy() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
 #[test]
 fn the_schemas_beside_the_files_are_those_of_the_types() {
-    for (kind, place) in SchemaOf::ALL {
+    for (kind, place) in ALL {
         let written = std::fs::read_to_string(deploy().join(place)).unwrap_or_default();
         let name = format!("{kind:?}").to_lowercase();
         assert!(

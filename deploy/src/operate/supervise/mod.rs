@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
+use support::file_error::FileError;
 use tokio::runtime::Runtime;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
@@ -104,13 +105,8 @@ pub enum SuperviseError {
     #[error("{} is missing: build it (cargo build --release), it belongs beside v2vloc", .0.display())]
     NoProgram(PathBuf),
     /// The log cannot be written.
-    #[error("cannot write the log {}: {source}", path.display())]
-    Log {
-        /// The log file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
+    #[error("cannot write the log {0}")]
+    Log(#[source] FileError),
     /// The runtime of the supervisor cannot be started.
     #[error("cannot start the supervisor: {0}")]
     Runtime(std::io::Error),

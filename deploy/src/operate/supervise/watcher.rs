@@ -8,6 +8,7 @@ use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
+use support::file_error::FileError;
 use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
@@ -42,7 +43,7 @@ impl Log {
     pub(super) fn create(path: PathBuf) -> Result<Self, SuperviseError> {
         match OpenOptions::new().create(true).append(true).open(&path) {
             Ok(file) => Ok(Self { path, file }),
-            Err(source) => Err(SuperviseError::Log { path, source }),
+            Err(error) => Err(SuperviseError::Log(FileError::new(path, error))),
         }
     }
 

@@ -130,19 +130,13 @@ impl MotionSearch<'_> {
 
     /// Candidates that a motion aligns, each box and each object once, the nearest first.
     fn matches(&self, motion: &Isometry3<f64>) -> Vec<(usize, usize)> {
-        let mut near: Vec<(f64, usize, usize)> = (self.candidates.iter())
-            .map(|&(object, index)| (self.distance(motion, object, index), object, index))
-            .filter(|(distance, ..)| *distance < self.config.fit_tolerance_m)
-            .collect();
-        near.sort_by(|one, other| one.0.total_cmp(&other.0));
-        let mut matches: Vec<(usize, usize)> = Vec::with_capacity(near.len());
-        for (_, object, index) in near {
-            let mut taken = matches.iter();
-            if taken.all(|&(other, taken)| other != object && taken != index) {
-                matches.push((object, index));
-            }
-        }
-        matches
+        let candidates = self.candidates.iter();
+        let distances = candidates.map(|&(object, index)| {
+            let distance = self.distance(motion, object, index);
+            (distance, (object, index))
+        });
+        let near = distances.filter(|(distance, _)| *distance < self.config.fit_tolerance_m);
+        planar_fit::one_to_one(near.collect())
     }
 
     fn distance(&self, motion: &Isometry3<f64>, object: usize, index: usize) -> f64 {

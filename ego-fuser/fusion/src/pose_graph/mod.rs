@@ -30,15 +30,6 @@ pub struct Observer<'a> {
     pub boxes: &'a [Detection],
 }
 
-/// Correction of an agent.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Corrected {
-    /// Its corrected pose; uncorrected where too few objects are shared.
-    pub ego_from_agent: Pose,
-    /// Number of objects that it shares with others; 0 where its pose was not corrected.
-    pub shared: usize,
-}
-
 /// Distance at which a box is half as accurate as nearby, metres.
 const HALF_EXACT_M: f64 = 60.0;
 
@@ -70,22 +61,19 @@ impl ObservedBox {
     }
 }
 
-/// Corrects the poses of all agents relative to the first, the ego, whose pose stays.
+/// Corrects the poses of all agents relative to the first, the ego, whose pose stays, as do those of agents that share
+/// too few objects.
 ///
 /// Agents join one after another, those first that share most with the joined ones: an agent that shares nothing with
 /// the ego may still be aligned through a third.
-pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Corrected> {
+pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Pose> {
     let seen = agents.iter().map(|agent| sound_boxes(agent.boxes, config));
     let seen: Vec<Vec<ObservedBox>> = seen.collect();
     let priors = agents.iter().map(|agent| flattened(&agent.ego_from_agent));
     let priors: Vec<Isometry3<f64>> = priors.collect();
-    let unmoved = agents.iter().map(|agent| Corrected {
-        ego_from_agent: agent.ego_from_agent,
-        shared: 0,
-    });
-    let mut corrected: Vec<Corrected> = unmoved.collect();
+    let mut corrected: Vec<Pose> = agents.iter().map(|agent| agent.ego_from_agent).collect();
     let Some(own) = seen.first() else {
-        return Vec::new();
+        return corrected;
     };
     let mut graph = Assembly::default();
     graph.join(0, &Isometry3::identity(), own, &[]);
@@ -97,15 +85,14 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
     if graph.joined.len() < 2 {
         return corrected;
     }
-    for (agent, solved, shared) in graph.solve(&priors, config) {
+    for (agent, solved) in graph.solve(&priors, config) {
         let centers = seen[agent].iter().map(|seen| &seen.center);
         if apart(centers, &priors[agent], &solved) < config.dead_zone_m {
             continue;
         }
         // The planar correction is applied from the left, so height, roll and pitch of the pose are kept.
         let moved = solved * priors[agent].inverse();
-        corrected[agent].ego_from_agent = (moved * agents[agent].ego_from_agent.isometry()).into();
-        corrected[agent].shared = shared;
+        corrected[agent] = (moved * agents[agent].ego_from_agent.isometry()).into();
     }
     corrected
 }
@@ -194,12 +181,12 @@ impl Assembly {
         self.joined.push((agent, *ego_from_agent));
     }
 
-    /// Agent, pose and number of shared objects of all joined agents but the ego.
+    /// Agent and pose of all joined agents but the ego.
     fn solve(
         self,
         priors: &[Isometry3<f64>],
         config: &PoseGraphConfig,
-    ) -> impl Iterator<Item = (usize, Isometry3<f64>, usize)> {
+    ) -> impl Iterator<Item = (usize, Isometry3<f64>)> {
         let mut viewers = vec![0usize; self.objects.len()];
         self.observations
             .iter()
@@ -219,12 +206,8 @@ impl Assembly {
             observations: shared,
         };
         graph.optimise();
-        let observations = graph.observations;
-        let solved = self.joined.into_iter().zip(graph.agents).enumerate();
-        solved.skip(1).map(move |(place, ((agent, _), solved))| {
-            let of_agent = observations.iter().filter(|of| of.agent == place);
-            (agent, planar(&solved), of_agent.count())
-        })
+        let solved = self.joined.into_iter().zip(graph.agents).skip(1);
+        solved.map(|((agent, _), solved)| (agent, planar(&solved)))
     }
 }
 

@@ -71,7 +71,6 @@ impl TrafAlignConfig {
         within("fusion layers", self.layers as i64, 1, 16)?;
         within("fusion field", self.field, 1, 64)?;
         within("fusion frames", self.frames as i64, 1, 16)?;
-        within("fusion frame_secs", self.frame_secs, 1e-3, 60.0)?;
-        Ok(())
+        Ok(within("fusion frame_secs", self.frame_secs, 1e-3, 60.0)?)
     }
 }

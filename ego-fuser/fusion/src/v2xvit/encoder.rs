@@ -72,14 +72,6 @@ impl Layer {
     pub fn blocks(&self) -> &[Block] {
         &self.blocks
     }
-
-    /// The feed-forward network on the tokens of one agent, `[T, C]` to the same.
-    ///
-    /// # Errors
-    /// [`tch::TchError`] when shapes do not fit.
-    pub fn feed_forward(&self, x: &Tensor, train: bool) -> tch::Result<Tensor> {
-        self.feed_forward.forward(x, train)
-    }
 }
 
 /// The whole encoder, on tokens in the order of [`BlockOrder`].
@@ -154,7 +146,7 @@ impl Encoder {
                 x = each_agent(&x, |x| {
                     let x = block.across_cells(x, train)?;
                     match is_last {
-                        true => layer.feed_forward(&x, train),
+                        true => layer.feed_forward.forward(&x, train),
                         false => Ok(x),
                     }
                 })?;

@@ -4,7 +4,7 @@ use tch::{Kind, TchError, Tensor, nn};
 
 use super::config::{Merge, WindowConfig};
 use crate::block_order::BlockOrder;
-use crate::f64_tensor::sum_over_first;
+use crate::f64_tensor::{one_after_another, sum_over_first};
 use crate::layers::{LayerNorm, Linear, SMALL, attend, dropout};
 
 /// Tokens that are computed at once outside training: intermediate results then stay in the cache.
@@ -155,11 +155,7 @@ impl WindowAttention {
         let seen: Vec<Vec<Tensor>> = seen.collect::<Result<_, _>>()?;
         let (weights, bias) = self.merged(&seen, tokens)?;
         let outputs = seen.iter().map(|seen| project(seen, &weights, &bias));
-        let output = match &outputs.collect::<Result<Vec<_>, _>>()?[..] {
-            // A single chunk is not copied.
-            [only] => only.shallow_clone(),
-            outputs => Tensor::f_cat(outputs, 0)?,
-        };
+        let output = one_after_another(&outputs.collect::<Result<Vec<_>, _>>()?)?;
         dropout(output, self.dropout, train)
     }
 

@@ -332,19 +332,9 @@ impl MatchSearch<'_> {
     /// Inliers of a motion, one to one, nearest first.
     fn together(&self, motion: &Isometry3<f64>) -> Vec<BoxMatch> {
         let all = (0..self.ego.len()).flat_map(|a| (0..self.neighbour.len()).map(move |b| (a, b)));
-        let mut near: Vec<(f64, BoxMatch)> = all
-            .map(|pair| (self.apart(pair, motion), pair))
-            .filter(|(distance, _)| *distance < self.config.fit_tolerance_m)
-            .collect();
-        near.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let mut matches: Vec<BoxMatch> = Vec::new();
-        for (_, pair) in near {
-            let mut known = matches.iter();
-            if known.all(|known| known.0 != pair.0 && known.1 != pair.1) {
-                matches.push(pair);
-            }
-        }
-        matches
+        let distances = all.map(|pair| (self.apart(pair, motion), pair));
+        let near = distances.filter(|(distance, _)| *distance < self.config.fit_tolerance_m);
+        planar_fit::one_to_one(near.collect())
     }
 
     /// Horizontal distance between two boxes after a motion, metres.

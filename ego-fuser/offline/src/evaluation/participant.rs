@@ -61,14 +61,11 @@ impl Participant {
             cloud: frame.points.clone(),
         };
         let gnss = frame.gnss();
-        let measured = [
-            gnss.map(|gnss| LoopInput::Gnss(capture_nanos, gnss)),
-            Some(LoopInput::Motion(capture_nanos, frame.motion())),
-            Some(LoopInput::Sweep(sweep)),
-        ];
+        let gnss = gnss.map(|gnss| LoopInput::Gnss(capture_nanos, gnss));
+        let motion = LoopInput::Motion(capture_nanos, frame.motion());
         let mut answer = Replies::default();
         let mut is_over = false;
-        for input in measured.into_iter().flatten() {
+        for input in gnss.into_iter().chain([motion, LoopInput::Sweep(sweep)]) {
             is_over |= self.handle(input, &mut answer)?;
         }
         while !is_over || self.agent_loop.is_computing() {

@@ -46,20 +46,20 @@ impl Replies {
     /// Takes a message of so many bytes on the wire.
     pub(super) fn note(&mut self, message: Message, bytes: u64) -> Result<(), WireError> {
         let mut rate = None;
-        let (stream, content) = match message {
+        let content = match message {
             Message::Bev(message) => {
                 rate = message.features.rate;
-                let map = message.features.decode(&Limits::default())?;
-                (Stream::Bev, Content::Features(map))
+                Content::Features(message.features.decode(&Limits::default())?)
             }
-            Message::Boxes(message) => (Stream::Boxes, Content::Boxes(message.into_objects())),
-            Message::Points(message) => (Stream::Points, Content::Points(message.points)),
+            Message::Boxes(message) => Content::Boxes(message.into_objects()),
+            Message::Points(message) => Content::Points(message.points),
             Message::Pose(pose) => {
                 self.pose = Some((pose, bytes));
                 return Ok(());
             }
             _ => return Ok(()),
         };
+        let stream = content.exchange().stream();
         let message = SentMessage {
             content,
             bytes,
@@ -71,24 +71,21 @@ impl Replies {
 
     /// True with a pose and a message of each of these streams.
     pub(super) fn is_complete(&self, streams: &[Stream]) -> bool {
-        self.pose.is_some()
-            && streams
-                .iter()
-                .all(|stream| self.messages.contains_key(stream))
+        let mut streams = streams.iter();
+        self.pose.is_some() && streams.all(|stream| self.messages.contains_key(stream))
     }
 
     /// The answer with its messages in the order of these streams, whatever the order of their arrival.
     pub(super) fn into_sent(mut self, frame: &Frame, streams: &[Stream]) -> Sent {
         let (pose, pose_bytes) = self.pose.unwrap_or((NO_SOURCE, 0));
+        let streams = streams.iter();
+        let messages = streams.filter_map(|stream| self.messages.remove(stream));
         Sent {
             cav: frame.cav.clone(),
             capture_nanos: frame.capture_nanos,
             pose,
             pose_bytes,
-            messages: streams
-                .iter()
-                .filter_map(|stream| self.messages.remove(stream))
-                .collect(),
+            messages: messages.collect(),
             failure: self.failure,
         }
     }

@@ -36,10 +36,10 @@ pub(super) fn run(
     on_frame: &mut dyn FnMut(EvaluatedFrame) -> ControlFlow<()>,
 ) -> Result<ControlFlow<()>, EvaluateError> {
     let (places, observers) = evaluator.setup.pool.places(scenario);
-    let Some(&ego_place) = places.first() else {
+    if places.is_empty() {
         return Ok(ControlFlow::Continue(()));
-    };
-    let mut run = SteppedRun::open(evaluator, scenario, (places, ego_place), observers)?;
+    }
+    let mut run = SteppedRun::open(evaluator, scenario, places, observers)?;
     let mut flow = ControlFlow::Continue(());
     for tick in run.begin..run.end {
         let Some(frame) = run.decide(tick)? else {
@@ -95,11 +95,11 @@ struct SteppedRun<'a> {
 }
 
 impl<'a> SteppedRun<'a> {
-    /// A run of the agents at `places`, of which one is the ego's.
+    /// A run of the agents at `places`, the ego first.
     fn open(
         evaluator: &'a mut Evaluator,
         scenario: &'a Scenario,
-        (places, ego_place): (Vec<usize>, usize),
+        places: Vec<usize>,
         observers: Vec<usize>,
     ) -> Result<Self, EvaluateError> {
         let setup = &evaluator.setup;
@@ -108,7 +108,7 @@ impl<'a> SteppedRun<'a> {
         for &place in places.iter().filter(|_| evaluator.remote.is_none()) {
             let index = places.iter().filter(|other| **other < place).count();
             let own = setup.vehicles.get(&scenario.agents[place]);
-            let (settings, is_ego) = (own.unwrap_or(&setup.agents), place == ego_place);
+            let (settings, is_ego) = (own.unwrap_or(&setup.agents), place == places[0]);
             // Without an exchange, neighbours send their pose only.
             let method = evaluator.ego.method();
             let needed = match method.exchange() {
@@ -123,7 +123,7 @@ impl<'a> SteppedRun<'a> {
         let end = begin.saturating_add(setup.frames.unwrap_or(usize::MAX));
         let first = scenario.ticks.get(begin);
         let began_nanos = first.map_or(0, |tick| tick.capture_nanos);
-        let ego = &scenario.agents[ego_place];
+        let ego = &scenario.agents[places[0]];
         let mut ego_loop = EgoLoop::new(ego, &evaluator.ego, setup.loop_options(scenario));
         let delivery = DelayedDelivery::new(setup.emulator(scenario)?, ego, began_nanos);
         // An ego-only method needs no messages of others.

@@ -38,15 +38,19 @@ impl Evaluator {
         self.left_out.add_tick(&loaded);
         let mut sweeps = Vec::with_capacity(loaded.frames.len());
         for (place, frame) in loaded.frames {
-            let maps = self.maps.as_mut().filter(|_| with_maps(place));
-            let maps = maps.and_then(|maps| Some((maps.index_of(&scenario.name)?, maps)));
-            let map = maps.map(|(index, maps)| maps.map(index, scenario, place, tick));
-            let map = match map.transpose() {
+            let mut map = Ok(None);
+            if with_maps(place)
+                && let Some(maps) = &mut self.maps
+                && let Some(index) = maps.index_of(&scenario.name)
+            {
+                map = maps.map(index, scenario, place, tick).map(Some);
+            }
+            let map = match map {
                 // It fails again where the vehicle perceives it, and is counted there.
                 Err(Error::Detector(error)) if error.is_of_frame() => None,
                 Err(Error::Read(error)) => {
-                    let rank = rank(place, places);
-                    self.left_out.add_unreadable(rank, Problem::from(&error));
+                    let problem = Problem::from(&error);
+                    self.left_out.add_unreadable(rank(place, places), problem);
                     continue;
                 }
                 map => map.map_err(Box::new)?,

@@ -82,20 +82,17 @@ pub(super) fn resized(mask: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>
 
 fn fuse_samples(maps: &Tensor, levels: &Levels<'_>) -> Result<Tensor, TchError> {
     let counts: Vec<i64> = levels.samples.iter().map(|sample| sample.agents).collect();
-    let fused = maps
-        .f_split_with_sizes(&counts, 0)?
-        .into_iter()
-        .zip(levels.samples)
-        .map(|(maps, sample)| {
-            let maps = match &sample.theta {
-                Some(theta) => coalign::warp_affine(&maps, theta)?,
-                None => maps,
-            };
-            match levels.aggregation {
-                MapAggregation::Attention => attend_ego(&maps, None),
-                MapAggregation::Max => maps.f_amax([0i64].as_slice(), false),
-            }
-        });
+    let of_samples = maps.f_split_with_sizes(&counts, 0)?.into_iter();
+    let fused = of_samples.zip(levels.samples).map(|(maps, sample)| {
+        let maps = match &sample.theta {
+            Some(theta) => coalign::warp_affine(&maps, theta)?,
+            None => maps,
+        };
+        match levels.aggregation {
+            MapAggregation::Attention => attend_ego(&maps, None),
+            MapAggregation::Max => maps.f_amax([0i64].as_slice(), false),
+        }
+    });
     Tensor::f_stack(&fused.collect::<Result<Vec<_>, _>>()?, 0)
 }
 

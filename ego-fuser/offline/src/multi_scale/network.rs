@@ -213,9 +213,7 @@ impl MultiScaleNetwork {
 fn mean_rate(masks: &Tensor, samples: &[MapAlignment]) -> Result<f64, TchError> {
     let counts: Vec<i64> = samples.iter().map(|sample| sample.agents).collect();
     let shares = masks.f_split_with_sizes(&counts, 0)?;
-    let sum: f64 = shares
-        .iter()
-        .map(|sample| sample.mean(Kind::Double).double_value(&[]))
-        .sum();
-    Ok(sum / samples.len().max(1) as f64)
+    let shares = shares.iter();
+    let means = shares.map(|sample| sample.mean(Kind::Double).double_value(&[]));
+    Ok(means.sum::<f64>() / samples.len().max(1) as f64)
 }

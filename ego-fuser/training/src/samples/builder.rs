@@ -6,7 +6,6 @@ use dataset::class_set::ClassSet;
 use dataset::frame::Frame;
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use perception::crop::Crop;
-use perception::model_config::DetectorConfig;
 use perception::pillars::voxels::{Pillars, Voxeliser};
 use protocol::{Box3d, NoPoseReason, Pose, PoseEstimate};
 use rand::Rng;
@@ -19,6 +18,7 @@ use super::scenes::{SceneSet, TickRef};
 use crate::feature_store::MapSource;
 use crate::{Error, Result};
 use fusion::MapMetadata;
+use fusion::model::CooperativeModel;
 use fusion::points::merge_points;
 use fusion::targets::{Labels, TargetAssigner};
 
@@ -107,7 +107,8 @@ pub struct Sample {
 pub struct SampleBuilder {
     scenes: Arc<SceneSet>,
     config: SampleConfig,
-    detector: DetectorConfig,
+    /// Area of the network.
+    lidar_range_m: [f64; 6],
     assigner: Arc<TargetAssigner>,
     crop: Crop,
     voxeliser: Voxeliser,
@@ -130,24 +131,25 @@ struct RawView {
 }
 
 impl SampleBuilder {
-    /// A builder over `scenes`; `assigner` holds the anchors of `detector`.
+    /// A builder over `scenes` of samples for a model.
+    ///
+    /// # Errors
+    /// [`Error::AnchorGrid`] when the anchors of the model are not on a grid.
     pub fn new(
         scenes: Arc<SceneSet>,
         config: SampleConfig,
-        detector: DetectorConfig,
-        assigner: Arc<TargetAssigner>,
-    ) -> Self {
-        let voxeliser = Voxeliser::for_detector(&detector);
-        let crop = Crop::for_detector(&detector);
-        Self {
+        model: &CooperativeModel,
+    ) -> Result<Self> {
+        let detector = model.config();
+        Ok(Self {
             scenes,
             config,
-            detector,
-            assigner,
-            crop,
-            voxeliser,
+            lidar_range_m: detector.lidar_range_m,
+            assigner: Arc::new(model.assigner()?),
+            crop: Crop::for_detector(detector),
+            voxeliser: Voxeliser::for_detector(detector),
             maps: None,
-        }
+        })
     }
 
     /// The scenes it draws from.
@@ -345,7 +347,7 @@ impl SampleBuilder {
         annotators: &[usize],
         ego_view: &ViewAugment,
     ) -> GroundTruth {
-        let range = self.detector.lidar_range_m;
+        let range = self.lidar_range_m;
         let rule = GroundTruthRule {
             x_m: ANYWHERE_M,
             y_m: ANYWHERE_M,

@@ -1,10 +1,8 @@
 //! Time steps of a sample: late neighbours and earlier maps.
 
 use dataset::Tick;
+use fusion::history::MAX_AGE_NANOS;
 use rand::Rng;
-
-/// Steps further back than this are not used, nanoseconds: the ego keeps none that old.
-const MAX_AGE_NANOS: u64 = fusion::history::MAX_AGE_NANOS;
 
 /// Time steps of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,6 +44,7 @@ impl Moments {
         newest: usize,
         gap: usize,
     ) -> Vec<usize> {
+        // The ego keeps none that is older.
         let is_young =
             |tick: &usize| ticks[now].capture_nanos - ticks[*tick].capture_nanos <= MAX_AGE_NANOS;
         let earlier = (1..self.frames.max(1))

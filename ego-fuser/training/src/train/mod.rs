@@ -105,10 +105,7 @@ impl<'a> FusionTraining<'a> {
         model.set_precision(run.precision);
         let (options, protocol) = (&config.open, &config.protocol);
         let scenes = Arc::new(SceneSet::open(&config.data, options, protocol)?);
-        let assigner = Arc::new(model.assigner()?);
-        let detector = model.config().clone();
-        let mut builder =
-            SampleBuilder::new(Arc::clone(&scenes), samples.clone(), detector, assigner);
+        let mut builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), &model)?;
         let mut validator = None;
         if !config.validation.is_empty() {
             let scenes = SceneSet::open(&config.validation, options, protocol)?;

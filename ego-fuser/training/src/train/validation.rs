@@ -26,7 +26,7 @@ impl Validator {
     /// Chooses `frames` ticks of `scenes`, evenly spread.
     ///
     /// # Errors
-    /// [`Error::Sample`] when a folder cannot be read.
+    /// [`Error`] when a folder cannot be read.
     pub(crate) fn open(
         scenes: SceneSet,
         samples: &SampleConfig,
@@ -41,8 +41,7 @@ impl Validator {
         (samples.poses.noise, samples.poses.lost_share) = (None, 0.0);
         (samples.moments.max_delay_nanos, samples.moments.gap) = (0, 1);
         samples.merged_truth = true;
-        let assigner = Arc::new(model.assigner()?);
-        let builder = SampleBuilder::new(scenes, samples, model.config().clone(), assigner);
+        let builder = SampleBuilder::new(scenes, samples, model)?;
         Ok(Self { builder, ticks })
     }
 

@@ -35,10 +35,7 @@ impl FrameOverlaps {
             .filter(|(_, found)| corners_within(&found.box3d.corners(), truth.area_m));
         let found = within.map(|(index, found)| (index, found.score, footprint(&found.box3d)));
         let (objects, ignored) = (footprints(&truth.objects), footprints(&truth.ignored));
-        Self {
-            detections: detections.len(),
-            by_score: candidates(found, &objects, &ignored),
-        }
+        Self::of(detections.len(), found, &objects, &ignored)
     }
 
     /// Overlaps of footprints that all count.
@@ -47,9 +44,27 @@ impl FrameOverlaps {
             .iter()
             .enumerate()
             .map(|(index, (found, score))| (index, *score, *found));
+        Self::of(detections.len(), found, objects, &[])
+    }
+
+    /// By falling score. The sort is stable: equal scores stay in the order of the detector.
+    fn of(
+        detections: usize,
+        found: impl Iterator<Item = (usize, f32, Polygon)>,
+        objects: &[Polygon],
+        ignored: &[Polygon],
+    ) -> Self {
+        let candidates = found.map(|(index, score, found)| ScoredCandidate {
+            index,
+            score,
+            overlaps: overlaps(&found, objects).collect(),
+            ignored_overlap: overlaps(&found, ignored).fold(0.0, f32::max),
+        });
+        let mut by_score: Vec<ScoredCandidate> = candidates.collect();
+        by_score.sort_by(|a, b| b.score.total_cmp(&a.score));
         Self {
-            detections: detections.len(),
-            by_score: candidates(found, objects, &[]),
+            detections,
+            by_score,
         }
     }
 
@@ -74,24 +89,6 @@ impl FrameOverlaps {
         }
         verdicts
     }
-}
-
-/// By falling score. The sort is stable: equal scores stay in the order of the detector.
-fn candidates(
-    found: impl Iterator<Item = (usize, f32, Polygon)>,
-    objects: &[Polygon],
-    ignored: &[Polygon],
-) -> Vec<ScoredCandidate> {
-    let mut candidates: Vec<ScoredCandidate> = found
-        .map(|(index, score, found)| ScoredCandidate {
-            index,
-            score,
-            overlaps: overlaps(&found, objects).collect(),
-            ignored_overlap: overlaps(&found, ignored).fold(0.0, f32::max),
-        })
-        .collect();
-    candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
-    candidates
 }
 
 fn overlaps(found: &Polygon, objects: &[Polygon]) -> impl Iterator<Item = f32> {

@@ -75,12 +75,7 @@ fn place_of(dir: &Path) -> Option<(PathBuf, Vec<PathBuf>)> {
     Some((dir.join(poses), clouds))
 }
 
-fn open(
-    root: &Path,
-    dir: &Path,
-    options: &OpenOptions,
-    problems: &mut Vec<ReadError>,
-) -> Result<Scenario> {
+fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
     let (path, mut files) =
         place_of(dir).ok_or_else(|| ReadError::malformed(dir, "no clouds with poses"))?;
     let mut faults = Faults::default();
@@ -125,12 +120,11 @@ fn open(
     without.report("cloud", problems);
     let of_poses = path.file_name().unwrap_or_default().display();
     let join = format!("{} poses of {of_poses} by {}", timed.len(), joined.by);
-    let name = files::name_below(root, dir);
     let clouds = timed.into_values().collect();
-    let storage = (SweepStorage::ByName, options);
+    let (layout, storage) = (Layout(&CLOUDS), SweepStorage::ByName);
     Ok(Scenario {
         joins: vec![join],
-        ..sequence::scenario(name, Layout(&CLOUDS), clouds, storage, vec![path], false)
+        ..sequence::scenario(layout, clouds, storage, vec![path], options)
     })
 }
 

@@ -101,9 +101,7 @@ fn read(
                 let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
                 objects.push(Object::new(id, class, world_from_object, size_m));
             }
-            Err(error) => problems.push(Problem::from(
-                &error.with_consequence("the object is left out"),
-            )),
+            Err(error) => problems.push(Problem::left_out("object", error)),
         }
     }
     Ok((objects, problems))

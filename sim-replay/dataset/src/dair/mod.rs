@@ -288,16 +288,10 @@ impl DairSource {
 
 /// The objects of a list; its faults are added to the frame's problems.
 fn usable(labels: Result<LabelledObjects>, problems: &mut Vec<Problem>) -> Option<Vec<Object>> {
-    match labels {
-        Ok((objects, wrong)) => {
-            problems.extend(wrong);
-            Some(objects)
-        }
-        Err(error) => {
-            problems.push(Problem::from(&error));
-            None
-        }
-    }
+    let read = labels.map_err(|error| problems.push(Problem::from(&error)));
+    let (objects, wrong) = read.ok()?;
+    problems.extend(wrong);
+    Some(objects)
 }
 
 impl FrameSource for DairSource {

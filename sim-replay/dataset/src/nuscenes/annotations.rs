@@ -6,7 +6,8 @@ use std::path::Path;
 use nalgebra::{Isometry3, Point3};
 use protocol::PointCloud;
 
-use super::rows::{read_all, referred, transform};
+use super::rows::{Indices, read_all, referred, transform};
+use super::tables::SceneSample;
 use crate::frame::{Object, ObjectClass};
 use crate::json::JsonField;
 use crate::{ReadError, Result, classes};
@@ -19,29 +20,28 @@ const MAX_UNKNOWN: usize = 20;
 /// Highest mount of a LiDAR above the roof, metres. Roadside units are mounted higher.
 const MAX_MOUNT_M: f64 = 1.5;
 
-/// Objects by sample. Rows that cannot be read are left out, with a problem; without `sample_annotation.json` there are
-/// none.
+/// Adds the objects to their samples. Rows that cannot be read are left out, with a problem; without
+/// `sample_annotation.json` there are none.
 pub(super) fn read(
     version: &Path,
-    samples: &HashMap<String, usize>,
+    indices: &Indices,
+    samples: &mut [SceneSample],
     problems: &mut Vec<ReadError>,
-) -> Vec<Vec<Object>> {
-    let mut objects = vec![Vec::new(); samples.len()];
+) {
     if !version.join("sample_annotation.json").is_file() {
-        return objects;
+        return;
     }
     let read = read_instances(version, problems).and_then(|instances| {
         read_all(version, "sample_annotation.json", problems, |row| {
-            let sample = referred(row, "sample_token", samples)?;
+            let sample = referred(row, "sample_token", indices)?;
             let object = object(row, &instances)?;
-            if let Some(objects) = objects.get_mut(sample) {
-                objects.push(object);
+            if let Some(sample) = samples.get_mut(sample) {
+                sample.objects.push(object);
             }
             Ok(())
         })
     });
     problems.extend(read.err());
-    objects
 }
 
 /// A physical object over time.

@@ -92,11 +92,10 @@ fn open_version(
         .unwrap_or_else(|| version.to_owned());
     let tables = tables::read(version, problems)?;
     let (scenes, layout) = (tables.scenes, layout(version, &tables.samples)?);
-    let mut moments: Vec<Vec<(SceneSample, Vec<Object>)>> =
-        scenes.iter().map(|_| Vec::new()).collect();
-    for (sample, objects) in tables.samples.into_iter().zip(tables.objects) {
+    let mut moments: Vec<Vec<SceneSample>> = scenes.iter().map(|_| Vec::new()).collect();
+    for sample in tables.samples {
         if let Some(moments) = moments.get_mut(sample.scene) {
-            moments.push((sample, objects));
+            moments.push(sample);
         }
     }
     let prefix = files::name_below(opened, version);
@@ -146,11 +145,11 @@ impl SceneBuilder<'_> {
     /// The scenario of a scene; nothing if no vehicle has a sweep.
     fn build(
         self,
-        mut samples: Vec<(SceneSample, Vec<Object>)>,
+        mut samples: Vec<SceneSample>,
         options: &OpenOptions,
         problems: &mut Vec<ReadError>,
     ) -> Result<Option<Scenario>> {
-        samples.sort_by_key(|(sample, _)| sample.micros);
+        samples.sort_by_key(|sample| sample.micros);
         let agents = self.agents(&samples)?;
         if agents.is_empty() {
             let scene = &self.scene.name;
@@ -161,7 +160,7 @@ impl SceneBuilder<'_> {
         }
         let capture_nanos = self.capture_times(&samples, options, problems);
         let (mut moments, mut missing, mut contents) = (Vec::new(), Vec::new(), HashMap::new());
-        for ((sample, objects), capture_nanos) in samples.into_iter().zip(capture_nanos) {
+        for (sample, capture_nanos) in samples.into_iter().zip(capture_nanos) {
             let mut channels = agents.iter().map(|(_, channel)| channel);
             // The first sweep in the order of the agents gives the name: the ego may lack one.
             let stem = channels.find_map(|channel| Some(sample.sweeps.get(channel)?.stem()));
@@ -183,6 +182,7 @@ impl SceneBuilder<'_> {
                 }
                 missing.push(MissingFrame::new(agent, &tick.stem));
             }
+            let objects = sample.objects;
             contents.insert(tick.stem.clone(), TickContents { sweeps, objects });
             moments.push(tick);
         }
@@ -225,8 +225,8 @@ impl SceneBuilder<'_> {
 
     /// Agents with the channels of their LiDARs, ego first: vehicles in the order of the data set or of their names, a
     /// roadside unit last.
-    fn agents(&self, moments: &[(SceneSample, Vec<Object>)]) -> Result<Vec<(CavId, String)>> {
-        let channels = moments.iter().flat_map(|(sample, _)| sample.sweeps.keys());
+    fn agents(&self, samples: &[SceneSample]) -> Result<Vec<(CavId, String)>> {
+        let channels = samples.iter().flat_map(|sample| sample.sweeps.keys());
         let mut agents = Vec::new();
         for channel in channels.collect::<BTreeSet<&String>>() {
             let agent = rig::agent_of(channel);
@@ -256,11 +256,11 @@ impl SceneBuilder<'_> {
     /// Times from the first on. If time stamps do not increase, capture times are assumed to be evenly spaced.
     fn capture_times(
         &self,
-        moments: &[(SceneSample, Vec<Object>)],
+        samples: &[SceneSample],
         options: &OpenOptions,
         problems: &mut Vec<ReadError>,
     ) -> Vec<u64> {
-        let micros: Vec<u64> = moments.iter().map(|(sample, _)| sample.micros).collect();
+        let micros: Vec<u64> = samples.iter().map(|sample| sample.micros).collect();
         if micros.array_windows().all(|[a, b]| a < b) {
             let start = micros.first().copied().unwrap_or(0);
             let since = micros.iter().map(|micros| micros - start);
@@ -272,7 +272,7 @@ impl SceneBuilder<'_> {
         );
         let path = self.version.join("sample.json");
         problems.push(ReadError::malformed(&path, reason));
-        let indices = 0..moments.len() as u64;
+        let indices = 0..samples.len() as u64;
         indices
             .map(|index| index.saturating_mul(options.period_nanos))
             .collect()
@@ -330,7 +330,7 @@ impl SceneSource {
     fn with_class(&self, object: &Object) -> Object {
         let is_narrow = self.layout == Layout::V2XSIM && object.size_m[1] <= TWO_WHEELER_WIDTH_M;
         let mut object = object.clone();
-        if is_narrow && object.class.is_vehicle() {
+        if is_narrow && ObjectClass::VEHICLES.contains(&object.class) {
             object.class = ObjectClass::TwoWheeler;
         }
         object

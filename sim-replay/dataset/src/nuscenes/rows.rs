@@ -8,36 +8,25 @@ use protocol::Pose;
 use protocol::text::excerpt;
 
 use crate::json::JsonField;
-use crate::json_table::{self, RowKeys};
+use crate::json_table;
 use crate::{ReadError, Result};
 
 /// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
-const MAX_BYTES: u64 = 4 << 30;
+pub(super) const MAX_BYTES: u64 = 4 << 30;
 /// Largest deviation of a published quaternion's length from 1; it is normalized.
 const QUATERNION_TOLERANCE: f64 = 0.01;
 
 /// Indices of rows by their tokens.
 pub(super) type Indices = HashMap<String, usize>;
 
-/// Reads the rows of a table that are needed.
-pub(super) fn read_rows(
-    version: &Path,
-    name: &str,
-    problems: &mut Vec<ReadError>,
-    is_needed: impl Fn(&RowKeys<'_>) -> bool,
-    row: impl FnMut(&JsonField<'_>) -> Result<()>,
-) -> Result<usize> {
-    json_table::read(&version.join(name), MAX_BYTES, problems, is_needed, row)
-}
-
-/// The same with all rows.
+/// Reads all rows of a table.
 pub(super) fn read_all(
     version: &Path,
     name: &str,
     problems: &mut Vec<ReadError>,
     row: impl FnMut(&JsonField<'_>) -> Result<()>,
 ) -> Result<usize> {
-    read_rows(version, name, problems, |_| true, row)
+    json_table::read_all(&version.join(name), MAX_BYTES, problems, row)
 }
 
 /// The index of the row that a token refers to.

@@ -7,9 +7,9 @@ use std::path::{Component, Path};
 use nalgebra::Isometry3;
 
 use super::annotations;
-use super::rows::{Indices, read_all, read_rows, referred, transform};
+use super::rows::{Indices, MAX_BYTES, read_all, referred, transform};
 use crate::frame::Object;
-use crate::json_table::RowKeys;
+use crate::json_table::{self, RowKeys};
 use crate::time_stamps;
 use crate::{ReadError, Result};
 
@@ -42,6 +42,8 @@ pub(super) struct SceneSample {
     pub(super) micros: u64,
     /// By channel, for example `LIDAR_TOP`.
     pub(super) sweeps: HashMap<String, SampleSweep>,
+    /// Annotated objects.
+    pub(super) objects: Vec<Object>,
 }
 
 /// File of a sweep, and the pose of its LiDAR.
@@ -58,8 +60,6 @@ pub(super) struct SampleSweep {
 pub(super) struct Tables {
     pub(super) scenes: Vec<Scene>,
     pub(super) samples: Vec<SceneSample>,
-    /// Annotated objects by sample.
-    pub(super) objects: Vec<Vec<Object>>,
 }
 
 /// A LiDAR on a vehicle.
@@ -86,12 +86,8 @@ pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tabl
     let (mut samples, sample_indices) = read_samples(version, &scene_indices, problems)?;
     let rows = read_sweeps(version, &mounts, &sample_indices, problems)?;
     place(version, rows, &mut samples, problems)?;
-    let objects = annotations::read(version, &sample_indices, problems);
-    Ok(Tables {
-        scenes,
-        samples,
-        objects,
-    })
+    annotations::read(version, &sample_indices, &mut samples, problems);
+    Ok(Tables { scenes, samples })
 }
 
 /// LiDARs by the token of their calibration.
@@ -155,6 +151,7 @@ fn read_samples(
             scene,
             micros: 0,
             sweeps: HashMap::new(),
+            objects: Vec::new(),
         });
         Ok(())
     })?;
@@ -177,7 +174,8 @@ fn read_sweeps(
         // A row without this key counts as one of a key frame.
         keys.is_key_frame != Some(false) && mounts.contains_key(&*keys.calibrated_sensor_token)
     };
-    read_rows(version, "sample_data.json", problems, is_needed, |row| {
+    let path = version.join("sample_data.json");
+    json_table::read(&path, MAX_BYTES, problems, is_needed, |row| {
         let token = row.required("calibrated_sensor_token")?;
         let mount = mounts
             .get(&token.id()?)
@@ -210,7 +208,8 @@ fn place(
 ) -> Result<()> {
     let tokens: std::collections::HashSet<String> = rows.keys().cloned().collect();
     let is_needed = |keys: &RowKeys<'_>| tokens.contains(&*keys.token);
-    read_rows(version, "ego_pose.json", problems, is_needed, |row| {
+    let path = version.join("ego_pose.json");
+    json_table::read(&path, MAX_BYTES, problems, is_needed, |row| {
         let world_from_vehicle = transform(row)?;
         let token = row.required("token")?.id()?;
         for row in rows.remove(&token).unwrap_or_default() {
@@ -229,7 +228,7 @@ fn place(
     if let Some(first) = without_pose.clone().min() {
         let count = without_pose.count();
         let reason = format!("no pose for {count} sweeps, the first {first}: left out");
-        problems.push(ReadError::malformed(&version.join("ego_pose.json"), reason));
+        problems.push(ReadError::malformed(&path, reason));
     }
     Ok(())
 }

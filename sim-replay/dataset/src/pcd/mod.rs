@@ -89,8 +89,7 @@ impl PcdError {
     fn at(line: u64, field: impl Into<String>, reason: impl Into<String>) -> Self {
         Self {
             line: Some(line),
-            field: Some(field.into()),
-            reason: reason.into(),
+            ..Self::of(field, reason)
         }
     }
 

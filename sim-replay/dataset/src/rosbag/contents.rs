@@ -116,6 +116,30 @@ impl BagContents {
         self.faults.entry(topic.to_owned()).or_default().push(fault);
     }
 
+    /// Takes the poses or the cloud of a message.
+    fn read(&mut self, message: BagMessage<'_>) -> Result<(), String> {
+        let (topic, recorded_nanos) = (&message.topic.name, message.recorded_nanos);
+        let data = message.data?;
+        if let Some(pose_type) = PoseType::of_name(&message.topic.type_name) {
+            let is_tf = pose_type == PoseType::TfMessage;
+            for transform in pose_type.read(&data).map_err(|error| error.to_string())? {
+                self.take_transform(topic, recorded_nanos, transform, is_tf);
+            }
+            return Ok(());
+        }
+        // A topic that is used and has no poses has clouds.
+        let (nanos, frame) = read_header(&data).map_err(|error| error.to_string())?;
+        let cloud = CloudStamp {
+            recorded_nanos,
+            nanos,
+            frame,
+            bytes: data.len(),
+            place: message.place,
+        };
+        self.clouds.entry(topic.clone()).or_default().push(cloud);
+        Ok(())
+    }
+
     fn take_transform(&mut self, topic: &str, recorded_nanos: u64, read: Transform, is_tf: bool) {
         let parent_from_child = match poses::of_rounded(&read.parent_from_child) {
             Ok(pose) => pose,
@@ -156,35 +180,9 @@ impl Scan for BagContents {
     }
 
     fn take(&mut self, message: BagMessage<'_>) {
-        let (topic, recorded_nanos) = (&message.topic.name, message.recorded_nanos);
-        let data = match message.data {
-            Ok(data) => data,
-            Err(reason) => return self.fault(topic, reason),
-        };
-        match PoseType::of_name(&message.topic.type_name) {
-            // A topic that is used and has no poses has clouds.
-            None => match read_header(&data) {
-                Ok((nanos, frame)) => {
-                    let cloud = CloudStamp {
-                        recorded_nanos,
-                        nanos,
-                        frame,
-                        bytes: data.len(),
-                        place: message.place,
-                    };
-                    self.clouds.entry(topic.clone()).or_default().push(cloud);
-                }
-                Err(error) => self.fault(topic, error.to_string()),
-            },
-            Some(pose_type) => match pose_type.read(&data) {
-                Ok(transforms) => {
-                    let is_tf = pose_type == PoseType::TfMessage;
-                    for transform in transforms {
-                        self.take_transform(topic, recorded_nanos, transform, is_tf);
-                    }
-                }
-                Err(error) => self.fault(topic, error.to_string()),
-            },
+        let topic = message.topic;
+        if let Err(reason) = self.read(message) {
+            self.fault(&topic.name, reason);
         }
     }
 

@@ -1,7 +1,7 @@
 //! Files of a bag: one file, or those that `metadata.yaml` lists, unpacked where they are compressed.
 
 use std::borrow::Cow;
-use std::io::{self, Read};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 use support::bounded_file;
@@ -151,20 +151,23 @@ pub(super) fn unpacked(path: &Path) -> Result<Option<TempPath>> {
 
 fn unpacked_copy(path: &Path) -> io::Result<TempPath> {
     let file = bounded_file::open(path)?;
-    let most = bounded_file::most_unpacked(file.metadata()?.len());
-    // One byte more than allowed shows that there is more.
-    let mut unpacked = zstd::stream::Decoder::new(file)?.take(most.saturating_add(1));
+    let size = file.metadata()?.len();
     let mut copy = tempfile::NamedTempFile::new()?;
-    if io::copy(&mut unpacked, copy.as_file_mut())? > most {
-        return Err(too_much(most));
-    }
+    unpack(file, size, copy.as_file_mut())?;
     Ok(copy.into_temp_path())
 }
 
-fn too_much(most: u64) -> io::Error {
-    io::Error::other(format!(
-        "unpacks to more than {most} bytes, the most that is read of its size"
-    ))
+/// Unpacks `size` bytes of zstd.
+fn unpack(packed: impl Read, size: u64, unpacked: &mut impl Write) -> io::Result<()> {
+    let most = bounded_file::most_unpacked(size);
+    // One byte more than allowed shows that there is more.
+    let mut bytes = zstd::stream::Decoder::new(packed)?.take(most.saturating_add(1));
+    if io::copy(&mut bytes, unpacked)? > most {
+        return Err(io::Error::other(format!(
+            "unpacks to more than {most} bytes, the most that is read of its size"
+        )));
+    }
+    Ok(())
 }
 
 /// A message as it was published, unpacked if it is compressed by itself: a message in CDR never begins as zstd does.
@@ -173,13 +176,6 @@ pub(super) fn unpacked_message(data: &[u8]) -> io::Result<Cow<'_, [u8]>> {
         return Ok(Cow::Borrowed(data));
     }
     let mut message = Vec::new();
-    let decoder = zstd::stream::Decoder::new(data)?;
-    let most = bounded_file::most_unpacked(data.len() as u64);
-    decoder
-        .take(most.saturating_add(1))
-        .read_to_end(&mut message)?;
-    if message.len() as u64 > most {
-        return Err(too_much(most));
-    }
+    unpack(data, data.len() as u64, &mut message)?;
     Ok(Cow::Owned(message))
 }

@@ -30,7 +30,6 @@ pub(super) use self::files::is_bag;
 use self::contents::BagContents;
 use self::join::{JoinedSweep, join};
 use self::storage::Storage;
-use super::files::name_below;
 use super::layout::{LayoutReader, LayoutRow};
 use super::points::{IntensityScale, Sweeps, divisor_of_first};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, single_vehicle};
@@ -69,12 +68,7 @@ struct Bag {
     divisor: OnceLock<f32>,
 }
 
-fn open(
-    root: &Path,
-    path: &Path,
-    options: &OpenOptions,
-    problems: &mut Vec<ReadError>,
-) -> Result<Scenario> {
+fn open(path: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
     let files = files::files_of(path, problems)?;
     let mut contents = BagContents::of(path);
     let storage = Storage::open(&files, &mut contents, problems)?;
@@ -90,10 +84,9 @@ fn open(
         scale: options.intensity_scale,
         divisor: OnceLock::new(),
     };
-    let name = name_below(root, path);
     Ok(Scenario {
         joins: vec![joined.text],
-        ..single_vehicle(name, Layout::ROSBAG, ticks, Arc::new(source))
+        ..single_vehicle(Layout::ROSBAG, ticks, Arc::new(source))
     })
 }
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
-use rusqlite::{Connection, OpenFlags, Result, Row};
+use rusqlite::{Connection, OpenFlags, Result};
 use support::bounded_file;
 
 use super::files::unpacked_message;
@@ -57,16 +57,15 @@ fn fault(name: &Path, error: &rusqlite::Error) -> ReadError {
 fn topics(connection: &Connection) -> Result<Vec<(i64, BagTopic)>> {
     let mut statement =
         connection.prepare("SELECT id, name, type, serialization_format FROM topics")?;
-    statement.query_map([], topic)?.collect()
-}
-
-fn topic(row: &Row<'_>) -> Result<(i64, BagTopic)> {
-    let topic = BagTopic {
-        name: row.get(1)?,
-        type_name: row.get(2)?,
-        encoding: row.get(3)?,
-    };
-    Ok((row.get(0)?, topic))
+    let topics = statement.query_map([], |row| {
+        let topic = BagTopic {
+            name: row.get(1)?,
+            type_name: row.get(2)?,
+            encoding: row.get(3)?,
+        };
+        Ok((row.get(0)?, topic))
+    });
+    topics?.collect()
 }
 
 fn messages(

@@ -2,6 +2,10 @@
 //!
 //! Tags are kept as text and never acted upon. The cost of a document is limited: its size, its depth, its nodes, and
 //! the repetitions of its parts by aliases.
+//!
+//! Calls go one way. [`read`] lets [`tree`] build a [`node`], with [`scalar`] for what is not quoted. Readers of data
+//! sets take a [`field`] of it, a node with its position; its [`numbers`] may be those of NumPy, which [`numpy_tags`]
+//! reads.
 
 mod field;
 mod node;
@@ -14,6 +18,7 @@ use std::path::Path;
 
 pub(super) use field::YamlField;
 pub(super) use node::{Value, YamlNode};
+pub(super) use numbers::whole;
 
 use tree::Unsound;
 
@@ -132,7 +137,8 @@ mod tests {
     #[test]
     fn broken_yaml_is_reported_with_line_and_reason_only() {
         let error = parse(Path::new("a.yaml"), b"a: 1\nb: [1, 2\nc: 3\n").unwrap_err();
-        assert!(error.line().is_some_and(|line| line > 1), "{error}");
+        let line = crate::Problem::from(&error).line;
+        assert!(line.is_some_and(|line| line > 1), "{error}");
         let text = error.to_string();
         assert!(
             text.starts_with("a.yaml:") && text.contains("no sound YAML: "),

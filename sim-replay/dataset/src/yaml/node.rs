@@ -1,4 +1,8 @@
 //! A node of a YAML document: line, tag and content.
+//!
+//! [`super::tree`] builds nodes. Readers see them through a [`super::YamlField`].
+
+use protocol::text::excerpt;
 
 /// A node of a document.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,7 +35,7 @@ impl Value {
             Self::Bool(value) => value.to_string(),
             Self::Integer(value) => value.to_string(),
             Self::Float(value) => value.to_string(),
-            Self::Text(text) => format!("the text {:?}", text.chars().take(40).collect::<String>()),
+            Self::Text(text) => format!("the text {:?}", excerpt(text, 40)),
             Self::List(items) => format!("a list of {}", items.len()),
             Self::Map(entries) => format!("a map of {}", entries.len()),
         }

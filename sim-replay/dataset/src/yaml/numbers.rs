@@ -1,9 +1,18 @@
 //! Numbers of a YAML document: plain, in lists, or in NumPy's pickled arrays and scalars, which may stand for any number.
+//!
+//! Readers of data sets call the methods of a field. A node with a tag of Python goes on to [`numpy_tags`], which calls
+//! nothing here.
 
 use super::field::YamlField;
 use super::node::Value;
 use super::numpy_tags::{self, NumpyArray};
 use crate::Result;
+
+/// The integer that a float is: ids are written as `-1.0` where they went through an array of floats.
+#[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
+pub(crate) fn whole(number: f64) -> Option<i64> {
+    (number.fract() == 0.0 && number.abs() < 1e15).then_some(number as i64)
+}
 
 impl YamlField<'_> {
     /// A finite number, in any notation.
@@ -23,16 +32,13 @@ impl YamlField<'_> {
             .ok_or_else(|| self.expected("a finite number"))
     }
 
-    /// An integer, or a float without fraction: ids are written as `-1.0` where they went through an array of floats.
-    #[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
+    /// An integer, or a float without fraction.
     pub(crate) fn integer(&self) -> Result<i64> {
         if let Value::Integer(value) = self.node.value {
             return Ok(value);
         }
-        match self.number() {
-            Ok(number) if number.fract() == 0.0 && number.abs() < 1e15 => Ok(number as i64),
-            _ => Err(self.expected("an integer")),
-        }
+        let number = self.number().ok().and_then(whole);
+        number.ok_or_else(|| self.expected("an integer"))
     }
 
     /// Exactly `N` finite numbers, as a list or an array with one row or column.

@@ -11,9 +11,9 @@ use super::data_protocol::converted_yaml;
 use super::error::SynthError;
 use super::layout::{
     AgentFrame, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, SweepVariant,
-    Unfinished, locked,
+    locked,
 };
-use super::scenes::check_folder;
+use super::scenes::begin_folder;
 use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
 
 /// Candidate lengths of a tick, nanoseconds: the step of a simulator, and resolutions of sensor clocks.
@@ -54,8 +54,7 @@ pub fn convert(
     options: &ConvertOptions,
     progress: &(dyn Fn(usize, usize) + Sync),
 ) -> Result<Converted, SynthError> {
-    check_folder(&options.out, options.force)?;
-    let unfinished = Unfinished::mark(&options.out)?;
+    let unfinished = begin_folder(&options.out, options.force)?;
     let mut writer = options.layout.writer(&options.out);
     let (omitted, left_out) = (Omissions::default(), Mutex::new(LeftOut::default()));
     locked(&left_out).add_files(&dataset.problems);

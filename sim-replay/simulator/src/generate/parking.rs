@@ -91,8 +91,6 @@ fn stands_on_a_lane(map_model: &MapModel, lanes: &LaneIndex, rectangle: &Rectang
         let (dx, dy) = (along * length, aside * width);
         let point = [x + dx * c - dy * s, y + dx * s + dy * c];
         let (graph, z_m) = (&map_model.lanes, Some(rectangle.z_m));
-        lanes
-            .nearest(graph, point, LANE_ROOM_M, None, z_m)
-            .is_some()
+        lanes.nearest(graph, point, LANE_ROOM_M, z_m).is_some()
     })
 }

@@ -69,7 +69,7 @@ impl Radar {
         let mount_m = [half_length_m + 0.05, 0.0, HEIGHT_M];
         let moved = vehicle.mounted(mount_m);
         // Of the mount and not of the vehicle's centre: a turn moves the front sideways.
-        let own_velocity = (moved.end.position_m - moved.start.position_m) / sweep_s;
+        let own_velocity = velocity_mps(&moved, sweep_s);
         let sensor = Course::still(moved.end);
         self.caster.cast(&sensor, ground, bodies);
         self.points.clear();

@@ -57,8 +57,7 @@ impl Summary {
 /// [`SynthError`] if an option is invalid, the map cannot be built or a file cannot be written.
 pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary> {
     options.validate()?;
-    check_folder(&options.out, options.force)?;
-    let unfinished = Unfinished::mark(&options.out)?;
+    let unfinished = begin_folder(&options.out, options.force)?;
     let mut writer = options.layout.writer(&options.out);
     let omitted = Omissions::default();
     let mut total = Summary {
@@ -117,14 +116,14 @@ fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpe
     }
 }
 
-/// Creates the output folder, or refuses one that is not empty.
-pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<()> {
+/// Creates the output folder and marks it as unfinished; refuses one that is not empty.
+pub(super) fn begin_folder(out: &std::path::Path, force: bool) -> Result<Unfinished> {
     make_folder(out)?;
     let mut entries = fs::read_dir(out).at(out).map_err(SynthError::Write)?;
     if entries.next().is_some() && !force {
         return Err(SynthError::NotEmpty(out.to_owned()));
     }
-    Ok(())
+    Unfinished::mark(out)
 }
 
 impl SynthScene<'_, '_> {

@@ -100,7 +100,7 @@ impl SynthScene<'_, '_> {
     ) -> AgentFrame {
         let moment = &recording.frames[index];
         // Vehicles come first in the list: hits and paints are matched to annotations by place.
-        let (mut bodies, seen) = vehicles_around(recording, moment, agent.vehicle);
+        let (mut bodies, seen) = vehicles_around(recording, moment, own);
         let here = own.motion.end.position_m;
         bodies.extend(self.world.standing_near([here.x, here.y], SIGHT_M));
 
@@ -267,12 +267,11 @@ fn class(kind: VehicleKind) -> ObjectClass {
 fn vehicles_around<'a>(
     recording: &'a SceneRecording,
     frame: &'a RecordedFrame,
-    own: usize,
+    own: &Moving,
 ) -> (Vec<RayBody<'a>>, Vec<Annotation<'a>>) {
-    let here = frame.of(own).map(|moving| moving.motion.end.position_m);
-    let here = here.unwrap_or_default();
+    let here = own.motion.end.position_m;
     let moving = frame.moving.iter();
-    let moving = moving.filter(|moving| moving.vehicle != own);
+    let moving = moving.filter(|moving| moving.vehicle != own.vehicle);
     let moving = moving.map(|moving| {
         let vehicle: &Vehicle = &recording.vehicles[moving.vehicle];
         (vehicle, moving.motion, moving.id, moving.speed_mps)

@@ -37,69 +37,72 @@ pub struct Vehicle {
     pub shape: SolidShape,
 }
 
-/// Mean sizes of a kind, the largest deviation of an instance (share), and the frequencies of driving and parking.
-struct Stock(VehicleKind, [f64; 3], [f64; 3], [f64; 2]);
-
-/// Sizes after the vehicles of CARLA. All stay under 2.9 m, so that a box stands within -3..1 m of a LiDAR at 1.95 m.
-/// Trucks and buses are rare: the clean-up of detections in OpenCOOD's protocol drops boxes longer than 6 m.
-const STOCK: [Stock; 7] = {
+/// All kinds, in the order of [`DRIVING`] and [`PARKED`].
+const KINDS: [VehicleKind; 7] = {
     use VehicleKind::{Bus, Hatchback, Pickup, Sedan, Suv, Truck, Van};
-    [
-        Stock(Sedan, [4.65, 1.95, 1.48], [0.07, 0.05, 0.04], [0.36, 0.38]),
-        Stock(
-            Hatchback,
-            [3.95, 1.85, 1.52],
-            [0.08, 0.05, 0.04],
-            [0.21, 0.26],
-        ),
-        Stock(Suv, [4.65, 2.05, 1.75], [0.07, 0.04, 0.06], [0.25, 0.24]),
-        Stock(Pickup, [5.30, 2.05, 1.88], [0.05, 0.04, 0.04], [0.05; 2]),
-        Stock(Van, [5.15, 2.05, 2.15], [0.08, 0.04, 0.12], [0.085, 0.07]),
-        Stock(Truck, [7.10, 2.40, 2.65], [0.12, 0.03, 0.05], [0.03, 0.0]),
-        Stock(Bus, [10.2, 2.50, 2.82], [0.10, 0.02, 0.015], [0.015, 0.0]),
-    ]
+    [Sedan, Hatchback, Suv, Pickup, Van, Truck, Bus]
 };
+/// Frequencies of [`KINDS`] in moving traffic and among parked vehicles. Trucks and buses are rare: the clean-up of
+/// detections in OpenCOOD's protocol drops boxes longer than 6 m.
+const DRIVING: [f64; 7] = [0.36, 0.21, 0.25, 0.05, 0.085, 0.03, 0.015];
+const PARKED: [f64; 7] = [0.38, 0.26, 0.24, 0.05, 0.07, 0.0, 0.0];
 
 impl VehicleKind {
     /// True for cars with a low roof, on which a LiDAR is mounted.
     pub(crate) fn is_low(self) -> bool {
         matches!(self, Self::Sedan | Self::Hatchback | Self::Suv)
     }
+
+    /// Mean length, width and height, metres, and the largest deviation of an instance from each, as a share.
+    ///
+    /// After the vehicles of CARLA. Heights stay under 2.9 m, so that a box stands within -3..1 m of a LiDAR at 1.95 m.
+    fn mean_and_spread(self) -> [[f64; 3]; 2] {
+        match self {
+            Self::Sedan => [[4.65, 1.95, 1.48], [0.07, 0.05, 0.04]],
+            Self::Hatchback => [[3.95, 1.85, 1.52], [0.08, 0.05, 0.04]],
+            Self::Suv => [[4.65, 2.05, 1.75], [0.07, 0.04, 0.06]],
+            Self::Pickup => [[5.30, 2.05, 1.88], [0.05, 0.04, 0.04]],
+            Self::Van => [[5.15, 2.05, 2.15], [0.08, 0.04, 0.12]],
+            Self::Truck => [[7.10, 2.40, 2.65], [0.12, 0.03, 0.05]],
+            Self::Bus => [[10.2, 2.50, 2.82], [0.10, 0.02, 0.015]],
+        }
+    }
 }
 
 impl Vehicle {
     /// A random vehicle with the frequencies of moving traffic.
     pub fn random_driving(random: &mut SplitMix64) -> Self {
-        Self::random(random, |Stock(.., [driving, _])| *driving)
+        Self::random(random, DRIVING)
     }
 
     /// A random vehicle with the frequencies of parked vehicles.
     pub(crate) fn random_parked(random: &mut SplitMix64) -> Self {
-        Self::random(random, |Stock(.., [_, parked])| *parked)
+        Self::random(random, PARKED)
     }
 
     /// A vehicle that may carry the sensors: one low enough for a LiDAR on its roof.
     pub(crate) fn random_connected(random: &mut SplitMix64) -> Self {
-        Self::random(random, |Stock(kind, .., [driving, _])| {
-            match kind.is_low() {
-                true => *driving,
-                false => 0.0,
-            }
-        })
+        let weights = std::array::from_fn(|place| match KINDS[place].is_low() {
+            true => DRIVING[place],
+            false => 0.0,
+        });
+        Self::random(random, weights)
     }
 
-    fn random(random: &mut SplitMix64, weight: impl Fn(&Stock) -> f64) -> Self {
-        let mut draw = random.unit() * STOCK.iter().map(&weight).sum::<f64>();
-        let chosen = STOCK.iter().find(|stock| {
-            draw -= weight(stock);
+    /// A random vehicle, with one weight for each of [`KINDS`].
+    fn random(random: &mut SplitMix64, weights: [f64; 7]) -> Self {
+        let mut draw = random.unit() * weights.iter().sum::<f64>();
+        let chosen = KINDS.into_iter().zip(weights).find(|(_, weight)| {
+            draw -= weight;
             draw < 0.0
         });
         // Rounding may leave a rest after the last weight.
-        let Stock(kind, size_m, spread, _) = chosen.unwrap_or(&STOCK[0]);
+        let kind = chosen.map_or(KINDS[0], |(kind, _)| kind);
+        let [mean_m, spread] = kind.mean_and_spread();
         let size_m = std::array::from_fn(|axis| {
-            size_m[axis] * (1.0 + spread[axis] * random.between(-1.0, 1.0))
+            mean_m[axis] * (1.0 + spread[axis] * random.between(-1.0, 1.0))
         });
-        Self::new(*kind, size_m, random)
+        Self::new(kind, size_m, random)
     }
 
     /// A vehicle of given outer sizes; proportions vary from one to the next.
@@ -113,36 +116,36 @@ impl Vehicle {
             height,
         };
         let parts = match kind {
-            VehicleKind::Sedan => form.car(
-                vary(0.62, 0.04),
-                [vary(0.24, 0.1), vary(0.06, 0.2)],
-                [vary(-0.42, 0.05), vary(0.19, 0.1)],
-                [vary(-0.25, 0.1), vary(0.03, 0.3)],
-            ),
-            VehicleKind::Hatchback => form.car(
-                vary(0.61, 0.04),
-                [vary(0.2, 0.1), 0.02],
-                [-0.49, vary(0.25, 0.08)],
-                [vary(-0.40, 0.06), vary(0.08, 0.2)],
-            ),
-            VehicleKind::Suv => form.car(
-                vary(0.60, 0.04),
-                [vary(0.18, 0.1), 0.02],
-                [-0.49, vary(0.22, 0.08)],
-                [vary(-0.43, 0.04), vary(0.09, 0.2)],
-            ),
-            VehicleKind::Pickup => form.car(
-                vary(0.58, 0.04),
-                [vary(0.12, 0.2), 0.01],
-                [vary(-0.1, 0.2), vary(0.22, 0.06)],
-                [vary(-0.06, 0.2), vary(0.13, 0.1)],
-            ),
-            VehicleKind::Van => form.car(
-                vary(0.52, 0.04),
-                [vary(0.1, 0.2), 0.01],
-                [-0.5, vary(0.38, 0.05)],
-                [-0.48, vary(0.27, 0.06)],
-            ),
+            VehicleKind::Sedan => form.car(&SideView {
+                belt: vary(0.62, 0.04),
+                drops: [vary(0.24, 0.1), vary(0.06, 0.2)],
+                cabin: [vary(-0.42, 0.05), vary(0.19, 0.1)],
+                roof: [vary(-0.25, 0.1), vary(0.03, 0.3)],
+            }),
+            VehicleKind::Hatchback => form.car(&SideView {
+                belt: vary(0.61, 0.04),
+                drops: [vary(0.2, 0.1), 0.02],
+                cabin: [-0.49, vary(0.25, 0.08)],
+                roof: [vary(-0.40, 0.06), vary(0.08, 0.2)],
+            }),
+            VehicleKind::Suv => form.car(&SideView {
+                belt: vary(0.60, 0.04),
+                drops: [vary(0.18, 0.1), 0.02],
+                cabin: [-0.49, vary(0.22, 0.08)],
+                roof: [vary(-0.43, 0.04), vary(0.09, 0.2)],
+            }),
+            VehicleKind::Pickup => form.car(&SideView {
+                belt: vary(0.58, 0.04),
+                drops: [vary(0.12, 0.2), 0.01],
+                cabin: [vary(-0.1, 0.2), vary(0.22, 0.06)],
+                roof: [vary(-0.06, 0.2), vary(0.13, 0.1)],
+            }),
+            VehicleKind::Van => form.car(&SideView {
+                belt: vary(0.52, 0.04),
+                drops: [vary(0.1, 0.2), 0.01],
+                cabin: [-0.5, vary(0.38, 0.05)],
+                roof: [-0.48, vary(0.27, 0.06)],
+            }),
             VehicleKind::Truck => form.truck(vary(0.24, 0.1), vary(0.84, 0.06)),
             VehicleKind::Bus => form.bus(),
         };
@@ -161,19 +164,28 @@ struct OuterBox {
     height: f32,
 }
 
+/// Outline of a car from the side, in shares of the height (`belt`) and of the length (all others).
+struct SideView {
+    /// Lower edge of the windows.
+    belt: f32,
+    /// Drops of the bonnet towards the nose and of the boot towards the tail.
+    drops: [f32; 2],
+    /// Rear and front of the cabin at the belt, from the middle.
+    cabin: [f32; 2],
+    /// Rear and front of the roof, from the middle.
+    roof: [f32; 2],
+}
+
 impl OuterBox {
-    /// By its outline from the side, in shares of the height (`belt`) and the length (all others): lower edge of the
-    /// windows, drops of the bonnet towards the nose and of the tail, rear and front of the cabin at the belt and of
-    /// the roof.
-    fn car(&self, belt: f32, drops: [f32; 2], cabin: [f32; 2], roof: [f32; 2]) -> Vec<Convex> {
+    fn car(&self, view: &SideView) -> Vec<Convex> {
         let Self { half, side, height } = *self;
         let length = 2.0 * half;
-        let (floor, bumper, belt) = (0.14 * height, 0.40 * height, belt * height);
+        let (floor, bumper, belt) = (0.14 * height, 0.40 * height, view.belt * height);
         let below = [0.05 - half, half - 0.08, side - 0.07];
         let widest = [-half, half, side];
-        let [bonnet, boot] = drops.map(|share| share * length);
-        let [rear, front] = cabin.map(|place| place * length);
-        let [roof_rear, roof_front] = roof.map(|place| place * length);
+        let [bonnet, boot] = view.drops.map(|share| share * length);
+        let [rear, front] = view.cabin.map(|place| place * length);
+        let [roof_rear, roof_front] = view.roof.map(|place| place * length);
         let shoulder = [boot - half, half - bonnet, side - 0.05];
         let cabin = [rear, front, side - 0.07];
         let roof = [roof_rear, roof_front, side - 0.26];
@@ -284,7 +296,7 @@ mod tests {
     #[test]
     fn every_kind_occurs_and_fills_its_box() {
         let fleet = fleet();
-        for Stock(kind, ..) in &STOCK {
+        for kind in &KINDS {
             assert!(
                 fleet.iter().any(|vehicle| vehicle.kind == *kind),
                 "{kind:?}"

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::lane::{JunctionId, Lane, LaneGraph, LaneId};
+use super::lane::{Lane, LaneGraph, LaneId};
 
 /// Lanes that pass each other at a greater height difference do not conflict, metres.
 const LEVEL_M: f64 = 3.0;
@@ -12,7 +12,7 @@ const OVERLAP: f64 = 0.75;
 /// Fills [`Lane::conflicts`]: pairs of lanes of one junction that cross or merge. Lanes with a common predecessor
 /// diverge and do not conflict, nor do neighbours that run side by side.
 pub(crate) fn find(graph: &mut LaneGraph) {
-    let mut members: BTreeMap<JunctionId, Vec<usize>> = BTreeMap::new();
+    let mut members: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for (index, lane) in graph.lanes.iter().enumerate() {
         if let Some(junction) = lane.junction {
             members.entry(junction).or_default().push(index);
@@ -54,7 +54,6 @@ fn crosses(a: &Lane, b: &Lane) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::lane::JunctionId;
     use super::*;
 
     fn lane(id: u32, from: [f64; 2], to: [f64; 2]) -> Lane {
@@ -65,7 +64,7 @@ mod tests {
             3.5,
             10.0,
         );
-        (lane.junction, lane.in_junction) = (Some(JunctionId(0)), true);
+        (lane.junction, lane.in_junction) = (Some(0), true);
         lane
     }
 

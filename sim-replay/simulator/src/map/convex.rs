@@ -40,8 +40,8 @@ impl PlanRectangle {
 
     pub(crate) fn corners(&self) -> Quad {
         let (sin, cos) = self.yaw_rad.sin_cos();
-        let ([x, y], [u, v]) = (self.center_m, self.half_m);
-        [[-u, -v], [u, -v], [u, v], [-u, v]]
+        let ([x, y], [a, b]) = (self.center_m, self.half_m);
+        [[-a, -b], [a, -b], [a, b], [-a, b]]
             .map(|[u, v]| [x + u * cos - v * sin, y + u * sin + v * cos])
     }
 }

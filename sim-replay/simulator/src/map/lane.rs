@@ -6,22 +6,6 @@ use std::f64::consts::PI;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LaneId(pub u32);
 
-/// A junction, numbered from 0 without gaps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct JunctionId(pub u32);
-
-/// Direction in which a lane leads through a junction.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Turn {
-    /// Ahead, and every lane outside junctions.
-    #[default]
-    Straight,
-    /// More than 30 degrees to the left.
-    Left,
-    /// More than 30 degrees to the right.
-    Right,
-}
-
 /// All driving lanes of a map.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct LaneGraph {
@@ -58,10 +42,8 @@ pub struct Lane {
     pub right: Option<LaneId>,
     /// True if it lies inside a junction.
     pub in_junction: bool,
-    /// The junction it lies in.
-    pub junction: Option<JunctionId>,
-    /// Direction in which it leads through its junction.
-    pub turn: Turn,
+    /// The junction it lies in, by its place in the network.
+    pub junction: Option<usize>,
     /// Lanes of the same junction that cross it or end where it ends (not those that begin together with it); give way
     /// by these.
     pub conflicts: Vec<LaneId>,

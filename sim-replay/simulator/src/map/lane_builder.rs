@@ -1,9 +1,8 @@
 //! Lane builder: makes a lane graph from a road network.
 
 use super::conflicts;
-use super::lane::{JunctionId, Lane, LaneGraph, LaneId, Turn, wrap_angle};
-use super::lane_links::{LinkCounts, Linker};
-use super::lane_table::{LaneOrigin, LaneTable};
+use super::lane::{Lane, LaneGraph, LaneId};
+use super::lane_links::{LaneOrigin, LinkCounts, Linker};
 use super::road::{LaneKind, Road, RoadNetwork};
 
 /// Distance between the points taken from the curves before they are spread evenly, metres.
@@ -12,41 +11,28 @@ const FINE_STEP_M: f64 = 0.25;
 const STEP_M: f64 = 1.0;
 /// Speed limit where neither lane nor road has one, metres per second.
 const DEFAULT_LIMIT_MPS: f64 = 13.9;
-/// Lanes that change heading by more than this through a junction turn off, radians.
-const TURN_RAD: f64 = 0.52;
 
 /// Builds the driving lanes of `network` and their links. `Road::leads_along` gives the direction of each lane:
 /// traffic keeps right or left, road by road.
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
-    let mut table = LaneTable::default();
     let (mut lanes, mut origins) = (Vec::new(), Vec::new());
     for (road_index, road) in network.roads.iter().enumerate() {
-        table.first_section.push(table.ids.len());
-        for section in 0..road.sections.len() {
-            let mut ids = Vec::new();
-            for lane_id in road.sections[section].lane_ids() {
+        for (section_index, section) in road.sections.iter().enumerate() {
+            for lane in section.lane_ids() {
                 let origin = LaneOrigin {
                     road: road_index,
-                    section,
-                    lane: lane_id,
+                    section: section_index,
+                    lane,
                 };
-                let lane = build_lane(road, origin, LaneId(lanes.len() as u32));
-                ids.push(lane.as_ref().map(|lane| lane.id));
-                if let Some(lane) = lane {
+                if let Some(lane) = build_lane(road, origin, LaneId(lanes.len() as u32)) {
                     lanes.push(lane);
                     origins.push(origin);
                 }
             }
-            let lowest = -(road.sections[section].right.len() as i32);
-            table.ids.push((lowest, ids));
         }
     }
     let mut graph = LaneGraph::new(lanes);
-    let linker = Linker {
-        network,
-        origins: &origins,
-        table: &table,
-    };
+    let linker = Linker { network, origins };
     linker.link_neighbours(&mut graph);
     let counts = linker.link_successors(&mut graph);
     conflicts::find(&mut graph);
@@ -72,16 +58,8 @@ fn build_lane(road: &Road, origin: LaneOrigin, id: LaneId) -> Option<Lane> {
     if road.lateral.is_level() {
         lane.banks_rad = Vec::new();
     }
-    lane.junction = road.junction.map(|junction| JunctionId(junction as u32));
+    lane.junction = road.junction;
     lane.in_junction = road.junction.is_some();
-    if lane.in_junction {
-        let turn = wrap_angle(lane.end_heading_rad() - lane.start_heading_rad());
-        lane.turn = match turn {
-            turn if turn > TURN_RAD => Turn::Left,
-            turn if turn < -TURN_RAD => Turn::Right,
-            _ => Turn::Straight,
-        };
-    }
     Some(lane)
 }
 

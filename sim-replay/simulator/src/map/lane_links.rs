@@ -4,8 +4,7 @@ use std::fmt;
 
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
-use super::lane_table::{LaneOrigin, LaneTable};
-use super::road::{Connection, Contact, RoadLink, RoadNetwork};
+use super::road::{Connection, Contact, RoadEnd, RoadLink, RoadNetwork};
 
 /// A link whose lanes are farther apart than this is refused, metres.
 const LINK_GAP_M: f64 = 0.5;
@@ -27,22 +26,49 @@ pub struct LinkCounts {
     pub findings: Vec<Finding>,
 }
 
+/// Origin of a lane of the graph in the road network.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct LaneOrigin {
+    pub(super) road: usize,
+    pub(super) section: usize,
+    pub(super) lane: i32,
+}
+
+impl LaneOrigin {
+    /// The section that follows along the road, or against it.
+    fn next_section(self, forward: bool) -> Option<usize> {
+        let step = if forward { 1 } else { -1 };
+        self.section.checked_add_signed(step)
+    }
+}
+
 /// Sections and lanes of the roads that the lanes of a graph were made from.
 pub(super) struct Linker<'a> {
     pub(super) network: &'a RoadNetwork,
-    pub(super) origins: &'a [LaneOrigin],
-    pub(super) table: &'a LaneTable,
+    /// By id of the lane, rising.
+    pub(super) origins: Vec<LaneOrigin>,
 }
 
 impl Linker<'_> {
+    /// The lane of the graph that was made from a lane of the network.
+    fn find(&self, road: usize, section: usize, lane: i32) -> Option<LaneId> {
+        let origin = LaneOrigin {
+            road,
+            section,
+            lane,
+        };
+        let place = self.origins.binary_search(&origin).ok()?;
+        Some(LaneId(place as u32))
+    }
+
     /// Fills [`Lane::left`] and [`Lane::right`].
     pub(super) fn link_neighbours(&self, graph: &mut LaneGraph) {
-        for (lane, origin) in graph.lanes.iter_mut().zip(self.origins) {
+        for (lane, origin) in graph.lanes.iter_mut().zip(&self.origins) {
             let (section, id) = (origin.section, origin.lane);
             let road = &self.network.roads[origin.road];
             let along = road.leads_along(section, id);
             let [inner, outer] = [id - id.signum(), id + id.signum()].map(|other| {
-                let found = self.table.get(origin.road, section, other);
+                let found = self.find(origin.road, section, other);
                 found.filter(|_| road.leads_along(section, other) == along)
             });
             // Seen along the road, the reference line is to the left of lanes with negative ids.
@@ -107,8 +133,8 @@ impl Linker<'_> {
         let own = road.sections[origin.section].lane(origin.lane)?;
         let next = road.sections.get(section)?.lane(origin.lane)?;
         let links = [own.linked(forward), next.linked(!forward)];
-        let own = self.table.get(origin.road, origin.section, origin.lane)?;
-        let next = self.table.get(origin.road, section, origin.lane)?;
+        let own = self.find(origin.road, origin.section, origin.lane)?;
+        let next = self.find(origin.road, section, origin.lane)?;
         let (own, onto) = (graph.lane(own), graph.lane(next));
         let widths = [own.widths_m[own.widths_m.len() - 1], onto.widths_m[0]];
         // A lane that ends in a point and one that begins in a point are two.
@@ -135,10 +161,18 @@ impl Linker<'_> {
         };
         match road.link(end) {
             None => Vec::new(),
-            Some(RoadLink::Road { road, contact }) => {
-                self.lanes_of(road, self.table.end_section(road, contact), next_lane)
+            Some(RoadLink::Road(RoadEnd { road, contact })) => {
+                self.lanes_of(road, self.end_section(road, contact), next_lane)
             }
             Some(RoadLink::Junction(junction)) => self.through_junction(junction, origin, end),
+        }
+    }
+
+    /// The section of a road at one of its ends.
+    fn end_section(&self, road: usize, contact: Contact) -> usize {
+        match contact {
+            Contact::Start => 0,
+            Contact::End => self.network.roads[road].sections.len() - 1,
         }
     }
 
@@ -149,8 +183,7 @@ impl Linker<'_> {
         ids: impl IntoIterator<Item = i32>,
     ) -> Vec<LaneId> {
         let ids = ids.into_iter();
-        ids.filter_map(|id| self.table.get(road, section, id))
-            .collect()
+        ids.filter_map(|id| self.find(road, section, id)).collect()
     }
 
     /// Lanes that the connections of a junction name for the lane of `origin`, which leads into it at `end` of its road.
@@ -164,7 +197,7 @@ impl Linker<'_> {
             let onto = links.filter(|(from, _)| *from == origin.lane);
             let onto = onto.map(|&(_, to)| to).chain(same_id(connection, origin));
             let (road, contact) = (connection.connecting, connection.contact);
-            lanes.extend(self.lanes_of(road, self.table.end_section(road, contact), onto));
+            lanes.extend(self.lanes_of(road, self.end_section(road, contact), onto));
         }
         // A direct junction is passed both ways: from the linked road onto the incoming one too.
         let back = connections.filter(|connection| {
@@ -178,7 +211,7 @@ impl Linker<'_> {
                     let onto = links.filter(|(_, to)| *to == origin.lane);
                     let onto = onto.map(|&(from, _)| from);
                     let onto = onto.chain(same_id(connection, origin));
-                    let section = self.table.end_section(connection.incoming, contact);
+                    let section = self.end_section(connection.incoming, contact);
                     lanes.extend(self.lanes_of(connection.incoming, section, onto));
                 }
             }

@@ -1,7 +1,7 @@
 //! Lane queries: the nearest lane to a position.
 
 use super::convex::{CellIndex, bounds};
-use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
+use super::lane::{Lane, LaneGraph, LaneId};
 
 /// Edge of a cell of the index, metres.
 const CELL_M: f64 = 8.0;
@@ -42,14 +42,13 @@ impl LaneIndex {
         index
     }
 
-    /// The lane nearest to `x`, `y` within `radius_m`; with `heading_rad`, only lanes that lead the same way within
-    /// 60 degrees; with `z_m`, only where the lane is within 3 m of that height (roads pass above each other).
+    /// The lane nearest to `x`, `y` within `radius_m`; with `z_m`, only where the lane is within 3 m of that height
+    /// (roads pass above each other).
     pub(crate) fn nearest(
         &self,
         graph: &LaneGraph,
         [x, y]: [f64; 2],
         radius_m: f64,
-        heading_rad: Option<f64>,
         z_m: Option<f64>,
     ) -> Option<LanePosition> {
         let mut best: Option<(f64, LanePosition)> = None;
@@ -61,12 +60,7 @@ impl LaneIndex {
                 return false;
             }
             let position = project_near(lane, place, x, y);
-            let (point, heading) = lane.at(position.s_m);
-            if heading_rad
-                .is_some_and(|wanted| wrap_angle(wanted - heading).abs() > 60f64.to_radians())
-            {
-                return false;
-            }
+            let (point, _) = lane.at(position.s_m);
             let distance = (x - point[0]).hypot(y - point[1]);
             if distance <= radius_m && best.is_none_or(|(least, _)| distance < least) {
                 best = Some((distance, position));
@@ -127,27 +121,19 @@ mod tests {
     }
 
     #[test]
-    fn nearest_lane_with_and_without_heading() {
+    fn nearest_lane_with_and_without_height() {
         let graph = two_way();
         let index = LaneIndex::new(&graph);
-        let found = index
-            .nearest(&graph, [30.3, -1.2], 5.0, None, None)
-            .unwrap();
+        let found = index.nearest(&graph, [30.3, -1.2], 5.0, None).unwrap();
         assert_eq!(found.lane, LaneId(0));
         assert!((found.s_m - 30.3).abs() < 1e-9 && (found.offset_m - 0.8).abs() < 1e-9);
-        let found = index
-            .nearest(&graph, [30.3, -1.2], 5.0, Some(3.0), Some(0.5))
-            .unwrap();
+        let found = index.nearest(&graph, [30.3, 1.2], 5.0, Some(0.5)).unwrap();
         assert_eq!(found.lane, LaneId(1));
-        assert!((found.s_m - 69.7).abs() < 1e-9 && (found.offset_m - 3.2).abs() < 1e-9);
+        assert!((found.s_m - 69.7).abs() < 1e-9 && (found.offset_m - 0.8).abs() < 1e-9);
+        assert!(index.nearest(&graph, [30.3, 40.0], 5.0, None).is_none());
         assert!(
             index
-                .nearest(&graph, [30.3, 40.0], 5.0, None, None)
-                .is_none()
-        );
-        assert!(
-            index
-                .nearest(&graph, [30.3, -1.2], 5.0, None, Some(6.0))
+                .nearest(&graph, [30.3, -1.2], 5.0, Some(6.0))
                 .is_none()
         );
     }

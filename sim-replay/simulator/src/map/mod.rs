@@ -7,7 +7,6 @@
 //! # Frames and units
 //! World frame of the map: right-handed, x east, y north, z up, metres; yaw turns x towards y.
 
-mod clearance;
 mod clothoid;
 mod conflicts;
 mod convex;
@@ -18,7 +17,6 @@ mod lane;
 pub mod lane_builder;
 pub(crate) mod lane_links;
 mod lane_queries;
-mod lane_table;
 pub mod lateral;
 mod layout;
 mod noise;
@@ -33,7 +31,7 @@ mod terrain;
 pub use finding::Finding;
 pub(crate) use ground::Triangle;
 pub use ground::{Ground, HeightGrid, Terrain};
-pub use lane::{JunctionId, Lane, LaneGraph, LaneId, Turn};
+pub use lane::{Lane, LaneGraph, LaneId};
 pub(crate) use lane_queries::LaneIndex;
 use layout::RoadLayout;
 pub use opendrive::OpenDriveError;

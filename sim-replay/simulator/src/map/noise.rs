@@ -1,5 +1,7 @@
 //! Smooth noise over the plane.
 
+use support::random::SplitMix64;
+
 /// Height of the hills at a place, metres; from about -3 to 9, features of some 60 to 150 m.
 pub(crate) fn hills_m(x: f64, y: f64, seed: u64) -> f64 {
     let coarse = value_noise(x / 140.0, y / 140.0, seed);
@@ -19,15 +21,13 @@ fn value_noise(x: f64, y: f64, seed: u64) -> f64 {
     low + v * (high - low)
 }
 
-/// A value 0..1 from two whole numbers and a seed; the mixing steps are those of splitmix64.
+/// A value 0..1 from two whole numbers and a seed.
 fn hashed(x: i64, y: i64, seed: u64) -> f64 {
-    let mut state = seed
-        ^ (x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)
-        ^ (y as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
-    state = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    state = (state ^ (state >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    state ^= state >> 31;
-    (state >> 11) as f64 / (1u64 << 53) as f64
+    const STEP: u64 = 0x9e37_79b9_7f4a_7c15;
+    let hash =
+        seed ^ (x as u64).wrapping_mul(STEP) ^ (y as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
+    // The generator takes this step before it mixes.
+    SplitMix64::new(hash.wrapping_sub(STEP)).unit()
 }
 
 #[cfg(test)]

@@ -63,14 +63,18 @@ pub struct Road {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RoadLink {
     /// Another road's start or end.
-    Road {
-        /// The other road.
-        road: usize,
-        /// End of the other road.
-        contact: Contact,
-    },
+    Road(RoadEnd),
     /// A junction; its connections give the roads that follow.
     Junction(usize),
+}
+
+/// A road and one of its ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RoadEnd {
+    /// The road, by its place in the network.
+    pub road: usize,
+    /// The end.
+    pub contact: Contact,
 }
 
 /// An end of a road.
@@ -196,8 +200,6 @@ pub struct RoadObject {
 /// A traffic light or sign of the map.
 #[derive(Debug, Clone)]
 pub struct RoadSignal {
-    /// Name in the map.
-    pub name: String,
     /// True if it changes (a traffic light).
     pub dynamic: bool,
     /// Place along the road, metres.

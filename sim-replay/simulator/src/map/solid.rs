@@ -1,5 +1,8 @@
 //! Solid things beside and above the road.
 
+use super::convex::PlanRectangle;
+use super::curve::Pose2;
+
 /// Kind of a solid; determines its reflectivity and the objects allowed beside it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
@@ -90,6 +93,16 @@ pub struct Solid {
 }
 
 impl Solid {
+    /// Outline seen from above.
+    pub(crate) fn outline(&self) -> PlanRectangle {
+        let half_m = self.shape.half_footprint_m();
+        // A round outline needs no turning.
+        let is_round = matches!(self.shape, Shape::Cylinder { .. });
+        let [x, y, _] = self.center_m;
+        let yaw_rad = if is_round { 0.0 } else { self.yaw_rad };
+        PlanRectangle::around(Pose2::new(x, y, yaw_rad), half_m)
+    }
+
     /// Height of its lowest point, metres in the world frame.
     pub(crate) fn bottom_m(&self) -> f64 {
         self.center_m[2] - self.shape.half_height_m()

@@ -83,7 +83,7 @@ impl DiffLoc {
         let features = features.f_to_kind(Kind::Float)?;
         let features = self.sweep_norm.forward(&features, train).f_relu()?;
         Ok(DescribedTokens {
-            places: self.head.classify(&features)?,
+            places: self.head.logits.forward(&features)?,
             static_logits: logits.f_squeeze_dim(2)?.f_to_kind(Kind::Float)?,
             features,
         })

@@ -43,7 +43,7 @@ impl Branch {
     /// # Errors
     /// Those of the tensor library.
     pub fn classify(&self, features: &Tensor) -> tch::Result<Tensor> {
-        self.head.classify(features)
+        self.head.logits.forward(features)
     }
 
     /// `[S, 5]` poses relative to `classes` `[S]`; cosine and sine of the heading have any length.

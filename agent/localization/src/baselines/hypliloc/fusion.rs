@@ -34,11 +34,3 @@ impl BranchFusion {
         euclidean.f_add(&self.poincare.forward(&tokens)?.f_mul(&curved?)?)
     }
 }
-
-/// Tokens of length 1.
-pub(super) fn normalise(tokens: &Tensor) -> tch::Result<Tensor> {
-    let squares = tokens
-        .f_square()?
-        .f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
-    tokens.f_div(&squares.f_add_scalar(1e-12)?.f_sqrt()?)
-}

@@ -4,13 +4,14 @@ use tch::nn::{self, Init};
 use tch::{Kind, Tensor, no_grad};
 
 use super::branch::Branch;
-use super::fusion::{BranchFusion, normalise};
+use super::fusion::BranchFusion;
 use super::graph_attention::{GraphAttention, Space};
 use super::panorama::{CircularLayer, panorama};
 use super::token_layer::{TokenLayer, WIDTH};
 use crate::baselines::place_classes::PlaceClasses;
 use crate::baselines::regressed_pose::{PoseRegressor, RegressPose};
 use crate::baselines::tokens::{RINGS, SECTORS, TOKENS};
+use crate::pgc::dense::of_unit_length;
 
 /// A HypLiLoc network of one scene, output of `agent train hypliloc`.
 pub type HypLiLocLocalizer = PoseRegressor<HypLiLoc>;
@@ -52,7 +53,7 @@ impl HypLiLoc {
 
         let fused = self
             .first
-            .forward(&normalise(&points)?, &normalise(&columns)?)?;
+            .forward(&of_unit_length(&points)?, &of_unit_length(&columns)?)?;
         let (inward, attention, outward) = &self.point_block;
         let of_points = inward.forward(&fused.f_narrow(1, 0, TOKENS)?)?;
         let of_points = outward.forward(&attention.forward(&of_points)?)?;

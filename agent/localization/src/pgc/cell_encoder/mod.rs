@@ -75,18 +75,17 @@ impl CellEncoder {
     /// [`LocalizerError`] when the file is missing, truncated or of another kind.
     pub fn load(path: &Path, device: Device) -> Result<(Self, String)> {
         let weights = Weights::load(path)?;
-        let sha256 = Self::sha256_of(&weights);
-        if BackboneEncoder::is_in(&weights) {
+        let encoder = if BackboneEncoder::is_in(&weights) {
             let encoder = Box::new(BackboneEncoder::of_detector(&weights, device)?);
-            let encoder = Self {
+            Self {
                 format: SweepFormat::Bev(encoder.format.clone()),
                 network: CellNetwork::Backbone(encoder),
                 device,
-            };
-            return Ok((encoder, sha256));
-        }
-        let encoder = SceneEncoder::from_weights(&weights, device)?;
-        Ok((Self::sparse(encoder, device), sha256))
+            }
+        } else {
+            Self::sparse(SceneEncoder::from_weights(&weights, device)?, device)
+        };
+        Ok((encoder, Self::sha256_of(&weights)))
     }
 
     /// SHA-256 that a head names the encoder of a file by, see [`Self::load`].

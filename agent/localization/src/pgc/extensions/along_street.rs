@@ -3,7 +3,7 @@
 //! Poles, trees and parked vehicles stand in rows, and a pose one place further along the street fits almost as well.
 //! Measured gain: none apart; the figures of [`super::other_parts`] include it.
 
-use nalgebra::{Translation3, Vector3};
+use nalgebra::Translation3;
 use support::stage_times::StageTimes;
 
 use crate::pgc::pose_search::{Attempt, PoseSearch};
@@ -22,8 +22,8 @@ pub(crate) fn search(
     let Ok(found) = &best.solved else {
         return Ok(best);
     };
-    let mut origin_from_sensor = found.world_from_sensor;
-    origin_from_sensor.translation.vector -= Vector3::from(coordinates.origin_m);
+    let origin = Translation3::from(coordinates.origin_m);
+    let origin_from_sensor = origin.inverse() * found.world_from_sensor;
     for ahead_m in AHEAD_M {
         if best.is_sufficient() {
             break;
@@ -41,7 +41,7 @@ mod tests {
     use std::path::Path;
 
     use dataset::LoadOptions;
-    use nalgebra::Isometry3;
+    use nalgebra::{Isometry3, Vector3};
     use perception::inference::Inference;
     use protocol::PointCloud;
     use simulator::generate::{Subset, SynthOptions, generate};

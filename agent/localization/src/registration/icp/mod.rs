@@ -130,7 +130,7 @@ impl IcpTarget {
 
     /// Planes at the finest level.
     pub fn planes(&self) -> usize {
-        self.levels.last().map_or(0, Surfels::len)
+        self.levels.last().map_or(0, |level| level.count)
     }
 }
 

@@ -9,7 +9,7 @@ use std::error::Error;
 use std::path::Path;
 
 use nalgebra::Vector3;
-use perception::weights::{CONFIG_KEY, FileError, KIND_KEY, with_header};
+use perception::weights::{CONFIG_KEY, FileError, KIND_KEY, parsed, with_header};
 use protocol::config::{FieldError, within};
 use protocol::text::hex;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
@@ -51,7 +51,6 @@ pub struct SurfelMap {
     place: String,
     /// Scale of the covariance of registered poses, if it was fitted.
     pub(crate) covariance_scale: Option<CovarianceScale>,
-    sha256: String,
 }
 
 impl SurfelMap {
@@ -85,11 +84,6 @@ impl SurfelMap {
         &self.place
     }
 
-    /// SHA-256 of the file.
-    pub fn sha256(&self) -> &str {
-        &self.sha256
-    }
-
     /// Writes the finest planes of a fitted target of a place; returns the file's SHA-256.
     ///
     /// # Errors
@@ -121,8 +115,7 @@ impl SurfelMap {
             range_m: target.range_m,
             place: place.to_owned(),
         };
-        let bytes = encode(&config, planes.len(), [&voxels, &centres, &normals])
-            .map_err(|error| FileError::new(path, error))?;
+        let bytes = encode(&config, planes.len(), [&voxels, &centres, &normals]).at(path)?;
         atomic_file::write(path, &bytes).at(path)?;
         Ok(hex(&Sha256::digest(&bytes)))
     }
@@ -133,7 +126,7 @@ impl SurfelMap {
     /// [`FileError`] when the file is missing, truncated, of another kind, or holds values that are no planes.
     pub fn load(path: &Path) -> Result<Self, FileError> {
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-        decode(&bytes).map_err(|problem| FileError::new(path, problem))
+        decode(&bytes).at(path)
     }
 }
 
@@ -155,13 +148,7 @@ fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>,
 }
 
 fn decode(bytes: &[u8]) -> Result<SurfelMap, Box<dyn Error>> {
-    let read = SafeTensors::read_metadata(bytes)
-        .and_then(|(_, header)| Ok((header, SafeTensors::deserialize(bytes)?)));
-    let (header, file) = read.map_err(|error| {
-        let count = bytes.len();
-        format!("not a complete safetensors file ({count} bytes): {error}")
-    })?;
-    let metadata = header.metadata().clone().unwrap_or_default();
+    let (metadata, file) = parsed(bytes)?;
     let kind = metadata.get(KIND_KEY).map(String::as_str);
     if kind != Some(KIND) {
         return Err(format!("a file of kind {kind:?}, needed is one of kind {KIND:?}").into());
@@ -207,7 +194,6 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, Box<dyn Error>> {
         },
         place: config.place,
         covariance_scale: scale,
-        sha256: hex(&Sha256::digest(bytes)),
     })
 }
 
@@ -311,7 +297,7 @@ pub(crate) mod tests {
         // Two hundred metres beside it nothing above the ground has a partner.
         let elsewhere = Isometry3::translation(200.0, 0.0, 0.0) * truth;
         assert!(register(&source, map.target(), &elsewhere, &config).is_err());
-        assert_eq!((map.sha256().len(), map.place()), (64, "yard"));
+        assert_eq!(map.place(), "yard");
     }
 
     #[test]

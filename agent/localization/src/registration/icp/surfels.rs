@@ -81,8 +81,8 @@ pub(super) struct Surfels {
     moments: Vec<PointSums>,
     /// By row of `sites`; made by [`Self::fit`].
     planes: Vec<Option<KeptPlane>>,
-    /// Voxels with a plane.
-    count: usize,
+    /// Number of voxels with a plane.
+    pub(super) count: usize,
 }
 
 impl Surfels {
@@ -172,11 +172,6 @@ impl Surfels {
         Vector3::from(voxel.map(f64::from)) * self.voxel_m
     }
 
-    /// Number of voxels with a plane.
-    pub(super) fn len(&self) -> usize {
-        self.count
-    }
-
     /// The plane whose centre is nearest to a point, among the eight voxels on the point's side: complete to half a
     /// voxel, approximate to one and a half.
     pub(super) fn near(&self, point_m: &Vector3<f64>) -> Option<Surfel> {
@@ -240,7 +235,7 @@ mod tests {
             let mut surfels = Surfels::new(0.5);
             patch(at, [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]).for_each(|point| surfels.add(&point));
             surfels.fit();
-            assert!(surfels.len() > 30);
+            assert!(surfels.count > 30);
             let beside = Vector3::from(at) + Vector3::new(1.2 - 0.16, 1.6 + 0.12, 1.0);
             let plane = surfels.near(&beside).unwrap();
             assert!((plane.normal.dot(&Vector3::new(0.8, -0.6, 0.0)).abs() - 1.0).abs() < 1e-6);
@@ -258,7 +253,7 @@ mod tests {
             surfels.add(&Vector3::new(50.0 + f64::from(k), f64::from(k * k), 0.0));
         }
         surfels.fit();
-        assert_eq!(surfels.len(), 0);
+        assert_eq!(surfels.count, 0);
         assert_eq!(surfels.near(&Vector3::new(5.0, 20.0, 0.3)), None);
     }
 
@@ -270,7 +265,7 @@ mod tests {
         patch([0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]).for_each(|point| surfels.add(&point));
         surfels.add(&Vector3::new(1e9, 0.0, 0.0));
         surfels.fit();
-        assert!(surfels.len() > 30);
+        assert!(surfels.count > 30);
         assert_eq!(surfels.near(&Vector3::new(f64::NAN, 0.0, 0.0)), None);
         assert!(decimate([Vector3::new(f64::NAN, 0.0, 0.0)], 0.5).is_empty());
     }

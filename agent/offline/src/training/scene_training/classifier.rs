@@ -1,6 +1,6 @@
 //! Classifier of a head, trained before its regressor: assigns a sweep to a cluster of sensor positions.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -9,8 +9,10 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::training::FeatureCache;
 use localization::pgc::SceneHead;
-use perception::train::{AdamW, AdamWConfig, one_cycle};
+use perception::train::{AdamW, AdamWConfig, Length, Observe, RunConfig, TrainingEvent, one_cycle};
 
+/// Largest share of a training by the clock that the classifier takes.
+const SHARE_OF_TIME: f64 = 0.12;
 /// Number of training steps.
 const STEPS: usize = 1500;
 const BATCH: usize = 256;
@@ -19,18 +21,22 @@ const LEARNING_RATE: f64 = 2e-3;
 /// Label smoothing, as in LightLoc.
 const LABEL_SMOOTHING: f64 = 0.1;
 
-/// Trains with cross entropy and label smoothing, at most for `limit`; the share of training sweeps that are classified correctly.
+/// Trains with cross entropy and label smoothing; notes the share of training sweeps that are classified correctly.
 pub(super) fn train_classifier(
     head: &SceneHead,
     variables: &VarStore,
     cache: &FeatureCache,
     class_of_sweep: &[usize],
-    seed: u64,
-    limit: Option<Duration>,
-) -> Result<f64, TchError> {
+    run: &RunConfig,
+    observe: &mut Observe<'_>,
+) -> Result<(), TchError> {
+    let limit = match run.length {
+        Length::Time(limit) => Some(limit.mul_f64(SHARE_OF_TIME)),
+        Length::Steps(_) | Length::Epochs(_) => None,
+    };
     let classes: Vec<i64> = class_of_sweep.iter().map(|&class| class as i64).collect();
     let classes = Tensor::f_from_slice(&classes)?.f_to_device(variables.device())?;
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut rng = ChaCha8Rng::seed_from_u64(run.seed);
     let mut optimizer = AdamW::new(variables, AdamWConfig::default());
     let started = Instant::now();
     for step in 0..STEPS {
@@ -60,5 +66,9 @@ pub(super) fn train_classifier(
     let logits = no_grad(|| head.classify(&cache.sweeps, false))?;
     let found = logits.f_argmax(1, false)?.f_eq_tensor(&classes)?;
     let share = found.f_to_kind(Kind::Float)?.f_mean(Kind::Float)?;
-    share.f_double_value(&[])
+    observe(&TrainingEvent::Note(format!(
+        "{:.1} % of the training sweeps are assigned to their cluster",
+        100.0 * share.f_double_value(&[])?
+    )));
+    Ok(())
 }

@@ -6,7 +6,7 @@ use super::config::SceneTrainConfig;
 use crate::Error;
 use crate::training::{FeatureCache, SweepAugmentation, SweepList};
 use localization::pgc::{CellEncoder, SweepFormat};
-use perception::train::{DataListing, Observe, TrainingEvent};
+use perception::train::Observe;
 
 /// Features of the sweeps of a scene.
 pub(super) struct Features {
@@ -14,8 +14,6 @@ pub(super) struct Features {
     pub(super) validation: Option<FeatureCache>,
     pub(super) format: SweepFormat,
     pub(super) encoder_sha256: String,
-    /// Origin of the training features.
-    pub(super) data: DataListing,
 }
 
 impl Features {
@@ -26,23 +24,18 @@ impl Features {
         validation: Option<&Arc<SweepList>>,
         observe: &mut Observe<'_>,
     ) -> Result<Self, Error> {
-        let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
-        let mut encode = |list: &Arc<SweepList>, augmentation| {
-            let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, observe)?;
-            observe(&TrainingEvent::Read(list.data()));
-            Ok::<_, Error>(cache)
-        };
-        let encoded = encode(training, config.augmentation)?;
-        let unchanged = SweepAugmentation {
-            copies: 1,
-            ..config.augmentation
-        };
+        let run = &config.run;
+        let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, run.device)?;
+        let training = FeatureCache::build(training, &encoder, config.augmentation, run, observe)?;
+        let unchanged = SweepAugmentation::NONE;
+        let validation = validation
+            .map(|list| FeatureCache::build(list, &encoder, unchanged, run, observe))
+            .transpose()?;
         Ok(Self {
-            training: encoded,
-            validation: validation.map(|list| encode(list, unchanged)).transpose()?,
+            training,
+            validation,
             format: encoder.format().clone(),
             encoder_sha256,
-            data: training.data(),
         })
     }
 }

@@ -12,7 +12,7 @@ mod statistics;
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use tch::nn::VarStore;
 use tch::{Kind, Tensor, no_grad};
@@ -38,10 +38,11 @@ use perception::train::{
 const CENTRE_WEIGHT_M: f64 = 5.0;
 /// Steps between two draws of the classifier's dropout.
 const LOGITS_EVERY: u64 = 50;
-/// Largest share of a training by the clock that its classifier takes.
-const CLASSIFIER_SHARE: f64 = 0.12;
 /// Largest number of cells of a sweep that a head regresses.
 const MAX_CELLS: usize = 1024;
+/// Columns of the training curve.
+const CURVE: &str =
+    "step,seconds,error_m,epsilon_m,cell_p50_m,pose_p50_m,pose_p50_deg,success_3m,success_1m";
 
 /// Trains a head; writes checkpoint, curve and weights into `config.run.out`. Reported are the L1 error of a cell, its
 /// predicted error, and that of the refiner's predictions, metres.
@@ -68,8 +69,8 @@ pub(crate) fn train_scene_on(
     validation: Option<&Arc<SweepList>>,
     observe: &mut Observe<'_>,
 ) -> Result<SceneSummary> {
-    let prepared = SceneTraining::prepare(config, training, validation, observe)?;
-    let (mut training, mut trainer) = prepared;
+    let (mut training, mut trainer) =
+        SceneTraining::prepare(config, training, validation, observe)?;
     trainer.run(&mut training, SaveEvery::Time(config.validate_every))?;
     training.finish(&trainer)
 }
@@ -100,6 +101,7 @@ struct SceneTraining<'a> {
 }
 
 impl<'a> SceneTraining<'a> {
+    /// Computes the features, makes the head, trains its classifier and opens the run: all that comes before the steps.
     fn prepare(
         config: &'a SceneTrainConfig,
         training: &Arc<SweepList>,
@@ -114,14 +116,8 @@ impl<'a> SceneTraining<'a> {
         let load =
             |init: &PathBuf| continued::load(init, &config.encoder, &features.encoder_sha256);
         let stored = config.init.as_ref().map(load).transpose()?;
-        let head_config = match &stored {
-            Some((_, config)) => SceneHeadConfig {
-                sweep_points: (config.sweep_points)
-                    .or_else(|| median_points(&features.training.points)),
-                ..config.clone()
-            },
-            None => head_config(config, &features)?,
-        };
+        let stored_config = stored.as_ref().map(|(_, config)| config);
+        let head_config = head_config(config, stored_config, &features)?;
         // Coordinates are relative to the origin of the head: f32 is exact enough near it only.
         let mut cache = features.training;
         cache.move_origin(head_config.origin_m)?;
@@ -140,19 +136,13 @@ impl<'a> SceneTraining<'a> {
         };
         // A resumed training has its classifier in the checkpoint.
         if !run.resume {
-            let (classes, limit) = (&class_of_sweep, classifier_time(run.length));
-            let share = train_classifier(&head, &variables, &cache, classes, run.seed, limit)?;
-            observe(&TrainingEvent::Note(format!(
-                "{:.1} % of the training sweeps are assigned to their cluster",
-                100.0 * share
-            )));
+            train_classifier(&head, &variables, &cache, &class_of_sweep, run, observe)?;
         }
         // After the classifier: where a checkpoint is resumed, it replaces all variables.
         let trainer = Trainer::begin(run, &variables, None, started)?;
         let redundancy = config
             .redundancy
             .map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
-        let header = "step,seconds,error_m,epsilon_m,cell_p50_m,pose_p50_m,pose_p50_deg,success_3m,success_1m";
         let training = Self {
             config,
             observe,
@@ -169,13 +159,14 @@ impl<'a> SceneTraining<'a> {
             means: Means::default(),
             reported: None,
             accuracy: None,
-            curve: trainer.curve(header)?,
-            data: features.data,
+            curve: trainer.curve(CURVE)?,
+            data: training.data(),
             preparing_seconds: started.elapsed().as_secs_f64(),
         };
         Ok((training, trainer))
     }
 
+    /// Saves the head.
     fn finish(mut self, trainer: &Trainer) -> Result<SceneSummary> {
         let variables = match self.config.init {
             // Cropped already, to the sweeps of its first training, which may have been elsewhere in the scene.
@@ -287,9 +278,9 @@ impl Task for SceneTraining<'_> {
         let mut row = vec![trainer.steps() as f64, seconds, error_m, epsilon_m];
         if let Some(validation) = &self.validation {
             let found = validate(&self.head, validation, self.config.run.precision.kind())?;
-            let poses = [found.pose_p50_m, found.pose_p50_deg];
-            let shares = [found.success_3m, found.success_1m];
-            row.extend([&[found.cell_p50_m], &poses[..], &shares].concat());
+            row.push(found.cell_p50_m);
+            row.extend([found.pose_p50_m, found.pose_p50_deg]);
+            row.extend([found.success_3m, found.success_1m]);
             let text = format!("{seconds:.0} s: {found}");
             (self.observe)(&TrainingEvent::Validated(text));
             self.accuracy = Some(found);
@@ -298,17 +289,20 @@ impl Task for SceneTraining<'_> {
     }
 }
 
-/// Longest time of the classifier's training: a part of a training by the clock.
-fn classifier_time(length: Length) -> Option<Duration> {
-    match length {
-        Length::Time(limit) => Some(limit.mul_f64(CLASSIFIER_SHARE)),
-        Length::Steps(_) | Length::Epochs(_) => None,
-    }
-}
-
-/// The configuration of the head for these features.
-fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig> {
+/// The configuration of the head that is `stored` to start from, or else of one for these features.
+fn head_config(
+    config: &SceneTrainConfig,
+    stored: Option<&SceneHeadConfig>,
+    features: &Features,
+) -> Result<SceneHeadConfig> {
     let (training, format) = (&features.training, &features.format);
+    let sweep_points = median_points(&training.points);
+    if let Some(stored) = stored {
+        return Ok(SceneHeadConfig {
+            sweep_points: stored.sweep_points.or(sweep_points),
+            ..stored.clone()
+        });
+    }
     let refiner = config
         .refiner
         .then(|| key_grid::covering(&training.targets_m, format.local_channels()));
@@ -324,7 +318,7 @@ fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHe
         origin_m: training.origin_m,
         max_cells: MAX_CELLS,
         refiner: refiner.transpose()?,
-        sweep_points: median_points(&training.points),
+        sweep_points,
     })
 }
 

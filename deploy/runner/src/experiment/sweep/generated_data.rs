@@ -14,10 +14,11 @@ use crate::experiment::spec::Experiment;
 /// Options with which the data set of the experiment is generated.
 fn generator(experiment: &Experiment) -> Option<SynthOptions> {
     let generate = experiment.generate.as_ref()?;
+    let [fewest, most] = generate.vehicles;
     Some(SynthOptions {
         frames: generate.frames,
         scenes: generate.scenes,
-        agents: generate.vehicles(),
+        agents: fewest..=most,
         threads: std::thread::available_parallelism().map_or(1, usize::from),
         ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
     })

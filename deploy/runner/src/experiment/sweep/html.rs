@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::Run;
-use super::table::{NOTES, rows};
+use super::table::NOTES;
 use super::varying::VaryingTable;
 use crate::experiment::spec::Experiment;
 
@@ -14,13 +14,14 @@ const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;ma
     th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #e2e5ea}th{position:sticky;top:0;background:#fff}\
     pre{background:#f5f6f8;padding:1rem;overflow-x:auto;font-size:.85rem}dt{font-weight:600}dd{margin:0 0 .4rem 1rem}";
 
-/// Page of an experiment with the file content `spec` and the SVG of the charts of each figure.
+/// Page of an experiment with the file content `spec`, the SVG of the charts of each figure, and the table of the runs.
 // Writing to a string cannot fail.
 pub(super) fn page(
     experiment: &Experiment,
     spec: &str,
     runs: &[Run],
     figures: &[Vec<String>],
+    table: &VaryingTable,
 ) -> String {
     let title = match experiment.title.as_str() {
         "" => &experiment.name,
@@ -40,16 +41,13 @@ pub(super) fn page(
         runs.len(),
         escaped(&experiment.name)
     );
-    let (columns, lines) = rows(experiment, runs);
-    let columns: Vec<&str> = columns.iter().map(|column| column.trim()).collect();
-    let table = VaryingTable::new(&columns, &lines);
     if let Some(sentence) = table.sentence() {
         let _ = writeln!(page, "<p>{}</p>", escaped(&sentence));
     }
     for figure in figures {
         let _ = writeln!(page, "<figure>{}</figure>", figure.concat());
     }
-    page += &runs_table(&table);
+    page += &runs_table(table);
     page += "<h2>Columns</h2>\n<dl>\n";
     for (column, note) in NOTES.lines().filter_map(|line| line.split_once(": ")) {
         let _ = writeln!(page, "<dt>{column}</dt><dd>{}</dd>", escaped(note));

@@ -380,12 +380,13 @@ impl ExperimentSweep {
         }
         let spec = bounded_file::read_text(&self.file, MAX_TEXT_BYTES)
             .with_context(|| self.file.display().to_string())?;
-        let page = html::page(&self.experiment, &spec, runs, &drawings);
+        let (columns, lines) = table::rows(&self.experiment, runs);
+        let varying = VaryingTable::new(&columns, &lines);
+        let page = html::page(&self.experiment, &spec, runs, &drawings, &varying);
         write(&self.out.join("report.html"), &page)?;
         let name = format!("{}.csv", self.experiment.name);
         write(&self.out.join(name), &csv(&self.experiment, runs))?;
-        let (columns, lines) = table::rows(&self.experiment, runs);
-        Ok(VaryingTable::new(&columns, &lines).text())
+        Ok(varying.text())
     }
 }
 

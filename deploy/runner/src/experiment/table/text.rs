@@ -14,44 +14,33 @@ use crate::experiment::cell::Cell;
 /// several show the global ordering only. The provenance follows below.
 pub fn markdown(table: &FilledTable) -> String {
     let mut text = format!("# {}\n\n", table.name);
-    let single = table.columns.len() == 1;
-    let heads: Vec<String> = if single {
-        let name = &table.columns[0].name;
-        let global = format!("{name}: AP@0.3 / 0.5 / 0.7, global order");
-        vec![
-            global,
-            "frame order".into(),
-            "bytes per message".into(),
-            "log2".into(),
-        ]
-    } else {
-        let names = table.columns.iter().map(|column| column.name.clone());
-        names.collect()
+    let heads: Vec<String> = match &table.columns[..] {
+        [only] => {
+            let global = format!("{}: AP@0.3 / 0.5 / 0.7, global order", only.name);
+            let others = ["frame order", "bytes per message", "log2"].map(str::to_owned);
+            [global].into_iter().chain(others).collect()
+        }
+        several => several.iter().map(|column| column.name.clone()).collect(),
     };
     // Writing to a string cannot fail.
     let _ = writeln!(text, "| method | {} |", heads.join(" | "));
     let _ = writeln!(text, "| --- |{}", " --- |".repeat(heads.len()));
     for FilledRow { row, cells } in &table.rows {
-        let values: Vec<String> = if single {
-            let cells = &cells[0];
-            let frame_order = precision(cells, |cell| cell.metrics.ap_frame_order);
+        let global = cells.iter();
+        let global = global.map(|of| precision(of, |cell| cell.metrics.ap_global));
+        let mut values: Vec<String> = global.collect();
+        if let [cells] = &cells[..] {
             let payload = mean(cells, &|cell| cell.metrics.comm.payload_bytes_mean);
             let log2 = mean(cells, &|cell| cell.metrics.comm.log2_payload);
-            vec![
-                precision(cells, |cell| cell.metrics.ap_global),
-                frame_order,
+            values.extend([
+                precision(cells, |cell| cell.metrics.ap_frame_order),
                 number(&payload, 0),
                 number(&log2, 2),
-            ]
-        } else {
-            let global = cells
-                .iter()
-                .map(|of| precision(of, |cell| cell.metrics.ap_global));
-            global.collect()
-        };
+            ]);
+        }
         let _ = writeln!(text, "| {} | {} |", row.label(), values.join(" | "));
     }
-    if !single {
+    if table.columns.len() != 1 {
         text += "\nAP@0.3 / 0.5 / 0.7 in the global order.\n";
     }
     text + &provenance(table)

@@ -41,14 +41,9 @@ impl ComputeTimes {
     /// # Errors
     /// [`FieldError`] for the first that is not 0 to 60 s.
     pub fn validate(&self, field: &str) -> Result<(), FieldError> {
-        let stages = [
-            ("pose_ms", self.pose_ms),
-            ("map_ms", self.map_ms),
-            ("fuse_ms", self.fuse_ms),
-        ];
-        stages
-            .into_iter()
-            .try_for_each(|(stage, ms)| within(&format!("{field}.{stage}"), ms, 0.0, 60_000.0))
+        within(&format!("{field}.pose_ms"), self.pose_ms, 0.0, 60_000.0)?;
+        within(&format!("{field}.map_ms"), self.map_ms, 0.0, 60_000.0)?;
+        within(&format!("{field}.fuse_ms"), self.fuse_ms, 0.0, 60_000.0)
     }
 
     /// Time until an agent has published all messages of a sweep.

@@ -50,17 +50,14 @@ pub enum RemoteError {
     },
 }
 
-/// Publishers of a vehicle's sweeps.
-struct SweepPublishers {
-    gnss: Publisher,
-    imu: Publisher,
-    lidar: Publisher,
-}
+/// Streams of a vehicle's sweeps.
+const SENSORS: [Stream; 3] = [Stream::Gnss, Stream::Imu, Stream::Lidar];
 
 /// All vehicles of a run in simulation time, each a process.
 pub struct RemotePool {
     inbox: Arc<Inbox>,
-    sensors: BTreeMap<CavId, SweepPublishers>,
+    /// A publisher for each of [`SENSORS`].
+    sensors: BTreeMap<CavId, [Publisher; 3]>,
     /// Streams of each vehicle beside its pose, in the order of sending.
     streams: BTreeMap<CavId, Vec<Stream>>,
     _subscriptions: Vec<Subscription>,
@@ -94,14 +91,11 @@ impl RemotePool {
         let here = bus.identity().process.clone();
         for (cav, streams) in vehicles {
             let options = PublisherOptions::SENSOR.lossless(1);
-            let publishers = SweepPublishers {
-                gnss: bus.publisher(Topic::stream(cav, Stream::Gnss), options)?,
-                imu: bus.publisher(Topic::stream(cav, Stream::Imu), options)?,
-                lidar: bus.publisher(Topic::stream(cav, Stream::Lidar), options)?,
-            };
-            sensors.insert(cav.clone(), publishers);
+            let topics = SENSORS.map(|stream| Topic::stream(cav, stream));
+            let [gnss, imu, lidar] = topics.map(|topic| bus.publisher(topic, options));
+            sensors.insert(cav.clone(), [gnss?, imu?, lidar?]);
             let there = process_id(Role::Agent, cav);
-            for stream in [Stream::Gnss, Stream::Imu, Stream::Lidar] {
+            for stream in SENSORS {
                 routes.push(Route::new(Topic::stream(cav, stream), there.clone()));
             }
             for stream in [Stream::Pose].into_iter().chain(streams.iter().copied()) {
@@ -122,10 +116,8 @@ impl RemotePool {
 
     /// Ends the streams of sweeps.
     pub(in super::super) fn finish(self) {
-        self.sensors
-            .into_values()
-            .flat_map(|SweepPublishers { gnss, imu, lidar }| [gnss, imu, lidar])
-            .for_each(Publisher::finish);
+        let publishers = self.sensors.into_values().flatten();
+        publishers.for_each(Publisher::finish);
     }
 
     /// True while messages of a vehicle are missing in its answer.
@@ -137,7 +129,7 @@ impl RemotePool {
     /// Sends the sweeps of a tick and waits for all answers, in the same order.
     pub(super) fn request(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
         for frame in frames {
-            let Some(SweepPublishers { gnss, imu, lidar }) = self.sensors.get(&frame.cav) else {
+            let Some([gnss, imu, lidar]) = self.sensors.get(&frame.cav) else {
                 continue;
             };
             // As in this process: the measurement is the recorded pose, without error.
@@ -183,12 +175,10 @@ impl RemotePool {
                 }
             }
         }
-        Ok(frames
-            .iter()
-            .filter_map(|frame| {
-                let streams = self.streams.get(&frame.cav)?;
-                Some(answers.remove(&frame.cav)?.into_sent(frame, streams))
-            })
-            .collect())
+        let sent = frames.iter().filter_map(|frame| {
+            let streams = self.streams.get(&frame.cav)?;
+            Some(answers.remove(&frame.cav)?.into_sent(frame, streams))
+        });
+        Ok(sent.collect())
     }
 }

@@ -4,10 +4,15 @@
 //! base64 data; converters of other data sets do so for any number. A Python loader would call the function named by
 //! the tag. Here the tag is compared with the few supported ones, every part of the node is checked, and anything else
 //! is an error: nothing is ever looked up or called by name.
+//!
+//! [`super::numbers`] calls [`array()`] and [`scalar()`] for the numbers of a field, [`super::tree`] calls
+//! [`key_text()`] for keys. Nothing else of the YAML is called here but a field's entries, items and texts.
 
 mod data;
 
 use std::path::Path;
+
+use protocol::text::excerpt;
 
 use super::field::YamlField;
 use super::node::{Value, YamlNode};
@@ -149,9 +154,7 @@ fn integer(field: &YamlField<'_>) -> Result<i64> {
 }
 
 fn shown(tag: Option<&str>) -> String {
-    tag.map_or("is missing".into(), |tag| {
-        format!("{:?}", tag.chars().take(80).collect::<String>())
-    })
+    tag.map_or("is missing".into(), |tag| format!("{:?}", excerpt(tag, 80)))
 }
 
 fn items<'a, const N: usize>(field: &YamlField<'a>) -> Result<[YamlField<'a>; N]> {

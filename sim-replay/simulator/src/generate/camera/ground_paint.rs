@@ -38,9 +38,8 @@ impl<'w> GroundPaint<'w> {
         let is_road = *self.is_road.entry(cell).or_insert_with(|| {
             let middle = cell.map(|axis| (f64::from(axis) + 0.5) * CELL_M);
             let lanes = &world.map_model.lanes;
-            let nearest = world
-                .lane_index
-                .nearest(lanes, middle, WIDEST_LANE_M, None, None);
+            let index = &world.lane_index;
+            let nearest = index.nearest(lanes, middle, WIDEST_LANE_M, None);
             nearest.is_some_and(|at| {
                 at.offset_m.abs() < lanes.lane(at.lane).width_m / 2.0 + SHOULDER_M
             })

@@ -40,10 +40,9 @@ impl TickFiles<'_> {
 #[derive(Debug)]
 pub(super) struct AgentFolderWriter {
     root: PathBuf,
-    /// Folder of each agent of the scene, and true for a roadside unit.
-    agents: Vec<(PathBuf, bool)>,
-    /// Number of the moment's tick, by index.
-    ticks: Vec<u64>,
+    scene: SceneHeader,
+    /// Folder of each agent of the scene.
+    folders: Vec<PathBuf>,
     mark: Option<Unfinished>,
     write_frame: WriteFrame,
 }
@@ -52,8 +51,8 @@ impl AgentFolderWriter {
     pub(super) fn new(root: &Path, write_frame: WriteFrame) -> Self {
         Self {
             root: root.to_owned(),
-            agents: Vec::new(),
-            ticks: Vec::new(),
+            scene: SceneHeader::default(),
+            folders: Vec::new(),
             mark: None,
             write_frame,
         }
@@ -67,22 +66,19 @@ impl SceneWriter for AgentFolderWriter {
         make_fresh_folder(&folder)?;
         self.mark = Some(Unfinished::mark(&folder)?);
         write_file(&folder.join(super::PROTOCOL_FILE), &scene.origin)?;
-        let names = agent_folders(scene).into_iter().zip(&scene.agents);
-        let agents = names.map(|(name, agent)| (folder.join(name), agent.is_roadside));
-        self.agents = agents.collect();
-        let nanos = scene.capture_nanos.iter();
-        self.ticks = nanos.map(|nanos| nanos / scene.tick_nanos).collect();
-        let mut folders = self.agents.iter();
-        folders.try_for_each(|(folder, _)| make_folder(folder))
+        let names = agent_folders(scene).into_iter();
+        self.folders = names.map(|name| folder.join(name)).collect();
+        self.scene = scene.clone();
+        let mut folders = self.folders.iter();
+        folders.try_for_each(|folder| make_folder(folder))
     }
 
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         moment.frames.iter().try_for_each(|frame| {
-            let (folder, is_roadside) = &self.agents[frame.agent];
             let files = TickFiles {
-                folder,
-                tick: self.ticks[moment.index],
-                is_roadside: *is_roadside,
+                folder: &self.folders[frame.agent],
+                tick: self.scene.capture_nanos[moment.index] / self.scene.tick_nanos,
+                is_roadside: self.scene.agents[frame.agent].is_roadside,
             };
             (self.write_frame)(&files, frame)
         })

@@ -171,6 +171,67 @@ impl Dair {
             Edition::V2xSeq => upright_label(kind, object.id, &upright_in(vehicle, object)),
         }
     }
+
+    /// The rows of a capture time in the lists of vehicle, unit and pairs.
+    fn rows_of(&self, moment: &Moment, id: &str, unit_id: &str) -> [Value; 3] {
+        let begin_micros = EPOCH_MICROS + self.scene as u64 * DAY_MICROS;
+        let micros = begin_micros + self.capture_nanos[moment.index] / 1000;
+        let vehicle = self.side_row(&VEHICLE, id, micros);
+        let unit = self.side_row(&UNIT, unit_id, micros);
+        let offset = json!({ "delta_x": 0.0, "delta_y": 0.0 });
+        let pair = match self.edition {
+            Edition::Dair => json!({
+                "infrastructure_image_path": format!("infrastructure-side/image/{unit_id}.jpg"),
+                "infrastructure_pointcloud_path": format!("infrastructure-side/velodyne/{unit_id}.pcd"),
+                "vehicle_image_path": format!("vehicle-side/image/{id}.jpg"),
+                "vehicle_pointcloud_path": format!("vehicle-side/velodyne/{id}.pcd"),
+                "cooperative_label_path": format!("cooperative/label_world/{id}.json"),
+                "system_error_offset": offset,
+            }),
+            Edition::V2xSeq => json!({
+                "vehicle_frame": id,
+                "infrastructure_frame": unit_id,
+                "vehicle_sequence": format!("{:04}", self.scene),
+                "infrastructure_sequence": format!("{:04}", self.scene),
+                "system_error_offset": offset,
+            }),
+        };
+        [vehicle, unit, pair]
+    }
+
+    /// The row of one side.
+    fn side_row(&self, side: &DairSide, id: &str, micros: u64) -> Value {
+        let [first, last] = [0, self.capture_nanos.len() - 1]
+            .map(|frame| format!("{:06}", side.first_number + self.first_frame + frame));
+        let mut row = json!({
+            "image_path": format!("image/{id}.jpg"),
+            "image_timestamp": micros.to_string(),
+            "pointcloud_path": format!("velodyne/{id}.pcd"),
+            "pointcloud_timestamp": micros.to_string(),
+            "intersection_loc": "generated",
+        });
+        let labels = format!("label/{}/{id}.json", side.labels);
+        for name in side.calibrations {
+            row[format!("calib_{name}_path")] = json!(format!("calib/{name}/{id}.json"));
+        }
+        match self.edition {
+            Edition::Dair => {
+                row["label_lidar_path"] = json!(labels);
+                row["batch_id"] = json!(self.scene.to_string());
+                row["batch_start_id"] = json!(first);
+                row["batch_end_id"] = json!(last);
+            }
+            Edition::V2xSeq => {
+                row["label_lidar_std_path"] = json!(labels);
+                row["frame_id"] = json!(id);
+                row["sequence_id"] = json!(format!("{:04}", self.scene));
+                row["num_frames"] = json!(self.capture_nanos.len().to_string());
+                row["start_frame_id"] = json!(first);
+                row["end_frame_id"] = json!(last);
+            }
+        }
+        row
+    }
 }
 
 impl SceneWriter for Dair {
@@ -246,68 +307,5 @@ impl SceneWriter for Dair {
             let rows = rows.iter().map(|(_, rows)| rows[list].clone());
             self.write_json(&format!("{folder}/data_info.json"), &rows.collect())
         })
-    }
-}
-
-impl Dair {
-    /// The rows of a capture time in the lists of vehicle, unit and pairs.
-    fn rows_of(&self, moment: &Moment, id: &str, unit_id: &str) -> [Value; 3] {
-        let begin_micros = EPOCH_MICROS + self.scene as u64 * DAY_MICROS;
-        let micros = begin_micros + self.capture_nanos[moment.index] / 1000;
-        let vehicle = self.side_row(&VEHICLE, id, micros);
-        let unit = self.side_row(&UNIT, unit_id, micros);
-        let offset = json!({ "delta_x": 0.0, "delta_y": 0.0 });
-        let pair = match self.edition {
-            Edition::Dair => json!({
-                "infrastructure_image_path": format!("infrastructure-side/image/{unit_id}.jpg"),
-                "infrastructure_pointcloud_path": format!("infrastructure-side/velodyne/{unit_id}.pcd"),
-                "vehicle_image_path": format!("vehicle-side/image/{id}.jpg"),
-                "vehicle_pointcloud_path": format!("vehicle-side/velodyne/{id}.pcd"),
-                "cooperative_label_path": format!("cooperative/label_world/{id}.json"),
-                "system_error_offset": offset,
-            }),
-            Edition::V2xSeq => json!({
-                "vehicle_frame": id,
-                "infrastructure_frame": unit_id,
-                "vehicle_sequence": format!("{:04}", self.scene),
-                "infrastructure_sequence": format!("{:04}", self.scene),
-                "system_error_offset": offset,
-            }),
-        };
-        [vehicle, unit, pair]
-    }
-
-    /// The row of one side.
-    fn side_row(&self, side: &DairSide, id: &str, micros: u64) -> Value {
-        let [first, last] = [0, self.capture_nanos.len() - 1]
-            .map(|frame| format!("{:06}", side.first_number + self.first_frame + frame));
-        let mut row = json!({
-            "image_path": format!("image/{id}.jpg"),
-            "image_timestamp": micros.to_string(),
-            "pointcloud_path": format!("velodyne/{id}.pcd"),
-            "pointcloud_timestamp": micros.to_string(),
-            "intersection_loc": "generated",
-        });
-        let labels = format!("label/{}/{id}.json", side.labels);
-        for name in side.calibrations {
-            row[format!("calib_{name}_path")] = json!(format!("calib/{name}/{id}.json"));
-        }
-        match self.edition {
-            Edition::Dair => {
-                row["label_lidar_path"] = json!(labels);
-                row["batch_id"] = json!(self.scene.to_string());
-                row["batch_start_id"] = json!(first);
-                row["batch_end_id"] = json!(last);
-            }
-            Edition::V2xSeq => {
-                row["label_lidar_std_path"] = json!(labels);
-                row["frame_id"] = json!(id);
-                row["sequence_id"] = json!(format!("{:04}", self.scene));
-                row["num_frames"] = json!(self.capture_nanos.len().to_string());
-                row["start_frame_id"] = json!(first);
-                row["end_frame_id"] = json!(last);
-            }
-        }
-        row
     }
 }

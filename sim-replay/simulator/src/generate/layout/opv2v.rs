@@ -46,7 +46,7 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
     for (number, camera) in &frame.cameras {
         write_camera(yaml, *number, camera, frame.world_from_lidar.as_ref())?;
     }
-    write_speed(yaml, frame)?;
+    write_speed(yaml, "ego_speed", frame.speed_mps)?;
     match (&agent.simulated, frame.motion().yaw_rate_rad_s) {
         (Some(simulated), _) => write_receivers(yaml, &simulated.fix)?,
         // Of the motion of a recorded frame, `ego_speed` alone holds the speed.

@@ -58,7 +58,7 @@ pub(super) fn write_files(files: &TickFiles<'_>, frame: &AgentFrame) -> Result<(
 
 fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     let frame = &agent.frame;
-    write_speed(yaml, frame)?;
+    write_speed(yaml, "ego_speed", frame.speed_mps)?;
     for (key, pose) in keyed_poses(frame) {
         writeln!(yaml, "{key}: {}", pickled_matrix(&pose))?;
     }

@@ -49,17 +49,14 @@ impl ObjectEntry<'_> {
             let mut between = more.filter(|(more, _)| key < *more && *more < next);
             between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))?;
         }
-        match self.object.speed_mps {
-            Some(speed_mps) => writeln!(yaml, "    speed: {}", KMH_PER_MPS * speed_mps),
-            None => Ok(()),
-        }
+        write_speed(yaml, "    speed", self.object.speed_mps)
     }
 }
 
-/// Writes the speed of the agent, where it is known.
-pub(super) fn write_speed(yaml: &mut String, frame: &Frame) -> fmt::Result {
-    match frame.speed_mps {
-        Some(speed_mps) => writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps),
+/// Writes a speed, where it is known.
+pub(super) fn write_speed(yaml: &mut String, key: &str, speed_mps: Option<f64>) -> fmt::Result {
+    match speed_mps {
+        Some(speed_mps) => writeln!(yaml, "{key}: {}", KMH_PER_MPS * speed_mps),
         None => Ok(()),
     }
 }
@@ -88,21 +85,19 @@ pub(super) fn write_vehicles(
 
 /// Reference points of the objects of a frame: from the simulation if known, else the centre of the box's bottom face.
 fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
-    match &frame.simulated {
-        Some(simulated) => simulated.anchors.clone(),
-        None => {
-            let bottoms = frame.frame.objects.iter().map(|object| {
-                let pose = object.world_from_object;
-                let up = pose.isometry().rotation * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
-                let location_m = Vector3::from(pose.translation_m) - up;
-                BoxAnchor {
-                    location_m: location_m.into(),
-                    center_offset_m: up.into(),
-                }
-            });
-            bottoms.collect()
-        }
+    if let Some(simulated) = &frame.simulated {
+        return simulated.anchors.clone();
     }
+    let bottoms = frame.frame.objects.iter().map(|object| {
+        let pose = object.world_from_object;
+        let up = pose.isometry().rotation * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
+        let location_m = Vector3::from(pose.translation_m) - up;
+        BoxAnchor {
+            location_m: location_m.into(),
+            center_offset_m: up.into(),
+        }
+    });
+    bottoms.collect()
 }
 
 /// The folders of a scene's agents. Readers sort them as text, roadside units (negative numbers) last: where the

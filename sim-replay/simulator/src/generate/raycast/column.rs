@@ -80,12 +80,8 @@ impl ColumnRays<'_> {
     /// Unit normal of the plane in which the rays lie.
     #[inline]
     pub(super) fn normal(&self) -> [f32; 3] {
-        let (h, u) = (self.forward, self.up);
-        [
-            u[1] * h[2] - u[2] * h[1],
-            u[2] * h[0] - u[0] * h[2],
-            u[0] * h[1] - u[1] * h[0],
-        ]
+        let (forward, up) = (Vector3::from(self.forward), Vector3::from(self.up));
+        up.cross(&forward).into()
     }
 }
 

@@ -129,7 +129,6 @@ pub(crate) struct Caster {
     cos: Vec<f32>,
     sin: Vec<f32>,
     columns: Vec<ColumnPose>,
-    order: Vec<(RaySpan, usize)>,
     /// The last sweep, as [`Caster::cast`] returned it.
     pub(crate) image: RangeImage,
 }
@@ -142,7 +141,6 @@ impl Caster {
             cos: elevations.clone().map(f32::cos).collect(),
             sin: elevations.map(f32::sin).collect(),
             columns: Vec::new(),
-            order: Vec::new(),
             image: RangeImage::default(),
             pattern,
         }
@@ -180,19 +178,16 @@ impl Caster {
         }
 
         let frames = SensorFrames::new(sensor);
-        self.order.clear();
         let visible = bodies
             .iter()
-            .zip(0..)
-            .filter_map(|(body, index)| Some((frames.footprint(&self.pattern, body)?, index)));
-        self.order.extend(visible);
+            .enumerate()
+            .filter_map(|(index, body)| Some((frames.footprint(&self.pattern, body)?, index)));
+        let mut order: Vec<(RaySpan, usize)> = visible.collect();
         // Near bodies first: bodies behind them need not be intersected. The index makes the order of ties
         // deterministic.
-        self.order
-            .sort_unstable_by(|(a, i), (b, j)| a.nearest_m.total_cmp(&b.nearest_m).then(i.cmp(j)));
-        for index in 0..self.order.len() {
-            let (footprint, body) = self.order[index].clone();
-            self.cast_body(&bodies[body], &footprint, body as u32, anchor);
+        order.sort_unstable_by(|(a, i), (b, j)| a.nearest_m.total_cmp(&b.nearest_m).then(i.cmp(j)));
+        for (footprint, body) in &order {
+            self.cast_body(&bodies[*body], footprint, *body as u32, anchor);
         }
         &self.image
     }

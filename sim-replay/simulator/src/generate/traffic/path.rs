@@ -163,28 +163,20 @@ impl Path {
         &self,
         graph: &LaneGraph,
         behind_m: f64,
-    ) -> impl Iterator<Item = LaneId> + '_ {
+    ) -> impl Iterator<Item = LaneId> {
         let mut left_m = behind_m - self.s_m;
-        let mut lanes = vec![self.lane()];
-        for &lane in self.lanes.iter().take(self.current).rev() {
-            if left_m <= 0.0 {
-                break;
-            }
-            lanes.push(lane);
+        let behind = self.lanes.iter().take(self.current).rev().copied();
+        let touched = behind.take_while(move |&lane| {
+            let is_touched = left_m > 0.0;
             left_m -= graph.lane(lane).length_m;
-        }
-        lanes.into_iter()
+            is_touched
+        });
+        std::iter::once(self.lane()).chain(touched)
     }
 
     /// The point `offset_m` ahead of (or behind) the vehicle's centre, extrapolated straight beyond the known path.
     pub(crate) fn point_m(&self, graph: &LaneGraph, offset_m: f64) -> [f64; 3] {
         self.mixed(graph, offset_m, point_on)
-    }
-
-    /// Slope across the path there, radians; positive where the left side is higher.
-    fn bank_rad(&self, graph: &LaneGraph, offset_m: f64) -> f64 {
-        let [bank_rad] = self.mixed(graph, offset_m, |lane, s_m| [lane.bank_rad(s_m)]);
-        bank_rad
     }
 
     /// Values of a lane property `offset_m` ahead of the vehicle's centre; during a change, mixed from both lanes.
@@ -234,7 +226,7 @@ impl Path {
         let (dx, dy, dz) = (front[0] - rear[0], front[1] - rear[1], front[2] - rear[2]);
         let base = dx.hypot(dy).max(1e-6);
         let middle: [f64; 3] = std::array::from_fn(|axis| 0.5 * (front[axis] + rear[axis]));
-        let roll_rad = self.bank_rad(graph, drive_m);
+        let [roll_rad] = self.mixed(graph, drive_m, |lane, s_m| [lane.bank_rad(s_m)]);
         let (rise, flat) = roll_rad.sin_cos();
         let aside_flat_m = aside_m * flat;
         let position = [

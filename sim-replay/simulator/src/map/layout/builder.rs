@@ -4,7 +4,8 @@ use super::super::clothoid;
 use super::super::curve::{PlanCurve, Pose2};
 use super::super::profile::Profile;
 use super::super::road::{
-    Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork,
+    Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadEnd, RoadLane, RoadLink,
+    RoadNetwork,
 };
 
 /// Lanes across a road, each outwards from the reference line: kind and width in metres.
@@ -12,13 +13,6 @@ use super::super::road::{
 pub(super) struct CrossProfile {
     pub left: Vec<(LaneKind, f64)>,
     pub right: Vec<(LaneKind, f64)>,
-}
-
-/// One end of a road.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct RoadEnd {
-    pub road: usize,
-    pub contact: Contact,
 }
 
 /// A lane that leads into or out of a junction.
@@ -41,11 +35,6 @@ impl RoadEnd {
 
     pub(super) fn lane(self, lane: i32) -> LaneEnd {
         LaneEnd { end: self, lane }
-    }
-
-    fn link(self) -> Option<RoadLink> {
-        let Self { road, contact } = self;
-        Some(RoadLink::Road { road, contact })
     }
 }
 
@@ -118,12 +107,12 @@ impl Builder {
     /// Lets one road follow another, lane by lane on the right.
     pub(super) fn follow(&mut self, before: usize, after: usize) {
         let road = &mut self.network.roads[before];
-        road.successor = RoadEnd::start(after).link();
+        road.successor = Some(RoadLink::Road(RoadEnd::start(after)));
         for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
             lane.successor = Some(-(place as i32 + 1));
         }
         let road = &mut self.network.roads[after];
-        road.predecessor = RoadEnd::end(before).link();
+        road.predecessor = Some(RoadLink::Road(RoadEnd::end(before)));
         for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
             lane.predecessor = Some(-(place as i32 + 1));
         }
@@ -146,7 +135,8 @@ impl Builder {
         let connecting = self.push(vec![curve], elevation, section, limit_mps);
         let road = &mut self.network.roads[connecting];
         road.junction = Some(junction);
-        (road.predecessor, road.successor) = (from.end.link(), to.end.link());
+        road.predecessor = Some(RoadLink::Road(from.end));
+        road.successor = Some(RoadLink::Road(to.end));
         let connections = &mut self.network.junctions[junction].connections;
         connections.push(Connection {
             incoming: from.end.road,

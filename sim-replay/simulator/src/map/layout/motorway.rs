@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use super::super::curve::Pose2;
 use super::super::profile::Profile;
-use super::super::road::{LaneKind, RoadStructure};
-use super::builder::{Builder, CrossProfile, RoadEnd, path};
+use super::super::road::{LaneKind, RoadEnd};
+use super::builder::{Builder, CrossProfile, path};
 use super::ring::Ring;
 
 /// Distance between the poses that a carriageway's clothoids connect, metres.
@@ -118,16 +118,6 @@ impl Motorway {
         let right = vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)];
         let profile = CrossProfile { left, right };
         builder.road(curves, elevation, &profile, RAMP_LIMIT_MPS)
-    }
-
-    /// Puts a tunnel over a whole carriageway.
-    pub(super) fn cover(builder: &mut Builder, road: usize) {
-        let length_m = builder.network.roads[road].length_m;
-        builder.network.roads[road].structures.push(RoadStructure {
-            tunnel: true,
-            s_m: 0.0,
-            length_m,
-        });
     }
 
     /// Left edge of the first lane, in driving direction.

@@ -4,8 +4,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use super::super::curve::{CurveShape, PlanCurve, Pose2};
 use super::super::profile::Profile;
-use super::super::road::LaneKind;
-use super::builder::{Builder, CrossProfile, RoadEnd};
+use super::super::road::{LaneKind, RoadEnd};
+use super::builder::{Builder, CrossProfile};
 
 /// Width of the ring's lane, metres.
 const LANE_M: f64 = 5.0;

@@ -6,8 +6,8 @@ use rand_chacha::ChaCha8Rng;
 use super::super::curve::Pose2;
 use super::super::lane::wrap_angle;
 use super::super::profile::Profile;
-use super::super::road::LaneKind;
-use super::builder::{Builder, CrossProfile, RoadEnd, path};
+use super::super::road::{LaneKind, RoadEnd};
+use super::builder::{Builder, CrossProfile, path};
 
 /// Half of the largest angle by which a street leaves its edge's direction, radians.
 const WIGGLE_RAD: f64 = 0.16;

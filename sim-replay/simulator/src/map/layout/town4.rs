@@ -7,8 +7,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::super::profile::Profile;
-use super::super::road::LaneKind;
-use super::builder::{Builder, CrossProfile, RoadEnd, path};
+use super::super::road::{LaneKind, RoadEnd, RoadStructure};
+use super::builder::{Builder, CrossProfile, path};
 use super::grid::{GridPlan, grid, spread};
 use super::motorway::{Motorway, RAMP_ZONE_M};
 use super::ring::Ring;
@@ -112,7 +112,12 @@ fn interchange(
         let inner = motorway.carriageway(builder, before, after, direction);
         let stops = [after + zone, (after + zone + first) / 2.0, first, second];
         let [leaving, covered] = motorway.carriageways(builder, &stops, direction);
-        Motorway::cover(builder, covered);
+        let tunnel_road = &mut builder.network.roads[covered];
+        tunnel_road.structures.push(RoadStructure {
+            tunnel: true,
+            s_m: 0.0,
+            length_m: tunnel_road.length_m,
+        });
         let back = before - zone + direction * around;
         let [rest, arriving] =
             motorway.carriageways(builder, &[second, (second + back) / 2.0, back], direction);

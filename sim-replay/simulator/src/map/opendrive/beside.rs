@@ -45,7 +45,6 @@ pub(super) fn read_signal(element: Element) -> Result<RoadSignal> {
         _ => 0.0,
     };
     Ok(RoadSignal {
-        name: element.optional_text("name").unwrap_or_default().to_owned(),
         dynamic: element.optional_text("dynamic") == Some("yes"),
         s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
         t_m: element.number("t", -1e4, 1e4)?,

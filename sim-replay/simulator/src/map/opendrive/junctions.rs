@@ -4,7 +4,7 @@ use super::super::finding::FindingLog;
 use super::super::road::{Connection, Junction};
 use super::Ids;
 use super::element::{Element, Result, children, noted};
-use super::links::read_contact;
+use super::links::{read_contact, read_road};
 
 /// Reads a junction; connections that cannot be read are left out.
 pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junction {
@@ -45,16 +45,14 @@ fn read_connection(
         return Ok(None);
     }
     let mut lane_links = Vec::new();
-    let mut is_empty = true;
     for link in children(element, "laneLink") {
-        is_empty = false;
         match (link.lane_id("from"), link.lane_id("to")) {
             (Ok(from), Ok(to)) => lane_links.push((from, to)),
             (Err(error), _) | (_, Err(error)) => error.note(log, "lane link left out"),
         }
     }
     // Without any link, lanes of one id are linked; links that are all unreadable link nothing.
-    if lane_links.is_empty() && !is_empty {
+    if lane_links.is_empty() && element.child("laneLink").is_some() {
         return Err(element.error_element("has no lane link that can be read"));
     }
     Ok(Some(Connection {
@@ -63,10 +61,4 @@ fn read_connection(
         contact: read_contact(element)?,
         lane_links,
     }))
-}
-
-fn read_road(element: Element, attribute: &'static str, ids: &Ids) -> Result<usize> {
-    let id = element.text(attribute)?;
-    let found = ids.roads.get(id).copied();
-    found.ok_or_else(|| element.error_value(attribute, id, "the id of a road of this map"))
 }

@@ -1,7 +1,7 @@
 //! `<link>`: links at the ends of a road, and the junction that it leads through.
 
 use super::super::finding::FindingLog;
-use super::super::road::{Contact, Road, RoadLink};
+use super::super::road::{Contact, Road, RoadEnd, RoadLink};
 use super::Ids;
 use super::element::{Element, Result, noted};
 
@@ -33,22 +33,26 @@ fn read_link(element: Element, ids: &Ids) -> Result<RoadLink> {
             Some(&junction) => Ok(RoadLink::Junction(junction)),
             None => Err(element.error_value("elementId", id, "the id of a junction of this map")),
         },
-        "road" => match ids.roads.get(id) {
-            Some(&road) if element.optional_text("contactPoint").is_some() => Ok(RoadLink::Road {
-                road,
-                contact: read_contact(element)?,
-            }),
-            Some(_) if element.optional_text("elementS").is_some() => {
-                let at = element.optional_text("elementS").unwrap_or_default();
+        "road" => {
+            let road = read_road(element, "elementId", ids)?;
+            let end = element.optional_text("contactPoint");
+            if let (None, Some(at)) = (end, element.optional_text("elementS")) {
                 let problem =
                     format!("meets road {id} at s={at}, between its ends (virtual junction)");
-                Err(element.error_element(&problem))
+                return Err(element.error_element(&problem));
             }
-            Some(_) => Err(element.error_element("has no attribute contactPoint")),
-            None => Err(element.error_value("elementId", id, "the id of a road of this map")),
-        },
+            let contact = read_contact(element)?;
+            Ok(RoadLink::Road(RoadEnd { road, contact }))
+        }
         other => Err(element.error_value("elementType", other, "road or junction")),
     }
+}
+
+/// The road of an id in this map.
+pub(super) fn read_road(element: Element, attribute: &'static str, ids: &Ids) -> Result<usize> {
+    let id = element.text(attribute)?;
+    let found = ids.roads.get(id).copied();
+    found.ok_or_else(|| element.error_value(attribute, id, "the id of a road of this map"))
 }
 
 pub(super) fn read_contact(element: Element) -> Result<Contact> {

@@ -145,7 +145,8 @@ fn read_param_poly3(
 
 /// The curve, if it is about as long as its element; a short one that is not becomes a straight line.
 fn checked(element: Element, curve: PlanCurve, log: &mut FindingLog) -> Result<PlanCurve> {
-    if keeps_its_length(&curve) {
+    // No tenth may be longer than twice its nominal length, which arbitrary polynomials exceed.
+    if tenths_m(&curve).all(|chord_m| chord_m <= 0.2 * curve.length_m + 0.1) {
         return Ok(curve);
     }
     let expected = "about the length of its curve";
@@ -162,11 +163,6 @@ fn checked(element: Element, curve: PlanCurve, log: &mut FindingLog) -> Result<P
 fn fits(curve: &PlanCurve) -> bool {
     let measured_m: f64 = tenths_m(curve).sum();
     measured_m > 0.5 * curve.length_m && measured_m < 2.0 * curve.length_m
-}
-
-/// True if no tenth of a curve is longer than twice its nominal length, which arbitrary polynomials may exceed.
-fn keeps_its_length(curve: &PlanCurve) -> bool {
-    tenths_m(curve).all(|chord_m| chord_m <= 0.2 * curve.length_m + 0.1)
 }
 
 /// Distances between the ends of each tenth of a curve, metres.

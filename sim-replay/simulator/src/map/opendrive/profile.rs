@@ -96,9 +96,7 @@ fn read_shapes(parent: Element) -> Result<Vec<CrossShape>> {
                 }
                 records.push(record);
             }
-            Some(last) if last.s_m > s_m => {
-                return Err(element.error_order("s", s_m));
-            }
+            Some(last) if last.s_m > s_m => return Err(element.error_order("s", s_m)),
             _ => shapes.push(CrossShape {
                 s_m,
                 height_m: Profile {

@@ -10,7 +10,7 @@ use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind};
 use super::frontage::{RoadSide, Zone, sides};
 use super::parts::{PartFootprint, wall};
-use super::site::{Site, outline};
+use super::site::Site;
 
 /// Longest straight piece, metres.
 const PIECE_M: f64 = 12.0;
@@ -89,7 +89,7 @@ fn between_directions(site: &mut Site, road: usize) {
     // Inside a junction only where no lane leads across.
     parts.retain(|part| {
         let [a, b] = [part.bottom_m(), part.top_m()];
-        let outline = outline(part);
+        let outline = part.outline();
         network.roads[road].junction.is_none()
             && !site.surface.any(&outline, |patch| {
                 patch.road as usize != road

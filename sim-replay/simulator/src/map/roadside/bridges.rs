@@ -8,7 +8,7 @@ use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind, Terrain};
 
 use super::parts::wall;
-use super::site::{HEADROOM_M, Site, outline};
+use super::site::{HEADROOM_M, Site};
 
 /// A road this far above the terrain stands on a bridge, metres.
 const BRIDGE_M: f64 = 1.2;
@@ -89,7 +89,7 @@ fn parapet(site: &mut Site, road: usize, from: &CrossSection, to: &CrossSection)
         let edges = [from, to].map(|cut| cut.height_m(cut.paved_m[side]));
         let z = [edges[0].min(edges[1]) - 0.3, edges[0].max(edges[1]) + 1.0];
         let part = wall(SolidKind::Barrier, a, b, z, 0.25, 0.45);
-        let joined = site.surface.any(&outline(&part), |patch| {
+        let joined = site.surface.any(&part.outline(), |patch| {
             let own = patch.road as usize == road && !patch.carriageway;
             !own && z[0] < patch.high_m() + HEADROOM_M && z[1] > patch.low_m() - 0.05
         });
@@ -111,7 +111,7 @@ fn pillars(site: &mut Site, cut: &CrossSection, thickness_m: f64) {
             continue;
         }
         let pillar = foot.post(SolidKind::Pillar, -0.5, [0.55, height + 0.5], 0.4);
-        let around = outline(&pillar).grown(0.5);
+        let around = pillar.outline().grown(0.5);
         // Clear of the lanes below; its own slab above does not count.
         let z = [pillar.bottom_m(), pillar.top_m() - 0.2];
         if site.surface.is_clear(&around, z, HEADROOM_M, true) {
@@ -176,14 +176,14 @@ fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
             let height = [z[0] - 0.3, z[1] + TUNNEL_M];
             let part = wall(SolidKind::TunnelWall, p, q, height, 0.4, 0.4);
             let z = [z[0], z[1] + 1.0];
-            if site.surface.is_clear(&outline(&part), z, HEADROOM_M, true) {
+            if site.surface.is_clear(&part.outline(), z, HEADROOM_M, true) {
                 site.place(&[part]);
             }
         }
         let height = [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8];
         let roof = slab(a, b, height, 1.3);
         let z = [roof.bottom_m(), roof.top_m()];
-        if site.surface.is_clear(&outline(&roof), z, HEADROOM_M, true) {
+        if site.surface.is_clear(&roof.outline(), z, HEADROOM_M, true) {
             site.place(&[roof]);
         }
         s = next;

@@ -1,6 +1,5 @@
 //! Ground plan of a scene: outlines that are occupied, and solids that have been placed.
 
-pub(super) use super::super::clearance::outline;
 use super::super::convex::{CellIndex, PlanRectangle, bounds, overlap, range};
 use super::super::curve::Pose2;
 use super::super::ground::Ground;
@@ -67,7 +66,7 @@ impl<'a> Site<'a> {
     /// Places all of `parts` if each is free, with `margin_m` around; else none of them. Parts may touch each other.
     pub(super) fn try_place(&mut self, parts: &[Solid], margin_m: f64, pavements: bool) -> bool {
         let free = parts.iter().all(|part| {
-            let outline = outline(part).grown(margin_m);
+            let outline = part.outline().grown(margin_m);
             self.is_free(&outline, [part.bottom_m(), part.top_m()], pavements)
         });
         if free {
@@ -79,7 +78,7 @@ impl<'a> Site<'a> {
     /// Places parts without a check: for parts of a road, or parts on ground reserved before.
     pub(super) fn place(&mut self, parts: &[Solid]) {
         for part in parts {
-            self.take(&outline(part), [part.bottom_m(), part.top_m()]);
+            self.take(&part.outline(), [part.bottom_m(), part.top_m()]);
             self.solids.push(*part);
         }
     }
