@@ -9,7 +9,7 @@ use crc32fast::Hasher;
 use crate::body::{PayloadReader, check_body};
 use crate::checks::check_limit;
 use crate::header::{HEADER_LEN, Header, Stamp};
-use crate::message::{Message, Payload};
+use crate::message::{Message, MessageSource, MessageVisitor, Payload};
 use crate::{Body, Limits, WireError, metadata};
 
 /// A message as it is transmitted: `head`, then `body`, nothing between or after.
@@ -74,7 +74,18 @@ pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireErro
 /// # Errors
 /// As [`encode`].
 pub fn encode_any(stamp: &Stamp, message: Message) -> Result<Encoded, WireError> {
-    message.encode(stamp)
+    message.visit(StampEncoder(stamp))
+}
+
+/// Encoding of a message of any kind.
+struct StampEncoder<'a>(&'a Stamp);
+
+impl MessageVisitor for StampEncoder<'_> {
+    type Output = Result<Encoded, WireError>;
+
+    fn visit<M: Payload>(self, message: M) -> Self::Output {
+        encode(self.0, message)
+    }
 }
 
 /// Reads the header only: sender, kind, times, sizes. Touches the first 92 bytes only, so that it may be called where
@@ -84,16 +95,20 @@ pub fn encode_any(stamp: &Stamp, message: Message) -> Result<Encoded, WireError>
 /// [`WireError`] when there is no header of this version.
 pub fn decode_header<'a>(pieces: impl IntoIterator<Item = &'a [u8]>) -> Result<Header, WireError> {
     let mut bytes = [0; HEADER_LEN];
-    let mut found = 0;
-    for (byte, from) in bytes.iter_mut().zip(pieces.into_iter().flatten()) {
-        *byte = *from;
-        found += 1;
+    let mut left = bytes.as_mut_slice();
+    for piece in pieces {
+        let (filled, rest) = left.split_at_mut(piece.len().min(left.len()));
+        for (byte, from) in filled.iter_mut().zip(piece) {
+            *byte = *from;
+        }
+        left = rest;
+        if left.is_empty() {
+            return Header::from_bytes(&bytes);
+        }
     }
     let expected = HEADER_LEN as u64;
-    if found < expected {
-        return Err(WireError::Truncated { expected, found });
-    }
-    Header::from_bytes(&bytes)
+    let found = expected - left.len() as u64;
+    Err(WireError::Truncated { expected, found })
 }
 
 /// Decodes a message of a known kind from its pieces.
@@ -125,16 +140,16 @@ pub fn decode_any<'a>(
 }
 
 /// A message whose header and lengths have been checked.
-pub(crate) struct Opened<'a, 'b> {
+struct Opened<'a, 'b> {
     header: Header,
     /// Holds exactly as many bytes as the header announces.
     reader: PayloadReader<'a>,
     limits: &'b Limits,
 }
 
-impl Opened<'_, '_> {
+impl MessageSource for &mut Opened<'_, '_> {
     /// Reads the payload. The checksum is reported first: all other errors of a corrupted message are consequences.
-    pub(crate) fn read<M: Payload>(&mut self) -> Result<M, WireError> {
+    fn read<M: Payload>(self) -> Result<M, WireError> {
         let parts = self.read_parts::<M>();
         let (expected, found) = (self.reader.finish(), self.header.payload_crc);
         if expected != found {
@@ -147,7 +162,9 @@ impl Opened<'_, '_> {
         }
         M::from_parts(metadata, body)
     }
+}
 
+impl Opened<'_, '_> {
     fn read_parts<M: Payload>(&mut self) -> Result<(M::Metadata, Body, bool), WireError> {
         let len = self.header.metadata_len as usize;
         let metadata: M::Metadata = metadata::decode(M::KIND, &self.reader.read_bytes(len))?;
@@ -159,7 +176,7 @@ impl Opened<'_, '_> {
 }
 
 /// Reads the header and compares all lengths with each other and with the limits.
-pub(crate) fn open<'a, 'b>(
+fn open<'a, 'b>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     limits: &'b Limits,
 ) -> Result<Opened<'a, 'b>, WireError> {

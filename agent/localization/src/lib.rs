@@ -2,6 +2,7 @@
 //!
 //! - [`pgc`]: pose generation with confidence, the method of the paper: scene-coordinate regression and a robust
 //!   solver.
+//! - [`map_search`]: the pose of a sweep on a surfel map, without any training.
 //! - [`baselines`]: networks that the paper compares it with.
 //! - [`registration`]: pose from correspondences (Kabsch, RANSAC, SC2-PCR) and ICP.
 //! - [`pose_source`]: origins of a vehicle's pose: recorded, noisy, estimated by one of the above.
@@ -35,7 +36,9 @@
 pub mod baselines;
 pub mod covariance_scale;
 pub mod map_registration;
+pub mod map_search;
 pub mod pgc;
+pub mod place_localizer;
 pub mod pose_covariance;
 pub mod pose_source;
 pub mod registration;

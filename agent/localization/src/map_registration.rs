@@ -6,22 +6,27 @@
 //! and another one is rejected: fog leaves as few partners at a right pose as at a wrong one. A sweep with a predicted
 //! pose is registered to it first, and the localizer is asked only if that fails.
 
+use std::cell::OnceCell;
 use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix6};
 use perception::weights::FileError;
+use protocol::PointCloud;
 
 use crate::covariance_scale::CovarianceScale;
 use crate::pgc::pose_evidence::PoseEvidence;
 use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
-use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, register};
+use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, Plane, register};
 
 /// Stage of a localization.
-const REGISTER: &str = "pose register";
+pub(crate) const REGISTER: &str = "pose register";
 /// Least share of the points above the ground with a partner, with which a registered pose is taken.
 const CONFIRMED: f64 = 0.2;
+/// Least share of the sweep's planes that agree with the map, with which one is taken that is not confirmed so: in fog
+/// scattered returns count among the points above the ground, and make no planes. Chosen on validation drives.
+pub(crate) const AGREED: f64 = 0.5;
 /// Confidence of the localizer with which a pose stays that the map does not confirm.
 const SURE: f64 = 0.8;
 /// Largest distance of a registered pose from its start, metres: a step beyond is no refinement.
@@ -32,12 +37,63 @@ const STD_FACTOR: f64 = 4.0;
 /// Smallest standard deviations: of a position per axis, metres, and of a rotation, radians.
 const LEAST_STD: [f64; 2] = [0.002, 1e-4];
 
+/// A sweep that is registered to a map.
+#[derive(Debug)]
+pub(crate) struct SweepOnMap<'a> {
+    cloud: &'a PointCloud,
+    config: IcpConfig,
+    source: IcpSource,
+    planes: OnceCell<Vec<Plane>>,
+}
+
+impl<'a> SweepOnMap<'a> {
+    pub(crate) fn new(cloud: &'a PointCloud) -> Self {
+        let config = SurfelMap::registration();
+        Self {
+            cloud,
+            source: IcpSource::of_sweep(&cloud.xyzi, &config),
+            config,
+            planes: OnceCell::new(),
+        }
+    }
+
+    /// The planes of the sweep, in the frame of its sensor.
+    pub(crate) fn planes(&self) -> &[Plane] {
+        self.planes
+            .get_or_init(|| SurfelMap::planes_of_sweep(&self.cloud.xyzi))
+    }
+
+    /// The registration from `start`, if it constrains the pose and stays near.
+    pub(crate) fn fit(&self, map: &SurfelMap, start: &Isometry3<f64>) -> Option<IcpFit> {
+        let fit = register(&self.source, map.target(), start, &self.config).ok()?;
+        let moved = fit.target_from_source.translation.vector - start.translation.vector;
+        (moved.norm() <= MOST_MOVED_M).then_some(fit)
+    }
+
+    /// Share of the planes that agree with the map.
+    pub(crate) fn agreement(&self, map: &SurfelMap, fit: &IcpFit) -> f64 {
+        map.target()
+            .agreement(self.planes(), &fit.target_from_source)
+    }
+
+    /// The pose of that registration, if the map confirms it.
+    pub(crate) fn registered(&self, map: &SurfelMap, start: &Isometry3<f64>) -> Option<FoundPose> {
+        let fit = self.fit(map, start)?;
+        self.confirms(map, &fit)
+            .then(|| found_pose(&fit, map.covariance_scale))
+    }
+
+    /// True if enough of the sweep lies on the map.
+    pub(crate) fn confirms(&self, map: &SurfelMap, fit: &IcpFit) -> bool {
+        fit.overlap_above_ground >= CONFIRMED || self.agreement(map, fit) >= AGREED
+    }
+}
+
 /// A localizer whose poses are registered to a surfel map.
 #[derive(Debug)]
 pub struct MapRegistration {
     localizer: Box<dyn Localize>,
     map: SurfelMap,
-    config: IcpConfig,
 }
 
 impl MapRegistration {
@@ -58,29 +114,19 @@ impl MapRegistration {
             _ => Ok(Box::new(Self {
                 localizer,
                 map: surfels,
-                config: SurfelMap::registration(),
             })),
         }
-    }
-
-    /// The pose of the registration from `start`, if it constrains the pose, stays near and the map confirms it.
-    fn registered(&self, source: &IcpSource, start: &Isometry3<f64>) -> Option<FoundPose> {
-        let fit = register(source, self.map.target(), start, &self.config).ok()?;
-        let moved = fit.target_from_source.translation.vector - start.translation.vector;
-        let is_near = moved.norm() <= MOST_MOVED_M;
-        (is_near && fit.overlap_above_ground >= CONFIRMED)
-            .then(|| found_pose(&fit, self.map.covariance_scale))
     }
 }
 
 impl Localize for MapRegistration {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = stopwatch();
-        let source = IcpSource::of_sweep(&sweep.cloud.xyzi, &self.config);
+        let on_map = SweepOnMap::new(sweep.cloud);
         // Step: near the prediction. Where the map confirms it, the networks are not needed.
         let near = sweep
             .predicted
-            .and_then(|start| self.registered(&source, &start));
+            .and_then(|start| on_map.registered(&self.map, &start));
         let registering = times.lap(REGISTER);
         if let Some(found) = near {
             return Ok(Localization::new(&Ok(found), times));
@@ -90,7 +136,7 @@ impl Localize for MapRegistration {
         localization.times.add(REGISTER, registering);
         let published = localization.found.filter(|found| !found.is_rejected);
         if let Some(found) = published {
-            let registered = self.registered(&source, &found.world_from_sensor);
+            let registered = on_map.registered(&self.map, &found.world_from_sensor);
             localization = judged(localization, &found, registered);
             localization.times.lap(REGISTER);
         }
@@ -127,7 +173,7 @@ fn judged(
 }
 
 /// The pose of a registration. Its confidence is that of the expected squared error (Eq. 6).
-fn found_pose(fit: &IcpFit, covariance_scale: Option<CovarianceScale>) -> FoundPose {
+pub(crate) fn found_pose(fit: &IcpFit, covariance_scale: Option<CovarianceScale>) -> FoundPose {
     let [position, rotation] = LEAST_STD.map(|std: f64| std * std);
     let least = [position, position, position, rotation, rotation, rotation];
     let least = Matrix6::from_diagonal(&least.into());
@@ -169,17 +215,13 @@ mod tests {
         }
     }
 
-    /// A sweep of the yard, with points above it that are on no plane of its map.
+    /// A sweep of the yard, with a number of points on walls that are not on its map.
     fn sweep(unmapped: u32) -> PointCloud {
         let mut xyzi = yard();
-        let place = |step: u32| step as f32 * 0.6 - 7.8;
         let point = |k: u32| {
-            [
-                place(k % 27),
-                place(k / 27 % 27),
-                14.0 + place(k / 729),
-                0.1,
-            ]
+            let (along, up, wall) = (k % 100, k / 100 % 20, k / 2000);
+            let [along, up] = [along as f32 * 0.35 - 17.5, up as f32 * 0.3 + 6.0];
+            [along, 4.0 * wall as f32 - 16.0, up, 0.1]
         };
         xyzi.extend((0..unmapped).map(point));
         PointCloud { xyzi }

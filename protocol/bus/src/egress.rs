@@ -67,32 +67,49 @@ const SMALL_QUEUES: [&str; 5] = [
 
 /// zenoh's `qos/network`. Each rule sees what the ones before it have made of a message.
 fn rules() -> Value {
+    // zenoh 1.10 writes an open end as 0: a configuration that it prints would not mean the same.
+    let large = json!({"payload_size": format!("{LARGE_BYTES}..{}", u32::MAX)});
     let tensors = TENSOR_PRIORITIES.map(|priority| {
         let filter = json!({"congestion_control": "block", "priority": priority});
-        let mut large = rule(&format!("egress-{priority}"), &filter, "block_first");
-        // zenoh 1.10 writes an open end as 0: a configuration that it prints would not mean the same.
-        large["payload_size"] = json!(format!("{LARGE_BYTES}..{}", u32::MAX));
-        large
+        let id = format!("egress-{priority}");
+        rule(&id, &filter, "block_first", &large)
     });
-    // What is still `block` here is no large tensor: the rules above have made those `block_first`.
-    let others = rule("egress", &json!({"congestion_control": "block"}), "drop");
-    // For receivers on the loopback large tensors are dropped like all else.
-    let block_first = json!({"congestion_control": "block_first"});
-    let mut here = rule("egress-here", &block_first, "drop");
-    here["interfaces"] = json!(LOOPBACK);
-    // Last: it overrides the rules above for lossless publishers, which alone use this priority.
-    let real_time = json!({"priority": "real_time"});
-    let lossless = rule("egress-lossless", &real_time, "block");
-    let rules = tensors.into_iter().chain([others, here, lossless]);
-    rules.collect()
+    let others = [
+        rule(
+            "egress",
+            // What is still `block` here is no large tensor: the rules above have made those `block_first`.
+            &json!({"congestion_control": "block"}),
+            "drop",
+            &json!({}),
+        ),
+        rule(
+            "egress-here",
+            // For receivers on the loopback large tensors are dropped like all else.
+            &json!({"congestion_control": "block_first"}),
+            "drop",
+            &json!({"interfaces": LOOPBACK}),
+        ),
+        rule(
+            "egress-lossless",
+            // Last: it overrides the rules above for lossless publishers, which alone use this priority.
+            &json!({"priority": "real_time"}),
+            "block",
+            &json!({}),
+        ),
+    ];
+    tensors.into_iter().chain(others).collect()
 }
 
-fn rule(id: &str, filter: &Value, congestion_control: &str) -> Value {
-    json!({
+fn rule(id: &str, filter: &Value, congestion_control: &str, only: &Value) -> Value {
+    let mut rule = json!({
         "id": id,
         "messages": ["put"],
         "flows": ["egress"],
         "qos": filter,
         "overwrite": {"congestion_control": congestion_control},
-    })
+    });
+    if let (Some(rule), Some(only)) = (rule.as_object_mut(), only.as_object()) {
+        rule.extend(only.clone());
+    }
+    rule
 }

@@ -40,6 +40,7 @@ pub use pose_estimate::{NoPoseReason, PlanarCovariance, PoseEstimate};
 pub use stats::{ProcessUsage, StageSummary, StageTiming, Stats, TopicTraffic};
 pub use sweep::{Lidar, Points, PointsMetadata, Radar, SweepMetadata};
 pub use table::{Kind, Message};
+pub(crate) use table::{MessageSource, MessageVisitor};
 pub use tracks::{Track, Tracks};
 pub use truth::{AgentTruth, TrueObject, Truth};
 

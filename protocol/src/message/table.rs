@@ -3,10 +3,25 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Bev, Boxes, Camera, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Points,
-    PoseEstimate, Radar, Stats, Tracks, Truth,
+    Bev, Boxes, Camera, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Payload,
+    Points, PoseEstimate, Radar, Stats, Tracks, Truth,
 };
 use crate::WireError;
+
+/// Operation on a message of any kind.
+pub(crate) trait MessageVisitor {
+    /// Result of the operation.
+    type Output;
+
+    /// Operates on a message.
+    fn visit<M: Payload>(self, message: M) -> Self::Output;
+}
+
+/// Source of one message whose kind is known.
+pub(crate) trait MessageSource {
+    /// Decodes the message.
+    fn read<M: Payload>(self) -> Result<M, WireError>;
+}
 
 /// Rows `number => Variant(Type) = "name"`, each with its documentation.
 macro_rules! messages {
@@ -46,17 +61,17 @@ macro_rules! messages {
                 }
             }
 
-            /// [`crate::wire::encode`] for the message that this is.
-            pub(crate) fn encode(self, stamp: &crate::Stamp) -> Result<crate::Encoded, WireError> {
+            /// Applies an operation to the message.
+            pub(crate) fn visit<V: MessageVisitor>(self, visitor: V) -> V::Output {
                 match self {
-                    $(Self::$variant(message) => crate::wire::encode(stamp, message),)+
+                    $(Self::$variant(message) => visitor.visit(message),)+
                 }
             }
 
             /// Reads a message of a kind.
-            pub(crate) fn read(kind: Kind, opened: &mut crate::wire::Opened<'_, '_>) -> Result<Self, WireError> {
+            pub(crate) fn read<S: MessageSource>(kind: Kind, source: S) -> Result<Self, WireError> {
                 match kind {
-                    $(Kind::$variant => opened.read().map(Self::$variant),)+
+                    $(Kind::$variant => source.read().map(Self::$variant),)+
                 }
             }
         }
@@ -105,7 +120,8 @@ mod tests {
     mod dummy {
         use serde::{Deserialize, Serialize};
 
-        use crate::{Body, BodyShape, Limits, Payload, WireError};
+        use super::super::{MessageSource, MessageVisitor, Payload};
+        use crate::{Body, BodyShape, Limits, WireError};
 
         #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
         pub(crate) struct Ping {
@@ -139,7 +155,26 @@ mod tests {
 
     use dummy::{Kind, Message, Ping};
 
-    use crate::{CavId, Limits, Stamp, WireError, wire};
+    use super::{MessageSource, MessageVisitor, Payload};
+    use crate::WireError;
+
+    struct MetadataBytes;
+
+    impl MessageVisitor for MetadataBytes {
+        type Output = Vec<u8>;
+
+        fn visit<M: Payload>(self, message: M) -> Vec<u8> {
+            serde_json::to_vec(&message.into_parts().0).unwrap()
+        }
+    }
+
+    struct FromBytes(Vec<u8>);
+
+    impl MessageSource for FromBytes {
+        fn read<M: Payload>(self) -> Result<M, WireError> {
+            M::from_parts(serde_json::from_slice(&self.0).unwrap(), crate::Body::Empty)
+        }
+    }
 
     #[test]
     fn a_new_message_is_one_row() {
@@ -157,15 +192,7 @@ mod tests {
             Kind::from_wire(1),
             Err(WireError::UnknownKind { found: 1 })
         ));
-        let stamp = Stamp {
-            cav: CavId::new("1").unwrap(),
-            epoch: 0,
-            sequence: 0,
-            capture_nanos: 0,
-            publish_nanos: 0,
-        };
-        let encoded = ping.clone().encode(&stamp).unwrap();
-        let mut opened = wire::open(encoded.pieces(), &Limits::DEFAULT).unwrap();
-        assert_eq!(Message::read(Kind::Ping, &mut opened).unwrap(), ping);
+        let bytes = ping.clone().visit(MetadataBytes);
+        assert_eq!(Message::read(Kind::Ping, FromBytes(bytes)).unwrap(), ping);
     }
 }

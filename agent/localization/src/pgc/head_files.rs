@@ -8,6 +8,7 @@ use support::file_error::Result;
 use support::shared_files;
 
 use super::{CellEncoder, SceneHead, SceneHeadConfig};
+use crate::registration::icp::surfel_map::SurfelMap;
 
 /// Ending of weights files.
 const ENDING: &str = "safetensors";
@@ -23,11 +24,16 @@ const SURFELS_PREFIX: &str = "surfels-";
 /// Folders of released weights from the working directory.
 const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
 
-/// The file of a head: a path, the folder of a training, or the name of a released one (`town1` or `pgc-town1`).
+/// The file of a head: a path, the folder of a training, or the name of a released one (`town1` or `pgc-town1`). A surfel
+/// map stands in for a head: its file, or the folder of a place that has no head.
 ///
 /// # Errors
 /// [`FileError`] with the names of the released heads.
 pub fn head_file(head: &Path) -> Result<PathBuf> {
+    let surfels = head.join(SURFELS_FILE);
+    if surfels.is_file() && !head.join(TRAINED_FILE).is_file() {
+        return Ok(surfels);
+    }
     released_file(head, "head", HEAD_PREFIX, TRAINED_FILE)
 }
 
@@ -65,11 +71,14 @@ fn released_file(head: &Path, kind: &str, prefix: &str, trained: &str) -> Result
 }
 
 /// The encoder of a head, scene encoder or detector: the file whose digest its metadata names, of those beside it or
-/// released; without one `pgc-encoder.safetensors` beside it.
+/// released; without one `pgc-encoder.safetensors` beside it. Empty for a surfel map in place of a head, which has none.
 ///
 /// # Errors
 /// [`FileError`] when there is none, or the head cannot be read.
 pub fn encoder_of(head: &Path) -> Result<PathBuf> {
+    if SurfelMap::is_in(head) {
+        return Ok(PathBuf::new());
+    }
     let beside = Some(head.with_file_name(ENCODER_FILE)).filter(|file| file.is_file());
     match (named_encoder(head), beside) {
         (Ok(Ok(found)), _) => Ok(found),

@@ -15,10 +15,20 @@ const LEVEL_M: f32 = 0.3;
 
 /// The hint, with the place in the head's metadata and the map of the scene, as far as they are known.
 pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> String {
-    let place = Weights::load(head).and_then(|weights| weights.config::<SceneHeadConfig>());
-    let place = place.ok().map(|config| config.scene_name);
+    let place = config_of(head).map(|config| config.scene_name);
     let head = head.display().to_string();
     hint(sweeps, &head, place.as_deref(), scene_map)
+}
+
+/// Median number of points of the sweeps that a head was made from, if its file states it.
+pub fn sweep_points(head: &Path) -> Option<usize> {
+    config_of(head)?.sweep_points
+}
+
+fn config_of(head: &Path) -> Option<SceneHeadConfig> {
+    Weights::load(head)
+        .and_then(|weights| weights.config())
+        .ok()
 }
 
 /// The hint that sweeps are those of another LiDAR, if their median number of points is far from that of

@@ -1,6 +1,6 @@
 //! Pose source that estimates from the sweep alone: no receiver, no recording.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use perception::inference::Inference;
 use protocol::config::{FieldError, within};
@@ -15,6 +15,7 @@ use crate::baselines::{LightLoc, load_baseline};
 use crate::map_registration::MapRegistration;
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, Localizer, Result};
+use crate::place_localizer::place_localizer;
 
 /// Networks of PGC.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -25,8 +26,8 @@ pub struct PgcConfig {
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
     pub encoder: PathBuf,
-    /// Weights of the scene-specific head: a file, the folder that `agent map` wrote, or a released one, town1 or town4
-    /// (pose sources pgc and tracked).
+    /// Weights of the scene-specific head: a file, the folder that `agent map` wrote, or a released one, town1 or town4; or
+    /// a surfel map, in which sweeps are sought without networks (pose sources pgc and tracked).
     #[arg(long, value_name = "FILE|NAME")]
     pub head: PathBuf,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
@@ -76,18 +77,20 @@ impl LocalizedPose {
     /// # Errors
     /// [`crate::pgc::LocalizerError`] names the file and what is wrong with it.
     pub fn pgc(config: &PgcConfig, inference: Inference) -> Result<Self> {
-        let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         let min_confidence = config.min_confidence;
-        localizer.set_min_confidence(min_confidence);
-        let solver = PoseSolver {
-            min_confidence,
-            ..PoseSolver::default()
+        let files: [&Path; 3] = [&config.encoder, &config.head, &config.surfel_map];
+        let localizer = match config.lightloc {
+            true => {
+                let localizer = Localizer::load(&config.encoder, &config.head, inference)?;
+                let solver = PoseSolver {
+                    min_confidence,
+                    ..PoseSolver::default()
+                };
+                let localizer = Box::new(LightLoc::new(localizer, solver));
+                MapRegistration::of(localizer, &config.surfel_map)?
+            }
+            false => place_localizer(files, min_confidence, inference, |_| ())?,
         };
-        let localizer: Box<dyn Localize> = match config.lightloc {
-            true => Box::new(LightLoc::new(localizer, solver)),
-            false => Box::new(localizer),
-        };
-        let localizer = MapRegistration::of(localizer, &config.surfel_map)?;
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 

@@ -3,7 +3,7 @@
 //! The pose of a sweep is known before anything is computed from it. What the localizer measures in the sweep corrects
 //! the poses of later ones. A vehicle that is lost is localized first, as by `pgc`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use perception::inference::Inference;
 use protocol::config::{FieldError, within};
@@ -13,8 +13,8 @@ use serde::{Deserialize, Serialize};
 
 use super::settings::{PoseSettings, require_file};
 use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
-use crate::map_registration::MapRegistration;
-use crate::pgc::{Localization, Localize, Localizer, LocalizerError};
+use crate::pgc::{Localization, Localize, LocalizerError};
+use crate::place_localizer::place_localizer;
 use crate::tracker::{
     Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits, seconds,
 };
@@ -152,12 +152,10 @@ impl TrackedPose {
         config: &TrackedPoseConfig,
         inference: Inference,
     ) -> Result<Box<dyn Localize>, LocalizerError> {
-        let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
-        localizer.most_parts = MOST_PARTS;
-        localizer.set_min_confidence(config.min_confidence);
-        // Outermost: near a prediction the registration alone may suffice, without the networks.
-        let localizer = MapRegistration::of(Box::new(localizer), &config.surfel_map);
-        Ok(localizer?)
+        let files: [&Path; 3] = [&config.encoder, &config.head, &config.surfel_map];
+        place_localizer(files, config.min_confidence, inference, |pgc| {
+            pgc.most_parts = MOST_PARTS;
+        })
     }
 
     /// Follows a vehicle with another localizer.

@@ -15,6 +15,7 @@ use dataset::{self, LeftOut};
 use localization::baselines::{LightLoc, ScanContext, load_baseline, load_descriptor};
 use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 use localization::map_registration::MapRegistration;
+use localization::map_search::MapSearch;
 use localization::pgc::confidence::{
     CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Labelled, Rejection,
 };
@@ -330,6 +331,9 @@ impl Args {
         }
         if let Some(weights) = &self.baseline {
             return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
+        }
+        if let Some(search) = MapSearch::of_file(head).map_err(BadInput::of)? {
+            return self.registered(Box::new(search));
         }
         // A stored model may be of an earlier version with other features: a new fit does not read it.
         let load = match self.fit_confidence {

@@ -5,11 +5,13 @@ use std::path::{Path, PathBuf};
 use dataset::IntensityScale;
 use dataset::cloud_files::{CloudFile, clouds_at};
 use dataset::findings::{self, SweepFindings};
-use localization::map_registration::MapRegistration;
 use localization::pgc::head_files::{encoder_or_named, head_file};
 use localization::pgc::pose_solver::FoundPose;
-use localization::pgc::wrong_place::{lowest_m, other_lidar_hint, vehicle_frame_hint};
-use localization::pgc::{Localization, Localize, Localizer, LocalizerInput};
+use localization::pgc::wrong_place::{
+    lowest_m, other_lidar_hint, sweep_points, vehicle_frame_hint,
+};
+use localization::pgc::{Localization, Localize, LocalizerInput};
+use localization::place_localizer::place_localizer;
 use localization::pose_covariance::{pose_covariance, position_bound_m};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
@@ -41,7 +43,8 @@ pub(crate) struct Args {
     /// Point clouds, or folders of them.
     #[arg(required = true, value_name = "CLOUD")]
     clouds: Vec<PathBuf>,
-    /// Weights of the head of the place: a file, the folder that `agent map` wrote, or a released one (town1, town4).
+    /// Weights of the head of the place: a file, the folder that `agent map` wrote, or a released one (town1, town4); or a
+    /// surfel map, in which clouds are sought without networks.
     #[arg(long, value_name = "FILE|NAME")]
     head: PathBuf,
     /// Weights of the encoder, or of a detector that has it [default: those that the head names, beside it or released].
@@ -128,16 +131,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let encoder = encoder_or_named(args.encoder.as_deref(), &head).map_err(BadInput::of)?;
     let inference = Inference::new(Device::Cpu, args.precision);
     within("--min-confidence", args.min_confidence, 0.0, 1.0).map_err(BadInput::of)?;
-    let mut localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
-    localizer.set_min_confidence(args.min_confidence);
-    let head_config = localizer.head_config().clone();
-    let map = surfel_map(args.surfel_map.as_deref())?;
-    let localizer = MapRegistration::of(Box::new(localizer), &map);
+    let files = [&encoder, &head, &surfel_map(args.surfel_map.as_deref())?];
+    let files = files.map(PathBuf::as_path);
+    let localizer = place_localizer(files, args.min_confidence, inference, |_| ());
     let mut localizer = localizer.map_err(BadInput::of)?;
+    let place = localizer.place().unwrap_or_default().to_owned();
     let (mut found, mut lost, mut bad) = (0, 0, 0);
     let (mut points, mut sweeps, mut lowest) = (Vec::new(), Vec::new(), Vec::new());
     for file in clouds_at(&args.clouds) {
-        let located = args.locate(&mut *localizer, &head_config.scene_name, file, &mut sweeps)?;
+        let located = args.locate(&mut *localizer, &place, file, &mut sweeps)?;
         match (&located.error, &located.pose) {
             (Some(_), _) => bad += 1,
             (None, Some(_)) => found += 1,
@@ -162,16 +164,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
     }
     if found == 0 && lost > 0 {
-        let (head, map) = (head.display(), &head_config.scene_name);
+        let head = head.display();
         output::note(format_args!(
             "no cloud found itself: is {head} the head of this place and this LiDAR, and were these roads driven for \
-             it? Its map is {map}"
+             it? Its map is {place}"
         ));
     }
     let folder = args.clouds.first().map_or(Path::new(""), PathBuf::as_path);
     let sweeps: Vec<&SweepFindings> = sweeps.iter().collect();
     findings::note(&findings::of_clouds(folder, &sweeps, IntensityScale::AUTO));
-    let other_lidar = other_lidar_hint(head_config.sweep_points, &points);
+    let other_lidar = other_lidar_hint(sweep_points(&head), &points);
     for hint in other_lidar.into_iter().chain(vehicle_frame_hint(&lowest)) {
         output::note(hint);
     }

@@ -33,7 +33,7 @@ const MAX_LEAN_RAD: f64 = 0.03;
 
 /// Cells of one sweep of a pair that enter the loss.
 #[derive(Debug)]
-pub struct ChosenCells {
+pub(crate) struct ChosenCells {
     /// The sweep, rotated at random.
     pub sweep: SweepVoxels,
     /// `[n]`: indices of its cells.
@@ -46,7 +46,7 @@ pub struct ChosenCells {
 
 /// Two sweeps of the same place.
 #[derive(Debug)]
-pub struct Pair {
+pub(crate) struct Pair {
     /// The sweep whose cells are the queries.
     pub anchor: ChosenCells,
     /// The sweep whose cells are the candidates.

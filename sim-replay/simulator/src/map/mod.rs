@@ -7,6 +7,7 @@
 //! # Frames and units
 //! World frame of the map: right-handed, x east, y north, z up, metres; yaw turns x towards y.
 
+mod clearance;
 mod clothoid;
 mod conflicts;
 mod convex;

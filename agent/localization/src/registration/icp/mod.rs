@@ -10,18 +10,21 @@ pub mod surfel_map;
 mod surfels;
 
 use nalgebra::{
-    Isometry3, Matrix6, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6,
+    Isometry3, Matrix6, Point3, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6,
 };
 use serde::{Deserialize, Serialize};
 
+pub(crate) use surfels::Surfel as Plane;
 use surfels::{Surfels, decimate};
 
 /// Distance that a rotation of one radian moves a typical point, metres: makes rotations and translations comparable.
 const LEVER_M: f64 = 10.0;
-/// Smallest vertical part of the normal of a level plane.
-const LEVEL_NORMAL_Z: f64 = 0.9;
 /// A step smaller than this ends a level: metres and, times [`LEVER_M`], radians.
 const CONVERGED_M: f64 = 1e-3;
+
+/// Largest distance of two planes that agree, metres, and smallest cosine between their normals.
+const AGREED_M: f64 = 0.2;
+const AGREED_COSINE: f64 = 0.85;
 
 /// One level of resolution.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -126,6 +129,34 @@ impl IcpTarget {
     /// Fits the planes to all that has been added.
     pub fn fit(&mut self) {
         self.levels.iter_mut().for_each(Surfels::fit);
+    }
+
+    /// The planes of the finest level, in the target frame.
+    pub(crate) fn finest_planes(&self) -> impl Iterator<Item = Plane> {
+        let origin_m = self.origin_m.unwrap_or_default();
+        let planes = self.levels.last().into_iter().flat_map(Surfels::planes);
+        planes.map(move |(_, plane)| Plane {
+            centre_m: plane.centre_m + origin_m,
+            normal: plane.normal,
+        })
+    }
+
+    /// Share of a sweep's planes that lie on a plane of the same direction; level ones, which fit everywhere, do not count.
+    pub(crate) fn agreement(&self, planes: &[Plane], target_from_sensor: &Isometry3<f64>) -> f64 {
+        let origin_m = self.origin_m.unwrap_or_default();
+        let standing = planes.iter().filter(|plane| !plane.is_level());
+        let (mut count, mut agreed) = (0, 0);
+        for plane in standing {
+            let centre_m = (target_from_sensor * Point3::from(plane.centre_m)).coords - origin_m;
+            let normal = target_from_sensor * plane.normal;
+            let near = self.levels.last().and_then(|planes| planes.near(&centre_m));
+            count += 1;
+            agreed += i32::from(near.is_some_and(|near| {
+                let distance_m = near.normal.dot(&(centre_m - near.centre_m));
+                distance_m.abs() < AGREED_M && near.normal.dot(&normal).abs() > AGREED_COSINE
+            }));
+        }
+        f64::from(agreed) / f64::from(count.max(1))
     }
 
     /// Planes at the finest level.
@@ -319,7 +350,7 @@ impl NormalEquations {
             // Three scales, squared. Pairs beyond have less than a hundredth of the weight: no overlap.
             if scaled < 9.0 {
                 sums.pairs += 1.0;
-                if plane.normal.z.abs() > LEVEL_NORMAL_Z {
+                if plane.is_level() {
                     sums.ground_pairs += 1.0;
                 }
                 sums.squares += distance * distance;

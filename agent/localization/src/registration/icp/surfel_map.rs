@@ -19,7 +19,7 @@ use support::file_error::AtFile;
 use support::{atomic_file, bounded_file};
 
 use super::surfels::{Surfel, Surfels};
-use super::{IcpConfig, IcpLevel, IcpTarget};
+use super::{IcpConfig, IcpLevel, IcpTarget, Plane};
 use crate::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 
 /// Kind of the file.
@@ -72,6 +72,19 @@ impl SurfelMap {
         config.levels.truncate(1);
         config.levels[0].voxel_m = voxel_m;
         config
+    }
+
+    /// True if a file holds a surfel map.
+    pub(crate) fn is_in(path: &Path) -> bool {
+        let bytes = bounded_file::read(path, MAX_BYTES).unwrap_or_default();
+        parsed(&bytes)
+            .is_ok_and(|(metadata, _)| metadata.get(KIND_KEY).is_some_and(|kind| kind == KIND))
+    }
+
+    /// Planes of one sweep, in the frame of its sensor.
+    pub(crate) fn planes_of_sweep(xyzi: &[[f32; 4]]) -> Vec<Plane> {
+        let sweep = IcpTarget::of_sweep(xyzi, &Self::building(VOXEL_M));
+        sweep.finest_planes().collect()
     }
 
     /// Planes of the place.

@@ -6,6 +6,8 @@ use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
 use perception::sparse::Sites;
 
+/// Smallest vertical part of the normal of a level plane.
+const LEVEL_NORMAL_Z: f64 = 0.9;
 /// Fewest points that a plane is fitted to.
 const MIN_POINTS: f64 = 6.0;
 /// Largest thickness of a plane: its smallest variance as a share of the middle one.
@@ -16,11 +18,18 @@ const MIN_WIDTH: f64 = 0.02;
 
 /// A small plane.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Surfel {
+pub(crate) struct Surfel {
     /// Mean of the voxel's own points, metres.
     pub centre_m: Vector3<f64>,
     /// Unit normal, of either sign.
     pub normal: Vector3<f64>,
+}
+
+impl Surfel {
+    /// True for a plane like the ground.
+    pub(crate) fn is_level(&self) -> bool {
+        self.normal.z.abs() > LEVEL_NORMAL_Z
+    }
 }
 
 /// A plane as it is kept: a town has half a million of them. Single precision is 30 nm in a voxel of half a metre.

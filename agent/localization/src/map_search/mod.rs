@@ -1,0 +1,297 @@
+//! Search of a surfel map: the pose of a sweep in a place for which no head was trained.
+//!
+//! Branch and bound over position and heading (Hess et al. 2016): the score of a pose is the number of the sweep's upright
+//! planes that lie on one of the map of the same direction. The best poses are registered (ICP), and the planes of the
+//! sweep that agree with the map decide between them, and whether there is a pose at all.
+
+mod branch_and_bound;
+mod grid;
+mod ground;
+
+use std::collections::HashSet;
+use std::path::Path;
+
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use perception::weights::FileError;
+use protocol::NoPoseReason;
+
+use self::branch_and_bound::{PlanarPose, Search};
+use self::grid::{CELL_M, RANGE_M, UprightGrid, UprightPlane, direction_bit};
+use self::ground::{Ground, LevelSums};
+use crate::map_registration::{AGREED, REGISTER, SweepOnMap, found_pose};
+use crate::pgc::localization::{SOLVE, VOXELISE};
+use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
+use crate::pose_source::no_pose;
+use crate::registration::icp::surfel_map::SurfelMap;
+use crate::registration::icp::{IcpFit, Plane};
+
+/// Largest number of a sweep's planes that are searched for.
+const MOST_PLANES: usize = 160;
+/// Largest number of poses that are registered.
+const MOST_POSES: usize = 8;
+/// Least score of another pose as a share of the best one's, once a pose is confirmed: one of a street that looks alike.
+const ALIKE_SCORE: f64 = 0.85;
+/// Least share of the planes that agree at a pose that is taken, and by how much it exceeds that of any other pose. Both
+/// chosen on validation drives.
+const LEAST_AGREED: f64 = 0.35;
+const LEAST_LEAD: f64 = 0.1;
+
+/// A surfel map in which sweeps are sought.
+#[derive(Debug)]
+pub struct MapSearch {
+    map: SurfelMap,
+    grid: UprightGrid,
+    ground: Ground,
+    min_confidence: f64,
+}
+
+impl MapSearch {
+    /// The search of the surfel map in a file; `None` of a file of another kind.
+    ///
+    /// # Errors
+    /// [`FileError`] as [`SurfelMap::load`], and of a map without upright planes or wider than 9 km.
+    pub fn of_file(path: &Path) -> Result<Option<Self>, FileError> {
+        if !SurfelMap::is_in(path) {
+            return Ok(None);
+        }
+        let map = SurfelMap::load(path)?;
+        let planes: Vec<Plane> = map.target().finest_planes().collect();
+        let upright: Vec<UprightPlane> = planes.iter().filter_map(UprightPlane::of).collect();
+        let problem = "no pose can be sought in it: it has no upright plane, or is wider than 9 km";
+        Ok(Some(Self {
+            grid: UprightGrid::of(&upright).ok_or_else(|| FileError::new(path, problem))?,
+            ground: Ground::of(&planes),
+            map,
+            min_confidence: 0.0,
+        }))
+    }
+
+    /// The same search, which rejects poses of less confidence.
+    pub fn rejecting(self, min_confidence: f64) -> Self {
+        Self {
+            min_confidence,
+            ..self
+        }
+    }
+
+    /// The registered pose at which most planes agree, and their share; `None` where nothing was registered.
+    fn found(&self, sweep: &SweepOnMap<'_>) -> Option<(IcpFit, f64)> {
+        let below = LevelSums::below_sensor(sweep.planes());
+        let levelled = below.levelled();
+        let planes = sought(sweep.planes(), &levelled);
+        let mut search = Search::new(&self.grid, &planes);
+        let (mut best, mut second) = (None::<(IcpFit, f64)>, 0.0);
+        let mut least = 1;
+        for _ in 0..MOST_POSES {
+            let Some(pose) = search.next(least) else {
+                break;
+            };
+            let start = self.start(&pose, &levelled, below.sensor_height_m());
+            let Some(fit) = start.and_then(|start| sweep.fit(&self.map, &start)) else {
+                continue;
+            };
+            let agreed = sweep.agreement(&self.map, &fit);
+            match best {
+                Some((_, most)) if most >= agreed => second = f64::max(second, agreed),
+                _ => {
+                    second = best.map_or(0.0, |(_, most)| most);
+                    best = Some((fit, agreed));
+                }
+            }
+            if agreed >= AGREED {
+                least = least.max((ALIKE_SCORE * pose.matched as f64) as usize);
+            }
+        }
+        best.filter(|(_, most)| most - second >= LEAST_LEAD)
+    }
+
+    /// A pose in the plane as one in the world, on the ground there; `None` where the map has no ground.
+    fn start(
+        &self,
+        pose: &PlanarPose,
+        levelled: &UnitQuaternion<f64>,
+        height_m: f64,
+    ) -> Option<Isometry3<f64>> {
+        let at_m = self.grid.centre_m(pose.position);
+        let (ground_m, tilt) = self.ground.at(&at_m)?;
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), pose.heading_rad);
+        let position = Translation3::new(at_m.x, at_m.y, ground_m + height_m);
+        Some(Isometry3::from_parts(position, tilt * turn * levelled))
+    }
+}
+
+/// The upright planes of a sweep that are sought, one per cell and direction, seen from above.
+fn sought(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<UprightPlane> {
+    let turned = planes.iter().map(|plane| Plane {
+        centre_m: levelled * plane.centre_m,
+        normal: levelled * plane.normal,
+    });
+    let mut taken = HashSet::new();
+    let mut planes: Vec<UprightPlane> = turned
+        .filter_map(|plane| UprightPlane::of(&plane))
+        .filter(|plane| plane.at_m.norm() < RANGE_M)
+        .filter(|plane| {
+            let cell: [i32; 2] = (plane.at_m / CELL_M).map(|at| at.floor() as i32).into();
+            taken.insert((cell, direction_bit(plane.normal_rad)))
+        })
+        .collect();
+    let stride = planes.len().div_ceil(MOST_PLANES).max(1);
+    let mut number = 0;
+    planes.retain(|_| {
+        number += 1;
+        number % stride == 0
+    });
+    planes
+}
+
+impl Localize for MapSearch {
+    /// The confidence is that of the registration; a pose at which too few planes agree is rejected.
+    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        let mut times = stopwatch();
+        let on_map = SweepOnMap::new(sweep.cloud);
+        let near = sweep
+            .predicted
+            .and_then(|start| on_map.registered(&self.map, &start));
+        times.lap(REGISTER);
+        if let Some(found) = near {
+            return Ok(Localization::new(&Ok(found), times));
+        }
+        on_map.planes();
+        times.lap(VOXELISE);
+        let best = self.found(&on_map);
+        times.lap(SOLVE);
+        let Some((fit, agreed)) = best else {
+            let none = no_pose(NoPoseReason::TooFewInliers);
+            return Ok(Localization::from_estimate(none, times));
+        };
+        let mut found = found_pose(&fit, self.map.covariance_scale);
+        found.evidence.inlier_ratio = agreed;
+        let is_confirmed = agreed >= LEAST_AGREED && on_map.confirms(&self.map, &fit);
+        found.is_rejected = !is_confirmed || found.sigma < self.min_confidence;
+        Ok(Localization::new(&Ok(found), times))
+    }
+
+    fn place(&self) -> Option<&str> {
+        Some(self.map.place()).filter(|place| !place.is_empty())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use protocol::{PointCloud, PoseEstimate};
+
+    use super::*;
+    use crate::registration::icp::IcpTarget;
+
+    /// Ground of 120 m by 120 m, 2 m below the origin, and houses of four walls that differ by the seed.
+    fn town(seed: u32) -> Vec<[f32; 4]> {
+        let ground = (0..160_000).map(|k| {
+            [
+                (k % 400) as f32 * 0.3 - 60.0,
+                (k / 400) as f32 * 0.3 - 60.0,
+                -2.0,
+                0.1,
+            ]
+        });
+        let houses = (0..24_u32).flat_map(|house| {
+            let number = (house + 24 * seed).wrapping_mul(2_654_435_769);
+            let [x, y, length] = [24, 16, 8].map(|shift| (number >> shift & 255) as f32 / 255.0);
+            let length_m = 4.0 + 8.0 * length;
+            let (sin, cos) = (house as f32 * 0.9).sin_cos();
+            (0..4000).map(move |k: u32| {
+                let along = ((k % 100) as f32 / 100.0 - 0.5) * length_m;
+                let up = (k / 100 % 10) as f32 * 0.5 - 2.0;
+                let [u, v] = match k / 1000 {
+                    0 => [along, -0.5 * length_m],
+                    1 => [along, 0.5 * length_m],
+                    2 => [-0.5 * length_m, along],
+                    _ => [0.5 * length_m, along],
+                };
+                let [x, y] = [x, y].map(|at| 100.0 * at - 50.0);
+                [x + u * cos - v * sin, y + u * sin + v * cos, up, 0.1]
+            })
+        });
+        ground.chain(houses).collect()
+    }
+
+    /// The town as a sensor sees it.
+    fn seen_from(town: &[[f32; 4]], town_from_sensor: &Isometry3<f64>) -> PointCloud {
+        let points = town.iter().map(|&[x, y, z, intensity]| {
+            let at = town_from_sensor.inverse_transform_point(&[x, y, z].map(f64::from).into());
+            let [x, y, z] = at.coords.cast::<f32>().into();
+            [x, y, z, intensity]
+        });
+        PointCloud {
+            xyzi: points.filter(|[x, y, ..]| x.hypot(*y) < 40.0).collect(),
+        }
+    }
+
+    /// The map of a town in a file.
+    fn stored() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("surfels.safetensors");
+        let mut target = IcpTarget::new(&SurfelMap::building(0.5));
+        target.add(&town(1), &Isometry3::identity());
+        target.fit();
+        SurfelMap::write(&path, "town", &target).unwrap();
+        (folder, path)
+    }
+
+    #[test]
+    fn a_sweep_is_found_wherever_it_was_taken_and_one_of_another_town_is_not() {
+        let (_folder, path) = stored();
+        let mut search = MapSearch::of_file(&path).unwrap().unwrap();
+        for (x, y, heading_rad) in [(0.0, 0.0, 0.0), (17.3, -8.6, 2.1), (-21.8, 14.1, -1.3)] {
+            let truth = Isometry3::new(Vector3::new(x, y, 0.1), Vector3::z() * heading_rad);
+            let found = search
+                .localize(LocalizerInput::of(&seen_from(&town(1), &truth)))
+                .unwrap();
+            let pose = found.estimate.world_from_cav().unwrap().isometry();
+            let off = truth.inv_mul(&pose);
+            assert!(
+                off.translation.vector.norm() < 0.05 && off.rotation.angle() < 5e-3,
+                "{off}"
+            );
+            assert!(found.inlier_ratio > 0.8, "{found:?}");
+        }
+        let elsewhere = seen_from(&town(2), &Isometry3::identity());
+        let lost = search.localize(LocalizerInput::of(&elsewhere)).unwrap();
+        assert!(
+            matches!(lost.estimate, PoseEstimate::NoPose { .. }),
+            "{lost:?}"
+        );
+        let empty = search
+            .localize(LocalizerInput::of(&PointCloud::default()))
+            .unwrap();
+        assert!(matches!(empty.estimate, PoseEstimate::NoPose { .. }));
+        assert_eq!(search.place(), Some("town"));
+    }
+
+    #[test]
+    fn a_pose_near_a_prediction_is_found_without_a_search_and_one_of_little_confidence_is_rejected()
+    {
+        let (_folder, path) = stored();
+        let truth = Isometry3::new(Vector3::new(5.0, -3.0, 0.0), Vector3::z() * 0.4);
+        let cloud = seen_from(&town(1), &truth);
+        let near = LocalizerInput {
+            predicted: Some(truth * Isometry3::translation(0.3, -0.2, 0.0)),
+            ..LocalizerInput::of(&cloud)
+        };
+        let search = || MapSearch::of_file(&path).unwrap().unwrap();
+        let found = search().localize(near).unwrap();
+        assert_eq!(found.inlier_ratio, 0.0, "nothing was sought");
+        assert!(found.estimate.world_from_cav().is_some());
+        let rejected = search().rejecting(1.0).localize(LocalizerInput::of(&cloud));
+        assert!(rejected.unwrap().found.unwrap().is_rejected);
+    }
+
+    #[test]
+    fn a_file_of_another_kind_is_no_map() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("head.safetensors");
+        std::fs::write(&file, "no map").unwrap();
+        assert!(MapSearch::of_file(&file).unwrap().is_none());
+    }
+}
