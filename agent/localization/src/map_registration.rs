@@ -268,7 +268,7 @@ mod tests {
         let (kept, found) = localize(SURE, 19_000);
         assert_eq!(kept.found, Some(found));
         assert_eq!(kept.estimate, PoseEstimate::new(start.into(), SURE as f32));
-        let (rejected, _) = localize(SURE - 0.01, 9_500);
+        let (rejected, _) = localize(SURE - 0.01, 19_000);
         assert!(rejected.found.unwrap().is_rejected);
         let PoseEstimate::NoPose { reason, .. } = rejected.estimate else {
             panic!("{:?}", rejected.estimate);

@@ -16,7 +16,7 @@ const PREFIXES: [&str; 2] = ["camera", "cam"];
 /// Most digits of the number of a camera, zeros in front included.
 const MAX_DIGITS: usize = 3;
 /// Endings of image files.
-const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
+const ENDINGS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
 /// Largest image file that is read, bytes.
 const MAX_BYTES: u64 = 32 << 20;
 
@@ -32,9 +32,7 @@ fn number(name: &str) -> Option<u8> {
     let digits = PREFIXES
         .iter()
         .find_map(|prefix| camera.strip_prefix(prefix))?;
-    let is_image = ENDINGS
-        .iter()
-        .any(|known| ending.eq_ignore_ascii_case(known));
+    let is_image = ENDINGS.contains(&ending);
     let is_number = digits.len() <= MAX_DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit());
     digits.parse().ok().filter(|_| is_image && is_number)
 }

@@ -377,6 +377,22 @@ fn a_map_of_a_drive_finds_its_sweeps_and_reports_where_it_was_driven() {
         "{text}"
     );
     assert_eq!(least("1.5").status.code(), Some(2));
+    // Without a head the cloud is sought among the planes of the place.
+    let surfels = out.join("surfels.safetensors").display().to_string();
+    let at = [
+        ["--head", out_text, "--surfel-map", out_text].as_slice(),
+        &["--head", &surfels],
+    ]
+    .map(|place| {
+        let located = agent(&[&["locate", cloud, "--json"], place].concat());
+        assert_eq!(located.status.code(), Some(0), "{place:?}");
+        position_m(&objects(&located)[0])
+    });
+    let off_m = at[0]
+        .iter()
+        .zip(at[1])
+        .map(|(with, without)| (with - without).abs());
+    assert!(off_m.fold(0.0, f64::max) < 0.02, "{at:?}");
     // The planes of this place are of no use to the head of another.
     let town1 = weights("pgc-town1.safetensors");
     let other = agent(&["locate", cloud, "--head", &town1, "--surfel-map", out_text]);

@@ -13,7 +13,7 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use perception::weights::FileError;
-use protocol::NoPoseReason;
+use protocol::{NoPoseReason, PoseEstimate};
 
 use self::branch_and_bound::{PlanarPose, Search};
 use self::grid::{CELL_M, RANGE_M, UprightGrid, UprightPlane, direction_bit};
@@ -21,7 +21,6 @@ use self::ground::{Ground, LevelSums};
 use crate::map_registration::{AGREED, REGISTER, SweepOnMap, found_pose};
 use crate::pgc::localization::{SOLVE, VOXELISE};
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
-use crate::pose_source::no_pose;
 use crate::registration::icp::surfel_map::SurfelMap;
 use crate::registration::icp::{IcpFit, Plane};
 
@@ -161,7 +160,7 @@ impl Localize for MapSearch {
         let best = self.found(&on_map);
         times.lap(SOLVE);
         let Some((fit, agreed)) = best else {
-            let none = no_pose(NoPoseReason::TooFewInliers);
+            let none = PoseEstimate::no_pose(NoPoseReason::TooFewInliers, 0);
             return Ok(Localization::from_estimate(none, times));
         };
         let mut found = found_pose(&fit, self.map.covariance_scale);
@@ -180,7 +179,7 @@ impl Localize for MapSearch {
 mod tests {
     use std::path::PathBuf;
 
-    use protocol::{PointCloud, PoseEstimate};
+    use protocol::PointCloud;
 
     use super::*;
     use crate::registration::icp::IcpTarget;

@@ -114,7 +114,8 @@ impl SynthScene<'_, '_> {
         let radar = has_radar
             .then(|| self.radar_points(&own.motion, half_length_m, &bodies, bench, noise(6)));
 
-        let cameras = self.images(&own.motion.end, &bodies, &seen, bench, noise(8));
+        // 7, 8 and 9 are those of the sweeps in other weather.
+        let cameras = self.images(&own.motion.end, &bodies, &seen, bench, noise(10));
 
         // Only vehicles with a point in the plain sweep are annotated.
         let mut hits = hits.iter();
