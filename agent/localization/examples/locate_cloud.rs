@@ -2,11 +2,12 @@
 //!
 //! `locate_cloud CLOUD [HEAD]`; the head is a file or the name of a released one (`town1`).
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use dataset::cloud_files::clouds_at;
+use localization::pgc::LocalizerInput;
 use localization::pgc::head_files::{encoder_of, head_file};
-use localization::pgc::{Localize, Localizer, LocalizerInput};
+use localization::place_localizer::place_localizer;
 use perception::inference::Inference;
 use protocol::PoseEstimate;
 
@@ -14,8 +15,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args_os().skip(1).map(PathBuf::from);
     let cloud = arguments.next().ok_or("which cloud?")?;
     let head = head_file(&arguments.next().unwrap_or("town1".into()))?;
-    // The head names the encoder with which it was trained.
-    let mut localizer = Localizer::load(&encoder_of(&head)?, &head, Inference::default())?;
+    // The head names the encoder with which it was trained. No surfel map, to which poses could be registered.
+    let files = [&encoder_of(&head)?, &head, Path::new("")];
+    let mut localizer = place_localizer(files, 0.0, Inference::default(), |_| ())?;
     for file in clouds_at(&[cloud]) {
         let file = file?;
         let points = file.read()?.points;

@@ -1,8 +1,8 @@
 //! Registration to a surfel map behind a localizer: the pose of a sweep to the millimetre, and evidence of its own.
 //!
 //! A pose that the localizer finds is registered to the planes of the place (ICP, point to plane). Points above the
-//! ground decide: at a wrong pose the ground fits too. Where enough of them have a partner the registered pose takes the
-//! place of the localizer's. Where too few have, or the map has no planes, a pose of which the localizer is sure stays
+//! ground and the sweep's own planes decide: at a wrong pose the ground fits too. Where enough of either have a partner the
+//! registered pose takes the place of the localizer's. Where too few have, or the map has no planes, a pose of which the localizer is sure stays
 //! and another one is rejected: fog leaves as few partners at a right pose as at a wrong one. A sweep with a predicted
 //! pose is registered to it first, and the localizer is asked only if that fails.
 
@@ -18,7 +18,7 @@ use crate::pgc::pose_evidence::PoseEvidence;
 use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
-use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, Plane, register};
+use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, MIN_POINTS, Plane, register};
 
 /// Stage of a localization.
 pub(crate) const REGISTER: &str = "pose register";
@@ -70,10 +70,13 @@ impl<'a> SweepOnMap<'a> {
         (moved.norm() <= MOST_MOVED_M).then_some(fit)
     }
 
-    /// Share of the planes that agree with the map.
+    /// Share of the planes that agree with the map; 0 of too few, which agree by chance.
     pub(crate) fn agreement(&self, map: &SurfelMap, fit: &IcpFit) -> f64 {
-        map.target()
-            .agreement(self.planes(), &fit.target_from_source)
+        let planes = self.planes();
+        match map.target().agreement(planes, &fit.target_from_source) {
+            [_, ..MIN_POINTS] => 0.0,
+            [agreed, count] => agreed as f64 / count as f64,
+        }
     }
 
     /// The pose of that registration, if the map confirms it.

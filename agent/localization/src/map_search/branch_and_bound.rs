@@ -70,9 +70,14 @@ impl<'a> Search<'a> {
         search
     }
 
+    /// True if it has taken too long: there may be better poses.
+    pub(super) fn is_exhausted(&self) -> bool {
+        self.scored >= MOST_WINDOWS
+    }
+
     /// The best pose apart from those before it; `None` if less than `least` planes are matched at it, or it takes too long.
     pub(super) fn next(&mut self, least: usize) -> Option<PlanarPose> {
-        while self.scored < MOST_WINDOWS && self.open.len() > least {
+        while !self.is_exhausted() && self.open.len() > least {
             let matched = self.open.len() - 1;
             let Some(window) = self.open[matched].pop() else {
                 self.open.pop();

@@ -14,6 +14,8 @@ pub(super) const COARSEST: u32 = 5;
 pub(super) const RANGE_M: f64 = 50.0;
 /// Cells around the place, so that all of a sweep lies on the grid, wherever in the place its sensor is.
 const MARGIN: usize = (RANGE_M / CELL_M) as usize + 2 + (1 << COARSEST);
+/// Largest place, square metres: a search begins with 240 windows on each of its squares of 32 m.
+const MOST_AREA_M2: f64 = 8e6;
 /// Largest vertical part of the normal of an upright plane.
 const UPRIGHT_NORMAL_Z: f64 = 0.5;
 /// Directions of normals that are told apart, over half a turn.
@@ -57,28 +59,28 @@ pub(super) struct UprightGrid {
 }
 
 impl UprightGrid {
-    /// The grid of a place; `None` of a place without an upright plane, or wider than the grid may be.
-    pub(super) fn of(planes: &[UprightPlane]) -> Option<Self> {
-        let first = planes.first()?.at_m;
+    /// The grid of the planes of a place; `None` of a place without one, or of more than [`MOST_AREA_M2`].
+    pub(super) fn of(planes: &[Plane]) -> Option<Self> {
+        let first = planes.first()?.centre_m.xy();
         let (lowest, highest) = planes.iter().fold((first, first), |(low, high), plane| {
-            (low.inf(&plane.at_m), high.sup(&plane.at_m))
+            let at_m = plane.centre_m.xy();
+            (low.inf(&at_m), high.sup(&at_m))
         });
         let place: [usize; 2] = ((highest - lowest) / CELL_M)
             .map(|cells| cells as usize + 1)
             .into();
+        let area_m2 = place[0] as f64 * place[1] as f64 * CELL_M.powi(2);
+        if area_m2 > MOST_AREA_M2 {
+            return None;
+        }
         let [columns, rows] = place.map(|cells| cells + 2 * MARGIN);
         let mut grid = Self {
             corner_m: lowest - Vector2::repeat(MARGIN as f64 * CELL_M),
             columns,
             place,
-            levels: vec![vec![
-                0;
-                columns
-                    .checked_mul(rows)
-                    .filter(|cells| *cells <= MOST_CELLS)?
-            ]],
+            levels: vec![vec![0; columns * rows]],
         };
-        for plane in planes {
+        for plane in planes.iter().filter_map(UprightPlane::of) {
             let cell = (plane.at_m - grid.corner_m) / CELL_M;
             let bit = direction_bit(plane.normal_rad);
             // The directions beside it too: normals have errors, and a heading of the search is half a step off.
@@ -103,9 +105,6 @@ impl UprightGrid {
         self.corner_m + cell * CELL_M
     }
 }
-
-/// Largest number of cells of a grid: with all its levels a gigabyte, a place of 9 km by 9 km.
-const MOST_CELLS: usize = 90_000_000;
 
 /// Windows of twice the side, of those of `side` cells.
 fn doubled(windows: &[u16], columns: usize, side: usize) -> Vec<u16> {

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
-use crate::registration::icp::Plane;
+use crate::registration::icp::{Plane, is_level};
 
 /// Side of a cell of the ground, metres.
 const CELL_M: f64 = 8.0;
@@ -23,13 +23,12 @@ pub(super) struct LevelSums {
 }
 
 impl LevelSums {
-    /// Sums over the level planes near a sensor, in its frame.
+    /// Sums over the level planes near a sensor and below it, in its frame.
     pub(super) fn below_sensor(planes: &[Plane]) -> Self {
         let mut sums = Self::default();
-        let near = planes
-            .iter()
-            .filter(|plane| plane.centre_m.xy().norm() < NEAR_M);
-        near.filter(|plane| plane.is_level())
+        let below = planes.iter().filter(|plane| plane.centre_m.z < 0.0);
+        below
+            .filter(|plane| is_level(&plane.normal) && plane.centre_m.xy().norm() < NEAR_M)
             .for_each(|plane| sums.add(plane));
         sums
     }
@@ -69,7 +68,7 @@ impl Ground {
     /// The ground of level planes in the world.
     pub(super) fn of(planes: &[Plane]) -> Self {
         let mut ground = Self::default();
-        for plane in planes.iter().filter(|plane| plane.is_level()) {
+        for plane in planes.iter().filter(|plane| is_level(&plane.normal)) {
             let cell = cell_at(&plane.centre_m.xy());
             ground.cells.entry(cell).or_default().add(plane);
         }

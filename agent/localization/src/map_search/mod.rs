@@ -13,7 +13,9 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use perception::weights::FileError;
+use protocol::config::within;
 use protocol::{NoPoseReason, PoseEstimate};
+use support::file_error::AtFile;
 
 use self::branch_and_bound::{PlanarPose, Search};
 use self::grid::{CELL_M, RANGE_M, UprightGrid, UprightPlane, direction_bit};
@@ -22,8 +24,12 @@ use crate::map_registration::{AGREED, REGISTER, SweepOnMap, found_pose};
 use crate::pgc::localization::{SOLVE, VOXELISE};
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
-use crate::registration::icp::{IcpFit, Plane};
+use crate::registration::icp::{IcpFit, MIN_POINTS, Plane};
 
+/// Least and largest side of the voxels of a map that is searched, metres: planes of a sweep have those of half a metre.
+const VOXELS_M: [f64; 2] = [0.3, 1.0];
+/// Registered poses nearer than this are one, metres.
+const SAME_M: f64 = 0.5;
 /// Largest number of a sweep's planes that are searched for.
 const MOST_PLANES: usize = 160;
 /// Largest number of poses that are registered.
@@ -48,17 +54,25 @@ impl MapSearch {
     /// The search of the surfel map in a file; `None` of a file of another kind.
     ///
     /// # Errors
-    /// [`FileError`] as [`SurfelMap::load`], and of a map without upright planes or wider than 9 km.
+    /// [`FileError`] as [`SurfelMap::load`], and of a map that is empty, too large or too coarse.
     pub fn of_file(path: &Path) -> Result<Option<Self>, FileError> {
         if !SurfelMap::is_in(path) {
             return Ok(None);
         }
         let map = SurfelMap::load(path)?;
+        let voxel_m = map.voxel_m();
+        within(
+            "voxel_m of a map that is searched",
+            voxel_m,
+            VOXELS_M[0],
+            VOXELS_M[1],
+        )
+        .at(path)?;
         let planes: Vec<Plane> = map.target().finest_planes().collect();
-        let upright: Vec<UprightPlane> = planes.iter().filter_map(UprightPlane::of).collect();
-        let problem = "no pose can be sought in it: it has no upright plane, or is wider than 9 km";
+        let problem =
+            "no pose can be sought in it: it has no plane, or is of more than 8 square kilometres";
         Ok(Some(Self {
-            grid: UprightGrid::of(&upright).ok_or_else(|| FileError::new(path, problem))?,
+            grid: UprightGrid::of(&planes).ok_or_else(|| FileError::new(path, problem))?,
             ground: Ground::of(&planes),
             map,
             min_confidence: 0.0,
@@ -91,9 +105,14 @@ impl MapSearch {
             };
             let agreed = sweep.agreement(&self.map, &fit);
             match best {
-                Some((_, most)) if most >= agreed => second = f64::max(second, agreed),
+                Some((known, most)) if most >= agreed => {
+                    if distance_m(&known, &fit) > SAME_M {
+                        second = f64::max(second, agreed);
+                    }
+                }
                 _ => {
-                    second = best.map_or(0.0, |(_, most)| most);
+                    let known = best.filter(|(known, _)| distance_m(known, &fit) > SAME_M);
+                    second = known.map_or(second, |(_, most)| most);
                     best = Some((fit, agreed));
                 }
             }
@@ -101,7 +120,9 @@ impl MapSearch {
                 least = least.max((ALIKE_SCORE * pose.matched as f64) as usize);
             }
         }
-        best.filter(|(_, most)| most - second >= LEAST_LEAD)
+        // Of a search that took too long only a pose that the map confirms counts: another one may be better.
+        let least = if search.is_exhausted() { AGREED } else { 0.0 };
+        best.filter(|(_, most)| most - second >= LEAST_LEAD && *most >= least)
     }
 
     /// A pose in the plane as one in the world, on the ground there; `None` where the map has no ground.
@@ -119,6 +140,11 @@ impl MapSearch {
     }
 }
 
+fn distance_m(a: &IcpFit, b: &IcpFit) -> f64 {
+    let [a, b] = [a, b].map(|fit| fit.target_from_source.translation.vector);
+    (a - b).norm()
+}
+
 /// The upright planes of a sweep that are sought, one per cell and direction, seen from above.
 fn sought(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<UprightPlane> {
     let turned = planes.iter().map(|plane| Plane {
@@ -126,7 +152,7 @@ fn sought(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<UprightPlane>
         normal: levelled * plane.normal,
     });
     let mut taken = HashSet::new();
-    let mut planes: Vec<UprightPlane> = turned
+    let planes: Vec<UprightPlane> = turned
         .filter_map(|plane| UprightPlane::of(&plane))
         .filter(|plane| plane.at_m.norm() < RANGE_M)
         .filter(|plane| {
@@ -134,13 +160,9 @@ fn sought(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<UprightPlane>
             taken.insert((cell, direction_bit(plane.normal_rad)))
         })
         .collect();
-    let stride = planes.len().div_ceil(MOST_PLANES).max(1);
-    let mut number = 0;
-    planes.retain(|_| {
-        number += 1;
-        number % stride == 0
-    });
-    planes
+    let count = planes.len().min(MOST_PLANES);
+    let rows = (0..count).map(|row| row * planes.len() / count);
+    rows.map(|row| planes[row]).collect()
 }
 
 impl Localize for MapSearch {
@@ -155,8 +177,17 @@ impl Localize for MapSearch {
         if let Some(found) = near {
             return Ok(Localization::new(&Ok(found), times));
         }
-        on_map.planes();
+        let enough = on_map.planes().len() >= MIN_POINTS;
         times.lap(VOXELISE);
+        // A tracked vehicle is sought from time to time without a prediction.
+        if !enough || sweep.predicted.is_some() {
+            let reason = match enough {
+                true => NoPoseReason::TooFewInliers,
+                false => NoPoseReason::TooFewPoints,
+            };
+            let none = PoseEstimate::no_pose(reason, 0);
+            return Ok(Localization::from_estimate(none, times));
+        }
         let best = self.found(&on_map);
         times.lap(SOLVE);
         let Some((fit, agreed)) = best else {

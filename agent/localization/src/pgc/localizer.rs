@@ -5,7 +5,7 @@ use std::path::Path;
 use perception::inference::Inference;
 use perception::int8::ScaleSearch;
 use perception::tensor_values::values;
-use perception::weights::Weights;
+use perception::weights::{FileError, Weights};
 use protocol::PointCloud;
 use protocol::config::FieldError;
 use serde::de::DeserializeOwned;
@@ -26,6 +26,7 @@ use super::scene_coordinates::SceneCoordinates;
 use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
 use crate::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
+use crate::registration::icp::surfel_map::SurfelMap;
 
 /// Largest number of regressed cells, where the head allows for more: more cells hardly improve poses, and they take
 /// time.
@@ -81,6 +82,9 @@ impl Localizer {
 
     fn open(encoder: &Path, head: &Path, inference: Inference) -> Result<(Self, Weights)> {
         let Inference { device, precision } = inference;
+        if SurfelMap::is_in(head) {
+            return Err(FileError::new(head, "a surfel map, needed is a head").into());
+        }
         let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
         let mut scene_head =

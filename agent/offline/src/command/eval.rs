@@ -25,6 +25,7 @@ use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer, stored_confidence};
 use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
+use localization::registration::icp::surfel_map::SurfelMap;
 use localization::registration::ransac::RansacConfig;
 use localization::registration::sc2pcr::Sc2PcrConfig;
 use nalgebra::Isometry3;
@@ -276,6 +277,8 @@ impl Args {
         for head in heads.filter(|_| self.uses_head()) {
             files.extend([self.encoder(head)?, head.to_owned()]);
         }
+        // A surfel map in place of a head has no encoder.
+        files.retain(|file| !file.as_os_str().is_empty());
         let commit = env!("V2VLOC_COMMIT");
         Ok(dataset::provenance(&scenarios, files, commit)?)
     }
@@ -333,6 +336,13 @@ impl Args {
             return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
         }
         if let Some(search) = MapSearch::of_file(head).map_err(BadInput::of)? {
+            let needs_head = self.lightloc || self.fit_confidence || self.max_wrong.is_some();
+            if needs_head || !drives.is_empty() {
+                let head = head.display();
+                return Err(BadInput::new(format!(
+                    "{head}: a surfel map, --lightloc, --retrieval, --fit-confidence and --max-wrong need a head"
+                )));
+            }
             return self.registered(Box::new(search));
         }
         // A stored model may be of an earlier version with other features: a new fit does not read it.
@@ -409,7 +419,7 @@ impl Args {
             fitted = Some((model, report));
         }
         // Behind a map, the head's own poses keep the head's factors.
-        let registered = self.surfel_map.is_some();
+        let registered = self.surfel_map.is_some() || SurfelMap::is_in(head);
         let samples: Vec<_> = (sweeps.iter())
             .filter(|sweep| sweep.is_registered() == registered)
             .filter_map(EvaluatedSweep::pose_sample)
@@ -424,9 +434,13 @@ impl Args {
             output::note(report_line(&report));
         }
         let map = surfel_map(self.surfel_map.as_deref())?;
+        let fitted = if map.as_os_str().is_empty() {
+            head
+        } else {
+            &map
+        };
         match scale {
-            Ok(scale) if registered => write_fit(&map, COVARIANCE_KEY, &scale),
-            Ok(scale) => write_fit(head, COVARIANCE_KEY, &scale),
+            Ok(scale) => write_fit(fitted, COVARIANCE_KEY, &scale),
             Err(reason) => {
                 output::note(format_args!("the covariances are not fitted: {reason}"));
                 Ok(())

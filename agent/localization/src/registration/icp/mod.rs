@@ -14,7 +14,7 @@ use nalgebra::{
 };
 use serde::{Deserialize, Serialize};
 
-pub(crate) use surfels::Surfel as Plane;
+pub(crate) use surfels::{Surfel as Plane, is_level};
 use surfels::{Surfels, decimate};
 
 /// Distance that a rotation of one radian moves a typical point, metres: makes rotations and translations comparable.
@@ -141,22 +141,29 @@ impl IcpTarget {
         })
     }
 
-    /// Share of a sweep's planes that lie on a plane of the same direction; level ones, which fit everywhere, do not count.
-    pub(crate) fn agreement(&self, planes: &[Plane], target_from_sensor: &Isometry3<f64>) -> f64 {
+    /// Planes of a sweep that lie on a plane of the same direction, of how many; level ones, which fit everywhere, do not
+    /// count.
+    pub(crate) fn agreement(
+        &self,
+        planes: &[Plane],
+        target_from_sensor: &Isometry3<f64>,
+    ) -> [usize; 2] {
         let origin_m = self.origin_m.unwrap_or_default();
-        let standing = planes.iter().filter(|plane| !plane.is_level());
         let (mut count, mut agreed) = (0, 0);
-        for plane in standing {
+        for plane in planes {
             let centre_m = (target_from_sensor * Point3::from(plane.centre_m)).coords - origin_m;
             let normal = target_from_sensor * plane.normal;
+            if is_level(&normal) {
+                continue;
+            }
             let near = self.levels.last().and_then(|planes| planes.near(&centre_m));
             count += 1;
-            agreed += i32::from(near.is_some_and(|near| {
+            agreed += usize::from(near.is_some_and(|near| {
                 let distance_m = near.normal.dot(&(centre_m - near.centre_m));
                 distance_m.abs() < AGREED_M && near.normal.dot(&normal).abs() > AGREED_COSINE
             }));
         }
-        f64::from(agreed) / f64::from(count.max(1))
+        [agreed, count]
     }
 
     /// Planes at the finest level.
@@ -246,7 +253,7 @@ pub enum NoIcpFit {
 }
 
 /// Fewest source points and target planes.
-const MIN_POINTS: usize = 50;
+pub(crate) const MIN_POINTS: usize = 50;
 
 /// Registers a sweep, starting at `start`.
 ///
@@ -350,7 +357,7 @@ impl NormalEquations {
             // Three scales, squared. Pairs beyond have less than a hundredth of the weight: no overlap.
             if scaled < 9.0 {
                 sums.pairs += 1.0;
-                if plane.is_level() {
+                if is_level(&plane.normal) {
                     sums.ground_pairs += 1.0;
                 }
                 sums.squares += distance * distance;

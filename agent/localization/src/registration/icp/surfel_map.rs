@@ -75,7 +75,7 @@ impl SurfelMap {
     }
 
     /// True if a file holds a surfel map.
-    pub(crate) fn is_in(path: &Path) -> bool {
+    pub fn is_in(path: &Path) -> bool {
         let bytes = bounded_file::read(path, MAX_BYTES).unwrap_or_default();
         parsed(&bytes)
             .is_ok_and(|(metadata, _)| metadata.get(KIND_KEY).is_some_and(|kind| kind == KIND))
@@ -90,6 +90,14 @@ impl SurfelMap {
     /// Planes of the place.
     pub fn target(&self) -> &IcpTarget {
         &self.target
+    }
+
+    /// Side of the voxels, metres.
+    pub(crate) fn voxel_m(&self) -> f64 {
+        self.target
+            .levels
+            .last()
+            .map_or(0.0, |planes| planes.voxel_m)
     }
 
     /// Name of the place, as of its head; empty if it is not known.

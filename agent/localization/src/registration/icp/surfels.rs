@@ -25,11 +25,9 @@ pub(crate) struct Surfel {
     pub normal: Vector3<f64>,
 }
 
-impl Surfel {
-    /// True for a plane like the ground.
-    pub(crate) fn is_level(&self) -> bool {
-        self.normal.z.abs() > LEVEL_NORMAL_Z
-    }
+/// True for the normal of a plane like the ground.
+pub(crate) fn is_level(normal: &Vector3<f64>) -> bool {
+    normal.z.abs() > LEVEL_NORMAL_Z
 }
 
 /// A plane as it is kept: a town has half a million of them. Single precision is 30 nm in a voxel of half a metre.
