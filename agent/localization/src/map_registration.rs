@@ -26,7 +26,7 @@ pub(crate) const REGISTER: &str = "pose register";
 const CONFIRMED: f64 = 0.2;
 /// Least share of the sweep's planes that agree with the map, with which one is taken that is not confirmed so: in fog
 /// scattered returns count among the points above the ground, and make no planes. Chosen on validation drives.
-pub(crate) const AGREED: f64 = 0.5;
+pub(crate) const AGREED: f64 = 0.55;
 /// Confidence of the localizer with which a pose stays that the map does not confirm.
 const SURE: f64 = 0.8;
 /// Largest distance of a registered pose from its start, metres: a step beyond is no refinement.

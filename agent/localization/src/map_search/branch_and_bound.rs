@@ -9,7 +9,7 @@ use super::grid::{CELL_M, COARSEST, UprightGrid, UprightPlane, direction_bit};
 /// Headings that are searched: a step moves a plane at the farthest by a cell and a third.
 const HEADINGS: usize = 240;
 /// Poses nearer than this to one that was found, metres and steps of the heading, are not found.
-const APART_M: f64 = 4.0;
+const APART_M: f64 = 2.0;
 const APART_STEPS: usize = 6;
 /// Largest number of windows that are scored: 2 s on one core.
 const MOST_WINDOWS: usize = 8_000_000;

@@ -33,7 +33,7 @@ const SAME_M: f64 = 0.5;
 /// Largest number of a sweep's planes that are searched for.
 const MOST_PLANES: usize = 160;
 /// Largest number of poses that are registered.
-const MOST_POSES: usize = 8;
+const MOST_POSES: usize = 12;
 /// Least score of another pose as a share of the best one's, once a pose is confirmed: one of a street that looks alike.
 const ALIKE_SCORE: f64 = 0.85;
 /// Least share of the planes that agree at a pose that is taken, and by how much it exceeds that of any other pose. Both
@@ -120,9 +120,8 @@ impl MapSearch {
                 least = least.max((ALIKE_SCORE * pose.matched as f64) as usize);
             }
         }
-        // Of a search that took too long only a pose that the map confirms counts: another one may be better.
-        let least = if search.is_exhausted() { AGREED } else { 0.0 };
-        best.filter(|(_, most)| most - second >= LEAST_LEAD && *most >= least)
+        // Of a search that took too long another pose may be as good.
+        best.filter(|(_, most)| most - second >= LEAST_LEAD && !search.is_exhausted())
     }
 
     /// A pose in the plane as one in the world, on the ground there; `None` where the map has no ground.
