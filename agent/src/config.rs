@@ -71,24 +71,20 @@ pub struct AgentConfig {
 
 /// Detector of a process, and where and with how many threads it computes.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
-#[serde(deny_unknown_fields)]
+#[serde(default, deny_unknown_fields)]
 pub struct ModelConfig {
     /// Weights of the detector (safetensors; its configuration is inside).
     #[arg(long, value_name = "FILE")]
-    #[serde(default)]
     pub weights: PathBuf,
     /// Number format in which networks are computed.
     #[arg(long, value_enum, default_value_t)]
-    #[serde(default)]
     pub precision: InferencePrecision,
     /// Threads that libtorch computes with, 1 to 256; the same number gives the same bits.
     #[arg(long)]
-    #[serde(default)]
     pub threads: Threads,
     /// Device that the networks compute on; cuda needs a libtorch with CUDA and a CUDA device, and its results are
     /// slightly different.
     #[arg(long, value_enum)]
-    #[serde(default)]
     pub device: ComputeDevice,
 }
 

@@ -19,17 +19,10 @@ pub(crate) struct PairedSweep<S> {
     pub(crate) pose: Option<Pose>,
     /// The motion measured at the same time.
     pub(crate) motion: Option<EgoMotion>,
-    /// Poses and motions of earlier sweeps, which were superseded.
-    pub(crate) unused: Unused,
-}
-
-/// Numbers of measurements that no sweep used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct Unused {
-    /// Poses.
-    pub(crate) poses: usize,
-    /// Motions.
-    pub(crate) motions: usize,
+    /// Number of poses of earlier sweeps, which were superseded.
+    pub(crate) unused_poses: usize,
+    /// Number of their motions.
+    pub(crate) unused_motions: usize,
 }
 
 /// Holds the newest sweep until its measured pose and motion arrive, or are known to be lost. Vehicles without a GNSS
@@ -42,8 +35,6 @@ pub(crate) struct SweepPairing<S> {
     waiting: Option<(u64, S, u64)>,
     poses: CaptureBuffer<Pose>,
     motions: CaptureBuffer<EgoMotion>,
-    expects_pose: bool,
-    expects_motion: bool,
 }
 
 impl<S> SweepPairing<S> {
@@ -52,23 +43,19 @@ impl<S> SweepPairing<S> {
         Self {
             timeout_nanos,
             waiting: None,
-            poses: CaptureBuffer(BTreeMap::new()),
-            motions: CaptureBuffer(BTreeMap::new()),
-            expects_pose: true,
-            expects_motion: true,
+            poses: CaptureBuffer::new(),
+            motions: CaptureBuffer::new(),
         }
     }
 
     /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
     /// Poses arrive in order, so a later one is left over from before the scene restarted.
     pub(crate) fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
-        self.expects_pose = true;
         self.poses.add(capture_nanos, pose)
     }
 
     /// Adds a motion. Returns as [`Self::add_pose`].
     pub(crate) fn add_motion(&mut self, capture_nanos: u64, motion: EgoMotion) -> usize {
-        self.expects_motion = true;
         self.motions.add(capture_nanos, motion)
     }
 
@@ -85,23 +72,21 @@ impl<S> SweepPairing<S> {
     /// The sweep, if there is nothing left to wait for.
     pub(crate) fn next(&mut self, now_nanos: u64) -> Option<PairedSweep<S>> {
         let &(capture_nanos, ..) = self.waiting.as_ref()?;
-        let is_awaited = self.expects_pose && self.poses.is_awaited(capture_nanos)
-            || self.expects_motion && self.motions.is_awaited(capture_nanos);
+        let is_awaited =
+            self.poses.is_awaited(capture_nanos) || self.motions.is_awaited(capture_nanos);
         if is_awaited && now_nanos < self.deadline_nanos()? {
             return None;
         }
-        let (pose, poses) = self.poses.take(capture_nanos);
-        let (motion, motions) = self.motions.take(capture_nanos);
-        // A pose of a later sweep shows a receiver, although the one of this sweep is lost.
-        self.expects_pose = pose.is_some() || !self.poses.0.is_empty();
-        self.expects_motion = motion.is_some() || !self.motions.0.is_empty();
+        let (pose, unused_poses) = self.poses.take(capture_nanos);
+        let (motion, unused_motions) = self.motions.take(capture_nanos);
         let (_, sweep, _) = self.waiting.take()?;
         Some(PairedSweep {
             capture_nanos,
             sweep,
             pose,
             motion,
-            unused: Unused { poses, motions },
+            unused_poses,
+            unused_motions,
         })
     }
 
@@ -114,32 +99,48 @@ impl<S> SweepPairing<S> {
 
 /// Measurements of one sensor by capture time.
 #[derive(Debug)]
-struct CaptureBuffer<T>(BTreeMap<u64, T>);
+struct CaptureBuffer<T> {
+    measurements: BTreeMap<u64, T>,
+    /// False once a sweep had to do without one, until one arrives.
+    is_expected: bool,
+}
 
 impl<T> CaptureBuffer<T> {
+    fn new() -> Self {
+        Self {
+            measurements: BTreeMap::new(),
+            is_expected: true,
+        }
+    }
+
     /// Adds a measurement; returns how many others were dropped.
     fn add(&mut self, capture_nanos: u64, measurement: T) -> usize {
+        self.is_expected = true;
         let left_over = self.take_later(capture_nanos).len();
-        let replaced = usize::from(self.0.insert(capture_nanos, measurement).is_some());
-        let too_many = self.0.len().saturating_sub(MAX_MEASUREMENTS);
+        let replaced = self.measurements.insert(capture_nanos, measurement);
+        let too_many = self.measurements.len().saturating_sub(MAX_MEASUREMENTS);
         for _ in 0..too_many {
-            self.0.pop_first();
+            self.measurements.pop_first();
         }
-        left_over + replaced + too_many
+        left_over + usize::from(replaced.is_some()) + too_many
     }
 
     /// True if the measurement may still arrive. They arrive in order: a later one shows that it is lost.
     fn is_awaited(&self, capture_nanos: u64) -> bool {
         let later = (Bound::Excluded(capture_nanos), Bound::Unbounded);
-        !self.0.contains_key(&capture_nanos) && self.0.range(later).next().is_none()
+        self.is_expected
+            && !self.measurements.contains_key(&capture_nanos)
+            && self.measurements.range(later).next().is_none()
     }
 
     /// Removes the measurement and all earlier ones, which it counts.
     fn take(&mut self, capture_nanos: u64) -> (Option<T>, usize) {
         let later = self.take_later(capture_nanos);
-        let measurement = self.0.remove(&capture_nanos);
-        let unused = self.0.len();
-        self.0 = later;
+        let measurement = self.measurements.remove(&capture_nanos);
+        let unused = self.measurements.len();
+        // One of a later sweep shows a sensor, although that of this sweep is lost.
+        self.is_expected = measurement.is_some() || !later.is_empty();
+        self.measurements = later;
         (measurement, unused)
     }
 
@@ -148,7 +149,7 @@ impl<T> CaptureBuffer<T> {
         // No capture time is later than the largest one.
         capture_nanos
             .checked_add(1)
-            .map_or_else(BTreeMap::new, |next| self.0.split_off(&next))
+            .map_or_else(BTreeMap::new, |next| self.measurements.split_off(&next))
     }
 }
 
@@ -161,10 +162,9 @@ mod tests {
     const NOW: u64 = 1_000_000_000;
 
     fn without_motion() -> SweepPairing<char> {
-        SweepPairing {
-            expects_motion: false,
-            ..SweepPairing::new(TIMEOUT)
-        }
+        let mut pairing = SweepPairing::new(TIMEOUT);
+        pairing.motions.is_expected = false;
+        pairing
     }
 
     fn at(x_m: f64) -> Pose {
@@ -179,14 +179,14 @@ mod tests {
             capture_nanos,
             sweep,
             pose,
-            unused,
+            unused_poses,
             ..
         } = pairing.next(now)?;
         Some((
             capture_nanos,
             sweep,
             pose.map(|pose| pose.translation_m[0]),
-            unused.poses,
+            unused_poses,
         ))
     }
 
@@ -320,14 +320,8 @@ mod tests {
         sweep(&mut pairing, 20);
         let paired = pairing.next(now).unwrap();
         assert_eq!(
-            (paired.motion, paired.unused),
-            (
-                Some(speed(6.0)),
-                Unused {
-                    poses: 0,
-                    motions: 1
-                }
-            )
+            (paired.motion, paired.unused_poses, paired.unused_motions),
+            (Some(speed(6.0)), 0, 1)
         );
         sweep(&mut pairing, 30);
         assert_eq!(pairing.next(now), None, "its motion may still arrive");

@@ -128,16 +128,19 @@ impl<'a> PayloadReader<'a> {
         {
             skip -= run.len();
         }
+        // What was skipped is not part of the checksum.
+        reader.crc = Hasher::new();
         reader
     }
 
-    /// The next contiguous bytes, at most `max`; `None` at the end.
+    /// The next contiguous bytes, at most `max`, which the checksum covers; `None` at the end.
     fn next_run(&mut self, max: usize) -> Option<&'a [u8]> {
         while self.piece.is_empty() {
             self.piece = self.pieces.next()?;
         }
         let (run, rest) = self.piece.split_at(max.min(self.piece.len()));
         self.piece = rest;
+        self.crc.update(run);
         Some(run)
     }
 
@@ -147,7 +150,6 @@ impl<'a> PayloadReader<'a> {
         while out.len() < len
             && let Some(run) = self.next_run(BLOCK_BYTES.min(len - out.len()))
         {
-            self.crc.update(run);
             out.extend_from_slice(run);
         }
         out
@@ -197,10 +199,9 @@ impl<'a> PayloadReader<'a> {
             let mut across = [[[0; 4]; N]];
             // Whole values within the piece. Zero: the next value spans two pieces, or the piece is used up.
             let whole = self.piece.len().min(left).min(BLOCK_BYTES) / value_bytes * value_bytes;
-            let block = if whole > 0 {
-                let (run, rest) = self.piece.split_at(whole);
-                self.piece = rest;
-                self.crc.update(run);
+            let block = if whole > 0
+                && let Some(run) = self.next_run(whole)
+            {
                 run.as_chunks().0.as_chunks().0
             } else if (self.fill(across.as_flattened_mut().as_flattened_mut())).is_some() {
                 &across
@@ -225,7 +226,6 @@ impl<'a> PayloadReader<'a> {
         let mut left = bytes;
         while !left.is_empty() {
             let run = self.next_run(left.len())?;
-            self.crc.update(run);
             let (filled, rest) = left.split_at_mut_checked(run.len())?;
             filled.copy_from_slice(run);
             left = rest;
@@ -236,9 +236,7 @@ impl<'a> PayloadReader<'a> {
     /// The checksum over all bytes of the payload, including those not yet read.
     pub(crate) fn finish(&mut self) -> u32 {
         // After an error in the metadata the body is unread, but the checksum covers it too.
-        while let Some(run) = self.next_run(usize::MAX) {
-            self.crc.update(run);
-        }
+        while self.next_run(usize::MAX).is_some() {}
         mem::take(&mut self.crc).finalize()
     }
 }

@@ -161,11 +161,6 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/*/camera/*"))
     }
 
-    /// One stream of every vehicle as it reaches `ego` over the link.
-    pub fn received(run: &RunId, ego: &CavId, stream: Stream) -> Self {
-        Self(format!("{KEY_ROOT}/{run}/rx/{ego}/*/{stream}"))
-    }
-
     /// One stream of every vehicle as it reaches any ego over the link.
     pub fn received_by_anyone(run: &RunId, stream: Stream) -> Self {
         Self(format!("{KEY_ROOT}/{run}/rx/*/*/{stream}"))
@@ -368,10 +363,6 @@ mod tests {
     fn selectors_name_the_keys_they_are_for() {
         let run = RunId::new("r1").unwrap();
         assert_eq!(KeyExpr::stream(&run, Stream::Bev).as_str(), "v2v/r1/*/bev");
-        assert_eq!(
-            KeyExpr::received(&run, &cav("4279"), Stream::Pose).as_str(),
-            "v2v/r1/rx/4279/*/pose"
-        );
         assert_eq!(
             KeyExpr::received_by_anyone(&run, Stream::Pose).as_str(),
             "v2v/r1/rx/*/*/pose"

@@ -271,20 +271,12 @@ impl Ledger {
     /// of its own process only.
     pub fn remove_foreign(&mut self, process: &ProcessId) -> Vec<Account> {
         let principal: Option<Principal> = process.to_string().parse().ok();
-        let mut foreign = Vec::new();
-        self.accounts.retain(|account, _| {
-            let is_own = match &account.to {
-                Some(to) => to == process,
-                None => principal
-                    .as_ref()
-                    .is_some_and(|principal| principal.publishes(&account.topic)),
-            };
-            if !is_own {
-                foreign.push(account.clone());
-            }
-            is_own
+        let (accounts, principal) = (&mut self.accounts, principal.as_ref());
+        let foreign = accounts.extract_if(.., |account, _| match &account.to {
+            Some(to) => to != process,
+            None => principal.is_none_or(|principal| !principal.publishes(&account.topic)),
         });
-        foreign
+        foreign.map(|(account, _)| account).collect()
     }
 
     fn counts(&mut self, account: &Account) -> &mut Counts {

@@ -94,21 +94,16 @@ impl MessageVisitor for StampEncoder<'_> {
 /// # Errors
 /// [`WireError`] when there is no header of this version.
 pub fn decode_header<'a>(pieces: impl IntoIterator<Item = &'a [u8]>) -> Result<Header, WireError> {
-    let mut bytes = [0; HEADER_LEN];
-    let mut left = bytes.as_mut_slice();
-    for piece in pieces {
-        let (filled, rest) = left.split_at_mut(piece.len().min(left.len()));
-        for (byte, from) in filled.iter_mut().zip(piece) {
-            *byte = *from;
-        }
-        left = rest;
-        if left.is_empty() {
-            return Header::from_bytes(&bytes);
-        }
+    let (mut bytes, mut found) = ([0; HEADER_LEN], 0);
+    for (byte, from) in bytes.iter_mut().zip(pieces.into_iter().flatten()) {
+        *byte = *from;
+        found += 1;
     }
     let expected = HEADER_LEN as u64;
-    let found = expected - left.len() as u64;
-    Err(WireError::Truncated { expected, found })
+    if found < expected {
+        return Err(WireError::Truncated { expected, found });
+    }
+    Header::from_bytes(&bytes)
 }
 
 /// Decodes a message of a known kind from its pieces.

@@ -5,9 +5,10 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use bus::BusError;
+use sim_replay::config::{RecorderConfig, ReplayConfig};
 use support::cli::exit_code;
 
-use crate::command;
+use crate::command::{self, ProcessArgs};
 
 /// Scenes: inspect recorded ones, generate new ones, stream either as live traffic, record a run.
 #[derive(Debug, Parser)]
@@ -28,9 +29,19 @@ enum Command {
     Export(command::export::Args),
     Inspect(command::inspect::Args),
     Link(Box<command::link::Args>),
-    Record(command::record::Args),
+    /// Write all messages of a run into an MCAP file, which `sim-replay stream` replays and Foxglove opens.
+    ///
+    /// Ends when the replay does, or on Ctrl-C. A truncated file can be replayed up to its last whole chunk.
+    Record(ProcessArgs<RecorderConfig>),
     Recover(command::recover::Args),
-    Stream(Box<command::stream::Args>),
+    /// Publish a scene as if its vehicles were driving now.
+    ///
+    /// The clock starts when all expected routes have carried a probe. While it runs, it obeys control messages
+    /// (`pause`, `resume`, `step`, `seek`, `start` with another rate).
+    ///
+    /// With a rate above 0 and without lockstep, a newer sweep replaces one that still waits for the network: the
+    /// summary counts them. Exit code 3 is for frames that cannot be read and ticks that are not answered.
+    Stream(Box<ProcessArgs<ReplayConfig>>),
     Synth(command::synth::Args),
 }
 

@@ -322,9 +322,8 @@ impl AgentLoop {
     /// First step of a sweep: its pose.
     fn localize(&mut self, paired: PairedSweep<Sweep>, now_nanos: u64) {
         // Measurements whose sweeps were superseded, and they with them.
-        let unused = paired.unused;
-        self.drop_messages(Stream::Gnss, unused.poses, DropReason::Superseded);
-        self.drop_messages(Stream::Imu, unused.motions, DropReason::Superseded);
+        self.drop_messages(Stream::Gnss, paired.unused_poses, DropReason::Superseded);
+        self.drop_messages(Stream::Imu, paired.unused_motions, DropReason::Superseded);
         let used = [
             paired.pose.map(|_| Stream::Gnss),
             paired.motion.map(|_| Stream::Imu),

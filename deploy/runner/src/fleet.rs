@@ -236,10 +236,8 @@ impl Fleet {
         let vehicles = self.agents.iter().map(|cav| self.settings_of(cav));
         let vehicles: Vec<_> = vehicles.collect();
         // Opened before, when the run was planned.
-        let link = scenario
-            .link
-            .as_ref()
-            .and_then(|link| LinkConfig::open(&link.model).ok());
+        let link = scenario.link.as_ref();
+        let link = link.and_then(|link| LinkConfig::open(&link.model).ok());
         let link = link.as_ref().map(|(link, folder)| (link, folder.as_path()));
         let weights = scenario.models.weights.clone();
         let files = files_of(scenario.method, weights, &vehicles, link);

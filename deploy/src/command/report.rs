@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use crate::operate::status::RunStatus;
-use crate::report::{Comparison, ReportError, RunReport, TrackReport, TrackTable};
+use crate::report::{Comparison, RunReport, TrackReport, track_table};
 use serde::Serialize;
-use support::output;
-
 use support::cli::{BadInput, Outcome};
+use support::file_error::FileError;
+use support::output;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -35,7 +35,9 @@ impl Arguments {
         let folders = folders.collect::<Result<Vec<_>, _>>()?;
         match (self.tracks, self.json, &folders[..]) {
             (true, true, folders) => print_json(&read(folders, TrackReport::read)?)?,
-            (true, false, folders) => output::text(TrackTable(&read(folders, TrackReport::read)?))?,
+            (true, false, folders) => {
+                output::text(track_table(&read(folders, TrackReport::read)?))?
+            }
             (false, true, folders) => print_json(&read(folders, RunReport::read)?)?,
             (false, false, [folder]) => {
                 let report = RunReport::read(folder).map_err(BadInput::of)?;
@@ -55,7 +57,7 @@ impl Arguments {
 /// Reads the reports of some runs.
 fn read<T>(
     folders: &[PathBuf],
-    read: impl Fn(&Path) -> Result<T, ReportError>,
+    read: impl Fn(&Path) -> Result<T, FileError>,
 ) -> Result<Vec<T>, BadInput> {
     let reports = folders.iter().map(|folder| read(folder));
     reports.collect::<Result<_, _>>().map_err(BadInput::of)

@@ -1,6 +1,5 @@
 //! Progress display of a run: a live line on a terminal, plain lines elsewhere.
 
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
@@ -15,7 +14,7 @@ const LINE_PERIOD: Duration = Duration::from_secs(2);
 
 /// Display of a run on standard error.
 pub struct Display {
-    bar: Option<ProgressBar>,
+    bar: ProgressBar,
     last_line: Instant,
     shown_frames: u64,
 }
@@ -23,10 +22,10 @@ pub struct Display {
 impl Display {
     /// A display for `ticks` ticks, or for a run without end.
     pub fn new(ticks: Option<usize>) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| match ticks {
+        let bar = match ticks {
             Some(ticks) => progress::bar(ticks, "frames"),
             None => progress::spinner("frames"),
-        });
+        };
         Self {
             bar,
             last_line: Instant::now(),
@@ -36,37 +35,26 @@ impl Display {
 
     /// Updates the live line, or prints a plain line if one is due.
     pub fn update(&mut self, progress: &Progress) {
-        match &self.bar {
-            Some(bar) => {
-                bar.set_position(progress.frames);
-                bar.set_message(summary(progress));
-            }
-            None if self.last_line.elapsed() >= LINE_PERIOD
-                && progress.frames != self.shown_frames =>
-            {
-                self.last_line = Instant::now();
-                self.shown_frames = progress.frames;
-                let (frames, ticks) = (progress.frames, progress.ticks);
-                let summary = summary(progress);
-                output::note(format_args!("answered {frames}/{ticks}  {summary}"));
-            }
-            None => {}
+        let (frames, ticks) = (progress.frames, progress.ticks);
+        if !self.bar.is_hidden() {
+            self.bar.set_position(frames);
+            self.bar.set_message(summary(progress));
+        } else if self.last_line.elapsed() >= LINE_PERIOD && frames != self.shown_frames {
+            self.last_line = Instant::now();
+            self.shown_frames = frames;
+            let summary = summary(progress);
+            output::note(format_args!("answered {frames}/{ticks}  {summary}"));
         }
     }
 
     /// Prints an event above the live line.
     pub fn print_line(&self, text: &str) {
-        match &self.bar {
-            Some(bar) => bar.suspend(|| output::note(text)),
-            None => output::note(text),
-        }
+        self.bar.suspend(|| output::note(text));
     }
 
     /// Removes the live line.
     pub fn finish(self) {
-        if let Some(bar) = self.bar {
-            bar.finish_and_clear();
-        }
+        self.bar.finish_and_clear();
     }
 }
 

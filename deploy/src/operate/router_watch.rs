@@ -83,10 +83,8 @@ impl RouterWatch {
         reported: Option<Instant>,
     ) -> Option<RouterFinding> {
         let now = Instant::now();
-        let silence = self
-            .probe
-            .as_mut()
-            .map_or(Duration::ZERO, |probe| probe.silence(now));
+        let probe = self.probe.as_mut();
+        let silence = probe.map_or(Duration::ZERO, |probe| probe.silence(now));
         let reported = reported.map_or(silence, |at| now.saturating_duration_since(at));
         // Any message that came through shows that the router passes messages.
         self.judge(silence.min(reported), scorer.router_lost_since(), now)

@@ -158,10 +158,8 @@ impl RunStatus {
 
     /// Problems as text: of processes during the run; of failed or crashed ones when it is over.
     pub fn troubles(&self) -> Vec<String> {
-        let sick = self
-            .processes
-            .iter()
-            .filter(|process| self.is_sick(process));
+        let all = self.processes.iter();
+        let sick = all.filter(|process| self.is_sick(process));
         let sick = sick.map(|process| {
             let why = why(process).map_or(String::new(), |why| format!(": {why}"));
             format!("{} is {}{why}", process.name, name_of(&process.state))

@@ -129,10 +129,8 @@ impl StatusReporter {
             let progress = scorer.progress();
             display.update(&progress);
             // The scorer is in this process, so its own reports prove nothing.
-            let others = progress
-                .last_reports
-                .iter()
-                .filter(|(name, _)| *name != SCORER);
+            let reports = &progress.last_reports;
+            let others = reports.iter().filter(|(name, _)| *name != SCORER);
             match self.router.look(scorer, others.map(|(_, at)| *at).max()) {
                 Some(RouterFinding::Hung(why)) => {
                     if let Some(router) = router {
@@ -143,7 +141,6 @@ impl StatusReporter {
                 None => {}
             }
             let is_gone = self.router.gone_s().is_some();
-            let reports = &progress.last_reports;
             for (name, why) in self.health.look(reports, is_gone, Instant::now()) {
                 supervisor.replace(&name, &why);
             }

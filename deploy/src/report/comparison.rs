@@ -3,9 +3,10 @@
 use std::fmt;
 use std::path::Path;
 
+use support::file_error::FileError;
 use terminal::text_table::{Side, TextTable, number};
 
-use super::{ReportError, RunReport, read_json};
+use super::{RunReport, read_json};
 use crate::operate::progress::bytes;
 use crate::score::metrics::{self, Metrics};
 
@@ -58,8 +59,8 @@ impl Comparison {
     /// Reads report and metrics in the folders of runs.
     ///
     /// # Errors
-    /// [`ReportError`] names the file.
-    pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, ReportError> {
+    /// [`FileError`] as that of [`RunReport::read`].
+    pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, FileError> {
         let runs = folders.iter().map(|folder| {
             let metrics = read_json(folder.as_ref().join(metrics::FILE));
             Ok((RunReport::read(folder.as_ref())?, metrics?))
@@ -70,16 +71,12 @@ impl Comparison {
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let runs = self
-            .0
-            .iter()
-            .map(|(report, _)| (report.run.as_str(), Side::Right));
+        let runs = self.0.iter();
+        let runs = runs.map(|(report, _)| (report.run.as_str(), Side::Right));
         let mut table = TextTable::new([("run", Side::Left)].into_iter().chain(runs));
         for (name, value) in ROWS {
-            let values = self
-                .0
-                .iter()
-                .map(|(report, metrics)| value(report, metrics));
+            let runs = self.0.iter();
+            let values = runs.map(|(report, metrics)| value(report, metrics));
             table.row([name.to_owned()].into_iter().chain(values));
         }
         write!(f, "{table}")?;

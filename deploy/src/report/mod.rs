@@ -23,7 +23,7 @@ pub use clocks::OtherClock;
 pub use comparison::Comparison;
 pub use pace::{AgentPace, RunPace};
 pub use resources::{ProcessResources, StageReport, StreamBytes};
-pub use tracks::{TrackReport, TrackTable};
+pub use tracks::{TrackReport, track_table};
 
 use crate::score::metrics::Metrics;
 use crate::score::{FrameRecord, ProcessStats};
@@ -87,17 +87,6 @@ impl Spread {
     }
 }
 
-/// Reason why a run has no report.
-#[derive(Debug, thiserror::Error)]
-pub enum ReportError {
-    /// The file cannot be read, or has another form.
-    #[error(transparent)]
-    File(#[from] FileError),
-    /// The run ended before its first tick.
-    #[error("{}: nothing was played in this run: it ended before its first tick", .0.display())]
-    NothingPlayed(PathBuf),
-}
-
 impl RunReport {
     /// Report from the ticks of a run, its metrics, and the last reports of its processes (none in simulation time).
     pub fn new(
@@ -128,13 +117,14 @@ impl RunReport {
     /// Reads the report in the folder of a run.
     ///
     /// # Errors
-    /// [`ReportError`] names the file.
-    pub fn read(folder: &Path) -> Result<Self, ReportError> {
+    /// [`FileError`] names the file, or the folder of a run that ended before its first tick.
+    pub fn read(folder: &Path) -> Result<Self, FileError> {
         let report: Self = read_json(folder.join(FILE))?;
-        match report.pace.ticks {
-            0 => Err(ReportError::NothingPlayed(folder.to_owned())),
-            _ => Ok(report),
+        if report.pace.ticks == 0 {
+            let problem = "nothing was played in this run: it ended before its first tick";
+            return Err(FileError::new(folder, problem));
         }
+        Ok(report)
     }
 }
 

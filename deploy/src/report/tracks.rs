@@ -5,7 +5,6 @@
 //! have, detections and the ego's own pose, no truth.
 
 use std::collections::HashMap;
-use std::fmt;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
@@ -21,7 +20,6 @@ use tracking::metrics::{
 };
 use tracking::{Tracker, TrackerConfig};
 
-use super::ReportError;
 use crate::score::{ScenarioLine, TRACKS, TruthLine};
 
 /// Longest line that is read, bytes: a result with the most boxes that a message may hold has less.
@@ -67,8 +65,8 @@ impl TrackReport {
     /// Tracks the detections in a folder.
     ///
     /// # Errors
-    /// [`ReportError`] names file and line.
-    pub fn read(folder: &Path) -> Result<Self, ReportError> {
+    /// [`FileError`] names file and line.
+    pub fn read(folder: &Path) -> Result<Self, FileError> {
         // No tracks where the ego did not track.
         let (mut results, mut tracks) = (HashMap::new(), HashMap::new());
         let mut method = None;
@@ -211,7 +209,7 @@ fn center_m(box3d: &Box3d) -> [f64; 2] {
 fn for_each_line<T: DeserializeOwned>(
     path: &Path,
     mut take: impl FnMut(T) -> Result<(), String>,
-) -> Result<(), ReportError> {
+) -> Result<(), FileError> {
     let mut reader = BufReader::new(bounded_file::open(path).at(path)?);
     let mut line = Vec::new();
     for index in 1.. {
@@ -230,43 +228,38 @@ fn for_each_line<T: DeserializeOwned>(
 }
 
 /// A table with a row for each run.
-#[derive(Debug)]
-pub struct TrackTable<'a>(pub &'a [TrackReport]);
-
-impl fmt::Display for TrackTable<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let numbers = [
-            "answered", "AMOTA", "AMOTP, m", "MOTA", "MOTP, m", "recall", "IDS", "FRAG", "MT",
-            "ML", "HOTA", "DetA", "AssA", "IDF1",
-        ];
-        let mut table = TextTable::of(&["run", "method"], &numbers);
-        for report in self.0 {
-            let quality = &report.quality;
-            let [ids, frag] = [quality.ids, quality.frag].map(|count| Some(count?.to_string()));
-            let [mt, ml] = [quality.mt, quality.ml]
-                .map(|count| Some(format!("{}/{}", count?, quality.true_tracks?)));
-            let [ids, frag, mt, ml] = [ids, frag, mt, ml].map(|text| text.unwrap_or("-".into()));
-            table.row([
-                report.run.clone(),
-                report.method.clone().unwrap_or_else(|| "-".into()),
-                format!("{}/{}", report.answered, report.ticks),
-                number(quality.amota, 3),
-                number(quality.amotp_m, 2),
-                number(quality.mota, 3),
-                number(quality.motp_m, 2),
-                number(quality.recall, 3),
-                ids,
-                frag,
-                mt,
-                ml,
-                number(quality.hota, 3),
-                number(quality.det_a, 3),
-                number(quality.ass_a, 3),
-                number(quality.idf1, 3),
-            ]);
-        }
-        write!(f, "{table}")
+pub fn track_table(reports: &[TrackReport]) -> TextTable {
+    let numbers = [
+        "answered", "AMOTA", "AMOTP, m", "MOTA", "MOTP, m", "recall", "IDS", "FRAG", "MT", "ML",
+        "HOTA", "DetA", "AssA", "IDF1",
+    ];
+    let mut table = TextTable::of(&["run", "method"], &numbers);
+    for report in reports {
+        let quality = &report.quality;
+        let [ids, frag] = [quality.ids, quality.frag].map(|count| Some(count?.to_string()));
+        let [mt, ml] = [quality.mt, quality.ml]
+            .map(|count| Some(format!("{}/{}", count?, quality.true_tracks?)));
+        let [ids, frag, mt, ml] = [ids, frag, mt, ml].map(|text| text.unwrap_or("-".into()));
+        table.row([
+            report.run.clone(),
+            report.method.clone().unwrap_or_else(|| "-".into()),
+            format!("{}/{}", report.answered, report.ticks),
+            number(quality.amota, 3),
+            number(quality.amotp_m, 2),
+            number(quality.mota, 3),
+            number(quality.motp_m, 2),
+            number(quality.recall, 3),
+            ids,
+            frag,
+            mt,
+            ml,
+            number(quality.hota, 3),
+            number(quality.det_a, 3),
+            number(quality.ass_a, 3),
+            number(quality.idf1, 3),
+        ]);
     }
+    table
 }
 
 #[cfg(test)]
@@ -341,7 +334,7 @@ mod tests {
         PoseEstimate::new(Pose::from_xyz_yaw([x, 0.0, 0.0], 0.0), 1.0)
     }
 
-    fn read(truth: &[String], detections: &[String]) -> Result<TrackReport, ReportError> {
+    fn read(truth: &[String], detections: &[String]) -> Result<TrackReport, FileError> {
         read_all(truth, detections, &[])
     }
 
@@ -349,7 +342,7 @@ mod tests {
         truth: &[String],
         detections: &[String],
         tracks: &[String],
-    ) -> Result<TrackReport, ReportError> {
+    ) -> Result<TrackReport, FileError> {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("run");
         std::fs::create_dir(&run).unwrap();
@@ -389,7 +382,7 @@ mod tests {
         assert_eq!((quality.amota, quality.idf1), (Some(1.0), Some(1.0)));
         assert_eq!((quality.ids, quality.mt), (Some(0), Some(2)));
         assert!(quality.hota > Some(0.99), "{quality:?}");
-        let text = TrackTable(&[report]).to_string();
+        let text = track_table(&[report]).to_string();
         assert!(text.contains("pastat") && text.contains("20/20"), "{text}");
     }
 

@@ -40,7 +40,8 @@ pub struct MotionReport {
 struct Measurements {
     speed_mps: TimeSeries<f64>,
     yaw_rate_rad_s: TimeSeries<f64>,
-    reports: BTreeMap<RosName, MotionReport>,
+    /// By topic.
+    reports: BTreeMap<String, MotionReport>,
 }
 
 /// Motion of one vehicle.
@@ -71,7 +72,9 @@ impl MotionInput {
             let (motion_type, topic) = (source.motion_type, source.source.topic.clone());
             let (measurements, ros_type) = (Arc::clone(&measurements), motion_type.ros_type());
             let report = MotionReport::default();
-            lock(&measurements).reports.insert(topic.clone(), report);
+            lock(&measurements)
+                .reports
+                .insert(topic.to_string(), report);
             let takes_yaw_rate = motion_type == MotionType::Imu || !has_imu;
             let log = Mutex::new(RefusalLog::of(topic.clone(), ros_type));
             let (cav, frames) = (cav.clone(), frames.clone());
@@ -112,16 +115,13 @@ impl MotionInput {
     pub(super) fn finish(self) -> BTreeMap<String, MotionReport> {
         let reports = std::mem::take(&mut lock(&self.measurements).reports);
         self.publisher.finish();
-        let reports = reports.into_iter();
         reports
-            .map(|(topic, report)| (topic.to_string(), report))
-            .collect()
     }
 }
 
 impl Measurements {
     fn add(&mut self, topic: &RosName, read: Option<TimedMotion>, takes_yaw_rate: bool) {
-        let report = self.reports.entry(topic.clone()).or_default();
+        let report = self.reports.entry(topic.to_string()).or_default();
         let Some(read) = read else {
             report.unreadable += 1;
             return;

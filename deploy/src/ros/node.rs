@@ -213,27 +213,25 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
 
     /// A process of a vehicle has joined or left: its topics appear, or disappear.
     fn note(&mut self, event: LivelinessEvent) -> Result<()> {
+        use LivelinessEvent::{Joined, Left};
+        use Role::Agent;
         match event {
-            LivelinessEvent::Joined { role, cav } => match role {
-                Role::Agent => {
-                    self.agents.insert(cav.clone());
-                    self.declare_all(&cav, &OF_AGENT)?;
-                    if !self.options.no_points {
-                        self.forward_sweeps(&cav)?;
-                    }
+            Joined { role: Agent, cav } => {
+                self.agents.insert(cav.clone());
+                self.declare_all(&cav, &OF_AGENT)?;
+                if !self.options.no_points {
+                    self.forward_sweeps(&cav)?;
                 }
-                _ => self.declare_all(&cav, &OF_EGO)?,
-            },
-            LivelinessEvent::Left { role, cav } => match role {
-                Role::Agent => {
-                    self.agents.remove(&cav);
-                    self.withdraw(&cav, &OF_AGENT);
-                    if let Some(forwarding) = self.sweeps.remove(&cav) {
-                        forwarding.end();
-                    }
+            }
+            Joined { cav, .. } => self.declare_all(&cav, &OF_EGO)?,
+            Left { role: Agent, cav } => {
+                self.agents.remove(&cav);
+                self.withdraw(&cav, &OF_AGENT);
+                if let Some(forwarding) = self.sweeps.remove(&cav) {
+                    forwarding.end();
                 }
-                _ => self.withdraw(&cav, &OF_EGO),
-            },
+            }
+            Left { cav, .. } => self.withdraw(&cav, &OF_EGO),
         }
         Ok(())
     }
@@ -256,13 +254,11 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
         let mount = self.options.mount.unwrap_or_default();
         let mut in_robots = self.frames.lidars_in_robots(&self.names);
         let robots: BTreeSet<CavId> = self.options.robots().collect();
-        let frames = self
-            .agents
-            .iter()
-            .filter_map(|cav| match robots.contains(cav) {
-                true => in_robots.remove(cav),
-                false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
-            });
+        let agents = self.agents.iter();
+        let frames = agents.filter_map(|cav| match robots.contains(cav) {
+            true => in_robots.remove(cav),
+            false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
+        });
         let frames: Vec<_> = frames.collect();
         // The stamp of a fixed transform has no meaning.
         let cdr = ros2::transforms(0, &frames);

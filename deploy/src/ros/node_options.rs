@@ -43,10 +43,8 @@ pub enum ClockMode {
 impl NodeOptions {
     /// Vehicles with an odometry: their frames are in a tree of their own.
     pub(super) fn robots(&self) -> impl Iterator<Item = CavId> {
-        let odometry = self
-            .motions
-            .iter()
-            .filter(|motion| motion.motion_type == MotionType::Odometry);
+        let motions = self.motions.iter();
+        let odometry = motions.filter(|motion| motion.motion_type == MotionType::Odometry);
         odometry.map(|motion| motion.source.cav.clone())
     }
 }

@@ -99,11 +99,8 @@ impl TimeSeries<f64> {
             return Some(last);
         };
         // Both ends have values of their own, so only what lies strictly between them is taken.
-        let between = self
-            .0
-            .iter()
-            .copied()
-            .filter(|(time, _)| (from + 1..to).contains(time));
+        let all = self.0.iter().copied();
+        let between = all.filter(|(time, _)| (from + 1..to).contains(time));
         let (mut sum, mut previous) = (0.0, (from, first));
         for next in between.chain([(to, last)]) {
             sum += 0.5 * (previous.1 + next.1) * seconds(next.0 - previous.0);

@@ -253,10 +253,8 @@ impl FrameScores {
         let ages_ms = fused.map(|of| of.age_nanos as f64 * 1e-6);
         let poses = result.pose.world_from_cav().zip(world_from_ego.as_ref());
         let ego_error = poses.map(|(found, truth)| PoseError::between(found, truth));
-        let stale = result
-            .skipped
-            .iter()
-            .filter(|one| one.reason == Some(DropReason::Stale));
+        let skipped = result.skipped.iter();
+        let stale = skipped.filter(|one| one.reason == Some(DropReason::Stale));
         self.records.push(FrameRecord {
             agent_frame: Some(result.agent_frame),
             latency_ms: stamps.detected_ms,

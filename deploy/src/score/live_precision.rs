@@ -68,13 +68,14 @@ impl LivePrecision {
         self.all_ticks.add(detections, truth.truth);
         // Before the result of this tick is added: it is published after the tick.
         let known = self.newest(truth);
-        let moved = known.as_ref().map_or(&[][..], |(_, moved)| moved);
+        let moved = known.as_ref().map_or(&[][..], |(.., moved)| moved);
         let verdicts = self.streaming.add(moved, truth.truth);
         let FrameCounts { detected, found } = FrameCounts::of(&self.streaming, &verdicts);
-        let streamed = known.map(|(of, _)| StreamedResult {
+        let streamed = known.map(|(tick, age_ms, _)| StreamedResult {
+            tick,
+            age_ms,
             detected,
             found,
-            ..of
         });
         let Some(answer) = answer else {
             return streamed;
@@ -116,9 +117,9 @@ impl LivePrecision {
         (self.ticks > 0 && !self.is_untimed).then(|| by_iou(&self.streaming, Ordering::Global))
     }
 
-    /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick. Older
-    /// ones are dropped.
-    fn newest(&mut self, truth: &TickTruth<'_>) -> Option<(StreamedResult, Vec<Detection>)> {
+    /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick, behind
+    /// their own tick and their age in ms. Older ones are dropped.
+    fn newest(&mut self, truth: &TickTruth<'_>) -> Option<(u64, f64, Vec<Detection>)> {
         let mut published = self.published.iter();
         let index = published.rposition(|published| published.nanos <= truth.began_nanos)?;
         self.published.drain(..index);
@@ -132,13 +133,8 @@ impl LivePrecision {
             box3d: found.box3d.transformed(&now_from_then),
             ..found.clone()
         });
-        let result = StreamedResult {
-            tick: newest.tick,
-            age_ms: truth.began_nanos.saturating_sub(newest.began_nanos) as f64 * 1e-6,
-            detected: 0,
-            found: 0,
-        };
-        Some((result, moved.collect()))
+        let age_ms = truth.began_nanos.saturating_sub(newest.began_nanos) as f64 * 1e-6;
+        Some((newest.tick, age_ms, moved.collect()))
     }
 }
 

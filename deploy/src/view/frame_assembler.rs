@@ -458,11 +458,9 @@ impl OpenFrame {
 
     /// Detections that single vehicles sent.
     fn single(&self) -> Vec<ShownBox> {
-        let shown = self
-            .own_boxes
-            .iter()
-            .flat_map(|(cav, boxes)| self.placed(cav, &boxes.pose, boxes.detections(), Some(cav)));
-        shown.collect()
+        let all = self.own_boxes.iter();
+        all.flat_map(|(cav, boxes)| self.placed(cav, &boxes.pose, boxes.detections(), Some(cav)))
+            .collect()
     }
 
     /// Detections in the frame of a vehicle, placed by its estimated pose, or else by its true one.

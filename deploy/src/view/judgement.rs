@@ -48,10 +48,8 @@ impl Judgement {
             .clone()
             .filter(|(_, verdict)| matches!(verdict, Verdict::Match(_)));
         let wrong = shown.filter(|(_, verdict)| **verdict == Verdict::FalsePositive);
-        let missed = self
-            .found
-            .values()
-            .filter(|score| score.is_none_or(|score| score < least_score));
+        let scores = self.found.values();
+        let missed = scores.filter(|score| score.is_none_or(|score| score < least_score));
         [matches.count(), wrong.count(), missed.count()]
     }
 }

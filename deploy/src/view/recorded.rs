@@ -346,10 +346,8 @@ impl RecordedRun {
         });
         let swept_ms = times.map(|(began, arrived)| ms_between(began, arrived));
         let summary = timeline.summaries.get(index);
-        let egos = self
-            .timelines
-            .iter()
-            .filter_map(|timeline| timeline.ego.clone());
+        let timelines = self.timelines.iter();
+        let egos = timelines.filter_map(|timeline| timeline.ego.clone());
         SceneFrame {
             swept_ms,
             tracks: self.tracks_at(index, timeline),
@@ -363,10 +361,8 @@ impl RecordedRun {
     /// Tracks of a scene frame with their trails, the same on every way to it.
     fn tracks_at(&self, index: usize, timeline: &Timeline) -> Vec<ShownTrack> {
         let (mut trails, mut shown) = (Trails::default(), Vec::new());
-        let now_nanos = self
-            .moments
-            .get(index)
-            .map_or(0, |moment| moment.capture_nanos);
+        let now = self.moments.get(index);
+        let now_nanos = now.map_or(0, |moment| moment.capture_nanos);
         let until = self.moments.iter().zip(&timeline.tracks).take(index + 1);
         for (RecordedMoment { capture_nanos, .. }, tracks) in until {
             if Trails::covers(now_nanos, *capture_nanos) {

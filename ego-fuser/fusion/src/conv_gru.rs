@@ -63,16 +63,9 @@ fn convolve(x: &Tensor, kernel: &Tensor, bias: Option<&Tensor>) -> Result<Tensor
 /// A convolutional GRU of which only the first step is computed.
 #[derive(Debug)]
 pub(super) struct ConvGru {
-    cells: Vec<GruCell>,
+    /// Of each layer the gates, reset then update, and the new state, all of input and state.
+    cells: Vec<[Conv; 2]>,
     hidden: i64,
-}
-
-#[derive(Debug)]
-struct GruCell {
-    /// Reset gate, then update gate, of input and state.
-    gates: Conv,
-    /// New state, of input and state.
-    candidate: Conv,
 }
 
 impl ConvGru {
@@ -88,10 +81,8 @@ impl ConvGru {
                 .map(|layer| {
                     let path = path / "cell_list" / layer;
                     let input = if layer == 0 { input } else { hidden } + hidden;
-                    GruCell {
-                        gates: Conv::new(&(&path / "conv_gates"), [input, 2 * hidden], kernel),
-                        candidate: Conv::new(&(&path / "conv_can"), [input, hidden], kernel),
-                    }
+                    [("conv_gates", 2 * hidden), ("conv_can", hidden)]
+                        .map(|(name, output)| Conv::new(&(&path / name), [input, output], kernel))
                 })
                 .collect(),
             hidden,
@@ -103,7 +94,7 @@ impl ConvGru {
         let hidden = self.hidden;
         self.cells
             .iter()
-            .try_fold(x.shallow_clone(), |x, GruCell { gates, candidate }| {
+            .try_fold(x.shallow_clone(), |x, [gates, candidate]| {
                 let input = x.size4()?.1;
                 // Update gate and candidate in one convolution over the input alone.
                 let [kernel, bias] = [

@@ -14,7 +14,7 @@ use perception::weights::{METHOD_KEY, Weights};
 use protocol::ConfidenceGate;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Error;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::{
     FusionConfig, MethodSpec, attention, coalign, cobevt, disconet, ermvp, max, own, pastat,
@@ -24,8 +24,11 @@ use crate::{
 pub use crate::Exchange;
 
 /// A collaboration method: how the views of several CAVs become one set of boxes.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub struct Method(&'static MethodSpec);
+
+protocol::written_as_text!(Method);
 
 /// Every method, in the order of tables, as `NAME: specification`.
 macro_rules! methods {
@@ -187,20 +190,6 @@ impl JsonSchema for Method {
             .collect();
         names.push(json_schema!({"pattern": "^script:.+", "description": "A TorchScript file, script:FILE.pt."}));
         json_schema!({"description": "How the views of several CAVs become one set of boxes.", "oneOf": names})
-    }
-}
-
-impl Serialize for Method {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(self.name())
-    }
-}
-
-impl<'de> Deserialize<'de> for Method {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        Cow::<str>::deserialize(deserializer)?
-            .parse()
-            .map_err(D::Error::custom)
     }
 }
 

@@ -47,11 +47,8 @@ impl Credentials {
         let metadata = fs::metadata(&key).map_err(|cause| bad(&key, &cause))?;
         let mode = metadata.permissions().mode();
         if mode & 0o077 != 0 {
-            tracing::warn!(
-                "{}: others on this machine can read this key (mode {:03o})",
-                key.display(),
-                mode & 0o777
-            );
+            let (key, mode) = (key.display(), mode & 0o777);
+            tracing::warn!("{key}: others on this machine can read this key (mode {mode:03o})");
         }
         let name = name_of(&folder.join(CERTIFICATE_FILE), SystemTime::now())?;
         Ok(Self { folder, name })
@@ -67,14 +64,12 @@ impl Credentials {
     /// # Errors
     /// [`BusError::Keys`] states both names.
     pub fn check_name(&self, wanted: &str) -> Result<(), BusError> {
-        if self.name == wanted {
+        let name = self.name();
+        if name == wanted {
             return Ok(());
         }
         let certificate = self.folder.join(CERTIFICATE_FILE);
-        let what = format!(
-            "this is the certificate of {}, and {wanted} needs its own",
-            self.name
-        );
+        let what = format!("this is the certificate of {name}, and {wanted} needs its own");
         Err(bad(&certificate, &what))
     }
 

@@ -74,28 +74,17 @@ fn rules() -> Value {
         let id = format!("egress-{priority}");
         rule(&id, &filter, "block_first", &large)
     });
+    let [block, block_first] =
+        ["block", "block_first"].map(|how| json!({"congestion_control": how}));
+    let lossless = json!({"priority": "real_time"});
+    let (always, here) = (json!({}), json!({"interfaces": LOOPBACK}));
     let others = [
-        rule(
-            "egress",
-            // What is still `block` here is no large tensor: the rules above have made those `block_first`.
-            &json!({"congestion_control": "block"}),
-            "drop",
-            &json!({}),
-        ),
-        rule(
-            "egress-here",
-            // For receivers on the loopback large tensors are dropped like all else.
-            &json!({"congestion_control": "block_first"}),
-            "drop",
-            &json!({"interfaces": LOOPBACK}),
-        ),
-        rule(
-            "egress-lossless",
-            // Last: it overrides the rules above for lossless publishers, which alone use this priority.
-            &json!({"priority": "real_time"}),
-            "block",
-            &json!({}),
-        ),
+        // What is still `block` here is no large tensor: the rules above have made those `block_first`.
+        rule("egress", &block, "drop", &always),
+        // For receivers on the loopback large tensors are dropped like all else.
+        rule("egress-here", &block_first, "drop", &here),
+        // Last: it overrides the rules above for lossless publishers, which alone use this priority.
+        rule("egress-lossless", &lossless, "block", &always),
     ];
     tensors.into_iter().chain(others).collect()
 }

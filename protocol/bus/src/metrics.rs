@@ -189,17 +189,12 @@ impl Collector for StatsCollector {
             .iter()
             .map(|(account, counts)| (topic_and_side(account), gauge(counts.in_flight)));
         encode_series(&mut encoder, help, None, series)?;
-        let help = (
-            "shared_memory_messages",
-            "Large messages of a process with a pool of shared memory, by their way",
-        );
+        let help = "Large messages of a process with a pool of shared memory, by their way";
         let series = self.0.shared_memory().into_iter();
         let series = series.map(|(way, count)| ([("way", way.as_str())], ConstCounter::new(count)));
-        encode_series(&mut encoder, help, None, series)?;
-        let help = (
-            "published",
-            "Bytes of published messages, each counted once for all its receivers",
-        );
+        encode_series(&mut encoder, ("shared_memory_messages", help), None, series)?;
+        let help = "Bytes of published messages, each counted once for all its receivers";
+        let help = ("published", help);
         let series = self.0.traffic().into_iter().map(|traffic| {
             let topic = ("topic", traffic.topic.to_string());
             ([topic], ConstCounter::new(traffic.bytes))
@@ -207,15 +202,12 @@ impl Collector for StatsCollector {
         encode_series(&mut encoder, help, Some(&Unit::Bytes), series)?;
         encode_frames(&self.0.frames(), &mut encoder)?;
         let peers = self.0.peers();
-        let help = (
-            "clock_offset",
-            "Clock of a vehicle minus ours, minus the shortest transit time",
-        );
+        let help = "Clock of a vehicle minus ours, minus the shortest transit time";
         let seconds = Some(&Unit::Seconds);
         let series = peers.iter().filter_map(|(cav, peer)| {
             Some((vehicle_label(cav), ConstGauge::new(peer.clock?.seconds())))
         });
-        encode_series(&mut encoder, help, seconds, series)?;
+        encode_series(&mut encoder, ("clock_offset", help), seconds, series)?;
         let help = ("trust", "Trust score of a vehicle, 0 to 1");
         let series = peers
             .iter()

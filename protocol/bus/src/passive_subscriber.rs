@@ -45,10 +45,6 @@ impl RawMessage {
     pub fn bytes(&self) -> std::borrow::Cow<'_, [u8]> {
         self.payload.to_bytes()
     }
-
-    fn len(&self) -> usize {
-        self.payload.len()
-    }
 }
 
 /// All messages on the keys of some selectors, in bounded queues, one per key, that keep the newest.
@@ -98,9 +94,8 @@ impl PassiveSubscriber {
     pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, RawMessage> {
         let taken = self.shared.queue.take(deadline);
         if let Pop::Item(_, raw_message) = &taken {
-            self.shared
-                .waiting_bytes
-                .fetch_sub(raw_message.len(), Ordering::Relaxed);
+            let waiting = &self.shared.waiting_bytes;
+            waiting.fetch_sub(raw_message.payload.len(), Ordering::Relaxed);
         }
         taken
     }
@@ -151,7 +146,7 @@ impl Shared {
     }
 
     fn keep(&self, raw_message: RawMessage) {
-        let len = raw_message.len();
+        let len = raw_message.payload.len();
         // Added before the push: the consumer may take the message, and subtract its bytes, at once.
         let waiting = self.waiting_bytes.fetch_add(len, Ordering::Relaxed);
         let (left_out, is_lost) = if waiting + len > MAX_WAITING {
@@ -159,9 +154,11 @@ impl Shared {
         } else {
             match self.queue.push(raw_message.key.topic.clone(), raw_message) {
                 PushOutcome::Queued => return,
-                PushOutcome::Replaced(lost) | PushOutcome::NoLane(lost) => (lost.len(), true),
+                PushOutcome::Replaced(lost) | PushOutcome::NoLane(lost) => {
+                    (lost.payload.len(), true)
+                }
                 // Sent after the end of the capture, such as the last reports of other processes.
-                PushOutcome::Closed(late) => (late.len(), false),
+                PushOutcome::Closed(late) => (late.payload.len(), false),
             }
         };
         self.waiting_bytes.fetch_sub(left_out, Ordering::Relaxed);

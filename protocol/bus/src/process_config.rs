@@ -38,13 +38,16 @@ pub fn minimal<C: ProcessConfig>(
 ) -> Result<C, serde_json::Error> {
     let mut root = json!({});
     for field in C::REQUIRED {
-        let (mut place, mut name) = (&mut root, *field);
-        for part in field.split('.') {
-            (place, name) = (&mut place[part], part);
-        }
-        *place = Value::String(value_of(name));
+        let place = field.split('.');
+        let place = place.fold(&mut root, |place, part| &mut place[part]);
+        *place = Value::String(value_of(option_name(field)));
     }
     serde_json::from_value(root)
+}
+
+/// Name of the option of a required field.
+fn option_name(field: &str) -> &str {
+    field.rsplit('.').next().unwrap_or(field)
 }
 
 /// Options of a process: those of its configuration, and `--config`.
@@ -108,10 +111,7 @@ impl<C: ProcessConfig> Args for Configured<C> {
         let defaults = minimal::<C>(|_| "x".into())
             .and_then(serde_json::to_value)
             .unwrap_or_default();
-        let required = C::REQUIRED
-            .iter()
-            .map(|field| field.rsplit('.').next().unwrap_or(field));
-        let required: Vec<&str> = required.collect();
+        let required: Vec<&str> = C::REQUIRED.iter().copied().map(option_name).collect();
         let options =
             // The help must not quote the placeholder of a required field as its default.
             options_of::<C>().filter(|option| !required.contains(&option.get_id().as_str()));

@@ -163,9 +163,7 @@ impl Publisher {
             .express(options.express)
             .wait()
             .map_err(|cause| BusError::zenoh(format!("declaring a publisher on {key}"), &cause))?;
-        let places = match options.overflow {
-            Overflow::KeepLast(places) | Overflow::Wait(places) => places,
-        };
+        let (Overflow::KeepLast(places) | Overflow::Wait(places)) = options.overflow;
         let has_subscribers = options
             .is_for_onlookers
             .then(|| has_subscribers(&publisher))

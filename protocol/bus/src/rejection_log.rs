@@ -61,11 +61,8 @@ impl RejectionLog {
             self.failed_handshakes.insert(PLAIN_TCP, plain);
         }
         let key = format!("@/{}/router/metrics", router.zid());
-        let query = router
-            .get(format!(
-                "{key}?descriptors=false;compression=false;per_key=false"
-            ))
-            .timeout(QUERY_TIMEOUT);
+        let selector = format!("{key}?descriptors=false;compression=false;per_key=false");
+        let query = router.get(selector).timeout(QUERY_TIMEOUT);
         let Ok(answers) = query.wait() else { return };
         while let Ok(answer) = answers.recv() {
             if let Ok(sample) = answer.result()

@@ -119,11 +119,9 @@ impl TopicSenders {
         // A restarted sender is accepted at once.
         while self
             .starts
-            .front()
-            .is_some_and(|start| now.duration_since(*start) > QUIET)
-        {
-            self.starts.pop_front();
-        }
+            .pop_front_if(|start| now.duration_since(*start) > QUIET)
+            .is_some()
+        {}
         self.starts.push_back(now);
         if self.starts.len() > STARTS {
             self.starts.pop_front();

@@ -135,11 +135,8 @@ impl BusOptions {
     pub fn for_zenohd(&self) -> Value {
         let mut whole = json!({});
         for (key, value) in self.settings() {
-            let mut place = &mut whole;
-            for part in key.split('/') {
-                place = &mut place[part];
-            }
-            *place = value;
+            let place = key.split('/');
+            *place.fold(&mut whole, |place, part| &mut place[part]) = value;
         }
         whole
     }

@@ -1,11 +1,11 @@
 //! Shutdown on request, within a time limit.
 
 use std::sync::mpsc;
-use std::sync::{Arc, Condvar, Mutex};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use support::sync::{lock, spawn, wait_at_most};
+use support::sync::{lock, spawn};
 
 #[derive(Default)]
 struct StopState {
@@ -57,15 +57,11 @@ impl Stop {
 
     /// Waits for the request, at most until `deadline`; true if it was made.
     pub fn wait_until(&self, deadline: Instant) -> bool {
-        let mut state = lock(&self.0.0);
-        while !state.requested {
-            let left = deadline.saturating_duration_since(Instant::now());
-            if left.is_zero() {
-                return false;
-            }
-            state = wait_at_most(&self.0.1, state, left);
-        }
-        true
+        let left = deadline.saturating_duration_since(Instant::now());
+        let (state, changed) = &*self.0;
+        let waited = changed.wait_timeout_while(lock(state), left, |state| !state.requested);
+        let (state, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        state.requested
     }
 
     /// Makes Ctrl-C and SIGTERM a request. A second one ends the process at once, with exit code 130.

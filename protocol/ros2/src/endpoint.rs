@@ -210,7 +210,7 @@ mod tests {
     use super::*;
 
     fn name(text: &str) -> RosName {
-        RosName::new(text).unwrap()
+        text.parse().unwrap()
     }
 
     fn node(namespace: Option<&str>) -> Node {

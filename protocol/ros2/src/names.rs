@@ -27,21 +27,6 @@ pub struct NameError {
 pub struct RosName(Box<str>);
 
 impl RosName {
-    /// Checks `text` by the rules of ROS 2 for absolute topic names.
-    ///
-    /// # Errors
-    /// [`NameError`] states the text that is no name.
-    pub fn new(text: &str) -> Result<Self, NameError> {
-        match text.strip_prefix('/') {
-            Some(tokens) if text.len() <= MAX_BYTES && tokens.split('/').all(is_token) => {
-                Ok(Self(text.into()))
-            }
-            _ => Err(NameError {
-                text: text.chars().take(MAX_BYTES).collect(),
-            }),
-        }
-    }
-
     /// A name that is made of valid parts.
     pub(crate) fn known(text: &str) -> Self {
         Self(text.into())
@@ -69,8 +54,16 @@ impl fmt::Display for RosName {
 impl FromStr for RosName {
     type Err = NameError;
 
+    /// Checks `text` by the rules of ROS 2 for absolute topic names.
     fn from_str(text: &str) -> Result<Self, NameError> {
-        Self::new(text)
+        match text.strip_prefix('/') {
+            Some(tokens) if text.len() <= MAX_BYTES && tokens.split('/').all(is_token) => {
+                Ok(Self(text.into()))
+            }
+            _ => Err(NameError {
+                text: text.chars().take(MAX_BYTES).collect(),
+            }),
+        }
     }
 }
 
@@ -150,7 +143,10 @@ mod tests {
 
     #[test]
     fn frames_are_in_the_namespace_of_their_node() {
-        let (cav, fleet) = (CavId::new("-1").unwrap(), RosName::new("/a/fleet").unwrap());
+        let (cav, fleet) = (
+            CavId::new("-1").unwrap(),
+            "/a/fleet".parse::<RosName>().unwrap(),
+        );
         assert_eq!(FrameNames::default().lidar(&cav), "cav_M1/lidar");
         assert_eq!(
             FrameNames::within(Some(&fleet)).camera(&cav, 2),
@@ -161,7 +157,7 @@ mod tests {
     #[test]
     fn names_are_checked_as_ros_does() {
         for text in ["/points", "/cav_1000/points", "/a/b/c", "/_x"] {
-            assert_eq!(RosName::new(text).unwrap().as_str(), text);
+            assert_eq!(text.parse::<RosName>().unwrap().as_str(), text);
         }
         let long = format!("/{}", "a".repeat(MAX_BYTES));
         for text in [
@@ -178,7 +174,7 @@ mod tests {
             "~/a",
             &long,
         ] {
-            let error = RosName::new(text).unwrap_err().to_string();
+            let error = text.parse::<RosName>().unwrap_err().to_string();
             assert!(error.len() < 600 && error.contains("ROS 2 name"), "{error}");
         }
     }
@@ -190,7 +186,7 @@ mod tests {
             prop_assume!(first.is_ok() && second.is_ok());
             let names = ids.each_ref().map(|id| vehicle_of(id));
             for name in &names {
-                prop_assert!(RosName::new(&format!("/{name}/points")).is_ok() && !name.contains("__"), "{}", name);
+                prop_assert!(format!("/{name}/points").parse::<RosName>().is_ok() && !name.contains("__"), "{}", name);
             }
             prop_assert_eq!(ids[0] == ids[1], names[0] == names[1]);
         }

@@ -117,7 +117,10 @@ mod tests {
 
     #[test]
     fn names_are_in_the_namespace_but_for_those_of_the_network() {
-        let (cav, fleet) = (CavId::new("1000").unwrap(), RosName::new("/fleet").unwrap());
+        let (cav, fleet) = (
+            CavId::new("1000").unwrap(),
+            "/fleet".parse::<RosName>().unwrap(),
+        );
         let points = RosTopic::Vehicle(cav, VehicleTopic::Points);
         assert_eq!(points.name(None).as_str(), "/cav_1000/points");
         assert_eq!(points.name(Some(&fleet)).as_str(), "/fleet/cav_1000/points");
@@ -130,7 +133,7 @@ mod tests {
         ] {
             let name = topic.name(Some(&fleet));
             assert_eq!(name, topic.name(None));
-            assert_eq!(RosName::new(name.as_str()).unwrap(), name);
+            assert_eq!(name.as_str().parse::<RosName>().unwrap(), name);
         }
     }
 }

@@ -57,16 +57,20 @@ impl Truth {
 }
 
 impl TrueObject {
-    fn check_values(&self) -> Result<(), WireError> {
-        check_name("class", &self.class)?;
-        check_pose("world_from_object", &self.world_from_object)?;
-        let box3d = Box3d {
+    /// Its upright box in the world.
+    pub fn box3d(&self) -> Box3d {
+        Box3d {
             center_m: self.world_from_object.translation_m,
             size_m: self.size_m,
             heading_rad: self.world_from_object.yaw_rad(),
-        };
+        }
+    }
+
+    fn check_values(&self) -> Result<(), WireError> {
+        check_name("class", &self.class)?;
+        check_pose("world_from_object", &self.world_from_object)?;
         // Data sets have objects without length, width or height: one of them must not reject the whole message.
-        box3d.check_from(0.0)?;
+        self.box3d().check_from(0.0)?;
         check_within("speed_mps", self.speed_mps.unwrap_or(0.0), -1e3, 1e3)
     }
 }

@@ -8,7 +8,7 @@ use csv::{ReaderBuilder, StringRecord, Terminator, Trim, Writer, WriterBuilder};
 use protocol::text::excerpt;
 
 use crate::bounded_file;
-use crate::file_error::{FileError, Result};
+use crate::file_error::{AtFile, FileError, Result};
 
 /// Maximum number of characters of a foreign field or line in an error.
 const SHOWN_CHARS: usize = 80;
@@ -35,11 +35,9 @@ impl CsvFile {
     /// # Errors
     /// [`FileError`].
     pub fn read(path: &Path, header: &'static str, max_bytes: u64) -> Result<Self> {
+        let text = bounded_file::read_text(path, max_bytes).at(path)?;
         let path = path.to_owned();
-        match bounded_file::read_text(&path, max_bytes) {
-            Ok(text) => Self { path, header, text }.checked(),
-            Err(error) => Err(FileError::new(path, error)),
-        }
+        Self { path, header, text }.checked()
     }
 
     fn checked(self) -> Result<Self> {

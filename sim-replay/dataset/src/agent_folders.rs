@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use protocol::CavId;
 
 use super::files::Listing;
-use super::frame_files::{AgentFolder, BIN, PCD, RADAR, holds_pairs};
+use super::frame_files::{AgentFolder, BIN, PCD, holds_pairs};
 use super::points::{SweepStorage, Sweeps};
 use super::yaml::{self, YamlField};
 use super::{MissingFrame, OpenOptions, ReadError, Result, Tick, files};
@@ -195,11 +195,6 @@ impl ScenarioFolder {
         self.agent_dir(agent).join(format!("{stem}.yaml"))
     }
 
-    /// True if the sweeps are bare floats, as V2X-Real stores them.
-    pub(super) fn has_bare_floats(&self) -> bool {
-        self.suffix == BIN
-    }
-
     /// The plain sweep of a frame, or a variant of it.
     pub(super) fn pcd(&self, agent: &CavId, stem: &str, variant: Option<&str>) -> PathBuf {
         let name = match variant {
@@ -225,11 +220,6 @@ impl ScenarioFolder {
             let files = stems.map(|stem| self.pcd(agent, stem, None));
             sweeps.with_agent(agent.clone(), files)
         })
-    }
-
-    /// The radar's points of a frame.
-    pub(super) fn radar(&self, agent: &CavId, stem: &str) -> PathBuf {
-        self.pcd(agent, stem, Some(RADAR))
     }
 
     /// Capture times of all stems. Stems count simulator ticks and are no clock: if `data_protocol.yaml` gives the

@@ -186,10 +186,8 @@ fn place(field: &YamlField<'_>) -> Result<CarlaPose> {
     let center = field
         .optional("center")?
         .map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
-    let (location, angle) = (
-        field.required("location")?.numbers()?,
-        field.required("angle")?,
-    );
+    let location = field.required("location")?.numbers()?;
+    let angle = field.required("angle")?;
     let angle_deg = angle.numbers::<3>()?;
     if angle_deg.iter().any(|angle| angle.abs() > MAX_ANGLE_DEG) {
         return Err(angle.error(format!("{angle_deg:?}, expected angles in degrees")));

@@ -24,12 +24,8 @@ pub struct CloudFile {
 
 #[derive(Debug, Clone)]
 enum CloudSource {
-    /// A frame of a data set.
-    Frame {
-        scenario: Arc<Scenario>,
-        agent: usize,
-        tick: usize,
-    },
+    /// A frame of a data set, by its agent and tick.
+    Frame(Arc<Scenario>, (usize, usize)),
     /// A file by itself, with the others of its folder.
     File(Arc<Sweeps>),
 }
@@ -83,13 +79,11 @@ fn listed(path: &Path) -> Result<Vec<Listed>> {
     }
     let scenarios = crate::open(path)?.scenarios.into_iter();
     let sweeps: Vec<Listed> = scenarios.flat_map(frames_of).map(Listed::Known).collect();
-    match sweeps.is_empty() {
-        true => Err(ReadError::malformed(
-            path,
-            "no cloud in it: expected files .pcd, .ply, .npy or .bin",
-        )),
-        false => Ok(sweeps),
+    if sweeps.is_empty() {
+        let reason = "no cloud in it: expected files .pcd, .ply, .npy or .bin";
+        return Err(ReadError::malformed(path, reason));
     }
+    Ok(sweeps)
 }
 
 /// All sweeps of a scenario.
@@ -105,11 +99,7 @@ fn frames_of(scenario: Scenario) -> Vec<CloudFile> {
         let path = if has_many { path.join(stem) } else { path };
         Some(CloudFile {
             path,
-            source: CloudSource::Frame {
-                scenario: Arc::clone(&scenario),
-                agent,
-                tick,
-            },
+            source: CloudSource::Frame(Arc::clone(&scenario), (agent, tick)),
         })
     })
     .collect()
@@ -199,11 +189,9 @@ impl CloudFile {
     /// with the exceeded limit.
     pub fn read(&self) -> Result<Cloud> {
         let cloud = match &self.source {
-            CloudSource::Frame {
-                scenario,
-                agent,
-                tick,
-            } => scenario.load_points(*agent, *tick, None)?,
+            CloudSource::Frame(scenario, (agent, tick)) => {
+                scenario.load_points(*agent, *tick, None)?
+            }
             CloudSource::File(sweeps) => sweeps.read(&single_vehicle_id(), &self.path)?,
         };
         let findings = SweepFindings::of(&cloud);
@@ -219,7 +207,7 @@ impl CloudFile {
             points,
             left_out,
             findings,
-            is_of_data_set: matches!(self.source, CloudSource::Frame { .. }),
+            is_of_data_set: matches!(self.source, CloudSource::Frame(..)),
         })
     }
 }

@@ -84,18 +84,12 @@ impl EvaluationProtocol {
             return self.ground_truth;
         }
         let [x_low, y_low, z_low, x_high, y_high, z_high] = area_m;
-        let GroundTruthRule { x_m, y_m, z_m, .. } = self.ground_truth;
-        let [x_m, y_m, z_m] = [
-            (x_m, x_low, x_high),
-            (y_m, y_low, y_high),
-            (z_m, z_low, z_high),
-        ]
-        .map(|([low, high], from, to)| [low.max(from), high.min(to)]);
+        let rule = self.ground_truth;
         GroundTruthRule {
-            x_m,
-            y_m,
-            z_m,
-            ..self.ground_truth
+            x_m: common(rule.x_m, [x_low, x_high]),
+            y_m: common(rule.y_m, [y_low, y_high]),
+            z_m: common(rule.z_m, [z_low, z_high]),
+            ..rule
         }
     }
 
@@ -124,6 +118,11 @@ impl EvaluationProtocol {
         order.truncate(self.max_agents);
         (!order.is_empty()).then(|| scenario.arranged(&order))
     }
+}
+
+/// The part of a range that lies in another one.
+fn common([low, high]: [f64; 2], [from, to]: [f64; 2]) -> [f64; 2] {
+    [low.max(from), high.min(to)]
 }
 
 impl fmt::Display for EvaluationProtocol {

@@ -108,22 +108,12 @@ pub struct GroundTruthRule {
 
 impl GroundTruthRule {
     /// OPV2V and V2XSet: x within 140 m, y within 40 m, z -3..1 m, all corners, 70 m of communication.
-    pub const OPV2V: Self = Self {
-        x_m: [-140.0, 140.0],
-        y_m: [-40.0, 40.0],
-        z_m: [-3.0, 1.0],
-        comm_range_m: 70.0,
-        min_corners: 8,
-        classes: ClassSet::VEHICLES,
-    };
+    pub const OPV2V: Self = vehicles_in(140.0, 40.0, [-3.0, 1.0], 70.0);
     /// V2V4Real: x within 100 m, y within 40 m, z -5..3 m, two corners, 70 m of communication.
     pub const V2V4REAL: Self = Self {
-        x_m: [-100.0, 100.0],
-        y_m: [-40.0, 40.0],
-        z_m: [-5.0, 3.0],
-        comm_range_m: 70.0,
         min_corners: 2,
         classes: ClassSet::ALL_BUT_PEDESTRIANS,
+        ..vehicles_in(100.0, 40.0, [-5.0, 3.0], 70.0)
     };
 
     /// True if enough corners lie in range, and all of them in x and y.
@@ -137,6 +127,23 @@ impl GroundTruthRule {
         // The second test is the reference's own, on x and y alone, after merging. It decides only if fewer than all
         // corners pass the first one.
         inside >= self.min_corners && are_in_plane
+    }
+}
+
+/// The rule for vehicles with all corners within x and y to both sides.
+pub(crate) const fn vehicles_in(
+    x: f64,
+    y: f64,
+    z_m: [f64; 2],
+    comm_range_m: f64,
+) -> GroundTruthRule {
+    GroundTruthRule {
+        x_m: [-x, x],
+        y_m: [-y, y],
+        z_m,
+        comm_range_m,
+        min_corners: 8,
+        classes: ClassSet::VEHICLES,
     }
 }
 

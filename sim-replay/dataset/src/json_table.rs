@@ -196,12 +196,10 @@ impl RowSplitter {
     }
 
     fn finish(&self) -> Result<(), String> {
+        let count = self.count;
         match self.is_over {
             true => Ok(()),
-            false => Err(format!(
-                "ends within the list, behind {} entries",
-                self.count
-            )),
+            false => Err(format!("ends within the list, behind {count} entries")),
         }
     }
 

@@ -26,10 +26,7 @@ pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
     data_sets: "KITTI object detection",
     files: "velodyne/<frame>.bin and calib/<frame>.txt (a folder)",
     protocol: "opv2v",
-    reader: Some(LayoutReader::Sequence {
-        is_one: is_split,
-        open,
-    }),
+    reader: Some(LayoutReader::Sequence(is_split, open)),
 };
 
 /// Numbers after the type in a line of labels; detections have a score as well.
@@ -81,10 +78,8 @@ impl FrameSource for Split {
             let rectified = calibration.rotation("R0_rect")?.isometry();
             // Labels are in the frame of the rectified camera: R0_rect follows Tr_velo_to_cam.
             let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
-            (frame.objects, frame.problems) = objects(
-                &self.file("label_2", tick, "txt"),
-                &camera_from_lidar.inverse(),
-            )?;
+            let labels = self.file("label_2", tick, "txt");
+            (frame.objects, frame.problems) = objects(&labels, &camera_from_lidar.inverse())?;
         }
         Ok(frame)
     }
@@ -102,10 +97,8 @@ impl FrameSource for Split {
         if !self.has_labels {
             return Vec::new();
         }
-        vec![
-            self.file("calib", tick, "txt"),
-            self.file("label_2", tick, "txt"),
-        ]
+        let folders = ["calib", "label_2"];
+        folders.map(|folder| self.file(folder, tick, "txt")).into()
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

@@ -21,10 +21,7 @@ pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
     data_sets: "KITTI odometry, SemanticKITTI",
     files: "velodyne/<scan>.bin and calib.txt (a file)",
     protocol: "opv2v",
-    reader: Some(LayoutReader::Sequence {
-        is_one: is_sequence,
-        open,
-    }),
+    reader: Some(LayoutReader::Sequence(is_sequence, open)),
 };
 
 /// True for a folder with scans and a calibration file.

@@ -34,13 +34,11 @@ pub struct LayoutRow {
 pub(crate) enum LayoutReader {
     /// Opens the data sets at or below a folder; `Ok(None)` where there are none.
     DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>>),
-    /// Opens sequences of a single vehicle, one at a time.
-    Sequence {
-        /// True for the folder of a sequence.
-        is_one: fn(&Path) -> bool,
-        /// Opens it; the caller gives it its name.
-        open: fn(&Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
-    },
+    /// True for the folder of a sequence of a single vehicle, and opens it; the caller gives it its name.
+    Sequence(
+        fn(&Path) -> bool,
+        fn(&Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
+    ),
 }
 
 impl Layout {

@@ -92,9 +92,7 @@ pub use left_out::LeftOut;
 pub use listing::{content_sha256, provenance};
 pub use open::{open, open_with};
 pub use options::OpenOptions;
-pub use points::{
-    IntensityOption, IntensityScale, IntensityScaleError, LiveIntensities, Plausibility,
-};
+pub use points::{IntensityOption, IntensityScale, LiveIntensities, Plausibility};
 pub use presence::LoadedTick;
 pub use problem::{Problem, reasons};
 pub use recorded::recording_of;
@@ -228,10 +226,8 @@ trait FrameSource: std::fmt::Debug + Send + Sync {
     /// Reads the radar's points. Called only for scenarios that have them.
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud> {
         let path = self.points_path(agent, tick, None);
-        Err(ReadError::malformed(
-            &path,
-            "there are no radar points beside it",
-        ))
+        let reason = "there are no radar points beside it";
+        Err(ReadError::malformed(&path, reason))
     }
 
     /// Adds the images of some cameras, by number, to a frame; those that are missing or unreadable are named.

@@ -35,10 +35,7 @@ pub(crate) static NCLT: LayoutRow = LayoutRow {
     data_sets: "NCLT, as published or as LightLoc converts it",
     files: "<day>/velodyne_sync/<microseconds>.bin, or <day>/velodyne_left/<microseconds>.bin in a folder named by a date",
     protocol: "opv2v",
-    reader: Some(LayoutReader::Sequence {
-        is_one: is_sequence,
-        open,
-    }),
+    reader: Some(LayoutReader::Sequence(is_sequence, open)),
 };
 
 /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.

@@ -28,24 +28,17 @@ pub fn open(dir: &Path) -> Result<Dataset> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset> {
-    check_file_system(dir)?;
+    let canonical = dir.canonicalize().unwrap_or_default();
+    let mut kernels = KERNEL_FOLDERS.iter();
+    // The folders and files of the kernel's file systems have no end.
+    if kernels.any(|kernel| canonical.starts_with(kernel)) {
+        let reason = "no data set: a folder of the kernel";
+        return Err(ReadError::layout(dir, reason));
+    }
     let mut dataset = open_among(&LAYOUTS, dir, options)?;
     unfinished::report(dir, &mut dataset);
     recorded_motion::check(&mut dataset);
     Ok(dataset)
-}
-
-/// Refuses the file systems of the kernel, whose folders and files have no end.
-fn check_file_system(dir: &Path) -> Result<()> {
-    let canonical = dir.canonicalize().unwrap_or_default();
-    let mut kernels = KERNEL_FOLDERS.iter();
-    match kernels.any(|kernel| canonical.starts_with(kernel)) {
-        true => Err(ReadError::layout(
-            dir,
-            "no data set: a folder of the kernel",
-        )),
-        false => Ok(()),
-    }
 }
 
 /// Tries `layouts` in their order.
@@ -82,7 +75,7 @@ impl SequenceSearch<'_> {
     /// Opens the sequences in `dir` or up to `depth` folders below.
     fn open_below(&mut self, dir: &Path, depth: usize) -> Result<()> {
         let reader = self.layouts.iter().find_map(|layout| match layout.reader {
-            Some(LayoutReader::Sequence { is_one, open }) if is_one(dir) => Some(open),
+            Some(LayoutReader::Sequence(is_one, open)) if is_one(dir) => Some(open),
             _ => None,
         });
         match reader.map(|open| open(dir, self.options, &mut self.problems)) {
@@ -158,10 +151,10 @@ mod tests {
         data_sets: "none",
         files: "dummy.txt with a number of ticks",
         protocol: "opv2v",
-        reader: Some(LayoutReader::Sequence {
-            is_one: |dir| dir.join("dummy.txt").is_file(),
-            open: open_dummy,
-        }),
+        reader: Some(LayoutReader::Sequence(
+            |dir| dir.join("dummy.txt").is_file(),
+            open_dummy,
+        )),
     };
 
     #[derive(Debug)]

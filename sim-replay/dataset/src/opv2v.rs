@@ -9,6 +9,7 @@ use protocol::{CavId, Handedness, InvalidPose, Pose};
 
 use super::agent_folders::ScenarioFolder;
 use super::annotations::Annotations;
+use super::frame_files::RADAR;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, YamlField};
@@ -52,7 +53,7 @@ impl FrameSource for Opv2v {
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud> {
-        points::read_pcd(&self.folder.radar(agent, &tick.stem))
+        points::read_pcd(&self.points_path(agent, tick, Some(RADAR)))
             .map(|cloud| self.right_handed(cloud))
     }
 

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use protocol::Handedness;
 
 use super::agent_folders::{self, ScenarioFolder};
+use super::frame_files::BIN;
 use super::layout::{LayoutReader, LayoutRow, opened};
 use super::options::OpenOptions;
 use super::opv2v::Opv2v;
@@ -125,7 +126,7 @@ fn family_layout(folder: &ScenarioFolder) -> Layout {
     let mut tried = frames.take(FRAMES_TO_TRY);
     match tried.find_map(|path| lidar_pose(&path).ok()) {
         Some(WrittenPose::Matrix(_)) => Layout::V2V4REAL,
-        _ if folder.has_bare_floats() => Layout::V2XREAL,
+        _ if folder.suffix == BIN => Layout::V2XREAL,
         _ => Layout::OPV2V,
     }
 }

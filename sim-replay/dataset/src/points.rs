@@ -14,7 +14,7 @@ use std::sync::OnceLock;
 use protocol::{CavId, intensity_divisor};
 
 pub(crate) use intensity::NO_INTENSITY;
-pub use intensity::{IntensityOption, IntensityScale, IntensityScaleError, LiveIntensities};
+pub use intensity::{IntensityOption, IntensityScale, LiveIntensities};
 pub use plausibility::Plausibility;
 
 use floats::FloatForm;
@@ -180,6 +180,8 @@ pub(super) fn divisor_of_first(clouds: impl Iterator<Item = PcdCloud>, path: &Pa
 }
 
 /// Format of a file, by the ending of its name.
+#[derive(strum::EnumString)]
+#[strum(serialize_all = "lowercase")]
 enum FileKind {
     Pcd,
     Ply,
@@ -195,17 +197,12 @@ impl FileKind {
     /// The ending, if files with it are not read.
     fn of(path: &Path) -> Result<Self> {
         let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
-        match &*ending.to_string_lossy() {
-            "pcd" => Ok(Self::Pcd),
-            "ply" => Ok(Self::Ply),
-            "npy" => Ok(Self::Npy),
-            "bin" => Ok(Self::Bin),
-            other => {
-                let reason =
-                    format!("{other:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin");
-                Err(ReadError::malformed(path, reason))
-            }
-        }
+        let ending = ending.to_string_lossy();
+        ending.parse().map_err(|_| {
+            let reason =
+                format!("{ending:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin");
+            ReadError::malformed(path, reason)
+        })
     }
 }
 

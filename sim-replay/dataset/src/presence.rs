@@ -82,16 +82,10 @@ impl Scenario {
             .iter()
             .filter_map(|&index| self.agents.get(index).cloned())
             .collect();
-        let missing = self
-            .missing
-            .iter()
-            .filter(|frame| agents.contains(&frame.agent));
-        let missing: Vec<MissingFrame> = missing.cloned().collect();
-        let units = self
-            .roadside_units
-            .iter()
-            .filter(|unit| agents.contains(unit));
-        let roadside_units = units.cloned().collect();
+        let mut missing = self.missing.clone();
+        missing.retain(|frame| agents.contains(&frame.agent));
+        let mut roadside_units = self.roadside_units.clone();
+        roadside_units.retain(|unit| agents.contains(unit));
         // Not only the present ticks: the new ego may have frames where the old one has none.
         let moments = self.absent_at.moments.clone();
         Self {

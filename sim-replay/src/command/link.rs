@@ -1,6 +1,6 @@
 //! `sim-replay link`: link emulation between the agents of a run and an ego.
 
-use bus::{Configured, log_to_stderr};
+use bus::log_to_stderr;
 use clap::{Arg, ArgMatches, Command, FromArgMatches};
 use link::{LinkConfig, LinkEmulator};
 use protocol::Role;
@@ -8,7 +8,7 @@ use sim_replay::config::LinkProcessConfig;
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use support::output;
 
-use super::{join, leave, print_json};
+use super::{ProcessArgs, join, leave, print_json};
 use support::cli::{BadInput, Outcome};
 
 /// Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost.
@@ -20,14 +20,7 @@ pub(crate) enum Args {
     Print(String),
 }
 
-#[derive(Debug, clap::Args)]
-pub(crate) struct ForwardArgs {
-    #[command(flatten)]
-    config: Configured<LinkProcessConfig>,
-    /// Print a JSON summary.
-    #[arg(long)]
-    json: bool,
-}
+type ForwardArgs = ProcessArgs<LinkProcessConfig>;
 
 impl clap::Args for Args {
     fn augment_args(command: Command) -> Command {

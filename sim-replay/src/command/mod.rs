@@ -13,11 +13,21 @@ use std::fmt::Display;
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{Bus, BusConfig, STOP_LIMIT};
+use bus::{Bus, BusConfig, Configured, ProcessConfig, STOP_LIMIT};
 use protocol::{CavId, Role, RunId};
 use serde::Serialize;
 use support::cli::Outcome;
 use support::output;
+
+// Without a doc comment, which clap would show as the description of the sub-command.
+#[derive(Debug, clap::Args)]
+pub(crate) struct ProcessArgs<C: ProcessConfig> {
+    #[command(flatten)]
+    config: Configured<C>,
+    /// Print a JSON summary.
+    #[arg(long)]
+    json: bool,
+}
 
 /// Prints a report as one line of JSON.
 fn print_json(report: &impl Serialize) -> anyhow::Result<()> {

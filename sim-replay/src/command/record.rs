@@ -1,28 +1,16 @@
 //! `sim-replay record`: records a live run into a file.
 
-use bus::{Configured, log_to_stderr};
+use bus::log_to_stderr;
 use protocol::{CavId, Role};
 use sim_replay::config::RecorderConfig;
 use sim_replay::recorder::{self, RecordReport, RecorderError};
 use support::output;
 
-use super::{join, leave, print_json};
+use super::{ProcessArgs, join, leave, print_json};
 use support::cli::Outcome;
 
-/// Write all messages of a run into an MCAP file, which `sim-replay stream` replays and Foxglove opens.
-///
-/// Ends when the replay does, or on Ctrl-C. A truncated file can be replayed up to its last whole chunk.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    #[command(flatten)]
-    config: Configured<RecorderConfig>,
-    /// Print a JSON summary.
-    #[arg(long)]
-    json: bool,
-}
-
 /// Records and prints a summary to standard output.
-pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
+pub(crate) fn run(args: ProcessArgs<RecorderConfig>) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = args.config.validated()?;
     let name = CavId::new("recorder")?;

@@ -3,34 +3,18 @@
 use std::collections::BTreeMap;
 
 use anyhow::Context;
-use bus::{Configured, log_to_stderr};
+use bus::log_to_stderr;
 use dataset::{self, OpenOptions, Scenario};
 use protocol::{CavId, DropReason, Role};
 use sim_replay::config::{ReplayConfig, SceneConfig};
 use sim_replay::stream::{Replay, StreamError, StreamReport};
 use support::output;
 
-use super::{join, leave, print_json};
+use super::{ProcessArgs, join, leave, print_json};
 use support::cli::Outcome;
 
-/// Publish a scene as if its vehicles were driving now.
-///
-/// The clock starts when all expected routes have carried a probe. While it runs, it obeys control messages (`pause`,
-/// `resume`, `step`, `seek`, `start` with another rate).
-///
-/// With a rate above 0 and without lockstep, a newer sweep replaces one that still waits for the network: the summary
-/// counts them. Exit code 3 is for frames that cannot be read and ticks that are not answered.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    #[command(flatten)]
-    config: Configured<ReplayConfig>,
-    /// Print a JSON summary.
-    #[arg(long)]
-    json: bool,
-}
-
 /// Plays the scene and prints a summary to standard output.
-pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
+pub(crate) fn run(args: ProcessArgs<ReplayConfig>) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = args.config.validated()?;
     let scenario = match open(&config.scene) {

@@ -17,4 +17,4 @@ pub use hypliloc::HypLiLocLocalizer;
 pub use lightloc::LightLoc;
 pub use polar_retrieval::{DescribePolar, PolarRetrieval, ScanContext};
 pub use regressed_pose::{PoseRegressor, PoseRegressorConfig, RegressPose};
-pub use retrieval::{DescribedSweep, Retrieval, SweepDatabase};
+pub use retrieval::{Retrieval, SweepDatabase};

@@ -115,11 +115,6 @@ impl<N: RegressPose> PoseRegressor<N> {
         weights.network(N::KIND, device, |path, config| Self::new(path, &config))
     }
 
-    /// Configuration: scene and origin of its positions.
-    pub fn config(&self) -> &PoseRegressorConfig {
-        &self.config
-    }
-
     /// Tokens `[TOKENS, channels]` of a sweep; `None` if it shows too little.
     ///
     /// # Errors
@@ -285,7 +280,7 @@ mod tests {
         let right = std::f64::consts::FRAC_PI_2;
         assert_pose(&answer(&path, &sweep()), [1055.0, -2052.5, 32.0], right);
         let loaded = PoseRegressor::<HypLiLoc>::load(&path, Device::Cpu).unwrap();
-        assert_eq!(loaded.config(), &config());
+        assert_eq!(loaded.config, config());
         // A large velocity away from any pose leads to the largest and the least one.
         let bias = [-9999.0, -9999.0, 9999.0, -9999.0, -9999.0];
         let path = network::<DiffLoc>(folder.path(), &[("denoiser.outward.1", &bias)]);

@@ -12,15 +12,6 @@ use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInp
 /// Smallest deviation of a channel: constant ones are scaled as if they had this one.
 const LEAST_DEVIATION: f32 = 1e-4;
 
-/// A sweep of the database.
-#[derive(Debug, Clone)]
-pub struct DescribedSweep {
-    /// Features of the whole sweep, `[sweep_channels]`.
-    pub descriptor: Vec<f32>,
-    /// True pose of its sensor, metres.
-    pub world_from_sensor: Isometry3<f64>,
-}
-
 /// Descriptors of sweeps with their poses.
 #[derive(Debug, Clone)]
 pub struct SweepDatabase {
@@ -32,9 +23,10 @@ pub struct SweepDatabase {
 }
 
 impl SweepDatabase {
-    /// A database of descriptors of equal length; `None` if there is none or they are empty.
-    pub fn new(sweeps: &[DescribedSweep]) -> Option<Self> {
-        let channels = Some(sweeps.first()?.descriptor.len()).filter(|&channels| channels > 0)?;
+    /// A database of sweeps: features of the whole sweep, `[sweep_channels]`, and true pose of its sensor, metres. `None` if
+    /// there is none or they have no features.
+    pub fn new(sweeps: &[(Vec<f32>, Isometry3<f64>)]) -> Option<Self> {
+        let channels = Some(sweeps.first()?.0.len()).filter(|&channels| channels > 0)?;
         let mean = (0..channels).map(|channel| mean_of(sweeps, |of| of[channel]));
         let mean: Vec<f32> = mean.collect();
         let variances = (0..channels)
@@ -44,11 +36,11 @@ impl SweepDatabase {
             scale: scale.collect(),
             mean,
             descriptors: Vec::new(),
-            world_from_sensor: sweeps.iter().map(|sweep| sweep.world_from_sensor).collect(),
+            world_from_sensor: sweeps.iter().map(|(_, pose)| *pose).collect(),
         };
         let normalised = sweeps
             .iter()
-            .flat_map(|sweep| database.normalise(&sweep.descriptor));
+            .flat_map(|(descriptor, _)| database.normalise(descriptor));
         database.descriptors = normalised.collect();
         Some(database)
     }
@@ -102,8 +94,8 @@ impl Localize for Retrieval {
     }
 }
 
-fn mean_of(sweeps: &[DescribedSweep], value: impl Fn(&[f32]) -> f32) -> f32 {
-    let values = sweeps.iter().map(|sweep| value(&sweep.descriptor));
+fn mean_of(sweeps: &[(Vec<f32>, Isometry3<f64>)], value: impl Fn(&[f32]) -> f32) -> f32 {
+    let values = sweeps.iter().map(|(descriptor, _)| value(descriptor));
     values.sum::<f32>() / sweeps.len() as f32
 }
 
@@ -114,10 +106,7 @@ mod tests {
     #[test]
     fn the_nearest_descriptor_is_found_whatever_the_scale_of_a_channel() {
         let place = |x: f64| Isometry3::translation(x, 0.0, 0.0);
-        let sweep = |descriptor: &[f32], x: f64| DescribedSweep {
-            descriptor: descriptor.into(),
-            world_from_sensor: place(x),
-        };
+        let sweep = |descriptor: &[f32], x: f64| (descriptor.to_vec(), place(x));
         let sweeps = [
             sweep(&[0.0, 1000.0], 1.0),
             sweep(&[1.0, 1001.0], 2.0),

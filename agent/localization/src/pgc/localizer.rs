@@ -131,11 +131,6 @@ impl Localizer {
         Ok(())
     }
 
-    /// The head's configuration: scene, origin.
-    pub fn head_config(&self) -> &SceneHeadConfig {
-        self.head.config()
-    }
-
     /// First steps: voxels, features, scene coordinates.
     ///
     /// # Errors

@@ -59,11 +59,6 @@ impl Refiner {
         })
     }
 
-    /// Configuration that it was built from.
-    pub fn config(&self) -> &RefinerConfig {
-        &self.config
-    }
-
     /// Predicted positions of cells, given their positions under a pose.
     ///
     /// # Shapes and frames

@@ -1,6 +1,6 @@
 //! Pose source that adds an error to the measured pose.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::ValueEnum;
 use perception::inference::Inference;
@@ -154,17 +154,10 @@ impl NoiseMode {
 /// Eq. 6 of the paper and in its experiments on recorded data; a replayed error has a confidence of its own.
 #[derive(Debug, Clone)]
 pub struct NoisyPose {
-    seed: u64,
-    step_nanos: f64,
-    kind: Noise,
-}
-
-#[derive(Debug, Clone)]
-enum Noise {
-    Fixed(PoseNoise),
-    Independent(PoseNoise),
-    Autoregressive(PoseNoise, f64),
-    Replayed(ErrorTable),
+    config: NoisyPoseConfig,
+    drawn: PoseNoise,
+    /// Errors that are replayed in place of drawn ones.
+    table: Option<ErrorTable>,
 }
 
 impl NoisyPose {
@@ -175,31 +168,31 @@ impl NoisyPose {
     pub fn new(config: &NoisyPoseConfig) -> Result<Self, PoseSourceError> {
         config.validate()?;
         let yaw_std_rad = config.heading_std_deg.to_radians();
-        let noise = PoseNoise::new(config.position_std_m, yaw_std_rad, config.seed);
-        let kind = match config.mode {
-            NoiseMode::Fixed => Noise::Fixed(noise),
-            NoiseMode::Independent => Noise::Independent(noise),
-            NoiseMode::Autoregressive => Noise::Autoregressive(noise, correlation(config)),
-            NoiseMode::Replayed => Noise::Replayed(ErrorTable::read(
-                config.table.as_deref().unwrap_or(Path::new("")),
-            )?),
-        };
+        // Checked above: there is a table where errors are replayed, and only there.
+        let table = config.table.as_deref().map(ErrorTable::read);
         Ok(Self {
-            seed: config.seed,
-            step_nanos: config.step_s * 1e9,
-            kind,
+            drawn: PoseNoise::new(config.position_std_m, yaw_std_rad, config.seed),
+            table: table.transpose()?,
+            config: config.clone(),
         })
     }
 
     /// The pose of a vehicle at a capture time when the true one is `pose`.
     pub fn disturbed(&self, cav: &CavId, capture_nanos: u64, pose: &Pose) -> PoseEstimate {
         // To the nearest step: capture times that jitter about a step keep its error.
-        let step = (capture_nanos as f64 / self.step_nanos).round() as u64;
-        let error = match &self.kind {
-            Noise::Fixed(noise) => noise.fixed(),
-            Noise::Independent(noise) => noise.independent(cav, step),
-            Noise::Autoregressive(noise, rho) => noise.autoregressive(cav, step, *rho),
-            Noise::Replayed(table) => return replayed(table.row(self.first_row(cav), step), pose),
+        let step_nanos = self.config.step_s * 1e9;
+        let step = (capture_nanos as f64 / step_nanos).round() as u64;
+        if let Some(table) = &self.table {
+            return replayed(table.row(self.first_row(cav), step), pose);
+        }
+        let error = match self.config.mode {
+            NoiseMode::Fixed => self.drawn.fixed(),
+            NoiseMode::Autoregressive => {
+                let rho = correlation(&self.config);
+                self.drawn.autoregressive(cav, step, rho)
+            }
+            // Replayed errors are those of the table.
+            NoiseMode::Independent | NoiseMode::Replayed => self.drawn.independent(cav, step),
         };
         // Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
         let confidence = 1.0 / (1.0 + error.distance_m().powi(2));
@@ -208,7 +201,7 @@ impl NoisyPose {
 
     /// Vehicles start at different rows of the table, so that their errors differ.
     fn first_row(&self, cav: &CavId) -> u64 {
-        let key = noise::key(self.seed, cav);
+        let key = noise::key(self.config.seed, cav);
         u64::from_le_bytes(std::array::from_fn(|byte| key[byte]))
     }
 }

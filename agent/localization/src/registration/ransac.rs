@@ -8,7 +8,6 @@
 use nalgebra::{Isometry3, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
 use super::pairs::{Gain, PairColumns};
 use super::sampling::{self, SampleTest};
@@ -23,8 +22,7 @@ const FINAL_STEPS: usize = 20;
 const SAMPLE_YIELD: f64 = 0.25;
 
 /// Minimal solver: computes a motion from a sample.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum MinimalSolver {
     /// From two points: heading and position of an upright vehicle; its tilt is estimated afterwards.
     #[default]
@@ -34,8 +32,7 @@ pub enum MinimalSolver {
 }
 
 /// Settings of the search.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RansacConfig {
     /// Largest residual of an inlier, metres.
     pub inlier_threshold_m: f64,

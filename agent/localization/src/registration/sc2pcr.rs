@@ -8,7 +8,6 @@
 use std::cmp::Ordering;
 
 use nalgebra::{Isometry3, Vector3};
-use serde::{Deserialize, Serialize};
 
 use super::compatibility::{Bits, distances, leading_eigenvectors};
 use super::kabsch::PairMoments;
@@ -20,8 +19,7 @@ const WEIGHT_EPSILON: f64 = 1e-6;
 const SMALL_SET: usize = 4;
 
 /// Settings; the names in brackets are those of the published implementation.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Sc2PcrConfig {
     /// Largest residual of an inlier, metres (`inlier_threshold`).
     pub inlier_threshold_m: f64,
@@ -46,8 +44,7 @@ pub struct Sc2PcrConfig {
 }
 
 /// Repeated weighted fits to the inliers.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
     /// Largest residual of an inlier, metres.
     pub threshold_m: f64,

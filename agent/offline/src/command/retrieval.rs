@@ -6,9 +6,7 @@ use agent_offline::Error;
 use agent_offline::sweep_database::described_sweeps;
 use dataset::LeftOut;
 use indicatif::ProgressBar;
-use localization::baselines::{
-    DescribePolar, DescribedSweep, PolarRetrieval, Retrieval, SweepDatabase,
-};
+use localization::baselines::{DescribePolar, PolarRetrieval, Retrieval, SweepDatabase};
 use localization::pgc::{Localize, Localizer, LocalizerError, stopwatch};
 use nalgebra::Isometry3;
 use protocol::PointCloud;
@@ -36,12 +34,7 @@ pub(crate) fn by_encoder(
     let sweeps = described(folders, left_out, |cloud| {
         localizer.sweep_features(cloud, &mut stopwatch())
     })?;
-    let sweeps = sweeps.into_iter();
-    let sweeps = sweeps.map(|(descriptor, world_from_sensor)| DescribedSweep {
-        descriptor,
-        world_from_sensor,
-    });
-    let database = SweepDatabase::new(&sweeps.collect::<Vec<_>>());
+    let database = SweepDatabase::new(&sweeps);
     let database = database.ok_or_else(|| Error::NoSweeps(folders.to_vec(), left_out.reasons()));
     let database = database.map_err(BadInput::of)?;
     Ok(Box::new(Retrieval::new(localizer, database)))

@@ -89,7 +89,6 @@ pub fn train_encoder(
         }),
         anchors,
         validation,
-        variables,
         encoder,
         contrast,
         curve: trainer.curve("step,seconds,loss,top1,offset_m")?,
@@ -101,7 +100,7 @@ pub fn train_encoder(
     // Only the encoder is saved, under the names it is loaded by.
     let encoder = VarStore::new(Device::Cpu);
     SceneEncoder::new(&encoder.root(), &config.encoder)?;
-    let trained = training.variables.variables();
+    let trained = variables.variables();
     for (name, mut variable) in encoder.variables() {
         no_grad(|| variable.f_copy_(&trained[&format!("encoder.{name}")]))?;
     }
@@ -133,7 +132,6 @@ struct Training<'a> {
     /// Number of sweeps that have a partner.
     anchors: usize,
     validation: Option<PairMaker>,
-    variables: VarStore,
     encoder: SceneEncoder,
     contrast: Contrast,
     curve: Curve,
@@ -156,10 +154,6 @@ impl Training<'_> {
 impl Task for Training<'_> {
     type Error = Error;
     const REPORT_EVERY: u64 = 10;
-
-    fn variables(&self) -> &VarStore {
-        &self.variables
-    }
 
     fn epoch(&self, steps: u64) -> f64 {
         (steps * self.config.run.batch as u64) as f64 / self.anchors as f64

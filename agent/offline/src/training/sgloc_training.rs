@@ -61,13 +61,12 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
         observe,
         sweeps: list.len(),
         cache,
-        variables,
         network,
         means: Means::default(),
     };
     trainer.run(&mut training, SaveEvery::Steps(CHECKPOINT_EVERY))?;
-    let (variables, kind) = (&training.variables, SgLocLocalizer::KIND);
-    Ok(trainer.save_network(variables, kind, &network_config, list.data())?)
+    let kind = SgLocLocalizer::KIND;
+    Ok(trainer.save_network(&variables, kind, &network_config, list.data())?)
 }
 
 struct SgLocTraining<'a> {
@@ -75,7 +74,6 @@ struct SgLocTraining<'a> {
     observe: &'a mut Observe<'a>,
     sweeps: usize,
     cache: FeatureCache,
-    variables: VarStore,
     network: SgLoc,
     means: Means<1>,
 }
@@ -83,10 +81,6 @@ struct SgLocTraining<'a> {
 impl Task for SgLocTraining<'_> {
     type Error = Error;
     const REPORT_EVERY: u64 = 10;
-
-    fn variables(&self) -> &VarStore {
-        &self.variables
-    }
 
     fn epoch(&self, steps: u64) -> f64 {
         (steps * self.run.batch as u64) as f64 / self.sweeps as f64

@@ -3,7 +3,6 @@
 use nalgebra::{Isometry3, Point3};
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, CavId, Detection, corners_within};
-use serde::{Deserialize, Serialize};
 
 use crate::boxes::decode::Decoded;
 use crate::boxes::nms::rotated_nms;
@@ -15,8 +14,7 @@ pub const SCORE_THRESHOLD: f32 = 0.1;
 
 /// Limits of post-processing. Defaults are those of the reference, except the score threshold, which is common to all
 /// methods here.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct PostprocessConfig {
     /// Score at or below which anchors are no candidates.
     pub score_threshold: f32,

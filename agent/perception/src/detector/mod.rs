@@ -20,7 +20,7 @@ pub(crate) use error::Result;
 pub use output::{EncoderOutput, Heads, check_values};
 
 use encoder::BevEncoder;
-use output::{check_boxes, flat};
+use output::check_boxes;
 
 use crate::boxes::anchors::Anchors;
 use crate::boxes::decode::{Decoded, decode};
@@ -33,7 +33,7 @@ use crate::model_config::{DetectorConfig, YAxis};
 use crate::pillars::point_pillars::PointPillars;
 use crate::pillars::projection::PillarProjection;
 use crate::pillars::voxels::{Pillars, Voxeliser};
-use crate::tensor_values::tensor;
+use crate::tensor_values::{tensor, values};
 use crate::weights::Weights;
 
 /// A trained PointPillars network in its fastest form, for one sweep at a time.
@@ -422,7 +422,7 @@ impl Detector {
             grid: self.grid(),
             channels: shape[0] as u32,
             code_of,
-            values: flat(&one_map(map, shape)?)?,
+            values: values(&one_map(map, shape)?)?,
         })
     }
 }

@@ -1,12 +1,13 @@
 //! Output of a detector.
 
 use protocol::StageTiming;
-use tch::{TchError, Tensor};
+use tch::Tensor;
 
 use super::backbone_level::BackboneLevel;
 use super::error::DetectorError;
 use crate::boxes::decode::Decoded;
 use crate::layers::head::HeadOutput;
+use crate::tensor_values::values;
 
 /// Output of the encoder for one sweep.
 #[derive(Debug)]
@@ -44,16 +45,11 @@ impl Heads {
         check_values("the output of the head (scores)", &output.scores)?;
         check_values("the output of the head (offsets of boxes)", &output.offsets)?;
         Ok(Self {
-            scores: flat(&output.scores)?,
-            offsets: flat(&output.offsets)?,
-            confidence: flat(&output.confidence())?,
+            scores: values(&output.scores)?,
+            offsets: values(&output.offsets)?,
+            confidence: values(&output.confidence())?,
         })
     }
-}
-
-/// The values of a tensor on any device, in row-major order.
-pub(super) fn flat(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    Vec::try_from(&tensor.f_contiguous()?.f_view([-1])?)
 }
 
 /// Largest absolute value inside a network; trained ones stay below 1e4, and messages have a lower limit of their own.

@@ -106,11 +106,6 @@ impl PillarBatch {
         }
     }
 
-    /// Device of the tensors.
-    pub fn device(&self) -> Device {
-        self.features.device()
-    }
-
     /// Number of points `P`.
     pub fn points(&self) -> i64 {
         self.features.size()[0]

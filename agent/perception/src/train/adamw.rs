@@ -7,15 +7,16 @@ use std::collections::BTreeMap;
 use tch::nn::VarStore;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-/// The constants of AdamW.
+/// Decay of the mean gradient.
+const BETA1: f64 = 0.9;
+/// Decay of the mean squared gradient.
+const BETA2: f64 = 0.999;
+/// Added to the denominator, so that the division is finite.
+const EPS: f64 = 1e-8;
+
+/// The constants of AdamW that trainings choose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamWConfig {
-    /// Decay of the mean gradient.
-    pub beta1: f64,
-    /// Decay of the mean squared gradient.
-    pub beta2: f64,
-    /// Added to the denominator, so that the division is finite.
-    pub eps: f64,
     /// Decoupled weight decay per unit of learning rate; vectors (norms, biases) have none.
     pub weight_decay: f64,
     /// Gradients are scaled down to this norm.
@@ -25,9 +26,6 @@ pub struct AdamWConfig {
 impl Default for AdamWConfig {
     fn default() -> Self {
         Self {
-            beta1: 0.9,
-            beta2: 0.999,
-            eps: 1e-8,
             weight_decay: 1e-2,
             max_gradient_norm: 10.0,
         }
@@ -96,8 +94,8 @@ impl AdamW {
             self.steps += 1;
             let (config, steps) = (self.config, self.steps as f64);
             // The moments start at zero: without these corrections the first steps are biased.
-            let mean_correction = 1.0 - config.beta1.powf(steps);
-            let square_correction = 1.0 - config.beta2.powf(steps);
+            let mean_correction = 1.0 - BETA1.powf(steps);
+            let square_correction = 1.0 - BETA2.powf(steps);
             for (entry, gradient) in self.entries.iter_mut().zip(&gradients) {
                 // A variable that is not part of the loss does not decay either.
                 if !gradient.defined() {
@@ -105,12 +103,12 @@ impl AdamW {
                 }
                 let (mean, square) = (&mut entry.mean, &mut entry.square);
                 let gradient = gradient * scale;
-                let squared = gradient.f_square()?.f_mul_scalar_(1.0 - config.beta2)?;
-                let _ = square.f_mul_scalar_(config.beta2)?.f_add_(&squared)?;
-                let change = gradient * (1.0 - config.beta1);
-                let _ = mean.f_mul_scalar_(config.beta1)?.f_add_(&change)?;
+                let squared = gradient.f_square()?.f_mul_scalar_(1.0 - BETA2)?;
+                let _ = square.f_mul_scalar_(BETA2)?.f_add_(&squared)?;
+                let change = gradient * (1.0 - BETA1);
+                let _ = mean.f_mul_scalar_(BETA1)?.f_add_(&change)?;
                 let mut root = (&*square / square_correction).f_sqrt_()?;
-                let deviation = root.f_add_scalar_(config.eps)?;
+                let deviation = root.f_add_scalar_(EPS)?;
                 // Decoupled: on the variable itself, not through the gradient and its moments.
                 if entry.decays {
                     let kept = 1.0 - learning_rate * config.weight_decay;

@@ -4,7 +4,7 @@
 //! stored. The one exception are scene-specific heads: one that is resumed begins a new pass over its cells, with all
 //! of its sweeps.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors};
@@ -32,13 +32,13 @@ const STEPS_KEY: &str = "optimizer_steps";
 /// [`FileError`] when the file cannot be written.
 pub fn save<P: Serialize>(
     path: &Path,
-    variables: &VarStore,
+    variables: &HashMap<String, Tensor>,
     optimizer: &AdamW,
     progress: &P,
 ) -> Result<(), FileError> {
     let (moments, steps) = optimizer.state();
-    let parameters = (variables.variables().into_iter())
-        .map(|(name, tensor)| (format!("parameter.{name}"), tensor));
+    let parameters = (variables.iter())
+        .map(|(name, tensor)| (format!("parameter.{name}"), tensor.shallow_clone()));
     let mut stored = Vec::new();
     for (name, tensor) in parameters.chain(moments) {
         let values = values(&tensor).at(path)?;
@@ -146,7 +146,7 @@ mod tests {
         let (variables, mut optimizer) = network(3);
         step(&variables, &mut optimizer);
         let progress = (1_u64, "max".to_owned());
-        save(&path, &variables, &optimizer, &progress).unwrap();
+        save(&path, &variables.variables(), &optimizer, &progress).unwrap();
         step(&variables, &mut optimizer);
         let (resumed, mut resumed_optimizer) = network(3);
         assert_eq!(
@@ -165,7 +165,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
         let (variables, optimizer) = network(3);
-        save(&path, &variables, &optimizer, &1).unwrap();
+        save(&path, &variables.variables(), &optimizer, &1).unwrap();
         let (other, mut other_optimizer) = network(4);
         let message = restore::<u64>(&path, &other, &mut other_optimizer)
             .unwrap_err()

@@ -3,7 +3,6 @@
 use std::time::{Duration, Instant};
 
 use tch::Tensor;
-use tch::nn::VarStore;
 
 use super::data_listing::DataListing;
 use super::error::TrainingError;
@@ -58,9 +57,6 @@ pub trait Task {
     /// Steps between two reports.
     const REPORT_EVERY: u64;
 
-    /// All variables of the checkpoint.
-    fn variables(&self) -> &VarStore;
-
     /// Number of passes over the data after so many steps.
     fn epoch(&self, steps: u64) -> f64;
 
@@ -102,7 +98,7 @@ impl Trainer {
             let loss = task.loss(self)?;
             let is_taken = self.step(&loss, task.share_done(self))?;
             // Right after the step, before a report or a validation that may take long.
-            self.check_interruption(task.variables())?;
+            self.check_interruption()?;
             task.stepped(self, is_taken)?;
             if task.is_report_due(self) {
                 task.report(self)?;
@@ -124,8 +120,7 @@ impl Trainer {
 
     fn save<T: Task>(&mut self, task: &mut T) -> Result<(), T::Error> {
         task.validate(self)?;
-        let saved = self.checkpoint(task.variables());
-        Ok(saved.map_err(TrainingError::from)?)
+        Ok(self.checkpoint().map_err(TrainingError::from)?)
     }
 
     /// Report of the steps done, with the means since the last report.

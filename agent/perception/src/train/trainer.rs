@@ -1,7 +1,7 @@
 //! Trainer: gradient descent along one cycle of the learning rate, with checkpoints to resume from, and weights at the
 //! end.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -80,6 +80,8 @@ pub struct Trained {
 #[derive(Debug)]
 pub struct Trainer {
     run: RunConfig,
+    /// All that a checkpoint holds, trained or not.
+    variables: HashMap<String, Tensor>,
     optimizer: AdamW,
     progress: CheckpointState,
     skipped: u32,
@@ -121,6 +123,7 @@ impl Trainer {
         let steps = run.interruption.steps();
         Ok(Self {
             run: run.clone(),
+            variables: variables.variables(),
             optimizer,
             progress,
             skipped: 0,
@@ -187,25 +190,25 @@ impl Trainer {
         Ok(taken)
     }
 
-    /// Writes a checkpoint of `variables` with the state that is needed to resume.
+    /// Writes a checkpoint of all variables with the state that is needed to resume.
     ///
     /// # Errors
     /// [`FileError`] when the file cannot be written.
-    pub fn checkpoint(&mut self, variables: &VarStore) -> Result<(), FileError> {
+    pub fn checkpoint(&mut self) -> Result<(), FileError> {
         self.progress.seconds = self.seconds();
         let path = checkpoint_path(&self.run);
-        checkpoint::save(&path, variables, &self.optimizer, &self.progress)
+        checkpoint::save(&path, &self.variables, &self.optimizer, &self.progress)
     }
 
     /// Ends the training if that was requested; writes a checkpoint before. To be called after each step.
     ///
     /// # Errors
     /// [`TrainingError::Interrupted`], or [`FileError`].
-    pub fn check_interruption(&mut self, variables: &VarStore) -> Result<(), TrainingError> {
+    pub fn check_interruption(&mut self) -> Result<(), TrainingError> {
         if !self.steps.is_interrupted() {
             return Ok(());
         }
-        self.checkpoint(variables)?;
+        self.checkpoint()?;
         Err(TrainingError::Interrupted(self.steps(), Interrupted))
     }
 

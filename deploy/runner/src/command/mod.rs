@@ -4,7 +4,6 @@ mod bench;
 mod capacity;
 mod demo;
 mod eval;
-mod schema;
 mod slices;
 mod sweep;
 mod up;
@@ -16,6 +15,7 @@ use anyhow::Context;
 use bus::{BusError, malloc_settings};
 use dataset::LeftOut;
 use runner::run::RunError;
+use runner::schema::SchemaOf;
 use support::cli::Outcome;
 use support::output;
 
@@ -37,7 +37,11 @@ pub(crate) enum Command {
     Sweep(sweep::Arguments),
     /// Print the JSON schema of a kind of file, for editors: the files in deploy/scenarios and deploy/experiments are
     /// its output.
-    Schema(schema::Arguments),
+    Schema {
+        /// Kind of file.
+        #[arg(value_enum)]
+        of: SchemaOf,
+    },
 }
 
 impl Command {
@@ -52,7 +56,10 @@ impl Command {
             Self::Up(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
             Self::Sweep(arguments) => arguments.run(),
-            Self::Schema(arguments) => arguments.run(),
+            Self::Schema { of } => {
+                output::text(of.json())?;
+                Ok(Outcome::Done)
+            }
         }
     }
 }

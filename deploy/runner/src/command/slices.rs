@@ -24,7 +24,7 @@ impl SliceArgs {
     pub(crate) fn slice(&self) -> Result<Option<Slice>, BadInput> {
         match self.slice {
             Some(slice) => Ok(Some(slice)),
-            None => Slice::of_slurm(|name| std::env::var(name).ok()).map_err(BadInput::of),
+            None => Slice::of_slurm(|name| std::env::var(name).ok()).map_err(BadInput::new),
         }
     }
 

@@ -84,10 +84,8 @@ impl OpenedData {
         let dataset = dataset::open_with(&trial.dataset, &options)?;
         let protocol = trial.protocol.resolve(dataset.layout);
         let protocol = protocol.map_err(|error| anyhow!("evaluation protocol: {error}"))?;
-        let arranged = dataset
-            .scenarios
-            .iter()
-            .filter_map(|scenario| protocol.arrange(scenario));
+        let all = dataset.scenarios.iter();
+        let arranged = all.filter_map(|scenario| protocol.arrange(scenario));
         let mut scenarios: Vec<Scenario> = arranged.collect();
         let frames = trial.setup.frames.unwrap_or(usize::MAX);
         for scenario in &mut scenarios {
@@ -187,10 +185,8 @@ impl Trial {
     /// Digests of all that these settings are applied to.
     fn provenance(&self, data: &OpenedData, method: Method) -> Result<Provenance> {
         let setup = &self.setup;
-        let link = setup
-            .link
-            .as_ref()
-            .map(|link| (&link.config, link.folder.as_path()));
+        let link = setup.link.as_ref();
+        let link = link.map(|link| (&link.config, link.folder.as_path()));
         let weights = weights_of(&setup.models.weights, method, self.sends_boxes())?;
         let files = files_of(method, weights, self.settings(), link);
         let data_sha256 = data.sha256(self.scenarios, setup.lidar_variant.as_deref());

@@ -71,10 +71,8 @@ pub fn run_notes(result: &RunResult) -> String {
             "most messages were still in flight at the end: the link carries next to nothing";
         lines.push(format!("stuck     {stuck}"));
     }
-    let dropped = messages
-        .dropped
-        .iter()
-        .map(|(reason, count)| format!("{count} {reason}"));
+    let dropped = messages.dropped.iter();
+    let dropped = dropped.map(|(reason, count)| format!("{count} {reason}"));
     let dropped = match messages.dropped.is_empty() {
         true => "none".into(),
         false => dropped.collect::<Vec<_>>().join(", "),
@@ -193,10 +191,8 @@ fn comparison(all: &[Metrics]) -> String {
     for metrics in all {
         let (method, Contribution { sent, used, .. }) = (&metrics.method, metrics.contribution);
         if let Some(what) = shared(method).filter(|_| used < sent) {
-            let size = metrics
-                .contribution
-                .sent_bytes_mean
-                .map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
+            let mean = metrics.contribution.sent_bytes_mean;
+            let size = mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
             let _ = writeln!(
                 text,
                 "{method}: of {sent} {what}{size} {used} arrived in time"
@@ -234,11 +230,8 @@ fn latency(metrics: &Metrics) -> String {
 /// Wire bytes of the fused messages, or if there were none, of all messages sent.
 fn wire_bytes(metrics: &Metrics) -> String {
     let sent = metrics.contribution.sent_bytes_mean;
-    metrics
-        .comm
-        .wire_bytes_mean
-        .or(sent)
-        .map_or("-".into(), bytes)
+    let mean = metrics.comm.wire_bytes_mean.or(sent);
+    mean.map_or("-".into(), bytes)
 }
 
 #[cfg(test)]

@@ -18,27 +18,20 @@ pub struct Slice {
     count: usize,
 }
 
-/// A text or an environment that names no slice.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{text}: a slice is M/N, with M from 1 to N and N up to {MOST_SLICES}")]
-pub struct SliceError {
-    text: String,
-}
-
 impl Slice {
     /// The slice of a task of a Slurm array, from its environment; `None` outside an array.
     ///
     /// # Errors
-    /// [`SliceError`] when the variables name no slice.
-    pub fn of_slurm(variable: impl Fn(&str) -> Option<String>) -> Result<Option<Self>, SliceError> {
+    /// The rule for slices when the variables name none.
+    pub fn of_slurm(variable: impl Fn(&str) -> Option<String>) -> Result<Option<Self>, String> {
         let names = ["SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT"];
         let [Some(task), Some(count)] = names.map(&variable) else {
             return Ok(None);
         };
         let slice = format!("{task}/{count}").parse();
-        slice.map(Some).map_err(|_| SliceError {
-            text: format!("{}={task}, {}={count}", names[0], names[1]),
-        })
+        slice
+            .map(Some)
+            .map_err(|_| refusal(&format!("{}={task}, {}={count}", names[0], names[1])))
     }
 
     /// Places of the cells of this slice, of `cells` in the order of the experiment. Cells of one encoder are
@@ -50,18 +43,21 @@ impl Slice {
 }
 
 impl FromStr for Slice {
-    type Err = SliceError;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, SliceError> {
+    fn from_str(text: &str) -> Result<Self, String> {
         let parsed = text.split_once('/').and_then(|(number, count)| {
             let (number, count) = (number.parse().ok()?, count.parse().ok()?);
             ((1..=count).contains(&number) && count <= MOST_SLICES)
                 .then_some(Self { number, count })
         });
-        parsed.ok_or_else(|| SliceError {
-            text: text.to_owned(),
-        })
+        parsed.ok_or_else(|| refusal(text))
     }
+}
+
+/// Message on a text or an environment that names no slice.
+fn refusal(text: &str) -> String {
+    format!("{text}: a slice is M/N, with M from 1 to N and N up to {MOST_SLICES}")
 }
 
 impl fmt::Display for Slice {

@@ -169,19 +169,14 @@ impl Fleet {
     }
 
     fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
-        let contents: BTreeSet<Stream> = self
-            .neighbours()
-            .flat_map(|cav| self.streams_of(cav))
-            .collect();
+        let contents = self.neighbours().flat_map(|cav| self.streams_of(cav));
+        let contents: BTreeSet<Stream> = contents.collect();
+        let streams = [Stream::Pose].into_iter().chain(contents);
         LinkProcessConfig {
             run: context.run.clone(),
             ego: self.ego.clone(),
             link: self.scenario.link.clone().unwrap_or_default(),
-            streams: [Stream::Pose]
-                .into_iter()
-                .chain(contents)
-                .chain([Stream::Descriptor])
-                .collect(),
+            streams: streams.chain([Stream::Descriptor]).collect(),
             keep_running: false,
             inbox: self.scenario.ego.inbox,
             bus,

@@ -14,10 +14,9 @@ impl Fleet {
         let scenario = &self.scenario;
         // Without a link in the scenario messages take the ideal one.
         let link = scenario.link.clone().unwrap_or_default();
-        let vehicles = scenario
-            .vehicles
-            .iter()
-            .map(|(cav, own)| (cav.clone(), own.over(&scenario.agents)));
+        let own = scenario.vehicles.iter();
+        let vehicles = own.map(|(cav, own)| (cav.clone(), own.over(&scenario.agents)));
+        let compute = scenario.stepped.and_then(|stepped| stepped.compute);
         let pool = std::iter::once(&self.ego).chain(self.neighbours());
         Ok(Setup {
             models: scenario.models.clone(),
@@ -28,10 +27,7 @@ impl Fleet {
             ego: scenario.ego.clone(),
             link: Some(EmulatedLink::open(&link.model, link.seed)?),
             delay_ms: 0,
-            compute: scenario
-                .stepped
-                .and_then(|stepped| stepped.compute)
-                .unwrap_or_default(),
+            compute: compute.unwrap_or_default(),
             protocol: Some(self.protocol.clone()),
             pool: AgentPool::Named(pool.cloned().collect()),
             seek: scenario.scene.seek,

@@ -80,10 +80,8 @@ impl AgentProcesses {
                 }
             }
         });
-        let vehicles = fleet
-            .agents
-            .iter()
-            .map(|cav| (cav.clone(), fleet.streams_of(cav)));
+        let agents = fleet.agents.iter();
+        let vehicles = agents.map(|cav| (cav.clone(), fleet.streams_of(cav)));
         let vehicles: Vec<_> = vehicles.collect();
         let timeouts = &fleet.scenario.timeouts;
         let ready = Duration::from_secs_f64(timeouts.ready_s);

@@ -161,10 +161,8 @@ fn frame_mb(fleet: &Fleet) -> Result<f64, RunError> {
         Exchange::Features => fleet.map_values(),
         _ => 0,
     };
-    let bytes = fleet
-        .agents
-        .iter()
-        .map(|cav| sweep_bytes + map_bytes(&fleet.settings_of(cav), values));
+    let agents = fleet.agents.iter();
+    let bytes = agents.map(|cav| sweep_bytes + map_bytes(&fleet.settings_of(cav), values));
     Ok(bytes.sum::<u64>() as f64 * 1e-6)
 }
 

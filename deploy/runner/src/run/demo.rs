@@ -52,14 +52,10 @@ fn try_draw(
     let detections: Vec<_> = found.map(|found| (found.box3d, found.score)).collect();
     let [x_m, y_m] = [(0, rule.x_m), (1, rule.y_m)].map(|(axis, limit): (usize, [f64; 2])| {
         let found = detections.iter().map(|(found, _)| found);
-        let boxes = frame
-            .truth
-            .iter()
-            .chain(found)
-            .map(|shape| shape.center_m[axis]);
-        let vehicles = loaded
-            .iter()
-            .map(|(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
+        let boxes = frame.truth.iter().chain(found);
+        let boxes = boxes.map(|shape| shape.center_m[axis]);
+        let vehicles = loaded.iter();
+        let vehicles = vehicles.map(|(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
         around(boxes.chain(vehicles), limit)
     });
     let views = loaded.iter().map(|(name, ego_from_cav, xyzi)| CavView {

@@ -118,10 +118,19 @@ impl Picture<'_> {
             self.draw_box(found, DETECTION, &plane)?;
         }
         for (found, score) in self.labelled() {
-            self.draw_score(found, score, &plane)?;
+            let [x, y, _] = found.center_m;
+            if self.is_near(x, y, 0.0) {
+                // Pixels, with y downwards: to the right of the centre and above it.
+                let text = Text::new(format!("{score:.2}"), (10, -20), text(14, DETECTION));
+                plane.draw(&(EmptyElement::at((x, y)) + text))?;
+            }
         }
         for (view, colour) in self.coloured_views() {
-            self.draw_position(view, colour, &plane)?;
+            let [x, y, _] = view.ego_from_cav.translation_m;
+            if self.is_near(x, y, 0.0) {
+                plane.draw(&Circle::new((x, y), 6, BACKGROUND.filled()))?;
+                plane.draw(&Circle::new((x, y), 4, colour.filled()))?;
+            }
         }
         self.draw_legend(&legend)
     }
@@ -201,30 +210,6 @@ impl Picture<'_> {
             }
         }
         labelled
-    }
-
-    fn draw_score(&self, found: &Box3d, score: f32, plane: &PlanView<'_>) -> Result<()> {
-        let [x, y, _] = found.center_m;
-        if !self.is_near(x, y, 0.0) {
-            return Ok(());
-        }
-        // Pixels, with y downwards: to the right of the centre and above it.
-        let text = Text::new(format!("{score:.2}"), (10, -20), text(14, DETECTION));
-        Ok(plane.draw(&(EmptyElement::at((x, y)) + text))?)
-    }
-
-    fn draw_position(
-        &self,
-        view: &CavView<'_>,
-        colour: RGBColor,
-        plane: &PlanView<'_>,
-    ) -> Result<()> {
-        let [x, y, _] = view.ego_from_cav.translation_m;
-        if !self.is_near(x, y, 0.0) {
-            return Ok(());
-        }
-        plane.draw(&Circle::new((x, y), 6, BACKGROUND.filled()))?;
-        Ok(plane.draw(&Circle::new((x, y), 4, colour.filled()))?)
     }
 
     fn draw_legend(&self, area: &Image<'_>) -> Result<()> {

@@ -55,26 +55,20 @@ impl Router {
             let wait = wait.clone();
             move || wait.request()
         });
-        let process = match network.connect {
-            Some(_) => None,
-            None => {
-                let events = events.clone();
-                let process = RouterProcess::start(network, context, restarts, events, &wait)?;
-                Some(process)
-            }
-        };
+        let is_own = network.connect.is_none();
+        let process = is_own
+            .then(|| RouterProcess::start(network, context, restarts, events.clone(), &wait))
+            .transpose()?;
         match RouterEndpoint::open(context.endpoint, context.keys, &wait) {
             Ok(place) => Ok(Self { place, process }),
             Err(error) => Err(match (process, error) {
                 (Some(process), BusError::Unreachable { .. } | BusError::Stopped { .. })
                     if !stop.requested() =>
                 {
+                    let how = process.gave_up.get().cloned();
                     RunError::Process {
                         process: ROUTER.to_owned(),
-                        how: process
-                            .gave_up
-                            .get()
-                            .map_or("does not answer".to_owned(), Clone::clone),
+                        how: how.unwrap_or_else(|| "does not answer".to_owned()),
                         log: context.folder.log_of(ROUTER),
                     }
                 }

@@ -58,11 +58,8 @@ impl Scenario {
 
     fn check_network(&self) -> Result<(), FieldError> {
         let listen = [("network.listen", &self.network.listen)].into_iter();
-        let connect = self
-            .network
-            .connect
-            .iter()
-            .map(|at| ("network.connect", at));
+        let connect = self.network.connect.iter();
+        let connect = connect.map(|at| ("network.connect", at));
         for (field, text) in listen.chain(connect) {
             let rule = match Endpoint::new(text) {
                 Err(_) => "must read tcp/ADDRESS:PORT or quic/ADDRESS:PORT",

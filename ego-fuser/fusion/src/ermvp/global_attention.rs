@@ -116,18 +116,15 @@ impl GlobalHalf {
         let groups = Partition::Window.cut(&small, self.window)?;
         let channels = groups.size()[3];
         let tokens = groups.f_view([groups.size()[0], -1, 1, channels])?;
-        let unseen = match slots.reach {
-            None => None,
-            Some(reach) => {
-                // A cell of the small feature map is valid where any of its cells is.
-                let step = [REDUCTION, REDUCTION];
-                let reach = reach.f_unsqueeze(1)?;
-                let reach = reach.f_max_pool2d(step, step, [0i64, 0], [1i64, 1], false)?;
-                let reach = reach.f_squeeze_dim(1)?;
-                let reach = Some(&reach);
-                Slots { reach, ..slots }.unseen(Partition::Window, self.window)?
-            }
-        };
+        let small_reach = slots.reach.map(|reach| {
+            // A cell of the small feature map is valid where any of its cells is.
+            let (reach, step) = (reach.f_unsqueeze(1)?, [REDUCTION, REDUCTION]);
+            let reach = reach.f_max_pool2d(step, step, [0i64, 0], [1i64, 1], false)?;
+            reach.f_squeeze_dim(1)
+        });
+        let small_reach = small_reach.transpose()?;
+        let reach = small_reach.as_ref();
+        let unseen = Slots { reach, ..slots }.unseen(Partition::Window, self.window)?;
         let seen = attend(&tokens, &tokens, &tokens, unseen.as_ref())?;
         seen.f_mean_dim([0i64].as_slice(), true, None::<Kind>)
     }

@@ -107,19 +107,13 @@ impl FusionSettings for ErmvpConfig {
     }
 }
 
-/// Attention with queries of the window, then with queries of the whole map.
-#[derive(Debug)]
-struct ErmvpLayer {
-    local: HalfBlock,
-    global: GlobalHalf,
-}
-
 /// The method behind the common interface.
 #[derive(Debug)]
 pub struct Ermvp {
     sampler: Sampler,
     consensus: FeatureConsensus,
-    layers: Vec<ErmvpLayer>,
+    /// Attention with queries of the window, then with queries of the whole map.
+    layers: Vec<(HalfBlock, GlobalHalf)>,
     head: MeanHead,
     window: i64,
 }
@@ -140,10 +134,8 @@ impl Ermvp {
                 .map(|index| {
                     let path = path / "layers" / index;
                     let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
-                    ErmvpLayer {
-                        local: HalfBlock::new(Partition::Window, &attention, &feed, sizes),
-                        global: GlobalHalf::new(&path, sizes),
-                    }
+                    let local = HalfBlock::new(Partition::Window, &attention, &feed, sizes);
+                    (local, GlobalHalf::new(&path, sizes))
                 })
                 .collect(),
             head: MeanHead::new(&(path / "mlp_head"), channels),
@@ -191,10 +183,10 @@ impl Fusion for Ermvp {
             reach: Some(&reach),
             count_missing: false,
         };
-        for layer in &self.layers {
-            let groups = layer.local.whole(&x, slots, self.window, is_training)?;
+        for (local, global) in &self.layers {
+            let groups = local.whole(&x, slots, self.window, is_training)?;
             x = Partition::Window.map(&groups, padding.size(), self.window)?;
-            x = layer.global.forward(&x, slots, is_training)?;
+            x = global.forward(&x, slots, is_training)?;
         }
         Ok(padding.crop(&self.head.forward(&x, slots)?)?.into())
     }

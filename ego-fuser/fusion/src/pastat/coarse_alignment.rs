@@ -37,7 +37,7 @@ pub(super) struct CoarseMaps {
     /// Earlier maps, pooled, on a padded grid of the ego.
     pub(super) earlier: Option<WarpedMaps>,
     /// Indices of these among [`AlignedMaps::earlier`].
-    pub(super) earlier_entries: Vec<usize>,
+    pub(super) earlier_entries: Vec<i64>,
     /// Origins of the newest and of the earlier maps, in this order.
     pub(super) origins: Origins,
     /// Indices of all entries in the input, and the number of entries there.
@@ -100,10 +100,7 @@ impl CoarseAlignment {
             received_cells: FullResolutionMap::shallow_clones(cells),
             earlier: earlier.transpose()?,
             origins: Origins::of(&chosen.collect::<Vec<_>>()),
-            earlier_entries: earlier_entries
-                .iter()
-                .map(|&entry| entry as usize)
-                .collect(),
+            earlier_entries,
             places,
             all: metadata.len() as i64,
         })

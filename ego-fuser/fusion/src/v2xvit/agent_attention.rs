@@ -28,13 +28,6 @@ pub struct AgentAttention {
     dropout: f64,
 }
 
-/// Projections of one query type to all types of senders, with the relations multiplied in.
-struct Asked {
-    query: (Tensor, Tensor),
-    /// For each type of sender.
-    key_value: [(Tensor, Tensor); AGENT_TYPES],
-}
-
 impl AgentAttention {
     /// Variables `q_linears`, `k_linears`, `v_linears`, `a_linears`, `relation_att` and `relation_msg` below `path`.
     pub fn new(path: &nn::Path<'_>, channels: i64, heads: i64, each: i64, dropout: f64) -> Self {
@@ -88,7 +81,9 @@ impl AgentAttention {
         let mut kinds = types[..queries].to_vec();
         kinds.sort_unstable();
         kinds.dedup();
-        let asked = kinds.into_iter().map(|kind| Ok((kind, self.asked(kind)?)));
+        let asked = kinds
+            .into_iter()
+            .map(|kind| Ok((kind, self.key_values(kind)?)));
         let asked = asked.collect::<Result<Vec<_>, TchError>>()?;
         let mut seen = Vec::new();
         for first in (0..cells).step_by(chunk.max(1) as usize) {
@@ -108,7 +103,7 @@ impl AgentAttention {
         unseen: Option<&Tensor>,
         types: &[usize],
         queries: usize,
-        asked: &[(usize, Asked)],
+        asked: &[(usize, Vec<Linear>)],
     ) -> Result<Tensor, TchError> {
         // [N, t] to [t, 1, 1, N]: added to the scores of all heads and all queries.
         let bias = unseen.map(|unseen| {
@@ -119,7 +114,7 @@ impl AgentAttention {
         });
         let bias = bias.transpose()?;
         let mut answers: Vec<Option<Tensor>> = (0..queries).map(|_| None).collect();
-        for (kind, asked) in asked {
+        for (kind, key_values) in asked {
             let askers: Vec<i64> = (0..queries as i64)
                 .filter(|&agent| types[agent as usize] == *kind)
                 .collect();
@@ -128,6 +123,7 @@ impl AgentAttention {
                 true => x.shallow_clone(),
                 false => picked(x, &askers)?,
             };
+            let asked = (*kind, &key_values[..]);
             let answer = self.answer(&query, x, types, asked, bias.as_ref())?;
             let answer = self.out[*kind].forward(&answer)?.f_transpose(0, 1)?;
             // One type asks for all: its answers already have the order of the agents.
@@ -148,28 +144,25 @@ impl AgentAttention {
         query: &Tensor,
         x: &Tensor,
         types: &[usize],
-        asked: &Asked,
+        (kind, key_values): (usize, &[Linear]),
         bias: Option<&Tensor>,
     ) -> Result<Tensor, TchError> {
-        let inner = asked.query.1.size()[0];
-        let first = types[0];
+        let inner = self.query[kind].weight.size()[0];
+        let first = &key_values[types[0]];
         if types.len() == 1 {
             // With a single agent all weights are 1.
-            let (weight, offset) = &asked.key_value[first];
-            let weight = weight.f_narrow(0, inner, inner)?;
-            let offset = offset.f_narrow(0, inner, inner)?;
-            return x.f_linear(&weight, Some(&offset))?.f_transpose(0, 1);
+            let weight = first.weight.f_narrow(0, inner, inner)?;
+            let offset = first.bias.as_ref();
+            let offset = offset.map(|offset| offset.f_narrow(0, inner, inner));
+            return x.f_linear(&weight, offset.transpose()?)?.f_transpose(0, 1);
         }
-        let query = query.f_linear(&asked.query.0, Some(&asked.query.1))?;
+        let query = self.query[kind].forward(query)?;
         // One product over all agents is faster than one for each.
-        let key_value = if types.iter().all(|&kind| kind == first) {
-            let (weight, offset) = &asked.key_value[first];
-            x.f_linear(weight, Some(offset))?
+        let key_value = if types.iter().all(|kind| *kind == types[0]) {
+            first.forward(x)?
         } else {
-            let each = types.iter().enumerate().map(|(agent, &kind)| {
-                let (weight, offset) = &asked.key_value[kind];
-                x.f_get(agent as i64)?.f_linear(weight, Some(offset))
-            });
+            let each = (0..).zip(types);
+            let each = each.map(|(agent, &kind)| key_values[kind].forward(&x.f_get(agent)?));
             Tensor::f_stack(&each.collect::<Result<Vec<_>, TchError>>()?, 0)?
         };
         // Cells are the groups, agents the tokens.
@@ -181,25 +174,22 @@ impl AgentAttention {
         attend(&query?, &key?, &value?, bias)
     }
 
-    fn asked(&self, kind: usize) -> Result<Asked, TchError> {
-        let Linear { weight, bias } = &self.query[kind];
-        let bias = bias.as_ref().expect("all projections have a bias");
-        let query = (weight.shallow_clone(), bias.shallow_clone());
-        let mut key_value = Vec::with_capacity(AGENT_TYPES);
-        for sender in 0..AGENT_TYPES {
+    /// Keys and values, in this order, of senders of each type for queries of type `kind`, with the relations multiplied
+    /// in.
+    fn key_values(&self, kind: usize) -> Result<Vec<Linear>, TchError> {
+        let senders = (0..AGENT_TYPES).map(|sender| {
             let relation = (kind * AGENT_TYPES + sender) as i64;
             let att = self.relation_att.f_get(relation)?;
             let msg = self.relation_msg.f_get(relation)?;
             // q W k = q (W k), and (v as a row) W = W^T v.
             let key = folded(&att, &self.key[sender])?;
             let value = folded(&msg.f_transpose(1, 2)?, &self.value[sender])?;
-            key_value.push((
-                Tensor::f_cat(&[key.0, value.0], 0)?,
-                Tensor::f_cat(&[key.1, value.1], 0)?,
-            ));
-        }
-        let key_value = key_value.try_into().expect("one for each type");
-        Ok(Asked { query, key_value })
+            Ok(Linear {
+                weight: Tensor::f_cat(&[key.0, value.0], 0)?,
+                bias: Some(Tensor::f_cat(&[key.1, value.1], 0)?),
+            })
+        });
+        senders.collect()
     }
 }
 

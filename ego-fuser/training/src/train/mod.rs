@@ -19,7 +19,6 @@ use perception::weights::Weights;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
-use tch::nn::VarStore;
 
 pub use config::TrainConfig;
 pub use observer::{Accuracy, TrainObserver, TrainSummary, TrainingReport};
@@ -175,10 +174,6 @@ impl Task for FusionTraining<'_> {
     type Error = Error;
     /// Reading the loss waits for the device.
     const REPORT_EVERY: u64 = 10;
-
-    fn variables(&self) -> &VarStore {
-        &self.model.variables
-    }
 
     fn epoch(&self, steps: u64) -> f64 {
         (steps * self.config.run.batch as u64) as f64 / self.scenes.ticks().len() as f64

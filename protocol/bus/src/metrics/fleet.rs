@@ -38,12 +38,8 @@ pub(super) fn fleet_exposition(own: &str, others: &[MetricsPeer]) -> String {
     );
     for (peer, text) in others.iter().zip(&texts) {
         // Writing to a string cannot fail. Names of processes need no escape.
-        let _ = writeln!(
-            up,
-            "v2vloc_process_up{{process=\"{}\"}} {}",
-            peer.process,
-            u8::from(text.is_some())
-        );
+        let (process, is_up) = (&peer.process, u8::from(text.is_some()));
+        let _ = writeln!(up, "v2vloc_process_up{{process=\"{process}\"}} {is_up}");
     }
     let served = texts.iter().flatten().map(String::as_str);
     merged([own, &up].into_iter().chain(served))

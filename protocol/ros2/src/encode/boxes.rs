@@ -100,11 +100,7 @@ impl From<&Track> for Marked {
 pub(crate) fn truth_marker(object: &TrueObject) -> Marked {
     Marked {
         id: Some(marker_id(object.id)),
-        box3d: Box3d {
-            center_m: object.world_from_object.translation_m,
-            size_m: object.size_m,
-            heading_rad: object.world_from_object.yaw_rad(),
-        },
+        box3d: object.box3d(),
         alpha: 0.35,
         text: object.class.clone(),
     }

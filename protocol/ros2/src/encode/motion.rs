@@ -68,10 +68,10 @@ fn twist_covariance(motion: EgoMotion) -> [[f64; 6]; 6] {
 
 fn diagonal(variances: [f64; 6]) -> [[f64; 6]; 6] {
     let mut rows = [[0.0; 6]; 6];
-    for (index, (row, variance)) in rows.iter_mut().zip(variances).enumerate() {
-        if let Some(place) = row.get_mut(index) {
-            *place = variance;
-        }
+    // From one place of the diagonal to the next it is a row and a column.
+    let places = rows.as_flattened_mut().iter_mut().step_by(7);
+    for (place, variance) in places.zip(variances) {
+        *place = variance;
     }
     rows
 }

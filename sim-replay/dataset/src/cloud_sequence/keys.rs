@@ -88,13 +88,11 @@ impl Keys {
             return Some(Self::Times(times));
         }
         let words: Vec<&str> = numbered.iter().map(|name| name.number).collect();
-        match whole_numbers(&words) {
-            Some(numbers) => Some(Self::Numbers(numbers)),
-            None => {
-                let have_fraction = words.iter().any(|word| word.contains('.'));
-                Self::of_times(&words, have_fraction.then_some(Unit::Seconds))
-            }
+        if let Some(numbers) = whole_numbers(&words) {
+            return Some(Self::Numbers(numbers));
         }
+        let have_fraction = words.iter().any(|word| word.contains('.'));
+        Self::of_times(&words, have_fraction.then_some(Unit::Seconds))
     }
 
     /// Keys of words without a statement of their meaning. `None` for whole numbers that are written with a fraction

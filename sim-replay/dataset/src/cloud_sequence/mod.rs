@@ -30,10 +30,7 @@ pub(crate) static CLOUDS: LayoutRow = LayoutRow {
             <sequence>_poses_tum.txt or optimized_poses.txt (x y z qx qy qz qw or the columns of a header, 3x4 or 4x4 \
             matrices; possibly with time, number or name of the cloud)",
     protocol: "opv2v",
-    reader: Some(LayoutReader::Sequence {
-        is_one: |dir| place_of(dir).is_some(),
-        open,
-    }),
+    reader: Some(LayoutReader::Sequence(|dir| place_of(dir).is_some(), open)),
 };
 
 /// Names of the file of poses, or their ends (KISS-ICP, SC-LIO-SAM), the first that exists.
@@ -109,11 +106,8 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
         let nanos = nanos
             .copied()
             .unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
-        let cloud = (
-            Tick::new(*stem, nanos),
-            file.clone(),
-            Some(world_from_lidar),
-        );
+        let tick = Tick::new(*stem, nanos);
+        let cloud = (tick, file.clone(), Some(world_from_lidar));
         // The index keeps clouds of equal times apart.
         timed.insert((nanos, index), cloud);
     }

@@ -25,22 +25,18 @@ const ROTATION_TOLERANCE: f64 = 0.05;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct VehiclePoses {
     pub(super) world_from_novatel: Isometry3<f64>,
-    novatel_from_lidar: Isometry3<f64>,
-}
-
-impl VehiclePoses {
-    pub(super) fn world_from_lidar(&self) -> Isometry3<f64> {
-        self.world_from_novatel * self.novatel_from_lidar
-    }
+    pub(super) world_from_lidar: Isometry3<f64>,
 }
 
 /// Reads the poses of the vehicle.
 pub(super) fn vehicle(sides: &Sides, pair: &FramePair) -> Result<VehiclePoses> {
     let [novatel_from_lidar, world_from_novatel] =
         VEHICLE.map(|folder| sides.json(folder, &pair.vehicle));
+    let (world_from_novatel, _) = read_transform(&world_from_novatel)?;
+    let (novatel_from_lidar, _) = read_transform(&novatel_from_lidar)?;
     Ok(VehiclePoses {
-        world_from_novatel: read_transform(&world_from_novatel)?.0,
-        novatel_from_lidar: read_transform(&novatel_from_lidar)?.0,
+        world_from_novatel,
+        world_from_lidar: world_from_novatel * novatel_from_lidar,
     })
 }
 
@@ -58,7 +54,7 @@ pub(super) fn infrastructure(sides: &Sides, pair: &FramePair) -> Result<Isometry
     if sides.kind == Kind::Dair || [x_m, y_m] == [0.0; 2] {
         return Ok(offset * world_from_lidar);
     }
-    let world_from_vehicle = vehicle(sides, pair)?.world_from_lidar();
+    let world_from_vehicle = vehicle(sides, pair)?.world_from_lidar;
     Ok(world_from_vehicle * offset * world_from_vehicle.inverse() * world_from_lidar)
 }
 

@@ -248,7 +248,7 @@ impl DairSource {
     fn vehicle_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let pair = self.pair(tick)?;
         let poses = calibration::vehicle(&self.sides, pair)?;
-        let world_from_lidar = poses.world_from_lidar();
+        let world_from_lidar = poses.world_from_lidar;
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(world_from_lidar.into());
         frame.world_from_vehicle = Some(poses.world_from_novatel.into());
@@ -277,7 +277,7 @@ impl DairSource {
         // Faults of the vehicle's labels are problems of its frame.
         let vehicle = calibration::vehicle(&self.sides, pair).and_then(|poses| {
             let path = self.sides.labels(pair, PairSide::Vehicle);
-            labels::in_frame(&path, &poses.world_from_lidar(), LabelList::Vehicle)
+            labels::in_frame(&path, &poses.world_from_lidar, LabelList::Vehicle)
         });
         if let Ok((others, _)) = vehicle {
             labels::share_ids(&mut frame.objects, &others, &world_from_lidar.inverse());

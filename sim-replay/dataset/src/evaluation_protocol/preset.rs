@@ -1,8 +1,7 @@
 //! Presets: the protocols of the supported data sets, with their sources.
 
 use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol};
-use crate::class_set::ClassSet;
-use crate::ground_truth::GroundTruthRule;
+use crate::ground_truth::{GroundTruthRule, vehicles_in};
 
 /// Names of all presets, with the data set of each.
 pub const PRESETS: [(&str, &str); 14] = [
@@ -78,17 +77,5 @@ fn rule(name: &str) -> (GroundTruthRule, usize) {
         "mars" => (vehicles_in(51.2, 51.2, [-5.0, 3.0], 70.0), 7),
         // OPV2V, V2XSet, V2VDet.
         _ => (GroundTruthRule::OPV2V, 7),
-    }
-}
-
-/// The rule for vehicles with all corners within x and y to both sides.
-fn vehicles_in(x: f64, y: f64, z_m: [f64; 2], comm_range_m: f64) -> GroundTruthRule {
-    GroundTruthRule {
-        x_m: [-x, x],
-        y_m: [-y, y],
-        z_m,
-        comm_range_m,
-        min_corners: 8,
-        classes: ClassSet::VEHICLES,
     }
 }

@@ -44,11 +44,8 @@ pub(super) fn read(
     problems.extend(read.err());
 }
 
-/// A physical object over time.
-struct Instance {
-    id: i64,
-    class: ObjectClass,
-}
+/// Id and class of a physical object over time.
+type Instance = (i64, ObjectClass);
 
 fn read_instances(
     version: &Path,
@@ -75,7 +72,7 @@ fn read_instances(
             .ok_or_else(|| category.error("no row of category.json has this token"))?;
         let class = classes::of_name(name).unwrap_or(ObjectClass::Other);
         let id = instances.len() as i64;
-        instances.insert(row.required("token")?.id()?, Instance { id, class });
+        instances.insert(row.required("token")?.id()?, (id, class));
         Ok(())
     })?;
     Ok(instances)
@@ -83,14 +80,14 @@ fn read_instances(
 
 fn object(row: &JsonField<'_>, instances: &HashMap<String, Instance>) -> Result<Object> {
     let token = row.required("instance_token")?;
-    let Instance { id, class } = instances
+    let (id, class) = *instances
         .get(&token.id()?)
         .ok_or_else(|| token.error("no row of instance.json has this token"))?;
     let size = row.required("size")?;
     // nuScenes has the width first. Sizes here begin with the length.
     let [width, length, height] = size.checked_size(size.numbers()?)?;
     let (pose, size_m) = (transform(row)?.into(), [length, width, height]);
-    Ok(Object::new(*id, *class, pose, size_m))
+    Ok(Object::new(id, class, pose, size_m))
 }
 
 /// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle

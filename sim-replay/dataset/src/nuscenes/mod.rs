@@ -90,10 +90,10 @@ fn open_version(
     let root = files::above(version)
         .find(|root| root.is_dir())
         .unwrap_or_else(|| version.to_owned());
-    let tables = tables::read(version, problems)?;
-    let (scenes, layout) = (tables.scenes, layout(version, &tables.samples)?);
+    let (scenes, samples) = tables::read(version, problems)?;
+    let layout = layout(version, &samples)?;
     let mut moments: Vec<Vec<SceneSample>> = scenes.iter().map(|_| Vec::new()).collect();
-    for sample in tables.samples {
+    for sample in samples {
         if let Some(moments) = moments.get_mut(sample.scene) {
             moments.push(sample);
         }

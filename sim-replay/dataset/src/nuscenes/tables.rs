@@ -55,13 +55,6 @@ pub(super) struct SampleSweep {
     pub(super) vehicle_from_lidar: Isometry3<f64>,
 }
 
-/// Contents of the tables that the reader needs.
-#[derive(Debug, Default)]
-pub(super) struct Tables {
-    pub(super) scenes: Vec<Scene>,
-    pub(super) samples: Vec<SceneSample>,
-}
-
 /// A LiDAR on a vehicle.
 #[derive(Debug, Clone)]
 struct SensorMount {
@@ -76,18 +69,22 @@ struct SweepRow {
     mount: SensorMount,
 }
 
-/// Reads the tables in the folder `version`. Unusable rows are left out, with a problem each.
+/// Reads the drives and their samples from the tables in the folder `version`. Unusable rows are left out, with a
+/// problem each.
 ///
 /// # Errors
 /// If a table is missing or broken before its first row. Annotations may be missing.
-pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tables> {
+pub(super) fn read(
+    version: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<(Vec<Scene>, Vec<SceneSample>)> {
     let mounts = read_mounts(version, problems)?;
     let (scenes, scene_indices) = read_scenes(version, problems)?;
     let (mut samples, sample_indices) = read_samples(version, &scene_indices, problems)?;
     let rows = read_sweeps(version, &mounts, &sample_indices, problems)?;
     place(version, rows, &mut samples, problems)?;
     annotations::read(version, &sample_indices, &mut samples, problems);
-    Ok(Tables { scenes, samples })
+    Ok((scenes, samples))
 }
 
 /// LiDARs by the token of their calibration.

@@ -32,7 +32,8 @@ pub(super) fn decode(header: &PcdHeader, body: &[u8]) -> Result<PcdCloud, PcdErr
         rest: body,
         begun: body,
         line: header.lines + 1,
-        colours: Colours::default(),
+        // No token is empty, so that none has this key.
+        colours: Colours(vec![(0, (0.0, 0)); 256]),
     };
     while let Some((point, label)) = lines
         .next_point()
@@ -241,13 +242,6 @@ fn short_token(text: &[u8]) -> Option<(u128, usize)> {
 
 /// Cache of parsed colours, by the bytes of their tokens: a sweep has few distinct ones, and parsing is slow.
 struct Colours(Vec<(u128, (f32, u8))>);
-
-impl Default for Colours {
-    fn default() -> Self {
-        // No token is empty.
-        Self(vec![(0, (0.0, 0)); 256])
-    }
-}
 
 impl Colours {
     fn find(&self, key: u128) -> Option<(f32, u8)> {

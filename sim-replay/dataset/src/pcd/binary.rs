@@ -67,8 +67,8 @@ pub(super) fn decode_compressed(header: &PcdHeader, body: &[u8]) -> Result<PcdCl
         );
         return Err(PcdError::of("DATA", reason));
     }
-    let unpacked = lzf::decompress(packed, unpacked_len)
-        .map_err(|error| PcdError::of("DATA", error.to_string()))?;
+    let unpacked =
+        lzf::decompress(packed, unpacked_len).map_err(|reason| PcdError::of("DATA", reason))?;
     Ok(gather(header, &unpacked, |(field, first)| BinaryColumn {
         field,
         // A field begins behind the numbers of all points of those before it.

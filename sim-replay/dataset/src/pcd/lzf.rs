@@ -7,27 +7,17 @@
 /// Largest number of output bytes per input byte: three bytes of input repeat up to 264.
 const MAX_RATIO: usize = 88;
 
-/// Reasons why bytes are not an LZF stream of the stated length.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum LzfError {
-    #[error("{packed} packed bytes cannot become {unpacked}")]
-    Ratio { packed: usize, unpacked: usize },
-    #[error("the packed bytes end inside a block")]
-    CutOff,
-    #[error("a block repeats output {distance} bytes back, but only {len} bytes precede it")]
-    Distance { distance: usize, len: usize },
-    #[error("{found} bytes unpacked, {stated} stated")]
-    Length { found: usize, stated: usize },
-}
+const CUT_OFF: &str = "the packed bytes end inside a block";
 
 /// Unpacks exactly `unpacked_len` bytes.
-pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, LzfError> {
+///
+/// # Errors
+/// A sentence if the bytes are not an LZF stream of that length.
+pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, String> {
     // Before the reservation: a false length must not claim the memory.
-    if packed.len().saturating_mul(MAX_RATIO) < unpacked_len {
-        return Err(LzfError::Ratio {
-            packed: packed.len(),
-            unpacked: unpacked_len,
-        });
+    let len = packed.len();
+    if len.saturating_mul(MAX_RATIO) < unpacked_len {
+        return Err(format!("{len} packed bytes cannot become {unpacked_len}"));
     }
     let mut output = Vec::with_capacity(unpacked_len);
     let mut input = packed;
@@ -42,18 +32,14 @@ pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, 
             break;
         }
     }
-    if output.len() == unpacked_len {
-        Ok(output)
-    } else {
-        Err(LzfError::Length {
-            found: output.len(),
-            stated: unpacked_len,
-        })
+    match output.len() {
+        found if found == unpacked_len => Ok(output),
+        found => Err(format!("{found} bytes unpacked, {unpacked_len} stated")),
     }
 }
 
-fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&'a [u8], LzfError> {
-    let (literals, rest) = input.split_at_checked(count).ok_or(LzfError::CutOff)?;
+fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&'a [u8], String> {
+    let (literals, rest) = input.split_at_checked(count).ok_or(CUT_OFF)?;
     output.extend_from_slice(literals);
     Ok(rest)
 }
@@ -62,7 +48,7 @@ fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&
     clippy::indexing_slicing,
     reason = "`at` is below the growing length: it begins `distance` before it"
 )]
-fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&'a [u8], LzfError> {
+fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&'a [u8], String> {
     let mut next = input.iter();
     let mut count = (control >> 5) + 2;
     // 7 in the three bits: one more byte of the length, before that of the distance.
@@ -71,9 +57,9 @@ fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&
     }
     let distance = ((control & 31) << 8) + byte(&mut next)? + 1;
     let len = output.len();
-    let start = len
-        .checked_sub(distance)
-        .ok_or(LzfError::Distance { distance, len })?;
+    let start = len.checked_sub(distance).ok_or_else(|| {
+        format!("a block repeats output {distance} bytes back, but only {len} bytes precede it")
+    })?;
     // The repeated range may overlap the output: copied byte by byte, unless it does not.
     if distance >= count {
         output.extend_from_within(start..start + count);
@@ -85,8 +71,8 @@ fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&
     Ok(next.as_slice())
 }
 
-fn byte(input: &mut std::slice::Iter<'_, u8>) -> Result<usize, LzfError> {
-    let byte = input.next().ok_or(LzfError::CutOff)?;
+fn byte(input: &mut std::slice::Iter<'_, u8>) -> Result<usize, String> {
+    let byte = input.next().ok_or(CUT_OFF)?;
     Ok(usize::from(*byte))
 }
 
@@ -162,27 +148,16 @@ pub(crate) mod tests {
 
     #[test]
     fn an_impossible_stream_is_refused() {
+        let fault = |packed: &[u8], stated| decompress(packed, stated).unwrap_err();
         assert_eq!(
-            decompress(&[0, b'a'], 1_000_000),
-            Err(LzfError::Ratio {
-                packed: 2,
-                unpacked: 1_000_000
-            })
+            fault(&[0, b'a'], 1_000_000),
+            "2 packed bytes cannot become 1000000"
         );
-        assert_eq!(decompress(&[3, b'a'], 4), Err(LzfError::CutOff));
+        assert_eq!(fault(&[3, b'a'], 4), CUT_OFF);
         assert_eq!(
-            decompress(&[0, b'a', 0x20, 9], 4),
-            Err(LzfError::Distance {
-                distance: 10,
-                len: 1
-            })
+            fault(&[0, b'a', 0x20, 9], 4),
+            "a block repeats output 10 bytes back, but only 1 bytes precede it"
         );
-        assert_eq!(
-            decompress(&[0, b'a'], 2),
-            Err(LzfError::Length {
-                found: 1,
-                stated: 2
-            })
-        );
+        assert_eq!(fault(&[0, b'a'], 2), "1 bytes unpacked, 2 stated");
     }
 }

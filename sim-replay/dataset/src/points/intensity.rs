@@ -42,33 +42,28 @@ pub struct IntensityOption {
     pub scale: IntensityScale,
 }
 
-/// Reasons why a text is no [`IntensityScale`].
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{0:?}, expected auto or a positive number that intensities are divided by, for example 1 or 255"
-)]
-pub struct IntensityScaleError(String);
-
 impl FromStr for IntensityScale {
-    type Err = IntensityScaleError;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
+    fn from_str(text: &str) -> Result<Self, String> {
         if text == "auto" {
             return Ok(Self::AUTO);
         }
         let divisor = text.parse().ok();
         // Neither 0 nor NaN, infinite or subnormal: intensities stay finite.
         match divisor.filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0) {
-            None => Err(IntensityScaleError(text.to_owned())),
+            None => Err(format!(
+                "{text:?}, expected auto or a positive number that intensities are divided by, for example 1 or 255"
+            )),
             divisor => Ok(Self { divisor }),
         }
     }
 }
 
 impl TryFrom<String> for IntensityScale {
-    type Error = IntensityScaleError;
+    type Error = String;
 
-    fn try_from(text: String) -> Result<Self, Self::Error> {
+    fn try_from(text: String) -> Result<Self, String> {
         text.parse()
     }
 }
@@ -262,7 +257,7 @@ mod tests {
         assert_eq!("auto".parse(), Ok(IntensityScale::AUTO));
         assert_eq!("255".parse::<IntensityScale>().unwrap().to_string(), "255");
         for wrong in ["", "0", "-1", "nan", "inf", "byte"] {
-            let error = wrong.parse::<IntensityScale>().unwrap_err().to_string();
+            let error = wrong.parse::<IntensityScale>().unwrap_err();
             assert!(
                 error.starts_with(&format!("{wrong:?}, expected auto or a positive number")),
                 "{error}"

@@ -113,13 +113,11 @@ pub(super) fn files_of(path: &Path, problems: &mut Vec<ReadError>) -> Result<Vec
         let reason = format!("does not exist, but {METADATA} lists it: left out");
         problems.push(ReadError::malformed(&file, reason));
     }
-    match there.is_empty() {
-        true => Err(ReadError::malformed(
-            &path.join(METADATA),
-            "none of the files that it lists exists",
-        )),
-        false => Ok(there),
+    if there.is_empty() {
+        let reason = "none of the files that it lists exists";
+        return Err(ReadError::malformed(&path.join(METADATA), reason));
     }
+    Ok(there)
 }
 
 /// The files that the description lists.

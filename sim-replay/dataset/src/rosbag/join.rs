@@ -29,8 +29,6 @@ pub(super) struct Joined {
 /// A sweep.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct JoinedSweep {
-    /// Stamp of its header.
-    pub(super) nanos: u64,
     pub(super) place: MessagePlace,
     /// `None` in a bag without poses.
     pub(super) world_from_lidar: Option<Pose>,
@@ -141,13 +139,11 @@ impl JoinAttempt {
         let joined = sweeps.sweeps.iter().zip(poses);
         let joined = joined.filter(|(_, pose)| pose.is_some() || chosen.is_none());
         let joined = joined.map(|(sweep, world_from_lidar)| {
-            let (nanos, place) = (sweep.nanos, sweep.place);
-            let sweep = JoinedSweep {
-                nanos,
-                place,
+            let joined = JoinedSweep {
+                place: sweep.place,
                 world_from_lidar,
             };
-            (nanos, sweep)
+            (sweep.nanos, joined)
         });
         let sweeps = joined.collect();
         Joined { sweeps, text }

@@ -44,10 +44,7 @@ pub(crate) static ROSBAG: LayoutRow = LayoutRow {
     files: "a folder with metadata.yaml of rosbag2, or a file <name>.mcap or .db3 (.zstd): sensor_msgs/PointCloud2 with \
             nav_msgs/Odometry, tf2_msgs/TFMessage, geometry_msgs/PoseStamped or PoseWithCovarianceStamped",
     protocol: "opv2v",
-    reader: Some(LayoutReader::Sequence {
-        is_one: is_bag,
-        open,
-    }),
+    reader: Some(LayoutReader::Sequence(is_bag, open)),
 };
 
 /// Limits of a sweep: those of a file.
@@ -97,11 +94,11 @@ impl Bag {
         })
     }
 
-    /// A sweep with the intensities as stored.
-    fn read_stored(&self, sweep: &JoinedSweep) -> Result<PcdCloud> {
+    /// The sweep of a stamp with the intensities as stored.
+    fn read_stored(&self, nanos: u64, sweep: &JoinedSweep) -> Result<PcdCloud> {
         let bytes = self.storage.read(sweep.place)?;
         let read = read_point_cloud(&bytes, LIMITS).map_err(|error| {
-            let reason = format!("sweep {}: {error}", sweep.nanos);
+            let reason = format!("sweep {nanos}: {error}");
             ReadError::malformed(self.storage.path(sweep.place), reason)
         })?;
         Ok(PcdCloud {
@@ -124,11 +121,12 @@ impl FrameSource for Bag {
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud> {
-        let mut cloud = self.read_stored(self.sweep(tick)?)?;
+        let mut cloud = self.read_stored(tick.capture_nanos, self.sweep(tick)?)?;
         self.scale.apply(&mut cloud, || {
             *self.divisor.get_or_init(|| {
-                let sweeps = self.sweeps.values().take(Sweeps::MOST_TRIED);
-                let clouds = sweeps.filter_map(|sweep| self.read_stored(sweep).ok());
+                let sweeps = self.sweeps.iter().take(Sweeps::MOST_TRIED);
+                let clouds =
+                    sweeps.filter_map(|(nanos, sweep)| self.read_stored(*nanos, sweep).ok());
                 divisor_of_first(clouds, &self.points_path(agent, tick, None))
             })
         });

@@ -72,7 +72,7 @@ impl PoseSources {
         sources.add_moving(path, &contents.moving, sweeps);
         let frame = &sweeps.frame;
         let chains = sources.transforms.worlds_of(frame);
-        let chains: Vec<LidarPoseSource> = chains
+        sources.sources = chains
             .into_iter()
             .map(|(world, route)| {
                 // A chain has no more poses than its sparsest trajectory.
@@ -88,11 +88,10 @@ impl PoseSources {
                 }
             })
             .collect();
-        if chains.is_empty() && !contents.moving.is_empty() {
+        if sources.sources.is_empty() && !contents.moving.is_empty() {
             let reason = format!("transforms: none leads from {frame} to a map or odometry");
             sources.unusable.push(reason);
         }
-        sources.sources = chains;
         for (topic, poses) in &contents.poses {
             match sources.of_topic(path, (topic, poses), sweeps) {
                 Ok(source) => sources.sources.push(source),

@@ -1,6 +1,5 @@
 //! Storage of a bag: its files, scanned once in order, and their messages by position.
 
-use std::fmt;
 use std::path::{Path, PathBuf};
 
 use recording::McapFile;
@@ -13,8 +12,10 @@ use crate::recorded::as_read_error;
 use crate::{ReadError, Result};
 
 /// The files of a bag.
+#[derive(Debug)]
 pub(super) struct Storage(Vec<BagFile>);
 
+#[derive(Debug)]
 struct BagFile {
     path: PathBuf,
     form: Form,
@@ -22,6 +23,7 @@ struct BagFile {
     _unpacked: Option<TempPath>,
 }
 
+#[derive(Debug)]
 enum Form {
     Mcap(McapFile),
     Sqlite(SqliteFile),
@@ -140,11 +142,4 @@ fn scan_mcap(
     let damage = mcap.damage().iter().map(ToString::to_string);
     problems.extend(damage.map(|damage| ReadError::malformed(name, damage)));
     Ok(mcap)
-}
-
-impl fmt::Debug for Storage {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let paths = self.0.iter().map(|file| &file.path);
-        f.debug_list().entries(paths).finish()
-    }
 }

@@ -89,7 +89,7 @@ fn a_bag_keeps_the_rules_of_rosbag2() {
             );
             assert!(channel.metadata["topic_type_hash"].starts_with("RIHS01_"));
             assert!(
-                ros2::RosName::new(&channel.topic).is_ok(),
+                channel.topic.parse::<ros2::RosName>().is_ok(),
                 "{}",
                 channel.topic
             );

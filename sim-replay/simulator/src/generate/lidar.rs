@@ -34,20 +34,18 @@ const GROUND_REFLECTIVITY: f32 = 0.25;
 #[derive(Debug, Clone)]
 pub struct Lidar {
     caster: Caster,
-    points: Vec<[f32; 4]>,
-    hits: Vec<u32>,
-    labels: Vec<u8>,
+    sweep: LidarSweep,
 }
 
 /// One sweep as the sensor reports it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LidarSweep<'a> {
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct LidarSweep {
     /// x, y, z in metres and intensity, in the (right-handed) frame of the sensor at the end of the sweep.
-    pub points: &'a [[f32; 4]],
+    pub points: Vec<[f32; 4]>,
     /// Number of points on each body.
-    pub hits: &'a [u32],
+    pub hits: Vec<u32>,
     /// For each point 0 if it lies on a surface, as in clear air, and 1 if it is clutter: fog or a flake.
-    pub labels: &'a [u8],
+    pub labels: Vec<u8>,
 }
 
 impl Default for Lidar {
@@ -67,9 +65,7 @@ impl Default for Lidar {
         };
         Self {
             caster: Caster::new(pattern),
-            points: Vec::new(),
-            hits: Vec::new(),
-            labels: Vec::new(),
+            sweep: LidarSweep::default(),
         }
     }
 }
@@ -85,7 +81,7 @@ impl Lidar {
         bodies: &[RayBody<'_>],
         weather: Weather,
         seed: u64,
-    ) -> LidarSweep<'_> {
+    ) -> &LidarSweep {
         self.caster.cast(sensor, ground, bodies);
         self.again(sensor, bodies, weather, seed)
     }
@@ -98,11 +94,12 @@ impl Lidar {
         bodies: &[RayBody<'_>],
         weather: Weather,
         seed: u64,
-    ) -> LidarSweep<'_> {
-        self.points.clear();
-        self.labels.clear();
-        self.hits.clear();
-        self.hits.resize(bodies.len(), 0);
+    ) -> &LidarSweep {
+        let sweep = &mut self.sweep;
+        sweep.points.clear();
+        sweep.labels.clear();
+        sweep.hits.clear();
+        sweep.hits.resize(bodies.len(), 0);
         let mut random = SplitMix64::new(seed);
         let image = &self.caster.image;
         let depths = image.depths_m.chunks_exact(CHANNELS);
@@ -114,19 +111,15 @@ impl Lidar {
                     continue;
                 };
                 let [x, y, z] = column.point_m(elevation, range_m);
-                self.points.push([x, y, z, intensity]);
-                self.labels.push(u8::from(hit == MISS));
+                sweep.points.push([x, y, z, intensity]);
+                sweep.labels.push(u8::from(hit == MISS));
                 // GROUND and MISS lie beyond the list.
-                if let Some(count) = self.hits.get_mut(hit as usize) {
+                if let Some(count) = sweep.hits.get_mut(hit as usize) {
                     *count += 1;
                 }
             }
         }
-        LidarSweep {
-            points: &self.points,
-            hits: &self.hits,
-            labels: &self.labels,
-        }
+        sweep
     }
 }
 

@@ -2,7 +2,9 @@
 
 use nalgebra::Vector3;
 
+use super::lidar::LIDAR_MOUNT_M;
 use super::raycast::{Caster, Course, GROUND, MISS, RayBody, RayPattern, Surface};
+use super::traffic::STEP_S;
 use support::random::SplitMix64;
 
 /// Radial velocities between plus and minus this fill the red channel, metres per second.
@@ -49,19 +51,13 @@ impl Default for Radar {
 
 impl Radar {
     /// The returns at the end of `vehicle`'s motion: x, y, z in metres and radial velocity in metres per second
-    /// (growing distance is positive), in the (right-handed) frame of a sensor at `reference_m` on the same vehicle.
+    /// (growing distance is positive), in the (right-handed) frame of the vehicle's LiDAR.
     ///
-    /// `half_length_m` is the vehicle's; `sweep_s` the time that the motions take.
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "two sensors' frames and one scene; a struct would hide none of it"
-    )]
+    /// `half_length_m` is the vehicle's; the motions take one simulation step.
     pub fn returns(
         &mut self,
         vehicle: &Course,
         half_length_m: f64,
-        reference_m: [f64; 3],
-        sweep_s: f64,
         ground: &dyn Surface,
         bodies: &[RayBody<'_>],
         seed: u64,
@@ -69,12 +65,12 @@ impl Radar {
         let mount_m = [half_length_m + 0.05, 0.0, HEIGHT_M];
         let moved = vehicle.mounted(mount_m);
         // Of the mount and not of the vehicle's centre: a turn moves the front sideways.
-        let own_velocity = velocity_mps(&moved, sweep_s);
+        let own_velocity = velocity_mps(&moved);
         let sensor = Course::still(moved.end);
         self.caster.cast(&sensor, ground, bodies);
         self.points.clear();
         let mut random = SplitMix64::new(seed);
-        let shift: Vector3<f64> = Vector3::from(mount_m) - Vector3::from(reference_m);
+        let shift: Vector3<f64> = Vector3::from(mount_m) - Vector3::from(LIDAR_MOUNT_M);
         let (image, channels) = (&self.caster.image, self.caster.pattern.channels);
         let rotation = sensor.end.rotation();
         for (index, column) in self.caster.columns_at_end(&sensor).enumerate() {
@@ -87,7 +83,7 @@ impl Radar {
                 let velocity = match hit {
                     GROUND => Vector3::zeros(),
                     // The velocity of the centre stands for the whole body, whose turn is neglected.
-                    body => velocity_mps(&bodies[body as usize].motion, sweep_s),
+                    body => velocity_mps(&bodies[body as usize].motion),
                 };
                 let exact =
                     Vector3::from(column.point_m(elevation, image.depths_m[ray])).cast::<f64>();
@@ -97,7 +93,7 @@ impl Radar {
                 let aside = Vector3::new(random.normal(), random.normal(), random.normal())
                     * DIRECTION_NOISE_RAD
                     * exact.norm();
-                // `shift` moves the point from the radar's mount to the reference. Both have the same axes.
+                // `shift` moves the point from the radar's mount to the LiDAR's. Both have the same axes.
                 let point = exact + direction * (RANGE_NOISE_M * random.normal()) + aside + shift;
                 let radial = radial + VELOCITY_NOISE_MPS * random.normal();
                 let [x, y, z]: [f32; 3] = point.map(|metres| metres as f32).into();
@@ -108,8 +104,8 @@ impl Radar {
     }
 }
 
-fn velocity_mps(motion: &Course, sweep_s: f64) -> Vector3<f64> {
-    (motion.end.position_m - motion.start.position_m) / sweep_s
+fn velocity_mps(motion: &Course) -> Vector3<f64> {
+    (motion.end.position_m - motion.start.position_m) / STEP_S
 }
 
 /// A radial velocity as the red channel holds it, 0..1; see [`RADAR_VELOCITY_SPAN_MPS`].
@@ -153,15 +149,7 @@ mod tests {
             },
         ];
         let mut radar = Radar::default();
-        let points = radar.returns(
-            &own,
-            2.2,
-            [-0.5, 0.0, 1.95],
-            0.05,
-            &Plane(-500.0),
-            &bodies,
-            1,
-        );
+        let points = radar.returns(&own, 2.2, &Plane(-500.0), &bodies, 1);
         assert!(points.len() > 8);
         for point in points {
             let expected = if point[1].abs() < 3.0 {

@@ -155,7 +155,7 @@ impl SynthScene<'_, '_> {
         let sweep = bench
             .lidar
             .sweep(&sensor, ground, bodies, weather, noise(5));
-        let (points, hits) = (sweep.points.to_vec(), sweep.hits.to_vec());
+        let (points, hits) = (sweep.points.clone(), sweep.hits.clone());
         let copies = self.options.copies.iter();
         let named = copies.filter_map(|weather| Some((*weather, weather.variant()?)));
         let variants = named.map(|(weather, name)| {
@@ -163,8 +163,8 @@ impl SynthScene<'_, '_> {
             let copy = bench.lidar.again(&sensor, bodies, weather, seed);
             SweepVariant {
                 name: name.to_owned(),
-                points: copy.points.to_vec(),
-                labels: copy.labels.to_vec(),
+                points: copy.points.clone(),
+                labels: copy.labels.clone(),
             }
         });
         (PointCloud { xyzi: points }, variants.collect(), hits)
@@ -210,15 +210,8 @@ impl SynthScene<'_, '_> {
         bench: &mut Bench<'_>,
         noise: u64,
     ) -> PointCloud {
-        let returns = bench.radar.returns(
-            vehicle,
-            half_length_m,
-            LIDAR_MOUNT_M,
-            STEP_S,
-            &*self.world.ground,
-            bodies,
-            noise,
-        );
+        let (radar, ground) = (&mut bench.radar, &*self.world.ground);
+        let returns = radar.returns(vehicle, half_length_m, ground, bodies, noise);
         let returns = returns.iter();
         let xyzi = returns.map(|&[x, y, z, velocity]| [x, y, z, velocity_to_red(velocity)]);
         let xyzi = xyzi.collect();

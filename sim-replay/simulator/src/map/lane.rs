@@ -50,24 +50,6 @@ pub struct Lane {
 }
 
 impl Lane {
-    /// A lane of one width outside junctions, not yet linked. `centerline` holds at least two points.
-    pub fn new(id: LaneId, centerline: Vec<[f64; 3]>, width_m: f64, speed_limit_mps: f64) -> Self {
-        let length_m = centerline
-            .windows(2)
-            .map(|pair| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]))
-            .sum();
-        let widths_m = vec![width_m; centerline.len()];
-        Self {
-            id,
-            centerline,
-            length_m,
-            widths_m,
-            width_m,
-            speed_limit_mps,
-            ..Self::default()
-        }
-    }
-
     /// Place on the centre line at `s_m` metres from its start (clamped to the lane), and the heading there in radians.
     pub fn at(&self, s_m: f64) -> ([f64; 3], f64) {
         let last = self.centerline.len() - 1;
@@ -137,6 +119,31 @@ pub(crate) fn wrap_angle(angle_rad: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl Lane {
+        /// A lane of one width outside junctions, not yet linked. `centerline` holds at least two points.
+        pub(crate) fn new(
+            id: LaneId,
+            centerline: Vec<[f64; 3]>,
+            width_m: f64,
+            speed_limit_mps: f64,
+        ) -> Self {
+            let length_m = centerline
+                .windows(2)
+                .map(|pair| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]))
+                .sum();
+            let widths_m = vec![width_m; centerline.len()];
+            Self {
+                id,
+                centerline,
+                length_m,
+                widths_m,
+                width_m,
+                speed_limit_mps,
+                ..Self::default()
+            }
+        }
+    }
 
     #[test]
     fn position_and_heading_on_a_circle() {

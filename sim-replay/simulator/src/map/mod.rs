@@ -128,12 +128,9 @@ fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result
         let problem = format_args!("none of its {roads} roads has a driving lane");
         return Err(FileError::new(path, problem));
     }
-    let [x_m, y_m] = [0, 1].map(|axis: usize| {
-        let points = graph.lanes.iter().flat_map(|lane| &lane.centerline);
-        let [low, high] = convex::range(points.map(|point| point[axis]));
-        high - low
-    });
-    let extent_m = x_m.max(y_m);
+    let points = graph.lanes.iter().flat_map(|lane| &lane.centerline);
+    let [low, high] = convex::bounds(points.map(|&[x, y, _]| [x, y]));
+    let extent_m = (high[0] - low[0]).max(high[1] - low[1]);
     if extent_m > MAX_EXTENT_M {
         let problem = format_args!(
             "its lanes reach over {extent_m:.0} m, more than the limit of {MAX_EXTENT_M} m"

@@ -268,14 +268,9 @@ impl Road {
 
     /// Place at `s_m`, `t_m` of section `section`, on the road's surface, metres.
     pub(crate) fn point_at(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 3] {
-        let z_m = self.elevation.at(s_m);
-        if self.lateral.is_level() {
-            let pose = self.pose_at(s_m).moved(0.0, t_m, 0.0);
-            return [pose.x, pose.y, z_m];
-        }
         let [aside_m, height_m] = self.aside_m(section, s_m, t_m);
         let pose = self.pose_at(s_m).moved(0.0, aside_m, 0.0);
-        [pose.x, pose.y, z_m + height_m]
+        [pose.x, pose.y, self.elevation.at(s_m) + height_m]
     }
 
     /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m` of

@@ -136,7 +136,6 @@ fn train<N: PoseLoss>(
         observe,
         network,
         curve: trainer.curve(CURVE)?,
-        variables,
         cache,
         validation,
         means: Vec::new(),
@@ -145,7 +144,7 @@ fn train<N: PoseLoss>(
     };
     trainer.run(&mut training, SaveEvery::Steps(CHECKPOINT_EVERY))?;
     Ok(PoseRegressionSummary {
-        trained: trainer.save_network(&training.variables, N::KIND, &network_config, data)?,
+        trained: trainer.save_network(&variables, N::KIND, &network_config, data)?,
         sweeps: count,
         network: network_config,
         validation: training.validated,
@@ -167,7 +166,6 @@ struct PoseTraining<'a, N> {
     sectors: i64,
     observe: &'a mut Observe<'a>,
     network: PoseRegressor<N>,
-    variables: VarStore,
     cache: TokenCache,
     validation: Option<TokenCache>,
     curve: Curve,
@@ -183,10 +181,6 @@ impl<N: PoseLoss> Task for PoseTraining<'_, N> {
     type Error = Error;
     /// Between reports nothing waits for the device but the optimizer.
     const REPORT_EVERY: u64 = 50;
-
-    fn variables(&self) -> &VarStore {
-        &self.variables
-    }
 
     fn epoch(&self, steps: u64) -> f64 {
         (steps * self.run.batch as u64) as f64 / self.cache.len() as f64

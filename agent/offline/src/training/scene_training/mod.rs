@@ -190,10 +190,6 @@ impl Task for SceneTraining<'_> {
     type Error = Error;
     const REPORT_EVERY: u64 = 20;
 
-    fn variables(&self) -> &VarStore {
-        &self.variables
-    }
-
     fn epoch(&self, _: u64) -> f64 {
         self.order.passes
     }

@@ -92,10 +92,8 @@ fn codec(point: &Point) -> Option<String> {
     if point.method.exchange() != Exchange::Features {
         return None;
     }
-    let kept = point
-        .codec
-        .keep
-        .map_or(String::new(), |keep| format!(" {} %", 100.0 * keep));
+    let kept = point.codec.keep;
+    let kept = kept.map_or(String::new(), |keep| format!(" {} %", 100.0 * keep));
     Some(point.codec.name() + &kept)
 }
 

@@ -79,10 +79,8 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
         dtype: experiment.dtype,
         ..CodecSpec::default()
     };
-    let first = grid
-        .codec
-        .as_ref()
-        .map(|codecs| codecs.iter().take(1).copied().collect());
+    let codecs = grid.codec.as_ref();
+    let first = codecs.map(|codecs| codecs.iter().take(1).copied().collect());
     let mut points = Vec::new();
     for (methods, codecs) in [(&grid.method, &grid.codec), (&grid.reference, &first)] {
         let plain = methods.iter().map(|&method| Point {

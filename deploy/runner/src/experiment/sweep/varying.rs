@@ -119,12 +119,9 @@ impl VaryingTable {
     }
 
     fn settings_of(&self, line: usize) -> String {
-        let pairs = self
-            .columns
-            .iter()
-            .zip(&self.lines[line])
-            .take(self.settings);
-        let given = pairs.filter(|(_, value)| !value.is_empty());
+        let pairs = self.columns.iter().zip(&self.lines[line]);
+        let settings = pairs.take(self.settings);
+        let given = settings.filter(|(_, value)| !value.is_empty());
         let texts = given.map(|(name, value)| format!("{name} {value}"));
         texts.collect::<Vec<_>>().join(", ")
     }

@@ -54,34 +54,29 @@ pub(crate) struct Displacements {
 impl Displacements {
     /// Concatenation of several comparisons.
     pub(crate) fn all(several: &[Self]) -> Result<Self, TchError> {
-        Ok(Self {
-            deltas: Self::concatenated(several, |each| &each.deltas)?,
-            fit: Self::concatenated(several, |each| &each.fit)?,
-            similarity: Self::concatenated(several, |each| &each.similarity)?,
-        })
+        Self::each(|part| Tensor::f_cat(&several.iter().map(part).collect::<Vec<_>>(), 0))
     }
 
-    fn concatenated(several: &[Self], of: fn(&Self) -> &Tensor) -> Result<Tensor, TchError> {
-        Tensor::f_cat(&several.iter().map(of).collect::<Vec<_>>(), 0)
+    /// Each part by `change`, which is given how to get at it.
+    fn each(
+        change: impl Fn(fn(&Self) -> &Tensor) -> Result<Tensor, TchError>,
+    ) -> Result<Self, TchError> {
+        Ok(Self {
+            deltas: change(|of| &of.deltas)?,
+            fit: change(|of| &of.fit)?,
+            similarity: change(|of| &of.similarity)?,
+        })
     }
 
     /// Rows of some maps.
     pub(crate) fn only(&self, rows: &[i64]) -> Result<Self, TchError> {
-        Ok(Self {
-            deltas: picked(&self.deltas, rows)?,
-            fit: picked(&self.fit, rows)?,
-            similarity: picked(&self.similarity, rows)?,
-        })
+        Self::each(|part| picked(part(self), rows))
     }
 
     /// The same with rows of another comparison for the maps in `rows`.
     pub(crate) fn with(&self, rows: &[i64], other: &Self) -> Result<Self, TchError> {
         let index = Tensor::f_from_slice(rows)?.f_to_device(self.deltas.device())?;
-        Ok(Self {
-            deltas: self.deltas.f_index_copy(0, &index, &other.deltas)?,
-            fit: self.fit.f_index_copy(0, &index, &other.fit)?,
-            similarity: self.similarity.f_index_copy(0, &index, &other.similarity)?,
-        })
+        Self::each(|part| part(self).f_index_copy(0, &index, part(other)))
     }
 }
 

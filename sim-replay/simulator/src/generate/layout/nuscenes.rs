@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 
 use super::boxes::{float_bytes, points_in, ring};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
-use super::nuscenes_tables::{AnnotationRecord, SampleRecord, SceneTables, SweepRecord, TableSet};
+use super::nuscenes_tables::{SampleRecord, SceneTables, SweepRecord, TableSet};
 use super::{DAY_MICROS, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::generate::error::SynthError;
 
@@ -97,10 +97,7 @@ impl SceneWriter for NuScenes {
         }
         let annotations = Moment::union(&moment.frames).into_iter().map(|object| {
             let points = moment.frames.iter().map(|frame| points_in(frame, object));
-            AnnotationRecord {
-                object: object.clone(),
-                lidar_points: points.sum(),
-            }
+            (object.clone(), points.sum::<usize>())
         });
         let annotations = annotations.collect();
         locked(&self.samples).push(SampleRecord {

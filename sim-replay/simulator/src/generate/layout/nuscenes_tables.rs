@@ -34,21 +34,14 @@ pub(super) struct SweepRecord {
     pub(super) world_from_vehicle: Option<Pose>,
 }
 
-/// An object listed by any agent.
-#[derive(Debug)]
-pub(super) struct AnnotationRecord {
-    pub(super) object: Object,
-    /// Points of all agents in its box.
-    pub(super) lidar_points: usize,
-}
-
 /// A moment that was written.
 #[derive(Debug)]
 pub(super) struct SampleRecord {
     pub(super) moment: usize,
     pub(super) micros: u64,
     pub(super) sweeps: Vec<SweepRecord>,
-    pub(super) annotations: Vec<AnnotationRecord>,
+    /// The objects listed by any agent, each with the number of points of all agents in its box.
+    pub(super) annotations: Vec<(Object, usize)>,
 }
 
 /// A scene whose capture times are written.
@@ -69,13 +62,14 @@ pub(super) struct SceneTables<'a> {
 pub(super) struct TableSet(BTreeMap<&'static str, Vec<Value>>);
 
 impl TableSet {
-    fn push(&mut self, table: &'static str, row: Value) {
-        self.0.entry(table).or_default().push(row);
+    /// The rows of a table, which begins empty.
+    fn rows(&mut self, table: &'static str) -> &mut Vec<Value> {
+        self.0.entry(table).or_default()
     }
 
     /// Adds a row, unless there is one with its token.
     fn push_once(&mut self, table: &'static str, row: Value) {
-        let rows = self.0.entry(table).or_default();
+        let rows = self.rows(table);
         if !rows.iter().any(|other| other["token"] == row["token"]) {
             rows.push(row);
         }
@@ -84,7 +78,7 @@ impl TableSet {
     /// All tables, empty ones included.
     pub(super) fn into_tables(mut self) -> BTreeMap<&'static str, Vec<Value>> {
         for name in EMPTY_TABLES {
-            self.0.entry(name).or_default();
+            self.rows(name);
         }
         self.0
     }
@@ -98,10 +92,9 @@ impl TableSet {
         self.add_scene(&scene, &tokens);
         let scene_token = scene_token(&scene, "scene", &[]);
         for (sample, (token, prev, next)) in scene.samples.iter().zip(linked(&tokens)) {
-            let row = json!({
+            self.rows("sample").push(json!({
                 "token": token, "timestamp": sample.micros, "prev": prev, "next": next, "scene_token": scene_token,
-            });
-            self.push("sample", row);
+            }));
         }
         self.add_sweeps(&scene, &tokens);
         self.add_annotations(&scene, &tokens);
@@ -110,12 +103,12 @@ impl TableSet {
     /// The scene, its log and its map.
     fn add_scene(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
         let [log, map, token] = ["log", "map", "scene"].map(|kind| scene_token(scene, kind, &[]));
-        let row = json!({
+        self.rows("log").push(json!({
             "token": log, "logfile": "", "vehicle": "", "date_captured": "", "location": "",
-        });
-        self.push("log", row);
-        let row = json!({ "token": map, "log_tokens": [log], "category": "semantic_prior", "filename": "" });
-        self.push("map", row);
+        }));
+        self.rows("map").push(json!({
+            "token": map, "log_tokens": [log], "category": "semantic_prior", "filename": "",
+        }));
         let mut row = json!({
             "token": token,
             "log_token": log,
@@ -127,7 +120,7 @@ impl TableSet {
         if let Some(row) = row.as_object_mut() {
             row.extend(scene.fields.clone());
         }
-        self.push("scene", row);
+        self.rows("scene").push(row);
     }
 
     /// Sensors, their mounts, the sweeps and the poses of the vehicles: a chain of sweeps per channel.
@@ -154,17 +147,15 @@ impl TableSet {
                 let world_from_vehicle: Pose =
                     (sweep.world_from_lidar * vehicle_from_lidar.inverse()).into();
                 // One pose for each sweep, so both rows share a token.
-                let row = json!({
+                self.rows("ego_pose").push(json!({
                     "token": token, "timestamp": sample.micros,
                     "rotation": world_from_vehicle.rotation_wxyz, "translation": world_from_vehicle.translation_m,
-                });
-                self.push("ego_pose", row);
-                let row = json!({
+                }));
+                self.rows("sample_data").push(json!({
                     "token": token, "sample_token": sample_token, "ego_pose_token": token,
                     "calibrated_sensor_token": mount, "timestamp": sample.micros, "fileformat": "bin",
                     "is_key_frame": true, "height": 0, "width": 0, "filename": sweep.file, "prev": prev, "next": next,
-                });
-                self.push("sample_data", row);
+                }));
             }
         }
     }
@@ -185,11 +176,10 @@ impl TableSet {
         let vehicle_from_lidar = world_from_vehicle.inv_mul(&first.world_from_lidar);
         let pose: Pose = vehicle_from_lidar.into();
         let token = scene_token(scene, "calibrated_sensor", &[channel]);
-        let row = json!({
+        self.rows("calibrated_sensor").push(json!({
             "token": token, "sensor_token": sensor, "translation": pose.translation_m,
             "rotation": pose.rotation_wxyz, "camera_intrinsic": [],
-        });
-        self.push("calibrated_sensor", row);
+        }));
         (token, vehicle_from_lidar)
     }
 
@@ -197,9 +187,9 @@ impl TableSet {
     fn add_annotations(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
         let mut by_object: BTreeMap<i64, Vec<_>> = BTreeMap::new();
         for (sample, token) in scene.samples.iter().zip(sample_tokens) {
-            for annotation in &sample.annotations {
-                let chain = by_object.entry(annotation.object.id).or_default();
-                chain.push((sample, token, annotation));
+            for (object, lidar_points) in &sample.annotations {
+                let chain = by_object.entry(object.id).or_default();
+                chain.push((sample, token, object, lidar_points));
             }
         }
         for (id, chain) in &by_object {
@@ -208,29 +198,27 @@ impl TableSet {
             let moments = chain.iter().map(|(sample, ..)| sample.moment.to_string());
             let tokens = moments.map(|moment| scene_token(scene, "annotation", &[&id, &moment]));
             let tokens: Vec<String> = tokens.collect();
-            let name = category_name(chain[0].2.object.class);
+            let name = category_name(chain[0].2.class);
             let category = token(&["category", name]);
             let row = json!({ "token": category, "name": name, "description": "" });
             self.push_once("category", row);
-            let row = json!({
+            self.rows("instance").push(json!({
                 "token": instance, "category_token": category, "nbr_annotations": tokens.len(),
                 "first_annotation_token": tokens.first(), "last_annotation_token": tokens.last(),
-            });
-            self.push("instance", row);
-            for ((_, sample_token, annotation), (token, prev, next)) in
+            }));
+            for ((_, sample_token, object, lidar_points), (token, prev, next)) in
                 chain.iter().zip(linked(&tokens))
             {
-                let pose = &annotation.object.world_from_object;
+                let pose = &object.world_from_object;
                 // Sizes of nuScenes are width, length, height.
-                let [length, width, height] = annotation.object.size_m;
-                let row = json!({
+                let [length, width, height] = object.size_m;
+                self.rows("sample_annotation").push(json!({
                     "token": token, "sample_token": sample_token, "instance_token": instance,
                     "visibility_token": "", "attribute_tokens": [],
                     "translation": pose.translation_m, "size": [width, length, height],
                     "rotation": pose.rotation_wxyz, "prev": prev, "next": next,
-                    "num_lidar_pts": annotation.lidar_points, "num_radar_pts": 0,
-                });
-                self.push("sample_annotation", row);
+                    "num_lidar_pts": lidar_points, "num_radar_pts": 0,
+                }));
             }
         }
     }
@@ -291,13 +279,7 @@ mod tests {
             world_from_lidar: Pose::from_xyz_yaw([moment as f64, 0.0, 2.0], 0.0).isometry(),
             world_from_vehicle: Some(Pose::from_xyz_yaw([moment as f64 + 0.5, 0.0, 0.0], 0.0)),
         };
-        let annotations = objects
-            .into_iter()
-            .map(|object| AnnotationRecord {
-                object,
-                lidar_points: 3,
-            })
-            .collect();
+        let annotations = objects.into_iter().map(|object| (object, 3)).collect();
         SampleRecord {
             moment,
             micros: 100_000 * moment as u64,

@@ -67,7 +67,7 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
             writeln!(yaml, "plan_trajectory: []")?;
         }
     }
-    write_vehicles(yaml, agent, write_object)
+    write_vehicles(yaml, agent, entry)
 }
 
 /// Calibration of a camera: its pose in the world, `extrinsic` from the LiDAR to the camera, both left-handed with x
@@ -127,19 +127,18 @@ fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {
     )
 }
 
-fn write_object(yaml: &mut String, object: &Object, anchor: &BoxAnchor) -> std::fmt::Result {
+fn entry<'a>(object: &'a Object, anchor: &BoxAnchor) -> ObjectEntry<'a> {
     let mut more = vec![("class", object.class.name().to_owned())];
     // Objects that are not vehicles must not count as vehicles.
     if let ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other = object.class {
         more.push(("obj_type", real_type(object.class).to_owned()));
     }
-    let entry = ObjectEntry {
+    ObjectEntry {
         object,
         angle_deg: CarlaPose::from_pose(&object.world_from_object).roll_yaw_pitch_deg,
         // Readers add the offset of the centre without rotating it, so it is rotated here.
         location_m: mirrored_point(anchor.location_m),
         center_m: mirrored_point(anchor.center_offset_m),
-        more: &more,
-    };
-    entry.write(yaml)
+        more,
+    }
 }

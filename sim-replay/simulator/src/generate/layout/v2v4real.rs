@@ -63,22 +63,20 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
         writeln!(yaml, "{key}: {}", pickled_matrix(&pose))?;
     }
     let lidar_from_world = agent.world_from_lidar().inverse();
-    write_vehicles(yaml, agent, |yaml, object, _| {
+    write_vehicles(yaml, agent, |object, _| {
         let lidar_from_object: Pose =
             (lidar_from_world * object.world_from_object.isometry()).into();
-        let more = [
-            ("ass_id", object.id.to_string()),
-            ("obj_type", real_type(object.class).to_owned()),
-        ];
-        let entry = ObjectEntry {
+        ObjectEntry {
             object,
             angle_deg: CarlaPose::from_right_handed(&lidar_from_object).roll_yaw_pitch_deg,
             location_m: lidar_from_object.translation_m,
             // The location already is the centre of the box.
             center_m: [0.0; 3],
-            more: &more,
-        };
-        entry.write(yaml)
+            more: vec![
+                ("ass_id", object.id.to_string()),
+                ("obj_type", real_type(object.class).to_owned()),
+            ],
+        }
     })
 }
 

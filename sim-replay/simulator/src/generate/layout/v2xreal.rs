@@ -21,16 +21,15 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     for (key, pose) in keyed_poses(frame) {
         write_list(yaml, "", key, &six(&pose))?;
     }
-    write_vehicles(yaml, agent, |yaml, object, anchor| {
+    write_vehicles(yaml, agent, |object, anchor| {
         let [.., roll, yaw, pitch] = six(&object.world_from_object);
-        let entry = ObjectEntry {
+        ObjectEntry {
             object,
             angle_deg: [roll, yaw, pitch],
             location_m: anchor.location_m,
             center_m: anchor.center_offset_m,
-            more: &[("obj_type", real_type(object.class).to_owned())],
-        };
-        entry.write(yaml)
+            more: vec![("obj_type", real_type(object.class).to_owned())],
+        }
     })
 }
 

@@ -30,12 +30,12 @@ pub(super) struct ObjectEntry<'a> {
     /// Offset from the location to the centre of the box, added without rotation.
     pub(super) center_m: [f64; 3],
     /// Keys and values of one layout only, in alphabetical order after `angle`.
-    pub(super) more: &'a [(&'static str, String)],
+    pub(super) more: Vec<(&'static str, String)>,
 }
 
 impl ObjectEntry<'_> {
     /// Writes the entry, with keys in alphabetical order.
-    pub(super) fn write(&self, yaml: &mut String) -> fmt::Result {
+    fn write(&self, yaml: &mut String) -> fmt::Result {
         writeln!(yaml, "  {}:", self.object.id)?;
         let half_m = self.object.size_m.map(|size| size / 2.0);
         for (key, list, next) in [
@@ -69,10 +69,10 @@ pub(super) fn keyed_poses(frame: &Frame) -> impl Iterator<Item = (&'static str, 
 }
 
 /// Writes the objects of a frame, each with the anchor of its box.
-pub(super) fn write_vehicles(
+pub(super) fn write_vehicles<'a>(
     yaml: &mut String,
-    agent: &AgentFrame,
-    mut write: impl FnMut(&mut String, &Object, &BoxAnchor) -> fmt::Result,
+    agent: &'a AgentFrame,
+    entry: impl Fn(&'a Object, &BoxAnchor) -> ObjectEntry<'a>,
 ) -> fmt::Result {
     let objects = &agent.frame.objects;
     if objects.is_empty() {
@@ -80,7 +80,7 @@ pub(super) fn write_vehicles(
     }
     writeln!(yaml, "vehicles:")?;
     let mut anchored = objects.iter().zip(anchors(agent));
-    anchored.try_for_each(|(object, anchor)| write(yaml, object, &anchor))
+    anchored.try_for_each(|(object, anchor)| entry(object, &anchor).write(yaml))
 }
 
 /// Reference points of the objects of a frame: from the simulation if known, else the centre of the box's bottom face.
@@ -182,7 +182,7 @@ mod tests {
             angle_deg: [0.0, 90.0, -0.0],
             location_m: [1.0, 2.5, 0.0],
             center_m: [0.0; 3],
-            more: &more,
+            more: more.into(),
         };
         let mut yaml = String::new();
         entry.write(&mut yaml).unwrap();

@@ -31,14 +31,6 @@ use crate::warp::SUM;
 /// tenths of a metre. A correction within this distance of that of its agent's newest map is replaced by the latter.
 const SAME_PLACE_M: f64 = 0.6;
 
-/// Maps from before their agents' newest.
-struct Earlier<'a> {
-    /// Of each the time step, 0 for the one before the newest; its sender's pose at capture; its features.
-    maps: Vec<(usize, Pose, &'a FullResolutionMap)>,
-    /// The grid of all maps.
-    grid: &'a BevGrid,
-}
-
 /// Blends earlier maps, by cell and channel, into the maximum of the newest, and likewise the ego's own newest, which
 /// can undo additions of neighbours; neutral before training.
 #[derive(Debug)]
@@ -79,9 +71,7 @@ impl TemporalMemory {
             return Ok(fused);
         }
         let likely = classes.likely(&fused)?;
-        let grid = &aligned.grid;
-        let past = Earlier { maps, grid };
-        self.forward([&fused, &fine.own], &past, context, &likely)
+        self.forward([&fused, &fine.own], &maps, &aligned.grid, context, &likely)
     }
 
     /// The earlier maps that take part, each with its time step and its sender's corrected pose.
@@ -101,7 +91,8 @@ impl TemporalMemory {
         let placed = entries.filter_map(|(index, &entry)| {
             // Step 0 is an earlier map whose agent has no newest map in reach. It takes no part.
             let step = origins.steps_back[first + index].checked_sub(1)?;
-            let (pose, map) = (&origins.ego_from_cav[first + index], maps.get(entry)?);
+            let map = maps.get(entry as usize)?;
+            let pose = &origins.ego_from_cav[first + index];
             let correction = corrections.as_ref().map(|all| &all[index]);
             let pose = correction.map_or(*pose, |delta| moved(pose, delta));
             (step < steps).then_some((step, pose, map))
@@ -140,13 +131,17 @@ impl TemporalMemory {
     /// `[1, C, H, W]` of `now`, the maximum of all agents' newest maps, of that shape, and the ego's `own`,
     /// `[C, H, W]`. Without a gradient `now` is overwritten if its channels are last in memory.
     ///
+    /// `past` has of each map from before its agent's newest the time step, 0 for the one before the newest; its
+    /// sender's pose at capture; its features. `grid` is that of all maps.
+    ///
     /// # Shapes
     /// - `ego`: `[1, h, w, D]`, the ego's tokens after the transformer
     /// - `likely`: `[1, 1, H, W]`, larger where a vehicle is more likely
     fn forward(
         &self,
         [now, own]: [&Tensor; 2],
-        past: &Earlier<'_>,
+        past: &[(usize, Pose, &FullResolutionMap)],
+        grid: &BevGrid,
         ego: &Tensor,
         likely: &Tensor,
     ) -> Result<Tensor> {
@@ -168,7 +163,7 @@ impl TemporalMemory {
         let now = shown.f_index_select(0, &at.middle)?;
         let gate = self.gate(0, &own, &known, &at)?;
         let mut change = gate * (own.f_index_select(0, &at.middle)? - &now);
-        let seen = FullResolutionMap::seen(&past.maps, &selection.near, past.grid)?;
+        let seen = FullResolutionMap::seen(past, &selection.near, grid)?;
         for (step, CellSamples { features, mask }) in seen {
             let gate = self.gate(1 + step, &features, &known, &at)?;
             let apart = features.f_index_select(0, &at.middle)? - &now;
@@ -390,18 +385,8 @@ mod tests {
         let own = now.get(0) * 0.9;
         let ego = uniform(9, &[1, 8, 16, 6]);
         let blended = |memory: &TemporalMemory| {
-            no_grad(|| {
-                memory.forward(
-                    [&now, &own],
-                    &Earlier {
-                        maps: maps(),
-                        grid: &grid,
-                    },
-                    &ego,
-                    &likely,
-                )
-            })
-            .unwrap()
+            let maps: Vec<_> = maps();
+            no_grad(|| memory.forward([&now, &own], &maps, &grid, &ego, &likely)).unwrap()
         };
         let few = blended(&memory);
         memory.share = 1.0;
