@@ -22,7 +22,10 @@ pub fn place_localizer(
     set: impl FnOnce(&mut Localizer),
 ) -> Result<Box<dyn Localize>> {
     let localizer: Box<dyn Localize> = match MapSearch::of_file(head)? {
-        Some(search) => Box::new(search.rejecting(min_confidence)),
+        Some(mut search) => {
+            search.min_confidence = min_confidence;
+            Box::new(search)
+        }
         None => {
             let mut pgc = Localizer::load(encoder, head, inference)?;
             pgc.set_min_confidence(min_confidence);

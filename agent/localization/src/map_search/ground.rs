@@ -10,8 +10,6 @@ use crate::registration::icp::{Plane, is_level};
 const CELL_M: f64 = 8.0;
 /// Radius around a sensor in which its ground is measured, metres.
 const NEAR_M: f64 = 12.0;
-/// Height of a sensor above ground that it does not see, metres: that of a LiDAR on a roof.
-const USUAL_HEIGHT_M: f64 = 2.0;
 
 /// Sums over level planes.
 #[derive(Debug, Clone, Copy, Default)]
@@ -39,17 +37,9 @@ impl LevelSums {
         self.count += 1.0;
     }
 
-    fn height_m(&self) -> f64 {
-        self.height / self.count
-    }
-
-    /// Height of the sensor above this ground, metres.
-    pub(super) fn sensor_height_m(&self) -> f64 {
-        if self.count > 0.0 {
-            -self.height_m()
-        } else {
-            USUAL_HEIGHT_M
-        }
+    /// Mean height, metres; `None` without a plane.
+    pub(super) fn height_m(&self) -> Option<f64> {
+        (self.count > 0.0).then(|| self.height / self.count)
     }
 
     /// Takes the normal of the ground to the vertical.
@@ -78,7 +68,7 @@ impl Ground {
     /// Height, metres, and the rotation that tilts the vertical to the ground's normal; `None` where there is no ground.
     pub(super) fn at(&self, at_m: &Vector2<f64>) -> Option<(f64, UnitQuaternion<f64>)> {
         let sums = self.cells.get(&cell_at(at_m))?;
-        Some((sums.height_m(), sums.levelled().inverse()))
+        Some((sums.height_m()?, sums.levelled().inverse()))
     }
 }
 

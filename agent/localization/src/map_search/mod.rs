@@ -30,6 +30,8 @@ use crate::registration::icp::{IcpFit, MIN_POINTS, Plane};
 const VOXELS_M: [f64; 2] = [0.3, 1.0];
 /// Registered poses nearer than this are one, metres.
 const SAME_M: f64 = 0.5;
+/// Height of a sensor above ground that it does not see, metres: that of a LiDAR on a roof.
+const USUAL_HEIGHT_M: f64 = 2.0;
 /// Largest number of a sweep's planes that are searched for.
 const MOST_PLANES: usize = 160;
 /// Largest number of poses that are registered.
@@ -47,7 +49,8 @@ pub struct MapSearch {
     map: SurfelMap,
     grid: UprightGrid,
     ground: Ground,
-    min_confidence: f64,
+    /// Poses of less confidence are rejected.
+    pub(crate) min_confidence: f64,
 }
 
 impl MapSearch {
@@ -79,18 +82,13 @@ impl MapSearch {
         }))
     }
 
-    /// The same search, which rejects poses of less confidence.
-    pub fn rejecting(self, min_confidence: f64) -> Self {
-        Self {
-            min_confidence,
-            ..self
-        }
-    }
-
     /// The registered pose at which most planes agree, and their share; `None` where nothing was registered.
     fn found(&self, sweep: &SweepOnMap<'_>) -> Option<(IcpFit, f64)> {
         let below = LevelSums::below_sensor(sweep.planes());
         let levelled = below.levelled();
+        let height_m = below
+            .height_m()
+            .map_or(USUAL_HEIGHT_M, |ground_m| -ground_m);
         let planes = sought(sweep.planes(), &levelled);
         let mut search = Search::new(&self.grid, &planes);
         let (mut best, mut second) = (None::<(IcpFit, f64)>, 0.0);
@@ -99,7 +97,7 @@ impl MapSearch {
             let Some(pose) = search.next(least) else {
                 break;
             };
-            let start = self.start(&pose, &levelled, below.sensor_height_m());
+            let start = self.start(&pose, &levelled, height_m);
             let Some(fit) = start.and_then(|start| sweep.fit(&self.map, &start)) else {
                 continue;
             };
@@ -312,7 +310,9 @@ mod tests {
         let found = search().localize(near).unwrap();
         assert_eq!(found.inlier_ratio, 0.0, "nothing was sought");
         assert!(found.estimate.world_from_cav().is_some());
-        let rejected = search().rejecting(1.0).localize(LocalizerInput::of(&cloud));
+        let mut strict = search();
+        strict.min_confidence = 1.0;
+        let rejected = strict.localize(LocalizerInput::of(&cloud));
         assert!(rejected.unwrap().found.unwrap().is_rejected);
     }
 
