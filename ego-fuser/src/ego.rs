@@ -614,7 +614,7 @@ impl ChosenViews<'_> {
         let mut marks = [false].iter().chain(is_out);
         self.aligned.retain(|_| marks.next() == Some(&false));
         let mut marks = is_out.iter();
-        let left_out = self.fused.extract_if(.., |_| marks.next() == Some(&true));
+        let left_out = self.fused.extract_if(.., |_| marks.next() != Some(&false));
         let skipped = left_out.map(|index| (index, Skipped::Unusable(reason)));
         self.skipped.extend(skipped);
     }

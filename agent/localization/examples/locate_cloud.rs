@@ -15,7 +15,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args_os().skip(1).map(PathBuf::from);
     let cloud = arguments.next().ok_or("which cloud?")?;
     let head = head_file(&arguments.next().unwrap_or("town1".into()))?;
-    // The head names the encoder with which it was trained. No surfel map, to which poses could be registered.
+    // The head names the encoder with which it was trained. Poses are not registered to a surfel map.
     let files = [&encoder_of(&head)?, &head, Path::new("")];
     let mut localizer = place_localizer(files, 0.0, Inference::default(), |_| ())?;
     for file in clouds_at(&[cloud]) {

@@ -9,7 +9,7 @@ use protocol::RunId;
 use serde::Serialize;
 use support::atomic_file;
 use support::csv_file::CsvText;
-use support::file_error::FileError;
+use support::file_error::{AtFile, FileError};
 use time::UtcDateTime;
 
 use crate::score::{FrameRecord, ms_between};
@@ -25,9 +25,9 @@ pub enum RunFolderError {
     Write(#[source] FileError),
 }
 
-/// The error of writing a file or folder at a path.
-fn at(path: &Path) -> impl FnOnce(io::Error) -> RunFolderError {
-    move |error| RunFolderError::Write(FileError::new(path, error))
+/// The result of writing a file or folder at a path.
+fn written<T>(result: io::Result<T>, path: &Path) -> Result<T, RunFolderError> {
+    result.at(path).map_err(RunFolderError::Write)
 }
 
 /// The recording of a run.
@@ -51,17 +51,17 @@ impl RunFolder {
     pub fn create(runs: &Path, name: &RunId) -> Result<Self, RunFolderError> {
         let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
         let path = runs.join(name.as_str());
-        fs::create_dir_all(&runs).map_err(at(&runs))?;
+        written(fs::create_dir_all(&runs), &runs)?;
         // One call that fails if the folder exists, so that two runs never share a folder.
         match fs::create_dir(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
                 return Err(RunFolderError::Taken(path));
             }
-            created => created.map_err(at(&path))?,
+            created => written(created, &path)?,
         }
         let log = path.join("log");
-        fs::create_dir(&log).map_err(at(&log))?;
-        atomic_file::sync_name(&path).map_err(at(&path))?;
+        written(fs::create_dir(&log), &log)?;
+        written(atomic_file::sync_name(&path), &path)?;
         Ok(Self { path })
     }
 
@@ -101,7 +101,7 @@ impl RunFolder {
     /// [`RunFolderError::Write`].
     pub fn write(&self, name: &str, text: &str) -> Result<(), RunFolderError> {
         let path = self.file(name);
-        atomic_file::write(&path, text).map_err(at(&path))
+        written(atomic_file::write(&path, text), &path)
     }
 
     /// Writes the configuration of a process to `config/<process>.yaml`; returns its path.
@@ -117,8 +117,8 @@ impl RunFolder {
         let path = self.file(&name);
         let text = serde_saphyr::to_string(config)
             .map_err(|error| io::Error::other(error.to_string()))
-            .and_then(|text| fs::create_dir_all(self.file("config")).map(|()| text))
-            .map_err(at(&path))?;
+            .and_then(|text| fs::create_dir_all(self.file("config")).map(|()| text));
+        let text = written(text, &path)?;
         self.write(&name, &text)?;
         Ok(path)
     }
@@ -128,8 +128,8 @@ impl RunFolder {
     /// # Errors
     /// [`RunFolderError::Write`].
     pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunFolderError> {
-        let text = serde_json::to_string_pretty(value)
-            .map_err(|error| at(&self.file(name))(error.into()))?;
+        let text = serde_json::to_string_pretty(value).map_err(io::Error::from);
+        let text = written(text, &self.file(name))?;
         self.write(name, &(text + "\n"))
     }
 }

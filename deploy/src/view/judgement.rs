@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use dataset::average_precision::{Ordering, Scorer, Verdict};
-use dataset::evaluation_protocol::{ApOrder, EvaluationProtocol};
+use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::ground_truth::GroundTruthRule;
 use protocol::{BevGrid, Detections, Truth};
 use serde::Serialize;
@@ -122,10 +122,8 @@ impl Judge {
     /// Average precision of the frames so far; `None` without an object.
     pub(super) fn average_precision(&self) -> Option<f64> {
         let tally = self.scorer.tallies().first()?;
-        let ordering = match self.protocol.as_ref().map(|protocol| protocol.ap_order) {
-            None | Some(ApOrder::Global) => Ordering::Global,
-            Some(ApOrder::Frame) => Ordering::Frame,
-        };
+        let protocol = self.protocol.as_ref();
+        let ordering = protocol.map_or(Ordering::Global, |protocol| protocol.ap_order);
         (tally.objects > 0).then(|| tally.curve(ordering).average_precision)
     }
 }

@@ -37,7 +37,8 @@ pub fn save<P: Serialize>(
     progress: &P,
 ) -> Result<(), FileError> {
     let (moments, steps) = optimizer.state();
-    let parameters = (variables.iter())
+    let parameters = variables
+        .iter()
         .map(|(name, tensor)| (format!("parameter.{name}"), tensor.shallow_clone()));
     let mut stored = Vec::new();
     for (name, tensor) in parameters.chain(moments) {

@@ -12,7 +12,7 @@ use deploy::score::FrameScores;
 use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::RunId;
-use support::file_error::FileError;
+use support::file_error::AtFile;
 use support::provenance::Provenance;
 use terminal::progress;
 
@@ -76,8 +76,8 @@ fn play(
 ) -> Result<FrameScores, RunError> {
     let (rule, map_values) = (fleet.ground_truth_rule(), fleet.map_values());
     let mut board = FrameScores::new(fleet.ego.clone(), rule, map_values);
-    let unwritable = |error| RunFolderError::Write(FileError::new(folder.path(), error));
-    let mut lines = FrameLines::create(folder.path()).map_err(unwritable)?;
+    let lines = FrameLines::create(folder.path()).at(folder.path());
+    let mut lines = lines.map_err(RunFolderError::Write)?;
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let _ = evaluator.run(&fleet.recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
@@ -86,7 +86,8 @@ fn play(
         written
     })?;
     bar.finish_and_clear();
-    lines.finish().map_err(unwritable)?;
+    let finished = lines.finish().at(folder.path());
+    finished.map_err(RunFolderError::Write)?;
     Ok(board)
 }
 

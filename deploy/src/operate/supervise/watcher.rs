@@ -8,7 +8,7 @@ use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use support::file_error::FileError;
+use support::file_error::AtFile;
 use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
@@ -41,10 +41,9 @@ pub(super) struct Log {
 
 impl Log {
     pub(super) fn create(path: PathBuf) -> Result<Self, SuperviseError> {
-        match OpenOptions::new().create(true).append(true).open(&path) {
-            Ok(file) => Ok(Self { path, file }),
-            Err(error) => Err(SuperviseError::Log(FileError::new(path, error))),
-        }
+        let file = OpenOptions::new().create(true).append(true).open(&path);
+        let file = file.at(&path).map_err(SuperviseError::Log)?;
+        Ok(Self { path, file })
     }
 
     /// Last line that is not empty.
