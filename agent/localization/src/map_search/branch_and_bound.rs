@@ -16,7 +16,7 @@ const MOST_WINDOWS: usize = 8_000_000;
 
 /// Poses of one heading at the positions of a square.
 #[derive(Debug, Clone, Copy)]
-struct Window {
+struct PoseWindow {
     heading: usize,
     /// Column and row of the square's first cell.
     position: [usize; 2],
@@ -26,7 +26,7 @@ struct Window {
 
 /// A pose in the plane.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct PlanarPose {
+pub(super) struct SoughtPose {
     /// Column and row of the place.
     pub(super) position: [usize; 2],
     pub(super) heading_rad: f64,
@@ -35,17 +35,17 @@ pub(super) struct PlanarPose {
 }
 
 /// A search under way.
-pub(super) struct Search<'a> {
+pub(super) struct BranchAndBound<'a> {
     grid: &'a UprightGrid,
     /// By heading: the offset of each plane's cell from the sensor's, and the bit of its direction.
     turned: Vec<Vec<(usize, u16)>>,
     /// By the largest number of planes that can be matched in them: windows that are not divided yet.
-    open: Vec<Vec<Window>>,
+    open: Vec<Vec<PoseWindow>>,
     scored: usize,
-    found: Vec<Window>,
+    found: Vec<PoseWindow>,
 }
 
-impl<'a> Search<'a> {
+impl<'a> BranchAndBound<'a> {
     /// Begins with all poses in the place.
     pub(super) fn new(grid: &'a UprightGrid, planes: &[UprightPlane]) -> Self {
         let turned = (0..HEADINGS).map(|heading| turned(grid, planes, heading));
@@ -59,7 +59,7 @@ impl<'a> Search<'a> {
         for heading in 0..HEADINGS {
             for row in (0..grid.place[1]).step_by(1 << COARSEST) {
                 for column in (0..grid.place[0]).step_by(1 << COARSEST) {
-                    search.open(Window {
+                    search.open(PoseWindow {
                         heading,
                         position: [column, row],
                         level: COARSEST,
@@ -76,7 +76,7 @@ impl<'a> Search<'a> {
     }
 
     /// The best pose apart from those before it; `None` if less than `least` planes are matched at it, or it takes too long.
-    pub(super) fn next(&mut self, least: usize) -> Option<PlanarPose> {
+    pub(super) fn next(&mut self, least: usize) -> Option<SoughtPose> {
         while !self.is_exhausted() && self.open.len() > least {
             let matched = self.open.len() - 1;
             let Some(window) = self.open[matched].pop() else {
@@ -88,7 +88,7 @@ impl<'a> Search<'a> {
             }
             if window.level == 0 {
                 self.found.push(window);
-                return Some(PlanarPose {
+                return Some(SoughtPose {
                     position: window.position,
                     heading_rad: heading_rad(window.heading),
                     matched,
@@ -99,7 +99,7 @@ impl<'a> Search<'a> {
         None
     }
 
-    fn divide(&mut self, window: Window) {
+    fn divide(&mut self, window: PoseWindow) {
         let level = window.level - 1;
         for quarter in 0..4 {
             let position = [
@@ -111,7 +111,7 @@ impl<'a> Search<'a> {
                 .zip(&self.grid.place)
                 .all(|(at, end)| at < end);
             if is_inside {
-                self.open(Window {
+                self.open(PoseWindow {
                     position,
                     level,
                     ..window
@@ -120,7 +120,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    fn open(&mut self, window: Window) {
+    fn open(&mut self, window: PoseWindow) {
         let cells = &self.grid.levels[window.level as usize];
         let sensor = self.grid.cell(window.position);
         let planes = self.turned[window.heading].iter();
@@ -134,7 +134,7 @@ impl<'a> Search<'a> {
     }
 }
 
-impl Window {
+impl PoseWindow {
     /// True if all poses of another window are near this one.
     fn is_near_all(&self, other: &Self) -> bool {
         let steps = self.heading.abs_diff(other.heading);

@@ -50,11 +50,11 @@ impl LevelSums {
 
 /// Ground of a place, by cell.
 #[derive(Debug, Default)]
-pub(super) struct Ground {
+pub(super) struct PlaceGround {
     cells: HashMap<[i32; 2], LevelSums>,
 }
 
-impl Ground {
+impl PlaceGround {
     /// The ground of level planes in the world.
     pub(super) fn of(planes: &[Plane]) -> Self {
         let mut ground = Self::default();

@@ -17,9 +17,9 @@ use protocol::config::within;
 use protocol::{NoPoseReason, PoseEstimate};
 use support::file_error::AtFile;
 
-use self::branch_and_bound::{PlanarPose, Search};
+use self::branch_and_bound::{BranchAndBound, SoughtPose};
 use self::grid::{CELL_M, RANGE_M, UprightGrid, UprightPlane, direction_bit};
-use self::ground::{Ground, LevelSums};
+use self::ground::{LevelSums, PlaceGround};
 use crate::map_registration::{AGREED, REGISTER, SweepOnMap, found_pose};
 use crate::pgc::localization::{SOLVE, VOXELISE};
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
@@ -48,7 +48,7 @@ const LEAST_LEAD: f64 = 0.1;
 pub struct MapSearch {
     map: SurfelMap,
     grid: UprightGrid,
-    ground: Ground,
+    ground: PlaceGround,
     /// Poses of less confidence are rejected.
     pub(crate) min_confidence: f64,
 }
@@ -76,7 +76,7 @@ impl MapSearch {
             "no pose can be sought in it: it has no plane, or is of more than 8 square kilometres";
         Ok(Some(Self {
             grid: UprightGrid::of(&planes).ok_or_else(|| FileError::new(path, problem))?,
-            ground: Ground::of(&planes),
+            ground: PlaceGround::of(&planes),
             map,
             min_confidence: 0.0,
         }))
@@ -90,7 +90,7 @@ impl MapSearch {
             .height_m()
             .map_or(USUAL_HEIGHT_M, |ground_m| -ground_m);
         let planes = sought(sweep.planes(), &levelled);
-        let mut search = Search::new(&self.grid, &planes);
+        let mut search = BranchAndBound::new(&self.grid, &planes);
         let (mut best, mut second) = (None::<(IcpFit, f64)>, 0.0);
         let mut least = 1;
         for _ in 0..MOST_POSES {
@@ -125,7 +125,7 @@ impl MapSearch {
     /// A pose in the plane as one in the world, on the ground there; `None` where the map has no ground.
     fn start(
         &self,
-        pose: &PlanarPose,
+        pose: &SoughtPose,
         levelled: &UnitQuaternion<f64>,
         height_m: f64,
     ) -> Option<Isometry3<f64>> {
