@@ -12,6 +12,7 @@ use std::path::Path;
 use nalgebra::{Isometry3, Matrix6};
 use perception::weights::FileError;
 use protocol::PointCloud;
+use support::stage_times::StageTimes;
 
 use crate::covariance_scale::CovarianceScale;
 use crate::pgc::pose_evidence::PoseEvidence;
@@ -21,7 +22,7 @@ use crate::registration::icp::surfel_map::SurfelMap;
 use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, MIN_POINTS, Plane, register};
 
 /// Stage of a localization.
-pub(crate) const REGISTER: &str = "pose register";
+const REGISTER: &str = "pose register";
 /// Least share of the points above the ground with a partner, with which a registered pose is taken.
 const CONFIRMED: f64 = 0.2;
 /// Least share of the sweep's planes that agree with the map, with which one is taken that is not confirmed so: in fog
@@ -86,6 +87,18 @@ impl<'a> SweepOnMap<'a> {
             .then(|| found_pose(&fit, map.covariance_scale))
     }
 
+    /// The localization near a predicted pose, if there is one and the map confirms it.
+    pub(crate) fn near_prediction(
+        &self,
+        map: &SurfelMap,
+        predicted: Option<Isometry3<f64>>,
+        times: &mut StageTimes,
+    ) -> Option<Localization> {
+        let found = predicted.and_then(|start| self.registered(map, &start));
+        times.lap(REGISTER);
+        found.map(|found| Localization::new(&Ok(found), times.clone()))
+    }
+
     /// True if enough of the sweep lies on the map.
     pub(crate) fn confirms(&self, map: &SurfelMap, fit: &IcpFit) -> bool {
         fit.overlap_above_ground >= CONFIRMED || self.agreement(map, fit) >= AGREED
@@ -126,14 +139,11 @@ impl Localize for MapRegistration {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = stopwatch();
         let on_map = SweepOnMap::new(sweep.cloud);
-        // Step: near the prediction. Where the map confirms it, the networks are not needed.
-        let near = sweep
-            .predicted
-            .and_then(|start| on_map.registered(&self.map, &start));
-        let registering = times.lap(REGISTER);
-        if let Some(found) = near {
-            return Ok(Localization::new(&Ok(found), times));
+        // Where the map confirms the prediction, the networks are not needed.
+        if let Some(near) = on_map.near_prediction(&self.map, sweep.predicted, &mut times) {
+            return Ok(near);
         }
+        let registering = times.total();
         let mut localization = self.localizer.localize(sweep)?;
         // The localizer has a stopwatch of its own, which began after the failed registration.
         localization.times.add(REGISTER, registering);

@@ -134,7 +134,7 @@ struct RunFollower<'scope, 'env> {
     sweeps: BTreeMap<CavId, Forwarding<'scope>>,
     /// Vehicles that have agents.
     agents: BTreeSet<CavId>,
-    /// What was published and left out so far.
+    /// Numbers of published and of rejected messages.
     report: NodeReport,
 }
 

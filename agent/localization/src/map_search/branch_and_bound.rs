@@ -12,7 +12,7 @@ const HEADINGS: usize = 240;
 const APART_M: f64 = 2.0;
 const APART_STEPS: usize = 6;
 /// Largest number of windows that are scored: 2 s on one core.
-const MOST_WINDOWS: usize = 8_000_000;
+const MAX_WINDOWS: usize = 8_000_000;
 
 /// Poses of one heading at the positions of a square.
 #[derive(Debug, Clone, Copy)]
@@ -24,9 +24,9 @@ struct PoseWindow {
     level: u32,
 }
 
-/// A pose in the plane.
+/// A pose in the plane with its score.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct SoughtPose {
+pub(super) struct PoseCandidate {
     /// Column and row of the place.
     pub(super) position: [usize; 2],
     pub(super) heading_rad: f64,
@@ -72,11 +72,11 @@ impl<'a> BranchAndBound<'a> {
 
     /// True if it has taken too long: there may be better poses.
     pub(super) fn is_exhausted(&self) -> bool {
-        self.scored >= MOST_WINDOWS
+        self.scored >= MAX_WINDOWS
     }
 
     /// The best pose apart from those before it; `None` if less than `least` planes are matched at it, or it takes too long.
-    pub(super) fn next(&mut self, least: usize) -> Option<SoughtPose> {
+    pub(super) fn next(&mut self, least: usize) -> Option<PoseCandidate> {
         while !self.is_exhausted() && self.open.len() > least {
             let matched = self.open.len() - 1;
             let Some(window) = self.open[matched].pop() else {
@@ -88,7 +88,7 @@ impl<'a> BranchAndBound<'a> {
             }
             if window.level == 0 {
                 self.found.push(window);
-                return Some(SoughtPose {
+                return Some(PoseCandidate {
                     position: window.position,
                     heading_rad: heading_rad(window.heading),
                     matched,

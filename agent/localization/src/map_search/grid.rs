@@ -15,7 +15,7 @@ pub(super) const RANGE_M: f64 = 50.0;
 /// Cells around the place, so that all of a sweep lies on the grid, wherever in the place its sensor is.
 const MARGIN: usize = (RANGE_M / CELL_M) as usize + 2 + (1 << COARSEST);
 /// Largest place, square metres: a search begins with 240 windows on each of its squares of 32 m.
-const MOST_AREA_M2: f64 = 8e6;
+const MAX_AREA_M2: f64 = 8e6;
 /// Largest vertical part of the normal of an upright plane.
 const UPRIGHT_NORMAL_Z: f64 = 0.5;
 /// Directions of normals that are told apart, over half a turn.
@@ -59,7 +59,7 @@ pub(super) struct UprightGrid {
 }
 
 impl UprightGrid {
-    /// The grid of the planes of a place; `None` of a place without one, or of more than [`MOST_AREA_M2`].
+    /// The grid of the planes of a place; `None` of a place without one, or of more than [`MAX_AREA_M2`].
     pub(super) fn of(planes: &[Plane]) -> Option<Self> {
         let first = planes.first()?.centre_m.xy();
         let (lowest, highest) = planes.iter().fold((first, first), |(low, high), plane| {
@@ -70,7 +70,7 @@ impl UprightGrid {
             .map(|cells| cells as usize + 1)
             .into();
         let area_m2 = place[0] as f64 * place[1] as f64 * CELL_M.powi(2);
-        if area_m2 > MOST_AREA_M2 {
+        if area_m2 > MAX_AREA_M2 {
             return None;
         }
         let [columns, rows] = place.map(|cells| cells + 2 * MARGIN);

@@ -1,8 +1,8 @@
-//! Search of a surfel map: the pose of a sweep in a place for which no head was trained.
+//! Global localization in a surfel map, without a trained head and without an initial pose.
 //!
-//! Branch and bound over position and heading (Hess et al. 2016): the score of a pose is the number of the sweep's upright
-//! planes that lie on one of the map of the same direction. The best poses are registered (ICP), and the planes of the
-//! sweep that agree with the map decide between them, and whether there is a pose at all.
+//! Correlative scan matching by branch and bound over position and heading (Hess et al. 2016): the score of a pose is the
+//! number of the sweep's upright planes that lie on a plane of the map of the same direction. The candidates with the highest
+//! scores are registered (ICP). The share of the sweep's planes that agree with the map selects one, and accepts or rejects it.
 
 mod branch_and_bound;
 mod grid;
@@ -17,10 +17,10 @@ use protocol::config::within;
 use protocol::{NoPoseReason, PoseEstimate};
 use support::file_error::AtFile;
 
-use self::branch_and_bound::{BranchAndBound, SoughtPose};
+use self::branch_and_bound::{BranchAndBound, PoseCandidate};
 use self::grid::{CELL_M, RANGE_M, UprightGrid, UprightPlane, direction_bit};
 use self::ground::{LevelSums, PlaceGround};
-use crate::map_registration::{AGREED, REGISTER, SweepOnMap, found_pose};
+use crate::map_registration::{AGREED, SweepOnMap, found_pose};
 use crate::pgc::localization::{SOLVE, VOXELISE};
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
@@ -28,22 +28,31 @@ use crate::registration::icp::{IcpFit, MIN_POINTS, Plane};
 
 /// Least and largest side of the voxels of a map that is searched, metres: planes of a sweep have those of half a metre.
 const VOXELS_M: [f64; 2] = [0.3, 1.0];
-/// Registered poses nearer than this are one, metres.
-const SAME_M: f64 = 0.5;
+/// Registered poses that are nearer to each other count as the same pose, metres.
+const DISTINCT_M: f64 = 0.5;
 /// Height of a sensor above ground that it does not see, metres: that of a LiDAR on a roof.
 const USUAL_HEIGHT_M: f64 = 2.0;
-/// Largest number of a sweep's planes that are searched for.
-const MOST_PLANES: usize = 160;
-/// Largest number of poses that are registered.
-const MOST_POSES: usize = 12;
-/// Least score of another pose as a share of the best one's, once a pose is confirmed: one of a street that looks alike.
-const ALIKE_SCORE: f64 = 0.85;
-/// Least share of the planes that agree at a pose that is taken, and by how much it exceeds that of any other pose. Both
-/// chosen on validation drives.
-const LEAST_AGREED: f64 = 0.35;
-const LEAST_LEAD: f64 = 0.1;
+/// Largest number of planes of a sweep that are matched.
+const MAX_PLANES: usize = 160;
+/// Largest number of candidates that are registered.
+const MAX_CANDIDATES: usize = 12;
+/// Once a pose is confirmed: smallest score of another candidate that is registered too, as a share of that of the first.
+const RIVAL_SCORE: f64 = 0.85;
+/// Smallest agreement of an accepted pose, and smallest difference to the agreement of any other candidate. Chosen on
+/// validation drives.
+const MIN_AGREEMENT: f64 = 0.35;
+const MIN_MARGIN: f64 = 0.1;
 
-/// A surfel map in which sweeps are sought.
+/// Result of a search.
+struct BestPose {
+    fit: IcpFit,
+    /// Share of the sweep's planes that agree with the map.
+    agreement: f64,
+    /// False if another pose fits nearly as well, or the search was cut short.
+    is_unique: bool,
+}
+
+/// Global localization in a surfel map.
 #[derive(Debug)]
 pub struct MapSearch {
     map: SurfelMap,
@@ -63,14 +72,8 @@ impl MapSearch {
             return Ok(None);
         }
         let map = SurfelMap::load(path)?;
-        let voxel_m = map.voxel_m();
-        within(
-            "voxel_m of a map that is searched",
-            voxel_m,
-            VOXELS_M[0],
-            VOXELS_M[1],
-        )
-        .at(path)?;
+        let [least_m, most_m] = VOXELS_M;
+        within("voxel_m of a searched map", map.voxel_m(), least_m, most_m).at(path)?;
         let planes: Vec<Plane> = map.target().finest_planes().collect();
         let problem =
             "no pose can be sought in it: it has no plane, or is of more than 8 square kilometres";
@@ -82,18 +85,16 @@ impl MapSearch {
         }))
     }
 
-    /// The registered pose at which most planes agree, and their share; `None` where nothing was registered.
-    fn found(&self, sweep: &SweepOnMap<'_>) -> Option<(IcpFit, f64)> {
+    /// The registered pose with the largest agreement; `None` where no candidate can be registered.
+    fn best_pose(&self, sweep: &SweepOnMap<'_>) -> Option<BestPose> {
         let below = LevelSums::below_sensor(sweep.planes());
         let levelled = below.levelled();
-        let height_m = below
-            .height_m()
-            .map_or(USUAL_HEIGHT_M, |ground_m| -ground_m);
-        let planes = sought(sweep.planes(), &levelled);
+        let height_m = -below.height_m().unwrap_or(-USUAL_HEIGHT_M);
+        let planes = planes_to_match(sweep.planes(), &levelled);
         let mut search = BranchAndBound::new(&self.grid, &planes);
-        let (mut best, mut second) = (None::<(IcpFit, f64)>, 0.0);
+        let mut fits: Vec<(IcpFit, f64)> = Vec::new();
         let mut least = 1;
-        for _ in 0..MOST_POSES {
+        for _ in 0..MAX_CANDIDATES {
             let Some(pose) = search.next(least) else {
                 break;
             };
@@ -102,30 +103,29 @@ impl MapSearch {
                 continue;
             };
             let agreed = sweep.agreement(&self.map, &fit);
-            match best {
-                Some((known, most)) if most >= agreed => {
-                    if distance_m(&known, &fit) > SAME_M {
-                        second = f64::max(second, agreed);
-                    }
-                }
-                _ => {
-                    let known = best.filter(|(known, _)| distance_m(known, &fit) > SAME_M);
-                    second = known.map_or(second, |(_, most)| most);
-                    best = Some((fit, agreed));
-                }
-            }
+            fits.push((fit, agreed));
             if agreed >= AGREED {
-                least = least.max((ALIKE_SCORE * pose.matched as f64) as usize);
+                least = least.max((RIVAL_SCORE * pose.matched as f64) as usize);
             }
         }
-        // Of a search that took too long another pose may be as good.
-        best.filter(|(_, most)| most - second >= LEAST_LEAD && !search.is_exhausted())
+        let (fit, agreement) = *fits.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
+        let others = fits
+            .iter()
+            .filter(|(other, _)| distance_m(other, &fit) > DISTINCT_M);
+        let rival = others.map(|(_, agreed)| *agreed).fold(0.0, f64::max);
+        // A search that was cut short may have missed a better pose.
+        let is_unique = agreement - rival >= MIN_MARGIN && !search.is_exhausted();
+        Some(BestPose {
+            fit,
+            agreement,
+            is_unique,
+        })
     }
 
     /// A pose in the plane as one in the world, on the ground there; `None` where the map has no ground.
     fn start(
         &self,
-        pose: &SoughtPose,
+        pose: &PoseCandidate,
         levelled: &UnitQuaternion<f64>,
         height_m: f64,
     ) -> Option<Isometry3<f64>> {
@@ -142,8 +142,8 @@ fn distance_m(a: &IcpFit, b: &IcpFit) -> f64 {
     (a - b).norm()
 }
 
-/// The upright planes of a sweep that are sought, one per cell and direction, seen from above.
-fn sought(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<UprightPlane> {
+/// At most [`MAX_PLANES`] upright planes of a sweep, one per cell and direction, seen from above.
+fn planes_to_match(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<UprightPlane> {
     let turned = planes.iter().map(|plane| Plane {
         centre_m: levelled * plane.centre_m,
         normal: levelled * plane.normal,
@@ -157,7 +157,7 @@ fn sought(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<UprightPlane>
             taken.insert((cell, direction_bit(plane.normal_rad)))
         })
         .collect();
-    let count = planes.len().min(MOST_PLANES);
+    let count = planes.len().min(MAX_PLANES);
     let rows = (0..count).map(|row| row * planes.len() / count);
     rows.map(|row| planes[row]).collect()
 }
@@ -167,16 +167,12 @@ impl Localize for MapSearch {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = stopwatch();
         let on_map = SweepOnMap::new(sweep.cloud);
-        let near = sweep
-            .predicted
-            .and_then(|start| on_map.registered(&self.map, &start));
-        times.lap(REGISTER);
-        if let Some(found) = near {
-            return Ok(Localization::new(&Ok(found), times));
+        if let Some(near) = on_map.near_prediction(&self.map, sweep.predicted, &mut times) {
+            return Ok(near);
         }
         let enough = on_map.planes().len() >= MIN_POINTS;
         times.lap(VOXELISE);
-        // A tracked vehicle is sought from time to time without a prediction.
+        // The tracker asks from time to time without a prediction: only then the whole map is searched.
         if !enough || sweep.predicted.is_some() {
             let reason = match enough {
                 true => NoPoseReason::TooFewInliers,
@@ -185,16 +181,16 @@ impl Localize for MapSearch {
             let none = PoseEstimate::no_pose(reason, 0);
             return Ok(Localization::from_estimate(none, times));
         }
-        let best = self.found(&on_map);
+        let best = self.best_pose(&on_map);
         times.lap(SOLVE);
-        let Some((fit, agreed)) = best else {
+        let Some(best) = best else {
             let none = PoseEstimate::no_pose(NoPoseReason::TooFewInliers, 0);
             return Ok(Localization::from_estimate(none, times));
         };
-        let mut found = found_pose(&fit, self.map.covariance_scale);
-        found.evidence.inlier_ratio = agreed;
-        let is_confirmed = agreed >= LEAST_AGREED && on_map.confirms(&self.map, &fit);
-        found.is_rejected = !is_confirmed || found.sigma < self.min_confidence;
+        let mut found = found_pose(&best.fit, self.map.covariance_scale);
+        found.evidence.inlier_ratio = best.agreement;
+        let is_confirmed = best.agreement >= MIN_AGREEMENT && on_map.confirms(&self.map, &best.fit);
+        found.is_rejected = !is_confirmed || !best.is_unique || found.sigma < self.min_confidence;
         Ok(Localization::new(&Ok(found), times))
     }
 

@@ -62,7 +62,7 @@ pub(crate) fn positions(
     Ok(sweeps.into_iter().map(|((), pose)| pose).collect())
 }
 
-/// What `describe` gives for each sweep of the drives, and its pose; with a bar of the progress.
+/// Descriptors of all sweeps of the drives, each with its pose; shows a progress bar. Sweeps without a descriptor are left out.
 fn described<D, E: Into<LocalizerError>>(
     folders: &[PathBuf],
     left_out: &mut LeftOut,
