@@ -75,8 +75,7 @@ impl MapSearch {
         let [least_m, most_m] = VOXELS_M;
         within("voxel_m of a searched map", map.voxel_m(), least_m, most_m).at(path)?;
         let planes: Vec<Plane> = map.target().finest_planes().collect();
-        let problem =
-            "no pose can be sought in it: it has no plane, or is of more than 8 square kilometres";
+        let problem = "global localization needs a map with planes, of at most 8 square kilometres";
         Ok(Some(Self {
             grid: UprightGrid::of(&planes).ok_or_else(|| FileError::new(path, problem))?,
             ground: PlaceGround::of(&planes),
@@ -304,7 +303,7 @@ mod tests {
         };
         let search = || MapSearch::of_file(&path).unwrap().unwrap();
         let found = search().localize(near).unwrap();
-        assert_eq!(found.inlier_ratio, 0.0, "nothing was sought");
+        assert_eq!(found.inlier_ratio, 0.0, "the map was not searched");
         assert!(found.estimate.world_from_cav().is_some());
         let mut strict = search();
         strict.min_confidence = 1.0;

@@ -27,7 +27,7 @@ pub struct PgcConfig {
     #[serde(default)]
     pub encoder: PathBuf,
     /// Weights of the scene-specific head: a file, the folder that `agent map` wrote, or a released one, town1 or town4; or
-    /// a surfel map, in which sweeps are sought without networks (pose sources pgc and tracked).
+    /// a surfel map in its place, for localization without networks (pose sources pgc and tracked).
     #[arg(long, value_name = "FILE|NAME")]
     pub head: PathBuf,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`

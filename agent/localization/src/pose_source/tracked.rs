@@ -27,7 +27,7 @@ pub struct TrackedPoseConfig {
     /// names.
     #[arg(skip)]
     pub encoder: PathBuf,
-    /// Weights of the scene-specific head, or the name of a released one; or a surfel map, in which sweeps are sought.
+    /// Weights of the scene-specific head, or the name of a released one; or a surfel map in its place.
     #[arg(skip)]
     pub head: PathBuf,
     /// Surfel map of the place, or the name of a released one. Absent: poses are not registered to a map.

@@ -44,7 +44,7 @@ pub(crate) struct Args {
     #[arg(required = true, value_name = "CLOUD")]
     clouds: Vec<PathBuf>,
     /// Weights of the head of the place: a file, the folder that `agent map` wrote, or a released one (town1, town4); or a
-    /// surfel map, in which clouds are sought without networks.
+    /// surfel map in its place, for localization without networks.
     #[arg(long, value_name = "FILE|NAME")]
     head: PathBuf,
     /// Weights of the encoder, or of a detector that has it [default: those that the head names, beside it or released].

@@ -47,7 +47,7 @@ pub(crate) struct Args {
     /// Time of everything, reading and encoding included, minutes.
     #[arg(long, default_value_t = 10.0)]
     minutes: f64,
-    /// Make the surfel map alone, in seconds: no head. Sweeps are sought in it without one.
+    /// Make the surfel map alone, in seconds, without training: it can take the place of a head.
     #[arg(long, visible_alias = "quick", conflicts_with_all = ["minutes", "sweeps", "encoder", "seed", "device", "threads", "resume", "json"])]
     surfels_only: bool,
     /// Distance between two sweeps of a drive in the surfel map, metres.
