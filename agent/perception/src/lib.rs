@@ -5,8 +5,8 @@
 //! - [`int8`]: the same layers in 8-bit integers, for inference.
 //! - [`sparse`]: sparse convolution, for the scene encoder of the localization.
 //! - [`weights`], [`model_config`]: checkpoints and the sizes of a model.
-//! - [`compute_device`]: where networks compute.
-//! - [`train`]: optimiser, schedule, checkpoints and progress of every training.
+//! - [`compute_device`], [`compute_precision`]: where and in which number format networks compute.
+//! - `train`, with the feature of that name: optimiser, schedule, checkpoints and progress of every training.
 //!
 //! Tensors are `[N, C, H, W]`; the row of a BEV feature map grows with y, the column with x.
 //!
@@ -30,6 +30,7 @@
 
 pub mod boxes;
 pub mod compute_device;
+pub mod compute_precision;
 pub mod crop;
 pub mod detector;
 pub mod inference;
@@ -40,5 +41,6 @@ pub mod pillars;
 pub mod sparse;
 pub mod tensor_values;
 pub mod torch_error;
+#[cfg(feature = "train")]
 pub mod train;
 pub mod weights;

@@ -15,7 +15,7 @@ use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::pillars::batch::PillarBatch;
 use perception::pillars::point_pillars::PointPillars;
 use perception::tensor_values::values;
-use perception::train::ComputePrecision;
+use perception::compute_precision::ComputePrecision;
 use perception::weights::{CONFIG_KEY, FileError, METHOD_KEY, Weights};
 use protocol::Detection;
 use protocol::config::require;

@@ -113,7 +113,7 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<()> {
                 f16::from_f32(value).is_finite()
             })?;
         }
-        bytes.extend_from_slice(cast_slice(block));
+        bytes.extend_from_slice(cast_slice(block.reinterpret_cast()));
     }
     Ok(())
 }
@@ -135,7 +135,7 @@ pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -
             let (mut halves, mut floats) = ([f16::ZERO; BLOCK], [0f32; BLOCK]);
             for chunk in bytes.chunks(2 * BLOCK) {
                 // Through the stack, because the bytes may be unaligned.
-                cast_slice_mut(&mut halves)[..chunk.len()].copy_from_slice(chunk);
+                cast_slice_mut(halves.reinterpret_cast_mut())[..chunk.len()].copy_from_slice(chunk);
                 let floats = &mut floats[..chunk.len() / 2];
                 halves[..floats.len()].convert_to_f32_slice(floats);
                 values.extend_from_slice(floats);

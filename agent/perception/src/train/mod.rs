@@ -23,7 +23,7 @@ pub use error::TrainingError;
 pub use interruption::Interruption;
 pub use options::{OptionsError, TrainingOptions, check_out};
 pub use prefetch::Prefetch;
-pub use run_config::{ComputePrecision, Length, RunConfig};
+pub use run_config::{Length, RunConfig};
 pub use schedule::{RateSchedule, one_cycle};
 pub use task::{Means, Observe, SaveEvery, StepReport, Task, TrainingEvent};
 pub use trainer::{Trained, Trainer};

@@ -9,7 +9,7 @@ use tch::Device;
 
 use super::checkpoint::CHECKPOINT_FILE;
 use super::interruption::Interruption;
-use super::run_config::{ComputePrecision, Length, RunConfig};
+use super::run_config::{Length, RunConfig};
 use super::trainer::Trained;
 use crate::compute_device::{ComputeDevice, NoCuda};
 

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use support::file_error::{AtFile, FileError};
-use tch::{Device, Kind};
+use tch::Device;
+
+use crate::compute_precision::ComputePrecision;
 
 use super::adamw::AdamWConfig;
 use super::checkpoint::CHECKPOINT_FILE;
@@ -78,26 +80,6 @@ impl RunConfig {
         match std::fs::remove_file(&path) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error).at(&path),
             _ => Ok(()),
-        }
-    }
-}
-
-/// Number format of the products of a training.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum ComputePrecision {
-    /// Single precision throughout.
-    F32,
-    /// Convolutions and products in bfloat16, several times faster if the CPU supports it; parameters, statistics and
-    /// losses stay single.
-    Bf16,
-}
-
-impl ComputePrecision {
-    /// The corresponding type of the tensor library.
-    pub fn kind(self) -> Kind {
-        match self {
-            Self::F32 => Kind::Float,
-            Self::Bf16 => Kind::BFloat16,
         }
     }
 }

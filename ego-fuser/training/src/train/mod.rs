@@ -14,7 +14,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use perception::int8::SCALES_KEY;
-use perception::train::{ComputePrecision, Prefetch, SaveEvery, Task, Trainer};
+use perception::compute_precision::ComputePrecision;
+use perception::train::{Prefetch, SaveEvery, Task, Trainer};
 use perception::weights::Weights;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
