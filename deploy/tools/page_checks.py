@@ -317,6 +317,23 @@ class LivePage(Checks):
         self.becomes("says that `v2vloc view` is gone", "#state", "v2vloc view is gone", 5)
 
 
+class CausesPage(Checks):
+    """A live run at `address` whose processes fail."""
+
+    def __init__(self, tab: Tab, address: str):
+        super().__init__(tab, "causes")
+        tab.open(address)
+
+    def plays(self) -> None:
+        self.becomes("state", "#state", "^live$", 30)
+
+    def loses_ego(self) -> None:
+        self.becomes("names the ego without results", "#state", "no result for \\d+", 10)
+
+    def loses_router(self) -> None:
+        self.becomes("says that the router is gone", "#state", "^router gone, last message", 10)
+
+
 class ReportPage(Checks):
     """Report of a sweep, a file at `address`."""
 

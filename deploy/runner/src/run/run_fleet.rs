@@ -233,7 +233,7 @@ fn watch(
     ));
     let everyone = specs.iter().map(|spec| spec.name.clone());
     let everyone: Vec<String> = everyone.chain([Role::Scorer.to_string()]).collect();
-    let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, events)?;
+    // Before the processes start: to open its probe may take seconds, in which nobody would watch them.
     let mut watch = StatusReporter::new(
         &fleet.scenario.timeouts,
         run,
@@ -245,6 +245,7 @@ fn watch(
         folder,
         fleet.applied_protocol(),
     );
+    let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, events)?;
     let processes = (&supervisor, router.supervisor());
     let ending = watch.follow(processes, happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
