@@ -421,6 +421,10 @@ mod tests {
         assert!(map.times.iter().all(|stage| stage.stage != "head"));
     }
 
+    fn stage_names(times: &[StageTiming]) -> Vec<&str> {
+        times.iter().map(|timing| timing.stage.as_str()).collect()
+    }
+
     #[test]
     fn a_sweep_becomes_pose_map_and_detections() {
         let mut agent = agent();
@@ -464,9 +468,8 @@ mod tests {
                 .iter()
                 .all(|detection| detection.source.as_ref() == Some(agent.cav()))
         );
-        let stages: Vec<&str> = times.iter().map(|timing| timing.stage.as_str()).collect();
         assert_eq!(
-            stages,
+            stage_names(times),
             [
                 "voxelise", "pillars", "backbone", "message", "head", "boxes"
             ]
@@ -528,21 +531,15 @@ mod tests {
             measured_pose: None,
             motion: EgoMotion::default(),
         };
-        let load = || Detector::load(&weights, Device::Cpu).unwrap();
-        let mut plain = Agent::new(CavId::new("7").unwrap(), Box::new(RecordedPose), load());
+        let detector = Detector::load(&weights, Device::Cpu).unwrap();
+        let mut plain = Agent::new(CavId::new("7").unwrap(), Box::new(RecordedPose), detector);
         let expected = plain.perceive(&cloud).unwrap();
-        let stages = |times: &[StageTiming]| {
-            times
-                .iter()
-                .map(|timing| timing.stage.clone())
-                .collect::<Vec<_>>()
-        };
         for (is_own, computes_first, steps) in [
             (true, true, [true, true]),
             (true, false, [false, true]),
             (false, true, [false, false]),
         ] {
-            let detector = load();
+            let detector = Detector::load(&weights, Device::Cpu).unwrap();
             let encoder = if is_own {
                 detector.encoder_sha256().to_owned()
             } else {
@@ -557,8 +554,8 @@ mod tests {
             let mut agent = Agent::new(CavId::new("7").unwrap(), Box::new(source), detector);
             let seen = agent.process(&input).unwrap().perception;
             assert_eq!(
-                (&seen.features, stages(&seen.times)),
-                (&expected.features, stages(&expected.times))
+                (&seen.features, stage_names(&seen.times)),
+                (&expected.features, stage_names(&expected.times))
             );
             // Levels are those of one sweep.
             let later = EncodedSweep {

@@ -364,22 +364,22 @@ mod tests {
         }
     }
 
+    /// Offset of the falsified pose from one at `x`, metres.
+    fn falsified_offset_m(attack: &Attack, x: f64) -> [f64; 2] {
+        let pose = Pose::from_xyz_yaw([x, 0.0, 0.0], 0.3);
+        let falsified = attack.pose(PoseEstimate::new(pose, 0.4));
+        assert_eq!(falsified.confidence(), 1.0);
+        let pose = *falsified.world_from_cav().unwrap();
+        assert!(pose.validate().is_ok());
+        [pose.translation_m[0] - x, pose.translation_m[1]]
+    }
+
     #[test]
     fn a_shifted_pose_has_a_constant_offset_and_full_confidence() {
         let attack = Attack::new(Falsification::ShiftedPose, &cav("a"), 1);
-        let falsified = |x: f64| {
-            let falsified = attack.pose(PoseEstimate::new(
-                Pose::from_xyz_yaw([x, 0.0, 0.0], 0.3),
-                0.4,
-            ));
-            assert_eq!(falsified.confidence(), 1.0);
-            let pose = *falsified.world_from_cav().unwrap();
-            assert!(pose.validate().is_ok());
-            [pose.translation_m[0] - x, pose.translation_m[1]]
-        };
-        let [dx, dy] = falsified(10.0);
+        let [dx, dy] = falsified_offset_m(&attack, 10.0);
         assert!((5.0..=30.0).contains(&dx.hypot(dy)));
-        assert!((falsified(20.0)[0] - dx).abs() < 1e-9);
+        assert!((falsified_offset_m(&attack, 20.0)[0] - dx).abs() < 1e-9);
         let other = Attack::new(Falsification::ShiftedPose, &cav("b"), 1).offset_m;
         assert!(other != attack.offset_m, "every attacker has its own");
     }
@@ -423,19 +423,16 @@ mod tests {
     #[test]
     fn copied_repeats_captured_messages_or_the_own_first_frame() {
         let mut attack = Attack::new(Falsification::Copied, &cav("a"), 1);
-        let later = || {
-            let mut later = truth();
-            later.features.values.fill(1.0);
-            later
-        };
+        let mut later = truth();
+        later.features.values.fill(1.0);
         assert_eq!(attack.perception(truth()).features, truth().features);
-        assert_eq!(attack.perception(later()).features, truth().features);
+        assert_eq!(attack.perception(later.clone()).features, truth().features);
         let captured = CapturedMessages {
-            features: Some(later().features),
+            features: Some(later.features.clone()),
             ..CapturedMessages::default()
         };
         attack.capture(captured);
-        assert_eq!(attack.perception(truth()).features, later().features);
+        assert_eq!(attack.perception(truth()).features, later.features);
         // Boxes of the other were never received: the own first ones stay.
         let mut moved = truth();
         moved.detections.clear();
@@ -444,14 +441,10 @@ mod tests {
 
     #[test]
     fn a_flood_is_a_thousand_objects_of_the_highest_score() {
-        let invented = |falsification| {
+        let [ten, flood] = [Falsification::Invented, Falsification::Flood].map(|falsification| {
             let mut attack = Attack::new(falsification, &cav("a"), 1);
             attack.perception(truth()).detections
-        };
-        let (ten, flood) = (
-            invented(Falsification::Invented),
-            invented(Falsification::Flood),
-        );
+        });
         assert_eq!((ten.len(), flood.len()), (10, 1000));
         assert!(flood.iter().all(|found| found.score == 1.0));
         assert_eq!(ten, flood[..10]);
@@ -460,12 +453,12 @@ mod tests {
     #[test]
     fn a_false_velocity_is_stated_for_every_object_and_only_by_its_attack() {
         let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
-        let boxes = || Boxes::new(pose, &[vehicle([5.0, 0.0, 0.0], 0.5).into()]);
-        let attack = |falsification| Attack::new(falsification, &cav("a"), 1);
-        assert_eq!(attack(Falsification::Invented).boxes(boxes()), boxes());
-        let falsified = attack(Falsification::FalseVelocity).boxes(boxes());
+        let boxes = Boxes::new(pose, &[vehicle([5.0, 0.0, 0.0], 0.5).into()]);
+        let [kept, falsified] = [Falsification::Invented, Falsification::FalseVelocity]
+            .map(|falsification| Attack::new(falsification, &cav("a"), 1).boxes(boxes.clone()));
+        assert_eq!(kept, boxes);
         let [u, v] = falsified.objects()[0].track.unwrap().velocity_mps;
         assert!((5.0..=30.0).contains(&u.hypot(v)));
-        assert!(falsified.detections().eq(boxes().detections()));
+        assert!(falsified.detections().eq(boxes.detections()));
     }
 }

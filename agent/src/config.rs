@@ -398,26 +398,27 @@ mod tests {
 
     #[test]
     fn a_fixed_error_spares_the_ego() {
-        let noisy = |mode| {
+        let [fixed, independent] = [NoiseMode::Fixed, NoiseMode::Independent].map(|mode| {
             PoseSourceConfig::Noisy(NoisyPoseConfig {
                 mode,
                 ..NoisyPoseConfig::default()
             })
-        };
-        let fixed = noisy(NoiseMode::Fixed);
+        });
         let recorded = in_fleet(fixed.clone(), 0, true).pose;
         assert_eq!(recorded, PoseSourceConfig::Recorded);
         assert_eq!(in_fleet(fixed.clone(), 1, false).pose, fixed);
-        let independent = noisy(NoiseMode::Independent);
         assert_eq!(in_fleet(independent.clone(), 0, true).pose, independent);
+    }
+
+    fn phase(settings: &AgentSettings) -> u32 {
+        match &settings.pose {
+            PoseSourceConfig::Tracked(tracked) => tracked.phase,
+            other => panic!("{other:?}"),
+        }
     }
 
     #[test]
     fn tracked_vehicles_measure_in_turn_and_the_map_of_the_ego_is_whole() {
-        let phase = |settings: AgentSettings| match settings.pose {
-            PoseSourceConfig::Tracked(tracked) => tracked.phase,
-            other => panic!("{other:?}"),
-        };
         let tracked = PoseSourceConfig::Tracked(TrackedPoseConfig::default());
         let [ego, neighbour] =
             [(2, true), (3, false)].map(|(index, is_ego)| in_fleet(tracked.clone(), index, is_ego));
@@ -425,7 +426,7 @@ mod tests {
             (ego.codec.budget_bytes, neighbour.codec.budget_bytes),
             (None, Some(4000))
         );
-        assert_eq!((phase(ego), phase(neighbour)), (2, 3));
+        assert_eq!((phase(&ego), phase(&neighbour)), (2, 3));
     }
 
     fn config(publish: &[Publish]) -> AgentConfig {

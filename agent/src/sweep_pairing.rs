@@ -297,36 +297,37 @@ mod tests {
         assert_eq!(paired(&mut pairing, now), None, "there is one now");
     }
 
+    fn add_sweep_with_pose(pairing: &mut SweepPairing<char>, capture_nanos: u64) {
+        assert_eq!(pairing.add_pose(capture_nanos, at(1.0)), 0);
+        assert_eq!(pairing.add_sweep(capture_nanos, 'a', NOW), None);
+    }
+
     #[test]
     fn a_vehicle_with_a_motion_sensor_waits_for_it_and_one_without_does_not() {
         let (mut pairing, now) = (SweepPairing::new(TIMEOUT), NOW);
-        let speed = |speed_mps| EgoMotion {
+        let [slow, fast] = [5.0, 6.0].map(|speed_mps| EgoMotion {
             speed_mps: Some(speed_mps),
             yaw_rate_rad_s: None,
-        };
-        let sweep = |pairing: &mut SweepPairing<char>, capture_nanos| {
-            assert_eq!(pairing.add_pose(capture_nanos, at(1.0)), 0);
-            assert_eq!(pairing.add_sweep(capture_nanos, 'a', now), None);
-        };
-        sweep(&mut pairing, 10);
+        });
+        add_sweep_with_pose(&mut pairing, 10);
         assert_eq!(pairing.next(now), None, "there may be a sensor");
         assert_eq!(pairing.next(now + TIMEOUT).unwrap().motion, None);
-        sweep(&mut pairing, 12);
+        add_sweep_with_pose(&mut pairing, 12);
         assert_eq!(pairing.next(now).unwrap().motion, None, "there is none");
         assert_eq!(
-            pairing.add_motion(15, speed(5.0)) + pairing.add_motion(20, speed(6.0)),
+            pairing.add_motion(15, slow) + pairing.add_motion(20, fast),
             0
         );
-        sweep(&mut pairing, 20);
+        add_sweep_with_pose(&mut pairing, 20);
         let paired = pairing.next(now).unwrap();
         assert_eq!(
             (paired.motion, paired.unused_poses, paired.unused_motions),
-            (Some(speed(6.0)), 0, 1)
+            (Some(fast), 0, 1)
         );
-        sweep(&mut pairing, 30);
+        add_sweep_with_pose(&mut pairing, 30);
         assert_eq!(pairing.next(now), None, "its motion may still arrive");
         assert_eq!(pairing.next(now + TIMEOUT).unwrap().motion, None);
-        sweep(&mut pairing, 40);
+        add_sweep_with_pose(&mut pairing, 40);
         assert!(pairing.next(now).is_some(), "the sensor is gone");
     }
 }

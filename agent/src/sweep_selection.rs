@@ -168,10 +168,13 @@ mod tests {
         assert_eq!(computed(&mut selection, 3..12, now), [3, 6, 9]);
     }
 
+    fn ego(number: usize) -> CavId {
+        CavId::new(&number.to_string()).unwrap()
+    }
+
     #[test]
     fn more_egos_than_are_followed_are_refused() {
         let (mut selection, now) = (PaceSelection::default(), NOW);
-        let ego = |number: usize| CavId::new(&number.to_string()).unwrap();
         assert!((0..MAX_EGOS).all(|number| selection.follow(&ego(number), every(2), now)));
         assert!(!selection.follow(&ego(MAX_EGOS), every(1), now));
         assert!(

@@ -422,22 +422,22 @@ mod tests {
 
     #[test]
     fn the_slot_of_a_vehicle_that_has_left_is_free() {
-        let cav = |id: usize| CavId::new(&id.to_string()).unwrap();
-        let vehicle = |has_left| LinkVehicle {
-            publishers: BTreeMap::new(),
-            ended: BTreeSet::new(),
-            position_m: None,
-            has_left,
-            _subscriptions: Vec::new(),
-        };
-        let mut vehicles: BTreeMap<CavId, LinkVehicle> =
-            (0..4).map(|id| (cav(id), vehicle(id < 3))).collect();
-        let [ego, on_its_way] = [cav(0), cav(1)];
-        let free = |vehicles: &BTreeMap<_, _>| {
-            place_to_free(vehicles, &ego, &BTreeSet::from([&on_its_way])).cloned()
-        };
-        assert_eq!(free(&vehicles), Some(cav(2)));
-        vehicles.remove(&cav(2));
-        assert_eq!(free(&vehicles), None);
+        let cavs = ["0", "1", "2", "3"].map(|id| CavId::new(id).unwrap());
+        let [ego, on_its_way, gone, present] = &cavs;
+        let mut vehicles = BTreeMap::new();
+        for cav in &cavs {
+            let vehicle = LinkVehicle {
+                publishers: BTreeMap::new(),
+                ended: BTreeSet::new(),
+                position_m: None,
+                has_left: cav != present,
+                _subscriptions: Vec::new(),
+            };
+            vehicles.insert(cav.clone(), vehicle);
+        }
+        let senders = BTreeSet::from([on_its_way]);
+        assert_eq!(place_to_free(&vehicles, ego, &senders), Some(gone));
+        vehicles.remove(gone);
+        assert_eq!(place_to_free(&vehicles, ego, &senders), None);
     }
 }

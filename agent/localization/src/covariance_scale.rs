@@ -214,7 +214,7 @@ mod tests {
             _ => 0.0,
         });
         let covariance = root * root.transpose();
-        let draw = |_| {
+        let samples = (0..count).map(|_| {
             let normal = Vector6::from_fn(|_, _| StandardNormal.sample(&mut random));
             PoseSample {
                 error: (root * normal)
@@ -222,8 +222,8 @@ mod tests {
                     .into(),
                 covariance: covariance.data.0,
             }
-        };
-        (0..count).map(draw).collect()
+        });
+        samples.collect()
     }
 
     #[test]
@@ -252,21 +252,27 @@ mod tests {
     #[test]
     fn few_poses_fit_nothing_and_a_thousand_are_needed_for_the_bound() {
         let all = samples(999, [2.0; 6], 3);
-        let fit = |count| CovarianceScale::fit(&all[..count]);
-        assert_eq!(fit(MIN_POSES - 1), Err(NoScale::TooFew(49)));
-        assert_eq!(fit(998).unwrap().bound, None);
-        let scale = fit(999).unwrap();
-        let is_within = |sample: &PoseSample| {
+        assert_eq!(
+            CovarianceScale::fit(&all[..MIN_POSES - 1]),
+            Err(NoScale::TooFew(49))
+        );
+        assert_eq!(CovarianceScale::fit(&all[..998]).unwrap().bound, None);
+        let scale = CovarianceScale::fit(&all).unwrap();
+        for sample in &all {
             let off_m = sample.error[0].hypot(sample.error[1]);
-            off_m <= scale.bound_m(&sample.covariance).unwrap() * (1.0 + 1e-9)
-        };
-        assert!(all.iter().all(is_within), "it is that of the worst of them");
+            let bound_m = scale.bound_m(&sample.covariance).unwrap();
+            assert!(
+                off_m <= bound_m * (1.0 + 1e-9),
+                "it is that of the worst of them"
+            );
+        }
         // Singular covariances count as exceeded: a few do not matter, more than one in twenty cannot be fitted.
         let mut singular = samples(100, [2.0; 6], 3);
         singular[..4]
             .iter_mut()
             .for_each(|sample| sample.covariance = [[0.0; 6]; 6]);
-        assert!(CovarianceScale::fit(&singular).unwrap().planar >= fit(100).unwrap().planar);
+        let regular = CovarianceScale::fit(&all[..100]).unwrap();
+        assert!(CovarianceScale::fit(&singular).unwrap().planar >= regular.planar);
         singular[..9]
             .iter_mut()
             .for_each(|sample| sample.covariance = [[0.0; 6]; 6]);

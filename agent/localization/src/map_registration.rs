@@ -231,12 +231,11 @@ mod tests {
     /// A sweep of the yard, with a number of points on walls that are not on its map.
     fn sweep(unmapped: u32) -> PointCloud {
         let mut xyzi = yard();
-        let point = |k: u32| {
+        xyzi.extend((0..unmapped).map(|k| {
             let (along, up, wall) = (k % 100, k / 100 % 20, k / 2000);
             let [along, up] = [along as f32 * 0.35 - 17.5, up as f32 * 0.3 + 6.0];
             [along, 4.0 * wall as f32 - 16.0, up, 0.1]
-        };
-        xyzi.extend((0..unmapped).map(point));
+        }));
         PointCloud { xyzi }
     }
 
@@ -257,6 +256,24 @@ mod tests {
         (registration.unwrap(), found)
     }
 
+    /// A sweep with unmapped walls, localized behind the localizer that finds `start`, and the pose of that localizer.
+    fn localized(start: Isometry3<f64>, sigma: f64, unmapped: u32) -> (Localization, FoundPose) {
+        let (mut registration, found) = registration(start, sigma);
+        let cloud = sweep(unmapped);
+        let localized = registration.localize(LocalizerInput::of(&cloud));
+        (localized.unwrap(), found)
+    }
+
+    /// The pose that is found in a sweep with a predicted one.
+    fn found_near(registration: &mut dyn Localize, predicted: Isometry3<f64>) -> FoundPose {
+        let cloud = sweep(0);
+        let input = LocalizerInput {
+            predicted: Some(predicted),
+            ..LocalizerInput::of(&cloud)
+        };
+        registration.localize(input).unwrap().found.unwrap()
+    }
+
     /// Distance between a pose and the true one, metres.
     fn off_m(found: &FoundPose, truth: &Isometry3<f64>) -> f64 {
         let off = truth.inv_mul(&found.world_from_sensor);
@@ -267,21 +284,15 @@ mod tests {
     fn points_above_the_ground_decide_whether_a_pose_is_taken_kept_or_rejected() {
         let (_folder, _, truth) = stored();
         let start = truth * Isometry3::new(Vector3::new(0.3, -0.2, 0.0), Vector3::z() * 0.01);
-        let localize = |sigma, unmapped| {
-            let (mut registration, found) = registration(start, sigma);
-            let cloud = sweep(unmapped);
-            let localized = registration.localize(LocalizerInput::of(&cloud));
-            (localized.unwrap(), found)
-        };
-        let (taken, _) = localize(0.5, 0);
+        let (taken, _) = localized(start, 0.5, 0);
         let pose = taken.found.unwrap();
         assert!(pose.is_registered && !pose.is_rejected && off_m(&pose, &truth) < 5e-3);
         assert!(pose.sigma > 0.999 && taken.estimate.world_from_cav().is_some());
         // Of too few points with a partner a sure pose stays as it was.
-        let (kept, found) = localize(SURE, 19_000);
+        let (kept, found) = localized(start, SURE, 19_000);
         assert_eq!(kept.found, Some(found));
         assert_eq!(kept.estimate, PoseEstimate::new(start.into(), SURE as f32));
-        let (rejected, _) = localize(SURE - 0.01, 19_000);
+        let (rejected, _) = localized(start, SURE - 0.01, 19_000);
         assert!(rejected.found.unwrap().is_rejected);
         let PoseEstimate::NoPose { reason, .. } = rejected.estimate else {
             panic!("{:?}", rejected.estimate);
@@ -294,22 +305,10 @@ mod tests {
         let (_folder, _, truth) = stored();
         let elsewhere = Isometry3::translation(90.0, 0.0, 0.0) * truth;
         let (mut registration, found) = registration(elsewhere, SURE);
-        let cloud = sweep(0);
-        let mut localize = |predicted: Isometry3<f64>| {
-            let sweep = LocalizerInput {
-                predicted: Some(predicted),
-                ..LocalizerInput::of(&cloud)
-            };
-            registration.localize(sweep).unwrap().found.unwrap()
-        };
-        assert!(
-            off_m(
-                &localize(truth * Isometry3::translation(0.2, 0.1, 0.0)),
-                &truth
-            ) < 5e-3
-        );
+        let near = truth * Isometry3::translation(0.2, 0.1, 0.0);
+        assert!(off_m(&found_near(registration.as_mut(), near), &truth) < 5e-3);
         // A prediction without planes falls back on the localizer, whose pose has no planes either.
-        assert_eq!(localize(elsewhere), found);
+        assert_eq!(found_near(registration.as_mut(), elsewhere), found);
     }
 
     #[test]

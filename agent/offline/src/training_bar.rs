@@ -187,42 +187,40 @@ mod tests {
 
     #[test]
     fn the_durations_of_encoding_and_training_are_estimated() {
-        let training = |length| estimate(600, 540.0, length, false);
-        let time = Length::Time(Duration::from_secs(1200));
-        assert_eq!(
-            training(time),
-            "encoding 600 sweeps takes 9 min, then 20 min of training"
-        );
-        assert_eq!(
-            training(Length::Steps(50)),
-            "encoding 600 sweeps takes 9 min, then 50 steps of training"
-        );
+        let [short, long] = [180, 1200].map(|time_s| Length::Time(Duration::from_secs(time_s)));
+        for (length, includes_encoding, then) in [
+            (long, false, ", then 20 min of training"),
+            (Length::Steps(50), false, ", then 50 steps of training"),
+            (
+                long,
+                true,
+                " of the 20 min in all, which leaves 11 min for the training",
+            ),
+            (
+                short,
+                true,
+                ", all of the 3 min in all: the training needs more time",
+            ),
+        ] {
+            assert_eq!(
+                estimate(600, 540.0, length, includes_encoding),
+                format!("encoding 600 sweeps takes 9 min{then}")
+            );
+        }
         assert_eq!(
             estimate(20, 42.4, Length::Epochs(3.0), false),
             "encoding 20 sweeps takes 42 s, then 3 passes of training"
-        );
-        let within = |time| estimate(600, 540.0, Length::Time(Duration::from_secs(time)), true);
-        assert_eq!(
-            within(1200),
-            "encoding 600 sweeps takes 9 min of the 20 min in all, which leaves 11 min for the training"
-        );
-        assert_eq!(
-            within(180),
-            "encoding 600 sweeps takes 9 min, all of the 3 min in all: the training needs more time"
         );
     }
 
     #[test]
     fn each_data_set_is_timed_from_its_own_beginning() {
         let bar = TrainingBar::of(Length::Steps(1));
-        let first = |done| {
+        // An earlier run stored sixty feature maps; then the next data set.
+        let first = [60, 150, 200, 50, 100].map(|done| {
             bar.encoded(done, 200);
             bar.encoding.get().map(|encoding| encoding.first)
-        };
-        // An earlier run stored sixty feature maps; then the next data set.
-        assert_eq!(
-            [first(60), first(150), first(200), first(50), first(100)],
-            [60, 60, 60, 50, 50].map(Some)
-        );
+        });
+        assert_eq!(first, [60, 60, 60, 50, 50].map(Some));
     }
 }

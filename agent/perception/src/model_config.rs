@@ -439,19 +439,18 @@ mod tests {
             (lean.pillar_grid(), lean.sent_channels()),
             ([256, 192, 1], 64)
         );
-        let compressed = |ratio| DetectorConfig {
-            compress_ratio: Some(ratio),
-            ..DetectorConfig::lean()
-        };
-        assert_eq!(
-            [1, 32, 100].map(|ratio| compressed(ratio).sent_channels()),
-            [64, 2, 1]
-        );
-        assert_eq!(
-            compressed(32).feature_channels(),
-            64,
-            "the receiver has the full number of channels"
-        );
+        for (ratio, sent_channels) in [(1, 64), (32, 2), (100, 1)] {
+            let compressed = DetectorConfig {
+                compress_ratio: Some(ratio),
+                ..DetectorConfig::lean()
+            };
+            assert_eq!(compressed.sent_channels(), sent_channels);
+            assert_eq!(
+                compressed.feature_channels(),
+                64,
+                "the receiver has the full number of channels"
+            );
+        }
     }
 
     #[test]
@@ -471,39 +470,39 @@ mod tests {
         );
     }
 
+    fn assert_refused(config: &DetectorConfig, field: &str, value: &str) {
+        let message = config.validate().unwrap_err().to_string();
+        assert!(
+            message.contains(field) && message.contains(value),
+            "{message}"
+        );
+    }
+
     #[test]
     fn sizes_beyond_memory_are_rejected_before_allocation() {
-        let refused = |config: DetectorConfig, field: &str, value: &str| {
-            let message = config.validate().unwrap_err().to_string();
-            assert!(
-                message.contains(field) && message.contains(value),
-                "{message}"
-            );
-        };
-        let wide = [-819.2, -819.2, -3.0, 819.2, 819.2, 1.0];
-        let lean = || DetectorConfig {
-            lidar_range_m: wide,
+        let wide = DetectorConfig {
+            lidar_range_m: [-819.2, -819.2, -3.0, 819.2, 819.2, 1.0],
             pillar_channels: 8,
             ..DetectorConfig::lean()
         };
-        refused(
-            DetectorConfig {
+        assert_refused(
+            &DetectorConfig {
                 pillar_channels: 4096,
-                ..lean()
+                ..wide.clone()
             },
             "pillar_channels",
             "68719476736",
         );
-        refused(
-            DetectorConfig {
+        assert_refused(
+            &DetectorConfig {
                 num_filters: vec![4096; 3],
-                ..lean()
+                ..wide
             },
             "num_filters",
             "17179869184",
         );
-        refused(
-            DetectorConfig {
+        assert_refused(
+            &DetectorConfig {
                 layer_nums: vec![64; 3],
                 num_filters: vec![1024; 3],
                 ..DetectorConfig::lean()
@@ -516,7 +515,7 @@ mod tests {
             compress_ratio: Some(1),
             ..DetectorConfig::lean()
         };
-        refused(ratio, "number of parameters", "256000000");
+        assert_refused(&ratio, "number of parameters", "256000000");
     }
 
     #[test]

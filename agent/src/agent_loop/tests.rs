@@ -40,19 +40,19 @@ fn agent(weights: &Path) -> Agent {
 }
 
 fn sweep(capture_nanos: u64) -> LoopInput {
-    let point = |k: u64| {
+    let points = (0..500_u64).map(|k| {
         [
             ((k + capture_nanos) % 83) as f32 * 0.3 - 12.0,
             (k % 41) as f32 * 0.3 - 6.0,
             -1.5,
             0.2,
         ]
-    };
+    });
     LoopInput::Sweep(Sweep {
         capture_nanos,
         arrived_nanos: 7_000 + capture_nanos,
         cloud: PointCloud {
-            xyzi: (0..500).map(point).collect(),
+            xyzi: points.collect(),
         },
     })
 }
@@ -90,6 +90,15 @@ fn outputs(agent_loop: &mut AgentLoop, inputs: Vec<LoopInput>) -> Vec<LoopOutput
     outputs
 }
 
+/// Streams of the outputs that are published.
+fn streams(outputs: Vec<LoopOutput>) -> Vec<Stream> {
+    let streams = outputs.into_iter().filter_map(|output| match output {
+        LoopOutput::Publish(message) => Some(message.stream),
+        _ => None,
+    });
+    streams.collect()
+}
+
 #[test]
 fn a_sweep_waits_for_its_pose_and_its_steps_are_published_one_by_one() {
     let folder = tempfile::tempdir().unwrap();
@@ -101,13 +110,6 @@ fn a_sweep_waits_for_its_pose_and_its_steps_are_published_one_by_one() {
     assert_eq!(first, [(Stream::Descriptor, 0), (Stream::Descriptor, 1)]);
     assert!(!agent_loop.is_computing() && agent_loop.wakes_nanos() > NOW);
 
-    let streams = |outputs: Vec<LoopOutput>| -> Vec<Stream> {
-        let stream = |output| match output {
-            LoopOutput::Publish(message) => Some(message.stream),
-            _ => None,
-        };
-        outputs.into_iter().filter_map(stream).collect()
-    };
     let pose = gnss(10, GnssSource::Recorded);
     assert!(streams(agent_loop.handle(pose, NOW)).is_empty());
     for step in [&[Stream::Pose][..], &[Stream::Bev], &[]] {
@@ -146,6 +148,43 @@ fn a_sweep_that_does_not_fail_by_its_values_is_counted_apart() {
     assert_eq!(dropped.collect::<Vec<_>>(), [DropReason::Shape]);
 }
 
+/// The encoded messages of two sweeps, each with its stream.
+fn encoded(options: &LoopOptions, weights: &Path) -> Vec<(Stream, Vec<u8>)> {
+    let mut agent_loop = AgentLoop::new(agent(weights), options.clone());
+    let encoder = MessageEncoder::new(options);
+    let inputs = vec![
+        gnss(5, GnssSource::Stated),
+        gnss(10, GnssSource::Recorded),
+        sweep(10),
+        sweep(20),
+        LoopInput::Motion(20, EgoMotion::default()),
+        gnss(20, GnssSource::Recorded),
+        LoopInput::Ended,
+    ];
+    let mut bytes = Vec::new();
+    for output in outputs(&mut agent_loop, inputs) {
+        let LoopOutput::Publish(message) = output else {
+            continue;
+        };
+        let turn = Turn {
+            number: message.number,
+            submitted_nanos: NOW,
+            begun_nanos: NOW,
+        };
+        let stamp = Stamp {
+            cav: cav(),
+            epoch: 1,
+            sequence: message.number,
+            capture_nanos: message.capture_nanos,
+            publish_nanos: NOW,
+        };
+        let stream = message.stream;
+        let (encoded, _) = encoder.encode(message, &stamp, Some(&turn)).unwrap();
+        bytes.push((stream, encoded.to_vec()));
+    }
+    bytes
+}
+
 #[test]
 fn the_same_inputs_give_the_same_bytes() {
     let options = LoopOptions {
@@ -159,48 +198,12 @@ fn the_same_inputs_give_the_same_bytes() {
     };
     let folder = tempfile::tempdir().unwrap();
     let weights = write_weights(folder.path());
-    let run = || {
-        let mut agent_loop = AgentLoop::new(agent(&weights), options.clone());
-        let encoder = MessageEncoder::new(&options);
-        let inputs = vec![
-            gnss(5, GnssSource::Stated),
-            gnss(10, GnssSource::Recorded),
-            sweep(10),
-            sweep(20),
-            LoopInput::Motion(20, EgoMotion::default()),
-            gnss(20, GnssSource::Recorded),
-            LoopInput::Ended,
-        ];
-        let mut bytes = Vec::new();
-        for output in outputs(&mut agent_loop, inputs) {
-            let LoopOutput::Publish(message) = output else {
-                continue;
-            };
-            let turn = Turn {
-                number: message.number,
-                submitted_nanos: NOW,
-                begun_nanos: NOW,
-            };
-            let stamp = Stamp {
-                cav: cav(),
-                epoch: 1,
-                sequence: message.number,
-                capture_nanos: message.capture_nanos,
-                publish_nanos: NOW,
-            };
-            let stream = message.stream;
-            let (encoded, _) = encoder.encode(message, &stamp, Some(&turn)).unwrap();
-            bytes.push((stream, encoded.to_vec()));
-        }
-        bytes
-    };
-    let first = run();
-    let count = |stream| first.iter().filter(|(of, _)| *of == stream).count();
+    let first = encoded(&options, &weights);
     let of_sweeps = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points];
     assert_eq!(
-        of_sweeps.map(count),
+        of_sweeps.map(|stream| first.iter().filter(|(of, _)| *of == stream).count()),
         [1; 4],
         "the second has superseded the first"
     );
-    assert_eq!(first, run());
+    assert_eq!(first, encoded(&options, &weights));
 }

@@ -119,18 +119,19 @@ mod tests {
         assert!((measured.noise_m2 - expected).amax() < 1e-6, "{measured:?}");
     }
 
+    fn is_usable(detection: &Detection) -> bool {
+        let config = TrackerConfig::default();
+        Measurement::new((0, detection), &Isometry3::identity(), None, &config).is_some()
+    }
+
     #[test]
     fn numbers_that_are_no_box_are_refused() {
-        let config = TrackerConfig::default();
-        let usable = |detection: &Detection| {
-            Measurement::new((0, detection), &Isometry3::identity(), None, &config).is_some()
-        };
-        assert!(usable(&detection(1.0, 0.5)));
+        assert!(is_usable(&detection(1.0, 0.5)));
         for bad in [f64::NAN, f64::INFINITY, -1e30] {
-            assert!(!usable(&detection(bad, 0.5)));
+            assert!(!is_usable(&detection(bad, 0.5)));
         }
         for bad in [f32::NAN, -0.1, 1.1] {
-            assert!(!usable(&detection(1.0, bad)));
+            assert!(!is_usable(&detection(1.0, bad)));
         }
     }
 }

@@ -76,6 +76,10 @@ mod tests {
         failures.in_words()
     }
 
+    fn logged(line: &str) -> ProcessEventKind {
+        ProcessEventKind::Logged { line: line.into() }
+    }
+
     fn report(failure: Option<&str>, not_written: u64) -> ProcessEventKind {
         let report = RecordReport {
             file: "runs/a/recording.mcap".into(),
@@ -88,9 +92,7 @@ mod tests {
             not_written,
             failure: failure.map(str::to_owned),
         };
-        ProcessEventKind::Logged {
-            line: serde_json::to_string(&report).unwrap(),
-        }
+        logged(&serde_json::to_string(&report).unwrap())
     }
 
     #[test]
@@ -114,9 +116,8 @@ mod tests {
 
     #[test]
     fn every_process_counts() {
-        let last_line = |line: &str| ProcessEventKind::Logged { line: line.into() };
         let events = [
-            ("replay", last_line("7 ticks were not answered")),
+            ("replay", logged("7 ticks were not answered")),
             ("replay", ProcessEventKind::Done { data_lost: true }),
             (
                 "link-1",
@@ -125,7 +126,7 @@ mod tests {
                 },
             ),
             ("agent-1", ProcessEventKind::Started { pid: 1 }),
-            ("agent-1", last_line("40 sweeps")),
+            ("agent-1", logged("40 sweeps")),
             ("agent-1", ProcessEventKind::Done { data_lost: false }),
             (
                 "recorder",

@@ -308,27 +308,32 @@ mod tests {
         began: Instant,
         [from_ms, to_ms, report_ms]: [u64; 3],
     ) -> Vec<(String, String)> {
-        let at = |ms| began + Duration::from_millis(ms);
-        let look = |ms| {
-            let last_reports = BTreeMap::from([
-                ("ego".to_owned(), at(report_ms)),
-                ("replay".to_owned(), at(ms)),
-            ]);
-            health.look(&last_reports, false, at(ms))
-        };
-        (from_ms..=to_ms).step_by(100).flat_map(look).collect()
+        let last_report = began + Duration::from_millis(report_ms);
+        (from_ms..=to_ms)
+            .step_by(100)
+            .flat_map(|ms| {
+                let now = began + Duration::from_millis(ms);
+                let last_reports =
+                    BTreeMap::from([("ego".to_owned(), last_report), ("replay".to_owned(), now)]);
+                health.look(&last_reports, false, now)
+            })
+            .collect()
+    }
+
+    /// State of the first process.
+    fn state(health: &Health, now: Instant) -> State {
+        health.statuses(&Progress::default(), now)[0].state
     }
 
     #[test]
     fn a_silent_process_is_shown_and_then_replaced() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 900, 0]).is_empty());
-        let state = |health: &Health| health.statuses(&Progress::default(), began)[0].state;
-        assert_eq!(state(&health), State::Starting);
+        assert_eq!(state(&health, began), State::Starting);
         assert!(look(&mut health, began, [1000, 1500, 1000]).is_empty());
-        assert_eq!(state(&health), State::Ready);
+        assert_eq!(state(&health, began), State::Ready);
         assert!(look(&mut health, began, [1600, 5900, 1000]).is_empty());
-        assert_eq!(state(&health), State::Silent);
+        assert_eq!(state(&health, began), State::Silent);
         let hanging = look(&mut health, began, [6000, 6100, 1000]);
         assert_eq!(
             hanging,
@@ -376,28 +381,25 @@ mod tests {
     fn no_process_counts_as_hung_without_a_network() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
-        let at = |ms| began + Duration::from_millis(ms);
-        // The scorer receives its own reports without a network.
-        let reports =
-            |ms| BTreeMap::from([("ego".to_owned(), at(1900)), ("scorer".to_owned(), at(ms))]);
-        assert!(
-            (2100..30_000)
-                .step_by(100)
-                .all(|ms| health.look(&reports(ms), false, at(ms)).is_empty())
-        );
-        assert_eq!(
-            health.statuses(&Progress::default(), at(30_000))[0].state,
-            State::Silent
-        );
+        let last_report = began + Duration::from_millis(1900);
+        for ms in (2100..30_000).step_by(100) {
+            let now = began + Duration::from_millis(ms);
+            // The scorer receives its own reports without a network.
+            let reports =
+                BTreeMap::from([("ego".to_owned(), last_report), ("scorer".to_owned(), now)]);
+            assert!(health.look(&reports, false, now).is_empty());
+        }
+        let end = began + Duration::from_secs(30);
+        assert_eq!(state(&health, end), State::Silent);
     }
 
     #[test]
     fn processes_have_their_time_again_when_the_router_is_back() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
-        let at = |ms| began + Duration::from_millis(ms);
         for ms in (2100..30_000).step_by(100) {
-            assert!(health.look(&BTreeMap::new(), true, at(ms)).is_empty());
+            let now = began + Duration::from_millis(ms);
+            assert!(health.look(&BTreeMap::new(), true, now).is_empty());
         }
         assert!(look(&mut health, began, [30_000, 35_000, 1900]).is_empty());
         assert_eq!(look(&mut health, began, [35_100, 35_100, 1900]).len(), 1);

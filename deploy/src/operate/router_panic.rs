@@ -47,17 +47,18 @@ fn is_of_router(thread: Option<&str>) -> bool {
 mod tests {
     use super::*;
 
+    fn panic_in_thread(name: &str) {
+        let thread = thread::Builder::new().name(name.into());
+        assert!(thread.spawn(|| panic!("poisoned")).unwrap().join().is_err());
+    }
+
     #[test]
     fn a_panic_of_a_thread_of_the_router_is_noted_and_one_of_another_is_not() {
         let stop = Stop::new();
         watch(&stop);
-        let fall = |name: &str| {
-            let thread = thread::Builder::new().name(name.into());
-            assert!(thread.spawn(|| panic!("poisoned")).unwrap().join().is_err());
-        };
-        fall("scorer");
+        panic_in_thread("scorer");
         assert!(first().is_none() && !stop.requested());
-        fall("rx-0");
+        panic_in_thread("rx-0");
         assert!(first().unwrap().contains("poisoned"), "{:?}", first());
         assert!(stop.requested());
     }

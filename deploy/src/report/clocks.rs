@@ -54,17 +54,19 @@ mod tests {
 
     #[test]
     fn clocks_that_differ_are_named_with_their_offsets() {
-        let record = |clock_offset_s, capture_offset_s| NeighbourRecord {
-            clock_offset_s,
-            capture_offset_s,
-            ..NeighbourRecord::default()
-        };
         let neighbours = [
-            ("1", record(Some(-0.002), None)),
-            ("2", record(Some(3.0), Some(0.3))),
-            ("3", record(None, Some(-0.1))),
+            ("1", Some(-0.002), None),
+            ("2", Some(3.0), Some(0.3)),
+            ("3", None, Some(-0.1)),
         ];
-        let neighbours = neighbours.map(|(cav, record)| (CavId::new(cav).unwrap(), record));
+        let neighbours = neighbours.map(|(cav, clock_offset_s, capture_offset_s)| {
+            let record = NeighbourRecord {
+                clock_offset_s,
+                capture_offset_s,
+                ..NeighbourRecord::default()
+            };
+            (CavId::new(cav).unwrap(), record)
+        });
         let lines: Vec<String> = others(&neighbours.into())
             .iter()
             .map(|(cav, clock)| format!("{cav}: {clock}"))

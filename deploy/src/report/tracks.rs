@@ -278,15 +278,18 @@ mod tests {
         }
     }
 
-    fn truth(tick: u64, objects: &[(i64, Box3d)], ignored: &[(i64, Box3d)]) -> String {
-        let boxes = |boxes: &[(i64, Box3d)]| {
-            let of_box = |(id, box3d): &(i64, Box3d)| TrueBox {
-                id: *id,
+    fn true_boxes(boxes: &[(i64, Box3d)]) -> Vec<TrueBox> {
+        boxes
+            .iter()
+            .map(|&(id, box3d)| TrueBox {
+                id,
                 class: dataset::frame::ObjectClass::Car,
-                box3d: *box3d,
-            };
-            boxes.iter().map(of_box).collect()
-        };
+                box3d,
+            })
+            .collect()
+    }
+
+    fn truth(tick: u64, objects: &[(i64, Box3d)], ignored: &[(i64, Box3d)]) -> String {
         let line = TruthLine {
             tick,
             capture_nanos: (tick + 1) * 100_000_000,
@@ -294,8 +297,8 @@ mod tests {
             ego: CavId::new(EGO).unwrap(),
             world_from_ego: Some(Pose::IDENTITY),
             truth: GroundTruth {
-                objects: boxes(objects),
-                ignored: boxes(ignored),
+                objects: true_boxes(objects),
+                ignored: true_boxes(ignored),
                 area_m: [-50.0, -50.0, 50.0, 50.0],
             },
         };
@@ -311,17 +314,17 @@ mod tests {
             capture_nanos: (tick + 1) * 100_000_000,
             publish_nanos: 0,
         };
-        let detection = |box3d: &Box3d| Detection {
-            box3d: *box3d,
+        let detections = boxes.iter().map(|&box3d| Detection {
+            box3d,
             score: 0.9,
             source: None,
-        };
+        });
         let result = Detections {
             ego: cav,
             agent_frame: tick,
             method: "pastat".into(),
             pose,
-            detections: boxes.iter().map(detection).collect(),
+            detections: detections.collect(),
             fused: vec![],
             skipped: vec![],
             neighbours: vec![],
@@ -365,8 +368,18 @@ mod tests {
 
     /// The ground truth of 20 ticks of it.
     fn street() -> Vec<String> {
-        let line = |tick| truth(tick, &[(7, boxes(tick)[0]), (9, boxes(tick)[1])], &[]);
-        (0..20).map(line).collect()
+        (0..20)
+            .map(|tick| truth(tick, &[(7, boxes(tick)[0]), (9, boxes(tick)[1])], &[]))
+            .collect()
+    }
+
+    /// The numbers of the quality without the last digits, in which numbers of JSON are rounded.
+    fn rounded_numbers(report: &TrackReport) -> Vec<Option<f64>> {
+        let quality = serde_json::to_value(&report.quality).unwrap();
+        let numbers = quality.as_object().unwrap().values();
+        numbers
+            .map(|number| Some((number.as_f64()? * 1e9).round()))
+            .collect()
     }
 
     #[test]
@@ -425,16 +438,7 @@ mod tests {
         let lines: Vec<String> = recorded.map(|report| report.to_json()).collect();
         let read = read_all(&truths, &results, &lines).unwrap();
         assert!(read.recorded && !made.recorded);
-        // Numbers in JSON are rounded in their last digit.
-        let numbers = |report: &TrackReport| {
-            let quality = serde_json::to_value(&report.quality).unwrap();
-            let numbers = quality.as_object().unwrap().values();
-            let rounded = |number: f64| (number * 1e9).round();
-            numbers
-                .map(|number| number.as_f64().map(rounded))
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(numbers(&read), numbers(&made));
+        assert_eq!(rounded_numbers(&read), rounded_numbers(&made));
         // What the ego has tracked counts, whatever its detections are.
         let read = read_all(&truths, &results, &lines[..10]).unwrap();
         assert!(read.quality.recall < made.quality.recall, "{read:?}");
@@ -494,13 +498,14 @@ mod tests {
     #[test]
     fn a_scene_that_is_played_again_begins_a_new_sequence() {
         let car = car(10.0, 0.0);
-        let again = |tick: u64| {
-            let mut line: serde_json::Value =
-                serde_json::from_str(&truth(tick, &[(7, car)], &[])).unwrap();
-            line["capture_nanos"] = ((tick % 5 + 1) * 100_000_000).into();
-            line.to_string()
-        };
-        let truths: Vec<String> = (0..10).map(again).collect();
+        let truths: Vec<String> = (0..10)
+            .map(|tick: u64| {
+                let mut line: serde_json::Value =
+                    serde_json::from_str(&truth(tick, &[(7, car)], &[])).unwrap();
+                line["capture_nanos"] = ((tick % 5 + 1) * 100_000_000).into();
+                line.to_string()
+            })
+            .collect();
         let results: Vec<String> = (0..10)
             .map(|tick| result(tick, posed(0.0), &[car]))
             .collect();

@@ -43,10 +43,13 @@ mod tests {
             (source.topic.as_str(), source.cav.as_str()),
             ("/velodyne/points", "1000")
         );
-        let error = |text: &str| text.parse::<AgentTopic>().unwrap_err().to_string();
-        assert!(error("/points").contains("TOPIC=AGENT"));
-        assert!(
-            error("points=1000").contains("ROS 2 name") && error("/points=A").contains("CAV id")
-        );
+        for (text, part) in [
+            ("/points", "TOPIC=AGENT"),
+            ("points=1000", "ROS 2 name"),
+            ("/points=A", "CAV id"),
+        ] {
+            let error = text.parse::<AgentTopic>().unwrap_err();
+            assert!(error.contains(part), "{error}");
+        }
     }
 }

@@ -131,16 +131,15 @@ mod tests {
     #[test]
     fn a_value_is_interpolated_and_held_for_a_short_time() {
         let series = series(&[(1000, 2.0), (1020, 4.0), (1500, 9.0)]);
-        let at = |ms: u64| series.at(ms * MS);
-        assert_eq!(
-            [at(1000), at(1010), at(1020)],
-            [Some(2.0), Some(3.0), Some(4.0)]
-        );
-        assert_eq!(
-            [at(900), at(1100), at(1600)],
-            [Some(2.0), Some(4.0), Some(9.0)]
-        );
-        assert_eq!([at(700), at(1250), at(1701)], [None; 3]);
+        for (ms, value) in [(1000, 2.0), (1010, 3.0), (1020, 4.0)] {
+            assert_eq!(series.at(ms * MS), Some(value), "{ms} ms");
+        }
+        for (ms, value) in [(900, 2.0), (1100, 4.0), (1600, 9.0)] {
+            assert_eq!(series.at(ms * MS), Some(value), "{ms} ms");
+        }
+        for ms in [700, 1250, 1701] {
+            assert_eq!(series.at(ms * MS), None, "{ms} ms");
+        }
         assert_eq!(TimeSeries::<f64>::default().at(5), None);
     }
 
@@ -150,10 +149,16 @@ mod tests {
         for (ms, x) in [(1000, 2.0), (1100, 4.0), (3000, 9.0)] {
             series.add(ms * MS, Isometry3::translation(x, 0.0, 0.0));
         }
-        let at = |ms: u64| series.at(ms * MS).map(|pose| pose.translation.x);
-        assert_eq!([at(1000), at(1050)], [Ok(2.0), Ok(3.0)]);
-        assert_eq!(at(3001), Err(NoPose::Later));
-        assert_eq!([at(999), at(2000)], [Err(NoPose::Never); 2]);
+        for (ms, expected) in [
+            (1000, Ok(2.0)),
+            (1050, Ok(3.0)),
+            (3001, Err(NoPose::Later)),
+            (999, Err(NoPose::Never)),
+            (2000, Err(NoPose::Never)),
+        ] {
+            let x = series.at(ms * MS).map(|pose| pose.translation.x);
+            assert_eq!(x, expected, "{ms} ms");
+        }
     }
 
     #[test]

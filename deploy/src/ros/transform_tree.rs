@@ -163,13 +163,12 @@ mod tests {
     #[test]
     fn a_frame_is_found_through_all_between_at_the_time_of_the_sweep() {
         let tree = robot();
-        let x = |nanos| {
-            tree.at(nanos, "odom", "velodyne")
-                .map(|pose| pose.translation.x)
-        };
-        assert_eq!(x(S + S / 2), Ok(16.5));
-        assert!(matches!(x(3 * S), Err(NoTransform::Later { frame, .. }) if frame == "base_link"));
-        assert!(matches!(x(S / 2), Err(NoTransform::Gap { .. })));
+        let pose = tree.at(S + S / 2, "odom", "velodyne").unwrap();
+        assert_eq!(pose.translation.x, 16.5);
+        let later = tree.at(3 * S, "odom", "velodyne").unwrap_err();
+        assert!(matches!(later, NoTransform::Later { frame, .. } if frame == "base_link"));
+        let gap = tree.at(S / 2, "odom", "velodyne").unwrap_err();
+        assert!(matches!(gap, NoTransform::Gap { .. }));
         let error = tree.at(S, "odom", "camera").unwrap_err().to_string();
         assert!(error.contains("\"camera\" has no parent"), "{error}");
     }

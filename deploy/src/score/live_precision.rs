@@ -143,6 +143,7 @@ mod tests {
     use protocol::Box3d;
 
     use super::*;
+    use crate::score::metrics::tests::is_near;
 
     /// A car at `x` metres, in an area of 50 by 40 m.
     fn truth_at(x: f64) -> GroundTruth {
@@ -223,21 +224,20 @@ mod tests {
     #[test]
     fn each_tick_names_the_result_that_it_was_scored_with() {
         let (_, streamed) = run(4, &[0, 2], 150, 0.0);
-        let of_first = |age_ms| {
+        let expected = [None, None, Some(200.0), Some(300.0)].map(|age_ms| {
             Some(StreamedResult {
                 tick: 0,
-                age_ms,
+                age_ms: age_ms?,
                 detected: 1,
                 found: 1,
             })
-        };
-        assert_eq!(streamed, [None, None, of_first(200.0), of_first(300.0)]);
+        });
+        assert_eq!(streamed, expected);
     }
 
     #[test]
     fn what_moves_is_no_longer_where_it_was_found() {
         // 0.5 m a tick and results that are one tick old: an overlap of 0.78. Two ticks old: 0.6.
-        let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
         assert!(is_near(streaming(5, &[0, 1, 2, 3, 4], 100, 0.5).at_70, 0.8));
         let late = streaming(5, &[0, 1, 2, 3, 4], 200, 0.5);
         assert!(

@@ -314,17 +314,25 @@ pub(crate) mod tests {
         }
     }
 
-    #[test]
-    fn the_file_names_the_three_precisions() {
-        let ap = |at_50| ByIou {
+    /// True if the value, which has to be known, is the expected one but for rounding.
+    pub(crate) fn is_near(found: Option<f64>, expected: f64) -> bool {
+        (found.unwrap() - expected).abs() < 1e-9
+    }
+
+    fn precision(at_50: f64) -> ByIou {
+        ByIou {
             at_50: Some(at_50),
             ..ByIou::default()
-        };
+        }
+    }
+
+    #[test]
+    fn the_file_names_the_three_precisions() {
         let metrics = Metrics {
             answered: 29,
-            ap_answered: ap(0.9),
-            ap_unanswered_empty: ap(0.5),
-            ap_streaming: Some(ap(0.25)),
+            ap_answered: precision(0.9),
+            ap_unanswered_empty: precision(0.5),
+            ap_streaming: Some(precision(0.25)),
             ..metrics("pastat")
         };
         let json = serde_json::to_value(&metrics).unwrap();
@@ -377,11 +385,7 @@ pub(crate) mod tests {
 
     #[test]
     fn thresholds_are_named_by_their_numbers() {
-        let text = serde_json::to_string(&ByIou {
-            at_50: Some(0.5),
-            ..ByIou::default()
-        })
-        .unwrap();
+        let text = serde_json::to_string(&precision(0.5)).unwrap();
         assert_eq!(text, r#"{"0.3":null,"0.5":0.5,"0.7":null}"#);
     }
 }

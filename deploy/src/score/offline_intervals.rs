@@ -104,12 +104,14 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
 mod tests {
     use super::*;
 
+    /// True if messages of the topic to that process concern the offline one.
+    fn is_concerned(topic: &str, to: &str, offline: &str) -> bool {
+        let account = Account::towards(topic.parse().unwrap(), &to.parse().unwrap());
+        concerns(&BTreeSet::from([offline.to_owned()]), &account)
+    }
+
     #[test]
     fn an_account_concerns_sender_receiver_and_link() {
-        let concerns = |topic: &str, to: &str, offline: &str| {
-            let account = Account::towards(topic.parse().unwrap(), &to.parse().unwrap());
-            super::concerns(&BTreeSet::from([offline.to_owned()]), &account)
-        };
         for (topic, to, offline) in [
             ("20/bev", "ego-10", "agent-20"),
             ("20/bev", "ego-10", "ego-10"),
@@ -119,9 +121,9 @@ mod tests {
             ("10/detections", "scorer", "ego-10"),
             ("10/tracks", "scorer", "ego-10"),
         ] {
-            assert!(concerns(topic, to, offline), "{topic} {to} {offline}");
-            assert!(!concerns(topic, to, "agent-30"), "{topic} {to}");
+            assert!(is_concerned(topic, to, offline), "{topic} {to} {offline}");
+            assert!(!is_concerned(topic, to, "agent-30"), "{topic} {to}");
         }
-        assert!(!concerns("20/lidar", "agent-20", "link-10"));
+        assert!(!is_concerned("20/lidar", "agent-20", "link-10"));
     }
 }

@@ -73,14 +73,14 @@ mod tests {
 
     #[test]
     fn stages_are_laid_out_from_the_end() {
-        let timing = |name, ms| StageTiming::new(name, Duration::from_millis(ms));
         let stages = [
-            timing("transport", 4),
-            timing("wait", 20),
-            timing("warp", 3),
-            timing("fuse", 7),
-            timing("send", 1),
-        ];
+            ("transport", 4),
+            ("wait", 20),
+            ("warp", 3),
+            ("fuse", 7),
+            ("send", 1),
+        ]
+        .map(|(name, ms)| StageTiming::new(name, Duration::from_millis(ms)));
         let stamps = StageStamps::of(1_000_000_000, Some(1_030_000_000), 1_100_000_000, &stages);
         let expected = StageStamps {
             began_nanos: Some(1_000_000_000),

@@ -137,29 +137,36 @@ mod tests {
     #[test]
     fn positives_and_missed_objects_are_counted_by_score_within_area_and_classes() {
         let ego = CavId::new("7").unwrap();
-        let object = |id: i64, class: &str, x_m: f64| TrueObject {
+        let objects = [
+            (1, "car", 10.0),
+            (2, "car", 20.0),
+            (3, "car", 80.0),
+            (4, "other", 30.0),
+        ]
+        .map(|(id, class, x_m)| TrueObject {
             id,
             class: class.into(),
             world_from_object: Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0),
             size_m: [4.0, 2.0, 1.5],
             speed_mps: None,
-        };
-        let objects = vec![
-            object(1, "car", 10.0),
-            object(2, "car", 20.0),
-            object(3, "car", 80.0),
-            object(4, "other", 30.0),
-        ];
+        });
         let agent = AgentTruth {
             cav: ego.clone(),
             world_from_lidar: Pose::IDENTITY,
-            objects,
+            objects: objects.into(),
         };
         let truth = Truth {
             tick: 0,
             agents: vec![agent],
         };
-        let detection = |x_m: f64, score: f32| Detection {
+        let detections = [
+            (10.2, 0.9),
+            (40.0, 0.6),
+            (20.0, 0.3),
+            (50.0, 0.3),
+            (30.0, 0.3),
+        ]
+        .map(|(x_m, score)| Detection {
             box3d: Box3d {
                 center_m: [x_m, 0.0, 0.0],
                 size_m: [4.0, 2.0, 1.5],
@@ -167,19 +174,13 @@ mod tests {
             },
             score,
             source: None,
-        };
+        });
         let result = Detections {
             ego,
             agent_frame: 0,
             method: "max".into(),
             pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
-            detections: vec![
-                detection(10.2, 0.9),
-                detection(40.0, 0.6),
-                detection(20.0, 0.3),
-                detection(50.0, 0.3),
-                detection(30.0, 0.3),
-            ],
+            detections: detections.into(),
             fused: vec![],
             skipped: vec![],
             neighbours: vec![],

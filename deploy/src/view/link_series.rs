@@ -120,19 +120,13 @@ mod tests {
 
     #[test]
     fn the_backlog_is_what_was_published_and_has_not_arrived() {
-        let link = |pairs: &[(u64, u64)]| {
-            let mut messages = pairs.to_vec();
-            accumulate(&mut messages);
-            messages
-        };
         // 100 bytes at 10, 200 at 20 and 300 at 30; they arrive in another order.
-        let (published, arrived) = (
-            link(&[(20, 200), (10, 100), (30, 300)]),
-            link(&[(25, 100), (60, 200), (40, 300)]),
-        );
-        let waiting = |now| until(&published, now) - until(&arrived, now);
+        let mut published = [(20, 200), (10, 100), (30, 300)];
+        let mut arrived = [(25, 100), (60, 200), (40, 300)];
+        accumulate(&mut published);
+        accumulate(&mut arrived);
         assert_eq!(
-            [0, 10, 24, 25, 30, 40, 60].map(waiting),
+            [0, 10, 24, 25, 30, 40, 60].map(|now| until(&published, now) - until(&arrived, now)),
             [0, 100, 300, 200, 500, 200, 0]
         );
     }

@@ -19,6 +19,7 @@ use recording::{RecordingOptions, RecordingWriter};
 use serde_json::Value;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage};
+use super::scene_frame::ShownTrack;
 use super::*;
 
 const EGO: &str = "4279";
@@ -60,14 +61,14 @@ fn truth(tick: u64) -> Truth {
         size_m: [4.0, 1.8, 1.6],
         speed_mps: None,
     };
-    let agent = |cav_id: &str| AgentTruth {
+    let agents = [EGO, OTHER].map(|cav_id| AgentTruth {
         cav: cav(cav_id),
         world_from_lidar: pose_of(cav_id, tick),
         objects: vec![object.clone()],
-    };
+    });
     Truth {
         tick,
-        agents: [EGO, OTHER].map(agent).into(),
+        agents: agents.into(),
     }
 }
 
@@ -135,19 +136,24 @@ fn feature_map(who: &str, tick: u64) -> Bev {
     }
 }
 
-/// A feature map of the other vehicle, which reaches the ego over a link, and later a result of the other vehicle.
-fn messages_of_a_second_ego(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
-    let stamp = |late_ms: u64| Stamp {
-        cav: cav(OTHER),
+fn stamp(who: &str, tick: u64, publish_nanos: u64) -> Stamp {
+    Stamp {
+        cav: cav(who),
         epoch: 1,
         sequence: tick,
         capture_nanos: 100_000_000 * (tick + 1),
-        publish_nanos: now + 1_000_000 * late_ms,
-    };
-    let map = wire::encode(&stamp(25), feature_map(OTHER, tick))
+        publish_nanos,
+    }
+}
+
+/// A feature map of the other vehicle, which reaches the ego over a link, and later a result of the other vehicle.
+fn messages_of_a_second_ego(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
+    let mapped = stamp(OTHER, tick, now + 25_000_000);
+    let map = wire::encode(&mapped, feature_map(OTHER, tick))
         .unwrap()
         .to_vec();
-    let result = wire::encode(&stamp(30), detections_of(OTHER, tick))
+    let detected = stamp(OTHER, tick, now + 30_000_000);
+    let result = wire::encode(&detected, detections_of(OTHER, tick))
         .unwrap()
         .to_vec();
     vec![
@@ -178,20 +184,9 @@ fn messages_of_a_second_ego(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
 
 /// The messages of a tick, published at `now`; the result half a tick later. Live, there are previews only.
 fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
-    let stamp = |who: &str, late_ms: u64| Stamp {
-        cav: cav(who),
-        epoch: 1,
-        sequence: tick,
-        capture_nanos: 100_000_000 * (tick + 1),
-        publish_nanos: now + 1_000_000 * late_ms,
-    };
-    let stream = |who: &str, stream| Topic::Stream {
-        cav: cav(who),
-        stream,
-    };
     let mut all = vec![(
         Topic::Truth,
-        wire::encode(&stamp("replay", 0), truth(tick))
+        wire::encode(&stamp("replay", tick, now), truth(tick))
             .unwrap()
             .to_vec(),
     )];
@@ -204,19 +199,22 @@ fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
         let lidar = Lidar {
             points: cloud(tick, count),
         };
+        let swept = stamp(who, tick, now);
         all.push((
-            stream(who, sweeps),
-            wire::encode(&stamp(who, 0), lidar).unwrap().to_vec(),
+            Topic::stream(&cav(who), sweeps),
+            wire::encode(&swept, lidar).unwrap().to_vec(),
         ));
         let estimate = PoseEstimate::new(pose_of(who, tick), 0.9);
+        let posed = stamp(who, tick, now + 20_000_000);
         all.push((
-            stream(who, Stream::Pose),
-            wire::encode(&stamp(who, 20), estimate).unwrap().to_vec(),
+            Topic::stream(&cav(who), Stream::Pose),
+            wire::encode(&posed, estimate).unwrap().to_vec(),
         ));
     }
+    let detected = stamp(EGO, tick, now + 50_000_000);
     all.push((
-        stream(EGO, Stream::Detections),
-        wire::encode(&stamp(EGO, 50), detections_of(EGO, tick))
+        Topic::stream(&cav(EGO), Stream::Detections),
+        wire::encode(&detected, detections_of(EGO, tick))
             .unwrap()
             .to_vec(),
     ));
@@ -242,13 +240,7 @@ fn tracks(tick: u64) -> (Topic, Vec<u8>) {
         age_s: 0.0,
         unseen_s: 0.0,
     };
-    let stamp = Stamp {
-        cav: ego.clone(),
-        epoch: 1,
-        sequence: tick,
-        capture_nanos: 100_000_000 * (tick + 1),
-        publish_nanos: 51_000_000,
-    };
+    let stamp = stamp(EGO, tick, 51_000_000);
     let topic = Topic::stream(&ego, Stream::Tracks);
     let message = Tracks {
         ego,
@@ -412,18 +404,17 @@ fn a_recording_with_nothing_to_show_is_refused_with_the_reason() {
             (topic, payload)
         })
         .collect();
-    let is_sweep = |topic: &Topic| {
-        matches!(
-            topic,
-            Topic::Stream {
-                stream: Stream::Lidar,
-                ..
-            }
-        )
-    };
     let sweeps: Vec<_> = all
         .into_iter()
-        .filter(|(topic, _)| is_sweep(topic))
+        .filter(|(topic, _)| {
+            matches!(
+                topic,
+                Topic::Stream {
+                    stream: Stream::Lidar,
+                    ..
+                }
+            )
+        })
         .collect();
     let run = RunId::new("test").unwrap();
     for (recorded, reason) in [
@@ -456,11 +447,15 @@ fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
         [cav(EGO), cav(OTHER)],
         "in the order of their results"
     );
-    let latency_ms = |ego: Option<&str>| run.timeline(ego.map(cav).as_ref())[1].latency_ms.unwrap();
-    assert_eq!(
-        [None, Some(EGO), Some(OTHER), Some("77")].map(latency_ms),
-        [50.0, 50.0, 30.0, 50.0]
-    );
+    for (ego, latency_ms) in [
+        (None, 50.0),
+        (Some(EGO), 50.0),
+        (Some(OTHER), 30.0),
+        (Some("77"), 50.0),
+    ] {
+        let timeline = run.timeline(ego.map(cav).as_ref());
+        assert_eq!(timeline[1].latency_ms, Some(latency_ms), "{ego:?}");
+    }
     for (ego, name) in [(None, EGO), (Some(cav(OTHER)), OTHER)] {
         let (frame, _) = parsed(&run.frame(2, ego.as_ref()).unwrap().unwrap().to_bytes());
         assert_eq!(
@@ -481,73 +476,86 @@ fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
     );
 
     let server = serve_recorded("127.0.0.1:0".parse().unwrap(), Arc::new(run)).unwrap();
-    let body = |path: &str| fetch(server.address(), path).unwrap().1;
-    assert_eq!(
-        parsed(&body(&format!("/frame/0?ego={OTHER}"))).0["ego"],
-        OTHER
-    );
-    let about: Value = serde_json::from_slice(&body(&format!("/run?ego={OTHER}"))).unwrap();
+    let [frame, about, map, no_map] = [
+        format!("/frame/0?ego={OTHER}"),
+        format!("/run?ego={OTHER}"),
+        format!("/map/{OTHER}?at=1"),
+        format!("/map/{EGO}?at=1"),
+    ]
+    .map(|path| fetch(server.address(), &path).unwrap().1);
+    assert_eq!(parsed(&frame).0["ego"], OTHER);
+    let about: Value = serde_json::from_slice(&about).unwrap();
     assert_eq!(about["timeline"][0]["latency_ms"], 30.0);
-    let map = body(&format!("/map/{OTHER}?at=1"));
     assert_eq!(&map[map.len() - 8..], [0, 0, 0, 0, 0, 85, 170, 255]);
-    assert!(
-        body(&format!("/map/{EGO}?at=1")).is_empty(),
-        "it has published none"
-    );
+    assert!(no_map.is_empty(), "it has published none");
+}
+
+/// The frame that a message of a replay with this epoch completes.
+fn completed_frame(
+    assembly: &mut FrameAssembler,
+    (topic, payload): &(Topic, Vec<u8>),
+    epoch: u64,
+) -> Option<SceneFrame> {
+    let mut header = wire::decode_header([payload.as_slice()]).unwrap();
+    header.stamp.epoch = epoch;
+    assembly.add(&ReceivedMessage {
+        topic,
+        header: &header,
+        arrived_nanos: 0,
+        payload: Some(payload),
+    })
 }
 
 #[test]
 fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
     let mut assembly = FrameAssembler::default();
-    let mut shown = |epoch: u64, tick: u64| {
-        let mut frames = Vec::new();
-        for (topic, payload) in messages(tick, 0, Stream::Lidar) {
-            let mut header = wire::decode_header([payload.as_slice()]).unwrap();
-            header.stamp.epoch = epoch;
-            let seen = ReceivedMessage {
-                topic: &topic,
-                header: &header,
-                arrived_nanos: 0,
-                payload: Some(&payload),
-            };
-            frames.extend(assembly.add(&seen).and_then(|frame| frame.tick));
-        }
-        frames
-    };
-    assert_eq!(shown(1, 3), [3]);
-    assert_eq!(shown(1, 2), [0; 0], "never back in time");
-    assert_eq!(shown(2, 0), [0], "but another replay has a time of its own");
-    assert_eq!(shown(2, 1), [1]);
+    for (epoch, tick, expected, why) in [
+        (1, 3, &[3][..], "the first"),
+        (1, 2, &[], "never back in time"),
+        (2, 0, &[0], "but another replay has a time of its own"),
+        (2, 1, &[1], "and goes on"),
+    ] {
+        let shown: Vec<u64> = messages(tick, 0, Stream::Lidar)
+            .iter()
+            .filter_map(|message| completed_frame(&mut assembly, message, epoch)?.tick)
+            .collect();
+        assert_eq!(shown, expected, "{why}");
+    }
+}
+
+/// Tracks shown with a live tick as they complete it, after its result and after its tracks.
+fn shown_tracks(
+    assembly: &mut FrameAssembler,
+    tick: u64,
+    has_tracks: bool,
+) -> [Option<Vec<ShownTrack>>; 2] {
+    let mut result = None;
+    for message in messages(tick, 100_000_000 * tick, Stream::Preview) {
+        result = completed_frame(assembly, &message, 1);
+    }
+    let tracked = has_tracks.then(|| completed_frame(assembly, &tracks(tick), 1));
+    [result, tracked.flatten()].map(|frame| Some(frame?.tracks))
 }
 
 #[test]
 fn a_live_frame_waits_for_tracks_as_long_as_the_ego_tracks() {
     let mut assembly = FrameAssembler::default();
-    // Tracks shown with each tick as they complete it, after its result and after its tracks.
-    let mut shown = |tick: u64, has_tracks: bool| {
-        let mut add = |(topic, payload): (Topic, Vec<u8>)| {
-            let seen = ReceivedMessage {
-                topic: &topic,
-                header: &wire::decode_header([payload.as_slice()]).unwrap(),
-                arrived_nanos: 0,
-                payload: Some(&payload),
-            };
-            assembly.add(&seen).map(|frame| frame.tracks)
-        };
-        let mut result = None;
-        for message in messages(tick, 100_000_000 * tick, Stream::Preview) {
-            result = add(message);
-        }
-        [result, has_tracks.then(|| add(tracks(tick))).flatten()]
-    };
-    assert_eq!(shown(0, true), [Some(vec![]), None], "not known yet");
+    assert_eq!(
+        shown_tracks(&mut assembly, 0, true),
+        [Some(vec![]), None],
+        "not known yet"
+    );
     for tick in [1, 2] {
-        let [result, tracks] = shown(tick, true);
+        let [result, tracks] = shown_tracks(&mut assembly, tick, true);
         assert!(result.is_none(), "tick {tick}");
         assert_eq!(tracks.unwrap()[0].trail_m.len() as u64, tick + 1);
     }
-    assert_eq!(shown(3, false), [None, None]);
-    assert_eq!(shown(4, false), [Some(vec![]), None], "it tracks no more");
+    assert_eq!(shown_tracks(&mut assembly, 3, false), [None, None]);
+    assert_eq!(
+        shown_tracks(&mut assembly, 4, false),
+        [Some(vec![]), None],
+        "it tracks no more"
+    );
 }
 
 #[test]
@@ -555,29 +563,17 @@ fn ticks_without_a_result_count_as_unanswered_once_a_later_one_is_shown() {
     let mut assembly = FrameAssembler::default();
     let mut pace = Vec::new();
     for tick in 0..6 {
-        let is_result = |topic: &Topic| {
-            matches!(
-                topic,
+        for message in messages(tick, 100_000_000 * tick, Stream::Preview) {
+            let is_result = matches!(
+                message.0,
                 Topic::Stream {
                     stream: Stream::Detections,
                     ..
                 }
-            )
-        };
-        for (topic, payload) in messages(tick, 100_000_000 * tick, Stream::Preview) {
-            let header = wire::decode_header([payload.as_slice()]).unwrap();
-            let seen = ReceivedMessage {
-                topic: &topic,
-                header: &header,
-                arrived_nanos: 0,
-                payload: Some(&payload),
-            };
-            if !is_result(&topic) || tick % 2 == 1 {
-                pace.extend(
-                    assembly
-                        .add(&seen)
-                        .map(|frame| (frame.pace.answered, frame.pace.ticks)),
-                );
+            );
+            if !is_result || tick % 2 == 1 {
+                let frame = completed_frame(&mut assembly, &message, 1);
+                pace.extend(frame.map(|frame| (frame.pace.answered, frame.pace.ticks)));
             }
         }
     }
@@ -703,12 +699,11 @@ fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
         "always a newer one: {captures:?}"
     );
     // On a busy machine the passive subscriber drops parts of some frames, but hardly ever of all.
-    let whole = |frame: &Value, points: usize| {
-        !frame["ego"].is_null() && !frame["truth"][0].is_null() && points == 8_000
-    };
     let (frame, points) = moments
         .iter()
-        .find(|(frame, points)| whole(frame, *points))
+        .find(|(frame, points)| {
+            !frame["ego"].is_null() && !frame["truth"][0].is_null() && *points == 8_000
+        })
         .expect("a whole moment");
     check(frame, *points);
     wait_for("no page is open", || run.watchers() == 0);

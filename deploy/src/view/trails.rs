@@ -61,8 +61,8 @@ mod tests {
     use super::*;
 
     fn tracks(x: f64, ids: &[u64]) -> Tracks {
-        let track = |id: &u64| Track {
-            id: *id,
+        let tracks = ids.iter().map(|&id| Track {
+            id,
             box3d: Box3d {
                 center_m: [1.0, 0.0, 0.0],
                 size_m: [4.0, 2.0, 1.5],
@@ -74,12 +74,12 @@ mod tests {
             hits: 2,
             age_s: 0.1,
             unseen_s: 0.1,
-        };
+        });
         Tracks {
             ego: CavId::new("7").unwrap(),
             agent_frame: 0,
             pose: PoseEstimate::new(Pose::from_xyz_yaw([x, 5.0, 0.0], 0.0), 0.9),
-            tracks: ids.iter().map(track).collect(),
+            tracks: tracks.collect(),
             left_out: 0,
         }
     }

@@ -184,6 +184,10 @@ mod tests {
         FullResolutionMap::seen(&given.collect::<Vec<_>>(), cells, &GRID).unwrap()
     }
 
+    fn count_different(a: &Tensor, b: &Tensor) -> i64 {
+        (a - b).abs().gt(1e-5).sum(Kind::Int64).int64_value(&[])
+    }
+
     #[test]
     fn numbers_and_tensors_agree_with_a_warp_of_the_whole_map() {
         let some: Vec<i64> = (0..16 * 32).filter(|cell| cell % 3 == 0).collect();
@@ -194,20 +198,17 @@ mod tests {
             .collect();
         let (maps, sent) = maps();
         let warped = warp_to_ego(&maps, Some(&sent), &poses(), &GRID).unwrap();
-        let picked = |maps: &Tensor| maps.flatten(2, 3).index_select(2, &index).transpose(1, 2);
-        let (features, mask) = (picked(&warped.features), picked(&warped.mask));
-        let expected = |tensor: &Tensor| [tensor.get(0).maximum(&tensor.get(2)), tensor.get(1)];
+        let [features, mask] = [&warped.features, &warped.mask].map(|maps| {
+            let picked = maps.flatten(2, 3).index_select(2, &index).transpose(1, 2);
+            [picked.get(0).maximum(&picked.get(2)), picked.get(1)]
+        });
         for with_gradient in [[false; 3], [true; 3], [false, true, true]] {
             let seen = seen(with_gradient, &[(0, 0), (1, 1), (0, 2)], &cells);
             assert!(seen.keys().eq(&[0, 1]));
-            for ((seen, features), mask) in
-                seen.values().zip(expected(&features)).zip(expected(&mask))
-            {
+            for ((seen, features), mask) in seen.values().zip(&features).zip(&mask) {
                 // At a position between two cells either may be the nearest.
-                let apart = |a: &Tensor, b: &Tensor| {
-                    (a - b).abs().gt(1e-5).sum(Kind::Int64).int64_value(&[])
-                };
-                assert!(apart(&seen.features, &features) <= 8 && apart(&seen.mask, &mask) <= 2);
+                assert!(count_different(&seen.features, features) <= 8);
+                assert!(count_different(&seen.mask, mask) <= 2);
                 assert!(seen.mask.sum(Kind::Float).double_value(&[]) > 50.0);
             }
         }

@@ -198,7 +198,18 @@ mod tests {
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 
-    /// A module of the shape that PyTorch writes: the features of each agent weighted by what it is told of them.
+    /// The features of each agent weighted by what a module is told of them.
+    fn weighted(inputs: &[Tensor]) -> Vec<Tensor> {
+        let [features, mask, poses, confidence, age_s] = inputs else {
+            panic!("{} inputs", inputs.len())
+        };
+        let weight =
+            confidence + age_s * 10.0 + poses.select(1, 0) * 100.0 + poses.select(1, 2) * 1000.0;
+        let weight = weight.view([-1, 1, 1, 1]) * mask;
+        vec![(features * weight).sum_dim_intlist([0_i64].as_slice(), false, None)]
+    }
+
+    /// Writes [`weighted`] as a module of the shape that PyTorch writes.
     fn write(file: &Path) {
         let mut example = [
             Tensor::rand([2, 3, 4, 5], FLOAT),
@@ -211,17 +222,6 @@ mod tests {
             .iter_mut()
             .map(|tensor| tensor.shallow_clone())
             .collect();
-        let mut weighted = |inputs: &[Tensor]| {
-            let [features, mask, poses, confidence, age_s] = inputs else {
-                panic!("{} inputs", inputs.len())
-            };
-            let weight = confidence
-                + age_s * 10.0
-                + poses.select(1, 0) * 100.0
-                + poses.select(1, 2) * 1000.0;
-            let weight = weight.view([-1, 1, 1, 1]) * mask;
-            vec![(features * weight).sum_dim_intlist([0_i64].as_slice(), false, None)]
-        };
         let module =
             CModule::create_by_tracing("Fusion", "forward", &inputs, &mut weighted).unwrap();
         module.save(file).unwrap();
@@ -247,6 +247,14 @@ mod tests {
             &[MapMetadata::fresh(0, Pose::IDENTITY), other],
             &grid,
         )
+    }
+
+    fn build_error(file: &Path) -> String {
+        let variables = nn::VarStore::new(Device::Cpu);
+        let config = ScriptConfig {
+            file: file.to_owned(),
+        };
+        config.build(&variables.root()).unwrap_err().to_string()
     }
 
     #[test]
@@ -326,25 +334,12 @@ mod tests {
     #[test]
     fn what_is_wrong_with_a_file_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        let build = |file: &Path| {
-            let variables = nn::VarStore::new(Device::Cpu);
-            ScriptConfig {
-                file: file.to_owned(),
-            }
-            .build(&variables.root())
-            .unwrap_err()
-            .to_string()
-        };
-        let missing = folder.path().join("missing.pt");
-        assert!(
-            build(&missing).contains("missing.pt"),
-            "{}",
-            build(&missing)
-        );
+        let message = build_error(&folder.path().join("missing.pt"));
+        assert!(message.contains("missing.pt"), "{message}");
         let broken = folder.path().join("broken.pt");
         std::fs::write(&broken, b"no archive").unwrap();
-        assert!(build(Path::new("/dev/zero")).contains("no regular file"));
-        let message = build(&broken);
+        assert!(build_error(Path::new("/dev/zero")).contains("no regular file"));
+        let message = build_error(&broken);
         assert!(
             message.contains("broken.pt") && !message.contains('\n'),
             "{message}"
@@ -352,19 +347,14 @@ mod tests {
         let file = folder.path().join("weighted.pt");
         write(&file);
         let script = ScriptFusion::load(&file, Device::Cpu).unwrap();
-        let refused = |mask: &[i64]| {
-            let maps = maps(
-                &Tensor::rand([2, 3, 4, 5], FLOAT),
-                &Tensor::ones(mask, FLOAT),
-            );
-            script.fuse(&maps).unwrap_err().to_string()
-        };
         // The module fails, or returns a map of another shape.
         for (mask, reason) in [
             (&[2, 2, 4, 5][..], "must match"),
             (&[7, 2, 1, 4, 5], "[2, 3, 4, 5], not of [3, 4, 5]"),
         ] {
-            let message = refused(mask);
+            let features = Tensor::rand([2, 3, 4, 5], FLOAT);
+            let maps = maps(&features, &Tensor::ones(mask, FLOAT));
+            let message = script.fuse(&maps).unwrap_err().to_string();
             assert!(
                 message.contains("weighted.pt") && message.contains(reason),
                 "{message}"

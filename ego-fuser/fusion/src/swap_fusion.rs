@@ -423,20 +423,17 @@ mod tests {
     fn invalid_settings_are_named() {
         assert!(SwapFusionConfig::full(256).validate().is_ok());
         assert!(SwapFusionConfig::lean(64).validate().is_ok());
-        let message = |config: SwapFusionConfig| config.validate().unwrap_err().to_string();
-        assert!(
-            message(SwapFusionConfig {
-                window: 0,
-                ..SwapFusionConfig::lean(64)
-            })
-            .contains("fusion.window is 0")
-        );
-        assert!(
-            message(SwapFusionConfig {
-                head_channels: 24,
-                ..SwapFusionConfig::lean(64)
-            })
-            .contains("divisor")
-        );
+        let no_window = SwapFusionConfig {
+            window: 0,
+            ..SwapFusionConfig::lean(64)
+        };
+        let uneven_heads = SwapFusionConfig {
+            head_channels: 24,
+            ..SwapFusionConfig::lean(64)
+        };
+        for (config, part) in [(no_window, "fusion.window is 0"), (uneven_heads, "divisor")] {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
     }
 }

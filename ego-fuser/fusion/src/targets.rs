@@ -274,12 +274,14 @@ mod tests {
     const CAR: [f64; 3] = [3.9, 1.6, 1.56];
 
     fn anchor_grid(height: usize, width: usize) -> Vec<Box3d> {
-        let cell = |row: usize, column: usize| [column as f64 * 0.8, row as f64 * 0.8, -1.0];
         (0..height * width * 2)
-            .map(|index| Box3d {
-                center_m: cell(index / 2 / width, index / 2 % width),
-                size_m: CAR,
-                heading_rad: if index % 2 == 0 { 0.0 } else { FRAC_PI_2 },
+            .map(|index| {
+                let (row, column) = (index / 2 / width, index / 2 % width);
+                Box3d {
+                    center_m: [column as f64 * 0.8, row as f64 * 0.8, -1.0],
+                    size_m: CAR,
+                    heading_rad: if index % 2 == 0 { 0.0 } else { FRAC_PI_2 },
+                }
             })
             .collect()
     }
@@ -337,8 +339,9 @@ mod tests {
         let labels = assigner.assign(&objects);
         let standing: Vec<Standing> = objects.iter().map(Standing::of).collect();
         for index in 0..labels.anchors {
-            let overlap = |object: &Standing| assigner.standing[index].overlap(object);
-            let over = standing.iter().map(overlap).fold(0.0, f32::max);
+            let anchor = &assigner.standing[index];
+            let overlaps = standing.iter().map(|object| anchor.overlap(object));
+            let over = overlaps.fold(0.0, f32::max);
             let positive = labels
                 .positives
                 .iter()

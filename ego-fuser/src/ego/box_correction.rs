@@ -125,8 +125,8 @@ mod tests {
 
     #[test]
     fn a_pose_is_corrected_where_its_boxes_match_better_then() {
-        let cars = |from_m: f64| PLACES.map(|[x, y]| car([x - from_m, y], 0.8));
-        let (own, received) = (cars(0.0), cars(20.0));
+        let [own, received] =
+            [0.0, 20.0].map(|from_m| PLACES.map(|[x, y]| car([x - from_m, y], 0.8)));
         let [x, y, _] = corrected(STATED, &received, &own).translation_m;
         assert!((x - 20.0).abs() < 0.1 && y.abs() < 0.1, "{x} {y}");
         assert_eq!(corrected(TRUE, &received, &own), TRUE);

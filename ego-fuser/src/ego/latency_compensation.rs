@@ -179,29 +179,30 @@ mod tests {
 
     use super::*;
 
+    fn car(world_m: [f64; 3], world_from_cav: &Pose) -> PerceivedObject {
+        let box3d = Box3d {
+            center_m: world_m,
+            size_m: [4.0, 1.8, 1.5],
+            heading_rad: 0.0,
+        };
+        PerceivedObject::from(Detection {
+            box3d: box3d.transformed(&world_from_cav.isometry().inverse()),
+            score: 0.9,
+            source: None,
+        })
+    }
+
     /// A sender that drives at 10 m/s and is turned by 90 degrees, and its view of a standing car and of one at 15 m/s.
     fn view(tick: u32) -> View {
         let t = 0.1 * f64::from(tick);
         let world_from_cav = Pose::from_xyz_yaw([0.0, 10.0 * t, 0.0], 90_f64.to_radians());
-        let car = |world_m: [f64; 3]| {
-            PerceivedObject::from(Detection {
-                box3d: Box3d {
-                    center_m: world_m,
-                    size_m: [4.0, 1.8, 1.5],
-                    heading_rad: 0.0,
-                }
-                .transformed(&world_from_cav.isometry().inverse()),
-                score: 0.9,
-                source: None,
-            })
-        };
         View {
             cav: CavId::new("1").unwrap(),
             pose: PoseEstimate::new(world_from_cav, 1.0),
             capture_nanos: u64::from(tick) * 100_000_000,
             content: Content::Boxes(vec![
-                car([20.0, 5.0, 0.0]),
-                car([15.0 * t - 10.0, -4.0, 0.0]),
+                car([20.0, 5.0, 0.0], &world_from_cav),
+                car([15.0 * t - 10.0, -4.0, 0.0], &world_from_cav),
             ]),
         }
     }
@@ -210,11 +211,18 @@ mod tests {
         let Content::Boxes(objects) = &view.content else {
             panic!("{view:?}");
         };
-        let center = |object: &PerceivedObject| object.detection.box3d.center_m;
         objects
             .iter()
-            .map(|object| [center(object)[0], center(object)[1]])
+            .map(|object| {
+                let [x, y, _] = object.detection.box3d.center_m;
+                [x, y]
+            })
             .collect()
+    }
+
+    /// At ages of 0, 0.1 and 0.4 s.
+    fn probabilities_carried_right(object: &PerceivedObject) -> [f64; 3] {
+        [0.0, 0.1, 0.4].map(|age_s| probability_carried_right(object, age_s))
     }
 
     #[test]
@@ -279,10 +287,7 @@ mod tests {
         let Content::Boxes(mut objects) = view(0).content else {
             panic!("boxes");
         };
-        let right = |object: &PerceivedObject| {
-            [0.0, 0.1, 0.4].map(|age_s| probability_carried_right(object, age_s))
-        };
-        let unknown = right(&objects[0]);
+        let unknown = probabilities_carried_right(&objects[0]);
         assert!(unknown[0] == 1.0 && unknown[2] < 0.02, "{unknown:?}");
         objects[0].track = Some(ObjectTrack {
             id: 1,
@@ -290,7 +295,7 @@ mod tests {
             position_covariance: [0.1, 0.0, 0.1],
             velocity_covariance: [1.0, 0.0, 1.0],
         });
-        let [now, soon, late] = right(&objects[0]);
+        let [now, soon, late] = probabilities_carried_right(&objects[0]);
         assert!(now == 1.0 && soon > 0.999 && (0.7..0.9).contains(&late));
     }
 

@@ -48,6 +48,11 @@ fn detector_of(compress_ratio: Option<i64>, logit: f64, weight: f64) -> Detector
     Detector::from_network(pillars)
 }
 
+/// The same with most scores between 0.1 and 0.2.
+fn unsure_detector() -> Detector {
+    detector_of(None, -1.8, 1e-4)
+}
+
 /// Sets values from the shapes only: tests that run at the same time share torch's generator.
 fn fill(network: &VarStore, logit: f64, weight: f64) {
     for (name, mut variable) in network.variables() {
@@ -129,6 +134,34 @@ pub(crate) fn near() -> Pose {
     Pose::from_xyz_yaw([104.0, 51.0, 2.0], 0.3)
 }
 
+/// What an ego without neighbours detects.
+fn ego_only(detector: impl Fn() -> Detector, method: Method) -> Vec<Detection> {
+    let own = view_by(detector(), "a", HERE, method, 0.0);
+    let mut ego = Ego::new(detector(), method).unwrap();
+    ego.detect(&own, &[]).unwrap().detections
+}
+
+fn detection_at(x: f64, score: f32) -> Detection {
+    Detection {
+        box3d: protocol::Box3d {
+            center_m: [x, 0.0, -1.0],
+            size_m: [4.0, 1.8, 1.5],
+            heading_rad: 0.0,
+        },
+        score,
+        source: None,
+    }
+}
+
+fn view_of_boxes(name: &str, world_from_cav: Pose, found: Vec<Detection>) -> View {
+    View {
+        cav: CavId::new(name).unwrap(),
+        pose: PoseEstimate::new(world_from_cav, 1.0),
+        capture_nanos: NOW,
+        content: Content::Boxes(found.into_iter().map(Into::into).collect()),
+    }
+}
+
 #[test]
 fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
     for method in [
@@ -161,56 +194,31 @@ fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
 
 #[test]
 fn ego_only_points_give_the_result_of_the_map_with_a_compressor_too() {
-    let ego_only = |compress_ratio, method| {
-        let own = view_by(detector_with(compress_ratio), "a", HERE, method, 0.0);
-        Ego::new(detector_with(compress_ratio), method)
-            .unwrap()
-            .detect(&own, &[])
-            .unwrap()
-            .detections
-    };
-    let by_map = ego_only(Some(4), Method::NONE);
-    assert!(!by_map.is_empty() && by_map != ego_only(None, Method::NONE));
-    assert_eq!(ego_only(Some(4), Method::EARLY), by_map);
+    let [by_map, by_points] =
+        [Method::NONE, Method::EARLY].map(|method| ego_only(|| detector_with(Some(4)), method));
+    assert!(!by_map.is_empty() && by_map != ego_only(detector, Method::NONE));
+    assert_eq!(by_points, by_map);
 }
 
 #[test]
 fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
-    let found = |x: f64, score: f32| Detection {
-        box3d: protocol::Box3d {
-            center_m: [x, 0.0, -1.0],
-            size_m: [4.0, 1.8, 1.5],
-            heading_rad: 0.0,
-        },
-        score,
-        source: None,
-    };
-    let boxes = |name: &str, world_from_cav: Pose, found: Vec<Detection>| View {
-        cav: CavId::new(name).unwrap(),
-        pose: PoseEstimate::new(world_from_cav, 1.0),
-        capture_nanos: NOW,
-        content: Content::Boxes(found.into_iter().map(Into::into).collect()),
-    };
     // The other is 4 m ahead: its box at 1 m is the ego's at 5 m, only it has detected the one at -10 m.
-    let own = boxes("a", HERE, vec![found(5.2, 0.6)]);
+    let own = view_of_boxes("a", HERE, vec![detection_at(5.2, 0.6)]);
     let ahead = Pose {
         translation_m: [104.0, 50.0, 2.0],
         ..HERE
     };
-    let other = boxes(
-        "b",
-        ahead,
-        vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)],
-    );
+    let found = [(1.0, 0.9), (-10.0, 0.5), (-6.0, 0.05)].map(|(x, score)| detection_at(x, score));
+    let other = view_of_boxes("b", ahead, found.into());
     let seen = |is_aligned, other: &View| -> Vec<(f64, String)> {
         let ego = Ego::new(detector(), Method::LATE).unwrap();
         let mut ego = ego.with_box_alignment(is_aligned);
         let output = ego.detect(&own, std::slice::from_ref(other)).unwrap();
-        let place = |found: &Detection| {
+        let places = output.detections.iter().map(|found| {
             let source = found.source.as_ref().unwrap();
             (found.box3d.center_m[0].round(), source.as_str().to_owned())
-        };
-        output.detections.iter().map(place).collect()
+        });
+        places.collect()
     };
     let box_of = |x: f64, cav: &str| (x, cav.to_owned());
     for is_aligned in [false, true] {
@@ -297,8 +305,8 @@ fn average_precisions(detections: &[Detection], objects: &[protocol::Box3d]) -> 
 
 /// Writes a TorchScript module that returns the ego's map times `factor`.
 fn write_script(file: &Path, factor: f64) {
-    let like = |shape: &[i64]| Tensor::ones(shape, (Kind::Float, Device::Cpu));
-    let inputs = [&[1, 2, 3, 4][..], &[1, 1, 3, 4], &[1, 3], &[1], &[1]].map(like);
+    let shapes: [&[i64]; 5] = [&[1, 2, 3, 4], &[1, 1, 3, 4], &[1, 3], &[1], &[1]];
+    let inputs = shapes.map(|shape| Tensor::ones(shape, (Kind::Float, Device::Cpu)));
     let mut scaled = |inputs: &[Tensor]| {
         let [features, mask, poses, confidence, age_s] = inputs else {
             panic!("{} inputs", inputs.len())
@@ -341,17 +349,8 @@ fn fused_values_that_are_nan_or_absurd_are_errors_of_the_frame() {
 
 #[test]
 fn ego_only_every_method_is_scored_as_none_down_to_the_same_score() {
-    // Most scores lie between 0.1 and 0.2: with a threshold above, hardly any box would be scored.
-    let unsure = || detector_of(None, -1.8, 1e-4);
-    let ego_only = |method| {
-        let own = view_by(unsure(), "a", HERE, method, 0.0);
-        Ego::new(unsure(), method)
-            .unwrap()
-            .detect(&own, &[])
-            .unwrap()
-            .detections
-    };
-    let expected = ego_only(Method::NONE);
+    // With a threshold above most scores, hardly any box would be scored.
+    let expected = ego_only(unsure_detector, Method::NONE);
     let scores: Vec<f32> = expected.iter().map(|found| found.score).collect();
     assert!(
         scores.iter().any(|score| (0.1..0.2).contains(score)),
@@ -366,7 +365,7 @@ fn ego_only_every_method_is_scored_as_none_down_to_the_same_score() {
         .into_iter()
         .filter(|method| leaves_one_map_as_it_is(*method))
     {
-        let found = ego_only(method);
+        let found = ego_only(unsure_detector, method);
         assert_eq!(found.len(), expected.len(), "{method}");
         for (found, expected) in found.iter().zip(&expected) {
             assert_eq!(found.score, expected.score, "{method}");
@@ -435,14 +434,13 @@ fn unselected_cells_are_not_sent_and_the_rest_is_fused_unchanged() {
         threshold: distinct[distinct.len() * 3 / 4],
         smoothing: None,
     };
-    let encode = |gate| {
+    let [dense, sparse] = [None, Some(gate)].map(|gate| {
         let codec = CodecConfig {
             gate,
             ..CodecConfig::default()
         };
         encode_features(map.features.clone(), &codec, Some(&confidence)).unwrap()
-    };
-    let (dense, sparse) = (encode(None), encode(Some(gate)));
+    });
     let (dense_bytes, sparse_bytes) = (dense.body.len(), sparse.body.len());
     let received = sparse.decode(&Limits::DEFAULT).unwrap();
     let sent = received
@@ -506,11 +504,25 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
     );
 }
 
+/// The same view for a network without a compressor.
+fn decompressed(view: &View) -> View {
+    let Content::Features(map) = &view.content else {
+        panic!("max exchanges maps")
+    };
+    let map = detector_with(Some(4)).received(map).unwrap();
+    View {
+        content: Content::Features(DecodedFeatures {
+            features: detector().to_message(&map).unwrap(),
+            sent: None,
+        }),
+        ..view.clone()
+    }
+}
+
 #[test]
 fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
-    let compressed = |ratio| detector_with(Some(ratio));
-    let own = view_by(compressed(4), "a", HERE, Method::MAX, 0.0);
-    let other = view_by(compressed(4), "b", near(), Method::MAX, 0.1);
+    let own = view_by(detector_with(Some(4)), "a", HERE, Method::MAX, 0.0);
+    let other = view_by(detector_with(Some(4)), "b", near(), Method::MAX, 0.1);
     let Content::Features(map) = &other.content else {
         panic!("max exchanges maps")
     };
@@ -518,25 +530,10 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
         (map.features.channels, map.features.code_of),
         (16, Some(64))
     );
-    let mut ego = Ego::new(compressed(4), Method::MAX).unwrap();
+    let mut ego = Ego::new(detector_with(Some(4)), Method::MAX).unwrap();
     let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
     assert_eq!(together.fused, [0]);
     // The same network without a compressor is given the decompressed maps.
-    let decompressed = |view: &View| {
-        let Content::Features(map) = &view.content else {
-            panic!("max exchanges maps")
-        };
-        let features = detector()
-            .to_message(&compressed(4).received(map).unwrap())
-            .unwrap();
-        View {
-            content: Content::Features(DecodedFeatures {
-                features,
-                sent: None,
-            }),
-            ..view.clone()
-        }
-    };
     let mut plain = Ego::new(detector(), Method::MAX).unwrap();
     assert_eq!(
         plain
@@ -554,7 +551,7 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     let mismatched = [
         of_another,
         decompressed(&other),
-        view_by(compressed(8), "b", near(), Method::MAX, 0.1),
+        view_by(detector_with(Some(8)), "b", near(), Method::MAX, 0.1),
     ];
     let skipped = ego.detect(&own, &mismatched).unwrap().skipped;
     assert_eq!(
@@ -563,33 +560,33 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     );
 }
 
+/// The ego's view of a frame, `x_m` ahead of [`HERE`].
+fn moving_view(frame: u64, x_m: f64) -> View {
+    View {
+        capture_nanos: NOW + frame * 100_000_000,
+        pose: PoseEstimate::new(Pose::from_xyz_yaw([100.0 + x_m, 50.0, 2.0], 0.0), 0.9),
+        ..view("a", HERE, Method::PASTAT, 0.0)
+    }
+}
+
+/// Views whose senders are at the ego's pose.
+fn aligned_here<'a>(own: &'a View, other: &'a View) -> [Aligned<'a>; 2] {
+    [own, other].map(|view| Aligned {
+        view,
+        ego_from_cav: Pose::IDENTITY,
+    })
+}
+
 #[test]
 fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
     let mut ego = Ego::new(detector(), Method::PASTAT).unwrap();
     assert_eq!(ego.fusion.requirements().history.frames, 3);
-    let at = |frame: u64, x: f64| View {
-        capture_nanos: NOW + frame * 100_000_000,
-        pose: PoseEstimate::new(Pose::from_xyz_yaw([100.0 + x, 50.0, 2.0], 0.0), 0.9),
-        ..view("a", HERE, Method::PASTAT, 0.0)
-    };
     let other = view("b", near(), Method::PASTAT, 0.15);
-    let (first, second) = (at(0, 0.0), at(1, 2.0));
+    let (first, second) = (moving_view(0, 0.0), moving_view(1, 2.0));
     ego.detect(&first, std::slice::from_ref(&other)).unwrap();
     // The neighbour has no newer message: its message serves again, and is not its own history.
-    let aligned = |own, other| {
-        vec![
-            Aligned {
-                view: own,
-                ego_from_cav: Pose::IDENTITY,
-            },
-            Aligned {
-                view: other,
-                ego_from_cav: Pose::IDENTITY,
-            },
-        ]
-    };
     let earlier = ego
-        .earlier(&aligned(&second, &other))
+        .earlier(&aligned_here(&second, &other))
         .into_iter()
         .map(|(_, metadata)| (metadata.agent, metadata.ego_from_cav));
     let earlier: Vec<_> = earlier.collect();
@@ -605,9 +602,9 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
         capture_nanos: NOW + 150_000_000,
         ..view("b", near(), Method::PASTAT, 0.15)
     };
-    let third = at(2, 4.0);
+    let third = moving_view(2, 4.0);
     let agents: Vec<usize> = ego
-        .earlier(&aligned(&third, &later))
+        .earlier(&aligned_here(&third, &later))
         .into_iter()
         .map(|(_, metadata)| metadata.agent)
         .collect();
@@ -619,30 +616,32 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
         },
         ..third.clone()
     };
-    assert!(ego.earlier(&aligned(&lost, &later)).is_empty());
+    assert!(ego.earlier(&aligned_here(&lost, &later)).is_empty());
     ego.forget();
-    assert!(ego.earlier(&aligned(&third, &later)).is_empty());
+    assert!(ego.earlier(&aligned_here(&third, &later)).is_empty());
+}
+
+/// The ego of a model that is written to a file.
+fn ego_of_file(file: &Path, model: &CooperativeModel) -> Ego {
+    save(file, &model.variables, &model.about(), Precision::Single).unwrap();
+    Ego::load(file, None, Device::Cpu).unwrap()
 }
 
 /// Egos of `method` from files of the same weights, without and with a box input.
 pub(crate) fn egos_of_files(method: Method) -> [Ego; 2] {
     let config = detector().config().clone();
-    let new = || CooperativeModel::new(&config, method, Device::Cpu).unwrap();
-    let (without, mut with) = (new(), new());
+    let [without, mut with] =
+        [(); 2].map(|()| CooperativeModel::new(&config, method, Device::Cpu).unwrap());
     with.train_box_input_only().unwrap();
     fill(&with.variables, 0.3, 1e-4);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("weights.safetensors");
-    let ego = |model: &CooperativeModel| {
-        save(&path, &model.variables, &model.about(), Precision::Single).unwrap();
-        Ego::load(&path, None, Device::Cpu).unwrap()
-    };
-    let with = ego(&with);
+    let with = ego_of_file(&path, &with);
     let weights = Weights::load(&path).unwrap();
     weights
         .copy_some_into(&without.variables, |_| true)
         .unwrap();
-    [ego(&without), with]
+    [ego_of_file(&path, &without), with]
 }
 
 #[test]
@@ -716,6 +715,20 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
     }
 }
 
+/// Vehicles on a raster, the less likely the higher the number.
+fn numbered_car(number: u16) -> PerceivedObject {
+    let [x, y] = [number % 16, number / 16 % 16].map(f64::from);
+    PerceivedObject::from(Detection {
+        box3d: protocol::Box3d {
+            center_m: [x - 8.0, y - 8.0, -1.0],
+            size_m: [4.0, 1.8, 1.6],
+            heading_rad: 0.4,
+        },
+        score: 1.0 - f32::from(number) / 2000.0,
+        source: None,
+    })
+}
+
 #[test]
 fn of_a_flood_as_many_boxes_are_read_as_the_ego_detects_and_a_few_more() {
     let [_, mut ego] = egos_of_files(Method::MAX);
@@ -724,22 +737,10 @@ fn of_a_flood_as_many_boxes_are_read_as_the_ego_detects_and_a_few_more() {
         panic!("{own:?}")
     };
     let seen = boxes_in(&ego.tensors(map, true).unwrap().0, &ego.detector).unwrap();
-    let car = |number: u16| {
-        let [x, y] = [number % 16, number / 16 % 16].map(f64::from);
-        PerceivedObject::from(Detection {
-            box3d: protocol::Box3d {
-                center_m: [x - 8.0, y - 8.0, -1.0],
-                size_m: [4.0, 1.8, 1.6],
-                heading_rad: 0.4,
-            },
-            score: 1.0 - f32::from(number) / 2000.0,
-            source: None,
-        })
-    };
     let mut detect = |count: u16| {
         let sender = View {
             cav: CavId::new("b").unwrap(),
-            content: Content::Boxes((0..count).map(car).collect()),
+            content: Content::Boxes((0..count).map(numbered_car).collect()),
             ..own.clone()
         };
         ego.forget();
@@ -774,8 +775,8 @@ fn boxes_are_placed_where_the_ego_detects_them_too() {
         ..own.clone()
     };
     let stated = Pose::from_xyz_yaw([4.8, 0.4, 0.0], 0.0);
-    let place = |view, ego_from_cav| Aligned { view, ego_from_cav };
-    let mut aligned = [place(&own, Pose::IDENTITY), place(&sender, stated)];
+    let mut aligned = [(&own, Pose::IDENTITY), (&sender, stated)]
+        .map(|(view, ego_from_cav)| Aligned { view, ego_from_cav });
     let mut stages = StageTimes::start();
     ego.correct_poses_of_boxes(&mut aligned, &mut stages)
         .unwrap();

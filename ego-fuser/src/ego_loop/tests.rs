@@ -74,13 +74,14 @@ impl Case {
 
     /// Streams of `b` whose messages were used, and those not used with the reason.
     fn accounts(outputs: &[Output]) -> (Vec<Stream>, Vec<(Stream, DropReason)>) {
-        let is_b = |cav: &CavId| cav.to_string() == "b";
         let used = outputs.iter().filter_map(|output| match output {
-            Output::Received((cav, stream)) if is_b(cav) => Some(*stream),
+            Output::Received((cav, stream)) if cav.as_str() == "b" => Some(*stream),
             _ => None,
         });
         let dropped = outputs.iter().filter_map(|output| match output {
-            Output::Dropped((cav, stream), reason) if is_b(cav) => Some((*stream, *reason)),
+            Output::Dropped((cav, stream), reason) if cav.as_str() == "b" => {
+                Some((*stream, *reason))
+            }
             _ => None,
         });
         (used.collect(), dropped.collect())

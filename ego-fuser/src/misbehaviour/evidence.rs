@@ -264,9 +264,11 @@ mod tests {
         let Content::Boxes(objects) = content else {
             panic!("boxes")
         };
-        let found = objects.iter().map(|object| &object.detection);
-        let at = |found: &Detection| [found.box3d.center_m[0], found.box3d.center_m[1]];
-        SeenMessage::of_boxes(found.map(|found| (at(found), found.score)).collect())
+        let found = objects.iter().map(|object| {
+            let [x, y, _] = object.detection.box3d.center_m;
+            ([x, y], object.detection.score)
+        });
+        SeenMessage::of_boxes(found.collect())
     }
 
     const WORLD: [[f64; 2]; 6] = [
@@ -277,6 +279,17 @@ mod tests {
         [25.0, -9.0],
         [14.0, 12.0],
     ];
+
+    /// Evidence about a neighbour that invents a vehicle.
+    fn with_invented(vehicle: [f64; 2]) -> Evidence {
+        let mut echo = WORLD.to_vec();
+        echo.push(vehicle);
+        let (own, theirs) = (
+            seen(&boxes(&WORLD, WORLD[0])),
+            seen(&boxes(&echo, WORLD[1])),
+        );
+        Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0)
+    }
 
     #[test]
     fn an_honest_neighbour_is_accepted_and_a_wrong_position_is_not() {
@@ -337,24 +350,17 @@ mod tests {
 
     #[test]
     fn a_single_invented_vehicle_in_full_view_counts_and_a_hidden_one_does_not() {
-        let own = seen(&boxes(&WORLD, WORLD[0]));
-        let with = |invented: [f64; 2]| {
-            let mut echo = WORLD.to_vec();
-            echo.push(invented);
-            let theirs = seen(&boxes(&echo, WORLD[1]));
-            Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0)
-        };
-        let phantom = with([12.0, -1.0]);
+        let phantom = with_invented([12.0, -1.0]);
         assert_eq!((phantom.contradicted, phantom.in_full_view), (1, 1));
         assert_eq!(
             phantom.judgement(),
             Some((FULL_VIEW, MisbehaviourReason::GhostObjects))
         );
         // Behind the vehicle at (10, -6).
-        let hidden = with([15.0, -9.0]);
+        let hidden = with_invented([15.0, -9.0]);
         assert_eq!((hidden.contradicted, hidden.in_full_view), (1, 0));
         assert!(hidden.log_odds() > phantom.log_odds());
-        let far = with([24.0, 5.5]);
+        let far = with_invented([24.0, 5.5]);
         assert_eq!(far.in_full_view, 0);
     }
 

@@ -54,18 +54,21 @@ impl ValueRange {
 mod tests {
     use super::*;
 
+    /// Two channels of 100 cells, with values up to these.
+    fn map(largest: [f32; 2]) -> Vec<f32> {
+        largest
+            .into_iter()
+            .flat_map(|largest| (0..100).map(move |cell| largest * cell as f32 / 99.0))
+            .collect()
+    }
+
     #[test]
     fn maps_of_the_network_stay_within_and_constant_ones_do_not() {
-        // Two channels of 100 cells, with values up to 1 and up to 10.
-        let map = |first: f32, second: f32| {
-            let channel = |largest: f32| (0..100).map(move |cell| largest * cell as f32 / 99.0);
-            channel(first).chain(channel(second)).collect::<Vec<_>>()
-        };
-        let mut range = ValueRange::of(&map(0.5, 2.0), 2);
-        range.widen(&map(1.0, 10.0));
-        range.widen(&map(0.1, 0.1));
-        assert!(!range.is_left_by(&map(1.4, 14.0)), "an honest neighbour");
-        let mut objects = map(1.0, 10.0);
+        let mut range = ValueRange::of(&map([0.5, 2.0]), 2);
+        range.widen(&map([1.0, 10.0]));
+        range.widen(&map([0.1, 0.1]));
+        assert!(!range.is_left_by(&map([1.4, 14.0])), "an honest neighbour");
+        let mut objects = map([1.0, 10.0]);
         objects[..5].fill(8.0);
         assert!(
             !range.is_left_by(&objects),
@@ -76,7 +79,7 @@ mod tests {
         for constant in [50.0, 9.0, 2.0, -50.0] {
             assert!(range.is_left_by(&[constant; 200]), "{constant}");
         }
-        objects = map(1.0, 10.0);
+        objects = map([1.0, 10.0]);
         objects[150] = 41.0;
         assert!(range.is_left_by(&objects), "a single value of no map");
         assert!(

@@ -243,6 +243,11 @@ mod tests {
         (loss.score.double_value(&[]), loss.boxes.double_value(&[]))
     }
 
+    fn alignment_term(corrections: &[Option<Tensor>], offsets: &[Vec<PoseOffset>]) -> f64 {
+        let loss = alignment_loss(corrections, offsets).unwrap();
+        loss.double_value(&[])
+    }
+
     fn maps() -> (Tensor, Tensor) {
         let options = (Kind::Float, Device::Cpu);
         (
@@ -282,16 +287,12 @@ mod tests {
             PoseOffset([0.0, 2.0, 0.0]),
         ]];
         let undone = Tensor::from_slice(&[1.0f32, -0.5, 0.02, 0.0, 2.0, 0.0]).view([2, 3]);
-        let loss = |corrections: &[Option<Tensor>], offsets: &[Vec<PoseOffset>]| {
-            alignment_loss(corrections, offsets)
-                .unwrap()
-                .double_value(&[])
-        };
-        assert!(loss(&[Some(undone.shallow_clone())], &offsets) < 1e-12);
+        assert!(alignment_term(&[Some(undone)], &offsets) < 1e-12);
         // No correction: |1|, |-0.5|, 20 m * |0.02|, |2| by smooth L1, over six numbers.
         let still = Tensor::zeros([2, 3], (Kind::Float, Device::Cpu)).set_requires_grad(true);
         let expected = (0.5 + 0.125 + 0.08 + 1.5) / 6.0;
-        assert!((loss(&[Some(still.shallow_clone())], &offsets) - expected).abs() < 1e-6);
+        let found = alignment_term(&[Some(still.shallow_clone())], &offsets);
+        assert!((found - expected).abs() < 1e-6);
         alignment_loss(
             &[Some(still.shallow_clone()), None],
             &[offsets[0].clone(), vec![]],
@@ -308,12 +309,12 @@ mod tests {
             PoseOffset([0.0, 0.0, 1.0]),
         ]];
         assert_eq!(
-            loss(&[Some(still.detach())], &lost),
+            alignment_term(&[Some(still.detach())], &lost),
             0.0,
             "a lost vehicle has no alignment loss"
         );
         assert_eq!(
-            loss(&[None], &[vec![PoseOffset::default()]]),
+            alignment_term(&[None], &[vec![PoseOffset::default()]]),
             0.0,
             "ego-only there is nothing to align"
         );

@@ -76,17 +76,19 @@ mod tests {
     fn the_fastest_message_gives_the_offset_and_a_clock_step_is_detected() {
         let begun = Instant::now();
         let mut clock = ClockOffset::new(begun);
-        let mut receive = |at_s: u64, ahead_ms: i64, under_way_ms: i64| {
+        for (at_s, ahead_ms, under_way_ms, expected) in [
+            (0_u64, 0_i64, 30_i64, (None, -30)),
+            (1, 0, 2, (None, -2)),
+            (2, 500, 5, (Some(true), 495)),
+            (3, 500, 5, (None, 495)),
+            (14, 0, 5, (None, 495)),
+            (30, 0, 5, (Some(false), -5)),
+        ] {
             let now = 1_000_000_000_000_i64 + at_s as i64 * 1_000_000_000;
             let sent = now + (ahead_ms - under_way_ms) * 1_000_000;
             let change = clock.note(sent as u64, now as u64, begun + Duration::from_secs(at_s));
-            (change, (clock.seconds() * 1e3).round() as i64)
-        };
-        assert_eq!(receive(0, 0, 30), (None, -30));
-        assert_eq!(receive(1, 0, 2), (None, -2));
-        assert_eq!(receive(2, 500, 5), (Some(true), 495));
-        assert_eq!(receive(3, 500, 5), (None, 495));
-        assert_eq!(receive(14, 0, 5), (None, 495));
-        assert_eq!(receive(30, 0, 5), (Some(false), -5));
+            let offset_ms = (clock.seconds() * 1e3).round() as i64;
+            assert_eq!((change, offset_ms), expected, "at {at_s} s");
+        }
     }
 }

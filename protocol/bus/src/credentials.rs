@@ -135,20 +135,21 @@ fn name_of(path: &Path, now: SystemTime) -> Result<String, BusError> {
 mod tests {
     use super::*;
 
+    fn expect_error(folder: &Path, file: &str) {
+        let error = Credentials::read(folder).unwrap_err().to_string();
+        assert!(error.contains(file), "{error}");
+    }
+
     #[test]
     fn errors_state_the_missing_or_invalid_file() {
         let folder = tempfile::tempdir().unwrap();
-        let expect_error = |text: &str| {
-            let error = Credentials::read(folder.path()).unwrap_err().to_string();
-            assert!(error.contains(text), "{error}");
-        };
-        expect_error("ca.pem");
+        expect_error(folder.path(), "ca.pem");
         fs::write(folder.path().join("ca.pem"), "").unwrap();
-        expect_error("key.pem");
+        expect_error(folder.path(), "key.pem");
         fs::write(folder.path().join("key.pem"), "").unwrap();
-        expect_error("cert.pem");
+        expect_error(folder.path(), "cert.pem");
         fs::write(folder.path().join("cert.pem"), "no certificate").unwrap();
-        expect_error("cert.pem");
+        expect_error(folder.path(), "cert.pem");
     }
 
     #[test]

@@ -535,15 +535,16 @@ mod tests {
     #[test]
     fn forged_ids_do_not_fill_the_ledger() {
         let stats = stats_of("ego-1");
-        let topic = |id: usize| format!("{id}/bev").parse::<Topic>().unwrap();
         for id in 0..3 * MAX_ACCOUNTS {
-            stats.subscribed(&topic(id));
-            stats.arrived(&topic(id));
-            stats.reject(&topic(id), DropReason::RateLimit, "too much");
+            let topic: Topic = format!("{id}/bev").parse().unwrap();
+            stats.subscribed(&topic);
+            stats.arrived(&topic);
+            stats.reject(&topic, DropReason::RateLimit, "too much");
         }
         assert_eq!(stats.ledger().len(), MAX_ACCOUNTS);
-        stats.received(&topic(0));
-        let account = Account::towards(topic(0), stats.process());
+        let first: Topic = "0/bev".parse().unwrap();
+        stats.received(&first);
+        let account = Account::towards(first, stats.process());
         assert_eq!(
             stats.ledger().get(&account).unwrap().received,
             1,

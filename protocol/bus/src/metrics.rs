@@ -301,22 +301,14 @@ mod tests {
             assert!(value.is_some_and(|value| value > 0.0), "{name} in\n{text}");
         }
         assert_eq!(text.matches("# EOF").count(), 1);
-        let bucket = |le: &str| {
+        let counts = ["0.0025", "0.005", "0.05", "+Inf"].map(|le| {
             let line = text.lines().find(|line| {
                 line.contains("stage_seconds_bucket") && line.contains(&format!("le=\"{le}\""))
             });
             line.and_then(|line| line.rsplit(' ').next())
                 .and_then(|count| count.parse::<u64>().ok())
-        };
-        assert_eq!(
-            [
-                bucket("0.0025"),
-                bucket("0.005"),
-                bucket("0.05"),
-                bucket("+Inf")
-            ],
-            [Some(1), Some(3), Some(4), Some(5)]
-        );
+        });
+        assert_eq!(counts, [Some(1), Some(3), Some(4), Some(5)]);
     }
 
     #[test]

@@ -176,6 +176,13 @@ mod tests {
         config: Configured<Config>,
     }
 
+    fn config(name: &str, seconds: f64, goes_on: bool) -> Config {
+        Config {
+            name: name.into(),
+            section: Section { seconds, goes_on },
+        }
+    }
+
     fn parsed(arguments: &[&str]) -> Result<Config, String> {
         let cli = Cli::try_parse_from([&["program"], arguments].concat())
             .map_err(|error| error.to_string())?;
@@ -188,10 +195,6 @@ mod tests {
         let path = folder.path().join("c.yaml");
         std::fs::write(&path, "name: a\nsection: {seconds: 4, goes_on: true}\n").unwrap();
         let file = path.to_str().unwrap();
-        let config = |name: &str, seconds, goes_on| Config {
-            name: name.into(),
-            section: Section { seconds, goes_on },
-        };
         assert_eq!(parsed(&["--name", "b"]).unwrap(), config("b", 2.5, false));
         assert_eq!(parsed(&["--config", file]).unwrap(), config("a", 4.0, true));
         assert_eq!(

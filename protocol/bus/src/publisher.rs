@@ -433,10 +433,11 @@ mod tests {
     fn subscribers_from_before_are_known_at_once() {
         let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
         let publisher = session.declare_publisher("v2v/test/truth").wait().unwrap();
-        let is_known = || has_subscribers(&publisher).unwrap().load(Ordering::Relaxed);
-        assert!(!is_known());
+        let is_known = has_subscribers(&publisher).unwrap();
+        assert!(!is_known.load(Ordering::Relaxed));
         let _subscriber = session.declare_subscriber("v2v/test/truth").wait().unwrap();
-        assert!(is_known());
+        let is_known = has_subscribers(&publisher).unwrap();
+        assert!(is_known.load(Ordering::Relaxed));
     }
 
     #[test]

@@ -143,17 +143,18 @@ fn label(labels: &str, wanted: &str) -> Option<String> {
 mod tests {
     use super::*;
 
+    fn metric_line(name: &str, reason: &str, cn: &str) -> String {
+        format!(
+            "{name}{{local_id=\"5b\",priority=\"data\",message=\"put\",protocol=\"\",reason=\"{reason}\",\
+             remote_zid=\"fb\",remote_whatami=\"client\",remote_group=\"\",remote_cn=\"{cn}\",\
+             disconnected=\"false\"}} 28"
+        )
+    }
+
     #[test]
     fn lines_of_zenoh_are_read() {
-        let line = |name: &str, reason: &str, cn: &str| {
-            format!(
-                "{name}{{local_id=\"5b\",priority=\"data\",message=\"put\",protocol=\"\",reason=\"{reason}\",\
-                 remote_zid=\"fb\",remote_whatami=\"client\",remote_group=\"\",remote_cn=\"{cn}\",\
-                 disconnected=\"false\"}} 28"
-            )
-        };
         let ((rejection, connection), count) =
-            rejected(&line(DROPPED, "access-control", "agent-1")).unwrap();
+            rejected(&metric_line(DROPPED, "access-control", "agent-1")).unwrap();
         assert_eq!(
             (
                 rejection.peer.as_str(),
@@ -163,16 +164,12 @@ mod tests {
             ("agent-1", "put", "fb data")
         );
         assert_eq!(count, 28);
-        assert_eq!(
-            rejected(&line(DROPPED, "low-pass", "")).unwrap().0.0.peer,
-            "fb",
-            "without a certificate"
-        );
-        assert_eq!(rejected(&line(DROPPED, "congestion", "agent-1")), None);
-        assert_eq!(
-            rejected(&line("zenoh_rx_bytes_total", "access-control", "agent-1")),
-            None
-        );
+        let ((rejection, _), _) = rejected(&metric_line(DROPPED, "low-pass", "")).unwrap();
+        assert_eq!(rejection.peer, "fb", "without a certificate");
+        let congestion = metric_line(DROPPED, "congestion", "agent-1");
+        assert_eq!(rejected(&congestion), None);
+        let another_metric = metric_line("zenoh_rx_bytes_total", "access-control", "agent-1");
+        assert_eq!(rejected(&another_metric), None);
         assert_eq!(rejected("# EOF"), None);
     }
 }

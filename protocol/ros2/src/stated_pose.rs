@@ -114,18 +114,10 @@ mod tests {
 
     #[test]
     fn a_pose_in_another_frame_or_without_a_variance_is_named() {
-        let error = |frame: &str, variances| {
-            let error = StatedPose::read(&message(frame, variances)).unwrap_err();
-            error.to_string()
-        };
-        assert_eq!(
-            error("odom", [0.25; 3]),
-            "header.frame_id is \"odom\", not \"map\""
-        );
-        assert_eq!(
-            error("map", [0.25, f64::NAN, 0.1]),
-            "covariance[7] is NaN, not a variance"
-        );
+        let odom = StatedPose::read(&message("odom", [0.25; 3])).unwrap_err();
+        assert_eq!(odom.to_string(), "header.frame_id is \"odom\", not \"map\"");
+        let nan = StatedPose::read(&message("map", [0.25, f64::NAN, 0.1])).unwrap_err();
+        assert_eq!(nan.to_string(), "covariance[7] is NaN, not a variance");
         let cut = StatedPose::read(&message("map", [0.25; 3])[..60]).unwrap_err();
         assert!(cut.to_string().starts_with("pose at byte"), "{cut}");
     }

@@ -121,22 +121,25 @@ mod tests {
         }
     }
 
+    fn read_as(name: &str, bytes: &[u8]) -> Result<Vec<Transform>, ReadError> {
+        PoseType::of_name(name).unwrap().read(bytes)
+    }
+
     #[test]
     fn poses_are_read_with_their_frames() {
         let odometry = message(Some("base_link"));
-        let read = |name: &str, bytes: &[u8]| PoseType::of_name(name).unwrap().read(bytes);
         assert_eq!(
-            read("nav_msgs/msg/Odometry", &odometry).unwrap(),
+            read_as("nav_msgs/msg/Odometry", &odometry).unwrap(),
             [expected(Some("base_link"))]
         );
         for name in [
             "geometry_msgs/msg/PoseStamped",
             "geometry_msgs/msg/PoseWithCovarianceStamped",
         ] {
-            assert_eq!(read(name, &message(None)).unwrap(), [expected(None)]);
+            assert_eq!(read_as(name, &message(None)).unwrap(), [expected(None)]);
         }
         assert_eq!(
-            read("nav_msgs/msg/Odometry", &message(Some(""))).unwrap(),
+            read_as("nav_msgs/msg/Odometry", &message(Some(""))).unwrap(),
             [expected(None)]
         );
         assert_eq!(read_header(&odometry), Ok((5_000_000_006, "odom".into())));

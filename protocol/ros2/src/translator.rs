@@ -270,6 +270,30 @@ mod tests {
         Translator::new(&RunId::new("test").unwrap())
     }
 
+    fn topic_names(messages: &[RosMessage]) -> Vec<String> {
+        messages
+            .iter()
+            .map(|message| message.topic.name(None).to_string())
+            .collect()
+    }
+
+    /// Speed in the odometry that a pose at this time gives.
+    fn speed_in_odometry(translator: &mut Translator, pose: &Message, nanos: u64) -> f64 {
+        let messages = translator.translate(&topic(Stream::Pose), nanos, pose);
+        assert_eq!(
+            topic_names(&messages),
+            ["/tf", "/cav_1/pose", "/cav_1/odometry"]
+        );
+        let cdr = &messages[2].cdr;
+        f64::from_le_bytes(*cdr[cdr.len() - 8 * (6 + 36)..].first_chunk().unwrap())
+    }
+
+    /// Names of the topics that an image of the camera is published on.
+    fn topics_of_image(camera: &Camera) -> Vec<String> {
+        let image = Message::Camera(camera.clone());
+        topic_names(&translator().translate(&topic(Stream::Camera(2)), 5, &image))
+    }
+
     #[test]
     fn a_pose_is_a_transform_a_pose_and_an_odometry_with_the_motion_of_its_time() {
         let mut translator = translator();
@@ -279,20 +303,10 @@ mod tests {
         });
         assert_eq!(translator.translate(&topic(Stream::Imu), 100, &motion), []);
         let pose = Message::Pose(PoseEstimate::new(Pose::IDENTITY, 0.9));
-        let speed = |translator: &mut Translator, at| {
-            let messages = translator.translate(&topic(Stream::Pose), at, &pose);
-            let names: Vec<_> = messages
-                .iter()
-                .map(|message| message.topic.name(None).to_string())
-                .collect();
-            assert_eq!(names, ["/tf", "/cav_1/pose", "/cav_1/odometry"]);
-            let cdr = &messages[2].cdr;
-            f64::from_le_bytes(*cdr[cdr.len() - 8 * (6 + 36)..].first_chunk().unwrap())
-        };
-        assert_eq!(
-            [speed(&mut translator, 100), speed(&mut translator, 200)],
-            [7.0, 0.0]
-        );
+        for (nanos, speed_mps) in [(100, 7.0), (200, 0.0)] {
+            let found = speed_in_odometry(&mut translator, &pose, nanos);
+            assert_eq!(found, speed_mps, "{nanos} ns");
+        }
         let none = Message::Pose(PoseEstimate::NoPose {
             reason: NoPoseReason::TooFewInliers,
             inlier_count: 3,
@@ -308,11 +322,7 @@ mod tests {
         let pose = Message::Pose(PoseEstimate::new(Pose::IDENTITY, 0.9));
         let mut translator = translator().with_frames(names, placed);
         let messages = translator.translate(&topic(Stream::Pose), 1, &pose);
-        let topics: Vec<_> = messages
-            .iter()
-            .map(|message| message.topic.name(None).to_string())
-            .collect();
-        assert_eq!(topics, ["/cav_1/pose", "/cav_1/odometry"]);
+        assert_eq!(topic_names(&messages), ["/cav_1/pose", "/cav_1/odometry"]);
         let frame = b"fleet/cav_1/lidar\0";
         assert!(
             messages[1]
@@ -334,22 +344,19 @@ mod tests {
             traffic: Vec::new(),
             problems: Vec::new(),
         };
-        let mut is_warning = |stats: &Stats| translator.status(stats).is_warning;
-        assert!(!is_warning(&stats));
+        assert!(!translator.status(&stats).is_warning);
         stats.ledger.dropped(
             &Account::towards(topic(Stream::Lidar), &process),
             DropReason::Superseded,
         );
-        assert_eq!([is_warning(&stats), is_warning(&stats)], [true, false]);
+        let warnings = [(); 2].map(|()| translator.status(&stats).is_warning);
+        assert_eq!(warnings, [true, false]);
         let message = Message::Stats(stats);
         let messages = translator.translate(&Topic::Stats(process), 0, &message);
-        let has = |text: &[u8]| {
-            messages[0]
-                .cdr
-                .windows(text.len())
-                .any(|bytes| bytes == text)
-        };
-        assert!(has(b"v2vloc: agent-1\0") && has(b"dropped: superseded\0") && has(b"test\0"));
+        for text in ["v2vloc: agent-1\0", "dropped: superseded\0", "test\0"] {
+            let mut windows = messages[0].cdr.windows(text.len());
+            assert!(windows.any(|bytes| bytes == text.as_bytes()), "{text}");
+        }
     }
 
     #[test]
@@ -370,19 +377,8 @@ mod tests {
             metadata,
             image: vec![1, 2, 3],
         };
-        let names = |camera: &Camera| {
-            let messages = translator().translate(
-                &topic(Stream::Camera(2)),
-                5,
-                &Message::Camera(camera.clone()),
-            );
-            messages
-                .iter()
-                .map(|message| message.topic.name(None).to_string())
-                .collect::<Vec<_>>()
-        };
         assert_eq!(
-            names(&camera),
+            topics_of_image(&camera),
             [
                 "/tf",
                 "/cav_1/camera_2/camera_info",
@@ -390,7 +386,10 @@ mod tests {
             ]
         );
         (camera.metadata.pinhole, camera.metadata.lidar_from_camera) = (None, None);
-        assert_eq!(names(&camera), ["/cav_1/camera_2/image/compressed"]);
+        assert_eq!(
+            topics_of_image(&camera),
+            ["/cav_1/camera_2/image/compressed"]
+        );
         assert!(Translator::wants(&topic(Stream::Camera(0))));
     }
 

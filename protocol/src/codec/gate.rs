@@ -268,17 +268,17 @@ mod tests {
 
     #[test]
     fn a_gate_is_read_from_a_threshold_and_a_window() {
-        let read = |text: &str| text.parse::<ConfidenceGate>();
-        assert_eq!(read("0.01").unwrap(), ConfidenceGate::default());
+        assert_eq!("0.01".parse(), Ok(ConfidenceGate::default()));
         assert_eq!(
-            read("0.1,none").unwrap(),
-            ConfidenceGate {
+            "0.1,none".parse(),
+            Ok(ConfidenceGate {
                 threshold: 0.1,
                 smoothing: None
-            }
+            })
         );
+        let everywhere: ConfidenceGate = "-1,3,0.5".parse().unwrap();
         assert_eq!(
-            read("-1,3,0.5").unwrap().smoothing,
+            everywhere.smoothing,
             Some(Smoothing {
                 kernel: 3,
                 sigma: 0.5
@@ -289,7 +289,7 @@ mod tests {
             ("0.1,3", "\"3\""),
             ("0.1,x,1", "window \"x\""),
         ] {
-            let message = read(text).unwrap_err();
+            let message = text.parse::<ConfidenceGate>().unwrap_err();
             assert!(message.contains(part), "{text}: {message}");
         }
     }

@@ -247,32 +247,28 @@ mod tests {
 
     #[test]
     fn formats_get_coarser_before_cells_are_left_out() {
-        // 192 cells of 8 channels: 6,144 bytes, 3,072, and 1,536 with 32 of scales.
-        let choice = |bytes| {
-            let encoded = encode(&CodecConfig::default(), HEAD_BYTES + bytes).unwrap();
-            (
-                encoded.codec.dtype,
-                encoded.codec.selection,
-                encoded.rate.unwrap().reason,
-            )
-        };
-        assert_eq!(
-            choice(6144),
-            (Dtype::F32, Selection::Dense, RateReason::Fits)
-        );
-        assert_eq!(
-            choice(6143),
-            (Dtype::F16, Selection::Dense, RateReason::SizeCoarser)
-        );
-        assert_eq!(
-            choice(3071),
-            (Dtype::I8, Selection::Dense, RateReason::SizeCoarser)
-        );
         // 24 bytes of mask and 8 per cell.
         let fewer = Selection::TopK {
             cells: (1567 - 32 - 24) / 8,
         };
-        assert_eq!(choice(1567), (Dtype::I8, fewer, RateReason::SizeFewerCells));
+        // 192 cells of 8 channels: 6,144 bytes, 3,072, and 1,536 with 32 of scales.
+        for (bytes, dtype, selection, reason) in [
+            (6144, Dtype::F32, Selection::Dense, RateReason::Fits),
+            (6143, Dtype::F16, Selection::Dense, RateReason::SizeCoarser),
+            (3071, Dtype::I8, Selection::Dense, RateReason::SizeCoarser),
+            (1567, Dtype::I8, fewer, RateReason::SizeFewerCells),
+        ] {
+            let encoded = encode(&CodecConfig::default(), HEAD_BYTES + bytes).unwrap();
+            assert_eq!(
+                (
+                    encoded.codec.dtype,
+                    encoded.codec.selection,
+                    encoded.rate.unwrap().reason
+                ),
+                (dtype, selection, reason),
+                "{bytes} bytes"
+            );
+        }
     }
 
     #[test]

@@ -143,11 +143,15 @@ mod tests {
     #[test]
     fn the_most_confident_win_and_ties_go_to_the_first() {
         let confidence = [0.1, 0.9, 0.5, 0.5, 0.5, 0.0, -0.0];
-        let of_all = |count| most_confident(&confidence, (0..7).collect(), count);
-        assert!(of_all(0).is_empty());
-        assert_eq!(of_all(1), [1]);
-        assert_eq!(of_all(3), [1, 2, 3]);
-        assert_eq!(of_all(7), [0, 1, 2, 3, 4, 5, 6]);
+        for (count, expected) in [
+            (0, &[][..]),
+            (1, &[1]),
+            (3, &[1, 2, 3]),
+            (7, &[0, 1, 2, 3, 4, 5, 6]),
+        ] {
+            let cells = most_confident(&confidence, (0..7).collect(), count);
+            assert_eq!(cells, expected);
+        }
         assert_eq!(most_confident(&confidence, vec![0, 3, 4], 2), [3, 4]);
     }
 

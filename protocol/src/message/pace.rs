@@ -80,10 +80,16 @@ mod tests {
 
     /// Numbers of the computed sweeps of a vehicle whose captures are `late_nanos` late.
     fn computed(pace: &Pace, late_nanos: impl Fn(u64) -> i64) -> Vec<u64> {
-        let capture = |sweep: u64| (sweep * PERIOD_NANOS).saturating_add_signed(late_nanos(sweep));
-        let interval = |sweep| pace.interval_of(capture(sweep));
-        (1..1001)
-            .filter(|&sweep| interval(sweep) != interval(sweep - 1))
+        let intervals: Vec<Option<i128>> = (0..1001)
+            .map(|sweep: u64| {
+                let capture_nanos = (sweep * PERIOD_NANOS).saturating_add_signed(late_nanos(sweep));
+                pace.interval_of(capture_nanos)
+            })
+            .collect();
+        (1..)
+            .zip(intervals.windows(2))
+            .filter(|(_, pair)| pair[0] != pair[1])
+            .map(|(sweep, _)| sweep)
             .collect()
     }
 
@@ -104,8 +110,10 @@ mod tests {
                     gaps.iter().all(|gap| (floor..=floor + 1).contains(gap)),
                     "{pace:?} {gaps:?}"
                 );
-                let jitter = |sweep: u64| (sweep as i64 * 7_919_333) % 49_000_000 - 24_000_000;
-                assert_eq!(computed(&pace, jitter), sweeps, "{pace:?}");
+                let jittered = computed(&pace, |sweep| {
+                    (sweep as i64 * 7_919_333) % 49_000_000 - 24_000_000
+                });
+                assert_eq!(jittered, sweeps, "{pace:?}");
                 assert!(sweeps.contains(&5), "sweep 0 of the pace is computed");
             }
         }
@@ -126,15 +134,17 @@ mod tests {
 
     #[test]
     fn a_pace_of_no_sweep_and_one_beyond_the_longest_interval_are_refused() {
-        let error = |pace: Pace| {
-            pace.check_values(&Limits::DEFAULT)
-                .map_err(|e| e.to_string())
-        };
-        assert_eq!(error(pace(1, 100)), Ok(()));
-        assert_eq!(error(Pace::EVERY_SWEEP), Ok(()));
-        assert!(error(pace(1, 101)).unwrap_err().contains("10100000000"));
-        for (computed, of) in [(0, 1), (2, 1), (0, 0)] {
-            assert!(error(pace(computed, of)).unwrap_err().contains("computed"));
+        for pace in [pace(1, 100), Pace::EVERY_SWEEP] {
+            assert_eq!(pace.check_values(&Limits::DEFAULT), Ok(()));
+        }
+        for (pace, part) in [
+            (pace(1, 101), "10100000000"),
+            (pace(0, 1), "computed"),
+            (pace(2, 1), "computed"),
+            (pace(0, 0), "computed"),
+        ] {
+            let error = pace.check_values(&Limits::DEFAULT).unwrap_err();
+            assert!(error.to_string().contains(part), "{error}");
         }
     }
 }

@@ -103,34 +103,44 @@ mod tests {
         }
     }
 
+    fn check_changed(change: impl FnOnce(&mut Track)) -> Result<(), String> {
+        let mut track = track();
+        change(&mut track);
+        track.check_values().map_err(|error| error.to_string())
+    }
+
     #[test]
     fn numbers_that_are_no_track_are_refused_by_name() {
-        let refused = |change: &dyn Fn(&mut Track)| {
-            let mut track = track();
-            change(&mut track);
-            track.check_values().map_err(|error| error.to_string())
-        };
-        assert_eq!(refused(&|_| {}), Ok(()));
-        let covariance = |value: f32, row: usize, column: usize| {
-            refused(&|track| track.covariance[row][column] = value)
-        };
+        assert_eq!(check_changed(|_| {}), Ok(()));
         for (found, name) in [
             (
-                refused(&|track| track.velocity_mps[1] = f64::NAN),
+                check_changed(|track| track.velocity_mps[1] = f64::NAN),
                 "velocity_mps",
             ),
             (
-                refused(&|track| track.velocity_mps[0] = 1e5),
+                check_changed(|track| track.velocity_mps[0] = 1e5),
                 "velocity_mps",
             ),
-            (refused(&|track| track.score = 1.5), "score"),
-            (refused(&|track| track.unseen_s = 1.5), "unseen_s"),
-            (refused(&|track| track.age_s = -1.0), "age_s"),
-            (refused(&|track| track.box3d.size_m[2] = 0.0), "size_m"),
-            (covariance(-1.0, 2, 2), "covariance"),
-            (covariance(1.1, 0, 3), "covariance"),
-            (covariance(f32::NAN, 1, 0), "covariance"),
-            (covariance(1e7, 3, 3), "covariance"),
+            (check_changed(|track| track.score = 1.5), "score"),
+            (check_changed(|track| track.unseen_s = 1.5), "unseen_s"),
+            (check_changed(|track| track.age_s = -1.0), "age_s"),
+            (check_changed(|track| track.box3d.size_m[2] = 0.0), "size_m"),
+            (
+                check_changed(|track| track.covariance[2][2] = -1.0),
+                "covariance",
+            ),
+            (
+                check_changed(|track| track.covariance[0][3] = 1.1),
+                "covariance",
+            ),
+            (
+                check_changed(|track| track.covariance[1][0] = f32::NAN),
+                "covariance",
+            ),
+            (
+                check_changed(|track| track.covariance[3][3] = 1e7),
+                "covariance",
+            ),
         ] {
             assert!(found.clone().unwrap_err().contains(name), "{found:?}");
         }

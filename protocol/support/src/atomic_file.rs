@@ -241,16 +241,23 @@ mod tests {
             }
         }
         let left = disk.restart();
-        let is_lost = |name: &usize| {
+        let lost = (0..3).filter(|name: &usize| {
             let found = left.get(Path::new(&format!("runs/{name}")));
             let oldest = reported[*name].saturating_sub(1);
             match found {
                 Some(found) => !versions[*name][oldest..].contains(found),
                 None => reported[*name] > 0,
             }
-        };
-        let lost = (0..3).filter(is_lost).count();
-        (lost, reported.iter().sum())
+        });
+        (lost.count(), reported.iter().sum())
+    }
+
+    /// Writes without syncing the name of the file.
+    fn write_without_folder(disk: &mut Forgetful, path: &Path, contents: &[u8]) -> io::Result<()> {
+        let mut file = disk.begin(path)?;
+        disk.append(&mut file, contents)?;
+        disk.sync(&file)?;
+        disk.rename(file, path)
     }
 
     #[test]
@@ -266,17 +273,10 @@ mod tests {
             "{written} files were written before the cuts"
         );
         // The same cuts find what is not synced, or renamed before it is.
-        let volatile = |seed| losses(seed, write_volatile_to);
-        assert!((0..200).filter(|seed| volatile(*seed).0 > 0).count() > 100);
-        let no_folder = |seed| {
-            losses(seed, |disk, path, bytes| {
-                let mut file = disk.begin(path)?;
-                disk.append(&mut file, bytes)?;
-                disk.sync(&file)?;
-                disk.rename(file, path)
-            })
-        };
-        assert!((0..200).filter(|seed| no_folder(*seed).0 > 0).count() > 100);
+        let volatile = (0..200).filter(|seed| losses(*seed, write_volatile_to).0 > 0);
+        assert!(volatile.count() > 100);
+        let no_folder = (0..200).filter(|seed| losses(*seed, write_without_folder).0 > 0);
+        assert!(no_folder.count() > 100);
     }
 
     #[test]
@@ -311,7 +311,8 @@ mod tests {
         let (atomic, plain) = (folder.path().join("atomic"), folder.path().join("plain"));
         write(&atomic, "").unwrap();
         fs::write(&plain, "").unwrap();
-        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode();
-        assert_eq!(mode(&atomic), mode(&plain));
+        let [atomic, plain] =
+            [atomic, plain].map(|path| fs::metadata(path).unwrap().permissions().mode());
+        assert_eq!(atomic, plain);
     }
 }

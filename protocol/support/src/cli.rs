@@ -133,6 +133,10 @@ mod tests {
         exit_code(result, |cause| cause.is::<std::num::ParseIntError>())
     }
 
+    fn io_error(kind: ErrorKind) -> anyhow::Error {
+        anyhow::Error::from(io::Error::from(kind))
+    }
+
     #[test]
     fn exit_codes_are_0_to_3_and_130() {
         for (outcome, code) in [
@@ -164,15 +168,15 @@ mod tests {
 
     #[test]
     fn a_full_disk_is_no_bad_input_wherever_it_is_found() {
-        let full = || anyhow::Error::from(io::Error::from(ErrorKind::StorageFull));
-        let refused = || anyhow::Error::from(io::Error::from(ErrorKind::NotFound));
         let of_file =
             Err::<(), _>(io::Error::from(ErrorKind::StorageFull)).at(Path::new("out/maps"));
+        let full = io_error(ErrorKind::StorageFull).context("out/frames.csv");
+        let not_written = io_error(ErrorKind::NotFound).context(NotWritten("out".into()));
         for error in [
-            BadInput::of(full()).into(),
-            anyhow::Error::from(BadInput::of(full().context("out/frames.csv"))).context("max"),
+            BadInput::of(io_error(ErrorKind::StorageFull)).into(),
+            anyhow::Error::from(BadInput::of(full)).context("max"),
             BadInput::of(of_file.unwrap_err()).into(),
-            BadInput::of(refused().context(NotWritten("out".into())).context("max")).into(),
+            BadInput::of(not_written.context("max")).into(),
         ] {
             assert_eq!(code_of(Err(error)), ExitCode::from(1));
         }

@@ -114,21 +114,24 @@ mod tests {
         },
     }
 
+    fn parsed(line: &str) -> Result<ArgMatches, clap::Error> {
+        with_verbosity(Cli::command()).try_get_matches_from(line.split(' '))
+    }
+
     #[test]
     fn verbosity_is_known_to_every_subcommand() {
-        let of = |line: &str| with_verbosity(Cli::command()).try_get_matches_from(line.split(' '));
         for (line, expected) in [
             ("program act --fast", Verbosity::Usual),
             ("program -v act", Verbosity::Debug),
             ("program act -vv", Verbosity::Trace),
             ("program act --quiet", Verbosity::Quiet),
         ] {
-            let matches = of(line).unwrap();
+            let matches = parsed(line).unwrap();
             let options = VerbosityOptions::from_arg_matches(&matches).unwrap();
             assert_eq!(options.verbosity(), expected, "{line}");
             let Sub::Act { fast } = Cli::from_arg_matches(&matches).unwrap().command;
             assert_eq!(fast, line.contains("--fast"));
         }
-        assert!(of("program act -v -q").is_err());
+        assert!(parsed("program act -v -q").is_err());
     }
 }

@@ -216,28 +216,19 @@ mod tests {
 
     #[test]
     fn an_error_states_file_line_field_and_both_values() {
-        let file_with = |row: &str| file(&format!("name,size_m\n{row}\n")).unwrap();
-        let message = |row: &str| {
-            let file = file_with(row);
+        for (row, expected) in [
+            ("a,2", "a.csv:2: size_m is \"2\", must be 0 to 1"),
+            ("a,NaN", "a.csv:2: size_m is \"NaN\", must be 0 to 1"),
+            ("a,1,2", "a.csv:2: \"a,1,2\" has 3 columns, must be 2"),
+            ("\"a,1", "a.csv:2: \"a,1\" has 1 columns, must be 2"),
+        ] {
+            let file = file(&format!("name,size_m\n{row}\n")).unwrap();
             let row = file.rows().next().unwrap();
-            row.complete()
-                .and_then(|row| row.number(1, 0.0..=1.0, "0 to 1"))
-                .unwrap_err()
-                .to_string()
-        };
-        assert_eq!(message("a,2"), "a.csv:2: size_m is \"2\", must be 0 to 1");
-        assert_eq!(
-            message("a,NaN"),
-            "a.csv:2: size_m is \"NaN\", must be 0 to 1"
-        );
-        assert_eq!(
-            message("a,1,2"),
-            "a.csv:2: \"a,1,2\" has 3 columns, must be 2"
-        );
-        assert_eq!(
-            message("\"a,1"),
-            "a.csv:2: \"a,1\" has 1 columns, must be 2"
-        );
+            let number = row
+                .complete()
+                .and_then(|row| row.number(1, 0.0..=1.0, "0 to 1"));
+            assert_eq!(number.unwrap_err().to_string(), expected);
+        }
         assert_eq!(
             file("x,y\n").unwrap_err().to_string(),
             "a.csv:1: header is \"x,y\", must be \"name,size_m\""

@@ -139,10 +139,11 @@ mod tests {
         for record in &records {
             writer.add(record).unwrap();
         }
-        let read = |kind| RecordReader::<String>::open(&path, kind);
-        let whole: Result<Vec<_>, _> = read("words").unwrap().collect();
+        let reader = RecordReader::<String>::open(&path, "words").unwrap();
+        let whole: Result<Vec<_>, _> = reader.collect();
         assert_eq!(whole.unwrap(), records);
-        let error = read("numbers").unwrap_err().to_string();
+        let error = RecordReader::<String>::open(&path, "numbers").unwrap_err();
+        let error = error.to_string();
         assert!(error.contains("is no log of numbers"), "{error}");
 
         let bytes = std::fs::read(&path).unwrap();
@@ -150,7 +151,8 @@ mod tests {
         *damaged.last_mut().unwrap() ^= 1;
         for damaged in [&bytes[..bytes.len() - 1], damaged.as_slice()] {
             std::fs::write(&path, damaged).unwrap();
-            let read: Vec<_> = read("words").unwrap().collect();
+            let reader = RecordReader::<String>::open(&path, "words").unwrap();
+            let read: Vec<_> = reader.collect();
             let (last, first) = read.split_last().unwrap();
             assert!(last.is_err() && first.iter().all(Result::is_ok) && first.len() == 2);
         }

@@ -108,10 +108,12 @@ mod tests {
     };
 
     fn failure(line: &str) -> Option<String> {
-        let words = || line.split(' ').map(OsString::from);
-        let help = SIBLING.exec_help(words());
-        let command = || SIBLING.extend(Command::new("program").subcommand(Command::new("run")));
-        let error = help.or_else(|| SIBLING.exec_subcommand(&command().get_matches_from(words())));
+        let words = line.split(' ').map(OsString::from);
+        let help = SIBLING.exec_help(words.clone());
+        let error = help.or_else(|| {
+            let command = Command::new("program").subcommand(Command::new("run"));
+            SIBLING.exec_subcommand(&SIBLING.extend(command).get_matches_from(words))
+        });
         error.map(|error| error.to_string())
     }
 

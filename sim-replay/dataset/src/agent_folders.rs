@@ -340,6 +340,13 @@ mod tests {
         folder.agents.iter().map(CavId::as_str).collect()
     }
 
+    fn scenario_names(root: &Path, below: &str) -> Vec<String> {
+        let dirs = find(&root.join(below), &mut Vec::new()).unwrap();
+        dirs.iter()
+            .map(|dir| files::name_below(root, dir))
+            .collect()
+    }
+
     #[test]
     fn scenarios_are_found_at_every_level() {
         let dir = tempfile::tempdir().unwrap();
@@ -353,17 +360,11 @@ mod tests {
                 "empty/x",
             ],
         );
-        let names = |below: &str| {
-            let found = find(&dir.path().join(below), &mut Vec::new()).unwrap();
-            found
-                .iter()
-                .map(|found| files::name_below(dir.path(), found))
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(names(""), ["test/a", "test/b", "train/c"]);
-        assert_eq!(names("test"), ["test/a", "test/b"]);
-        assert_eq!(names("test/a"), ["test/a"]);
-        assert!(names("empty").is_empty());
+        let root = dir.path();
+        assert_eq!(scenario_names(root, ""), ["test/a", "test/b", "train/c"]);
+        assert_eq!(scenario_names(root, "test"), ["test/a", "test/b"]);
+        assert_eq!(scenario_names(root, "test/a"), ["test/a"]);
+        assert!(scenario_names(root, "empty").is_empty());
         assert!(is_agent(&dir.path().join("test/a/1")) && !is_agent(&dir.path().join("test/a")));
     }
 
@@ -479,34 +480,27 @@ mod tests {
                 &[&format!("1/{stem}.yaml"), &format!("1/{stem}.pcd")],
             );
         }
-        let times = |expected_problems: usize| {
+        for (protocol, expected_problems, millis) in [
+            (None, 0, [0, 100, 300]),
+            (
+                Some("world: {fixed_delta_seconds: 0.05}"),
+                0,
+                [4900, 5000, 5200],
+            ),
+            (Some("world: {fixed_delta_seconds: -1}"), 1, [0, 100, 300]),
+        ] {
+            if let Some(text) = protocol {
+                fs::write(dir.path().join("data_protocol.yaml"), text).unwrap();
+            }
             let mut problems = Vec::new();
             let ticks = scan(dir.path()).0.ticks(100_000_000, &mut problems);
             assert_eq!(problems.len(), expected_problems, "{problems:?}");
-            ticks
-                .into_iter()
-                .map(|tick| (tick.stem, tick.capture_nanos / 1_000_000))
-                .collect::<Vec<_>>()
-        };
-        let expected = |millis: [u64; 3]| {
-            ["98", "100", "104"]
-                .map(str::to_owned)
-                .into_iter()
-                .zip(millis)
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(times(0), expected([0, 100, 300]));
-        fs::write(
-            dir.path().join("data_protocol.yaml"),
-            "world: {fixed_delta_seconds: 0.05}",
-        )
-        .unwrap();
-        assert_eq!(times(0), expected([4900, 5000, 5200]));
-        fs::write(
-            dir.path().join("data_protocol.yaml"),
-            "world: {fixed_delta_seconds: -1}",
-        )
-        .unwrap();
-        assert_eq!(times(1), expected([0, 100, 300]));
+            let times: Vec<(&str, u64)> = ticks
+                .iter()
+                .map(|tick| (tick.stem.as_str(), tick.capture_nanos / 1_000_000))
+                .collect();
+            let expected: Vec<(&str, u64)> = ["98", "100", "104"].into_iter().zip(millis).collect();
+            assert_eq!(times, expected, "{protocol:?}");
+        }
     }
 }

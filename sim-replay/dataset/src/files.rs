@@ -166,15 +166,16 @@ mod tests {
     #[test]
     fn links_are_followed_and_those_to_nothing_are_not_there() {
         let dir = tempfile::tempdir().unwrap();
-        let link = |target: &Path, name: &str| {
-            std::os::unix::fs::symlink(target, dir.path().join(name)).unwrap()
-        };
         fs::create_dir(dir.path().join("4279")).unwrap();
         fs::write(dir.path().join("a.yaml"), "").unwrap();
-        link(&dir.path().join("4279"), "4288");
-        link(&dir.path().join("a.yaml"), "b.yaml");
-        link(Path::new("/nowhere.png"), "a_camera0.png");
-        link(Path::new("loop"), "loop");
+        for (target, name) in [
+            (dir.path().join("4279"), "4288"),
+            (dir.path().join("a.yaml"), "b.yaml"),
+            ("/nowhere.png".into(), "a_camera0.png"),
+            ("loop".into(), "loop"),
+        ] {
+            std::os::unix::fs::symlink(target, dir.path().join(name)).unwrap();
+        }
         let listing = list(dir.path()).unwrap();
         assert_eq!(
             (listing.files, listing.folders),

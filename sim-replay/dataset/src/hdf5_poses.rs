@@ -149,15 +149,17 @@ pub(crate) mod tests {
         assert!((pose.yaw_rad() - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
     }
 
+    fn refusal(bytes: Vec<u8>) -> String {
+        parse(bytes, RowOrder::Matrix).unwrap_err().to_string()
+    }
+
     #[test]
     fn what_is_wrong_is_named() {
-        let message = |bytes, order| parse(bytes, order).unwrap_err().to_string();
         let stamps: Vec<i64> = (0..11).collect();
         assert!(
-            message(file(&stamps, &[MATRIX; 10]), RowOrder::Matrix)
-                .contains("shape [10, 12], expected [11, 12]")
+            refusal(file(&stamps, &[MATRIX; 10])).contains("shape [10, 12], expected [11, 12]")
         );
-        assert!(message(b"no".to_vec(), RowOrder::Matrix).starts_with("a.h5: no sound HDF5"));
+        assert!(refusal(b"no".to_vec()).starts_with("a.h5: no sound HDF5"));
     }
 
     #[test]

@@ -266,23 +266,25 @@ mod tests {
         }
     }
 
+    /// Problems with paths below `root`.
+    fn problems_below(root: &Path, dataset: &Dataset) -> Vec<String> {
+        let root = root.to_string_lossy();
+        dataset
+            .problems
+            .iter()
+            .map(|problem| problem.to_string().replace(&*root, ""))
+            .collect()
+    }
+
     #[test]
     fn times_and_missing_lines() {
         let dir = tempfile::tempdir().unwrap();
         build(dir.path(), ".", "poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n");
         fs::write(dir.path().join("times.txt"), "0.0\n1.036e-01\n").unwrap();
-        let problems = |dataset: &Dataset| {
-            let root = dir.path().to_string_lossy();
-            dataset
-                .problems
-                .iter()
-                .map(|problem| problem.to_string().replace(&*root, ""))
-                .collect::<Vec<_>>()
-        };
         let dataset = crate::open(dir.path()).unwrap();
         assert_eq!(stems(&dataset), ["000000"]);
         assert_eq!(
-            problems(&dataset),
+            problems_below(dir.path(), &dataset),
             ["/poses.txt: no line for scan 1: there are 1: the scan is left out"]
         );
         fs::write(
@@ -318,7 +320,7 @@ mod tests {
             fs::write(dir.path().join("times.txt"), times).unwrap();
             let dataset = crate::open(dir.path()).unwrap();
             assert_eq!(
-                (stems(&dataset).len(), problems(&dataset)),
+                (stems(&dataset).len(), problems_below(dir.path(), &dataset)),
                 (kept, vec![expected.to_owned()])
             );
         }
@@ -327,13 +329,8 @@ mod tests {
     #[test]
     fn a_blank_line_is_a_scan_without_value() {
         let dir = tempfile::tempdir().unwrap();
-        let pose = |x: u8| format!("1 0 0 0 0 1 0 0 0 0 1 {x}\n");
-        build(
-            dir.path(),
-            ".",
-            "poses.txt",
-            &format!("{}\n{}", pose(0), pose(2)),
-        );
+        let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n\n1 0 0 0 0 1 0 0 0 0 1 2\n";
+        build(dir.path(), ".", "poses.txt", poses);
         fs::write(dir.path().join("velodyne/000002.bin"), b"AAAAAAAAAAAAAAAA").unwrap();
         let dataset = crate::open(dir.path()).unwrap();
         let scenario = &dataset.scenarios[0];

@@ -146,20 +146,19 @@ mod tests {
             [1.0, 2.0, 3.0]
         );
         assert_eq!(calibration.rotation("R0_rect").unwrap(), Pose::IDENTITY);
-        let message = |result: Result<Pose, ReadError>| {
-            result
-                .unwrap_err()
-                .to_string()
-                .replace(&*path.to_string_lossy(), "")
-        };
-        assert_eq!(
-            message(calibration.rotation("Bad")),
-            ":5: Bad: \"x\" is no finite number"
-        );
-        assert_eq!(
-            message(calibration.transform("P0")),
-            ":1: P0: 2 numbers, expected 12"
-        );
-        assert_eq!(message(calibration.transform("Q")), ": Q: missing");
+        for (result, expected) in [
+            (
+                calibration.rotation("Bad"),
+                ":5: Bad: \"x\" is no finite number",
+            ),
+            (
+                calibration.transform("P0"),
+                ":1: P0: 2 numbers, expected 12",
+            ),
+            (calibration.transform("Q"), ": Q: missing"),
+        ] {
+            let message = result.unwrap_err().to_string();
+            assert_eq!(message.replace(&*path.to_string_lossy(), ""), expected);
+        }
     }
 }

@@ -99,21 +99,23 @@ mod tests {
         content_sha256(&dataset.scenarios, None, &FileDigests::default())
     }
 
+    /// The bytes with one bit at `place` changed.
+    fn flipped(bytes: &[u8], place: usize) -> Vec<u8> {
+        let mut bytes = bytes.to_vec();
+        bytes[place] ^= 1;
+        bytes
+    }
+
     #[test]
     fn any_byte_changes_the_hash_and_another_place_does_not() {
         let points: Vec<u8> = (0..5000u32).map(|k| (k % 251) as u8).collect();
         let [one, other] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         let original = sha256(&scene(one.path(), &points));
         assert_eq!(sha256(&scene(other.path(), &points)), original);
-        let flipped = |place: usize| {
-            let mut bytes = points.clone();
-            bytes[place] ^= 1;
-            bytes
-        };
         for (name, bytes) in [
-            ("000070.pcd", flipped(3)),
-            ("000070.pcd", flipped(2500)),
-            ("000070.pcd", flipped(4990)),
+            ("000070.pcd", flipped(&points, 3)),
+            ("000070.pcd", flipped(&points, 2500)),
+            ("000070.pcd", flipped(&points, 4990)),
             ("000070.pcd", points[..4000].to_vec()),
             ("000068.yaml", b"lidar_pose: [0, 0, 0, 0, 0, 0]".to_vec()),
         ] {

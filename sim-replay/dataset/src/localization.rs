@@ -200,6 +200,7 @@ mod tests {
     use std::fs;
 
     use super::*;
+    use crate::frame::Frame;
     use crate::{Dataset, LoadOptions};
 
     /// First time stamp.
@@ -356,6 +357,18 @@ mod tests {
         );
     }
 
+    fn load_only_tick(root: &Path) -> Frame {
+        let dataset = open(root);
+        assert_eq!(
+            (dataset.problems.len(), dataset.scenarios[0].ticks.len()),
+            (0, 1),
+            "one sweep has no pose"
+        );
+        dataset.scenarios[0]
+            .load(0, 0, &LoadOptions::default())
+            .unwrap()
+    }
+
     #[test]
     fn raw_nclt_takes_its_poses_from_the_ground_truth() {
         let dir = tempfile::tempdir().unwrap();
@@ -376,18 +389,7 @@ mod tests {
             "ground_truth/groundtruth_2012-01-15.csv",
             rows.as_bytes(),
         );
-        let load = || {
-            let dataset = open(dir.path());
-            assert_eq!(
-                (dataset.problems.len(), dataset.scenarios[0].ticks.len()),
-                (0, 1),
-                "one sweep has no pose"
-            );
-            dataset.scenarios[0]
-                .load(0, 0, &LoadOptions::default())
-                .unwrap()
-        };
-        let pose = load().world_from_lidar.unwrap();
+        let pose = load_only_tick(dir.path()).world_from_lidar.unwrap();
         let [x, y, z] = pose.translation_m;
         assert!(
             (x - 1.0).abs() < 1e-9 && (y + 0.5).abs() < 1e-9 && (z - 3.0).abs() < 1e-9,
@@ -403,7 +405,7 @@ mod tests {
             "NCLT_pose_stats.txt",
             b"100.0\n-50.0000000\n-4.0\n",
         );
-        let moved = load().world_from_lidar.unwrap();
+        let moved = load_only_tick(dir.path()).world_from_lidar.unwrap();
         let [x, y, z] = moved.translation_m;
         assert!(
             (x + 99.0).abs() < 1e-9 && (y + 50.5).abs() < 1e-9 && (z + 1.0).abs() < 1e-9,
@@ -425,7 +427,8 @@ mod tests {
             "# mean, deviation\n100 -50 -4\n3 4 nan\n",
         ] {
             write(dir.path(), "NCLT_pose_stats.txt", rows.as_bytes());
-            assert_eq!(load().world_from_lidar, Some(moved), "{rows}");
+            let frame = load_only_tick(dir.path());
+            assert_eq!(frame.world_from_lidar, Some(moved), "{rows}");
         }
         for (rows, expected) in [
             (

@@ -134,13 +134,13 @@ mod tests {
     #[test]
     fn angles_turn_about_z_then_y_then_x() {
         let truth = sound(&format!("{T0},0,0,0,0.1,0.2,0.3"));
-        let axis = |axis, angle| UnitQuaternion::from_axis_angle(&axis, angle);
-        let (x, y, z) = (
-            nalgebra::Vector3::x_axis(),
-            nalgebra::Vector3::y_axis(),
-            nalgebra::Vector3::z_axis(),
-        );
-        let expected = axis(z, 0.3) * axis(y, 0.2) * axis(x, 0.1);
+        let [x, y, z] = [
+            (nalgebra::Vector3::x_axis(), 0.1),
+            (nalgebra::Vector3::y_axis(), 0.2),
+            (nalgebra::Vector3::z_axis(), 0.3),
+        ]
+        .map(|(axis, angle)| UnitQuaternion::from_axis_angle(&axis, angle));
+        let expected = z * y * x;
         assert!(truth.at(T0).unwrap().rotation.angle_to(&expected) < 1e-12);
     }
 
@@ -154,9 +154,12 @@ mod tests {
         assert!(truth.at(T0 + 1_000_001).is_ok());
     }
 
+    fn row_text(micros: u64, x: u64) -> String {
+        format!("{micros},{x},0,0,0,0,0\n")
+    }
+
     #[test]
     fn a_bad_row_is_left_out_and_named_with_its_line() {
-        let row = |micros: u64, x: u64| format!("{micros},{x},0,0,0,0,0\n");
         for (bad, expected) in [
             (
                 "2,0,0\n".to_owned(),
@@ -171,16 +174,16 @@ mod tests {
                 ":2: utime: -5 are no microseconds: the row is left out",
             ),
             (
-                row(T0, 99),
+                row_text(T0, 99),
                 ":2: utime: 1326652795000000 is not between the times around it: the row is left out",
             ),
             (
-                row(T0 + 999, 99),
+                row_text(T0 + 999, 99),
                 ":2: utime: 1326652795000999 is not between the times around it: the row is left out",
             ),
         ] {
-            let (truth, problems) =
-                parse(&(row(T0, 1) + &bad + &row(T0 + 20, 3) + &row(T0 + 30, 4)));
+            let text = row_text(T0, 1) + &bad + &row_text(T0 + 20, 3) + &row_text(T0 + 30, 4);
+            let (truth, problems) = parse(&text);
             assert_eq!(
                 problems,
                 [format!("groundtruth_2012-01-15.csv{expected}")],

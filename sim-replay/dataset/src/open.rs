@@ -188,11 +188,12 @@ mod tests {
             .ok()
             .and_then(|text| text.trim().parse().ok());
         let count: u64 = count.ok_or_else(|| ReadError::malformed(&file, "no number"))?;
-        let tick = |index: u64| Tick {
-            stem: index.to_string(),
-            capture_nanos: index * options.period_nanos,
-        };
-        let ticks = (0..count).map(tick).collect();
+        let ticks = (0..count)
+            .map(|index| Tick {
+                stem: index.to_string(),
+                capture_nanos: index * options.period_nanos,
+            })
+            .collect();
         let source = Arc::new(Dummy(file));
         Ok(single_vehicle(Layout(&DUMMY), ticks, source))
     }
@@ -208,21 +209,23 @@ mod tests {
 
     #[test]
     fn parts_of_kitti_that_are_not_read_have_advice() {
-        let message = |cloud: &str| {
+        for (cloud, expected) in [
+            (
+                "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/0000000000.bin",
+                "this looks like KITTI raw",
+            ),
+            (
+                "training/velodyne/0000/000000.bin",
+                "this looks like KITTI tracking",
+            ),
+        ] {
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join(cloud);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, [0; 16]).unwrap();
-            open(dir.path()).unwrap_err().to_string()
-        };
-        let raw =
-            message("2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/0000000000.bin");
-        assert!(raw.contains("this looks like KITTI raw"), "{raw}");
-        let tracking = message("training/velodyne/0000/000000.bin");
-        assert!(
-            tracking.contains("this looks like KITTI tracking"),
-            "{tracking}"
-        );
+            let message = open(dir.path()).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
     }
 
     #[test]

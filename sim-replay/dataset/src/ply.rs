@@ -236,7 +236,7 @@ mod tests {
     }
 
     fn body(double: fn(f64) -> [u8; 8], short: fn(u16) -> [u8; 2]) -> Vec<u8> {
-        let point = |x: f64, intensity| {
+        let points = [(1.25, 7), (f64::NAN, 8)].map(|(x, intensity)| {
             [
                 &double(x)[..],
                 &double(-2.0),
@@ -245,8 +245,8 @@ mod tests {
                 &short(intensity),
             ]
             .concat()
-        };
-        [point(1.25, 7), point(f64::NAN, 8)].concat()
+        });
+        points.concat()
     }
 
     #[test]
@@ -279,27 +279,30 @@ mod tests {
         assert_eq!(decode(file.as_bytes()).unwrap().points.len(), 2);
     }
 
+    fn refusal(bytes: &[u8]) -> String {
+        decode(bytes).unwrap_err()
+    }
+
     #[test]
     fn faults_are_named_with_both_values() {
-        let message = |bytes: &[u8]| decode(bytes).unwrap_err();
-        assert_eq!(message(b"ply\n"), "no line end_header");
-        assert_eq!(message(b"PLY\n"), "the first line is not ply");
+        assert_eq!(refusal(b"ply\n"), "no line end_header");
+        assert_eq!(refusal(b"PLY\n"), "the first line is not ply");
         let cut = file("binary_little_endian", &[0; 53]);
         assert_eq!(
-            message(&cut),
+            refusal(&cut),
             "2 vertices of 27 bytes stated, 53 bytes found: the file is cut off"
         );
-        assert!(message(&file("ascii", b"1 2 3 4 5\n")).starts_with("2 vertices stated, 1 found"));
+        assert!(refusal(&file("ascii", b"1 2 3 4 5\n")).starts_with("2 vertices stated, 1 found"));
         assert_eq!(
-            message(&file("ascii", b"1 2 3 4 5\n1 2\n")),
+            refusal(&file("ascii", b"1 2 3 4 5\n1 2\n")),
             "vertex 1: 2 numbers, expected 5"
         );
-        assert!(message(&file("binary", b"")).starts_with("format \"binary\", expected ascii"));
+        assert!(refusal(&file("binary", b"")).starts_with("format \"binary\", expected ascii"));
         let huge = b"ply\nformat binary_little_endian 1.0\nelement vertex 18446744073709551615\nproperty float x\n\
                      property float y\nproperty float z\nend_header\n";
-        assert!(message(huge).contains("the file is cut off"));
+        assert!(refusal(huge).contains("the file is cut off"));
         assert_eq!(
-            message(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"),
+            refusal(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"),
             "element vertex has no property x"
         );
     }

@@ -150,11 +150,8 @@ mod tests {
             (scenario.ticks.len(), scenario.absent_frames()),
             (10, 8 + 8)
         );
-        let present = |tick| scenario.present_agents(tick).collect::<Vec<_>>();
-        assert_eq!(
-            [present(1), present(2), present(9)],
-            [vec![0, 1], vec![0], vec![0, 2]]
-        );
+        let present = [1, 2, 9].map(|tick| scenario.present_agents(tick).collect::<Vec<_>>());
+        assert_eq!(present, [vec![0, 1], vec![0], vec![0, 2]]);
         let loaded = scenario.load_tick(9, 0..3, &LoadOptions::default());
         assert_eq!(
             loaded

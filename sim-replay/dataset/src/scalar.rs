@@ -118,35 +118,40 @@ mod tests {
 
     #[test]
     fn numbers_of_every_type_and_order_are_read() {
-        let read = |kind, size, is_big_endian, bytes: &[u8]| {
-            Scalar {
-                kind,
-                size,
-                is_big_endian,
-            }
-            .read(bytes)
-        };
-        assert_eq!(
-            read(ScalarKind::Signed, 2, false, &[0xfe, 0xff, 9]),
-            Some(-2.0)
-        );
-        assert_eq!(read(ScalarKind::Signed, 2, true, &[0xff, 0xfe]), Some(-2.0));
-        assert_eq!(
-            read(ScalarKind::Signed, 8, false, &(-7_i64).to_le_bytes()),
-            Some(-7.0)
-        );
-        assert_eq!(read(ScalarKind::Unsigned, 1, false, &[0xfe]), Some(254.0));
-        assert_eq!(
-            read(ScalarKind::Float, 4, true, &1.5_f32.to_be_bytes()),
-            Some(1.5)
-        );
-        assert_eq!(
-            read(ScalarKind::Float, 8, false, &(-1e300_f64).to_le_bytes()),
-            Some(-1e300)
-        );
-        assert_eq!(read(ScalarKind::Float, 8, false, &[0; 7]), None);
-        assert_eq!(read(ScalarKind::Float, 3, false, &[0; 8]), None);
-        assert_eq!(read(ScalarKind::Padding, 4, false, &[0; 8]), None);
+        type Case<'a> = (ScalarKind, usize, bool, &'a [u8], Option<f64>);
+        let cases: [Case<'_>; 9] = [
+            (ScalarKind::Signed, 2, false, &[0xfe, 0xff, 9], Some(-2.0)),
+            (ScalarKind::Signed, 2, true, &[0xff, 0xfe], Some(-2.0)),
+            (
+                ScalarKind::Signed,
+                8,
+                false,
+                &(-7_i64).to_le_bytes(),
+                Some(-7.0),
+            ),
+            (ScalarKind::Unsigned, 1, false, &[0xfe], Some(254.0)),
+            (
+                ScalarKind::Float,
+                4,
+                true,
+                &1.5_f32.to_be_bytes(),
+                Some(1.5),
+            ),
+            (
+                ScalarKind::Float,
+                8,
+                false,
+                &(-1e300_f64).to_le_bytes(),
+                Some(-1e300),
+            ),
+            (ScalarKind::Float, 8, false, &[0; 7], None),
+            (ScalarKind::Float, 3, false, &[0; 8], None),
+            (ScalarKind::Padding, 4, false, &[0; 8], None),
+        ];
+        for (kind, size, is_big_endian, bytes, expected) in cases {
+            let scalar = Scalar::new(kind, size, is_big_endian);
+            assert_eq!(scalar.read(bytes), expected, "{scalar:?}");
+        }
     }
 
     fn number(kind: ScalarKind, bytes: &[u8], is_big_endian: bool) -> f64 {

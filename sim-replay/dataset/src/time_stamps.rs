@@ -34,24 +34,34 @@ pub(super) fn micros(stamp: f64, micros_per_unit: f64) -> u64 {
 mod tests {
     use super::*;
 
+    fn micros_of_file(stamps: &[f64]) -> Vec<u64> {
+        let unit = micros_per_unit(stamps.iter().copied());
+        stamps.iter().map(|&stamp| micros(stamp, unit)).collect()
+    }
+
     #[test]
     fn the_numbers_of_a_file_determine_the_unit() {
-        let read = |stamps: &[f64]| {
-            let unit = micros_per_unit(stamps.iter().copied());
-            stamps
-                .iter()
-                .map(|&stamp| micros(stamp, unit))
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(read(&[1_532_402_927_647_951.0]), [1_532_402_927_647_951]);
-        assert_eq!(read(&[1_557_858_039_302_414.8]), [1_557_858_039_302_415]);
-        assert_eq!(read(&[1.673_069_019_066_784e18]), [1_673_069_019_066_784]);
         assert_eq!(
-            read(&[1_673_069_019.0, 1_673_069_019.25]),
+            micros_of_file(&[1_532_402_927_647_951.0]),
+            [1_532_402_927_647_951]
+        );
+        assert_eq!(
+            micros_of_file(&[1_557_858_039_302_414.8]),
+            [1_557_858_039_302_415]
+        );
+        assert_eq!(
+            micros_of_file(&[1.673_069_019_066_784e18]),
+            [1_673_069_019_066_784]
+        );
+        assert_eq!(
+            micros_of_file(&[1_673_069_019.0, 1_673_069_019.25]),
             [1_673_069_019_000_000, 1_673_069_019_250_000]
         );
-        assert_eq!(read(&[1_673_069_019_066.5]), [1_673_069_019_066_500]);
-        assert_eq!(read(&[0.0, 0.1]), [0, 100_000]);
-        assert_eq!(read(&[0.0, 100_000.0]), [0, 100_000]);
+        assert_eq!(
+            micros_of_file(&[1_673_069_019_066.5]),
+            [1_673_069_019_066_500]
+        );
+        assert_eq!(micros_of_file(&[0.0, 0.1]), [0, 100_000]);
+        assert_eq!(micros_of_file(&[0.0, 100_000.0]), [0, 100_000]);
     }
 }

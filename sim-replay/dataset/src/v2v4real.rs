@@ -170,14 +170,9 @@ mod tests {
         );
         assert_eq!(ego.speed_mps, Some(1.0));
         assert_eq!(ego.objects[0].class, ObjectClass::Truck);
-        let place = |frame: &Frame| frame.objects[0].world_from_object.translation_m;
-        for (a, b) in place(&ego).iter().zip(place(&partner)) {
-            assert!(
-                (a - b).abs() < 1e-9,
-                "the same truck: {:?} {:?}",
-                place(&ego),
-                place(&partner)
-            );
+        let places = [&ego, &partner].map(|frame| frame.objects[0].world_from_object.translation_m);
+        for (a, b) in places[0].iter().zip(places[1]) {
+            assert!((a - b).abs() < 1e-9, "the same truck: {places:?}");
         }
         // Without partner: object id + 100 * agent id. The pedestrian does not count.
         let ids: Vec<i64> = merge(&[&ego, &partner], 0, &GroundTruthRule::V2V4REAL)

@@ -134,13 +134,13 @@ mod tests {
     use super::*;
 
     fn steps(rates: &[u64]) -> ServiceCurve {
-        let step = |(index, &bits_per_s): (usize, &u64)| Step {
+        let steps = rates.iter().enumerate().map(|(index, &bits_per_s)| Step {
             from_nanos: index as u64 * 700_000_000,
             bits_per_s,
             latency_ms: 0.0,
             loss: 0.0,
-        };
-        let trace = Trace::Steps(rates.iter().enumerate().map(step).collect());
+        });
+        let trace = Trace::Steps(steps.collect());
         ServiceCurve::new(
             &CapacityConfig::Trace(TraceConfig::new("trace.csv".as_ref())),
             Some(&trace),

@@ -418,53 +418,52 @@ mod tests {
 
     #[test]
     fn wrong_numbers_are_named() {
-        let message = |config: LinkConfig| config.validate().unwrap_err().to_string();
-        let rate = CapacityConfig::TokenBucket {
-            bandwidth_mbps: 0.0,
-            burst_bytes: 0,
-        };
-        assert!(
-            message(LinkConfig {
-                capacity: rate,
-                ..LinkConfig::default()
-            })
-            .contains("bandwidth_mbps is 0")
-        );
-        let latency = LatencyModel::UniformMs([5.0, 2.0]);
-        assert!(
-            message(LinkConfig {
-                latency,
-                ..LinkConfig::default()
-            })
-            .contains("latency is 2")
-        );
-        let clock = DeviceClock {
-            offset_ms: f64::NAN,
-            ..DeviceClock::default()
-        };
-        assert!(
-            message(LinkConfig {
-                clock,
-                ..LinkConfig::default()
-            })
-            .contains("offset_ms is NaN")
-        );
-        let loss = LossModel::Bernoulli(f64::NAN);
-        assert!(
-            message(LinkConfig {
-                loss,
-                ..LinkConfig::default()
-            })
-            .contains("loss is NaN")
-        );
-        let loss = LossModel::Distance(vec![[50.0, 0.1], [20.0, 0.2]]);
-        assert!(
-            message(LinkConfig {
-                loss,
-                ..LinkConfig::default()
-            })
-            .contains("loss.distance is 20: must be 50")
-        );
+        for (config, expected) in [
+            (
+                LinkConfig {
+                    capacity: CapacityConfig::TokenBucket {
+                        bandwidth_mbps: 0.0,
+                        burst_bytes: 0,
+                    },
+                    ..LinkConfig::default()
+                },
+                "bandwidth_mbps is 0",
+            ),
+            (
+                LinkConfig {
+                    latency: LatencyModel::UniformMs([5.0, 2.0]),
+                    ..LinkConfig::default()
+                },
+                "latency is 2",
+            ),
+            (
+                LinkConfig {
+                    clock: DeviceClock {
+                        offset_ms: f64::NAN,
+                        ..DeviceClock::default()
+                    },
+                    ..LinkConfig::default()
+                },
+                "offset_ms is NaN",
+            ),
+            (
+                LinkConfig {
+                    loss: LossModel::Bernoulli(f64::NAN),
+                    ..LinkConfig::default()
+                },
+                "loss is NaN",
+            ),
+            (
+                LinkConfig {
+                    loss: LossModel::Distance(vec![[50.0, 0.1], [20.0, 0.2]]),
+                    ..LinkConfig::default()
+                },
+                "loss.distance is 20: must be 50",
+            ),
+        ] {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
         let config = LinkConfig {
             latency: LatencyModel::Trace,
             ..LinkConfig::default()

@@ -153,36 +153,47 @@ mod tests {
         let (_folder, path) =
             file("time_s,bandwidth_mbps,latency_ms,loss\n0,27,10,0\n2.5,1.5,40,0.1\n\n");
         let trace = Trace::read_csv(&path, 0).unwrap();
-        let rate = |seconds: f64| trace.at((seconds * 1e9) as u64).unwrap().bits_per_s;
-        assert_eq!(
-            [rate(0.0), rate(2.499), rate(2.5), rate(900.0)],
-            [27_000_000, 27_000_000, 1_500_000, 1_500_000]
-        );
+        for (seconds, bits_per_s) in [
+            (0.0, 27_000_000),
+            (2.499, 27_000_000),
+            (2.5, 1_500_000),
+            (900.0, 1_500_000),
+        ] {
+            let step = trace.at((seconds * 1e9) as u64).unwrap();
+            assert_eq!(step.bits_per_s, bits_per_s, "{seconds}");
+        }
+    }
+
+    /// Start in seconds and rate of every step of a link that begins at `offset_s`.
+    fn steps_from(path: &Path, offset_s: f64) -> Result<Vec<(f64, u64)>, String> {
+        match Trace::read_csv(path, (offset_s * 1e9) as u64) {
+            Ok(Trace::Steps(steps)) => Ok(steps
+                .iter()
+                .map(|step| (step.from_nanos as f64 * 1e-9, step.bits_per_s))
+                .collect()),
+            other => Err(other.unwrap_err().to_string()),
+        }
     }
 
     #[test]
     fn a_link_begins_at_any_moment_of_its_trace() {
         let text = "time_s,bandwidth_mbps,latency_ms,loss\n10,27,10,0\n12.5,1.5,40,0.1\n20,6,5,0\n";
         let (_folder, path) = file(text);
-        let steps = |offset_s: f64| match Trace::read_csv(&path, (offset_s * 1e9) as u64) {
-            Ok(Trace::Steps(steps)) => Ok(steps
-                .iter()
-                .map(|step| (step.from_nanos as f64 * 1e-9, step.bits_per_s))
-                .collect::<Vec<_>>()),
-            other => Err(other.unwrap_err().to_string()),
-        };
         assert_eq!(
-            steps(10.0).unwrap(),
+            steps_from(&path, 10.0).unwrap(),
             [(0.0, 27_000_000), (2.5, 1_500_000), (10.0, 6_000_000)]
         );
-        assert_eq!(steps(13.0).unwrap(), [(0.0, 1_500_000), (7.0, 6_000_000)]);
-        assert_eq!(steps(20.0).unwrap(), [(0.0, 6_000_000)]);
+        assert_eq!(
+            steps_from(&path, 13.0).unwrap(),
+            [(0.0, 1_500_000), (7.0, 6_000_000)]
+        );
+        assert_eq!(steps_from(&path, 20.0).unwrap(), [(0.0, 6_000_000)]);
         assert!(
-            steps(9.0).unwrap_err().contains("trace.txt:2:"),
+            steps_from(&path, 9.0).unwrap_err().contains("trace.txt:2:"),
             "it has not begun"
         );
         assert!(
-            steps(20.5)
+            steps_from(&path, 20.5)
                 .unwrap_err()
                 .contains("offset_s is 20.5, behind the last line")
         );

@@ -93,31 +93,26 @@ mod tests {
 
     #[test]
     fn a_path_without_offset_begins_at_the_beginning() {
-        let read = |text: &str| serde_saphyr::from_str::<TraceConfig>(text);
-        assert_eq!(
-            read("link.csv").unwrap(),
-            TraceConfig::new(Path::new("link.csv"))
-        );
+        let first = TraceConfig::new(Path::new("link.csv"));
         let later = TraceConfig {
             offset_s: 90.5,
-            ..TraceConfig::new(Path::new("link.csv"))
+            ..first.clone()
         };
-        assert_eq!(read("{path: link.csv, offset_s: 90.5}").unwrap(), later);
-        assert_eq!(
-            read(&serde_json::to_string(&later).unwrap()).unwrap(),
-            later
-        );
-        assert!(
-            read("{path: link.csv, ofset_s: 1}")
-                .unwrap_err()
-                .to_string()
-                .contains("ofset_s")
-        );
-        assert!(
-            read("{offset_s: 1}")
-                .unwrap_err()
-                .to_string()
-                .contains("path")
-        );
+        let written = serde_json::to_string(&later).unwrap();
+        for (text, expected) in [
+            ("link.csv", &first),
+            ("{path: link.csv, offset_s: 90.5}", &later),
+            (written.as_str(), &later),
+        ] {
+            let read: TraceConfig = serde_saphyr::from_str(text).unwrap();
+            assert_eq!(read, *expected, "{text}");
+        }
+        for (text, field) in [
+            ("{path: link.csv, ofset_s: 1}", "ofset_s"),
+            ("{offset_s: 1}", "path"),
+        ] {
+            let error = serde_saphyr::from_str::<TraceConfig>(text).unwrap_err();
+            assert!(error.to_string().contains(field), "{error}");
+        }
     }
 }

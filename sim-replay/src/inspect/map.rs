@@ -106,18 +106,16 @@ mod tests {
     fn a_map_is_counted_and_its_findings_are_listed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.xodr");
-        let lane = |id: i32| {
+        let [left, right] = [1, -1].map(|id| {
             format!(
                 r#"<lane id="{id}" type="driving"><width sOffset="0" a="3" b="0" c="0" d="0"/><speed max="-1"/></lane>"#
             )
-        };
+        });
         let text = format!(
             r#"<OpenDRIVE><road id="1" length="40" rule="LHT"><planView>
             <geometry s="0" x="0" y="0" hdg="0" length="40"><line/></geometry></planView>
             <lateralProfile><superelevation s="0" a="0.1" b="0" c="0" d="0"/></lateralProfile>
-            <lanes><laneSection s="0"><left>{}</left><right>{}</right></laneSection></lanes></road></OpenDRIVE>"#,
-            lane(1),
-            lane(-1)
+            <lanes><laneSection s="0"><left>{left}</left><right>{right}</right></laneSection></lanes></road></OpenDRIVE>"#
         );
         std::fs::write(&path, text).unwrap();
         let report = inspect_map(&path).unwrap();

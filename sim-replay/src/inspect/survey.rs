@@ -452,6 +452,10 @@ mod tests {
         (messages, report.to_string())
     }
 
+    fn intensity_problems(sweeps: &[&[f32]]) -> String {
+        of_intensities(sweeps).0.concat()
+    }
+
     #[test]
     fn intensities_are_reported_and_their_faults_are_problems() {
         let (messages, table) = of_intensities(&[&[0.0, 0.25, 1.0], &[0.5]]);
@@ -463,21 +467,27 @@ mod tests {
             messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"),
             "{table}"
         );
-        let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
-        assert_eq!(message(&[&[0.5; 19]]), "", "few points are not evaluated");
         assert_eq!(
-            message(&[&[0.5; 19], &[0.5]]),
+            intensity_problems(&[&[0.5; 19]]),
+            "",
+            "few points are not evaluated"
+        );
+        assert_eq!(
+            intensity_problems(&[&[0.5; 19], &[0.5]]),
             "/1: sweeps of agent 1: all 20 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
              differ"
         );
         assert_eq!(
-            message(&[&[0.5], &[1.0], &[0.25], &[200.0, 0.0]]),
+            intensity_problems(&[&[0.5], &[1.0], &[0.25], &[200.0, 0.0]]),
             "/1: sweeps of agent 1: 1 of 5 intensities are above 1, up to 200 (field intensity divided by 1): see \
              --intensity-scale"
         );
-        assert!(message(&[&[-0.5, 0.5]]).contains("1 of 2 intensities are below 0, down to -0.5"));
+        assert!(
+            intensity_problems(&[&[-0.5, 0.5]])
+                .contains("1 of 2 intensities are below 0, down to -0.5")
+        );
         assert_eq!(
-            message(&[&[1.0, 700.0]]),
+            intensity_problems(&[&[1.0, 700.0]]),
             "/1: sweeps of agent 1: intensities reach 700, neither 0 to 1 nor 0 to 255: divided by 1023 unless their \
              scale is stated"
         );
@@ -504,13 +514,20 @@ mod tests {
         );
     }
 
+    /// YAML of 20 cars, this far ahead of the agent.
+    fn cars_at(x_m: u32) -> String {
+        let cars = (0..20).map(|id| {
+            format!(
+                "  {id}: {{location: [{x_m}, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n"
+            )
+        });
+        cars.collect()
+    }
+
     #[test]
     fn boxes_that_cannot_be_in_the_right_frame_are_a_problem() {
         let dir = tempfile::tempdir().unwrap();
-        let car = |id: usize| {
-            format!("  {id}: {{location: [900, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n")
-        };
-        let cars: String = (0..20).map(car).collect();
+        let cars = cars_at(900);
         let yaml = format!("lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles:\n{cars}");
         write(dir.path(), "scene/1/000010.yaml", yaml.as_bytes());
         write(
@@ -533,10 +550,7 @@ mod tests {
     #[test]
     fn a_missing_pose_is_named_and_not_its_consequences() {
         let dir = tempfile::tempdir().unwrap();
-        let car = |id: usize| {
-            format!("  {id}: {{location: [9, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n")
-        };
-        let yaml = format!("vehicles:\n{}", (0..20).map(car).collect::<String>());
+        let yaml = format!("vehicles:\n{}", cars_at(9));
         for stem in ["000010", "000012"] {
             write(dir.path(), &format!("scene/1/{stem}.yaml"), yaml.as_bytes());
             let points = sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]);

@@ -182,14 +182,17 @@ mod tests {
         );
     }
 
+    fn read_error(path: &Path, scenario: &str, ticks: usize) -> String {
+        Place::read(path, scenario, ticks).unwrap_err().to_string()
+    }
+
     #[test]
     fn a_checkpoint_of_another_scene_and_a_broken_one_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
         write(&path, &place()).unwrap();
-        let error_of = |found: Result<Option<Place>, FileError>| found.unwrap_err().to_string();
         for (scenario, ticks) in [("town4", 10), ("town1", 6)] {
-            let error = error_of(Place::read(&path, scenario, ticks));
+            let error = read_error(&path, scenario, ticks);
             assert!(
                 error.contains("tick 7 of scenario town1") && error.contains(scenario),
                 "{error}"
@@ -197,10 +200,10 @@ mod tests {
         }
         for broken in ["{", "[]", "{\"scenario\": \"town1\"}"] {
             fs::write(&path, broken).unwrap();
-            assert!(error_of(Place::read(&path, "town1", 10)).contains("not a replay checkpoint"));
+            assert!(read_error(&path, "town1", 10).contains("not a replay checkpoint"));
         }
         fs::write(&path, " ".repeat(MAX_BYTES as usize + 1)).unwrap();
-        assert!(error_of(Place::read(&path, "town1", 10)).contains("larger than"));
+        assert!(read_error(&path, "town1", 10).contains("larger than"));
     }
 
     #[test]

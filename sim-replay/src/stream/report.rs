@@ -132,9 +132,12 @@ mod tests {
 
     use super::*;
 
+    fn published(topic: &str) -> Account {
+        Account::published(topic.parse().unwrap())
+    }
+
     #[test]
     fn messages_dropped_before_sending_are_reported() {
-        let published = |topic: &str| Account::published(topic.parse().unwrap());
         let mut ledger = Ledger::default();
         for topic in ["1/lidar", "2/lidar", "1/gnss"] {
             ledger.sent(&published(topic));

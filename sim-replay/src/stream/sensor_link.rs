@@ -143,7 +143,7 @@ mod tests {
             loss: LossModel::Bernoulli(0.5),
             ..LinkConfig::default()
         };
-        let arrived = |cavs: &[&CavId]| {
+        let [with_other, alone] = [vec![&other, &cav], vec![&cav]].map(|cavs| {
             let mut link_under_test = SensorLink::new(&lossy, 1).unwrap();
             let began = link_under_test.began;
             for tick in 0..100 {
@@ -155,8 +155,8 @@ mod tests {
                 .into_iter()
                 .filter(|held| held.frame.cav == cav);
             arrived.map(|held| held.capture_nanos).collect::<Vec<_>>()
-        };
-        assert_eq!(arrived(&[&other, &cav]), arrived(&[&cav]));
+        });
+        assert_eq!(with_other, alone);
     }
 
     #[test]

@@ -139,24 +139,32 @@ mod tests {
 
     /// Posts of several heights, each before a low wall, around a sensor that has turned by an angle.
     fn sweep(heights: [f32; 3], turn: f64) -> PointCloud {
-        let post = |(number, height): (usize, f32)| {
-            let (sin, cos) = (number as f64 * 1.9 + 0.25 - turn).sin_cos();
-            let range = 11.0 + 9.0 * number as f64;
-            let at = |range: f64, z| [(range * cos) as f32, (range * sin) as f32, z, 0.1];
-            [at(range, height), at(range + 20.0, 0.5)]
-        };
+        let posts = heights
+            .into_iter()
+            .enumerate()
+            .flat_map(|(number, height)| {
+                let (sin, cos) = (number as f64 * 1.9 + 0.25 - turn).sin_cos();
+                let range = 11.0 + 9.0 * number as f64;
+                [(range, height), (range + 20.0, 0.5)]
+                    .map(|(range, z)| [(range * cos) as f32, (range * sin) as f32, z, 0.1])
+            });
         PointCloud {
-            xyzi: heights.into_iter().enumerate().flat_map(post).collect(),
+            xyzi: posts.collect(),
         }
+    }
+
+    fn described(cloud: &PointCloud) -> Option<Tensor> {
+        ScanContext.polar(cloud, &mut stopwatch()).unwrap()
     }
 
     #[test]
     fn a_sweep_is_found_in_another_direction() {
-        let described = |cloud: &PointCloud| ScanContext.polar(cloud, &mut stopwatch()).unwrap();
-        let place = |x: f64| Isometry3::translation(x, 0.0, 0.0);
         let known = [[0.0, 2.0, 0.5], [3.0, 1.0, 4.0]].map(|heights| sweep(heights, 0.0));
         let known = known.iter().zip([20.0, 10.0]);
-        let known = known.map(|(cloud, x)| (described(cloud).unwrap(), place(x)));
+        let known = known.map(|(cloud, x)| {
+            let place = Isometry3::translation(x, 0.0, 0.0);
+            (described(cloud).unwrap(), place)
+        });
         let mut database = PolarRetrieval::new(Box::new(ScanContext), known.collect()).unwrap();
         let angle = TAU / 12.0;
         let turned = sweep([3.1, 1.0, 3.9], angle);

@@ -231,10 +231,11 @@ mod tests {
             .unwrap();
         let named = variables.variables();
         for (layer, bias) in biases {
-            let of = |what: &str| named[&format!("regressor.{layer}.{what}")].shallow_clone();
+            let [mut weight, mut outputs] = ["weight", "bias"]
+                .map(|part| named[&format!("regressor.{layer}.{part}")].shallow_clone());
             no_grad(|| {
-                let _ = of("weight").zero_();
-                of("bias").copy_(&Tensor::from_slice(bias));
+                let _ = weight.zero_();
+                outputs.copy_(&Tensor::from_slice(bias));
             });
         }
         let config = serde_json::to_string(&config()).unwrap();
@@ -301,27 +302,30 @@ mod tests {
         let few = PointCloud {
             xyzi: (0..10).map(|k| [3.0 * k as f32, 3.0, 0.5, 0.1]).collect(),
         };
-        let none = |reason| PoseEstimate::NoPose {
-            reason,
-            inlier_count: 0,
-        };
         for cloud in [PointCloud::default(), nan, few] {
-            assert_eq!(answer(&path, &cloud), none(NoPoseReason::TooFewPoints));
+            assert_eq!(
+                answer(&path, &cloud),
+                PoseEstimate::no_pose(NoPoseReason::TooFewPoints, 0)
+            );
         }
-        assert_eq!(answer(&path, &sweep()), none(NoPoseReason::Failed));
+        assert_eq!(
+            answer(&path, &sweep()),
+            PoseEstimate::no_pose(NoPoseReason::Failed, 0)
+        );
+    }
+
+    fn load_error(path: &Path) -> String {
+        let loaded = load_baseline(path, Device::Cpu, PoseSolver::default());
+        loaded.unwrap_err().to_string()
     }
 
     #[test]
     fn files_of_something_else_and_of_earlier_versions_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let empty = VarStore::new(Device::Cpu);
-        let error_text = |path: &Path| {
-            let loaded = load_baseline(path, Device::Cpu, PoseSolver::default());
-            loaded.unwrap_err().to_string()
-        };
         let old = r#"{"scene_name":"town1","origin_m":[0.0,0.0,0.0],"scale_m":[9.0,9.0,1.0]}"#;
         for kind in [DiffLoc::KIND, HypLiLoc::KIND] {
-            let message = error_text(&write(folder.path(), &empty, old, kind));
+            let message = load_error(&write(folder.path(), &empty, old, kind));
             let wanted = format!("weights of kind {kind:?} have no encoder");
             assert!(
                 message.contains("weights.safetensors") && message.contains(&wanted),
@@ -345,7 +349,7 @@ mod tests {
             ),
         ] {
             let text = serde_json::to_string(&wrong).unwrap();
-            let message = error_text(&write(folder.path(), &empty, &text, DiffLoc::KIND));
+            let message = load_error(&write(folder.path(), &empty, &text, DiffLoc::KIND));
             assert!(message.contains(named), "{message}");
         }
         let path = hypliloc(folder.path(), [0.0; 3], [0.0; 2]);

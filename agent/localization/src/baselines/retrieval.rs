@@ -103,10 +103,16 @@ fn mean_of(sweeps: &[(Vec<f32>, Isometry3<f64>)], value: impl Fn(&[f32]) -> f32)
 mod tests {
     use super::*;
 
+    fn place(x: f64) -> Isometry3<f64> {
+        Isometry3::translation(x, 0.0, 0.0)
+    }
+
+    fn sweep(descriptor: &[f32], x: f64) -> (Vec<f32>, Isometry3<f64>) {
+        (descriptor.to_vec(), place(x))
+    }
+
     #[test]
     fn the_nearest_descriptor_is_found_whatever_the_scale_of_a_channel() {
-        let place = |x: f64| Isometry3::translation(x, 0.0, 0.0);
-        let sweep = |descriptor: &[f32], x: f64| (descriptor.to_vec(), place(x));
         let sweeps = [
             sweep(&[0.0, 1000.0], 1.0),
             sweep(&[1.0, 1001.0], 2.0),

@@ -167,6 +167,10 @@ mod tests {
         }
     }
 
+    fn value(pooled: &Tensor, token: i64, channel: i64) -> f32 {
+        pooled.double_value(&[token, channel]) as f32
+    }
+
     #[test]
     fn cells_that_stand_out_are_averaged_by_direction_and_distance() {
         // Two ahead and near, one of them of the ground; two behind and far.
@@ -179,11 +183,16 @@ mod tests {
         let features = Tensor::from_slice(&[1f32, 2.0, 3.0, 5.0]).view([4, 1]);
         let pooled = pool(&cells, &features).unwrap();
         assert_eq!(pooled.size(), [TOKENS, 1 + GEOMETRY]);
-        let at = |token: i64, channel: i64| pooled.double_value(&[token, channel]) as f32;
         let (near, far) = (SECTORS / 2, SECTORS);
-        assert_eq!((at(near, 0), at(far, 0)), (1.0, 4.0));
-        assert_eq!((at(far, 3), at(far, 5)), (30f32.hypot(0.5) / 32.0, 0.4));
-        assert!((at(near, 2) - 10f32.hypot(0.5) / 32.0).abs() < 1e-6);
+        for (token, channel, expected) in [
+            (near, 0, 1.0),
+            (far, 0, 4.0),
+            (far, 3, 30f32.hypot(0.5) / 32.0),
+            (far, 5, 0.4),
+        ] {
+            assert_eq!(value(&pooled, token, channel), expected);
+        }
+        assert!((value(&pooled, near, 2) - 10f32.hypot(0.5) / 32.0).abs() < 1e-6);
         let occupied = pooled.select(1, 1).gt(0.0).sum(Kind::Int64);
         assert_eq!(occupied.int64_value(&[]), 2);
     }
@@ -204,9 +213,10 @@ mod tests {
         assert_eq!(tokens.get(0).abs().max().double_value(&[]), 0.0);
         // The plane that they lie in has two.
         let deviations = tokens.narrow(0, 1, 499).std_dim(0, false, false);
-        let deviation = |component: i64| deviations.double_value(&[component]);
-        assert!(deviation(0) < 0.1, "{deviations}");
-        assert!((deviation(1) - 1.0).abs() < 0.02 && (deviation(2) - 1.0).abs() < 0.02);
+        let [flat, first, second] =
+            [0, 1, 2].map(|component| deviations.double_value(&[component]));
+        assert!(flat < 0.1, "{deviations}");
+        assert!((first - 1.0).abs() < 0.02 && (second - 1.0).abs() < 0.02);
         pooled = pooled.view([50, 10, 3 + GEOMETRY]);
         assert_eq!(projection.forward(&pooled).unwrap().size(), [50, 10, 9]);
     }

@@ -301,11 +301,11 @@ mod tests {
             predicted: Some(truth * Isometry3::translation(0.3, -0.2, 0.0)),
             ..LocalizerInput::of(&cloud)
         };
-        let search = || MapSearch::of_file(&path).unwrap().unwrap();
-        let found = search().localize(near).unwrap();
+        let mut search = MapSearch::of_file(&path).unwrap().unwrap();
+        let found = search.localize(near).unwrap();
         assert_eq!(found.inlier_ratio, 0.0, "the map was not searched");
         assert!(found.estimate.world_from_cav().is_some());
-        let mut strict = search();
+        let mut strict = MapSearch::of_file(&path).unwrap().unwrap();
         strict.min_confidence = 1.0;
         let rejected = strict.localize(LocalizerInput::of(&cloud));
         assert!(rejected.unwrap().found.unwrap().is_rejected);

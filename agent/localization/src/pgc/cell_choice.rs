@@ -22,17 +22,19 @@ pub(crate) fn choose_evenly(cells: &[SweepCell], count: usize) -> Vec<usize> {
 mod tests {
     use super::*;
 
-    #[test]
-    fn ground_is_never_more_than_its_share() {
-        let cells = |high: usize, flat: usize| -> Vec<SweepCell> {
-            let cell = |extent_m| SweepCell {
+    fn cells(high: usize, flat: usize) -> Vec<SweepCell> {
+        let cells = [(2.0, high), (0.1, flat)].map(|(extent_m, count)| {
+            let cell = SweepCell {
                 extent_m,
                 ..SweepCell::default()
             };
-            std::iter::repeat_n(cell(2.0), high)
-                .chain(std::iter::repeat_n(cell(0.1), flat))
-                .collect()
-        };
+            vec![cell; count]
+        });
+        cells.concat()
+    }
+
+    #[test]
+    fn ground_is_never_more_than_its_share() {
         for (high, flat, expected) in [
             (1000, 1000, 256),
             (60, 1000, 80),

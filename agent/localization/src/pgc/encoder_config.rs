@@ -205,40 +205,41 @@ mod tests {
         assert_eq!(SceneEncoderConfig::preset("huge"), None);
     }
 
+    fn is_refused_by_name(config: SceneEncoderConfig, field: &str) -> bool {
+        config.validate().unwrap_err().to_string().contains(field)
+    }
+
     #[test]
     fn absurd_configurations_are_rejected_by_name() {
-        let refused = |config: SceneEncoderConfig, field: &str| {
-            config.validate().unwrap_err().to_string().contains(field)
-        };
-        assert!(refused(
+        assert!(is_refused_by_name(
             SceneEncoderConfig {
                 voxel_m: 0.0,
                 ..SceneEncoderConfig::lean()
             },
             "voxel_m"
         ));
-        assert!(refused(
+        assert!(is_refused_by_name(
             SceneEncoderConfig {
                 voxel_m: 1e-6,
                 ..SceneEncoderConfig::lean()
             },
             "range_m"
         ));
-        assert!(refused(
+        assert!(is_refused_by_name(
             SceneEncoderConfig {
                 widths: vec![4],
                 ..SceneEncoderConfig::lean()
             },
             "widths"
         ));
-        assert!(refused(
+        assert!(is_refused_by_name(
             SceneEncoderConfig {
                 height_m: [2.0, 1.0],
                 ..SceneEncoderConfig::lean()
             },
             "height_m"
         ));
-        assert!(refused(
+        assert!(is_refused_by_name(
             SceneEncoderConfig {
                 context_m: vec![9.0; 17],
                 ..SceneEncoderConfig::lean()
@@ -246,7 +247,7 @@ mod tests {
             "context_m"
         ));
         for residual_widths in [vec![1; 17], vec![4096; 9]] {
-            assert!(refused(
+            assert!(is_refused_by_name(
                 SceneEncoderConfig {
                     residual_widths,
                     ..SceneEncoderConfig::lean()

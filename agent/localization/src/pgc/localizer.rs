@@ -261,36 +261,37 @@ mod tests {
 
     use super::*;
 
+    /// What is read from a head's file with this model.
+    fn stored(folder: &Path, model: &ConfidenceModel) -> Result<Confidence> {
+        let path = folder.join("head.safetensors");
+        let metadata: BTreeMap<_, _> = [(
+            CONFIDENCE_KEY.to_owned(),
+            serde_json::to_string(model).unwrap(),
+        )]
+        .into();
+        weights::save(
+            &path,
+            &VarStore::new(Device::Cpu),
+            &metadata,
+            Precision::Single,
+        )
+        .unwrap();
+        stored_confidence(&Weights::load(&path).unwrap())
+    }
+
     #[test]
     fn a_confidence_that_would_fail_on_a_sweep_is_rejected_with_its_file() {
         let folder = tempfile::tempdir().unwrap();
-        let stored = |model: &ConfidenceModel| {
-            let path = folder.path().join("head.safetensors");
-            let metadata: BTreeMap<_, _> = [(
-                CONFIDENCE_KEY.to_owned(),
-                serde_json::to_string(model).unwrap(),
-            )]
-            .into();
-            weights::save(
-                &path,
-                &VarStore::new(Device::Cpu),
-                &metadata,
-                Precision::Single,
-            )
-            .unwrap();
-            stored_confidence(&Weights::load(&path).unwrap())
-        };
         let model = ConfidenceModel::example();
         assert_eq!(
-            stored(&model).unwrap(),
+            stored(folder.path(), &model).unwrap(),
             Confidence::Calibrated(model.clone())
         );
-        let message = stored(&ConfidenceModel {
+        let absurd = ConfidenceModel {
             bias: -1e308,
             ..model
-        })
-        .unwrap_err()
-        .to_string();
+        };
+        let message = stored(folder.path(), &absurd).unwrap_err().to_string();
         assert!(
             message.contains("head.safetensors") && message.contains("bias"),
             "{message}"

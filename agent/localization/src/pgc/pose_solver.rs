@@ -220,6 +220,20 @@ mod tests {
         }
     }
 
+    /// Largest distance between the found and the true position of some sweeps, metres.
+    fn worst_off_m(scene: &SyntheticScene, factor: f64) -> f64 {
+        let off_m = (0..6).map(|seed| {
+            let coordinates = scene.coordinates(seed);
+            let truth = scene.world_from_sensor(seed).translation.vector
+                - Vector3::from(coordinates.origin_m);
+            match PoseSolver::default().search_wider(&coordinates, factor) {
+                Ok(found) => (found.target_from_source.translation.vector - truth).norm(),
+                Err(_) => f64::INFINITY,
+            }
+        });
+        off_m.fold(0.0, f64::max)
+    }
+
     #[test]
     fn cells_that_are_metres_off_are_found_by_a_wider_search() {
         let scene = SyntheticScene {
@@ -227,55 +241,37 @@ mod tests {
             outliers: 0.3,
             ..SyntheticScene::default()
         };
-        let solver = PoseSolver::default();
-        let off_m = |factor| {
-            let errors =
-                (0..6).map(
-                    |seed| match solver.search_wider(&scene.coordinates(seed), factor) {
-                        Ok(found) => {
-                            let truth = scene.world_from_sensor(seed).translation.vector
-                                - Vector3::from(scene.coordinates(seed).origin_m);
-                            (found.target_from_source.translation.vector - truth).norm()
-                        }
-                        Err(_) => f64::INFINITY,
-                    },
-                );
-            errors.fold(0.0, f64::max)
-        };
-        assert!(
-            off_m(4.0) < 1.5 && off_m(4.0) < off_m(1.0),
-            "{} {}",
-            off_m(4.0),
-            off_m(1.0)
-        );
+        let [wide_m, narrow_m] = [4.0, 1.0].map(|factor| worst_off_m(&scene, factor));
+        assert!(wide_m < 1.5 && wide_m < narrow_m, "{wide_m} {narrow_m}");
+    }
+
+    fn no_pose_reason(scene: &SyntheticScene) -> Option<NoPoseReason> {
+        match estimate(&PoseSolver::default().solve(&scene.coordinates(3))) {
+            PoseEstimate::NoPose { reason, .. } => Some(reason),
+            PoseEstimate::Pose { .. } => None,
+        }
     }
 
     #[test]
     fn thin_evidence_gives_no_pose_but_a_reason() {
-        let reason = |scene: &SyntheticScene| match estimate(
-            &PoseSolver::default().solve(&scene.coordinates(3)),
-        ) {
-            PoseEstimate::NoPose { reason, .. } => Some(reason),
-            PoseEstimate::Pose { .. } => None,
-        };
         let scene = SyntheticScene::default();
-        assert_eq!(reason(&scene), None);
+        assert_eq!(no_pose_reason(&scene), None);
         assert_eq!(
-            reason(&SyntheticScene {
+            no_pose_reason(&SyntheticScene {
                 cells: 0,
                 ..scene.clone()
             }),
             Some(NoPoseReason::TooFewPoints)
         );
         assert_eq!(
-            reason(&SyntheticScene {
+            no_pose_reason(&SyntheticScene {
                 cells: 10,
                 ..scene.clone()
             }),
             Some(NoPoseReason::TooFewPoints)
         );
         assert_eq!(
-            reason(&SyntheticScene {
+            no_pose_reason(&SyntheticScene {
                 outliers: 1.0,
                 ..scene
             }),

@@ -107,8 +107,9 @@ mod tests {
             .drawn(seed);
             let mut moments = PairMoments::default();
             for pair in &problem.pairs {
-                let point = |point: [f32; 3]| Vector3::from(point.map(f64::from));
-                moments.add(&point(pair.source_m), &point(pair.target_m), 1.0);
+                let [source, target] =
+                    [pair.source_m, pair.target_m].map(|point| Vector3::from(point.map(f64::from)));
+                moments.add(&source, &target, 1.0);
             }
             let fitted = moments.fit().unwrap();
             let (off_m, _) = problem.error(&fitted);
@@ -121,36 +122,32 @@ mod tests {
         assert!((0.75..1.25).contains(&ratio), "{ratio}");
     }
 
+    /// Standard deviation of the identity, of pairs that are off by plus or minus this distance along each axis.
+    fn std_of_identity(noise_m: [f64; 3]) -> PoseStd {
+        let pairs = (0..200_i32).map(|k| {
+            let source_m = [
+                (k % 10) as f32 * 4.0 - 18.0,
+                (k / 10) as f32 * 3.0 - 28.0,
+                (k % 7) as f32,
+            ];
+            let target_m = std::array::from_fn(|axis| {
+                let is_negative = ((k * 2_654_435) >> (axis as i32 + 4)) & 1 == 0;
+                let sign = if is_negative { -1.0 } else { 1.0 };
+                source_m[axis] + (sign * noise_m[axis]) as f32
+            });
+            Correspondence {
+                source_m,
+                target_m,
+                weight: 1.0,
+            }
+        });
+        let pairs: Vec<Correspondence> = pairs.collect();
+        PoseStd::of(&Isometry3::identity(), pairs.iter().map(|pair| (pair, 1.0)))
+    }
+
     #[test]
     fn the_worst_axis_is_the_one_along_which_residuals_are_large() {
-        let std = |noise_m: [f64; 3]| {
-            let pairs: Vec<Correspondence> = (0..200)
-                .map(|k| {
-                    let source_m = [
-                        (k % 10) as f32 * 4.0 - 18.0,
-                        (k / 10) as f32 * 3.0 - 28.0,
-                        (k % 7) as f32,
-                    ];
-                    let sign = |bit: i32| {
-                        if ((k * 2_654_435) >> bit) & 1 == 0 {
-                            -1.0
-                        } else {
-                            1.0
-                        }
-                    };
-                    let target_m = std::array::from_fn(|axis| {
-                        source_m[axis] + (sign(axis as i32 + 4) * noise_m[axis]) as f32
-                    });
-                    Correspondence {
-                        source_m,
-                        target_m,
-                        weight: 1.0,
-                    }
-                })
-                .collect();
-            PoseStd::of(&Isometry3::identity(), pairs.iter().map(|pair| (pair, 1.0)))
-        };
-        let (even, long) = (std([0.2; 3]), std([0.8, 0.2, 0.2]));
+        let [even, long] = [[0.2; 3], [0.8, 0.2, 0.2]].map(std_of_identity);
         assert!(even.worst_axis_m < even.position_m && long.worst_axis_m < long.position_m);
         assert!(
             long.worst_axis_m > 2.5 * even.worst_axis_m,

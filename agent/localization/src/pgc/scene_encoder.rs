@@ -392,13 +392,10 @@ mod tests {
                 .map(|[x, y, z]| [x + 8.0, y - 4.0, z]),
             &config,
         );
-        let encode = |sweep| {
-            encoder.encode(
-                &VoxelBatch::new(&[sweep], &config, Device::Cpu).unwrap(),
-                Kind::Float,
-            )
-        };
-        let (here, there) = (encode(&here).unwrap(), encode(&there).unwrap());
+        let [here, there] = [&here, &there].map(|sweep| {
+            let batch = VoxelBatch::new(&[sweep], &config, Device::Cpu).unwrap();
+            encoder.encode(&batch, Kind::Float).unwrap()
+        });
         assert!(here.cells.allclose(&there.cells, 1e-3, 1e-3, false));
     }
 

@@ -101,12 +101,11 @@ mod tests {
 
     #[test]
     fn clouds_whose_ground_is_at_zero_are_named() {
-        let cloud = |ground: f32| PointCloud {
-            xyzi: (0..200)
-                .map(|k| [k as f32, 1.0, ground + (k / 40) as f32, 0.0])
-                .collect(),
-        };
-        let lowest = [-1.9, 0.05, 0.02].map(|ground| lowest_m(&cloud(ground)).unwrap());
+        let lowest = [-1.9, 0.05, 0.02].map(|ground: f32| {
+            let points = (0..200).map(|k| [k as f32, 1.0, ground + (k / 40) as f32, 0.0]);
+            let xyzi = points.collect();
+            lowest_m(&PointCloud { xyzi }).unwrap()
+        });
         assert_eq!(lowest, [-1.9, 0.05, 0.02]);
         let text = vehicle_frame_hint(&lowest).unwrap();
         assert!(
@@ -122,18 +121,17 @@ mod tests {
 
     #[test]
     fn sweeps_of_another_density_are_named_with_both_numbers() {
-        let hint = |own: &[usize], of_head| other_lidar_hint(of_head, own);
-        let text = hint(&[21_000, 22_000, 400], Some(57_000)).unwrap();
+        let text = other_lidar_hint(Some(57_000), &[21_000, 22_000, 400]).unwrap();
         assert!(
             text.contains("21000 points") && text.contains("57000"),
             "{text}"
         );
-        assert!(hint(&[150_000], Some(57_000)).is_some());
+        assert!(other_lidar_hint(Some(57_000), &[150_000]).is_some());
         assert_eq!(
             [
-                hint(&[40_000], Some(57_000)),
-                hint(&[], Some(57_000)),
-                hint(&[9], None)
+                other_lidar_hint(Some(57_000), &[40_000]),
+                other_lidar_hint(Some(57_000), &[]),
+                other_lidar_hint(None, &[9])
             ],
             [None, None, None]
         );

@@ -190,17 +190,17 @@ mod tests {
         let cloud = PointCloud::default();
         // A measured pose far off: it must not matter.
         let measured = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);
-        let input = |step| PoseInput {
-            cav: &cav,
-            capture_nanos: step * 100_000_000,
-            cloud: &cloud,
-            levels: None,
-            measured: Some(&measured),
-            motion: EgoMotion::default(),
-        };
-        (0..count)
-            .map(|step| source.estimate(&input(step)))
-            .collect()
+        let estimates = (0..count).map(|step| {
+            source.estimate(&PoseInput {
+                cav: &cav,
+                capture_nanos: step * 100_000_000,
+                cloud: &cloud,
+                levels: None,
+                measured: Some(&measured),
+                motion: EgoMotion::default(),
+            })
+        });
+        estimates.collect()
     }
 
     #[test]

@@ -178,11 +178,10 @@ mod tests {
 
     /// Factors on the confidence of poses a tenth of a second apart.
     fn factors(motion_gate: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<f64> {
-        let capture = |step: usize| step as u64 * TENTH_NANOS;
         poses
             .iter()
             .enumerate()
-            .map(|(step, pose)| motion_gate.judge(capture(step), *pose))
+            .map(|(step, pose)| motion_gate.judge(step as u64 * TENTH_NANOS, *pose))
             .collect()
     }
 

@@ -137,11 +137,13 @@ mod tests {
         CavId::new(name).unwrap()
     }
 
-    fn correlation(pairs: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
-        let pairs: Vec<_> = pairs.collect();
-        let variance = pairs.iter().map(|(a, _)| a * a).sum::<f64>();
+    /// Correlation of values with the next ones, and their spread.
+    fn correlation(values: impl Iterator<Item = f64>) -> (f64, f64) {
+        let values: Vec<f64> = values.collect();
+        let pairs = values.windows(2);
+        let variance = pairs.clone().map(|pair| pair[0] * pair[0]).sum::<f64>();
         (
-            pairs.iter().map(|(a, b)| a * b).sum::<f64>() / variance,
+            pairs.clone().map(|pair| pair[0] * pair[1]).sum::<f64>() / variance,
             (variance / pairs.len() as f64).sqrt(),
         )
     }
@@ -170,20 +172,21 @@ mod tests {
     #[test]
     fn independent_errors_have_the_configured_spread_and_no_correlation() {
         let noise = PoseNoise::new(0.5, 0.02, 1);
-        let x = |step| noise.independent(&cav("a"), step).position_m[0];
-        let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));
+        let errors = (0..=4000).map(|step| noise.independent(&cav("a"), step));
+        let (correlation, spread) = correlation(errors.map(|error| error.position_m[0]));
         assert!(
             (spread - 0.5).abs() < 0.03 && correlation.abs() < 0.05,
             "{spread} {correlation}"
         );
-        assert_ne!(x(7), noise.independent(&cav("b"), 7).position_m[0]);
+        let [a, b] = ["a", "b"].map(|name| noise.independent(&cav(name), 7));
+        assert_ne!(a.position_m[0], b.position_m[0]);
     }
 
     #[test]
     fn autoregressive_errors_are_correlated_by_rho() {
         let noise = PoseNoise::new(0.5, 0.02, 1);
-        let x = |step| noise.autoregressive(&cav("a"), step, 0.9).position_m[0];
-        let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));
+        let errors = (0..=4000).map(|step| noise.autoregressive(&cav("a"), step, 0.9));
+        let (correlation, spread) = correlation(errors.map(|error| error.position_m[0]));
         assert!(
             (spread - 0.5).abs() < 0.06 && (correlation - 0.9).abs() < 0.03,
             "{spread} {correlation}"

@@ -255,16 +255,19 @@ mod tests {
         CavId::new(name).unwrap()
     }
 
+    fn disturbed(mode: NoiseMode, name: &str, seconds: u64) -> PoseEstimate {
+        source(mode).disturbed(&cav(name), seconds * 1_000_000_000, &TRUE_POSE)
+    }
+
     #[test]
     fn modes_differ_in_what_the_error_depends_on() {
-        let at = |mode, name: &str, seconds: u64| {
-            source(mode).disturbed(&cav(name), seconds * 1_000_000_000, &TRUE_POSE)
-        };
-        assert_eq!(at(NoiseMode::Fixed, "a", 1), at(NoiseMode::Fixed, "b", 2));
+        let fixed = disturbed(NoiseMode::Fixed, "a", 1);
+        assert_eq!(fixed, disturbed(NoiseMode::Fixed, "b", 2));
         for mode in [NoiseMode::Independent, NoiseMode::Autoregressive] {
-            assert_eq!(at(mode, "a", 1), at(mode, "a", 1), "{mode:?}");
-            assert_ne!(at(mode, "a", 1), at(mode, "a", 2), "{mode:?}");
-            assert_ne!(at(mode, "a", 1), at(mode, "b", 1), "{mode:?}");
+            let first = disturbed(mode, "a", 1);
+            assert_eq!(first, disturbed(mode, "a", 1), "{mode:?}");
+            assert_ne!(first, disturbed(mode, "a", 2), "{mode:?}");
+            assert_ne!(first, disturbed(mode, "b", 1), "{mode:?}");
         }
     }
 

@@ -108,6 +108,14 @@ mod tests {
             .0
     }
 
+    fn least_confidence(words: &[&str]) -> f64 {
+        match parsed(words) {
+            PoseSourceConfig::Pgc(pgc) => pgc.min_confidence,
+            PoseSourceConfig::Tracked(tracked) => tracked.min_confidence,
+            other => panic!("{other:?}"),
+        }
+    }
+
     #[test]
     fn options_choose_a_source_and_set_it_up() {
         assert_eq!(parsed(&[]), PoseSourceConfig::Recorded);
@@ -130,14 +138,10 @@ mod tests {
             (pgc.encoder.to_str(), pgc.head.to_str()),
             (Some("e"), Some("h"))
         );
-        let least = |words: &[&str]| match parsed(words) {
-            PoseSourceConfig::Pgc(pgc) => pgc.min_confidence,
-            PoseSourceConfig::Tracked(tracked) => tracked.min_confidence,
-            other => panic!("{other:?}"),
-        };
         for source in ["--pose-source=pgc", "--pose-source=tracked"] {
-            assert_eq!(least(&[source, "--head=h", "--min-confidence=0.8"]), 0.8);
-            assert_eq!(least(&[source, "--head=h"]), 0.0);
+            let words = [source, "--head=h", "--min-confidence=0.8"];
+            assert_eq!(least_confidence(&words), 0.8);
+            assert_eq!(least_confidence(&words[..2]), 0.0);
         }
         let message = parsed(&["--pose-source=pgc", "--encoder=e"])
             .validate()

@@ -265,16 +265,26 @@ mod tests {
         inlier_count: 12,
     };
 
+    fn row(cav: &CavId, capture_nanos: u64, estimate: PoseEstimate) -> PoseRow<'_> {
+        PoseRow {
+            cav,
+            capture_nanos,
+            estimate,
+        }
+    }
+
+    fn config(file: &Path, scenario: Option<&str>) -> PoseSourceConfig {
+        PoseSourceConfig::Cached(CachedPoseConfig {
+            file: file.to_owned(),
+            scenario: scenario.map(str::to_owned),
+        })
+    }
+
     #[test]
     fn rows_come_back_by_scenario_vehicle_and_time() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("poses.csv");
         let (a, b) = (cav("a"), cav("b"));
-        let row = |cav, capture_nanos, estimate| PoseRow {
-            cav,
-            capture_nanos,
-            estimate,
-        };
         PoseTable::append(
             &file,
             "towns/one",
@@ -308,43 +318,30 @@ mod tests {
         assert_eq!(table.get("one", &b, 100), Some(&LOST));
         assert_eq!(table.get("one", &b, 200), None);
 
-        let config = |scenario: Option<&str>| {
-            PoseSourceConfig::Cached(CachedPoseConfig {
-                file: file.clone(),
-                scenario: scenario.map(str::to_owned),
-            })
-        };
-        let mut source = config(Some("one")).build(Inference::default()).unwrap();
+        let mut source = config(&file, Some("one"))
+            .build(Inference::default())
+            .unwrap();
         let cloud = PointCloud::default();
-        let mut ask = |cav, capture_nanos| {
-            source.estimate(&PoseInput {
-                cav,
+        for (capture_nanos, expected) in [(100, LOST), (300, NO_SOURCE)] {
+            let estimate = source.estimate(&PoseInput {
+                cav: &b,
                 capture_nanos,
                 cloud: &cloud,
                 levels: None,
                 measured: Some(&Pose::IDENTITY),
                 motion: protocol::EgoMotion::default(),
-            })
-        };
+            });
+            assert_eq!(estimate, expected);
+        }
+        for (scenario, named) in [(None, "2 scenarios"), (Some("three"), "three")] {
+            let built = config(&file, scenario).build(Inference::default());
+            let message = built.unwrap_err().to_string();
+            assert!(message.contains(named), "{message}");
+        }
         assert_eq!(
-            (ask(&b, 100), ask(&b, 300)),
-            (LOST, super::super::NO_SOURCE)
+            config(&file, None).for_scenario("two"),
+            config(&file, Some("two"))
         );
-        assert!(
-            config(None)
-                .build(Inference::default())
-                .unwrap_err()
-                .to_string()
-                .contains("2 scenarios")
-        );
-        assert!(
-            config(Some("three"))
-                .build(Inference::default())
-                .unwrap_err()
-                .to_string()
-                .contains("three")
-        );
-        assert_eq!(config(None).for_scenario("two"), config(Some("two")));
     }
 
     #[test]

@@ -193,12 +193,13 @@ mod tests {
         pose: Section<PoseSourceConfig>,
     }
 
+    fn parsed(words: &str) -> Result<PoseSourceConfig, clap::Error> {
+        let words = ["program"].into_iter().chain(words.split_whitespace());
+        Cli::try_parse_from(words).map(|cli| cli.pose.0)
+    }
+
     #[test]
     fn a_new_source_is_one_file_and_one_row() {
-        let parsed = |words: &str| {
-            let words = ["program"].into_iter().chain(words.split_whitespace());
-            Cli::try_parse_from(words).map(|cli| cli.pose.0)
-        };
         assert_eq!(parsed("").unwrap(), PoseSourceConfig::Recorded);
         let options = "--pose-source beacon --beacon-file b.csv --beacon-number 3";
         let mut source = parsed(options).unwrap();

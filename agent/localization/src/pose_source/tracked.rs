@@ -472,27 +472,20 @@ mod tests {
 
     #[test]
     fn with_a_yaw_rate_every_fourth_sweep_is_measured_and_vehicles_take_turns() {
-        let measured = |phase: u32| {
-            let steps = steps(
-                road(),
-                TrackedPoseConfig {
-                    phase,
-                    ..Default::default()
-                },
-                Some(0.0),
-            );
-            let measured = steps
-                .take(44)
-                .enumerate()
-                .skip(4)
-                .filter(|(_, (_, is_measured))| *is_measured);
-            measured.map(|(sweep, _)| sweep).collect::<Vec<_>>()
-        };
         for (phase, turn) in (0u32..8).zip(0usize..) {
+            let config = TrackedPoseConfig {
+                phase,
+                ..Default::default()
+            };
+            let steps = steps(road(), config, Some(0.0)).take(44).enumerate();
+            let measured = steps
+                .skip(4)
+                .filter(|(_, (_, is_measured))| *is_measured)
+                .map(|(sweep, _)| sweep);
             let expected: Vec<usize> = (4..44)
                 .filter(|sweep| (sweep + turn).is_multiple_of(4))
                 .collect();
-            assert_eq!(measured(phase), expected, "phase {phase}");
+            assert_eq!(measured.collect::<Vec<_>>(), expected, "phase {phase}");
         }
         let estimates: Vec<_> = steps(road(), TrackedPoseConfig::default(), Some(0.0))
             .take(44)
@@ -555,12 +548,38 @@ mod tests {
         );
     }
 
-    #[test]
-    fn a_stated_pose_is_where_the_vehicle_is_until_its_sweeps_tell() {
-        let cloud = |sweep: usize| PointCloud {
+    /// One sweep of a vehicle that drives straight ahead, with a pose that is stated before it.
+    fn step(source: &mut TrackedPose, sweep: usize, stated: Option<[f64; 2]>) -> PoseEstimate {
+        let cloud = PointCloud {
             xyzi: vec![[0.0; 4]; sweep],
         };
-        let cav = CavId::new("7").unwrap();
+        let capture_nanos = sweep as u64 * 100_000_000;
+        let input = PoseInput {
+            cav: &CavId::new("7").unwrap(),
+            capture_nanos,
+            cloud: &cloud,
+            levels: None,
+            measured: None,
+            motion: EgoMotion {
+                speed_mps: Some(10.0),
+                yaw_rate_rad_s: Some(0.0),
+            },
+        };
+        if let Some([x, y]) = stated {
+            assert!(source.start_at(&PoseMeasurement {
+                capture_nanos,
+                world_from_lidar: Isometry3::translation(x, y, 2.0),
+                position_std_m: 0.5,
+                yaw_std_rad: 0.1,
+            }));
+        }
+        let estimate = source.estimate(&input);
+        source.observe(&input);
+        estimate
+    }
+
+    #[test]
+    fn a_stated_pose_is_where_the_vehicle_is_until_its_sweeps_tell() {
         let mut source = TrackedPose::new(
             Box::new(Road {
                 blind: 0..12,
@@ -568,58 +587,35 @@ mod tests {
             }),
             TrackedPoseConfig::default(),
         );
-        let mut step = |sweep: usize, stated: Option<[f64; 2]>| {
-            let (cloud, capture_nanos) = (cloud(sweep), sweep as u64 * 100_000_000);
-            let input = PoseInput {
-                cav: &cav,
-                capture_nanos,
-                cloud: &cloud,
-                levels: None,
-                measured: None,
-                motion: EgoMotion {
-                    speed_mps: Some(10.0),
-                    yaw_rate_rad_s: Some(0.0),
-                },
-            };
-            if let Some([x, y]) = stated {
-                assert!(source.start_at(&PoseMeasurement {
-                    capture_nanos,
-                    world_from_lidar: Isometry3::translation(x, y, 2.0),
-                    position_std_m: 0.5,
-                    yaw_std_rad: 0.1,
-                }));
-            }
-            let estimate = source.estimate(&input);
-            source.observe(&input);
-            estimate
-        };
-        assert_eq!(step(9, None).world_from_cav(), None, "nothing is known");
-        let stated = step(10, Some([10.6, 0.3]));
+        let first = step(&mut source, 9, None);
+        assert_eq!(first.world_from_cav(), None, "nothing is known");
+        let stated = step(&mut source, 10, Some([10.6, 0.3]));
         assert_eq!(x_y(&stated), [10.6, 0.3]);
         assert!(stated.confidence() < 0.7, "it is no measurement");
-        let [x, y] = x_y(&step(11, None));
+        let [x, y] = x_y(&step(&mut source, 11, None));
         assert!((x - 11.6).abs() < 0.1 && (y - 0.3).abs() < 0.1, "{x}, {y}");
-        let found: Vec<[f64; 2]> = (12..20).map(|sweep| x_y(&step(sweep, None))).collect();
+        let found = (12..20).map(|sweep| x_y(&step(&mut source, sweep, None)));
+        let found: Vec<[f64; 2]> = found.collect();
         let [x, y] = found[7];
         assert!((x - 19.0).abs() < 0.2 && y.abs() < 0.1, "{found:?}");
     }
 
     #[test]
     fn settings_out_of_range_are_named() {
-        let refused = |config: TrackedPoseConfig| config.validate().unwrap_err().to_string();
-        assert!(
-            refused(TrackedPoseConfig {
-                measure_every: 0,
-                ..Default::default()
-            })
-            .contains("measure_every is 0")
-        );
-        assert!(
-            refused(TrackedPoseConfig {
-                max_coast_s: -1.0,
-                ..Default::default()
-            })
-            .contains("max_coast_s")
-        );
+        let unmeasured = TrackedPoseConfig {
+            measure_every: 0,
+            ..Default::default()
+        };
+        let backwards = TrackedPoseConfig {
+            max_coast_s: -1.0,
+            ..Default::default()
+        };
+        for (config, named) in [
+            (unmeasured, "measure_every is 0"),
+            (backwards, "max_coast_s"),
+        ] {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(named), "{message}");
+        }
     }
 }

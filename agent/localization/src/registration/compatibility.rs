@@ -101,12 +101,13 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 mod tests {
     use super::*;
 
+    fn entry(row: usize, column: usize) -> f32 {
+        f32::from(u8::from((row * column + row + column).is_multiple_of(3)))
+    }
+
     #[test]
     fn common_bits_are_the_square_of_the_matrix() {
         let size = 130;
-        let entry = |row: usize, column: usize| {
-            f32::from(u8::from((row * column + row + column).is_multiple_of(3)))
-        };
         let entries: Vec<f32> = (0..size * size)
             .map(|place| entry(place / size, place % size))
             .collect();

@@ -169,14 +169,14 @@ mod tests {
     #[test]
     fn a_mirror_image_still_gives_a_rotation() {
         let box_corners = (0..8).map(|corner| {
-            let side = |bit: usize, reach: f64| {
-                if corner >> bit & 1 == 0 {
+            Vector3::from_fn(|axis, _| {
+                let reach: f64 = [4.0, 2.0, 1.0][axis];
+                if corner >> axis & 1 == 0 {
                     -reach
                 } else {
                     reach
                 }
-            };
-            Vector3::new(side(0, 4.0), side(1, 2.0), side(2, 1.0))
+            })
         });
         let pairs: Vec<_> = box_corners
             .map(|p| (p, Vector3::new(p.x, p.y, -p.z), 1.0))
@@ -191,21 +191,26 @@ mod tests {
         );
     }
 
+    /// Points, each with itself turned.
+    fn turned(
+        points: &[Vector3<f64>],
+        turn: UnitQuaternion<f64>,
+    ) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
+        points.iter().map(|p| (*p, turn * p, 1.0)).collect()
+    }
+
     #[test]
     fn a_plane_is_enough_and_a_line_is_not() {
         let turn = UnitQuaternion::from_euler_angles(0.3, -0.2, 1.0);
-        let moved = |points: &[Vector3<f64>]| {
-            points
-                .iter()
-                .map(|p| (*p, turn * p, 1.0))
-                .collect::<Vec<_>>()
-        };
         let plane = [[0.0, 0.0, 1.0], [4.0, 0.0, 1.0], [0.0, 2.0, 1.0]].map(Vector3::from);
-        assert!((fit(&moved(&plane)).unwrap().rotation.angle_to(&turn)) < 1e-9);
+        assert!((fit(&turned(&plane, turn)).unwrap().rotation.angle_to(&turn)) < 1e-9);
         let line = [0.0, 1.0, 5.0].map(|x| Vector3::new(x, 2.0 * x, 1.0));
-        assert!(matches!(fit(&moved(&line)), Err(Degenerate::Collinear(_))));
         assert!(matches!(
-            fit(&moved(&line[..1])),
+            fit(&turned(&line, turn)),
+            Err(Degenerate::Collinear(_))
+        ));
+        assert!(matches!(
+            fit(&turned(&line[..1], turn)),
             Err(Degenerate::Collinear(_))
         ));
     }

@@ -88,12 +88,12 @@ mod tests {
     use crate::registration::test_problem::TestProblem;
 
     fn pairs(problem: &TestProblem) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
-        let vector = |point: [f32; 3]| Vector3::from(point.map(f64::from));
-        problem
-            .pairs
-            .iter()
-            .map(|pair| (vector(pair.source_m), vector(pair.target_m), 1.0))
-            .collect()
+        let pairs = problem.pairs.iter().map(|pair| {
+            let [source, target] =
+                [pair.source_m, pair.target_m].map(|point| Vector3::from(point.map(f64::from)));
+            (source, target, 1.0)
+        });
+        pairs.collect()
     }
 
     #[test]

@@ -63,8 +63,8 @@ impl TestProblem {
             );
             let is_outlier = random.random_bool(self.outliers);
             let target = if is_outlier {
-                let mut place = |reach: f64| random.random_range(-reach..reach);
-                Point3::new(place(260.0), place(260.0), place(5.0))
+                let reaches = [260.0, 260.0, 5.0];
+                Point3::from(reaches.map(|reach: f64| random.random_range(-reach..reach)))
             } else {
                 let mut shaken = self.truth * source;
                 shaken

@@ -42,11 +42,11 @@ fn measured(sweep: u64, off_m: [f64; 2], position_std_m: f64) -> PoseMeasurement
 
 /// Motion as a vehicle on the drive measures it, with a biased gyroscope.
 fn motion(sweep: u64, bias_rad_s: f64) -> EgoMotion {
-    let yaw = |sweep: u64| truth(sweep).rotation.euler_angles().2;
-    let yaw_rate_rad_s = Some((yaw(sweep) - yaw(sweep.saturating_sub(1))) / 0.1 + bias_rad_s);
+    let [before_rad, yaw_rad] =
+        [sweep.saturating_sub(1), sweep].map(|sweep| truth(sweep).rotation.euler_angles().2);
     EgoMotion {
         speed_mps: Some(10.0),
-        yaw_rate_rad_s,
+        yaw_rate_rad_s: Some((yaw_rad - before_rad) / 0.1 + bias_rad_s),
     }
 }
 
@@ -54,19 +54,18 @@ fn motion(sweep: u64, bias_rad_s: f64) -> EgoMotion {
 /// measured, of a LiDAR ahead of the rear axle.
 fn worst(motion: impl Fn(u64) -> EgoMotion, lever_m: f64) -> [f64; 2] {
     let mut tracker = PoseTracker::new(LIMITS);
-    let lidar = |sweep: u64| truth(sweep) * Translation3::new(lever_m, 0.0, 0.0);
     let mut worst: [f64; 2] = [0.0; 2];
     for sweep in 0..200 {
         let state = tracker.predict(sweep * TENTH_NANOS, &motion(sweep));
+        let world_from_lidar = truth(sweep) * Translation3::new(lever_m, 0.0, 0.0);
         if let Some(state) = state.filter(|_| sweep >= 60) {
-            let off = lidar(sweep).inv_mul(&state.world_from_lidar);
+            let off = world_from_lidar.inv_mul(&state.world_from_lidar);
             worst = [
                 worst[0].max(off.translation.vector.xy().norm()),
                 worst[1].max(off.rotation.angle()),
             ];
         }
         if sweep % 4 == 0 || tracker.needs_measurement() {
-            let world_from_lidar = lidar(sweep);
             tracker.correct(&PoseMeasurement {
                 world_from_lidar,
                 ..measured(sweep, [0.0; 2], 0.02)
@@ -132,23 +131,25 @@ fn predictions_are_about_as_good_as_measurements_and_stay_within_their_bounds() 
     );
 }
 
+/// Error of the prediction after one measurement, metres.
+fn second_error_m(motion: &EgoMotion) -> Option<f64> {
+    let mut tracker = PoseTracker::new(LIMITS);
+    tracker.predict(0, motion);
+    tracker.correct(&measured(0, [0.0; 2], 0.05));
+    tracker
+        .predict(TENTH_NANOS, motion)
+        .map(|state| error_m(&state, 1))
+}
+
 #[test]
 fn the_speed_that_the_vehicle_measures_is_used() {
     let speed = EgoMotion {
         speed_mps: Some(10.0),
         yaw_rate_rad_s: None,
     };
-    let off = |motion: &EgoMotion| {
-        let mut tracker = PoseTracker::new(LIMITS);
-        tracker.predict(0, motion);
-        tracker.correct(&measured(0, [0.0; 2], 0.05));
-        tracker
-            .predict(TENTH_NANOS, motion)
-            .map(|state| error_m(&state, 1))
-    };
     // The first pose says nothing of the speed.
-    assert!(off(&speed).unwrap() < 0.1);
-    assert!(off(&EgoMotion::default()).unwrap() > 0.9);
+    assert!(second_error_m(&speed).unwrap() < 0.1);
+    assert!(second_error_m(&EgoMotion::default()).unwrap() > 0.9);
 }
 
 #[test]
@@ -166,11 +167,14 @@ fn a_yaw_rate_keeps_the_prediction_from_lagging_in_bends() {
         without[1] > 0.01 && with[1] < 0.002 && with[0] < 0.02,
         "{without:?} {with:?}"
     );
-    let broken = |sweep| EgoMotion {
-        yaw_rate_rad_s: Some(f64::NAN),
-        ..motion(sweep, 0.0)
-    };
-    assert_eq!(worst(broken, 0.0), without, "no yaw rate");
+    let broken = worst(
+        |sweep| EgoMotion {
+            yaw_rate_rad_s: Some(f64::NAN),
+            ..motion(sweep, 0.0)
+        },
+        0.0,
+    );
+    assert_eq!(broken, without, "no yaw rate");
 }
 
 #[test]
@@ -183,11 +187,13 @@ fn a_lidar_ahead_of_the_rear_axle_is_swung_aside_in_bends() {
 #[test]
 fn a_gyroscope_that_fails_does_not_lose_the_vehicle() {
     for rate in [0.0, -0.3] {
-        let stuck = |sweep| EgoMotion {
-            yaw_rate_rad_s: Some(rate),
-            ..motion(sweep, 0.0)
-        };
-        let [off_m, _] = worst(stuck, 0.0);
+        let [off_m, _] = worst(
+            |sweep| EgoMotion {
+                yaw_rate_rad_s: Some(rate),
+                ..motion(sweep, 0.0)
+            },
+            0.0,
+        );
         assert!(off_m < 1.0, "{rate} rad/s: {off_m} m");
     }
 }

@@ -127,21 +127,16 @@ mod tests {
 
     #[test]
     fn heads_are_of_one_town_or_of_all() {
-        let map = |name: &str, seed| {
-            Some(GeneratedMap {
-                name: name.into(),
-                seed,
-            })
-        };
         for (text, expected) in [
             ("h.st", None),
-            ("town1=h.st", map("town1", 0)),
-            ("town4:3=h.st", map("town4", 3)),
+            ("town1=h.st", Some(("town1", 0))),
+            ("town4:3=h.st", Some(("town4", 3))),
         ] {
             let head: SceneHeadFile = text.parse().unwrap();
+            let map = head.map.as_ref().map(|map| (map.name.as_str(), map.seed));
             assert_eq!(
-                (head.map, head.weights),
-                (expected, PathBuf::from("h.st")),
+                (map, head.weights.as_path()),
+                (expected, Path::new("h.st")),
                 "{text}"
             );
         }
@@ -156,7 +151,12 @@ mod tests {
     #[test]
     fn scenes_are_taken_together_by_the_head_of_their_town() {
         let folder = tempfile::tempdir().unwrap();
-        let scene = |subset, name: &str| {
+        let [a, b, c] = [
+            (Subset::Town1loc, "a"),
+            (Subset::Town4loc, "b"),
+            (Subset::Town1loc, "c"),
+        ]
+        .map(|(subset, name)| {
             let out = folder.path().join(name);
             let options = SynthOptions {
                 frames: 1,
@@ -164,13 +164,7 @@ mod tests {
             };
             generate(&options, &|_| {}).unwrap();
             out
-        };
-        let [a, b, c] = [
-            (Subset::Town1loc, "a"),
-            (Subset::Town4loc, "b"),
-            (Subset::Town1loc, "c"),
-        ]
-        .map(|(subset, name)| scene(subset, name));
+        });
         let scenes = [a.clone(), b.clone(), c.clone()];
         let heads: Vec<SceneHeadFile> = ["town1=1.st", "town4=4.st"]
             .map(|head| head.parse().unwrap())

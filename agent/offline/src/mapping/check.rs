@@ -114,10 +114,11 @@ mod tests {
         let pose = Pose::from_xyz_yaw([5.0, 6.0, 2.0], 0.7);
         let (copy, turned_pose) = turned(&cloud, &pose, &mut ChaCha8Rng::seed_from_u64(3));
         assert!((100..200).contains(&copy.len()));
-        let place = |pose: &Pose, [x, y, z, _]: [f32; 4]| {
-            pose.isometry() * nalgebra::Point3::new(x, y, z).cast::<f64>()
-        };
-        let moved = place(&pose, cloud.xyzi[0]) - place(&turned_pose, copy.xyzi[0]);
+        let [before, after] =
+            [(&pose, cloud.xyzi[0]), (&turned_pose, copy.xyzi[0])].map(|(pose, [x, y, z, _])| {
+                pose.isometry() * nalgebra::Point3::new(x, y, z).cast::<f64>()
+            });
+        let moved = before - after;
         assert!(moved.norm() < 1e-5, "{moved}");
         assert_eq!(mirrored(&cloud).xyzi[0], [10.0, 3.0, 1.0, 0.5]);
     }

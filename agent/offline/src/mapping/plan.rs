@@ -181,21 +181,19 @@ mod tests {
     #[test]
     fn a_plan_is_read_back_for_the_same_sweeps_only() {
         let folder = tempfile::tempdir().unwrap();
-        let reason = |sweeps| {
-            StoredPlan::read(folder.path(), sweeps)
-                .unwrap_err()
-                .to_string()
-        };
-        assert!(reason(680).contains("plan.json"));
+        let missing = StoredPlan::read(folder.path(), 680).unwrap_err();
+        assert!(missing.to_string().contains("plan.json"), "{missing}");
         let plan = Plan::new(600, 80, 0.1, 600.0);
         StoredPlan { sweeps: 680, plan }
             .write(folder.path())
             .unwrap();
         assert_eq!(StoredPlan::read(folder.path(), 680).unwrap(), plan);
+        let message = StoredPlan::read(folder.path(), 681)
+            .unwrap_err()
+            .to_string();
         assert!(
-            reason(681).contains("of 680 sweeps, the drives have 681"),
-            "{}",
-            reason(681)
+            message.contains("of 680 sweeps, the drives have 681"),
+            "{message}"
         );
     }
 

@@ -77,10 +77,10 @@ mod tests {
 
     #[test]
     fn heaps_become_clusters() {
-        let heap = |x: f64| {
+        let points = [0.0, 50.0, 100.0].into_iter().flat_map(|x: f64| {
             (0..20).map(move |k| [x + 0.1 * f64::from(k % 5), 0.1 * f64::from(k / 5), 0.0])
-        };
-        let points: Vec<[f64; 3]> = heap(0.0).chain(heap(50.0)).chain(heap(100.0)).collect();
+        });
+        let points: Vec<[f64; 3]> = points.collect();
         let (centres, labels) = kmeans(&points, 3, 1);
         assert_eq!(centres.len(), 3);
         assert!(

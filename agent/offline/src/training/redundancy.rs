@@ -197,24 +197,27 @@ mod tests {
         assert_eq!(redundancy.weights, [1.0; 8]);
     }
 
+    /// The sweeps that a random choice leaves out.
+    fn left_out(seed: u64) -> Vec<usize> {
+        let config = RedundancyConfig {
+            leave_out: LeaveOut::Random,
+            seed,
+            ..RedundancyConfig::default()
+        };
+        let mut redundancy = Redundancy::new(config, vec![0; 8]);
+        for _ in 0..2 {
+            redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| {
+                (sweep, sweep as f32)
+            }));
+        }
+        assert!(redundancy.advance(0.25));
+        (0..8)
+            .filter(|&sweep: &usize| redundancy.weights[sweep] == 0.0)
+            .collect()
+    }
+
     #[test]
     fn a_random_choice_leaves_out_as_many() {
-        let left_out = |seed| {
-            let config = RedundancyConfig {
-                leave_out: LeaveOut::Random,
-                seed,
-                ..RedundancyConfig::default()
-            };
-            let mut redundancy = Redundancy::new(config, vec![0; 8]);
-            for _ in 0..2 {
-                redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| {
-                    (sweep, sweep as f32)
-                }));
-            }
-            assert!(redundancy.advance(0.25));
-            let unused = |&sweep: &usize| redundancy.weights[sweep] == 0.0;
-            (0..8).filter(unused).collect::<Vec<usize>>()
-        };
         let choices: Vec<_> = (0..8).map(left_out).collect();
         assert!(
             choices.iter().all(|choice| choice.len() == 2),

@@ -206,22 +206,24 @@ mod tests {
         assert_eq!(refinement.refined(&map, Vec::new()).unwrap(), []);
     }
 
+    /// Detections that a network of constant weights has refined.
+    fn refined(y_axis: YAxis, map: &Tensor, found: Vec<Detection>) -> Vec<Detection> {
+        let variables = VarStore::new(Device::Cpu);
+        let refinement = BoxRefinement::new(&variables.root(), &detector(y_axis));
+        tch::manual_seed(5);
+        for (name, variable) in variables.variables() {
+            let fan = if name.ends_with("out.weight") {
+                0.1
+            } else {
+                0.05
+            };
+            let _ = tch::no_grad(|| variable.shallow_clone().fill_(fan));
+        }
+        refinement.refined(map, found).unwrap()
+    }
+
     #[test]
     fn a_mirrored_network_corrects_the_mirrored_box() {
-        let refine = |y_axis: YAxis, map: &Tensor, found: Vec<Detection>| {
-            let variables = VarStore::new(Device::Cpu);
-            let refinement = BoxRefinement::new(&variables.root(), &detector(y_axis));
-            tch::manual_seed(5);
-            for (name, variable) in variables.variables() {
-                let fan = if name.ends_with("out.weight") {
-                    0.1
-                } else {
-                    0.05
-                };
-                let _ = tch::no_grad(|| variable.shallow_clone().fill_(fan));
-            }
-            refinement.refined(map, found).unwrap()
-        };
         tch::manual_seed(4);
         let map = Tensor::rand([1, 64, 20, 20], (Kind::Float, Device::Cpu));
         let found = detection([1.0, 2.0, -1.0], 0.3, 0.9);
@@ -229,8 +231,8 @@ mod tests {
             box3d: found.box3d.mirrored_y(),
             ..found.clone()
         };
-        let left = refine(YAxis::Left, &map, vec![mirrored]);
-        let right = refine(YAxis::Right, &map, vec![found.clone()]);
+        let left = refined(YAxis::Left, &map, vec![mirrored]);
+        let right = refined(YAxis::Right, &map, vec![found.clone()]);
         let back = left[0].box3d.mirrored_y();
         for axis in 0..3 {
             assert!((right[0].box3d.center_m[axis] - back.center_m[axis]).abs() < 1e-5);

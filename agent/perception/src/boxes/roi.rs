@@ -156,16 +156,18 @@ mod tests {
         assert!(x_m.abs() < 1e-9 && y_m.abs() < 1e-9);
     }
 
+    /// Centres of a number of cells along an axis, metres.
+    fn centres_m(count: i64, low_m: f64) -> Tensor {
+        Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.8 + low_m + 0.4
+    }
+
     #[test]
     fn a_map_is_read_between_its_cells_and_as_zeros_beyond_its_edges() {
         // Two channels: x and y of the centres of the cells.
-        let along = |count: i64, low_m: f64| {
-            Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.8 + low_m + 0.4
-        };
-        let x = along(20, -8.0)
+        let x = centres_m(20, -8.0)
             .view([1, 1, 1, 20])
             .expand([1, 1, 10, 20], true);
-        let y = along(10, -4.0)
+        let y = centres_m(10, -4.0)
             .view([1, 1, 10, 1])
             .expand([1, 1, 10, 20], true);
         let map = Tensor::cat(&[x, y], 1);

@@ -554,18 +554,20 @@ mod tests {
         serde_json::from_value(scales).unwrap()
     }
 
+    /// A sweep that is encoded with its own scales, halved so many times.
+    fn encoded_in_integers(halvings: i64) -> Result<EncoderOutput> {
+        let (_store, pillars) = network();
+        let mut detector = Detector::from_network(pillars);
+        let scales = scales_of(&mut detector, &cloud(), halvings);
+        let mut quantised = detector.quantised(&scales).unwrap();
+        assert!(quantised.is_quantised());
+        quantised.encode_sweep(&cloud())
+    }
+
     #[test]
     fn a_sweep_that_far_too_small_scales_clamp_is_an_error_of_its_frame() {
-        let encoded = |halvings| {
-            let (_store, pillars) = network();
-            let mut detector = Detector::from_network(pillars);
-            let scales = scales_of(&mut detector, &cloud(), halvings);
-            let mut quantised = detector.quantised(&scales).unwrap();
-            assert!(quantised.is_quantised());
-            quantised.encode_sweep(&cloud())
-        };
-        assert!(encoded(0).is_ok());
-        let error = encoded(10).unwrap_err();
+        assert!(encoded_in_integers(0).is_ok());
+        let error = encoded_in_integers(10).unwrap_err();
         assert!(
             matches!(error, DetectorError::Saturated { level: 0 }) && error.is_of_frame(),
             "{error:?}"
@@ -678,16 +680,13 @@ mod tests {
             (4, Some(64), 4 * cells)
         );
         let whole = detector.through_compressor(&encoded).unwrap();
-        let received = |sent| {
-            detector
-                .received(&DecodedFeatures {
-                    features: features.clone(),
-                    sent,
-                })
-                .unwrap()
+        let mut message = DecodedFeatures {
+            features,
+            sent: None,
         };
-        assert!(received(None).equal(&whole));
-        let half = received(Some((0..cells).map(|cell| cell < cells / 2).collect()));
+        assert!(detector.received(&message).unwrap().equal(&whole));
+        message.sent = Some((0..cells).map(|cell| cell < cells / 2).collect());
+        let half = detector.received(&message).unwrap();
         let values: Vec<f32> = Vec::try_from(half.view([-1])).unwrap();
         assert!(
             values
@@ -752,27 +751,20 @@ mod tests {
         }
         pillars.config.y_axis = YAxis::Right;
         let mut mirrored = Detector::from_network(pillars);
-        let flip = |cloud: PointCloud| PointCloud {
-            xyzi: cloud
-                .xyzi
-                .iter()
-                .map(|&[x, y, z, i]| [x, -y, z, i])
-                .collect(),
+        let flipped = cloud().xyzi.into_iter().map(|[x, y, z, i]| [x, -y, z, i]);
+        let flipped = PointCloud {
+            xyzi: flipped.collect(),
         };
         let (there, here) = (
             plain.encode(&cloud()).unwrap(),
-            mirrored.encode(&flip(cloud())).unwrap(),
+            mirrored.encode(&flipped).unwrap(),
         );
         assert!(there.features.equal(&here.features));
-        let boxes = |detector: &Detector, features| {
-            detector
-                .boxes(&detector.heads(features).unwrap(), 0.3)
-                .unwrap()
-        };
-        let (theirs, ours) = (
-            boxes(&plain, &there.features),
-            boxes(&mirrored, &here.features),
-        );
+        let [theirs, ours] =
+            [(&plain, &there.features), (&mirrored, &here.features)].map(|(detector, features)| {
+                let heads = detector.heads(features).unwrap();
+                detector.boxes(&heads, 0.3).unwrap()
+            });
         assert!(!theirs.is_empty() && theirs.len() == ours.len());
         for (theirs, ours) in theirs.iter().zip(&ours) {
             assert_eq!(theirs.box3d.center_m[1], -ours.box3d.center_m[1]);

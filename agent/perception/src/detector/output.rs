@@ -98,9 +98,8 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn boxes_that_no_vehicle_has_are_an_error() {
-        let turned = |center_m, size_m, heading_rad| Decoded {
+    fn decoded(center_m: [f64; 3], size_m: [f64; 3], heading_rad: f64) -> Decoded {
+        Decoded {
             anchor: 0,
             score: 0.9,
             box3d: Box3d {
@@ -108,15 +107,18 @@ mod tests {
                 size_m,
                 heading_rad,
             },
-        };
-        let decoded = |center_m, size_m| turned(center_m, size_m, 0.5);
-        let bus = decoded([140.0, -39.0, -1.0], [18.0, 2.5, 3.0]);
+        }
+    }
+
+    #[test]
+    fn boxes_that_no_vehicle_has_are_an_error() {
+        let bus = decoded([140.0, -39.0, -1.0], [18.0, 2.5, 3.0], 0.5);
         assert!(check_boxes(&[bus]).is_ok());
         for wrong in [
-            decoded([1.0, 2.0, -1.0], [4.0, 11_000.0, 1.5]),
-            decoded([1.0, 2.0, -1.0], [4.0, 1e-9, 1.5]),
-            decoded([1.0, -3e5, -1.0], [4.0, 2.0, 1.5]),
-            turned([1.0, 2.0, -1.0], [4.0, 2.0, 1.5], -1e4),
+            decoded([1.0, 2.0, -1.0], [4.0, 11_000.0, 1.5], 0.5),
+            decoded([1.0, 2.0, -1.0], [4.0, 1e-9, 1.5], 0.5),
+            decoded([1.0, -3e5, -1.0], [4.0, 2.0, 1.5], 0.5),
+            decoded([1.0, 2.0, -1.0], [4.0, 2.0, 1.5], -1e4),
         ] {
             let error = check_boxes(&[bus, wrong]).unwrap_err();
             assert!(error.is_of_frame(), "{error}");

@@ -111,21 +111,16 @@ mod tests {
             search.observe(name, values).unwrap();
         }
         let scales = search.scales();
-        let found = |name: &str| scales.get(name).unwrap();
-        assert_eq!(
-            found("even"),
-            Quantisation::unsigned(Scale::of_exponent(-8))
-        );
-        assert_eq!(
-            found("outlier"),
-            Quantisation::unsigned(Scale::of_exponent(-7))
-        );
-        assert_eq!(
-            found("signed"),
-            Quantisation {
-                scale: Scale::of_exponent(-8),
-                zero_point: MIDDLE
-            }
-        );
+        let signed = Quantisation {
+            scale: Scale::of_exponent(-8),
+            zero_point: MIDDLE,
+        };
+        for (name, expected) in [
+            ("even", Quantisation::unsigned(Scale::of_exponent(-8))),
+            ("outlier", Quantisation::unsigned(Scale::of_exponent(-7))),
+            ("signed", signed),
+        ] {
+            assert_eq!(scales.get(name).unwrap(), expected, "{name}");
+        }
     }
 }

@@ -72,11 +72,11 @@ mod tests {
     }
 
     fn rows(block: &Tensor, sites: &Sites) -> Tensor {
-        let at = |coord: &[i32; 3]| {
+        let rows = sites.coords().iter().map(|coord| {
             let [x, y, z] = coord.map(i64::from);
             block.i((0, .., x, y, z))
-        };
-        Tensor::stack(&sites.coords().iter().map(at).collect::<Vec<_>>(), 0)
+        });
+        Tensor::stack(&rows.collect::<Vec<_>>(), 0)
     }
 
     /// Values and gradients of a sparse convolution and of a dense one over the same occupancy.

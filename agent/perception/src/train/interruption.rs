@@ -64,18 +64,22 @@ mod tests {
 
     use super::*;
 
+    fn ends_process(interruption: &Interruption) -> bool {
+        interruption.ends_process.load(Ordering::Relaxed)
+    }
+
     #[test]
     fn a_signal_during_the_steps_is_a_request_and_ends_the_process_otherwise() {
         let interruption = Interruption::by_signals().unwrap();
-        let ends_process = || interruption.ends_process.load(Ordering::Relaxed);
-        assert!(ends_process(), "before the steps");
+        assert!(ends_process(&interruption), "before the steps");
         for signal in [SIGINT, SIGTERM] {
             let steps = interruption.steps();
             assert!(!steps.is_interrupted());
             raise(signal).unwrap();
-            assert!(steps.is_interrupted() && ends_process(), "a second one");
+            assert!(steps.is_interrupted());
+            assert!(ends_process(&interruption), "a second one");
         }
         drop(interruption.steps());
-        assert!(ends_process(), "after the steps");
+        assert!(ends_process(&interruption), "after the steps");
     }
 }

@@ -234,33 +234,35 @@ mod tests {
         );
     }
 
+    fn run_config_in(out: &Path, more: &str) -> Result<RunConfig, OptionsError> {
+        let line = format!("train --steps 3 --out {} {more}", out.display());
+        run_config(&line, 4)
+    }
+
     #[test]
     fn a_training_is_overwritten_only_on_request() {
         let folder = tempfile::tempdir().unwrap();
-        let line = |rest: &str| {
-            run_config(
-                &format!("train --steps 3 --out {} {rest}", folder.path().display()),
-                4,
-            )
-        };
-        assert!(line("").is_ok());
-        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let out = folder.path();
+        assert!(run_config_in(out, "").is_ok());
+        let checkpoint = out.join("checkpoint.safetensors");
         assert_eq!(
-            line("--resume").unwrap_err(),
+            run_config_in(out, "--resume").unwrap_err(),
             OptionsError::NoCheckpoint(checkpoint)
         );
         for name in ["checkpoint.safetensors", "weights.safetensors"] {
-            let file = folder.path().join(name);
+            let file = out.join(name);
             std::fs::write(&file, b"").unwrap();
-            assert_eq!(line("").unwrap_err(), OptionsError::Trained(file), "{name}");
+            let error = run_config_in(out, "").unwrap_err();
+            assert_eq!(error, OptionsError::Trained(file), "{name}");
         }
-        let message = line("").unwrap_err().to_string();
+        let message = run_config_in(out, "").unwrap_err().to_string();
         assert!(
             message.contains("weights.safetensors")
                 && message.contains("--resume")
                 && message.contains("--force")
         );
-        assert!(line("--resume").unwrap().resume && !line("--force").unwrap().resume);
+        assert!(run_config_in(out, "--resume").unwrap().resume);
+        assert!(!run_config_in(out, "--force").unwrap().resume);
         assert!(
             Line::try_parse_from(["train", "--steps", "3", "--out", "x", "--resume", "--force"])
                 .is_err()
@@ -269,18 +271,16 @@ mod tests {
 
     #[test]
     fn bfloat16_is_used_where_the_device_has_it() {
-        let precision = |name: &str, device, has_bfloat16| {
+        for (name, device, has_bfloat16, expected) in [
+            ("bf16", Device::Cpu, true, ComputePrecision::Bf16),
+            ("bf16", Device::Cpu, false, ComputePrecision::F32),
+            ("bf16", Device::Cuda(0), false, ComputePrecision::Bf16),
+            ("f32", Device::Cpu, true, ComputePrecision::F32),
+        ] {
             let line =
                 Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--precision", name])
                     .unwrap();
-            line.options.precision_on(device, has_bfloat16)
-        };
-        assert_eq!(precision("bf16", Device::Cpu, true), ComputePrecision::Bf16);
-        assert_eq!(precision("bf16", Device::Cpu, false), ComputePrecision::F32);
-        assert_eq!(
-            precision("bf16", Device::Cuda(0), false),
-            ComputePrecision::Bf16
-        );
-        assert_eq!(precision("f32", Device::Cpu, true), ComputePrecision::F32);
+            assert_eq!(line.options.precision_on(device, has_bfloat16), expected);
+        }
     }
 }

@@ -56,20 +56,25 @@ mod tests {
 
     #[test]
     fn rises_to_the_peak_and_falls_to_almost_nothing() {
-        let at = |share: f64| one_cycle(2e-3, share);
-        assert!((at(0.0) - 8e-5).abs() < 1e-12);
-        assert!((at(RISE) - 2e-3).abs() < 1e-12);
-        assert!((at(1.0) - 2e-6).abs() < 1e-12);
-        assert!((at(7.0) - at(1.0)).abs() < 1e-12);
-        let falling: Vec<f64> = (2..=20).map(|step| at(f64::from(step) / 20.0)).collect();
+        for (progress, expected) in [
+            (0.0, 8e-5),
+            (RISE, 2e-3),
+            (1.0, 2e-6),
+            (7.0, one_cycle(2e-3, 1.0)),
+        ] {
+            let rate = one_cycle(2e-3, progress);
+            assert!((rate - expected).abs() < 1e-12, "{progress}: {rate}");
+        }
+        let falling = (2..=20).map(|step| one_cycle(2e-3, f64::from(step) / 20.0));
         assert!(falling.is_sorted_by(|a, b| a > b));
     }
 
     #[test]
     fn a_held_rate_stays_at_the_peak_for_four_fifths() {
-        let at = |share: f64| RateSchedule::HeldRate.rate(2e-3, share);
-        assert_eq!((at(0.0), at(0.1), at(0.79)), (8e-5, 2e-3, 2e-3));
-        assert!((at(0.9) - 1e-3).abs() < 1e-5);
-        assert!((at(1.0) - 2e-6).abs() < 1e-12 && at(2.0) == at(1.0));
+        let [first, risen, held, falling, end, beyond] = [0.0, 0.1, 0.79, 0.9, 1.0, 2.0]
+            .map(|progress| RateSchedule::HeldRate.rate(2e-3, progress));
+        assert_eq!((first, risen, held), (8e-5, 2e-3, 2e-3));
+        assert!((falling - 1e-3).abs() < 1e-5);
+        assert!((end - 2e-6).abs() < 1e-12 && beyond == end);
     }
 }

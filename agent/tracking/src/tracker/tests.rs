@@ -145,6 +145,20 @@ fn front_and_rear_are_distinguished_by_a_clear_motion() {
     assert!(tracks[29][0].box3d.heading_rad.abs() < 0.06, "{tracks:?}");
 }
 
+/// Identities after a pose that jumps by 4 m to the side.
+fn ids_after_jump(covariance: Option<&PlanarCovariance>) -> Vec<u64> {
+    let mut tracker = Tracker::new(TrackerConfig::default());
+    let mut tracks = Vec::new();
+    for tick in 1..=20 {
+        let pose = Pose::from_xyz_yaw([0.0, if tick < 20 { 0.0 } else { 4.0 }, 0.0], 0.0);
+        let detections = [detection(20.0, 0.0, 0.9)];
+        tracks = tracker
+            .update(tick * TICK_NANOS, &pose, covariance, &detections)
+            .unwrap();
+    }
+    ids(&tracks)
+}
+
 #[test]
 fn an_uncertain_pose_widens_the_gate() {
     let covariance = PlanarCovariance {
@@ -153,50 +167,37 @@ fn an_uncertain_pose_widens_the_gate() {
         yy_m2: 4.0,
         yaw_rad2: 0.0,
     };
-    let identities = |covariance: Option<&PlanarCovariance>| {
-        let mut tracker = Tracker::new(TrackerConfig::default());
-        let mut tracks = Vec::new();
-        for tick in 1..=20 {
-            // The pose jumps by 4 m to the side.
-            let pose = Pose::from_xyz_yaw([0.0, if tick < 20 { 0.0 } else { 4.0 }, 0.0], 0.0);
-            let detections = [detection(20.0, 0.0, 0.9)];
-            tracks = tracker
-                .update(tick * TICK_NANOS, &pose, covariance, &detections)
-                .unwrap();
-        }
-        ids(&tracks)
-    };
-    assert_eq!(identities(Some(&covariance)), [1]);
-    assert_eq!(identities(None), [1, 2]);
+    assert_eq!(ids_after_jump(Some(&covariance)), [1]);
+    assert_eq!(ids_after_jump(None), [1, 2]);
 }
 
 #[test]
 fn time_that_does_not_advance_and_a_broken_pose_change_nothing() {
     let mut tracker = Tracker::new(TrackerConfig::default());
     let seen = [detection(5.0, 0.0, 0.9)];
-    let at = |tracker: &mut Tracker, nanos, pose: &Pose| tracker.update(nanos, pose, None, &seen);
     let nan = Pose {
         translation_m: [f64::NAN, 0.0, 0.0],
         ..Pose::IDENTITY
     };
-    at(&mut tracker, TICK_NANOS, &Pose::IDENTITY).unwrap();
+    let here = Pose::IDENTITY;
+    tracker.update(TICK_NANOS, &here, None, &seen).unwrap();
     for given_nanos in [0, TICK_NANOS] {
-        let error = at(&mut tracker, given_nanos, &Pose::IDENTITY).unwrap_err();
+        let error = tracker.update(given_nanos, &here, None, &seen);
         let previous_nanos = TICK_NANOS;
         assert_eq!(
-            error,
+            error.unwrap_err(),
             TrackingError::Time {
                 previous_nanos,
                 given_nanos
             }
         );
     }
-    let error = at(&mut tracker, 2 * TICK_NANOS, &nan).unwrap_err();
-    assert!(matches!(error, TrackingError::Pose(_)));
-    let tracks = at(&mut tracker, 2 * TICK_NANOS, &Pose::IDENTITY).unwrap();
+    let error = tracker.update(2 * TICK_NANOS, &nan, None, &seen);
+    assert!(matches!(error, Err(TrackingError::Pose(_))));
+    let tracks = tracker.update(2 * TICK_NANOS, &here, None, &seen).unwrap();
     assert_eq!((ids(&tracks), tracks[0].hits), (vec![1], 2));
     // A pause of a century ends tracks, and numbers stay finite.
-    let tracks = at(&mut tracker, u64::MAX, &Pose::IDENTITY).unwrap();
+    let tracks = tracker.update(u64::MAX, &here, None, &seen).unwrap();
     assert_eq!(ids(&tracks), [2]);
 }
 
@@ -244,6 +245,15 @@ fn velocity_and_covariance_are_along_the_axes_of_the_ego() {
     assert!((track.age_s - 3.9).abs() < 1e-9 && track.unseen_s == 0.0);
 }
 
+/// A hundred detections beside each other, the farther the higher the score.
+fn row_of_detections(offset: f64) -> Vec<Detection> {
+    let seen = (0..100_u16).map(|k| {
+        let (x, score) = (f64::from(k) * 10.0, 0.3 + f32::from(k) / 200.0);
+        detection(x, offset, score)
+    });
+    seen.collect()
+}
+
 #[test]
 fn detections_beyond_the_largest_number_are_counted_and_those_of_the_highest_scores_are_taken() {
     let config = TrackerConfig {
@@ -252,24 +262,17 @@ fn detections_beyond_the_largest_number_are_counted_and_those_of_the_highest_sco
         ..TrackerConfig::default()
     };
     let mut tracker = Tracker::new(config);
-    let frame = |offset: f64| {
-        let seen = |k: u16| {
-            let (x, score) = (f64::from(k) * 10.0, 0.3 + f32::from(k) / 200.0);
-            detection(x, offset, score)
-        };
-        (0..100).map(seen).collect::<Vec<_>>()
-    };
-    let mut update = |tick: u64, offset| {
-        let tracks = tracker.update(tick * TICK_NANOS, &Pose::IDENTITY, None, &frame(offset));
-        (tracks.unwrap(), tracker.left_out)
-    };
-    let (tracks, left_out) = update(1, 0.0);
-    assert_eq!((tracks.len(), left_out), (30, 70));
+    let seen = row_of_detections(0.0);
+    let tracks = tracker.update(TICK_NANOS, &Pose::IDENTITY, None, &seen);
+    let tracks = tracks.unwrap();
+    assert_eq!((tracks.len(), tracker.left_out), (30, 70));
     let least = tracks.iter().map(|track| track.box3d.center_m[0]);
     assert_eq!(least.fold(f64::INFINITY, f64::min), 700.0);
     // All 30 are new objects; there is room for 10.
-    let (tracks, left_out) = update(2, 500.0);
-    assert_eq!((tracks.len(), left_out), (40, 160));
+    let seen = row_of_detections(500.0);
+    let tracks = tracker.update(2 * TICK_NANOS, &Pose::IDENTITY, None, &seen);
+    let tracks = tracks.unwrap();
+    assert_eq!((tracks.len(), tracker.left_out), (40, 160));
     let new = tracks
         .iter()
         .filter(|track| track.hits == 1 && track.unseen_s == 0.0);
@@ -277,9 +280,8 @@ fn detections_beyond_the_largest_number_are_counted_and_those_of_the_highest_sco
     assert_eq!(least.fold(f64::INFINITY, f64::min), 900.0);
 }
 
-#[test]
-fn results_are_followed_through_frames_without_pose_and_scenes_that_begin_again() {
-    let result = |pose| Detections {
+fn result(pose: PoseEstimate) -> Detections {
+    Detections {
         ego: protocol::CavId::new("7").unwrap(),
         agent_frame: 4,
         method: "max".into(),
@@ -289,7 +291,11 @@ fn results_are_followed_through_frames_without_pose_and_scenes_that_begin_again(
         skipped: vec![],
         neighbours: vec![],
         stages: vec![],
-    };
+    }
+}
+
+#[test]
+fn results_are_followed_through_frames_without_pose_and_scenes_that_begin_again() {
     let posed = result(PoseEstimate::new(Pose::IDENTITY, 0.9));
     let unposed = result(PoseEstimate::NoPose {
         reason: protocol::NoPoseReason::TooFewPoints,
@@ -314,25 +320,23 @@ fn results_are_followed_through_frames_without_pose_and_scenes_that_begin_again(
 
 #[test]
 fn equal_inputs_give_equal_tracks() {
-    let frames = || {
-        (0..50).map(|tick| {
-            let time = f64::from(tick);
-            let seen = (0..20).map(|k| {
-                let k = f64::from(k);
-                detection(
-                    (k * 37.0 + time * k / 9.0) % 80.0 - 40.0,
-                    (k * 3.3) % 40.0 - 20.0,
-                    0.6,
-                )
-            });
-            (
-                Pose::from_xyz_yaw([time, 0.0, 0.0], 0.01 * time),
-                seen.collect(),
+    let frames = (0..50).map(|tick| {
+        let time = f64::from(tick);
+        let seen = (0..20).map(|k| {
+            let k = f64::from(k);
+            detection(
+                (k * 37.0 + time * k / 9.0) % 80.0 - 40.0,
+                (k * 3.3) % 40.0 - 20.0,
+                0.6,
             )
-        })
-    };
-    let tracks = run(TrackerConfig::default(), frames());
-    assert_eq!(tracks, run(TrackerConfig::default(), frames()));
+        });
+        (
+            Pose::from_xyz_yaw([time, 0.0, 0.0], 0.01 * time),
+            seen.collect::<Vec<_>>(),
+        )
+    });
+    let tracks = run(TrackerConfig::default(), frames.clone());
+    assert_eq!(tracks, run(TrackerConfig::default(), frames));
     assert!(
         tracks
             .iter()

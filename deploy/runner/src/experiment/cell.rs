@@ -94,14 +94,17 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn a_method_in_a_folder_is_cached_and_another_key_is_another_cell() {
-        let folder = tempfile::tempdir().unwrap();
-        let key = |sha256: &str| CellKey {
+    fn key(sha256: &str) -> CellKey {
+        CellKey {
             method: "script:fusion/mine.pt".parse().unwrap(),
             sha256: sha256.repeat(32),
             provenance: Provenance::default(),
-        };
+        }
+    }
+
+    #[test]
+    fn a_method_in_a_folder_is_cached_and_another_key_is_another_cell() {
+        let folder = tempfile::tempdir().unwrap();
         let cell = Cell {
             key: key("0a"),
             metrics: Metrics::default(),
@@ -110,11 +113,12 @@ mod tests {
             wall_seconds: 0.5,
         };
         cell.write(folder.path()).unwrap();
-        let read = |key: &CellKey| Cell::read(key, folder.path());
-        assert_eq!(read(&cell.key).unwrap(), Some(cell.clone()));
-        assert_eq!(read(&key("0b")).unwrap(), None);
+        let cached = Cell::read(&cell.key, folder.path()).unwrap();
+        assert_eq!(cached.as_ref(), Some(&cell));
+        assert_eq!(Cell::read(&key("0b"), folder.path()).unwrap(), None);
         fs::write(cell.key.file(folder.path()), "{").unwrap();
-        let message = read(&cell.key).unwrap_err().to_string();
+        let error = Cell::read(&cell.key, folder.path()).unwrap_err();
+        let message = error.to_string();
         assert!(message.contains("script-fusion-mine.pt-0a0a"), "{message}");
     }
 }

@@ -239,12 +239,16 @@ mod tests {
     use super::*;
     use deploy::score::metrics::{ByIou, Latencies};
 
+    fn precision(at_50: Option<f64>) -> ByIou {
+        ByIou {
+            at_50,
+            ..ByIou::default()
+        }
+    }
+
     fn metrics(method: &str, at_50: Option<f64>) -> Metrics {
         Metrics {
-            ap_global: ByIou {
-                at_50,
-                ..ByIou::default()
-            },
+            ap_global: precision(at_50),
             latency_ms: Latencies {
                 capture_to_detection: Percentiles {
                     p50: Some(81.4),
@@ -261,16 +265,12 @@ mod tests {
     }
 
     fn answered(method: &str, answered: u64, ap: f64) -> Metrics {
-        let ap = |share: f64| ByIou {
-            at_50: Some(ap * share),
-            ..ByIou::default()
-        };
         Metrics {
             frames: answered,
             answered,
-            ap_unanswered_empty: ap(0.5),
-            ap_streaming: Some(ap(0.25)),
-            ..metrics(method, ap(1.0).at_50)
+            ap_unanswered_empty: precision(Some(0.5 * ap)),
+            ap_streaming: Some(precision(Some(0.25 * ap))),
+            ..metrics(method, Some(ap))
         }
     }
 

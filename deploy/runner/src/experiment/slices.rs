@@ -153,6 +153,14 @@ mod tests {
         }
     }
 
+    fn slice_of_slurm_array(task: &str, count: &str) -> Result<Option<Slice>, String> {
+        Slice::of_slurm(|name| match name {
+            "SLURM_ARRAY_TASK_ID" => Some(task.to_owned()),
+            "SLURM_ARRAY_TASK_COUNT" => Some(count.to_owned()),
+            _ => None,
+        })
+    }
+
     #[test]
     fn a_slice_is_read_from_text_or_from_the_environment_of_an_array() {
         assert_eq!(
@@ -169,22 +177,15 @@ mod tests {
                 "{error}"
             );
         }
-        let array = |task: &'static str, count: &'static str| {
-            Slice::of_slurm(move |name| match name {
-                "SLURM_ARRAY_TASK_ID" => Some(task.to_owned()),
-                "SLURM_ARRAY_TASK_COUNT" => Some(count.to_owned()),
-                _ => None,
-            })
-        };
         assert_eq!(
-            array("3", "3"),
+            slice_of_slurm_array("3", "3"),
             Ok(Some(Slice {
                 number: 3,
                 count: 3
             }))
         );
         assert!(
-            array("7", "3")
+            slice_of_slurm_array("7", "3")
                 .unwrap_err()
                 .to_string()
                 .contains("SLURM_ARRAY_TASK_ID=7")
@@ -195,15 +196,16 @@ mod tests {
     #[test]
     fn files_of_engines_run_every_slice_and_then_the_command() {
         let command = ["v2vloc", "sweep", "a b.yaml", "--out", "out"];
-        let file = |engine: Engine| engine.file(&command, 4, Path::new("out/a.csv"));
-        assert!(file(Engine::Slurm).contains("--array=1-4"));
-        assert!(file(Engine::Slurm).contains(r"--wrap 'v2vloc sweep '\''a b.yaml'\'' --out out'"));
-        let parallel = file(Engine::Parallel);
+        let result = Path::new("out/a.csv");
+        let slurm = Engine::Slurm.file(&command, 4, result);
+        assert!(slurm.contains("--array=1-4"));
+        assert!(slurm.contains(r"--wrap 'v2vloc sweep '\''a b.yaml'\'' --out out'"));
+        let parallel = Engine::Parallel.file(&command, 4, result);
         assert!(
             parallel.ends_with("--slice {}/4\nv2vloc sweep 'a b.yaml' --out out\n"),
             "{parallel}"
         );
-        let snakefile = file(Engine::Snakemake);
+        let snakefile = Engine::Snakemake.file(&command, 4, result);
         assert!(
             snakefile.contains("--slice {wildcards.slice}/4"),
             "{snakefile}"

@@ -314,15 +314,14 @@ mod tests {
             (PIXELS_PER_M * (20.0 - y)) as usize,
         );
         let wanted = [colour.0, colour.1, colour.2];
-        let is_like = |at: usize| {
-            pixels[3 * at..]
+        let mut around = (row - 1..=row + 1)
+            .flat_map(|row| (column - 1..=column + 1).map(move |column| 960 * row + column));
+        around.any(|place| {
+            pixels[3 * place..]
                 .iter()
                 .zip(wanted)
                 .all(|(found, wanted)| found.abs_diff(wanted) < 40)
-        };
-        let around = (row - 1..=row + 1)
-            .flat_map(|row| (column - 1..=column + 1).map(move |column| 960 * row + column));
-        around.into_iter().any(is_like)
+        })
     }
 
     #[test]

@@ -37,18 +37,33 @@ mod tests {
 
     use super::*;
 
+    /// Files of the vehicles, of the method and of the link.
+    const NAMES: [&str; 10] = [
+        "weights",
+        "own weights",
+        "script.pt",
+        "encoder",
+        "town1",
+        "town4",
+        "baseline",
+        "poses",
+        "errors",
+        "trace.csv",
+    ];
+
+    fn pgc(folder: &Path, head: &str) -> PoseSourceConfig {
+        PoseSourceConfig::Pgc(PgcConfig {
+            encoder: folder.join("encoder"),
+            head: folder.join(head),
+            ..Default::default()
+        })
+    }
+
     /// Two heads of one encoder, a baseline, a table of poses and one of errors; one vehicle has a network of its own.
     fn vehicles(folder: &Path) -> Vec<AgentSettings> {
-        let pgc = |head: &str| {
-            PoseSourceConfig::Pgc(PgcConfig {
-                encoder: folder.join("encoder"),
-                head: folder.join(head),
-                ..Default::default()
-            })
-        };
         let poses = vec![
-            pgc("town1"),
-            pgc("town4"),
+            pgc(folder, "town1"),
+            pgc(folder, "town4"),
             PoseSourceConfig::Baseline(BaselinePoseConfig {
                 weights: folder.join("baseline"),
                 ..Default::default()
@@ -74,48 +89,38 @@ mod tests {
         vehicles
     }
 
+    /// Key of a result that is made of all files in the folder.
+    fn key(folder: &Path) -> String {
+        let method = format!("script:{}", folder.join("script.pt").display());
+        let trace = TraceConfig::new(Path::new("trace.csv"));
+        let link = LinkConfig {
+            capacity: CapacityConfig::Trace(trace),
+            ..LinkConfig::default()
+        };
+        let files = files_of(
+            method.parse().unwrap(),
+            folder.join("weights"),
+            &vehicles(folder),
+            Some((&link, folder)),
+        );
+        let digests = FileDigests::default();
+        let provenance = Provenance::collect(&[], "data".into(), files, "commit", &digests);
+        let provenance = provenance.unwrap();
+        assert_eq!(provenance.files_sha256.len(), NAMES.len());
+        provenance.key("settings")
+    }
+
     #[test]
     fn a_flipped_byte_of_any_file_changes_the_key_and_a_moved_folder_does_not() {
-        let names = [
-            "weights",
-            "own weights",
-            "script.pt",
-            "encoder",
-            "town1",
-            "town4",
-            "baseline",
-            "poses",
-            "errors",
-            "trace.csv",
-        ];
         let [one, other] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         for folder in [&one, &other] {
-            for name in names {
+            for name in NAMES {
                 std::fs::write(folder.path().join(name), name).unwrap();
             }
         }
-        let key = |folder: &Path| {
-            let method = format!("script:{}", folder.join("script.pt").display());
-            let trace = TraceConfig::new(Path::new("trace.csv"));
-            let link = LinkConfig {
-                capacity: CapacityConfig::Trace(trace),
-                ..LinkConfig::default()
-            };
-            let files = files_of(
-                method.parse().unwrap(),
-                folder.join("weights"),
-                &vehicles(folder),
-                Some((&link, folder)),
-            );
-            let digests = FileDigests::default();
-            let provenance = Provenance::collect(&[], "data".into(), files, "commit", &digests);
-            let provenance = provenance.unwrap();
-            assert_eq!(provenance.files_sha256.len(), names.len());
-            provenance.key("settings")
-        };
         let original = key(one.path());
         assert_eq!(key(other.path()), original);
-        for name in names {
+        for name in NAMES {
             let path = one.path().join(name);
             let mut flipped = name.as_bytes().to_vec();
             flipped[0] ^= 1;

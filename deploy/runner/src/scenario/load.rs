@@ -138,6 +138,19 @@ mod tests {
         config_file::parse(text, Path::new("s.yaml"))
     }
 
+    fn read_with_overrides(file: &Path, texts: &[&str]) -> Result<Scenario, FileError> {
+        let overrides: Vec<FieldOverride> =
+            texts.iter().map(|text| text.parse().unwrap()).collect();
+        Scenario::read_with(file, &overrides)
+    }
+
+    /// A scenario in which one vehicle has this pose source.
+    fn text_with_pose(pose: &str) -> String {
+        format!(
+            "scene: {{dir: .}}\nmodels: {{weights: s.yaml}}\nvehicles:\n  4288: {{pose: {{{pose}}}}}\n"
+        )
+    }
+
     #[test]
     fn scene_and_weights_are_enough() {
         let scenario = parse(SMALL).unwrap();
@@ -155,17 +168,12 @@ mod tests {
             format!("{SMALL}vehicles: {{4288: {{codec: {{dtype: i8}}}}}}\n"),
         )
         .unwrap();
-        let read = |texts: &[&str]| {
-            let overrides: Vec<FieldOverride> =
-                texts.iter().map(|text| text.parse().unwrap()).collect();
-            Scenario::read_with(&file, &overrides)
-        };
-        let scenario = read(&[
+        let overrides = [
             "scene.lockstep=true",
             "agents.codec.dtype=f32",
             "vehicles.4288.codec.zstd_level=3",
-        ])
-        .unwrap();
+        ];
+        let scenario = read_with_overrides(&file, &overrides).unwrap();
         assert!(scenario.scene.lockstep && scenario.agents.codec.dtype == Dtype::F32);
         let own = scenario.settings_of(&CavId::new("4288").unwrap()).codec;
         assert_eq!((own.dtype, own.zstd_level), (Dtype::I8, Some(3)));
@@ -173,17 +181,14 @@ mod tests {
             scenario.scene.dir,
             without_dots(&folder.path().join("../scene"))
         );
-        let message = read(&["scene.lockstep=maybe"]).unwrap_err().to_string();
+        let error = read_with_overrides(&file, &["scene.lockstep=maybe"]).unwrap_err();
+        let message = error.to_string();
         assert!(
             message.contains("s.yaml") && message.contains("--set scene.lockstep=\"maybe\""),
             "{message}"
         );
-        assert!(
-            read(&["scene.lock=true"])
-                .unwrap_err()
-                .to_string()
-                .contains("unknown field `lock`")
-        );
+        let error = read_with_overrides(&file, &["scene.lock=true"]).unwrap_err();
+        assert!(error.to_string().contains("unknown field `lock`"));
     }
 
     #[test]
@@ -216,17 +221,16 @@ mod tests {
             "{SMALL}agents: {{rate: {{bytes_per_second: 750000, watch_queue: true}}}}\nvehicles:\n  4288: {{rate: {{message_bytes: 75000}}}}\n"
         );
         let scenario = parse(&text).unwrap();
-        let rate_of = |cav| scenario.settings_of(&CavId::new(cav).unwrap()).rate;
-        let rate = rate_of("4279");
-        assert_eq!(
-            (rate.message_bytes, rate.bytes_per_second, rate.watch_queue),
-            (None, Some(750_000), true)
-        );
-        let rate = rate_of("4288");
-        assert_eq!(
-            (rate.message_bytes, rate.bytes_per_second, rate.watch_queue),
-            (Some(75_000), None, false)
-        );
+        for (cav, expected) in [
+            ("4279", (None, Some(750_000), true)),
+            ("4288", (Some(75_000), None, false)),
+        ] {
+            let rate = scenario.settings_of(&CavId::new(cav).unwrap()).rate;
+            assert_eq!(
+                (rate.message_bytes, rate.bytes_per_second, rate.watch_queue),
+                expected
+            );
+        }
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
         let message = parse(&format!("{SMALL}agents: {{rate: {{bytes: 3}}}}\n"))
             .unwrap_err()
@@ -238,15 +242,11 @@ mod tests {
     fn one_vehicle_may_find_its_pose_itself() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("s.yaml");
-        let text = |pose: &str| {
-            format!(
-                "scene: {{dir: .}}\nmodels: {{weights: s.yaml}}\nvehicles:\n  4288: {{pose: {{{pose}}}}}\n"
-            )
-        };
-        std::fs::write(&file, text("pgc: {encoder: e.safetensors}")).unwrap();
+        std::fs::write(&file, text_with_pose("pgc: {encoder: e.safetensors}")).unwrap();
         let message = Scenario::load(&file).unwrap_err().to_string();
         assert!(message.contains("head"), "{message}");
-        std::fs::write(&file, text("pgc: {encoder: e.safetensors, head: s.yaml}")).unwrap();
+        let text = text_with_pose("pgc: {encoder: e.safetensors, head: s.yaml}");
+        std::fs::write(&file, text).unwrap();
         let message = Scenario::load(&file).unwrap_err().to_string();
         assert!(
             message.contains("agents.pose: ") && message.contains("e.safetensors"),
@@ -264,7 +264,7 @@ mod tests {
             PoseSourceConfig::Recorded
         );
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
-        std::fs::write(&file, text("baseline: {weights: e.safetensors}")).unwrap();
+        std::fs::write(&file, text_with_pose("baseline: {weights: e.safetensors}")).unwrap();
         assert_eq!(Scenario::load(&file).unwrap().poses()[1].name(), "baseline");
     }
 

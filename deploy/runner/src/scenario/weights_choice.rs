@@ -126,31 +126,20 @@ mod tests {
         ] {
             std::fs::write(folder.path().join(name), b"").unwrap();
         }
-        let of = |method| weights_of(folder.path(), method, false);
         for method in [Method::NONE, Method::LATE, Method::EARLY] {
-            assert!(
-                of(method).unwrap().ends_with("lean-none.safetensors"),
-                "{method}"
-            );
+            let file = weights_of(folder.path(), method, false).unwrap();
+            assert!(file.ends_with("lean-none.safetensors"), "{method}");
         }
         std::fs::write(folder.path().join("lean-early.safetensors"), b"").unwrap();
-        assert!(
-            of(Method::EARLY)
-                .unwrap()
-                .ends_with("lean-early.safetensors")
-        );
-        assert!(
-            of(Method::MAX)
-                .unwrap_err()
-                .to_string()
-                .contains("2 files named *-max.safetensors")
-        );
-        assert!(
-            of(Method::ATTENTION)
-                .unwrap_err()
-                .to_string()
-                .contains("0 files")
-        );
+        let file = weights_of(folder.path(), Method::EARLY, false).unwrap();
+        assert!(file.ends_with("lean-early.safetensors"));
+        for (method, problem) in [
+            (Method::MAX, "2 files named *-max.safetensors"),
+            (Method::ATTENTION, "0 files"),
+        ] {
+            let error = weights_of(folder.path(), method, false).unwrap_err();
+            assert!(error.to_string().contains(problem), "{error}");
+        }
         assert_eq!(
             weights_of(Path::new("w.safetensors"), Method::LATE, true).unwrap(),
             Path::new("w.safetensors")
@@ -178,13 +167,10 @@ mod tests {
         for method in [Method::NONE, Method::MAX] {
             write_trained(&folder.path().join(method.name()), method);
         }
-        let of = |method| weights_of(folder.path(), method, true);
-        assert!(
-            of(Method::LATE)
-                .unwrap()
-                .ends_with("none/weights.safetensors")
-        );
-        let refused = of(Method::MAX).unwrap_err().to_string();
+        let file = weights_of(folder.path(), Method::LATE, true).unwrap();
+        assert!(file.ends_with("none/weights.safetensors"));
+        let error = weights_of(folder.path(), Method::MAX, true).unwrap_err();
+        let refused = error.to_string();
         assert!(
             refused.contains("max/weights.safetensors") && refused.contains("no box input"),
             "{refused}"
@@ -194,18 +180,19 @@ mod tests {
         let _ = out.var("weight", &[2], Init::Const(1.0));
         let with = folder.path().join("lean-max-boxes.safetensors");
         save(&with, &variables, &BTreeMap::new(), Precision::Single).unwrap();
-        assert_eq!(of(Method::MAX).unwrap(), with);
+        assert_eq!(weights_of(folder.path(), Method::MAX, true).unwrap(), with);
     }
 
     #[test]
     fn the_folder_of_a_training_serves_the_method_it_was_trained_for() {
         let folder = tempfile::tempdir().unwrap();
         write_trained(folder.path(), Method::NONE);
-        let of = |method| weights_of(folder.path(), method, false);
         for method in [Method::NONE, Method::LATE, Method::EARLY] {
-            assert!(of(method).unwrap().ends_with(TRAINED_FILE), "{method}");
+            let file = weights_of(folder.path(), method, false).unwrap();
+            assert!(file.ends_with(TRAINED_FILE), "{method}");
         }
-        let refused = of(Method::ATTENTION).unwrap_err().to_string();
+        let error = weights_of(folder.path(), Method::ATTENTION, false).unwrap_err();
+        let refused = error.to_string();
         assert!(
             refused.contains(
                 "trained for none, and method attention needs weights trained for attention"
@@ -220,24 +207,18 @@ mod tests {
         for method in [Method::NONE, Method::MAX] {
             write_trained(&folder.path().join(method.name()), method);
         }
-        let of = |method| weights_of(folder.path(), method, false);
-        assert_eq!(
-            of(Method::MAX).unwrap(),
-            folder.path().join("max").join(TRAINED_FILE)
-        );
-        assert_eq!(
-            of(Method::LATE).unwrap(),
-            folder.path().join("none").join(TRAINED_FILE)
-        );
-        assert!(
-            of(Method::ATTENTION)
-                .unwrap_err()
-                .to_string()
-                .contains("attention/weights.safetensors")
-        );
+        for (method, name) in [(Method::MAX, "max"), (Method::LATE, "none")] {
+            assert_eq!(
+                weights_of(folder.path(), method, false).unwrap(),
+                folder.path().join(name).join(TRAINED_FILE)
+            );
+        }
+        let error = weights_of(folder.path(), Method::ATTENTION, false).unwrap_err();
+        assert!(error.to_string().contains("attention/weights.safetensors"));
         std::fs::write(folder.path().join("lean-max.safetensors"), b"").unwrap();
+        let error = weights_of(folder.path(), Method::MAX, false).unwrap_err();
         assert!(
-            of(Method::MAX).unwrap_err().to_string().contains("2 files"),
+            error.to_string().contains("2 files"),
             "two that could be meant"
         );
     }

@@ -74,14 +74,13 @@ fn every_setting_of_a_process_is_an_option_with_the_same_name_and_default() {
 
 #[test]
 fn a_scenario_and_an_experiment_are_made_of_the_types_of_the_processes() {
-    let definition = |of: &Value, name: &str| of["definitions"][name].clone();
-    let schema = |kind: SchemaOf| -> Value { serde_json::from_str(&kind.json()).unwrap() };
     let (agent, ego, replay) = (
         schema_of::<AgentConfig>(),
         schema_of::<EgoConfig>(),
         schema_of::<ReplayConfig>(),
     );
-    let (scenario, experiment) = (schema(SchemaOf::Scenario), schema(SchemaOf::Experiment));
+    let [scenario, experiment] = [SchemaOf::Scenario, SchemaOf::Experiment]
+        .map(|kind| serde_json::from_str::<Value>(&kind.json()).unwrap());
     for (process, name) in [
         (&agent, "AgentSettings"),
         (&agent, "ModelConfig"),
@@ -106,6 +105,10 @@ fn a_scenario_and_an_experiment_are_made_of_the_types_of_the_processes() {
             "{name}"
         );
     }
+}
+
+fn definition<'a>(schema: &'a Value, name: &str) -> &'a Value {
+    &schema["definitions"][name]
 }
 
 fn schema_of<T: JsonSchema>() -> Value {

@@ -86,9 +86,6 @@ fn a_killed_service_is_started_again() {
 
 #[test]
 fn a_requested_end_is_reported_with_the_last_line() {
-    let waits = |code| {
-        format!("trap 'echo 7 missing; exit {code}' TERM; echo up; while :; do sleep 0.05; done")
-    };
     for (code, ended) in [
         (0, ProcessEventKind::Done { data_lost: false }),
         (3, ProcessEventKind::Done { data_lost: true }),
@@ -99,8 +96,11 @@ fn a_requested_end_is_reported_with_the_last_line() {
             },
         ),
     ] {
+        let script = format!(
+            "trap 'echo 7 missing; exit {code}' TERM; echo up; while :; do sleep 0.05; done"
+        );
         let (supervisor, events, _folder) =
-            start(shell("recorder", RestartPolicy::Optional, &waits(code)), 3);
+            start(shell("recorder", RestartPolicy::Optional, &script), 3);
         assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
         assert_eq!(
             next(&events),

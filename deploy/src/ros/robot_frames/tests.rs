@@ -113,17 +113,20 @@ fn a_lidar_without_a_place_on_the_robot_gives_no_transform() {
     assert!(logged.contains("\"velodyne\" has no parent"), "{logged}");
 }
 
+/// Frame of the robot, frame of the LiDAR, and the place of the LiDAR in the former.
+fn lidar_in_robot(frames: &RobotFrames) -> FrameInParent {
+    frames.lidars_in_robots(&FrameNames::default())[&cav()].clone()
+}
+
 #[test]
 fn the_lidar_of_the_vehicle_hangs_in_the_tree_of_the_robot() {
-    let names = FrameNames::default();
-    let parents = |frames: &RobotFrames| frames.lidars_in_robots(&names)[&cav()].clone();
-    let (parent, child, place) = parents(&robot(None));
+    let (parent, child, place) = lidar_in_robot(&robot(None));
     assert_eq!(
         (parent.as_str(), child.as_str()),
         ("velodyne", "cav_1/lidar")
     );
     assert_eq!(place, Pose::IDENTITY);
-    let (parent, _, place) = parents(&robot(Some("1,0,0")));
+    let (parent, _, place) = lidar_in_robot(&robot(Some("1,0,0")));
     assert_eq!(
         (parent.as_str(), place.translation_m),
         ("base_link", [1.0, 0.0, 0.0])

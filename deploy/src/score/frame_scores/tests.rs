@@ -7,6 +7,7 @@ use protocol::{
 
 use super::super::open_ticks::MOST_OPEN;
 use super::*;
+use crate::score::metrics::tests::is_near;
 use crate::score::metrics::{Communication, PoseErrors};
 
 const RULE: GroundTruthRule = GroundTruthRule {
@@ -44,13 +45,16 @@ fn object(id: i64, class: &str, x: f64) -> TrueObject {
     }
 }
 
-/// The ego at the origin sees 1 and a pedestrian, its neighbour at x = 20 m sees 1 and 2.
-fn truth(tick: u64) -> Truth {
-    let agent = |name: &str, x: f64, objects| AgentTruth {
+fn agent(name: &str, x: f64, objects: Vec<TrueObject>) -> AgentTruth {
+    AgentTruth {
         cav: cav(name),
         world_from_lidar: Pose::from_xyz_yaw([x, 0.0, 0.0], 0.0),
         objects,
-    };
+    }
+}
+
+/// The ego at the origin sees 1 and a pedestrian, its neighbour at x = 20 m sees 1 and 2.
+fn truth(tick: u64) -> Truth {
     let (first, second) = (object(1, "car", 10.0), object(2, "van", 30.0));
     Truth {
         tick,
@@ -62,7 +66,7 @@ fn truth(tick: u64) -> Truth {
 }
 
 fn result(tick: u64, at_x: &[f64]) -> Detections {
-    let found = |&x: &f64| Detection {
+    let detections = at_x.iter().map(|&x| Detection {
         box3d: Box3d {
             center_m: [x, 0.0, -1.0],
             size_m: [4.0, 2.0, 1.5],
@@ -70,13 +74,13 @@ fn result(tick: u64, at_x: &[f64]) -> Detections {
         },
         score: 0.9,
         source: None,
-    };
+    });
     Detections {
         ego: cav("e"),
         agent_frame: tick,
         method: "max".into(),
         pose: PoseEstimate::new(Pose::from_xyz_yaw([1.0, 0.0, 0.0], 0.0), 1.0),
-        detections: at_x.iter().map(found).collect(),
+        detections: detections.collect(),
         fused: vec![FusedNeighbour {
             cav: cav("n"),
             age_nanos: 0,
@@ -130,32 +134,36 @@ fn a_frame_is_judged_against_everyones_truth() {
     assert_eq!(scores.showpiece().unwrap().truth.len(), 2);
 }
 
+/// Scores of ten ticks, of which each result comes after its truth, or everything in the opposite order.
+fn scores_of_ten_ticks(backwards: bool) -> FrameScores {
+    let mut scores = scores();
+    let mut ticks: Vec<u64> = (0..10).collect();
+    if backwards {
+        ticks.reverse();
+    }
+    for tick in ticks {
+        let detected: &[f64] = if tick % 2 == 0 {
+            &[10.0]
+        } else {
+            &[-7.0, 30.0]
+        };
+        if backwards {
+            scores.result(&stamp("e", tick, 50), result(tick, detected));
+            scores.truth(&stamp("replay", tick, 0), truth(tick));
+        } else {
+            scores.truth(&stamp("replay", tick, 0), truth(tick));
+            scores.result(&stamp("e", tick, 50), result(tick, detected));
+        }
+    }
+    scores.close();
+    scores
+}
+
 #[test]
 fn order_of_arrival_changes_nothing() {
-    let score = |backwards: bool| {
-        let mut scores = scores();
-        let mut ticks: Vec<u64> = (0..10).collect();
-        if backwards {
-            ticks.reverse();
-        }
-        for tick in ticks {
-            let detected: &[f64] = if tick % 2 == 0 {
-                &[10.0]
-            } else {
-                &[-7.0, 30.0]
-            };
-            if backwards {
-                scores.result(&stamp("e", tick, 50), result(tick, detected));
-                scores.truth(&stamp("replay", tick, 0), truth(tick));
-            } else {
-                scores.truth(&stamp("replay", tick, 0), truth(tick));
-                scores.result(&stamp("e", tick, 50), result(tick, detected));
-            }
-        }
-        scores.close();
-        (scores.average_precision(), scores.records().to_vec())
-    };
-    assert_eq!(score(false), score(true));
+    let [forwards, backwards] = [false, true].map(scores_of_ten_ticks);
+    assert_eq!(forwards.average_precision(), backwards.average_precision());
+    assert_eq!(forwards.records(), backwards.records());
 }
 
 #[test]
@@ -180,12 +188,15 @@ fn a_tick_without_result_is_missed_and_a_second_result_ignored() {
     );
 }
 
+fn began_ms(tick: u64) -> u64 {
+    1_000 + 100 * tick
+}
+
 /// Three precisions of hand-made ticks, 100 ms apart, with two cars that stand still in front of an ego that stands too:
 /// tick 0 is answered in full after 50 ms, tick 1 not at all, tick 2 in full after 250 ms, tick 3 with one car.
 #[test]
 fn the_three_precisions_differ_in_what_they_count() {
     let mut scores = scores();
-    let began_ms = |tick: u64| 1_000 + 100 * tick;
     for tick in 0..4 {
         scores.truth(&stamp("replay", tick, began_ms(tick)), truth(tick));
     }
@@ -200,7 +211,6 @@ fn the_three_precisions_differ_in_what_they_count() {
         );
     }
     scores.close();
-    let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
     // Five of the six boxes of the answered ticks, and five of the eight of all.
     assert!(is_near(scores.average_precision().0.at_50, 5.0 / 6.0));
     assert!(is_near(scores.live.unanswered_empty().at_50, 5.0 / 8.0));

@@ -73,16 +73,13 @@ mod tests {
 
     fn ledger() -> (Ledger, CavId) {
         let (ego, to) = (CavId::new("1").unwrap(), ProcessId::new("ego-1").unwrap());
-        let topic = |name: &str, stream| Topic::Stream {
-            cav: CavId::new(name).unwrap(),
-            stream,
-        };
         let mut ledger = Ledger::default();
-        for name in ["1", "2", "3"] {
+        for cav in ["1", "2", "3"].map(|name| CavId::new(name).unwrap()) {
             for stream in [Stream::Pose, Stream::Bev] {
-                let towards = Account::towards(topic(name, stream), &to);
+                let published = Account::published(Topic::stream(&cav, stream));
+                let towards = Account::towards(Topic::stream(&cav, stream), &to);
                 for tick in 0..4 {
-                    ledger.sent(&Account::published(topic(name, stream)));
+                    ledger.sent(&published);
                     match (tick, stream) {
                         (0, _) | (_, Stream::Pose) => ledger.received(&towards),
                         _ => ledger.dropped(&towards, DropReason::Stale),

@@ -246,15 +246,16 @@ mod tests {
         Tensor::rand(size, (Kind::Float, Device::Cpu))
     }
 
-    fn head(detector: &DetectorConfig) -> HeadOutput {
+    fn random_output(detector: &DetectorConfig, channels: i64) -> Tensor {
         let grid = detector.feature_grid();
-        let of = |channels: i64| {
-            let size = [1, channels, grid.height.into(), grid.width.into()];
-            Tensor::randn(size, (Kind::Float, Device::Cpu))
-        };
+        let size = [1, channels, grid.height.into(), grid.width.into()];
+        Tensor::randn(size, (Kind::Float, Device::Cpu))
+    }
+
+    fn head(detector: &DetectorConfig) -> HeadOutput {
         HeadOutput {
-            scores: of(2),
-            offsets: of(14),
+            scores: random_output(detector, 2),
+            offsets: random_output(detector, 14),
         }
     }
 
@@ -333,17 +334,16 @@ mod tests {
         let (variables, detector) = (VarStore::new(Device::Cpu), detector());
         let input = BoxInput::new(&variables.root(), &detector);
         let map = map(&detector);
-        let nothing = |head: HeadOutput| HeadOutput {
-            scores: head.scores.zeros_like(),
-            offsets: head.offsets.zeros_like(),
-        };
         for (weight, size_m) in [(50.0, [1e3; 3]), (-50.0, [1e-3; 3])] {
             let _ = tch::no_grad(|| variables.variables()[WEIGHT].shallow_clone().fill_(weight));
             let mut strange = car(1);
             strange.box3d.size_m = size_m;
-            let after = input
-                .change(&map, nothing(head(&detector)), &[strange])
-                .unwrap();
+            let head = head(&detector);
+            let nothing = HeadOutput {
+                scores: head.scores.zeros_like(),
+                offsets: head.offsets.zeros_like(),
+            };
+            let after = input.change(&map, nothing, &[strange]).unwrap();
             // Sizes of an anchor change by up to e^2.75, scores by as much as they can.
             let sizes = after.offsets.narrow(1, 3, 3).abs().max().double_value(&[]);
             assert!(sizes > 0.0 && sizes <= 2.75 + 1e-5, "{sizes}");

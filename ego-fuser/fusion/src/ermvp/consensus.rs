@@ -193,6 +193,16 @@ mod tests {
         (variables, consensus)
     }
 
+    /// The cells of a map `[24, 32, ..]` away from its edges.
+    fn inner(map: &Tensor) -> Tensor {
+        map.narrow(0, 6, 12).narrow(1, 6, 20)
+    }
+
+    fn inner_error(map: &Tensor, expected: &Tensor) -> f64 {
+        let error = inner(map) - inner(expected);
+        error.abs().mean(Kind::Float).double_value(&[])
+    }
+
     #[test]
     fn an_offset_of_two_cells_is_corrected() {
         let (_variables, consensus) = trusting();
@@ -200,7 +210,7 @@ mod tests {
         // A feature of the ego at a column is two columns further and one row up in the neighbour's map.
         let other = ego.roll([2i64, -1].as_slice(), [1i64, 0].as_slice());
         let weight = Tensor::zeros([24, 32], (Kind::Float, Device::Cpu));
-        let _ = weight.narrow(0, 6, 12).narrow(1, 6, 20).fill_(1.0);
+        let _ = inner(&weight).fill_(1.0);
         let motion = consensus.motion(&ego, &other, &weight).unwrap().unwrap();
         assert!(
             (motion.shift.double_value(&[0]) + 2.0).abs() < 0.1,
@@ -213,20 +223,9 @@ mod tests {
             motion.shift
         );
         assert!(motion.angle.double_value(&[]).abs() < 0.01);
-        let inner = |map: &Tensor| map.narrow(0, 6, 12).narrow(1, 6, 20);
         let (moved, mask) = motion.apply(&other, &weight.ones_like()).unwrap();
-        let error = |map: &Tensor| {
-            (inner(map) - inner(&ego))
-                .abs()
-                .mean(Kind::Float)
-                .double_value(&[])
-        };
-        assert!(
-            error(&moved) < 0.2 * error(&other),
-            "{} of {}",
-            error(&moved),
-            error(&other)
-        );
+        let [after, before] = [&moved, &other].map(|map| inner_error(map, &ego));
+        assert!(after < 0.2 * before, "{after} of {before}");
         assert_eq!(
             mask.double_value(&[10, 31]),
             0.0,

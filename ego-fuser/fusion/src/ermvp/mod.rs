@@ -200,20 +200,20 @@ mod tests {
     fn invalid_settings_are_named() {
         assert!(ErmvpConfig::full(256).validate().is_ok());
         assert!(ErmvpConfig::lean(64).validate().is_ok());
-        let message = |config: ErmvpConfig| config.validate().unwrap_err().to_string();
-        assert!(
-            message(ErmvpConfig {
-                kept: 0.0,
-                ..ErmvpConfig::lean(64)
-            })
-            .contains("fusion.kept is 0")
-        );
-        assert!(
-            message(ErmvpConfig {
-                search: 99,
-                ..ErmvpConfig::lean(64)
-            })
-            .contains("fusion.search")
-        );
+        let none_kept = ErmvpConfig {
+            kept: 0.0,
+            ..ErmvpConfig::lean(64)
+        };
+        let far_search = ErmvpConfig {
+            search: 99,
+            ..ErmvpConfig::lean(64)
+        };
+        for (config, part) in [
+            (none_kept, "fusion.kept is 0"),
+            (far_search, "fusion.search"),
+        ] {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
     }
 }

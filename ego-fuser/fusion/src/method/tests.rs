@@ -203,14 +203,14 @@ fn settings_come_back_from_json_and_unknown_ones_are_named() {
         let read: FusionConfig = serde_json::from_str(&text).unwrap();
         assert!(read == config && method.has_fusion(&read), "{method}");
     }
-    let error = |text: &str| {
-        serde_json::from_str::<FusionConfig>(text)
-            .unwrap_err()
-            .to_string()
-    };
-    assert!(error("{\"kind\":\"mean\"}").contains("mean"));
-    assert!(error("{\"kind\":\"max\",\"power\":2}").contains("power"));
-    assert!(error("{}").contains("kind"));
+    for (text, part) in [
+        ("{\"kind\":\"mean\"}", "mean"),
+        ("{\"kind\":\"max\",\"power\":2}", "power"),
+        ("{}", "kind"),
+    ] {
+        let error = serde_json::from_str::<FusionConfig>(text).unwrap_err();
+        assert!(error.to_string().contains(part), "{error}");
+    }
 }
 
 /// A method as an external group would add it: settings, module and specification, and nothing elsewhere.

@@ -461,6 +461,17 @@ mod tests {
 
     use super::*;
 
+    fn fused(detector: &DetectorConfig, maps: &Tensor, facts: &[MapMetadata]) -> Tensor {
+        let stage = FusionStage::untrained(Method::ATTENTION, detector, Device::Cpu).unwrap();
+        let received = ReceivedMaps::new(maps.shallow_clone(), None);
+        let aligned = stage.align(&received, facts).unwrap();
+        stage.fuse(&aligned).unwrap().map
+    }
+
+    fn turned_map(agent: usize, yaw_rad: f64) -> MapMetadata {
+        MapMetadata::fresh(agent, Pose::from_xyz_yaw([1.0, 2.0, 0.0], yaw_rad))
+    }
+
     /// A mirrored network gets mirrored maps and returns a mirrored one.
     #[test]
     fn a_mirrored_world_is_fused_like_this_one() {
@@ -486,16 +497,8 @@ mod tests {
         let facts: Vec<MapMetadata> = (0..3)
             .map(|agent| MapMetadata::fresh(agent, poses[agent]))
             .collect();
-        let fused = |detector: &DetectorConfig, maps: &Tensor| {
-            let stage = FusionStage::untrained(Method::ATTENTION, detector, Device::Cpu).unwrap();
-            let received = ReceivedMaps::new(maps.shallow_clone(), None);
-            stage
-                .fuse(&stage.align(&received, &facts).unwrap())
-                .unwrap()
-                .map
-        };
-        let here = fused(&plain, &maps);
-        let there = fused(&mirrored, &maps.flip([2])).flip([1]);
+        let here = fused(&plain, &maps, &facts);
+        let there = fused(&mirrored, &maps.flip([2]), &facts).flip([1]);
         assert!(here.allclose(&there, 1e-3, 1e-3, false));
     }
 
@@ -531,15 +534,13 @@ mod tests {
 
     #[test]
     fn earlier_maps_are_turned_as_when_they_were_the_newest() {
-        let turned = |yaw_rad: f64| Pose::from_xyz_yaw([1.0, 2.0, 0.0], yaw_rad);
-        let fact = |agent: usize, yaw_rad: f64| MapMetadata::fresh(agent, turned(yaw_rad));
         // The ego has turned by 0.1 since; it has no map of a third time step.
         let facts = [
             MapMetadata::fresh(0, Pose::IDENTITY),
-            fact(1, 0.7),
-            fact(0, -0.1),
-            fact(1, 0.5),
-            fact(1, 0.4),
+            turned_map(1, 0.7),
+            turned_map(0, -0.1),
+            turned_map(1, 0.5),
+            turned_map(1, 0.4),
         ];
         let yaws: Vec<f64> = then_from_cav(&facts, 2).iter().map(Pose::yaw_rad).collect();
         assert!(

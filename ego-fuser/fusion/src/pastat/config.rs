@@ -270,6 +270,13 @@ fn lcm(a: i64, b: i64) -> i64 {
 mod tests {
     use super::*;
 
+    fn with_memory(memory: MemoryConfig) -> PastatConfig {
+        PastatConfig {
+            temporal_memory: Some(memory),
+            ..PastatConfig::lean(64)
+        }
+    }
+
     #[test]
     fn presets_are_valid_and_come_back_from_json() {
         for config in [PastatConfig::lean(64), PastatConfig::full(256)] {
@@ -290,10 +297,6 @@ mod tests {
 
     #[test]
     fn invalid_settings_are_named() {
-        let with_memory = |memory| PastatConfig {
-            temporal_memory: Some(memory),
-            ..PastatConfig::lean(64)
-        };
         for (config, part) in [
             (
                 PastatConfig {

@@ -100,9 +100,10 @@ mod tests {
 
     #[test]
     fn the_oldest_is_step_one_and_a_late_map_lies_between_steps() {
-        let at = |age| encoding(age, &config())[0];
-        assert!((at(0.2) - 1.0_f32.sin()).abs() < 1e-6);
-        assert!((at(0.05) - 2.5_f32.sin()).abs() < 1e-6);
+        for (age_secs, step) in [(0.2, 1.0_f32), (0.05, 2.5)] {
+            let found = encoding(age_secs, &config())[0];
+            assert!((found - step.sin()).abs() < 1e-6, "{age_secs}: {found}");
+        }
         assert_ne!(encoding(0.0, &config()), encoding(0.5, &config()));
         assert!(
             encoding(f64::INFINITY, &config())

@@ -31,17 +31,18 @@ impl Scene {
     fn new(agent: &[usize], age_secs: &[f64]) -> Self {
         tch::set_num_threads(1);
         let entries = agent.len() as i64;
-        let fact = |(&agent, &age_secs): (&usize, &f64)| MapMetadata {
+        let facts = agent.iter().zip(age_secs);
+        let facts = facts.map(|(&agent, &age_secs)| MapMetadata {
             agent,
             // All senders are at the ego's pose: maps as received are equal to maps on the ego's grid.
             ego_from_cav: Pose::IDENTITY,
             confidence: 0.8,
             age_secs,
-        };
+        });
         Self {
             features: uniform(9, &[entries, 4, 12, 20]),
             mask: Tensor::ones([entries, 1, 12, 20], FLOAT),
-            facts: agent.iter().zip(age_secs).map(fact).collect(),
+            facts: facts.collect(),
         }
     }
 
@@ -55,13 +56,11 @@ impl Scene {
     }
 
     fn aligned_with_cells_of(&self, cells: i64) -> AlignedMaps {
-        let is_newest = |entry: &usize| {
-            self.facts[..*entry]
-                .iter()
-                .all(|facts| facts.agent != self.facts[*entry].agent)
-        };
         let (newest, earlier): (Vec<usize>, Vec<usize>) =
-            (0..self.facts.len()).partition(is_newest);
+            (0..self.facts.len()).partition(|&entry| {
+                let mut before = self.facts[..entry].iter();
+                before.all(|facts| facts.agent != self.facts[entry].agent)
+            });
         let (newest, earlier) = (self.only(&newest), self.only(&earlier));
         let received = ReceivedMaps::new(
             newest.features.shallow_clone(),
@@ -76,10 +75,10 @@ impl Scene {
     }
 
     fn pooled(&self, cells: i64) -> EarlierMaps {
-        let of = |tensor: &Tensor, entry: usize| tensor.narrow(0, entry as i64, 1);
-        let map = |entry| {
-            FullResolutionMap::of(&of(&self.features, entry), Some(&of(&self.mask, entry))).unwrap()
-        };
+        let maps = (0..self.facts.len() as i64).map(|entry| {
+            let [map, sent] = [&self.features, &self.mask].map(|maps| maps.narrow(0, entry, 1));
+            FullResolutionMap::of(&map, Some(&sent)).unwrap()
+        });
         let head = VarStore::new(Device::Cpu);
         let classes = Classes::under(&head.root(), [4, 2]);
         redraw(&head, &["cls_head"], 1.0);
@@ -88,7 +87,7 @@ impl Scene {
         EarlierMaps {
             warped: WarpedMaps { features, mask },
             metadata: self.facts.clone(),
-            full_resolution: Some(((0..self.facts.len()).map(map).collect(), classes)),
+            full_resolution: Some((maps.collect(), classes)),
         }
     }
 
@@ -195,7 +194,6 @@ fn the_order_of_neighbours_does_not_matter() {
 
 #[test]
 fn each_switch_decides_whether_its_input_matters() {
-    let base = || Scene::new(&[0, 1], &[0.0, 0.1]);
     for (ce, te) in [(false, false), (true, false), (false, true)] {
         let te = te.then_some(Wavelengths::Printed);
         let is_timed = te.is_some();
@@ -205,7 +203,7 @@ fn each_switch_decides_whether_its_input_matters() {
             fsa: None,
             ..small()
         });
-        let mut scene = base();
+        let mut scene = Scene::new(&[0, 1], &[0.0, 0.1]);
         let fused = scene.fused(&pastat);
         scene.facts[1].confidence = 0.1;
         assert_eq!(
@@ -221,13 +219,11 @@ fn each_switch_decides_whether_its_input_matters() {
             "age"
         );
     }
-    let count = |fsa| {
-        trained(&PastatConfig { fsa, ..small() })
-            .0
-            .variables()
-            .len()
-    };
-    assert!(count(None) < count(Some(FsaConfig::default())));
+    let [without_fsa, with_fsa] = [None, Some(FsaConfig::default())].map(|fsa| {
+        let (store, _) = trained(&PastatConfig { fsa, ..small() });
+        store.variables().len()
+    });
+    assert!(without_fsa < with_fsa);
 }
 
 #[test]
@@ -279,9 +275,9 @@ fn fsa_learns_a_shift_from_the_maps_only() {
         let shift = if step.is_multiple_of(2) { 1 } else { -1 };
         scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
         let fine = fine(&pastat, &scene.aligned_with_cells_of(1));
-        let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
-        let difference = inside(fine.neighbours.maps().features.get(0)) - inside(cells.get(0));
-        let loss = difference.square().mean(Kind::Float);
+        let [moved, expected] = [fine.neighbours.maps().features.get(0), cells.get(0)]
+            .map(|map| map.narrow(1, 2, 8).narrow(2, 4, 12));
+        let loss = (moved - expected).square().mean(Kind::Float);
         if train {
             optimizer.zero_grad();
             loss.backward();

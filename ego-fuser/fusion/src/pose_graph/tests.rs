@@ -23,10 +23,10 @@ impl Scene {
                 rng.random_range(-25.0..25.0),
                 -1.0,
             ];
-            let near = |car: &Box3d| {
+            let is_near_another = cars.iter().any(|car| {
                 (car.center_m[0] - center_m[0]).hypot(car.center_m[1] - center_m[1]) < 7.0
-            };
-            if !cars.iter().any(near) {
+            });
+            if !is_near_another {
                 let heading_rad = rng.random_range(-PI..PI);
                 cars.push(Box3d {
                     center_m,
@@ -92,11 +92,11 @@ impl Scene {
 
 /// Mean distance between the boxes under two poses.
 fn off(one: &Pose, other: &Pose, boxes: &[Detection]) -> f64 {
-    let apart = |found: &Detection| {
+    let distances_m = boxes.iter().map(|found| {
         let center = Point3::from(found.box3d.center_m);
         (one.isometry() * center - other.isometry() * center).norm()
-    };
-    boxes.iter().map(apart).sum::<f64>() / boxes.len() as f64
+    });
+    distances_m.sum::<f64>() / boxes.len() as f64
 }
 
 #[test]

@@ -108,8 +108,8 @@ mod tests {
             .unwrap()
             .view([3, 3, 6, 4, 2]);
         // Of the token in row 2, column 1, the point one row below and one column to the left.
-        let at = |axis: i64| points.double_value(&[2, 0, 2, 1, axis]);
-        assert!((at(0) - (0.5 / 4.0 * 2.0 - 1.0)).abs() < 1e-6, "{}", at(0));
-        assert!((at(1) - (3.5 / 6.0 * 2.0 - 1.0)).abs() < 1e-6, "{}", at(1));
+        let [x, y] = [0, 1].map(|axis| points.double_value(&[2, 0, 2, 1, axis]));
+        assert!((x - (0.5 / 4.0 * 2.0 - 1.0)).abs() < 1e-6, "{x}");
+        assert!((y - (3.5 / 6.0 * 2.0 - 1.0)).abs() < 1e-6, "{y}");
     }
 }

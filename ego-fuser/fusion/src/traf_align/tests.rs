@@ -32,11 +32,17 @@ fn fuse(fusion: &dyn Fusion, features: &Tensor, facts: &[MapMetadata], train: bo
 }
 
 fn facts(agents_and_ages: &[(usize, f64)]) -> Vec<MapMetadata> {
-    let facts = |&(agent, age_secs): &(usize, f64)| MapMetadata {
-        age_secs,
-        ..MapMetadata::fresh(agent, Pose::IDENTITY)
-    };
-    agents_and_ages.iter().map(facts).collect()
+    agents_and_ages
+        .iter()
+        .map(|&(agent, age_secs)| MapMetadata {
+            age_secs,
+            ..MapMetadata::fresh(agent, Pose::IDENTITY)
+        })
+        .collect()
+}
+
+fn largest_difference(one: &Tensor, other: &Tensor) -> f64 {
+    (one - other).abs().max().double_value(&[])
 }
 
 #[test]
@@ -74,10 +80,9 @@ fn history_changes_what_is_gathered_and_so_does_its_age() {
             )
         })
     };
-    let difference = |one: &Tensor, other: &Tensor| (one - other).abs().max().double_value(&[]);
     let (ego_only, with_history) = (fused(1, 0.0), fused(2, 0.1));
-    assert!(difference(&ego_only, &with_history) > 1e-3);
-    assert!(difference(&with_history, &fused(2, 0.3)) > 1e-4);
+    assert!(largest_difference(&ego_only, &with_history) > 1e-3);
+    assert!(largest_difference(&with_history, &fused(2, 0.3)) > 1e-4);
 }
 
 /// An object that moves two cells per frame is to be detected at its next position: it is missing in the newest map and
@@ -106,8 +111,8 @@ fn it_learns_to_attend_along_a_motion() {
         optimizer.backward_step(&loss);
         losses.push(loss.double_value(&[]));
     }
-    let mean = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
-    let (first, last) = (mean(&losses[..10]), mean(&losses[280..]));
+    let [first, last] = [&losses[..10], &losses[280..]]
+        .map(|losses| losses.iter().sum::<f64>() / losses.len() as f64);
     // With the newest map only, the loss stays at 0.82. The tensor library has one seed for all tests that run at a
     // time, so weights differ from run to run: of 60 the slowest came to 0.43.
     assert!(last < 0.7 * first, "{first} to {last}");

@@ -137,18 +137,19 @@ fn windows(channels: i64, sizes: [(i64, i64); 3]) -> Vec<WindowConfig> {
 mod tests {
     use super::*;
 
+    fn message_after(change: fn(&mut V2xVitConfig)) -> String {
+        let mut config = V2xVitConfig::lean(64);
+        change(&mut config);
+        config.validate().unwrap_err().to_string()
+    }
+
     #[test]
     fn invalid_settings_are_named() {
         assert!(V2xVitConfig::full(256).validate().is_ok());
         assert!(V2xVitConfig::lean(64).validate().is_ok());
-        let message = |change: fn(&mut V2xVitConfig)| {
-            let mut config = V2xVitConfig::lean(64);
-            change(&mut config);
-            config.validate().unwrap_err().to_string()
-        };
-        assert!(message(|config| config.windows[0].edge = 3).contains("[3, 8, 16]"));
-        assert!(message(|config| config.windows.clear()).contains("windows.edge"));
-        assert!(message(|config| config.depth = 0).contains("fusion.depth is 0"));
-        assert!(message(|config| config.dropout = 1.0).contains("fusion.dropout"));
+        assert!(message_after(|config| config.windows[0].edge = 3).contains("[3, 8, 16]"));
+        assert!(message_after(|config| config.windows.clear()).contains("windows.edge"));
+        assert!(message_after(|config| config.depth = 0).contains("fusion.depth is 0"));
+        assert!(message_after(|config| config.dropout = 1.0).contains("fusion.dropout"));
     }
 }

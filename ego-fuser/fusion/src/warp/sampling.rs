@@ -245,17 +245,14 @@ mod tests {
 
     #[test]
     fn half_way_the_even_cell_is_the_nearest_and_what_is_no_place_has_none() {
-        let nearest = |at: f32| AxisCells::around(at, 4).nearest;
         assert_eq!(
-            [0.5, 1.5, 2.5, -0.5, 3.5].map(nearest),
+            [0.5, 1.5, 2.5, -0.5, 3.5].map(|at| AxisCells::around(at, 4).nearest),
             [Some(0), Some(2), Some(2), Some(0), None]
         );
         for at in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 3e9, -3e9] {
-            assert_eq!(nearest(at), None);
-            assert_eq!(
-                AxisCells::around(at, 4).weights.map(|weight| weight == 0.0),
-                [true; 2]
-            );
+            let cells = AxisCells::around(at, 4);
+            assert_eq!(cells.nearest, None);
+            assert_eq!(cells.weights.map(|weight| weight == 0.0), [true; 2]);
         }
     }
 }

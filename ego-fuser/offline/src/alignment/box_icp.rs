@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     fn cars(from: &Isometry3<f64>) -> Vec<Box3d> {
-        let at = [
+        let places: [[f64; 2]; 6] = [
             [0.0, 8.0],
             [14.0, -6.0],
             [-22.0, 3.0],
@@ -74,15 +74,15 @@ mod tests {
             [25.0, -20.0],
         ];
         let inverse = from.inverse();
-        let car = |[x, y]: [f64; 2]| {
+        let cars = places.map(|[x, y]| {
             let center = inverse.rotation * Vector3::new(x, y, 0.0) + inverse.translation.vector;
             Box3d {
                 center_m: center.into(),
                 size_m: [4.5, 1.9, 1.6],
                 heading_rad: 0.0,
             }
-        };
-        at.map(car).into()
+        });
+        cars.into()
     }
 
     #[test]

@@ -352,23 +352,33 @@ mod tests {
     use super::*;
 
     fn boxes(centres: impl IntoIterator<Item = Vector3<f64>>) -> Vec<Box3d> {
-        let car = |centre: Vector3<f64>| Box3d {
-            center_m: centre.into(),
-            size_m: [4.5, 1.9, 1.6],
-            heading_rad: 0.0,
-        };
-        centres.into_iter().map(car).collect()
+        centres
+            .into_iter()
+            .map(|centre| Box3d {
+                center_m: centre.into(),
+                size_m: [4.5, 1.9, 1.6],
+                heading_rad: 0.0,
+            })
+            .collect()
     }
 
     fn scattered(count: usize, random: &mut ChaCha8Rng) -> Vec<Vector3<f64>> {
-        let mut place = || {
-            Vector3::new(
-                random.random_range(-50.0..50.0),
-                random.random_range(-38.0..38.0),
-                -1.0,
-            )
-        };
-        (0..count).map(|_| place()).collect()
+        (0..count)
+            .map(|_| {
+                Vector3::new(
+                    random.random_range(-50.0..50.0),
+                    random.random_range(-38.0..38.0),
+                    -1.0,
+                )
+            })
+            .collect()
+    }
+
+    /// A point with noise up to `noise_m` in x and in y.
+    fn noisy(point: &Vector3<f64>, noise_m: f64, random: &mut ChaCha8Rng) -> Vector3<f64> {
+        let x = random.random_range(-noise_m..=noise_m);
+        let y = random.random_range(-noise_m..=noise_m);
+        point + Vector3::new(x, y, 0.0)
     }
 
     /// Boxes that two vehicles detect of `shared` vehicles and of `others` each, in their own frames, with noise up to
@@ -386,15 +396,17 @@ mod tests {
             Vector3::z() * heading,
         );
         let common = scattered(shared, &mut random);
-        let mut shaken = |point: &Vector3<f64>| {
-            let mut off = || random.random_range(-noise_m..=noise_m);
-            point + Vector3::new(off(), off(), 0.0)
-        };
-        let mut ego: Vec<_> = common.iter().map(&mut shaken).collect();
+        let mut ego: Vec<_> = common
+            .iter()
+            .map(|point| noisy(point, noise_m, &mut random))
+            .collect();
         let inverse = truth.inverse();
         let mut neighbour: Vec<_> = common
             .iter()
-            .map(|point| shaken(&(inverse.rotation * point + inverse.translation.vector)))
+            .map(|point| {
+                let point = inverse.rotation * point + inverse.translation.vector;
+                noisy(&point, noise_m, &mut random)
+            })
             .collect();
         ego.extend(scattered(others, &mut random));
         neighbour.splice(0..0, scattered(others, &mut random));
@@ -487,10 +499,9 @@ mod tests {
 
     #[test]
     fn a_row_of_parked_cars_could_be_anywhere_along_itself() {
-        let row = |from: i32| {
-            boxes((from..from + 8).map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0)))
-        };
-        let found = align(&row(0), &row(-3), &FreeAlignConfig::default());
+        let [ego, neighbour] = [0..8, -3..5]
+            .map(|row| boxes(row.map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0))));
+        let found = align(&ego, &neighbour, &FreeAlignConfig::default());
         assert!(
             matches!(found, Err(NoAlignment::Ambiguous { .. })),
             "{found:?}"

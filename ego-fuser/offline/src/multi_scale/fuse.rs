@@ -104,6 +104,20 @@ mod tests {
 
     use super::*;
 
+    fn fused(
+        backbone: &BevBackbone,
+        canvas: &Tensor,
+        samples: &[MapAlignment],
+        aggregation: MapAggregation,
+    ) -> Result<Tensor, TchError> {
+        let levels = Levels {
+            samples,
+            aggregation,
+            sent: None,
+        };
+        no_grad(|| fuse_levels(backbone, canvas, &levels))
+    }
+
     #[test]
     fn ego_only_it_is_the_backbone_and_wrong_counts_are_rejected() {
         tch::set_num_threads(1);
@@ -117,36 +131,22 @@ mod tests {
             [2, config.pillar_channels, 32, 32],
             (Kind::Float, Device::Cpu),
         );
-        let fused = |samples: &[MapAlignment], aggregation| {
-            no_grad(|| {
-                fuse_levels(
-                    &backbone,
-                    &canvas,
-                    &Levels {
-                        samples,
-                        aggregation,
-                        sent: None,
-                    },
-                )
-            })
-        };
         let expected = no_grad(|| backbone.forward(&canvas, false));
         let grid = config.feature_grid();
-        let alone = || MapAlignment::of_poses(&[Pose::IDENTITY], &grid).unwrap();
+        let ego_only = [(); 2].map(|()| MapAlignment::of_poses(&[Pose::IDENTITY], &grid).unwrap());
+        let [both, too_many] = [2, 3].map(|agents| {
+            [MapAlignment {
+                agents,
+                theta: None,
+            }]
+        });
         for aggregation in [MapAggregation::Attention, MapAggregation::Max] {
-            let alone = fused(&[alone(), alone()], aggregation).unwrap();
+            let alone = fused(&backbone, &canvas, &ego_only, aggregation).unwrap();
             assert!(
                 alone.allclose(&expected, 1e-4, 1e-4, false),
                 "{aggregation:?}"
             );
-            let together = fused(
-                &[MapAlignment {
-                    agents: 2,
-                    theta: None,
-                }],
-                aggregation,
-            )
-            .unwrap();
+            let together = fused(&backbone, &canvas, &both, aggregation).unwrap();
             assert_eq!(together.size()[0], 1);
             assert!(
                 !together
@@ -155,15 +155,6 @@ mod tests {
                 "{aggregation:?}"
             );
         }
-        assert!(
-            fused(
-                &[MapAlignment {
-                    agents: 3,
-                    theta: None
-                }],
-                MapAggregation::Max
-            )
-            .is_err()
-        );
+        assert!(fused(&backbone, &canvas, &too_many, MapAggregation::Max).is_err());
     }
 }

@@ -208,14 +208,17 @@ mod tests {
     fn each_sample_draws_its_own_error_and_confidence_falls_with_it() {
         let cav = CavId::new("a").unwrap();
         let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
-        let off = |seed| drawn(NoiseMode::Independent, 1.0, seed).added(found, &cav, 5, [0, 2]);
-        assert_eq!(off(1), off(1));
-        assert_ne!(off(1), off(2));
+        let [first, again, other] = [1, 1, 2].map(|seed| {
+            let error = drawn(NoiseMode::Independent, 1.0, seed);
+            error.added(found, &cav, 5, [0, 2])
+        });
+        assert_eq!(first, again);
+        assert_ne!(first, other);
         let PoseEstimate::Pose {
             world_from_cav,
             confidence,
             ..
-        } = off(1)
+        } = first
         else {
             panic!()
         };
@@ -227,21 +230,18 @@ mod tests {
     #[test]
     fn a_share_that_is_none_is_refused_by_name() {
         for share in [-0.1, 1.1, f64::NAN] {
-            let refused = |poses: SamplePoses| poses.validate().unwrap_err().to_string();
-            assert!(
-                refused(SamplePoses {
-                    lost_share: share,
-                    ..SamplePoses::default()
-                })
-                .contains("lost_share")
-            );
-            assert!(
-                refused(SamplePoses {
-                    noise_share: share,
-                    ..SamplePoses::default()
-                })
-                .contains("noise_share")
-            );
+            let lost = SamplePoses {
+                lost_share: share,
+                ..SamplePoses::default()
+            };
+            let noisy = SamplePoses {
+                noise_share: share,
+                ..SamplePoses::default()
+            };
+            for (poses, name) in [(lost, "lost_share"), (noisy, "noise_share")] {
+                let refused = poses.validate().unwrap_err().to_string();
+                assert!(refused.contains(name), "{refused}");
+            }
         }
     }
 

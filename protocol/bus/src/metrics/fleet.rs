@@ -91,14 +91,13 @@ mod tests {
 
     #[test]
     fn samples_of_a_family_are_together_and_described_once() {
-        let text = |process: &str| {
+        let [first, second] = ["a", "b"].map(|process| {
             format!(
                 "# HELP v2vloc_ticks Ticks.\n# TYPE v2vloc_ticks counter\nv2vloc_ticks_total{{process=\"{process}\"}} 1\n\
                  # HELP v2vloc_stage_seconds Stage.\n# TYPE v2vloc_stage_seconds histogram\n\
                  v2vloc_stage_seconds_sum{{process=\"{process}\"}} 2\n# EOF\n"
             )
-        };
-        let [first, second] = [text("a"), text("b")];
+        });
         let expected = "# HELP v2vloc_stage_seconds Stage.\n# TYPE v2vloc_stage_seconds histogram\n\
                         v2vloc_stage_seconds_sum{process=\"a\"} 2\nv2vloc_stage_seconds_sum{process=\"b\"} 2\n\
                         # HELP v2vloc_ticks Ticks.\n# TYPE v2vloc_ticks counter\n\
@@ -113,15 +112,12 @@ mod tests {
             .unwrap()
             .local_addr()
             .unwrap();
-        let peer = |process: &str, address| MetricsPeer {
+        let peers = [("agent-1", silent.local_addr().unwrap()), ("ego-1", closed)];
+        let others = peers.map(|(process, address)| MetricsPeer {
             process: process.into(),
             address,
-        };
+        });
         let began = std::time::Instant::now();
-        let others = [
-            peer("agent-1", silent.local_addr().unwrap()),
-            peer("ego-1", closed),
-        ];
         let text = fleet_exposition("# TYPE a gauge\na 1\n# EOF\n", &others);
         assert!(began.elapsed() < 3 * WAIT_LIMIT, "{:?}", began.elapsed());
         for line in [

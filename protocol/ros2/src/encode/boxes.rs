@@ -173,6 +173,13 @@ fn marker(
 mod tests {
     use super::*;
 
+    fn f64_bytes(values: &[f64]) -> Vec<u8> {
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
+    }
+
     #[test]
     fn a_track_has_its_identity_and_the_covariance_of_its_place() {
         let box3d = Box3d {
@@ -194,12 +201,16 @@ mod tests {
             unseen_s: 0.0,
         };
         let cdr = tracks(7, "f", std::slice::from_ref(&track));
-        let values: Vec<u8> = [0.5, 0.25]
-            .iter()
-            .flat_map(|value: &f64| value.to_le_bytes())
-            .collect();
-        let has = |bytes: &[u8]| cdr.windows(bytes.len()).any(|window| window == bytes);
-        assert!(has(b"\x04\0\0\x00417\0") && has(&values) && has(&0.75f64.to_le_bytes()));
+        for bytes in [
+            b"\x04\0\0\x00417\0".to_vec(),
+            f64_bytes(&[0.5, 0.25]),
+            f64_bytes(&[0.75]),
+        ] {
+            assert!(
+                cdr.windows(bytes.len()).any(|window| window == bytes),
+                "{bytes:?}"
+            );
+        }
         let marked = Marked::from(&track);
         assert_eq!(
             (marked.id, marked.text.as_str()),
@@ -223,12 +234,6 @@ mod tests {
                 source: None,
             }],
         );
-        let f64s = |values: &[f64]| {
-            values
-                .iter()
-                .flat_map(|value| value.to_le_bytes())
-                .collect::<Vec<u8>>()
-        };
         let header = b"\x07\0\0\0\x08\0\0\0\x02\0\0\0f\0";
         let mut expected = vec![0, 1, 0, 0];
         expected.extend(header);
@@ -238,9 +243,11 @@ mod tests {
         expected.extend(b"\x08\0\0\0vehicle\0");
         // Aligned to 8, counted from the end of the encapsulation header.
         expected.extend([0; 4]);
-        expected.extend(f64s(&[0.5, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]));
+        expected.extend(f64_bytes(&[0.5, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]));
         expected.extend([0; 36 * 8]);
-        expected.extend(f64s(&[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0]));
+        expected.extend(f64_bytes(&[
+            1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0,
+        ]));
         expected.extend(b"\x01\0\0\0\0");
         assert_eq!(cdr, expected);
     }

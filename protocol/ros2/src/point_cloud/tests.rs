@@ -126,26 +126,33 @@ fn what_is_written_for_ros_is_read_back() {
     assert_eq!(sweep, expected);
 }
 
+/// Intensity of the only point of a cloud, and its field as it is found.
+fn read_intensity(
+    name: &'static str,
+    datatype: u8,
+    value: f64,
+) -> (f32, Option<(String, IntensityKind)>) {
+    let fields = vec![("X", 0, 7), ("y", 4, 7), ("z", 8, 7), (name, 12, datatype)];
+    let cloud = Cloud {
+        fields,
+        ..Cloud::plain(&[[1.0, 2.0, 3.0, value]])
+    };
+    let sweep = cloud.read().unwrap();
+    (sweep.points.xyzi[0][3], sweep.intensity)
+}
+
 #[test]
 fn intensities_are_found_by_the_names_that_files_have() {
-    let read = |name: &'static str, datatype, value: f64| {
-        let fields = vec![("X", 0, 7), ("y", 4, 7), ("z", 8, 7), (name, 12, datatype)];
-        let cloud = Cloud {
-            fields,
-            ..Cloud::plain(&[[1.0, 2.0, 3.0, value]])
-        };
-        let sweep = cloud.read().unwrap();
-        (sweep.points.xyzi[0][3], sweep.intensity)
-    };
     for name in ["Intensity", "i", "reflectivity", "signal"] {
         let expected = Some((name.to_owned(), IntensityKind::Number));
-        assert_eq!(read(name, 7, 255.0), (255.0, expected));
+        assert_eq!(read_intensity(name, 7, 255.0), (255.0, expected));
     }
     let byte = Some(("intensity".to_owned(), IntensityKind::Byte));
-    assert_eq!(read("intensity", 2, 7.0), (7.0, byte));
+    assert_eq!(read_intensity("intensity", 2, 7.0), (7.0, byte));
     let red = Some(("rgb".to_owned(), IntensityKind::RedByte));
-    assert_eq!(read("rgb", 6, f64::from(0x00c2_0102)), (194.0, red));
-    assert_eq!(read("ring", 7, 9.0), (0.0, None));
+    let colour = f64::from(0x00c2_0102);
+    assert_eq!(read_intensity("rgb", 6, colour), (194.0, red));
+    assert_eq!(read_intensity("ring", 7, 9.0), (0.0, None));
 }
 
 #[test]
@@ -232,82 +239,83 @@ fn layouts_of_drivers_are_read() {
     );
 }
 
+/// The cloud with another field in that place: name, offset and datatype.
+fn with_field(cloud: &Cloud, index: usize, field: (&'static str, u32, u8)) -> Cloud {
+    let mut fields = cloud.fields.clone();
+    fields[index] = field;
+    Cloud {
+        fields,
+        ..cloud.clone()
+    }
+}
+
 #[test]
 fn a_wrong_message_is_named_with_field_and_values() {
     let plain = Cloud::plain(&[[1.0, 2.0, 3.0, 4.0]; 3]);
-    let error = |cloud: Cloud| cloud.read().unwrap_err().to_string();
-    let xyz = |index: usize, field| {
-        let mut fields = plain.fields.clone();
-        fields[index] = field;
-        Cloud {
-            fields,
-            ..plain.clone()
-        }
-    };
-    let cases = [
+    for (cloud, expected) in [
         (
-            error(Cloud {
+            Cloud {
                 stamp: (-1, 0),
                 ..plain.clone()
-            }),
+            },
             "header.stamp is -1 s and 0 ns",
         ),
         (
-            error(Cloud {
+            Cloud {
                 stamp: (1, 1_000_000_000),
                 ..plain.clone()
-            }),
+            },
             "1000000000 ns",
         ),
         (
-            error(xyz(1, ("range", 4, 7))),
+            with_field(&plain, 1, ("range", 4, 7)),
             r#"no field "y" among ["x", "range", "z", "intensity"]"#,
         ),
         (
-            error(xyz(2, ("z", 8, 4))),
+            with_field(&plain, 2, ("z", 8, 4)),
             r#"field "z" has datatype 4 and count 1, not datatype 7 or 8"#,
         ),
         (
-            error(xyz(3, ("intensity", 8, 9))),
+            with_field(&plain, 3, ("intensity", 8, 9)),
             r#"field "intensity" has datatype 9"#,
         ),
         (
-            error(Cloud {
+            Cloud {
                 point_step: 15,
                 ..plain.clone()
-            }),
+            },
             "point_step is 15, not at least 16",
         ),
         (
-            error(Cloud {
+            Cloud {
                 width: 4,
                 ..plain.clone()
-            }),
+            },
             "length of data is 48, not at least 64",
         ),
         (
-            error(Cloud {
+            Cloud {
                 height: 3,
                 width: 2,
                 row_step: 31,
                 points: Vec::new(),
                 ..plain.clone()
-            }),
+            },
             "row_step is 31",
         ),
         (
-            error(Cloud {
+            Cloud {
                 height: 1 << 16,
                 width: 17,
                 row_step: 0,
                 points: Vec::new(),
                 ..plain.clone()
-            }),
+            },
             "1114112, at most 1048576",
         ),
-    ];
-    for (found, expected) in cases {
-        assert!(found.contains(expected), "{found}");
+    ] {
+        let error = cloud.read().unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
     }
     let bytes = plain.bytes::<LittleEndian>([0, 1, 0, 0]);
     let error = read_point_cloud(&bytes[..bytes.len() - 10], LIMITS)
@@ -341,8 +349,8 @@ fn any_cloud() -> impl Strategy<Value = Cloud> {
     )
         .prop_flat_map(
             |((x, y, z, intensity), paddings, order, height, width, is_big_endian, row_padding)| {
-                let float = |is_double| if is_double { 8 } else { 7 };
-                let datatypes = [float(x), float(y), float(z), intensity];
+                let [x, y, z] = [x, y, z].map(|is_double| if is_double { 8 } else { 7 });
+                let datatypes = [x, y, z, intensity];
                 let mut fields = Vec::new();
                 let mut end = 0;
                 for (index, padding) in order.into_iter().zip(paddings) {

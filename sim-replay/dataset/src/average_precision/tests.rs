@@ -133,21 +133,22 @@ proptest! {
     }
 }
 
-/// Cars from -32 to 32 m; trucks do not count.
-fn narrow(cars: &[f64], trucks: &[f64]) -> GroundTruth {
-    let of_class = |class| {
-        move |(id, x): (i64, &f64)| TrueBox {
+fn true_boxes(class: ObjectClass, places: &[f64]) -> Vec<TrueBox> {
+    (0..)
+        .zip(places)
+        .map(|(id, x)| TrueBox {
             id,
             class,
             box3d: car(*x),
-        }
-    };
+        })
+        .collect()
+}
+
+/// Cars from -32 to 32 m; trucks do not count.
+fn narrow(cars: &[f64], trucks: &[f64]) -> GroundTruth {
     GroundTruth {
-        objects: (0..).zip(cars).map(of_class(ObjectClass::Car)).collect(),
-        ignored: (0..)
-            .zip(trucks)
-            .map(of_class(ObjectClass::Truck))
-            .collect(),
+        objects: true_boxes(ObjectClass::Car, cars),
+        ignored: true_boxes(ObjectClass::Truck, trucks),
         area_m: [-32.0, -32.0, 32.0, 32.0],
     }
 }
@@ -200,6 +201,23 @@ fn an_object_that_counts_is_matched_before_one_that_does_not() {
     assert_eq!(verdicts, [[Verdict::Match(0)]]);
 }
 
+fn distance_along_x(a: &Box3d, b: &Box3d) -> f64 {
+    (a.center_m[0] - b.center_m[0]).abs()
+}
+
+/// Whether two cars overlap by half, as intervals of x.
+fn overlap_along_x(a: &Box3d, b: &Box3d) -> bool {
+    let common = (4.0 - distance_along_x(a, b)).max(0.0);
+    common / (8.0 - common) >= 0.5
+}
+
+/// The largest precision from a rank on: `judged` has the score and 1 for a hit or 0, the highest score first.
+fn precision_from(judged: &[(f32, f64)], rank: usize) -> f64 {
+    (rank..=judged.len())
+        .map(|count| judged[..count].iter().map(|(_, hit)| hit).sum::<f64>() / count as f64)
+        .fold(0.0, f64::max)
+}
+
 /// AP of one part of the objects, computed frame by frame with intervals instead of polygons: `is_in` selects objects
 /// by distance and class, `is_near` false positives by distance.
 fn plain_average_precision(
@@ -207,10 +225,6 @@ fn plain_average_precision(
     is_in: impl Fn(f64, ObjectClass) -> bool,
     is_near: impl Fn(f64) -> bool,
 ) -> f64 {
-    let overlap = |a: &Box3d, b: &Box3d| {
-        let common = (4.0 - (a.center_m[0] - b.center_m[0]).abs()).max(0.0);
-        common / (8.0 - common) >= 0.5
-    };
     let (mut judged, mut objects) = (Vec::new(), 0);
     for (found, truth) in frames {
         let (wanted, others): (Vec<&TrueBox>, Vec<&TrueBox>) = truth
@@ -225,65 +239,62 @@ fn plain_average_precision(
             .iter()
             .filter(|one| one.box3d.center_m[0].abs() + 2.0 <= 80.0)
         {
-            let distance = |other: &&&Box3d| (other.center_m[0] - one.box3d.center_m[0]).abs();
-            let best = open
-                .iter()
-                .min_by(|a, b| distance(a).total_cmp(&distance(b)));
-            match best.copied().filter(|best| overlap(best, &one.box3d)) {
+            let best = open.iter().copied().min_by(|a, b| {
+                distance_along_x(a, &one.box3d).total_cmp(&distance_along_x(b, &one.box3d))
+            });
+            match best.filter(|best| overlap_along_x(best, &one.box3d)) {
                 Some(best) => {
                     open.retain(|other| *other != best);
                     judged.push((one.score, 1.0));
                 }
-                None if others.iter().any(|other| overlap(&other.box3d, &one.box3d)) => {}
+                None if others
+                    .iter()
+                    .any(|other| overlap_along_x(&other.box3d, &one.box3d)) => {}
                 None if is_near(one.box3d.center_m[0].abs()) => judged.push((one.score, 0.0)),
                 None => {}
             }
         }
     }
     judged.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let precision_from = |rank: usize| {
-        let hits = |count: usize| judged[..count].iter().map(|(_, hit)| hit).sum::<f64>();
-        (rank..=judged.len())
-            .map(|count| hits(count) / count as f64)
-            .fold(0.0, f64::max)
-    };
     let hits = (1..=judged.len()).filter(|rank| judged[rank - 1].1 > 0.0);
-    hits.map(precision_from).sum::<f64>() / objects as f64
+    let precisions = hits.map(|rank| precision_from(&judged, rank));
+    precisions.sum::<f64>() / objects as f64
+}
+
+/// A car every 7 m with an error that grows, every third a van; a box on nothing every 11 m.
+fn shifted_frame(index: u32) -> (Vec<Detection>, GroundTruth) {
+    let shift = f64::from(index);
+    let objects: Vec<TrueBox> = (0..12)
+        .map(|id| TrueBox {
+            id,
+            class: if id % 3 == 0 {
+                ObjectClass::Van
+            } else {
+                ObjectClass::Car
+            },
+            box3d: car(7.0 * id as f64 - shift),
+        })
+        .collect();
+    let on_objects = objects.iter().map(|one| {
+        let x = one.box3d.center_m[0];
+        found(
+            x + 0.015 * x.abs(),
+            0.9 - 0.01 * (x.abs() as f32) + 0.003 * index as f32,
+        )
+    });
+    let on_nothing = (0..6).map(|k| found(-11.0 * f64::from(k) - 9.0, 0.85 - 0.1 * k as f32));
+    let found = on_objects.chain(on_nothing).collect();
+    let truth = GroundTruth {
+        objects,
+        ignored: vec![],
+        area_m: [-80.0, -80.0, 80.0, 80.0],
+    };
+    (found, truth)
 }
 
 #[test]
 fn ap_by_distance_and_by_class_is_that_of_a_plain_computation() {
-    let frame = |index: u32| {
-        // A car every 7 m with an error that grows, every third a van; a box on nothing every 11 m.
-        let shift = f64::from(index);
-        let objects: Vec<TrueBox> = (0..12)
-            .map(|id| TrueBox {
-                id,
-                class: if id % 3 == 0 {
-                    ObjectClass::Van
-                } else {
-                    ObjectClass::Car
-                },
-                box3d: car(7.0 * id as f64 - shift),
-            })
-            .collect();
-        let on_objects = objects.iter().map(|one| {
-            let x = one.box3d.center_m[0];
-            found(
-                x + 0.015 * x.abs(),
-                0.9 - 0.01 * (x.abs() as f32) + 0.003 * index as f32,
-            )
-        });
-        let on_nothing = (0..6).map(|k| found(-11.0 * f64::from(k) - 9.0, 0.85 - 0.1 * k as f32));
-        let found = on_objects.chain(on_nothing).collect();
-        let truth = GroundTruth {
-            objects,
-            ignored: vec![],
-            area_m: [-80.0, -80.0, 80.0, 80.0],
-        };
-        (found, truth)
-    };
-    let frames: Vec<(Vec<Detection>, GroundTruth)> = (0..3).map(frame).collect();
+    let frames: Vec<(Vec<Detection>, GroundTruth)> = (0..3).map(shifted_frame).collect();
     let mut scorer = Scorer::new(&[0.5]).with_breakdowns();
     for (found, truth) in &frames {
         scorer.add(found, truth);

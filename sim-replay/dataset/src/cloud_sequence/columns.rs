@@ -248,13 +248,6 @@ mod tests {
 
     #[test]
     fn columns_are_found_by_name() {
-        let first = |names: &str| {
-            let columns = quaternion(names).unwrap();
-            let PoseColumns::Quaternion(values) = columns.pose else {
-                panic!("{names}");
-            };
-            (values, columns.time)
-        };
         let unknown = Some(TimeColumns::One(0, None));
         let nanos = Some(TimeColumns::One(0, Some(Unit::Nanoseconds)));
         let w_first = [1, 2, 3, 5, 6, 7, 4];
@@ -290,7 +283,11 @@ mod tests {
                 Some(TimeColumns::SecondsAndNanos(0, 1)),
             ),
         ] {
-            assert_eq!(first(names), (values, time), "{names}");
+            let columns = quaternion(names).unwrap();
+            let PoseColumns::Quaternion(found) = columns.pose else {
+                panic!("{names}");
+            };
+            assert_eq!((found, columns.time), (values, time), "{names}");
         }
         let named = quaternion("file,frame,x,y,z,qx,qy,qz,qw").unwrap();
         assert_eq!(

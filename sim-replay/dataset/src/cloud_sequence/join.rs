@@ -238,13 +238,17 @@ mod tests {
         Ok((rows.into_iter().map(|row| row.unwrap_or(99)).collect(), by))
     }
 
+    fn times(nanos: &[u64]) -> Vec<Keys> {
+        vec![Keys::Times(nanos.to_vec())]
+    }
+
+    fn times_in_tenths(tenths: &[u64]) -> Vec<Keys> {
+        let nanos: Vec<u64> = tenths.iter().map(|tenth| tenth * 100_000_000).collect();
+        times(&nanos)
+    }
+
     #[test]
     fn rows_belong_to_clouds_by_key_or_by_a_proven_order() {
-        let times = |steps: &[u64]| {
-            vec![Keys::Times(
-                steps.iter().map(|step| step * 100_000_000).collect(),
-            )]
-        };
         type Case<'a> = (&'a [&'a str], Vec<Keys>, usize, &'a [usize], &'a str);
         let cases: [Case<'_>; 10] = [
             (
@@ -261,21 +265,33 @@ mod tests {
                 &[1, 99, 0],
                 "number",
             ),
-            (&["000001", "000002"], times(&[0, 1]), 2, &[0, 1], "order"),
+            (
+                &["000001", "000002"],
+                times_in_tenths(&[0, 1]),
+                2,
+                &[0, 1],
+                "order",
+            ),
             (&["scan_1", "scan_2"], vec![], 2, &[0, 1], "order"),
             (
                 &["0", "12", "20"],
-                times(&[3, 15, 23]),
+                times_in_tenths(&[3, 15, 23]),
                 3,
                 &[0, 1, 2],
                 "order",
             ),
             (&["0", "2"], vec![], 3, &[0, 2], "number of the row"),
             (&["1", "3"], vec![], 3, &[0, 2], "number of the row"),
-            (&["7.1", "7.2"], times(&[71, 99, 72]), 3, &[0, 2], "time"),
+            (
+                &["7.1", "7.2"],
+                times_in_tenths(&[71, 99, 72]),
+                3,
+                &[0, 2],
+                "time",
+            ),
             (
                 &["1600000000.1", "1600000000.2"],
-                times(&[0, 1]),
+                times_in_tenths(&[0, 1]),
                 2,
                 &[0, 1],
                 "order",
@@ -299,7 +315,6 @@ mod tests {
 
     #[test]
     fn lists_that_contradict_each_other_are_refused() {
-        let times = |times: &[u64]| vec![Keys::Times(times.to_vec())];
         let cases: [(&[&str], Vec<Keys>, usize, &str); 8] = [
             (
                 &["1", "2"],

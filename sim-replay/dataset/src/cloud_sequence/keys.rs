@@ -285,12 +285,15 @@ mod tests {
         }
     }
 
-    #[test]
-    fn a_list_of_times_has_one_unit() {
-        let times = |words: &[&str]| match Keys::of_times(words, None) {
+    fn times(words: &[&str]) -> Vec<u64> {
+        match Keys::of_times(words, None) {
             Some(Keys::Times(times)) => times,
             other => panic!("{other:?}"),
-        };
+        }
+    }
+
+    #[test]
+    fn a_list_of_times_has_one_unit() {
         assert_eq!(times(&["0", "100000000"]), [0, 100_000_000], "nanoseconds");
         assert_eq!(
             times(&["1000", "1001"]),

@@ -163,16 +163,25 @@ mod tests {
 
     fn poses(dataset: &Dataset) -> Vec<(String, [f64; 3], f32)> {
         let scenario = &dataset.scenarios[0];
-        let frame = |tick: usize| scenario.load(0, tick, &LoadOptions::default()).unwrap();
-        let pose = |tick: usize| {
-            let frame = frame(tick);
-            (
-                scenario.ticks[tick].stem.clone(),
-                frame.world_from_lidar.unwrap().translation_m,
-                frame.points.xyzi[0][0],
-            )
-        };
-        (0..scenario.ticks.len()).map(pose).collect()
+        (0..scenario.ticks.len())
+            .map(|tick| {
+                let frame = scenario.load(0, tick, &LoadOptions::default()).unwrap();
+                (
+                    scenario.ticks[tick].stem.clone(),
+                    frame.world_from_lidar.unwrap().translation_m,
+                    frame.points.xyzi[0][0],
+                )
+            })
+            .collect()
+    }
+
+    fn twelve_rows(row: impl Fn(usize) -> String) -> String {
+        (0..12).map(row).collect()
+    }
+
+    fn open_with_poses(dir: &Path, text: &str) -> Dataset {
+        fs::write(dir.join("poses.txt"), text).unwrap();
+        crate::open(dir).unwrap()
     }
 
     #[test]
@@ -183,20 +192,21 @@ mod tests {
             dir.path(),
             &names.iter().map(String::as_str).collect::<Vec<_>>(),
         );
-        let rows = |row: fn(usize) -> String| (0..12).map(row).collect::<String>();
-        let matrix = |number: usize| format!("1 0 0 {number} 0 1 0 0 0 0 1 0\n");
-        let timed = |number: usize| format!("{:.6} {number} 0 0 0 0 0 1\n", 0.1 * number as f64);
-        let counted = |number: usize| format!("{number}.0 {number} 0 0 0 0 0 1\n");
-        let keyed =
-            |number: usize| format!("{} 1 0 0 {} 0 1 0 0 0 0 1 0\n", 11 - number, 11 - number);
+        let matrices = twelve_rows(|number| format!("1 0 0 {number} 0 1 0 0 0 0 1 0\n"));
+        let timed =
+            twelve_rows(|number| format!("{:.6} {number} 0 0 0 0 0 1\n", 0.1 * number as f64));
+        let counted = twelve_rows(|number| format!("{number}.0 {number} 0 0 0 0 0 1\n"));
+        let keyed = twelve_rows(|row| {
+            let number = 11 - row;
+            format!("{number} 1 0 0 {number} 0 1 0 0 0 0 1 0\n")
+        });
         for (text, by) in [
-            (rows(matrix), "order"),
-            (rows(timed), "order"),
-            (rows(counted), "order"),
-            (rows(keyed), "number"),
+            (matrices, "order"),
+            (timed, "order"),
+            (counted, "order"),
+            (keyed, "number"),
         ] {
-            fs::write(dir.path().join("poses.txt"), text).unwrap();
-            let dataset = crate::open(dir.path()).unwrap();
+            let dataset = open_with_poses(dir.path(), &text);
             let scenario = &dataset.scenarios[0];
             assert_eq!(scenario.joins, [format!("12 poses of poses.txt by {by}")]);
             let found = poses(&dataset);
@@ -293,20 +303,25 @@ mod tests {
             ("10.5".into(), [1.0, 2.0, 3.0], 1.0),
             ("11".into(), [4.0, 5.0, 6.0], 2.0),
         ];
-        let of = |text: &str| {
-            fs::write(dir.path().join("poses.txt"), text).unwrap();
-            crate::open(dir.path()).unwrap()
-        };
-        let by_time = of("# time x y z q\n11.0002 4 5 6 0 0 0 1\n10.5 1 2 3 0 0 1 0\n");
+        let by_time = open_with_poses(
+            dir.path(),
+            "# time x y z q\n11.0002 4 5 6 0 0 0 1\n10.5 1 2 3 0 0 1 0\n",
+        );
         assert_eq!(
             (by_time.layout.name(), poses(&by_time)),
             ("clouds with poses", expected.clone())
         );
-        let by_name = of("file,x,y,z,qx,qy,qz,qw\n11.bin,4,5,6,0,0,0,1\n10.5.bin,1,2,3,0,0,0,1\n");
+        let by_name = open_with_poses(
+            dir.path(),
+            "file,x,y,z,qx,qy,qz,qw\n11.bin,4,5,6,0,0,0,1\n10.5.bin,1,2,3,0,0,0,1\n",
+        );
         assert_eq!(poses(&by_name), expected);
-        let by_order = of("1 0 0 1 0 1 0 2 0 0 1 3\n1 0 0 4 0 1 0 5 0 0 1 6\n");
+        let by_order = open_with_poses(
+            dir.path(),
+            "1 0 0 1 0 1 0 2 0 0 1 3\n1 0 0 4 0 1 0 5 0 0 1 6\n",
+        );
         assert_eq!(poses(&by_order), expected);
-        let lacking = of("10.5 1 2 3 0 0 1 0\n11 4 5 6 0 0 0 2\n");
+        let lacking = open_with_poses(dir.path(), "10.5 1 2 3 0 0 1 0\n11 4 5 6 0 0 0 2\n");
         assert_eq!((poses(&lacking).len(), lacking.problems.len()), (1, 2));
         assert!(
             lacking.problems[0]

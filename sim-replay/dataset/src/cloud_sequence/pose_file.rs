@@ -314,17 +314,21 @@ mod tests {
         );
     }
 
+    fn rows_with_pose(text: &str) -> Vec<bool> {
+        let poses = read(text).unwrap().poses;
+        poses.iter().map(Option::is_some).collect()
+    }
+
     #[test]
     fn a_blank_line_is_a_row_without_pose_where_rows_have_no_key() {
         let pose = "1 0 0 5 0 1 0 0 0 0 1 0";
-        let present = |text: &str| -> Vec<bool> {
-            let poses = read(text).unwrap().poses;
-            poses.iter().map(Option::is_some).collect()
-        };
         assert_eq!(
-            present(&format!("{pose}\n\n{pose}\n\n")),
+            rows_with_pose(&format!("{pose}\n\n{pose}\n\n")),
             [true, false, true]
         );
-        assert_eq!(present(&format!("0 {pose}\n\n1 {pose}\n")), [true, true]);
+        assert_eq!(
+            rows_with_pose(&format!("0 {pose}\n\n1 {pose}\n")),
+            [true, true]
+        );
     }
 }

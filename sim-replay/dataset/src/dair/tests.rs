@@ -41,16 +41,9 @@ impl DataSet {
             "cooperative/data_info.json",
             &json!([set.pair(kind, 1), set.pair(kind, 0)]),
         );
-        let capture = |number: u64| {
-            json!({
-                "pointcloud_path": format!("velodyne/{:06}.pcd", 10 + number), "frame_id": format!("{:06}", 10 + number),
-                "pointcloud_timestamp": (T0_MICROS + 100_000 * number).to_string(),
-                "batch_id": "7", "sequence_id": "0003",
-            })
-        };
         set.write(
             "vehicle-side/data_info.json",
-            &json!([capture(0), capture(1), capture(2)]),
+            &json!([0, 1, 2].map(vehicle_capture)),
         );
         (0..2).for_each(|number| set.write_frames(kind, number));
         set
@@ -174,6 +167,15 @@ impl DataSet {
     }
 }
 
+fn vehicle_capture(number: u64) -> Value {
+    let frame = format!("{:06}", 10 + number);
+    json!({
+        "pointcloud_path": format!("velodyne/{frame}.pcd"), "frame_id": frame,
+        "pointcloud_timestamp": (T0_MICROS + 100_000 * number).to_string(),
+        "batch_id": "7", "sequence_id": "0003",
+    })
+}
+
 fn label(kind: &str, [x, y, z]: [f64; 3], rotation: f64) -> Value {
     json!({
         "type": kind, "occluded_state": 0, "3d_dimensions": {"h": 1.5, "w": 1.9, "l": 4.4},
@@ -184,16 +186,15 @@ fn label(kind: &str, [x, y, z]: [f64; 3], rotation: f64) -> Value {
 
 /// A van of 4 x 2 x 1.5 m at (100, 230, 21) that faces y.
 fn world_label() -> Value {
-    let corners = |z: f64| {
+    let corners = [20.25, 21.75].map(|z: f64| {
         [
             [99.0, 232.0, z],
             [101.0, 232.0, z],
             [101.0, 228.0, z],
             [99.0, 228.0, z],
         ]
-    };
-    let all: Vec<[f64; 3]> = corners(20.25).into_iter().chain(corners(21.75)).collect();
-    json!({"type": "Van", "world_8_points": all})
+    });
+    json!({"type": "Van", "world_8_points": corners.concat()})
 }
 
 fn close(found: [f64; 3], expected: [f64; 3]) -> bool {
@@ -491,25 +492,23 @@ fn either_order_of_corners_is_the_same_box() {
 fn calibrations_that_are_none_are_named() {
     let set = DataSet::new(Kind::Dair);
     let name = "infrastructure-side/calib/virtuallidar_to_world/000500.json";
-    let load = |value: &Value| {
-        set.write(name, value);
+    for (calibration, expected) in [
+        (
+            json!({"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, 1]], "translation": [1, 2, 3]}),
+            "no rotation: off orthonormal by 0.000, determinant -1.000, expected at most 0.05 and 1",
+        ),
+        (json!({"rotation": [1, 2, 3]}), "3 numbers, expected 9"),
+        (json!({}), "missing"),
+    ] {
+        set.write(name, &calibration);
         let error = set.open().scenarios[0]
             .load(1, 0, &LoadOptions::default())
             .unwrap_err();
-        set.shown([error]).remove(0)
-    };
-    let mirror = json!({"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, 1]], "translation": [1, 2, 3]});
-    assert_eq!(
-        load(&mirror),
-        format!(
-            "{name}: rotation: no rotation: off orthonormal by 0.000, determinant -1.000, expected at most 0.05 and 1"
-        )
-    );
-    assert_eq!(
-        load(&json!({"rotation": [1, 2, 3]})),
-        format!("{name}: rotation: 3 numbers, expected 9")
-    );
-    assert_eq!(load(&json!({})), format!("{name}: rotation: missing"));
+        assert_eq!(
+            set.shown([error]),
+            [format!("{name}: rotation: {expected}")]
+        );
+    }
 }
 
 #[test]

@@ -56,9 +56,9 @@ fn every_preset_has_a_protocol_of_its_name() {
 
 #[test]
 fn the_layout_decides_without_options() {
-    let resolve = |layout| ProtocolConfig::default().resolve(layout).unwrap();
-    assert_eq!(resolve(Layout::OPV2V).ground_truth, GroundTruthRule::OPV2V);
-    let v2v4real = resolve(Layout::V2V4REAL);
+    let [opv2v, v2v4real] = [Layout::OPV2V, Layout::V2V4REAL]
+        .map(|layout| ProtocolConfig::default().resolve(layout).unwrap());
+    assert_eq!(opv2v.ground_truth, GroundTruthRule::OPV2V);
     assert_eq!(
         (v2v4real.ground_truth, v2v4real.ap_order),
         (GroundTruthRule::V2V4REAL, ApOrder::Frame)
@@ -95,30 +95,32 @@ fn the_range_of_a_preset_ends_with_the_area_of_the_network() {
     );
 }
 
+fn refusal(json: &str) -> String {
+    serde_json::from_str::<ProtocolConfig>(json)
+        .unwrap()
+        .resolve(Layout::OPV2V)
+        .unwrap_err()
+}
+
 #[test]
 fn wrong_options_are_named_with_both_values() {
-    let error = |json: &str| {
-        serde_json::from_str::<ProtocolConfig>(json)
-            .unwrap()
-            .resolve(Layout::OPV2V)
-            .unwrap_err()
-    };
     assert!(
-        error(r#"{"preset": "kitty"}"#).starts_with("unknown protocol \"kitty\"; there are opv2v,")
+        refusal(r#"{"preset": "kitty"}"#)
+            .starts_with("unknown protocol \"kitty\"; there are opv2v,")
     );
     assert_eq!(
-        error(r#"{"min_corners": 9}"#),
+        refusal(r#"{"min_corners": 9}"#),
         "min_corners: 9, expected 1 to 8"
     );
     assert_eq!(
-        error(r#"{"comm_range_m": -1}"#),
+        refusal(r#"{"comm_range_m": -1}"#),
         "comm_range_m: -1, expected 0 to 100000"
     );
     assert_eq!(
-        error(r#"{"ground_truth_range_m": [1, 2]}"#),
+        refusal(r#"{"ground_truth_range_m": [1, 2]}"#),
         "ground_truth_range_m: 2 numbers, expected 6"
     );
-    let reversed = error(r#"{"ground_truth_range_m": [1, 0, 0, -1, 1, 1]}"#);
+    let reversed = refusal(r#"{"ground_truth_range_m": [1, 0, 0, -1, 1, 1]}"#);
     assert_eq!(reversed, "ground_truth_range_m: from 1 to -1 is no range");
 }
 

@@ -90,12 +90,12 @@ mod tests {
             half in prop::array::uniform3(0.1..60.0f32),
         ) {
             let box_from_lidar = Isometry3::new(center.into(), nalgebra::Vector3::new(0.0, 0.0, yaw)).inverse();
-            let holds = |point: &[f32; 4]| {
+            let cells = PointCells::new(&PointCloud { xyzi: points.clone() });
+            let expected = points.iter().any(|point| {
                 let local = box_from_lidar * Point3::new(point[0], point[1], point[2]);
                 (0..3).all(|axis| local[axis].abs() <= half[axis])
-            };
-            let cells = PointCells::new(&PointCloud { xyzi: points.clone() });
-            prop_assert_eq!(cells.holds_point(&box_from_lidar, half), points.iter().any(holds));
+            });
+            prop_assert_eq!(cells.holds_point(&box_from_lidar, half), expected);
         }
     }
 }

@@ -3,26 +3,26 @@ use std::fs;
 use super::*;
 use crate::OpenOptions;
 
-/// A scene of one agent with 20 boxes around the sensor in each of `frames` frames, of which `empty` hold no point.
-fn scene(dir: &Path, frames: usize, empty: usize, intensity: f32) -> Vec<Problem> {
+/// Findings in a scene of one agent with 20 boxes around the sensor in each of 60 frames, of which `empty` hold no
+/// point.
+fn scene_findings(dir: &Path, empty: usize, intensity: f32) -> Vec<String> {
     let folder = dir.join("scene/1");
     fs::create_dir_all(&folder).unwrap();
-    let car = |id: usize| {
-        let x = if id < empty { 900 } else { 10 };
-        format!(
-            "  {id}: {{location: [{x}, {}, 0], angle: [0, 0, 0], extent: [1, 1, 1]}}\n",
-            4 * id
-        )
-    };
-    let yaml = format!(
-        "lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles:\n{}",
-        (0..20).map(car).collect::<String>()
-    );
+    let cars: String = (0..20)
+        .map(|id| {
+            let x = if id < empty { 900 } else { 10 };
+            format!(
+                "  {id}: {{location: [{x}, {}, 0], angle: [0, 0, 0], extent: [1, 1, 1]}}\n",
+                4 * id
+            )
+        })
+        .collect();
+    let yaml = format!("lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles:\n{cars}");
     let points: String = (0..20)
         .map(|id| format!("10 {} 0 {}\n", 4 * id, intensity * id as f32))
         .collect();
     let head = "FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 20\nDATA ascii\n";
-    for frame in 0..frames {
+    for frame in 0..60 {
         fs::write(folder.join(format!("{frame:06}.yaml")), &yaml).unwrap();
         fs::write(
             folder.join(format!("{frame:06}.pcd")),
@@ -32,20 +32,16 @@ fn scene(dir: &Path, frames: usize, empty: usize, intensity: f32) -> Vec<Problem
     }
     let dataset = crate::open_with(dir, &OpenOptions::default()).unwrap();
     sampled(&dataset.scenarios, IntensityScale::AUTO)
+        .into_iter()
+        .map(|finding| finding.message)
+        .collect()
 }
 
 #[test]
 fn a_sample_has_the_findings_of_the_whole() {
     let dir = tempfile::tempdir().unwrap();
-    let messages = |empty, intensity| {
-        let findings = scene(dir.path(), 60, empty, intensity);
-        findings
-            .into_iter()
-            .map(|one| one.message)
-            .collect::<Vec<_>>()
-    };
-    assert!(messages(10, 0.05).is_empty());
-    let found = messages(11, -1.0);
+    assert!(scene_findings(dir.path(), 10, 0.05).is_empty());
+    let found = scene_findings(dir.path(), 11, -1.0);
     assert_eq!(found.len(), 2, "{found:?}");
     assert!(
         found[0].starts_with("scene: agent 1: 440 of 800 boxes (55 %) hold none of its points"),

@@ -21,6 +21,13 @@ fn car(id: i64, x: f64, y: f64) -> Object {
     }
 }
 
+fn truck(id: i64, x: f64) -> Object {
+    Object {
+        class: ObjectClass::Truck,
+        ..car(id, x, 0.0)
+    }
+}
+
 fn ids(frames: &[Frame], ego: usize, rule: &GroundTruthRule) -> Vec<i64> {
     merge(&frames.iter().collect::<Vec<_>>(), ego, rule)
         .into_iter()
@@ -72,16 +79,16 @@ fn agents_out_of_range_do_not_contribute() {
 
 #[test]
 fn every_corner_must_lie_in_range_border_included() {
-    let inside = |x, y| {
-        !ids(
-            &[frame("1", 0.0, vec![car(1, x, y)])],
-            0,
-            &GroundTruthRule::OPV2V,
-        )
-        .is_empty()
-    };
-    assert!(inside(138.0, 39.0) && inside(-138.0, -39.0));
-    assert!(!inside(138.1, 0.0) && !inside(0.0, 39.1));
+    for (x, y, is_inside) in [
+        (138.0, 39.0, true),
+        (-138.0, -39.0, true),
+        (138.1, 0.0, false),
+        (0.0, 39.1, false),
+    ] {
+        let frames = [frame("1", 0.0, vec![car(1, x, y)])];
+        let found = ids(&frames, 0, &GroundTruthRule::OPV2V);
+        assert_eq!(!found.is_empty(), is_inside, "{x} {y}");
+    }
     let mut high = car(1, 0.0, 0.0);
     high.size_m[2] = 4.5;
     assert!(
@@ -115,10 +122,6 @@ fn pedestrians_are_no_targets() {
 
 #[test]
 fn objects_of_other_classes_are_ignored_at_any_distance() {
-    let truck = |id, x| Object {
-        class: ObjectClass::Truck,
-        ..car(id, x, 0.0)
-    };
     let rule = GroundTruthRule {
         x_m: [-32.0, 32.0],
         classes: "car".parse().unwrap(),
@@ -135,11 +138,9 @@ fn objects_of_other_classes_are_ignored_at_any_distance() {
         ],
     );
     let truth = GroundTruth::of_tick(&[&frame], 0, &rule);
-    let ids = |boxes: &[TrueBox]| boxes.iter().map(|object| object.id).collect::<Vec<_>>();
-    assert_eq!(
-        (ids(&truth.objects), ids(&truth.ignored)),
-        (vec![1], vec![3, 4])
-    );
+    let ids = [&truth.objects, &truth.ignored]
+        .map(|boxes| boxes.iter().map(|object| object.id).collect::<Vec<_>>());
+    assert_eq!(ids, [vec![1], vec![3, 4]]);
     assert_eq!(truth.area_m, [-32.0, -40.0, 32.0, 40.0]);
 }
 

@@ -40,16 +40,18 @@ impl DataSet {
             dir: tempfile::tempdir().unwrap(),
             version,
         };
-        let token = |index: usize| format!("sensor{index}");
         let mut sensors: Vec<Value> = (rigs.iter().enumerate())
-            .map(|(index, rig)| json!({"token": token(index), "channel": rig.channel, "modality": "lidar"}))
+            .map(|(index, rig)| {
+                let token = format!("sensor{index}");
+                json!({"token": token, "channel": rig.channel, "modality": "lidar"})
+            })
             .collect();
         sensors.push(json!({"token": "camera", "channel": "CAM_FRONT", "modality": "camera"}));
         set.table("sensor", json!(sensors));
         let mut mounts: Vec<Value> = (rigs.iter().enumerate())
             .map(|(index, rig)| {
                 json!({
-                    "token": format!("mount{index}"), "sensor_token": token(index), "camera_intrinsic": [],
+                    "token": format!("mount{index}"), "sensor_token": format!("sensor{index}"), "camera_intrinsic": [],
                     "translation": [0.5, 0, 2], "rotation": quaternion(rig.mount_degrees),
                 })
             })
@@ -61,8 +63,13 @@ impl DataSet {
             json!([{"token": "scene", "name": "scene_5", "vehicle_list": ["mike", "maisy"]}]),
         );
         // Not in the order of time.
-        let sample = |number: u64| json!({"token": number.to_string(), "scene_token": "scene", "timestamp": T0_MICROS + 200_000 * number});
-        set.table("sample", json!([sample(1), sample(0)]));
+        let samples = [1_u64, 0].map(|number| {
+            json!({
+                "token": number.to_string(), "scene_token": "scene",
+                "timestamp": T0_MICROS + 200_000 * number,
+            })
+        });
+        set.table("sample", json!(samples));
         let (mut data, mut poses) = (Vec::new(), Vec::new());
         for number in 0..2 {
             for (index, rig) in rigs.iter().enumerate() {
@@ -156,6 +163,12 @@ impl DataSet {
         crate::open(self.dir.path()).unwrap()
     }
 
+    /// The error of opening.
+    fn refusal(&self) -> String {
+        let error = crate::open(self.dir.path()).unwrap_err().to_string();
+        error.replace(&format!("{}/", self.dir.path().display()), "")
+    }
+
     fn problems(&self, dataset: &Dataset) -> Vec<String> {
         let root = format!("{}/", self.dir.path().display());
         dataset
@@ -177,26 +190,35 @@ fn place(translation_m: [f64; 3], size_wlh: [f64; 3], degrees: f64) -> Value {
     json!({"translation": translation_m, "size": size_wlh, "rotation": quaternion(degrees)})
 }
 
-/// Vehicle 1 at (10, 20) faces y, vehicle 2 at (10, 50) faces x, the unit's LiDAR is at (0.5, 0, 2).
-fn v2x_sim() -> DataSet {
-    let rig = |channel, position_m, heading_degrees, points| Rig {
+/// A LiDAR that faces as its vehicle.
+fn aligned_rig(
+    channel: &'static str,
+    position_m: [f64; 3],
+    heading_degrees: f64,
+    points: Vec<[f32; 5]>,
+) -> Rig {
+    Rig {
         channel,
         position_m,
         heading_degrees,
         mount_degrees: 0.0,
         points,
-    };
+    }
+}
+
+/// Vehicle 1 at (10, 20) faces y, vehicle 2 at (10, 50) faces x, the unit's LiDAR is at (0.5, 0, 2).
+fn v2x_sim() -> DataSet {
     DataSet::new(
         "v1.0-mini",
         &[
-            rig(
+            aligned_rig(
                 "LIDAR_TOP_id_0",
                 [0.0; 3],
                 0.0,
                 vec![[30.0, 0.0, -1.0, 0.1, 3.0]],
             ),
             // On the car, on its own roof, on the pedestrian.
-            rig(
+            aligned_rig(
                 "LIDAR_TOP_id_1",
                 [10.0, 20.0, 0.0],
                 90.0,
@@ -207,7 +229,7 @@ fn v2x_sim() -> DataSet {
                 ],
             ),
             // On the motorcycle.
-            rig(
+            aligned_rig(
                 "LIDAR_TOP_id_2",
                 [10.0, 50.0, 0.0],
                 0.0,
@@ -376,17 +398,18 @@ fn a_sweep_of_four_floats_among_those_of_five_is_refused() {
     assert!(message.ends_with(&expected), "{message}");
 }
 
+fn listed(frame: &Frame) -> Vec<(i64, ObjectClass)> {
+    frame
+        .objects
+        .iter()
+        .map(|object| (object.id, object.class))
+        .collect()
+}
+
 #[test]
 fn agents_list_what_their_sweeps_hit_but_not_themselves() {
     let set = v2x_sim();
     let frames = load(&set.open().scenarios[0], 0);
-    let listed = |frame: &Frame| {
-        frame
-            .objects
-            .iter()
-            .map(|object| (object.id, object.class))
-            .collect::<Vec<_>>()
-    };
     assert_eq!(
         listed(&frames[0]),
         [(0, ObjectClass::Car), (2, ObjectClass::Pedestrian)]
@@ -443,17 +466,17 @@ fn a_missing_sweep_is_an_absent_agent_and_the_egos_a_missing_tick() {
 
 #[test]
 fn mars_names_its_vehicles_and_has_no_annotations() {
-    let rig = |channel, x| Rig {
+    let rigs = [
+        ("LIDAR_FRONT_CENTER_maisy", 20.0),
+        ("LIDAR_FRONT_CENTER_mike", -146.0),
+    ]
+    .map(|(channel, x)| Rig {
         channel,
         position_m: [x, 0.0, 0.0],
         heading_degrees: 180.0,
         mount_degrees: -2.0,
         points: vec![[3.0, -6.0, -1.5, 9.0, 4.0], [5.0, -8.0, -0.3, 204.0, 53.0]],
-    };
-    let rigs = [
-        rig("LIDAR_FRONT_CENTER_maisy", 20.0),
-        rig("LIDAR_FRONT_CENTER_mike", -146.0),
-    ];
+    });
     let set = DataSet::new("v1.0", &rigs, &[]);
     let dataset = set.open();
     assert_eq!(
@@ -591,25 +614,21 @@ fn unknown_categories_are_no_vehicles_and_reported() {
 #[test]
 fn tables_that_are_no_data_set_are_reported() {
     let set = v2x_sim();
-    let message = || {
-        let error = crate::open(set.dir.path()).unwrap_err().to_string();
-        error.replace(&format!("{}/", set.dir.path().display()), "")
-    };
     set.table(
         "sensor",
         json!([{"token": "sensor0", "channel": "LIDAR_FRONT_LEFT", "modality": "lidar"}]),
     );
+    let message = set.refusal();
     assert!(
-        message().contains("no row of calibrated_sensor.json")
-            || message().contains("LIDAR_FRONT_LEFT"),
-        "{}",
-        message()
+        message.contains("no row of calibrated_sensor.json")
+            || message.contains("LIDAR_FRONT_LEFT"),
+        "{message}"
     );
     fs::remove_file(set.dir.path().join("v1.0-mini/scene.json")).unwrap();
+    let message = set.refusal();
     assert!(
-        message().starts_with("v1.0-mini/scene.json: No such file"),
-        "{}",
-        message()
+        message.starts_with("v1.0-mini/scene.json: No such file"),
+        "{message}"
     );
 }
 

@@ -430,10 +430,13 @@ fn coordinates_of_utm_are_places_like_others() {
     assert_eq!((frame.objects.len(), frame.problems.len()), (1, 0));
 }
 
+fn pickled_triple(values: [f64; 3]) -> String {
+    pickled_array(&[3], &values, "      ")
+}
+
 #[test]
 fn a_pickled_pose_of_six_numbers_is_opv2v() {
     let pickled = pickled_array(&[6], &[10.0, 20.0, 2.0, 0.0, 90.0, 1e-6], "  ");
-    let three = |values: [f64; 3]| pickled_array(&[3], &values, "      ");
     let id = pickled_scalar("i8", "<", &4335i64.to_le_bytes());
     let plain = load_with("RSU: false", "RSU: true").unwrap();
     for (from, to) in [
@@ -443,15 +446,15 @@ fn a_pickled_pose_of_six_numbers_is_opv2v() {
         ),
         (
             "angle: [0, 90, 0]\n",
-            format!("angle: {}", three([0.0, 90.0, 0.0])),
+            format!("angle: {}", pickled_triple([0.0, 90.0, 0.0])),
         ),
         (
             "location: [10, 30, 0]\n",
-            format!("location: {}", three([10.0, 30.0, 0.0])),
+            format!("location: {}", pickled_triple([10.0, 30.0, 0.0])),
         ),
         (
             "extent: [2, 1, 0.75]\n",
-            format!("extent: {}", three([2.0, 1.0, 0.75])),
+            format!("extent: {}", pickled_triple([2.0, 1.0, 0.75])),
         ),
         (
             "speed: 18\n",
@@ -532,17 +535,20 @@ fn copies_of_agents_and_loose_frames_are_no_agents() {
     );
 }
 
+fn link_to_nothing(path: &Path) {
+    std::os::unix::fs::symlink("/nowhere", path).unwrap();
+}
+
 #[test]
 fn dangling_links_cost_only_their_targets() {
     let dir = tempfile::tempdir().unwrap();
-    let link = |name: &str| std::os::unix::fs::symlink("/nowhere", dir.path().join(name)).unwrap();
     write_frame(dir.path(), "scene/1/000070", YAML, &[]);
     write_frame(dir.path(), "scene/1/000072", YAML, &[]);
-    link("scene/1/000070_camera0.png");
-    link("beside");
+    link_to_nothing(&dir.path().join("scene/1/000070_camera0.png"));
+    link_to_nothing(&dir.path().join("beside"));
     assert_eq!(opened(dir.path()).ticks.len(), 2);
     fs::remove_file(dir.path().join("scene/1/000072.pcd")).unwrap();
-    link("scene/1/000072.pcd");
+    link_to_nothing(&dir.path().join("scene/1/000072.pcd"));
     let dataset = crate::open(dir.path()).unwrap();
     assert_eq!(
         (dataset.scenarios[0].ticks.len(), dataset.problems.len()),

@@ -33,17 +33,15 @@ fn street() -> Vec<Point3<f64>> {
 
 /// `world_from_lidar` of a drive: 1 m a frame, from the tenth on in a curve to the left.
 fn drive() -> Vec<Isometry3<f64>> {
-    let step = |turn: f64| {
-        Isometry3::from_parts(
-            Translation3::new(1.0, 0.0, 0.0),
-            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn),
-        )
-    };
     let mut pose = Isometry3::translation(0.0, 0.0, 1.8);
     (0..FRAMES)
         .map(|frame| {
             let now = pose;
-            pose *= step(if frame < 10 { 0.0 } else { 0.08 });
+            let turn = if frame < 10 { 0.0 } else { 0.08 };
+            pose *= Isometry3::from_parts(
+                Translation3::new(1.0, 0.0, 0.0),
+                UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn),
+            );
             now
         })
         .collect()

@@ -375,23 +375,21 @@ mod tests {
 
     #[test]
     fn a_fault_in_a_line_is_reported() {
-        let message = |lines: &[&str]| {
-            decode(&file("x y z rgb", "F F F F", lines))
-                .unwrap_err()
-                .to_string()
-        };
-        assert_eq!(
-            message(&["1 2 3 0", "1 2 three 0"]),
-            "line 12: z: \"three\" is no number"
-        );
-        assert_eq!(
-            message(&["1 2 3"]),
-            "line 11: rgb: 3 values in the line, expected 4"
-        );
-        assert_eq!(
-            message(&["1 2 3 4 5"]),
-            "line 11: rgb: 5 values in the line, expected 4"
-        );
+        let cases: [(&[&str], &str); 3] = [
+            (
+                &["1 2 3 0", "1 2 three 0"],
+                "line 12: z: \"three\" is no number",
+            ),
+            (&["1 2 3"], "line 11: rgb: 3 values in the line, expected 4"),
+            (
+                &["1 2 3 4 5"],
+                "line 11: rgb: 5 values in the line, expected 4",
+            ),
+        ];
+        for (lines, expected) in cases {
+            let error = decode(&file("x y z rgb", "F F F F", lines)).unwrap_err();
+            assert_eq!(error.to_string(), expected);
+        }
     }
 
     #[test]

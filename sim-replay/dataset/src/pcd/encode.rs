@@ -89,17 +89,20 @@ mod tests {
     use super::*;
     use crate::pcd::decode;
 
+    fn bits(point: &[f32; 4]) -> [u32; 4] {
+        point.map(f32::to_bits)
+    }
+
     proptest! {
         #[test]
         fn finite_points_come_back_bit_by_bit(
             points in prop::collection::vec(prop::array::uniform4(any::<f32>()), 0..50),
             encoding in prop::sample::select(vec![Encoding::Ascii, Encoding::Binary]),
         ) {
-            let finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
             let file = encode(&PointCloud { xyzi: points.clone() }, encoding, IntensityField::Intensity);
             let back = decode(&file).unwrap();
-            let bits = |point: &[f32; 4]| point.map(f32::to_bits);
-            let expected: Vec<_> = points.iter().filter(|point| finite(point)).map(bits).collect();
+            let finite = points.iter().filter(|point| point.iter().all(|value| value.is_finite()));
+            let expected: Vec<_> = finite.map(bits).collect();
             prop_assert_eq!(back.points.xyzi.iter().map(bits).collect::<Vec<_>>(), expected);
             prop_assert_eq!(back.dropped, points.len() - back.points.len());
         }

@@ -82,26 +82,28 @@ pub(crate) mod tests {
 
     use super::*;
 
+    /// Moves the pending bytes to the packed ones, as literals.
+    fn flush(packed: &mut Vec<u8>, pending: &mut Vec<u8>) {
+        for block in pending.chunks(32) {
+            packed.push(block.len() as u8 - 1);
+            packed.extend_from_slice(block);
+        }
+        pending.clear();
+    }
+
     /// A simple packer: greedy over the last 8 KiB. Slow, but sufficient for test files.
     pub(in crate::pcd) fn compress(data: &[u8]) -> Vec<u8> {
         let mut packed = Vec::new();
         let mut pending: Vec<u8> = Vec::new();
-        let flush = |packed: &mut Vec<u8>, pending: &mut Vec<u8>| {
-            for block in pending.chunks(32) {
-                packed.push(block.len() as u8 - 1);
-                packed.extend_from_slice(block);
-            }
-            pending.clear();
-        };
         let mut at = 0;
         while at < data.len() {
-            let match_len = |start: usize| {
-                (0..264.min(data.len() - at))
-                    .take_while(|&i| data[start + i] == data[at + i])
-                    .count()
-            };
             let best = (at.saturating_sub(512)..at)
-                .map(|start| (match_len(start), start))
+                .map(|start| {
+                    let length = (0..264.min(data.len() - at))
+                        .take_while(|&i| data[start + i] == data[at + i])
+                        .count();
+                    (length, start)
+                })
                 .max();
             match best.filter(|&(length, _)| length >= 3) {
                 Some((length, start)) => {
@@ -148,16 +150,22 @@ pub(crate) mod tests {
 
     #[test]
     fn an_impossible_stream_is_refused() {
-        let fault = |packed: &[u8], stated| decompress(packed, stated).unwrap_err();
-        assert_eq!(
-            fault(&[0, b'a'], 1_000_000),
-            "2 packed bytes cannot become 1000000"
-        );
-        assert_eq!(fault(&[3, b'a'], 4), CUT_OFF);
-        assert_eq!(
-            fault(&[0, b'a', 0x20, 9], 4),
-            "a block repeats output 10 bytes back, but only 1 bytes precede it"
-        );
-        assert_eq!(fault(&[0, b'a'], 2), "1 bytes unpacked, 2 stated");
+        let cases: [(&[u8], usize, &str); 4] = [
+            (
+                &[0, b'a'],
+                1_000_000,
+                "2 packed bytes cannot become 1000000",
+            ),
+            (&[3, b'a'], 4, CUT_OFF),
+            (
+                &[0, b'a', 0x20, 9],
+                4,
+                "a block repeats output 10 bytes back, but only 1 bytes precede it",
+            ),
+            (&[0, b'a'], 2, "1 bytes unpacked, 2 stated"),
+        ];
+        for (packed, stated, expected) in cases {
+            assert_eq!(decompress(packed, stated).unwrap_err(), expected);
+        }
     }
 }

@@ -182,17 +182,20 @@ mod tests {
     use super::*;
     use crate::pcd::IntensityOrigin;
 
+    fn one_point(intensity: f32) -> PointCloud {
+        PointCloud {
+            xyzi: vec![[1.0, 2.0, 3.0, intensity]],
+        }
+    }
+
     fn scaled(scale: IntensityScale, kind: IntensityKind, stored: f32) -> (f32, f32) {
         let intensity = Some(IntensityOrigin {
             field: "intensity".into(),
             kind,
             divisor: 1.0,
         });
-        let points = PointCloud {
-            xyzi: vec![[1.0, 2.0, 3.0, stored]],
-        };
         let mut cloud = PcdCloud {
-            points,
+            points: one_point(stored),
             intensity,
             ..PcdCloud::default()
         };
@@ -219,35 +222,34 @@ mod tests {
 
     #[test]
     fn live_sweeps_have_the_scale_of_files_and_findings_are_reported_once() {
-        let cloud = |intensity: f32| PointCloud {
-            xyzi: vec![[1.0, 2.0, 3.0, intensity]],
-        };
-        let number = || Some(("i".to_owned(), IntensityKind::Number));
+        let number = Some(("i".to_owned(), IntensityKind::Number));
         let mut live = LiveIntensities::new(IntensityScale::AUTO);
-        let mut scaled = |intensity: f32, field| {
-            let mut points = cloud(intensity);
+        for (intensity, field, expected) in [
+            (255.0, number.clone(), (1.0, None)),
+            (51.0, number.clone(), (0.2, None)),
+            (0.0, None, (0.0, Some(NO_INTENSITY.to_owned()))),
+            (0.0, None, (0.0, None)),
+        ] {
+            let mut points = one_point(intensity);
             let finding = live.scale(&mut points, field);
-            (points.xyzi[0][3], finding)
-        };
-        assert_eq!(scaled(255.0, number()), (1.0, None));
-        assert_eq!(scaled(51.0, number()), (0.2, None));
-        assert_eq!(scaled(0.0, None), (0.0, Some(NO_INTENSITY.to_owned())));
-        assert_eq!(scaled(0.0, None).1, None);
+            assert_eq!((points.xyzi[0][3], finding), expected, "{intensity}");
+        }
         let mut stated = LiveIntensities::new("100".parse().unwrap());
-        let mut points = cloud(150.0);
-        let finding = stated.scale(&mut points, number()).unwrap();
+        let mut points = one_point(150.0);
+        let finding = stated.scale(&mut points, number.clone()).unwrap();
         assert!(
             finding.starts_with("field i reaches 150, 1.5 divided by 100"),
             "{finding}"
         );
         let mut unusual = LiveIntensities::new(IntensityScale::AUTO);
-        let finding = unusual.scale(&mut cloud(4000.0), number()).unwrap();
+        let finding = unusual.scale(&mut one_point(4000.0), number).unwrap();
         assert!(
             finding.contains("neither 0 to 1 nor 0 to 255: divided by 4095"),
             "{finding}"
         );
         let byte = Some(("intensity".to_owned(), IntensityKind::Byte));
-        let (mut live, mut points) = (LiveIntensities::new(IntensityScale::AUTO), cloud(1.0));
+        let mut live = LiveIntensities::new(IntensityScale::AUTO);
+        let mut points = one_point(1.0);
         assert_eq!(live.scale(&mut points, byte), None);
         assert_eq!(points.xyzi[0][3], 1.0 / 255.0);
     }

@@ -108,26 +108,31 @@ impl PcdCloud {
 mod tests {
     use super::*;
 
-    fn fault(points: &[[f32; 4]]) -> Option<String> {
-        let cloud = PointCloud {
+    fn plausibility(points: &[[f32; 4]]) -> Plausibility {
+        Plausibility::of(&PointCloud {
             xyzi: points.to_vec(),
-        };
-        Plausibility::of(&cloud).fault()
+        })
+    }
+
+    fn fault(points: &[[f32; 4]]) -> Option<String> {
+        plausibility(points).fault()
     }
 
     #[test]
     fn one_return_in_range_is_a_sweep_and_none_is_not() {
-        let fault = |points: &[[f32; 4]]| {
-            let xyzi = points.to_vec();
-            Plausibility::of(&PointCloud { xyzi }).nothing_in_range()
-        };
         let (far, origin) = ([450_000.0, 5_400_000.0, 110.0, 0.5], [0.0; 4]);
-        assert_eq!(fault(&[far, origin, [9.0, 0.0, 0.0, 0.5]]), None);
-        assert_eq!(
-            fault(&[far, origin]).unwrap(),
-            "none of the 2 points is a return within 300 m"
-        );
-        assert_eq!(fault(&[]).unwrap(), "the sweep has no point");
+        let cases: [(&[[f32; 4]], Option<&str>); 3] = [
+            (&[far, origin, [9.0, 0.0, 0.0, 0.5]], None),
+            (
+                &[far, origin],
+                Some("none of the 2 points is a return within 300 m"),
+            ),
+            (&[], Some("the sweep has no point")),
+        ];
+        for (points, expected) in cases {
+            let fault = plausibility(points).nothing_in_range();
+            assert_eq!(fault.as_deref(), expected);
+        }
     }
 
     #[test]

@@ -80,16 +80,17 @@ fn a_cut_file_and_a_nan_are_named() {
 
 /// Points all round like those of a LiDAR of 32 lasers, with any numbers after x, y, z.
 pub(crate) fn turn(points: usize, behind: impl Fn(usize) -> Vec<f32>) -> Vec<u8> {
-    let point = |index: usize| {
-        let (angle, range) = (index as f32 * 0.37, 5.0 + (index * 7919 % 400) as f32 * 0.1);
-        let position = [
-            range * angle.cos(),
-            range * angle.sin(),
-            -1.9 + (index % 32) as f32 * 0.1,
-        ];
-        floats(&[&position[..], &behind(index)].concat())
-    };
-    (0..points).flat_map(point).collect()
+    (0..points)
+        .flat_map(|index| {
+            let (angle, range) = (index as f32 * 0.37, 5.0 + (index * 7919 % 400) as f32 * 0.1);
+            let position = [
+                range * angle.cos(),
+                range * angle.sin(),
+                -1.9 + (index % 32) as f32 * 0.1,
+            ];
+            floats(&[&position[..], &behind(index)].concat())
+        })
+        .collect()
 }
 
 fn form_of(bytes: &[u8]) -> (&'static str, usize) {
@@ -100,9 +101,13 @@ fn form_of(bytes: &[u8]) -> (&'static str, usize) {
 const FOUR: &str = "4 floats per point: x y z intensity";
 const FIVE: &str = "5 floats per point: x y z intensity ring";
 
+/// Hundredths from 0 to 1.
+fn hundredths(index: usize) -> f32 {
+    (index % 101) as f32 / 100.0
+}
+
 #[test]
 fn four_and_five_floats_are_distinguished_also_if_both_fit() {
-    let intensity = |index: usize| (index % 101) as f32 / 100.0;
     // 40 points of 20 bytes are 50 of 16.
     for points in [40, 400, 41, 35_000] {
         let with_ring = turn(points, |index| vec![17.0, (index % 32) as f32]);
@@ -111,9 +116,9 @@ fn four_and_five_floats_are_distinguished_also_if_both_fit() {
             vec![(index % 256) as f32, (index % 32) as f32]
         });
         assert_eq!(form_of(&with_bytes), (FIVE, points));
-        let with_time = turn(points, |index| vec![intensity(index), index as f32 * 1e-5]);
+        let with_time = turn(points, |index| vec![hundredths(index), index as f32 * 1e-5]);
         assert_eq!(form_of(&with_time), (FIVE, points));
-        let plain = turn(points, |index| vec![intensity(index)]);
+        let plain = turn(points, |index| vec![hundredths(index)]);
         assert_eq!(form_of(&plain), (FOUR, points));
         let bytes = turn(points, |index| vec![(index % 256) as f32]);
         assert_eq!(form_of(&bytes), (FOUR, points));
@@ -194,7 +199,7 @@ fn other_forms_are_refused_with_the_figure() {
 /// return, range (m).
 fn additions(index: usize) -> [f32; 7] {
     [
-        (index % 101) as f32 / 100.0,
+        hundredths(index),
         (index % 32) as f32,
         0.01,
         (index * 37 % 256) as f32,
@@ -223,33 +228,45 @@ fn six_seven_eight_and_ten_floats_are_refused_in_any_order_of_the_points() {
     }
 }
 
+/// A sweep with intensities of 0.5, and one other.
+fn sweep_up_to(largest: f32) -> Vec<u8> {
+    turn(40, |index| vec![if index == 7 { largest } else { 0.5 }])
+}
+
+/// The largest intensity of a sweep, and their divisor.
+fn largest_intensity(sweeps: &Sweeps, path: &Path) -> (f32, f32) {
+    let cloud = sweeps.read(&id(), path).unwrap();
+    let largest = cloud
+        .points
+        .xyzi
+        .iter()
+        .map(|point| point[3])
+        .fold(0.0, f32::max);
+    (largest, cloud.intensity.unwrap().divisor)
+}
+
 #[test]
 fn intensities_of_all_files_are_scaled_alike() {
-    let sweep = |largest: f32| turn(40, |index| vec![if index == 7 { largest } else { 0.5 }]);
-    let largest = |sweeps: &Sweeps, path: &Path| {
-        let cloud = sweeps.read(&id(), path).unwrap();
-        let largest = cloud
-            .points
-            .xyzi
-            .iter()
-            .map(|point| point[3])
-            .fold(0.0, f32::max);
-        (largest, cloud.intensity.unwrap().divisor)
-    };
     let (dir, sweeps) = agent(
         SweepStorage::ByName,
-        &[("0.bin", sweep(1.0)), ("1.bin", sweep(51.0))],
+        &[("0.bin", sweep_up_to(1.0)), ("1.bin", sweep_up_to(51.0))],
     );
     assert_eq!(
-        largest(&sweeps, &dir.path().join("0.bin")),
+        largest_intensity(&sweeps, &dir.path().join("0.bin")),
         (1.0 / 255.0, 255.0)
     );
-    assert_eq!(largest(&sweeps, &dir.path().join("1.bin")), (0.2, 255.0));
-    let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", sweep(1.0))]);
-    assert_eq!(largest(&sweeps, &dir.path().join("0.bin")), (1.0, 1.0));
-    let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", sweep(1000.0))]);
     assert_eq!(
-        largest(&sweeps, &dir.path().join("0.bin")),
+        largest_intensity(&sweeps, &dir.path().join("1.bin")),
+        (0.2, 255.0)
+    );
+    let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", sweep_up_to(1.0))]);
+    assert_eq!(
+        largest_intensity(&sweeps, &dir.path().join("0.bin")),
+        (1.0, 1.0)
+    );
+    let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", sweep_up_to(1000.0))]);
+    assert_eq!(
+        largest_intensity(&sweeps, &dir.path().join("0.bin")),
         (1000.0 / 1023.0, 1023.0)
     );
     let forced = OpenOptions {
@@ -257,25 +274,26 @@ fn intensities_of_all_files_are_scaled_alike() {
         ..OpenOptions::default()
     };
     let sweeps = Sweeps::new(SweepStorage::ByName, &forced).with_agent(id(), []);
-    assert_eq!(largest(&sweeps, &dir.path().join("0.bin")), (10.0, 100.0));
+    assert_eq!(
+        largest_intensity(&sweeps, &dir.path().join("0.bin")),
+        (10.0, 100.0)
+    );
+}
+
+/// A file with the bytes of one field behind x, y, z.
+fn pcd_of_one_point(name: &str, kind: char, bytes: &[u8]) -> Vec<u8> {
+    let size = bytes.len();
+    let head = format!(
+        "FIELDS x y z {name}\nSIZE 4 4 4 {size}\nTYPE F F F {kind}\nWIDTH 1\nDATA binary\n"
+    );
+    [head.as_bytes(), &floats(&[1.0, 2.0, 3.0]), bytes].concat()
 }
 
 #[test]
 fn a_packed_colour_and_a_byte_need_no_other_sweep() {
-    let file = |number: &str, bytes: &[u8]| {
-        let (name, kind, size) = if number == "rgb" {
-            ("rgb", 'F', 4)
-        } else {
-            ("Intensity", 'U', 1)
-        };
-        let head = format!(
-            "FIELDS x y z {name}\nSIZE 4 4 4 {size}\nTYPE F F F {kind}\nWIDTH 1\nDATA binary\n"
-        );
-        [head.as_bytes(), &floats(&[1.0, 2.0, 3.0]), bytes].concat()
-    };
     let files = [
-        ("0.pcd", file("rgb", &[9, 9, 1, 0])),
-        ("1.pcd", file("byte", &[1])),
+        ("0.pcd", pcd_of_one_point("rgb", 'F', &[9, 9, 1, 0])),
+        ("1.pcd", pcd_of_one_point("Intensity", 'U', &[1])),
     ];
     let (dir, sweeps) = agent(SweepStorage::ByName, &files);
     for name in ["0.pcd", "1.pcd"] {

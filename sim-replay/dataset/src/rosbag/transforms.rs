@@ -186,47 +186,49 @@ mod tests {
     #[test]
     fn frames_are_connected_over_others_in_both_directions() {
         let transforms = robot();
-        let at = |target: &str, source: &str, nanos: u64| {
+        for (target, source, nanos, expected) in [
+            ("map", "lidar", 5, Ok(1.0 + 10.0 + 1.5)),
+            ("lidar", "map", 5, Ok(-12.5)),
+            ("wheel", "lidar", 10, Ok(1.5 - 9.0)),
+            ("lidar", "lidar", 99, Ok(0.0)),
+            ("odom", "lidar", 11, Err(Unposed::Outside)),
+        ] {
             let route = transforms.route(target, source).unwrap();
-            transforms
-                .along(&route, nanos)
-                .map(|pose| pose.translation.x)
-        };
-        assert_eq!(at("map", "lidar", 5), Ok(1.0 + 10.0 + 1.5));
-        assert_eq!(at("lidar", "map", 5), Ok(-12.5));
-        assert_eq!(at("wheel", "lidar", 10), Ok(1.5 - 9.0));
-        assert_eq!(at("lidar", "lidar", 99), Ok(0.0));
-        assert_eq!(at("odom", "lidar", 11), Err(Unposed::Outside));
+            let pose = transforms.along(&route, nanos);
+            assert_eq!(
+                pose.map(|pose| pose.translation.x),
+                expected,
+                "{target} {source}"
+            );
+        }
         assert!(transforms.route("map", "camera").is_none());
+    }
+
+    fn world_names<'a>(transforms: &'a Transforms, frame: &str) -> Vec<&'a str> {
+        let worlds = transforms.worlds_of(frame);
+        worlds.into_iter().map(|(world, _)| world).collect()
     }
 
     #[test]
     fn worlds_are_maps_odometry_and_the_topmost_moving_frame() {
-        let names = |transforms: &Transforms, frame: &str| -> Vec<String> {
-            let worlds = transforms.worlds_of(frame);
-            worlds
-                .iter()
-                .map(|(world, _)| (*world).to_owned())
-                .collect()
-        };
-        assert_eq!(names(&robot(), "lidar"), ["map", "odom"]);
+        assert_eq!(world_names(&robot(), "lidar"), ["map", "odom"]);
         let mut fixed = Transforms::default();
         fixed.add("map", "odom", Motion::Fixed(moved(5.0)));
         fixed.add("odom", "base_link", Motion::Moving(moving(1.0)));
         assert_eq!(
-            names(&fixed, "base_link"),
+            world_names(&fixed, "base_link"),
             ["odom"],
             "the map is odometry by another name"
         );
         let mut head = Transforms::default();
         head.add("base_link", "head", Motion::Moving(moving(1.0)));
         assert!(
-            names(&head, "head").is_empty(),
+            world_names(&head, "head").is_empty(),
             "a robot does not move in its own body"
         );
         let mut other = Transforms::default();
         other.add("camera_init", "body", Motion::Moving(moving(1.0)));
-        assert_eq!(names(&other, "body"), ["camera_init"]);
+        assert_eq!(world_names(&other, "body"), ["camera_init"]);
         assert!(is_map("robot1/map") && !is_map("odom"));
     }
 }

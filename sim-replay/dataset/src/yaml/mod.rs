@@ -184,26 +184,26 @@ mod tests {
         let a = YamlField::root(Path::new("a.yaml"), &node)
             .required("a")
             .unwrap();
-        let value = |key: &str| a.required(key).unwrap().integer().unwrap();
-        assert_eq!(
-            (value("x"), value("y"), a.entries().unwrap().len()),
-            (3, 2, 2)
-        );
+        let values = ["x", "y"].map(|key| a.required(key).unwrap().integer().unwrap());
+        assert_eq!((values, a.entries().unwrap().len()), ([3, 2], 2));
+    }
+
+    fn refusal(text: &str) -> String {
+        message(parse(Path::new("a.yaml"), text.as_bytes()))
     }
 
     #[test]
     fn bombs_are_refused() {
-        let refused = |text: &str| message(parse(Path::new("a.yaml"), text.as_bytes()));
-        assert!(refused(&"[".repeat(10_000)).contains("no sound YAML"));
-        assert!(refused(&"- ".repeat(10_000)).contains("no sound YAML"));
-        assert!(refused(&format!("[{}]", "1,".repeat(600_000))).contains("more than 500000 nodes"));
+        assert!(refusal(&"[".repeat(10_000)).contains("no sound YAML"));
+        assert!(refusal(&"- ".repeat(10_000)).contains("no sound YAML"));
+        assert!(refusal(&format!("[{}]", "1,".repeat(600_000))).contains("more than 500000 nodes"));
         let mut aliases = String::from("a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n");
         for level in 1..12 {
             let repeats = vec![format!("*a{}", level - 1); 10].join(", ");
             aliases += &format!("a{level}: &a{level} [{repeats}]\n");
         }
-        assert!(refused(&aliases).contains("aliases repeat more than 200000 nodes"));
-        assert!(refused("a: &a [*a]\n").contains("an alias within its own anchor"));
+        assert!(refusal(&aliases).contains("aliases repeat more than 200000 nodes"));
+        assert!(refusal("a: &a [*a]\n").contains("an alias within its own anchor"));
     }
 
     proptest! {

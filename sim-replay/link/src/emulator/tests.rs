@@ -10,11 +10,10 @@ use super::*;
 const MS: u64 = 1_000_000;
 
 fn packet(from: &str, sequence: u64, bytes: u64, submitted_nanos: u64) -> Packet {
-    let cav = |name: &str| CavId::new(name).unwrap();
     Packet {
         id: sequence,
-        from: cav(from),
-        to: cav("ego"),
+        from: CavId::new(from).unwrap(),
+        to: CavId::new("ego").unwrap(),
         stream: Stream::Bev,
         sequence,
         bytes,
@@ -124,7 +123,7 @@ fn small_messages_do_not_wait_and_cost_their_time() {
 
 #[test]
 fn a_full_queue_drops_the_newcomer_or_the_oldest() {
-    let packets = || (0..4).map(|k| packet("a", k, 20_000, k * MS));
+    let packets = [0, 1, 2, 3].map(|k| packet("a", k, 20_000, k * MS));
     let dropped = Delivery::Dropped(DropReason::LinkQueue);
     let queue = QueueConfig {
         bytes: 40_000,
@@ -140,7 +139,7 @@ fn a_full_queue_drops_the_newcomer_or_the_oldest() {
         (1, 40, ARRIVED),
         (2, 60, ARRIVED),
     ];
-    assert_eq!(times_ms(&all(&tail, packets())), expected);
+    assert_eq!(times_ms(&all(&tail, packets.clone())), expected);
     let head = LinkConfig {
         queue: QueueConfig {
             drop: QueueDrop::Head,
@@ -154,7 +153,7 @@ fn a_full_queue_drops_the_newcomer_or_the_oldest() {
         (2, 40, ARRIVED),
         (3, 60, ARRIVED),
     ];
-    assert_eq!(times_ms(&all(&head, packets())), expected);
+    assert_eq!(times_ms(&all(&head, packets.clone())), expected);
     let newest = LinkConfig {
         queue: QueueConfig {
             keep_last: true,
@@ -169,7 +168,7 @@ fn a_full_queue_drops_the_newcomer_or_the_oldest() {
         (0, 20, ARRIVED),
         (3, 40, ARRIVED),
     ];
-    assert_eq!(times_ms(&all(&newest, packets())), expected);
+    assert_eq!(times_ms(&all(&newest, packets)), expected);
 }
 
 #[test]
@@ -234,19 +233,15 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
         &config,
         (0..2000).map(|k| packet("a", k, 132_500, k * 100 * MS)),
     );
-    let frames = |count: u64| {
-        let late = |outcome: &&PacketOutcome| {
-            outcome.nanos - outcome.packet.submitted_nanos == count * 100 * MS
-        };
-        outcomes.iter().filter(late).count()
-    };
-    assert_eq!(frames(0) + frames(1), 2000);
+    let [at_once, one_frame_late] = [0, 100 * MS].map(|delay_nanos| {
+        outcomes
+            .iter()
+            .filter(|outcome| outcome.nanos - outcome.packet.submitted_nanos == delay_nanos)
+            .count()
+    });
+    assert_eq!(at_once + one_frame_late, 2000);
     // U(0, 100) + 39.3 + 10 ms is below 100 ms in 50.7 of 100 cases.
-    assert!(
-        (frames(0) as f64 / 2000.0 - 0.507).abs() < 0.035,
-        "{}",
-        frames(0)
-    );
+    assert!((at_once as f64 / 2000.0 - 0.507).abs() < 0.035, "{at_once}");
     for delay_ms in [0, 100, 200, 300, 400, 500] {
         let config = LinkConfig {
             latency: LatencyModel::ConstantMs(delay_ms as f64 + 30.0),
@@ -277,21 +272,23 @@ fn late_messages_and_copies_are_cut_down_to_whole_frames_too() {
     assert_eq!(times, [107, 207]);
 }
 
+/// Numbers of 200 packets in the order in which they arrive.
+fn arrival_order(config: &LinkConfig) -> Vec<u64> {
+    all(config, (0..200).map(|k| packet("a", k, 10, k * MS)))
+        .iter()
+        .map(|outcome| outcome.packet.sequence)
+        .collect()
+}
+
 #[test]
 fn jitter_reorders_unless_order_is_kept() {
     let jitter = LinkConfig {
         latency: LatencyModel::UniformMs([0.0, 50.0]),
         ..LinkConfig::default()
     };
-    let order = |config: &LinkConfig| -> Vec<u64> {
-        all(config, (0..200).map(|k| packet("a", k, 10, k * MS)))
-            .iter()
-            .map(|outcome| outcome.packet.sequence)
-            .collect()
-    };
-    assert!(!order(&jitter).is_sorted());
+    assert!(!arrival_order(&jitter).is_sorted());
     assert!(
-        order(&LinkConfig {
+        arrival_order(&LinkConfig {
             keep_order: true,
             ..jitter.clone()
         })
@@ -306,7 +303,14 @@ fn jitter_reorders_unless_order_is_kept() {
         reorder: late,
         ..LinkConfig::default()
     };
-    assert!(!order(&some).is_sorted());
+    assert!(!arrival_order(&some).is_sorted());
+}
+
+fn outcomes_from(cav: &str, outcomes: Vec<PacketOutcome>) -> Vec<PacketOutcome> {
+    outcomes
+        .into_iter()
+        .filter(|outcome| outcome.packet.from.as_str() == cav)
+        .collect()
 }
 
 #[test]
@@ -320,19 +324,16 @@ fn a_link_is_independent_of_other_links() {
         duplicate: 0.1,
         ..shaped(27.0)
     };
-    let of_a = |outcomes: Vec<PacketOutcome>| -> Vec<PacketOutcome> {
-        outcomes
-            .into_iter()
-            .filter(|outcome| outcome.packet.from.as_str() == "a")
-            .collect()
-    };
-    let single = of_a(all(
-        &config,
-        (0..300).map(|k| packet("a", k, 40_000, k * 10 * MS)),
-    ));
+    let single = outcomes_from(
+        "a",
+        all(
+            &config,
+            (0..300).map(|k| packet("a", k, 40_000, k * 10 * MS)),
+        ),
+    );
     let together =
         (0..300).flat_map(|k| ["b", "a", "c"].map(|from| packet(from, k, 40_000, k * 10 * MS)));
-    assert_eq!(of_a(all(&config, together)), single);
+    assert_eq!(outcomes_from("a", all(&config, together)), single);
     let other_seed = LinkEmulator::new(config, Path::new("."), 6).map(|mut emulator| {
         (0..300).for_each(|k| emulator.submit(packet("a", k, 40_000, k * 10 * MS)));
         emulator.advance(u64::MAX / 4)

@@ -109,16 +109,19 @@ fn map_yaml(findings: &[Finding]) -> String {
 mod tests {
     use super::*;
 
-    #[test]
-    fn findings_of_the_map_are_read_back() {
-        let finding = |within: Option<&str>, found: &str| Finding {
+    fn finding(within: Option<&str>, found: &str) -> Finding {
+        Finding {
             line: 7,
             within: within.map(str::to_owned),
             element: "speed".into(),
             found: found.into(),
             action: "treated as absent".into(),
             count: 2,
-        };
+        }
+    }
+
+    #[test]
+    fn findings_of_the_map_are_read_back() {
         let findings = [
             finding(Some("road 1: '2'"), "max=\"-1\" #{[: \u{e9}"),
             finding(None, "- x"),

@@ -166,11 +166,10 @@ mod tests {
             }],
             0.5,
         );
-        let place = |x: f64, y: f64| RayBody {
+        let bodies = [[8.0, 6.0], [-7.0, 5.0], [3.0, -9.0]].map(|[x, y]| RayBody {
             shape: &pole,
             motion: Course::still(Placement::level([x, y, 0.0], 0.0)),
-        };
-        let bodies = [place(8.0, 6.0), place(-7.0, 5.0), place(3.0, -9.0)];
+        });
         // 30 m/s and 60 degrees a second.
         let vehicle = Course {
             start: Placement::level([0.0, 0.0, 0.0], 0.0),
@@ -212,14 +211,13 @@ mod tests {
             ))],
             0.5,
         );
-        let wall = |x: f64| RayBody {
+        let wall = RayBody {
             shape: &shell,
-            motion: Course::still(Placement::level([x, 0.0, 0.0], 0.0)),
+            motion: Course::still(Placement::level([20.5, 0.0, 0.0], 0.0)),
         };
         let sensor = Course::still(Placement::level([0.0; 3], 0.0));
         let mut lidar = Lidar::default();
-        let near = [wall(20.5)];
-        let sweep = lidar.sweep(&sensor, &Plane(-500.0), &near, Weather::Sunny, 1);
+        let sweep = lidar.sweep(&sensor, &Plane(-500.0), &[wall], Weather::Sunny, 1);
         let ahead: Vec<_> = sweep
             .points
             .iter()

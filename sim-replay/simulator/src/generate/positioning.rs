@@ -118,19 +118,25 @@ impl Positioning {
 mod tests {
     use super::*;
 
-    /// Last step before a time of a drive at 10 m/s, 60 m from the origin.
+    /// Place at a time of a drive at 10 m/s, 60 m from the origin.
+    fn place_on_a_circle(time_s: f64) -> Placement {
+        let angle = time_s * 10.0 / 60.0;
+        Placement::level(
+            [60.0 * angle.sin(), -60.0 * angle.cos(), 0.0],
+            wrapped(angle),
+        )
+    }
+
+    /// Last step before a time of that drive.
     fn on_a_circle(time_s: f64) -> Course {
-        let at = |time_s: f64| {
-            let angle = time_s * 10.0 / 60.0;
-            Placement::level(
-                [60.0 * angle.sin(), -60.0 * angle.cos(), 0.0],
-                wrapped(angle),
-            )
-        };
         Course {
-            start: at(time_s - STEP_S),
-            end: at(time_s),
+            start: place_on_a_circle(time_s - STEP_S),
+            end: place_on_a_circle(time_s),
         }
+    }
+
+    fn squared_error_m2(truth: &Placement, x: f64, y: f64) -> f64 {
+        (x - truth.position_m.x).powi(2) + (y - truth.position_m.y).powi(2)
     }
 
     #[test]
@@ -141,11 +147,9 @@ mod tests {
             let motion = on_a_circle(f64::from(step) * 0.1);
             let (truth, fix) = (motion.end, positioning.fix(&motion, 10.0, 0.1));
             if step > 20 {
-                let off = |x: f64, y: f64| {
-                    (x - truth.position_m.x).powi(2) + (y - truth.position_m.y).powi(2)
-                };
-                raw += off(fix.gnss_m[0], fix.gnss_m[1]);
-                filtered += off(fix.estimate.position_m.x, fix.estimate.position_m.y);
+                let estimate_m = fix.estimate.position_m;
+                raw += squared_error_m2(&truth, fix.gnss_m[0], fix.gnss_m[1]);
+                filtered += squared_error_m2(&truth, estimate_m.x, estimate_m.y);
             }
         }
         assert!(
@@ -155,32 +159,34 @@ mod tests {
         );
         assert!(filtered < 0.6 * raw, "{filtered} {raw}");
     }
+
+    /// Mean and deviation of the error of the yaw rate over a drive, degrees per second.
+    fn yaw_rate_errors_degps(seed: u64) -> (f64, f64) {
+        let mut positioning = Positioning::new(seed);
+        let error_degps: Vec<f64> = (0..2000)
+            .map(|step| {
+                positioning
+                    .fix(&on_a_circle(f64::from(step) * 0.1), 10.0, 0.1)
+                    .yaw_rate_radps
+                    - 1.0 / 6.0
+            })
+            .map(f64::to_degrees)
+            .collect();
+        let mean = error_degps.iter().sum::<f64>() / 2000.0;
+        (
+            mean,
+            (error_degps
+                .iter()
+                .map(|error| (error - mean).powi(2))
+                .sum::<f64>()
+                / 2000.0)
+                .sqrt(),
+        )
+    }
+
     #[test]
     fn a_gyroscope_has_noise_and_a_bias_of_its_own() {
-        // Mean and deviation of the error over a drive, degrees per second.
-        let errors = |seed: u64| {
-            let mut positioning = Positioning::new(seed);
-            let error_degps: Vec<f64> = (0..2000)
-                .map(|step| {
-                    positioning
-                        .fix(&on_a_circle(f64::from(step) * 0.1), 10.0, 0.1)
-                        .yaw_rate_radps
-                        - 1.0 / 6.0
-                })
-                .map(f64::to_degrees)
-                .collect();
-            let mean = error_degps.iter().sum::<f64>() / 2000.0;
-            (
-                mean,
-                (error_degps
-                    .iter()
-                    .map(|error| (error - mean).powi(2))
-                    .sum::<f64>()
-                    / 2000.0)
-                    .sqrt(),
-            )
-        };
-        let drives: Vec<(f64, f64)> = (0..100).map(errors).collect();
+        let drives: Vec<(f64, f64)> = (0..100).map(yaw_rate_errors_degps).collect();
         assert!(
             drives
                 .iter()

@@ -123,6 +123,13 @@ mod tests {
     use super::*;
     use crate::generate::raycast::{Bounds, Convex, Placement, Plane, SolidShape};
 
+    fn drive(from_m: [f64; 3], to_m: [f64; 3]) -> Course {
+        Course {
+            start: Placement::level(from_m, 0.0),
+            end: Placement::level(to_m, 0.0),
+        }
+    }
+
     #[test]
     fn velocities_are_relative_and_along_the_ray() {
         let block = SolidShape::new(
@@ -132,10 +139,6 @@ mod tests {
             ))],
             0.5,
         );
-        let drive = |from: [f64; 3], to: [f64; 3]| Course {
-            start: Placement::level(from, 0.0),
-            end: Placement::level(to, 0.0),
-        };
         let own = drive([-0.5, 0.0, 0.0], [0.0, 0.0, 0.0]);
         // One comes towards us at 5 m/s, one stands beside the road.
         let bodies = [

@@ -233,23 +233,19 @@ mod tests {
 
     #[test]
     fn a_stand_is_as_long_as_the_place_is_the_same() {
-        let frame = |tick: u64, x_m: f64| {
-            let motion = Course::still(Placement::level([x_m, 0.0, 0.0], 0.0));
-            RecordedFrame {
-                tick,
-                moving: vec![Moving {
-                    vehicle: 0,
-                    id: 1000,
-                    motion,
-                    speed_mps: 0.0,
-                }],
-            }
-        };
         let places = [0.0, 5.0, 5.0, 5.05, 5.0, 9.0, 9.0];
         let frames: Vec<_> = places
             .iter()
             .zip(0..)
-            .map(|(&x_m, k)| frame(60 + 20 * k, x_m))
+            .map(|(&x_m, k)| RecordedFrame {
+                tick: 60 + 20 * k,
+                moving: vec![Moving {
+                    vehicle: 0,
+                    id: 1000,
+                    motion: Course::still(Placement::level([x_m, 0.0, 0.0], 0.0)),
+                    speed_mps: 0.0,
+                }],
+            })
             .collect();
         assert!((longest_stand_s(&frames) - 3.0).abs() < 1e-9);
         assert_eq!(longest_stand_s(&[]), 0.0);

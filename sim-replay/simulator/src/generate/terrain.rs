@@ -381,13 +381,10 @@ mod tests {
                 surface.cast(&rays, &mut depth, &mut hit);
 
                 let direction: Vector3<f64> = (forward * cos[0] + Vector3::z() * sin[0]).cast();
-                let below = |at: f64| {
+                let expected = (1..24_000).map(|step| 0.005 * f64::from(step)).find(|&at| {
                     let point = origin + direction * at;
                     point.z <= grid.height_m(point.x, point.y)
-                };
-                let expected = (1..24_000)
-                    .map(|step| 0.005 * f64::from(step))
-                    .find(|&at| below(at));
+                });
                 match expected {
                     Some(at) => assert!((at - f64::from(depth[0])).abs() < 0.011, "{at} {depth:?}"),
                     None => assert_eq!(hit[0], 0, "{depth:?}"),

@@ -119,10 +119,16 @@ mod tests {
         echoes.filter(|echo| is(echo)).count() as f64 / 20_000.0
     }
 
+    fn is_target(echo: &Echo) -> bool {
+        matches!(echo, Echo::Target(_))
+    }
+
+    fn is_backscatter(echo: &Echo) -> bool {
+        matches!(echo, Echo::Backscatter(..))
+    }
+
     #[test]
     fn fog_hides_far_targets_and_backscatters() {
-        let is_target = |echo: &Echo| matches!(echo, Echo::Target(_));
-        let is_backscatter = |echo: &Echo| matches!(echo, Echo::Backscatter(..));
         assert!(share(Weather::Fog, Some(15.0), is_target) > 0.95);
         assert_eq!(share(Weather::Fog, Some(60.0), is_target), 0.0);
         assert!((share(Weather::Fog, Some(60.0), is_backscatter) - 0.3).abs() < 0.02);

@@ -57,13 +57,12 @@ mod tests {
     use super::*;
 
     fn lane(id: u32, from: [f64; 2], to: [f64; 2]) -> Lane {
-        let at = |i: u32, axis: usize| from[axis] + (to[axis] - from[axis]) * f64::from(i) / 20.0;
-        let mut lane = Lane::new(
-            LaneId(id),
-            (0..=20).map(|i| [at(i, 0), at(i, 1), 0.0]).collect(),
-            3.5,
-            10.0,
-        );
+        let points = (0..=20).map(|i| {
+            let [x, y] = [0, 1]
+                .map(|axis: usize| from[axis] + (to[axis] - from[axis]) * f64::from(i) / 20.0);
+            [x, y, 0.0]
+        });
+        let mut lane = Lane::new(LaneId(id), points.collect(), 3.5, 10.0);
         (lane.junction, lane.in_junction) = (Some(0), true);
         lane
     }

@@ -141,16 +141,17 @@ impl CellIndex {
 mod tests {
     use super::*;
 
+    fn square(x: f64, yaw_rad: f64) -> Quad {
+        PlanRectangle {
+            center_m: [x, 0.0],
+            half_m: [1.0, 1.0],
+            yaw_rad,
+        }
+        .corners()
+    }
+
     #[test]
     fn turned_squares_overlap_only_when_they_do() {
-        let square = |x: f64, yaw_rad| {
-            PlanRectangle {
-                center_m: [x, 0.0],
-                half_m: [1.0, 1.0],
-                yaw_rad,
-            }
-            .corners()
-        };
         let diamond = std::f64::consts::FRAC_PI_4;
         assert!(overlap(&square(0.0, 0.0), &square(1.9, 0.0)));
         assert!(!overlap(&square(0.0, 0.0), &square(2.1, 0.0)));

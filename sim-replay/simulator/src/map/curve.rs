@@ -285,10 +285,10 @@ mod tests {
         )
         .end();
         assert!((normalized.x - 10.0).abs() < 1e-12 && (normalized.y - 1.0).abs() < 1e-12);
-        let scaled = |c: [f64; 4]| [c[0], c[1] / 11.0, c[2] / 121.0, c[3] / 1331.0];
+        let [u, v] = [u, v].map(|[a, b, c, d]| [a, b / 11.0, c / 121.0, d / 1331.0]);
         let plain = CurveShape::ParamPoly3 {
-            u: scaled(u),
-            v: scaled(v),
+            u,
+            v,
             normalized: false,
         };
         assert!(curve(plain, 11.0).end().distance_m(&normalized) < 1e-9);

@@ -99,24 +99,11 @@ mod tests {
     use super::*;
 
     fn two_way() -> LaneGraph {
-        let line = |y: f64, forward: bool| {
-            (0..=100)
-                .map(|i| {
-                    [
-                        if forward {
-                            f64::from(i)
-                        } else {
-                            f64::from(100 - i)
-                        },
-                        y,
-                        0.0,
-                    ]
-                })
-                .collect()
-        };
+        let there = (0..=100).map(|i| [f64::from(i), -2.0, 0.0]);
+        let back = (0..=100).rev().map(|i| [f64::from(i), 2.0, 0.0]);
         LaneGraph::new(vec![
-            Lane::new(LaneId(0), line(-2.0, true), 3.5, 10.0),
-            Lane::new(LaneId(1), line(2.0, false), 3.5, 10.0),
+            Lane::new(LaneId(0), there.collect(), 3.5, 10.0),
+            Lane::new(LaneId(1), back.collect(), 3.5, 10.0),
         ])
     }
 

@@ -111,25 +111,17 @@ mod tests {
 
     #[test]
     fn shapes_change_evenly_from_one_cross_section_to_the_next() {
-        let roof = |height: f64| {
+        // Roofs with their ridge over the reference line.
+        let roofs = [(0.0, 0.4), (100.0, 0.8)].map(|(s_m, ridge_m)| {
             let records = vec![
-                (-4.0, [0.0, height / 4.0, 0.0, 0.0]),
-                (0.0, [height, -height / 4.0, 0.0, 0.0]),
+                (-4.0, [0.0, ridge_m / 4.0, 0.0, 0.0]),
+                (0.0, [ridge_m, -ridge_m / 4.0, 0.0, 0.0]),
             ];
-            Profile { records }
-        };
-        let shapes = vec![
-            CrossShape {
-                s_m: 0.0,
-                height_m: roof(0.4),
-            },
-            CrossShape {
-                s_m: 100.0,
-                height_m: roof(0.8),
-            },
-        ];
+            let height_m = Profile { records };
+            CrossShape { s_m, height_m }
+        });
         let lateral = LateralProfile {
-            shapes,
+            shapes: roofs.into(),
             ..LateralProfile::default()
         };
         for (s, t, expected) in [

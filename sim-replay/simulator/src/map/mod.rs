@@ -194,6 +194,10 @@ mod tests {
         }
     }
 
+    fn weighted_sum(values: impl Iterator<Item = [f64; 3]>) -> f64 {
+        values.map(|[x, y, z]| x + 2.0 * y + 3.0 * z).sum()
+    }
+
     /// Scenes of a seed are the same from one version to the next only if the procedural maps are the same.
     #[test]
     fn procedural_maps_are_unchanged() {
@@ -210,21 +214,14 @@ mod tests {
             ),
         ] {
             let map_model = build(&source, 0).unwrap();
-            let sum = |values: &mut dyn Iterator<Item = [f64; 3]>| -> f64 {
-                values.map(|[x, y, z]| x + 2.0 * y + 3.0 * z).sum()
-            };
+            let lanes = map_model.lanes.lanes.iter();
+            let parking = map_model.parking.iter();
             let found = [
-                sum(&mut map_model
-                    .lanes
-                    .lanes
-                    .iter()
-                    .flat_map(|lane| &lane.centerline)
-                    .copied()),
-                sum(&mut map_model.solids.iter().map(|solid| solid.center_m)),
-                sum(&mut map_model
-                    .parking
-                    .iter()
-                    .map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad])),
+                weighted_sum(lanes.flat_map(|lane| &lane.centerline).copied()),
+                weighted_sum(map_model.solids.iter().map(|solid| solid.center_m)),
+                weighted_sum(
+                    parking.map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad]),
+                ),
             ];
             let counted = [
                 map_model.lanes.lanes.len(),
@@ -251,60 +248,59 @@ mod tests {
         }
     }
 
+    fn build_error(path: &Path) -> String {
+        build(&RoadMapSource::OpenDrive(path.to_owned()), 0)
+            .unwrap_err()
+            .to_string()
+    }
+
+    fn one_road(lanes: &str, length_m: u32) -> String {
+        format!(
+            "<OpenDRIVE><road id=\"1\" length=\"{length_m}\"><planView><geometry s=\"0\" x=\"0\" y=\"0\" hdg=\"0\" \
+             length=\"{length_m}\"><line/></geometry></planView><lanes><laneSection s=\"0\"><right>{lanes}</right>\
+             </laneSection></lanes></road></OpenDRIVE>"
+        )
+    }
+
     #[test]
     fn unusable_maps_are_refused_with_their_path() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("town.xodr");
-        let error = || {
-            build(&RoadMapSource::OpenDrive(path.clone()), 0)
-                .unwrap_err()
-                .to_string()
-        };
-        assert!(
-            error().starts_with(&path.display().to_string()),
-            "{}",
-            error()
-        );
+        let error = build_error(&path);
+        assert!(error.starts_with(&path.display().to_string()), "{error}");
         std::fs::write(
             &path,
             "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>",
         )
         .unwrap();
+        let error = build_error(&path);
         assert!(
-            error().ends_with("line 1: <road> has no <planView>"),
-            "{}",
-            error()
+            error.ends_with("line 1: <road> has no <planView>"),
+            "{error}"
         );
-        let road = |lanes: &str, length: u32| {
-            format!(
-                "<OpenDRIVE><road id=\"1\" length=\"{length}\"><planView><geometry s=\"0\" x=\"0\" y=\"0\" hdg=\"0\" \
-                 length=\"{length}\"><line/></geometry></planView><lanes><laneSection s=\"0\"><right>{lanes}</right>\
-                 </laneSection></lanes></road></OpenDRIVE>"
-            )
-        };
         std::fs::File::create(&path)
             .unwrap()
             .set_len(opendrive::MAX_BYTES as u64 + 1)
             .unwrap();
+        let error = build_error(&path);
         assert!(
-            error().ends_with("larger than 67108864 bytes, the most that is read"),
-            "{}",
-            error()
+            error.ends_with("larger than 67108864 bytes, the most that is read"),
+            "{error}"
         );
-        std::fs::write(&path, road("", 10)).unwrap();
+        std::fs::write(&path, one_road("", 10)).unwrap();
+        let error = build_error(&path);
         assert!(
-            error().ends_with("none of its 1 roads has a driving lane"),
-            "{}",
-            error()
+            error.ends_with("none of its 1 roads has a driving lane"),
+            "{error}"
         );
         let lane = "<lane id=\"-1\" type=\"driving\"><width sOffset=\"0\" a=\"3\" b=\"0\" c=\"0\" d=\"0\"/></lane>";
-        std::fs::write(&path, road(lane, 60_000)).unwrap();
+        std::fs::write(&path, one_road(lane, 60_000)).unwrap();
+        let error = build_error(&path);
         assert!(
-            error().ends_with("its lanes reach over 60000 m, more than the limit of 50000 m"),
-            "{}",
-            error()
+            error.ends_with("its lanes reach over 60000 m, more than the limit of 50000 m"),
+            "{error}"
         );
-        std::fs::write(&path, road(lane, 400)).unwrap();
+        std::fs::write(&path, one_road(lane, 400)).unwrap();
         let map_model = build(&RoadMapSource::OpenDrive(path.clone()), 0).unwrap();
         assert_eq!(
             (map_model.name.as_str(), map_model.lanes.lanes.len()),

@@ -370,13 +370,16 @@ impl Road {
 mod tests {
     use super::*;
 
+    fn driving_lane(width_m: f64) -> RoadLane {
+        RoadLane::new(LaneKind::Driving, Profile::constant(width_m))
+    }
+
     #[test]
     fn lane_spans_stack_outwards_from_the_offset() {
-        let lane = |width: f64| RoadLane::new(LaneKind::Driving, Profile::constant(width));
         let section = LaneSection {
             s_m: 0.0,
-            left: vec![lane(3.0)],
-            right: vec![lane(3.5), lane(2.0)],
+            left: vec![driving_lane(3.0)],
+            right: vec![driving_lane(3.5), driving_lane(2.0)],
         };
         assert_eq!(section.lane_ids().collect::<Vec<_>>(), [-2, -1, 1]);
         assert!(

@@ -363,15 +363,15 @@ mod tests {
             .position(|road| road.junction.is_none())
             .unwrap();
         let cut = surface.roads[road][5];
-        let above = |t: f64, z: [f64; 2]| {
-            let rectangle = PlanRectangle {
-                center_m: cut.at(t),
-                half_m: [0.2, 0.2],
-                yaw_rad: 0.0,
-            };
-            surface.is_clear(&rectangle, z, 4.5, false)
-        };
-        assert!(!above(1.0, [0.0, 3.0]) && above(1.0, [4.6, 8.0]) && above(1.0, [-3.0, -0.2]));
-        assert!(above(cut.paved_m[1] + 0.5, [0.0, 3.0]));
+        for (t_m, z_m, is_clear) in [
+            (1.0, [0.0, 3.0], false),
+            (1.0, [4.6, 8.0], true),
+            (1.0, [-3.0, -0.2], true),
+            (cut.paved_m[1] + 0.5, [0.0, 3.0], true),
+        ] {
+            let square = PlanRectangle::square(cut.at(t_m), 0.2);
+            let found = surface.is_clear(&square, z_m, 4.5, false);
+            assert_eq!(found, is_clear, "{t_m} {z_m:?}");
+        }
     }
 }

@@ -110,15 +110,12 @@ mod tests {
         let schedule = NoiseSchedule::new(Device::Cpu).unwrap();
         let truth = Tensor::from_slice(&[0.5f32, -1.5, 0.1, 0.6, -0.8]).view([1, 1, 5]);
         let start = Tensor::randn([1, 1, 5], (Kind::Float, Device::Cpu));
-        let perfect = |noisy: &Tensor, step: i64| {
-            let kept = schedule.kept[step as usize];
-            Ok((noisy * kept.sqrt() - &truth) / (1.0 - kept).sqrt())
-        };
         let mut calls = 0;
         let found = schedule
             .denoise(&start, 10, |noisy, step| {
                 calls += 1;
-                perfect(noisy, step)
+                let kept = schedule.kept[step as usize];
+                Ok((noisy * kept.sqrt() - &truth) / (1.0 - kept).sqrt())
             })
             .unwrap();
         assert_eq!(calls, 10);
@@ -137,9 +134,9 @@ mod tests {
                 &Tensor::from_slice(&[0_i64, schedule.steps() - 1]),
             )
             .unwrap();
-        let value = |window| noisy.double_value(&[window, 2, 4]);
-        assert!((value(0) - (0.9999_f64.sqrt() - 0.01)).abs() < 1e-6);
-        assert!(value(1) < -0.9, "{}", value(1));
+        let [first, last] = [0, 1].map(|window| noisy.double_value(&[window, 2, 4]));
+        assert!((first - (0.9999_f64.sqrt() - 0.01)).abs() < 1e-6);
+        assert!(last < -0.9, "{last}");
     }
 
     #[test]
@@ -148,8 +145,9 @@ mod tests {
         let steps = Tensor::from_slice(&[0_i64, schedule.steps() - 1]);
         let noisy = Tensor::full([2, 1, 5], 3.0, (Kind::Float, Device::Cpu));
         let velocity = noisy.zeros_like();
-        let found = |velocity: &Tensor| schedule.poses(&noisy, velocity, &steps).unwrap();
-        let moved = found(&velocity) - found(&(&velocity + 1.0));
+        let [right, wrong] = [&velocity, &(&velocity + 1.0)]
+            .map(|velocity| schedule.poses(&noisy, velocity, &steps).unwrap());
+        let moved = right - wrong;
         assert!(
             (moved.double_value(&[0, 0, 0]) - 0.01).abs() < 1e-3,
             "{moved}"

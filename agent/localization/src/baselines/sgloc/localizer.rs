@@ -207,40 +207,44 @@ mod tests {
         );
     }
 
+    fn load_error(path: &Path) -> String {
+        SgLocLocalizer::load(path, Device::Cpu, PoseSolver::default())
+            .unwrap_err()
+            .to_string()
+    }
+
+    fn config_with(encoder: SceneEncoderConfig) -> SgLocConfig {
+        SgLocConfig {
+            encoder,
+            ..config()
+        }
+    }
+
     #[test]
     fn files_of_something_else_are_named() {
         let folder = tempfile::tempdir().unwrap();
-        let error_text = |path: &Path| {
-            SgLocLocalizer::load(path, Device::Cpu, PoseSolver::default())
-                .unwrap_err()
-                .to_string()
-        };
-        let with = |encoder| SgLocConfig {
-            encoder,
-            ..config()
-        };
-        let wider = with(SceneEncoderConfig {
+        let wider = config_with(SceneEncoderConfig {
             residual_widths: vec![16],
             ..config().encoder
         });
         let path = write(folder.path(), &wider, [0.0; 3]);
         assert!(
-            error_text(&path).contains("weights.safetensors: tensor \""),
+            load_error(&path).contains("weights.safetensors: tensor \""),
             "{}",
-            error_text(&path)
+            load_error(&path)
         );
         let path = write(
             folder.path(),
-            &with(SceneEncoderConfig {
+            &config_with(SceneEncoderConfig {
                 voxel_m: -1.0,
                 ..config().encoder
             }),
             [0.0; 3],
         );
         assert!(
-            error_text(&path).contains("voxel_m is -1"),
+            load_error(&path).contains("voxel_m is -1"),
             "{}",
-            error_text(&path)
+            load_error(&path)
         );
         let path = write(folder.path(), &config(), [0.0; 3]);
         let message = Localizer::load(&path, &path, Inference::default())
@@ -253,10 +257,10 @@ mod tests {
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
         assert!(
-            error_text(&path).contains("not a complete safetensors file"),
+            load_error(&path).contains("not a complete safetensors file"),
             "{}",
-            error_text(&path)
+            load_error(&path)
         );
-        assert!(error_text(&folder.path().join("missing")).contains("missing"));
+        assert!(load_error(&folder.path().join("missing")).contains("missing"));
     }
 }

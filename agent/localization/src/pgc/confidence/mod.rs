@@ -146,7 +146,8 @@ mod tests {
 
     #[test]
     fn sigma_decreases_with_evidence_against_a_pose() {
-        let sigma = |outliers, noise_m| {
+        let noisier = [(0.1, 0.1), (0.3, 0.2), (0.6, 0.4), (0.8, 0.6)];
+        let falling = noisier.map(|(outliers, noise_m)| {
             let scene = SyntheticScene {
                 outliers,
                 noise_m,
@@ -154,13 +155,7 @@ mod tests {
             };
             let found = PoseSolver::default().solve(&scene.coordinates(1)).unwrap();
             ConfidenceModel::example().sigma(&found.evidence)
-        };
-        let falling = [
-            sigma(0.1, 0.1),
-            sigma(0.3, 0.2),
-            sigma(0.6, 0.4),
-            sigma(0.8, 0.6),
-        ];
+        });
         assert!(
             falling.windows(2).all(|pair| pair[0] > pair[1]),
             "{falling:?}"
@@ -178,16 +173,17 @@ mod tests {
         assert!(serde_json::from_str::<ConfidenceModel>(&text.replace("bias", "bais")).is_err());
     }
 
+    fn is_refused_by_name(model: ConfidenceModel, field: &str) -> bool {
+        model.check().unwrap_err().to_string().contains(field)
+    }
+
     #[test]
     fn values_that_no_fit_has_are_rejected_by_name() {
         let example = ConfidenceModel::example;
         assert_eq!(example().check(), Ok(()));
-        let refused = |model: ConfidenceModel, field: &str| {
-            model.check().unwrap_err().to_string().contains(field)
-        };
         let mut weights = [0.3; FEATURES];
         weights[3] = 1e308;
-        assert!(refused(
+        assert!(is_refused_by_name(
             ConfidenceModel {
                 weights,
                 ..example()
@@ -195,21 +191,21 @@ mod tests {
             "a weight is 1000000"
         ));
         weights[3] = -0.1;
-        assert!(refused(
+        assert!(is_refused_by_name(
             ConfidenceModel {
                 weights,
                 ..example()
             },
             "-0.1"
         ));
-        assert!(refused(
+        assert!(is_refused_by_name(
             ConfidenceModel {
                 bias: f64::NAN,
                 ..example()
             },
             "bias is NaN"
         ));
-        assert!(refused(
+        assert!(is_refused_by_name(
             ConfidenceModel {
                 reject_below: 1.5,
                 ..example()
@@ -221,7 +217,7 @@ mod tests {
             vec![(0.0, 0.4), (1.0, 0.5)],
             vec![(0.0, 2.0)],
         ] {
-            assert!(refused(
+            assert!(is_refused_by_name(
                 ConfidenceModel {
                     sigma: MonotoneMap::falling(knots),
                     ..example()

@@ -418,17 +418,17 @@ impl NormalEquations {
 mod tests {
     use super::*;
 
+    fn span(from: f64, to: f64, step: f64) -> impl Iterator<Item = f64> {
+        (0..((to - from) / step) as usize).map(move |k| from + step * (k as f64 + 0.37))
+    }
+
     /// Sweep of a LiDAR at a height of 2 m at `world_from_sensor` in a crossing of two streets: ground, eight walls,
     /// posts.
     fn crossing(world_from_sensor: &Isometry3<f64>, shift: f64) -> Vec<[f32; 4]> {
         let mut world = Vec::new();
-        let mut add = |x: f64, y: f64, z: f64| world.push(Vector3::new(x, y, z));
-        let span = |from: f64, to: f64, step: f64| {
-            (0..((to - from) / step) as usize).map(move |k| from + step * (k as f64 + 0.37))
-        };
         for x in span(-40.0, 40.0, 0.6) {
             for y in span(-40.0, 40.0, 0.6) {
-                add(x + shift, y - shift, 0.0);
+                world.push(Vector3::new(x + shift, y - shift, 0.0));
             }
         }
         for along in span(10.0, 40.0, 0.3) {
@@ -436,17 +436,18 @@ mod tests {
                 for (sx, sy) in [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)] {
                     // Corners of different depth, so that no two views are alike.
                     let depth = 8.0 + sx + 0.5 * sy;
-                    add(sx * (along + shift), sy * depth, z);
-                    add(sx * depth, sy * (along - shift), z + 0.1 * shift);
+                    world.push(Vector3::new(sx * (along + shift), sy * depth, z));
+                    let y = sy * (along - shift);
+                    world.push(Vector3::new(sx * depth, y, z + 0.1 * shift));
                 }
             }
         }
         let sensor_from_world = world_from_sensor.inverse();
-        let single = |point: Vector3<f64>| {
-            let seen = sensor_from_world * nalgebra::Point3::from(point);
+        let points = world.into_iter().map(|point| {
+            let seen = sensor_from_world * Point3::from(point);
             [seen.x as f32, seen.y as f32, seen.z as f32, 0.5]
-        };
-        world.into_iter().map(single).collect()
+        });
+        points.collect()
     }
 
     fn pose(x: f64, y: f64, yaw: f64) -> Isometry3<f64> {
@@ -507,18 +508,20 @@ mod tests {
         );
     }
 
+    /// A side of a lorry that begins at `x`.
+    fn lorry(x: f64) -> impl Iterator<Item = [f64; 3]> {
+        (0..800).map(move |k| [x + f64::from(k % 40) * 0.2, 4.0, f64::from(k / 40) * 0.15])
+    }
+
     #[test]
     fn traffic_that_has_moved_is_an_outlier() {
         let config = IcpConfig::default();
         let (here, there) = (pose(0.0, 0.0, 0.0), pose(1.0, 0.3, 0.02));
         let mut moved = crossing(&there, 0.1);
         let static_points = moved.len();
-        // A side of a lorry, two metres farther than in the target.
-        let lorry = |x: f64| {
-            (0..800).map(move |k| [x + f64::from(k % 40) * 0.2, 4.0, f64::from(k / 40) * 0.15])
-        };
         let mut target = crossing(&here, 0.0);
         target.extend(lorry(3.0).map(|p| [p[0] as f32, p[1] as f32, p[2] as f32 - 2.0, 0.1]));
+        // Two metres farther than in the target.
         moved.extend(
             lorry(5.0).map(|p| [p[0] as f32 - 1.0, p[1] as f32 - 0.3, p[2] as f32 - 2.0, 0.1]),
         );
@@ -538,34 +541,35 @@ mod tests {
         );
     }
 
+    fn ground(shift: f32) -> Vec<[f32; 4]> {
+        let points = (0..10_000).map(|k| {
+            [
+                (k % 100) as f32 * 0.5 - 25.0 + shift,
+                (k / 100) as f32 * 0.5 - 25.0,
+                -2.0,
+                0.1,
+            ]
+        });
+        points.collect()
+    }
+
+    /// Two parallel walls along x.
+    fn walls(shift: f32) -> impl Iterator<Item = [f32; 4]> {
+        [6.0, -6.0].into_iter().flat_map(move |y| {
+            (0..2_000).map(move |k| {
+                [
+                    (k % 200) as f32 * 0.25 - 25.0 + shift,
+                    y,
+                    (k / 200) as f32 * 0.4 - 2.0,
+                    0.1,
+                ]
+            })
+        })
+    }
+
     #[test]
     fn bare_ground_and_a_tunnel_leave_directions_unconstrained() {
         let config = IcpConfig::default();
-        let ground = |shift: f32| -> Vec<[f32; 4]> {
-            (0..10_000)
-                .map(|k| {
-                    [
-                        (k % 100) as f32 * 0.5 - 25.0 + shift,
-                        (k / 100) as f32 * 0.5 - 25.0,
-                        -2.0,
-                        0.1,
-                    ]
-                })
-                .collect()
-        };
-        let walls = |shift: f32| {
-            let wall = move |y: f32| {
-                (0..2_000).map(move |k| {
-                    [
-                        (k % 200) as f32 * 0.25 - 25.0 + shift,
-                        y,
-                        (k / 200) as f32 * 0.4 - 2.0,
-                        0.1,
-                    ]
-                })
-            };
-            wall(6.0).chain(wall(-6.0))
-        };
         for (source, target) in [
             (ground(0.1), ground(0.0)),
             (

@@ -326,11 +326,6 @@ pub(crate) mod tests {
         let (folder, path, _) = stored();
         let whole = std::fs::read(&path).unwrap();
         let other = folder.path().join("other.safetensors");
-        let message = |bytes: &[u8]| {
-            std::fs::write(&other, bytes).unwrap();
-            SurfelMap::load(&other).unwrap_err().to_string()
-        };
-        assert!(message(&whole[..whole.len() - 9]).contains("not a complete safetensors file"));
         let config = Config {
             voxel_m: 0.0,
             origin_m: [0.0; 3],
@@ -338,6 +333,13 @@ pub(crate) mod tests {
             place: String::new(),
         };
         let one = encode(&config, 1, [&[0; 6], &[0; 3], &[0; 3]]).unwrap();
-        assert!(message(&one).contains("voxel_m is 0: must be "));
+        for (bytes, fault) in [
+            (&whole[..whole.len() - 9], "not a complete safetensors file"),
+            (one.as_slice(), "voxel_m is 0: must be "),
+        ] {
+            std::fs::write(&other, bytes).unwrap();
+            let message = SurfelMap::load(&other).unwrap_err().to_string();
+            assert!(message.contains(fault), "{message}");
+        }
     }
 }

@@ -305,34 +305,31 @@ mod tests {
         ];
         let cells = cells.map(cell);
         let statics = static_tokens(&cells, &[car], &sensor.isometry());
-        let of = |number: usize| statics[token_of(cells[number].centroid_m).0];
-        assert_eq!((of(0), of(3)), (0.0, 1.0));
+        let [car, wall] = [0, 3].map(|cell: usize| statics[token_of(cells[cell].centroid_m).0]);
+        assert_eq!((car, wall), (0.0, 1.0));
         assert_eq!(statics.iter().sum::<f32>(), TOKENS as f32 - 1.0);
+    }
+
+    /// A sweep of a sensor that has turned to the right from east, with a wall to the left of where it was.
+    fn turned_sweep(turn: f64) -> TokenSweeps {
+        let (sin, cos) = (1.7 + turn).sin_cos();
+        let features = Tensor::ones([1, 1], (Kind::Float, Device::Cpu));
+        let wall = pool(&[cell([9.0 * cos, 9.0 * sin, 0.0])], &features).unwrap();
+        TokenSweeps {
+            tokens: wall.unsqueeze(0),
+            statics: wall.narrow(1, 0, 1).view([1, TOKENS]),
+            poses: Tensor::from_slice(&[5f32, 6.0, 7.0, turn.cos() as f32, -turn.sin() as f32])
+                .view([1, 5]),
+        }
     }
 
     #[test]
     fn turned_sweeps_are_those_of_a_turned_sensor() {
-        // A wall to the left of a sensor that heads east, then of one that has turned by two sectors to the right.
+        // By two sectors to the right.
         let angle = 2.0 * TAU / SECTORS as f64;
-        let wall = |turn: f64| {
-            let (sin, cos) = (1.7 + turn).sin_cos();
-            pool(
-                &[cell([9.0 * cos, 9.0 * sin, 0.0])],
-                &Tensor::ones([1, 1], on()),
-            )
-            .unwrap()
-        };
-        fn on() -> (Kind, Device) {
-            (Kind::Float, Device::Cpu)
-        }
-        let sweep = |turn: f64| TokenSweeps {
-            tokens: wall(turn).unsqueeze(0),
-            statics: wall(turn).narrow(1, 0, 1).view([1, TOKENS]),
-            poses: Tensor::from_slice(&[5f32, 6.0, 7.0, turn.cos() as f32, -turn.sin() as f32])
-                .view([1, 5]),
-        };
-        let found = sweep(0.0).turned(&Tensor::from_slice(&[2_i64])).unwrap();
-        let wanted = sweep(angle);
+        let turns = Tensor::from_slice(&[2_i64]);
+        let found = turned_sweep(0.0).turned(&turns).unwrap();
+        let wanted = turned_sweep(angle);
         for (found, wanted) in [
             (&found.tokens, &wanted.tokens),
             (&found.statics, &wanted.statics),
@@ -347,7 +344,7 @@ mod tests {
 
     #[test]
     fn windows_stay_within_a_drive() {
-        let place = |number: usize| Isometry3::translation(number as f64, 0.0, 0.0);
+        let places = (0..5).map(|number| Isometry3::translation(f64::from(number), 0.0, 0.0));
         let drives = vec![0, 0, 0, 4, 4];
         let projection = TokenProjection::new(&tch::nn::VarStore::new(Device::Cpu).root(), 1);
         let sweeps = PooledSweeps {
@@ -357,7 +354,7 @@ mod tests {
             ),
             statics: vec![[1.0; TOKENS as usize]; 5],
             drives: drives.clone(),
-            world_from_sensor: (0..5).map(place).collect(),
+            world_from_sensor: places.collect(),
         };
         let cache = sweeps.cache(&projection, [0.0; 3]).unwrap();
         let windows = cache.draw(200, 3).unwrap().poses.narrow(1, 0, 1);

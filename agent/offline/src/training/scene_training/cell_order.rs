@@ -126,15 +126,18 @@ mod tests {
     use super::*;
     use crate::training::RedundancyConfig;
 
+    fn zeros(rows: i64, columns: i64) -> Tensor {
+        Tensor::zeros([rows, columns], (Kind::Float, Device::Cpu))
+    }
+
     /// Ten sweeps of ten cells each.
     fn cache() -> FeatureCache {
-        let cells = |columns: i64| Tensor::zeros([100, columns], (Kind::Float, Device::Cpu));
         FeatureCache {
-            cells: cells(1),
+            cells: zeros(100, 1),
             sweep_of_cell: Tensor::arange(100, (Kind::Int64, Device::Cpu)).floor_divide_scalar(10),
-            targets_m: cells(3),
-            sensor_m: cells(3),
-            sweeps: Tensor::zeros([10, 1], (Kind::Float, Device::Cpu)),
+            targets_m: zeros(100, 3),
+            sensor_m: zeros(100, 3),
+            sweeps: zeros(10, 1),
             points: vec![1; 10],
             world_from_sensor: vec![nalgebra::Isometry3::identity(); 10],
             origin_m: [0.0; 3],

@@ -253,22 +253,23 @@ mod tests {
         assert!(points[4..].iter().all(|point| point.codec.keep.is_none()));
     }
 
+    fn shaped_link(point: &Point) -> LinkConfig {
+        let mut link = LinkConfig::default();
+        point.shape(&mut link);
+        link
+    }
+
     #[test]
     fn a_point_shapes_the_link() {
         let text = "{method: [max], latency_ms: [50], jitter_ms: [0, 10], bandwidth_mbps: [.inf, 6], loss: [0.1]}";
         let experiment = experiment(text);
         let points = points(&experiment);
-        let shaped = |point: &Point| {
-            let mut link = LinkConfig::default();
-            point.shape(&mut link);
-            link
-        };
-        let first = shaped(&points[0]);
+        let first = shaped_link(&points[0]);
         assert_eq!(
             (first.latency, first.capacity),
             (LatencyModel::ConstantMs(50.0), CapacityConfig::Unlimited)
         );
-        let last = shaped(&points[3]);
+        let last = shaped_link(&points[3]);
         assert_eq!(
             last.latency,
             LatencyModel::Normal {
@@ -294,15 +295,13 @@ mod tests {
             .iter()
             .map(|point| (point.codec.name(), point.rate().bytes_per_second))
             .collect();
-        let name = |text: &str| text.to_owned();
-        let fitted = name("f32 fitted to 0.5");
         let expected = [
-            (name("f32"), None),
-            (name("f32"), None),
-            (fitted.clone(), Some(375_000)),
-            (fitted, None),
+            ("f32", None),
+            ("f32", None),
+            ("f32 fitted to 0.5", Some(375_000)),
+            ("f32 fitted to 0.5", None),
         ];
-        assert_eq!(rates, expected);
+        assert_eq!(rates, expected.map(|(name, rate)| (name.to_owned(), rate)));
     }
 
     #[test]

@@ -160,11 +160,11 @@ mod tests {
             "ap_global_50",
             "e2e_ms_p50",
         ];
-        let line = |fields: [&str; 7]| fields.map(str::to_owned).to_vec();
         let lines = [
-            line(["max", "", "0", "1", "10", "0.9000", "31"]),
-            line(["max", "", "0.1", "1", "10", "0.8000", "30"]),
-        ];
+            ["max", "", "0", "1", "10", "0.9000", "31"],
+            ["max", "", "0.1", "1", "10", "0.8000", "30"],
+        ]
+        .map(|fields| fields.map(str::to_owned).to_vec());
         let table = VaryingTable::new(&columns, &lines);
         assert_eq!(table.columns, ["loss", "ap_global_50", "e2e_ms_p50"]);
         let constants = [("method", "max"), ("seed", "1"), ("frames", "10")];

@@ -210,27 +210,32 @@ mod tests {
         }
     }
 
-    fn table(columns: &[&str]) -> FilledTable {
-        let row = |method: Method, trainings: &[f64]| FilledRow {
-            row: Row {
-                name: Some(format!("{method}, here")),
-                method,
-                weights: vec![],
-                poses: None,
-                vehicles: None,
-                neighbour_weights: None,
-                boxes: None,
-                box_alignment: false,
-            },
-            cells: columns
-                .iter()
-                .map(|_| trainings.iter().map(|&at_50| cell(method, at_50)).collect())
-                .collect(),
+    fn filled_row(method: Method, trainings: &[f64], columns: usize) -> FilledRow {
+        let row = Row {
+            name: Some(format!("{method}, here")),
+            method,
+            weights: vec![],
+            poses: None,
+            vehicles: None,
+            neighbour_weights: None,
+            boxes: None,
+            box_alignment: false,
         };
+        let cells: Vec<Cell> = trainings.iter().map(|&at_50| cell(method, at_50)).collect();
+        FilledRow {
+            row,
+            cells: vec![cells; columns],
+        }
+    }
+
+    fn table(columns: &[&str]) -> FilledTable {
         FilledTable {
             name: "main".into(),
             columns: columns.iter().map(|name| column(name)).collect(),
-            rows: vec![row(Method::NONE, &[0.5]), row(Method::PASTAT, &[0.6, 0.8])],
+            rows: vec![
+                filled_row(Method::NONE, &[0.5], columns.len()),
+                filled_row(Method::PASTAT, &[0.6, 0.8], columns.len()),
+            ],
         }
     }
 

@@ -203,10 +203,24 @@ mod tests {
         Area::new(&GRID, [64, 96], 4)
     }
 
-    /// Synthetic vehicles at some places, zero mean.
+    /// Synthetic vehicles at some places.
+    fn vehicle_cells(seed: u64, channels: i64) -> Tensor {
+        let cells = uniform(seed, &[1, channels, 64, 96]).gt(0.99);
+        cells.to_kind(Kind::Float)
+    }
+
+    /// The same with zero mean.
     fn map(seed: u64) -> Tensor {
-        let cells = uniform(seed, &[1, 2, 64, 96]).gt(0.99).to_kind(Kind::Float);
+        let cells = vehicle_cells(seed, 2);
         &cells - cells.mean(Kind::Float)
+    }
+
+    fn with_full_mask(features: Tensor) -> WarpedMaps {
+        let (maps, _, height, width) = features.size4().unwrap();
+        WarpedMaps {
+            features,
+            mask: Tensor::ones([maps, 1, height, width], FLOAT),
+        }
     }
 
     /// Offsets found for senders at the ego's position.
@@ -261,17 +275,14 @@ mod tests {
     fn in_training_a_gain_below_the_margin_moves_nothing() {
         let ego = map(1);
         let other = ego.roll([12], [3]) * 0.6 + &ego * 0.5;
-        let with = |margin, train| {
-            found(
-                [&ego, &other],
-                &area(),
-                SearchConfig { margin, ..CONFIG },
-                train,
-            )
-        };
-        assert_eq!(with(0.0, true), [-6.0, 0.0, 0.0]);
-        assert_eq!(with(0.2, true), [0.0; 3]);
-        assert_eq!(with(0.2, false), [-6.0, 0.0, 0.0]);
+        for (margin, train, expected) in [
+            (0.0, true, [-6.0, 0.0, 0.0]),
+            (0.2, true, [0.0; 3]),
+            (0.2, false, [-6.0, 0.0, 0.0]),
+        ] {
+            let config = SearchConfig { margin, ..CONFIG };
+            assert_eq!(found([&ego, &other], &area(), config, train), expected);
+        }
     }
 
     /// Corrections of FSA with a search for three maps: the ego's; the same twelve cells too far along x and sixteen
@@ -295,34 +306,24 @@ mod tests {
         };
         let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &config);
         redraw(&variables, &["matching"], 0.3);
-        let map = |seed| uniform(seed, &[1, 4, 64, 96]).gt(0.99).to_kind(Kind::Float);
-        let with_mask = |features: Tensor| {
-            let (maps, _, height, width) = features.size4().unwrap();
-            WarpedMaps {
-                features,
-                mask: Tensor::ones([maps, 1, height, width], FLOAT),
-            }
-        };
-        let others = with_mask(Tensor::cat(
-            &[&map(5), &map(5).roll([-16, 12], [2, 3]), &map(6)],
-            0,
-        ));
+        let [ego, foreign] = [5, 6].map(|seed| vehicle_cells(seed, 4));
+        let others = Tensor::cat(&[&ego, &ego.roll([-16, 12], [2, 3]), &foreign], 0);
+        let [ego, others] = [ego, others].map(with_full_mask);
         let poses = [
             Pose::IDENTITY,
             Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3),
             Pose::IDENTITY,
         ];
-        let compared = || {
-            let [ego, others] =
-                [&with_mask(map(5)), &others].map(|maps| fsa.reduced(maps).unwrap());
+        let deltas = no_grad(|| {
+            let [ego, others] = [&ego, &others].map(|maps| fsa.reduced(maps).unwrap());
             let pairs = fsa
                 .pairs([&ego, &others], &confidences, &poses, &area)
                 .unwrap();
             displacements(&fsa, &pairs, &area, known, train)
                 .unwrap()
                 .deltas
-        };
-        Vec::try_from(no_grad(compared).view(-1)).unwrap()
+        });
+        Vec::try_from(deltas.view(-1)).unwrap()
     }
 
     #[test]
@@ -409,22 +410,16 @@ mod tests {
                 .fill_(0.6)
         });
         let map = uniform(5, &[1, 4, 16, 32]).gt(0.97).to_kind(Kind::Float);
-        let maps = [map.shallow_clone(), map.roll([3], [3])].map(|features| {
-            fsa.reduced(&WarpedMaps {
-                mask: features.ones_like().narrow(1, 0, 1),
-                features,
-            })
-            .unwrap()
-        });
-        let shift_x_m = |train| {
+        let maps = [map.shallow_clone(), map.roll([3], [3])]
+            .map(|features| fsa.reduced(&with_full_mask(features)).unwrap());
+        let [first, both] = [true, false].map(|train| {
             let confidences = Tensor::ones([1, CONFIDENCES], FLOAT);
             let pairs = fsa
                 .pairs([&maps[0], &maps[1]], &confidences, &[Pose::IDENTITY], &area)
                 .unwrap();
             let found = displacements(&fsa, &pairs, &area, None, train).unwrap();
             found.deltas.double_value(&[0, 0])
-        };
-        let (first, both) = (shift_x_m(true), shift_x_m(false));
+        });
         assert!(first < -AGAIN_M, "{first}");
         assert!(
             (both + 1.5).abs() < 0.7 * (first + 1.5).abs(),

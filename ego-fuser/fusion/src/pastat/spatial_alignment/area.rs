@@ -196,8 +196,9 @@ mod tests {
         )
         .unwrap();
         let by_delta = map_moved(&maps, [1.0, -0.5, 0.1], Pose::IDENTITY);
-        let inside = |map: &Tensor| map.narrow(2, 4, 8).narrow(3, 8, 16);
-        assert!(inside(&by_delta).allclose(&inside(&by_pose.features), 1e-3, 1e-3, false));
+        let [by_delta, by_pose] =
+            [&by_delta, &by_pose.features].map(|map| map.narrow(2, 4, 8).narrow(3, 8, 16));
+        assert!(by_delta.allclose(&by_pose, 1e-3, 1e-3, false));
     }
 
     #[test]
@@ -210,15 +211,11 @@ mod tests {
         let padded = Area::new(&GRID, [20, 40], 4);
         let places = own_sampling_grid(&deltas, &[pose], [&padded, &area()]).unwrap();
         let (read, valid) = resample(&maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &places).unwrap();
-        let inside = |map: &Tensor| map.narrow(2, 0, 16).narrow(3, 0, 32);
-        assert!(
-            (inside(&(read * &valid)) - by_pose.features)
-                .abs()
-                .mean(Kind::Float)
-                .double_value(&[])
-                < 1e-3
-        );
-        assert_eq!(inside(&valid), by_pose.mask);
+        let [own_cells, own_mask] =
+            [&(read * &valid), &valid].map(|map| map.narrow(2, 0, 16).narrow(3, 0, 32));
+        let error = (own_cells - by_pose.features).abs().mean(Kind::Float);
+        assert!(error.double_value(&[]) < 1e-3);
+        assert_eq!(own_mask, by_pose.mask);
         assert!(
             valid.sum(Kind::Float).double_value(&[])
                 > by_pose.mask.sum(Kind::Float).double_value(&[])

@@ -120,23 +120,20 @@ mod tests {
             uniform(6, &[3, 16, 32]) - 0.5,
             uniform(7, &[2, 1, 16, 32]) * 2.0,
         );
-        let found = |with_gradient| {
+        let [numbers, tensors] = [false, true].map(|with_gradient| {
             let maps = WarpedMaps {
                 features: features.shallow_clone(),
                 mask: mask.shallow_clone(),
             };
-            let cells = |map| {
+            let cells = (0..2).map(|map| {
                 FullResolutionMap::of(&features.narrow(0, map, 1), Some(&mask.narrow(0, map, 1)))
                     .unwrap()
-            };
-            let cells = (0..2).map(cells).collect();
-            let moved =
-                NeighbourMaps::at(maps, cells, places.copy().set_requires_grad(with_gradient))
-                    .unwrap();
+            });
+            let places = places.copy().set_requires_grad(with_gradient);
+            let moved = NeighbourMaps::at(maps, cells.collect(), places).unwrap();
             assert_eq!(moved.places.is_none(), with_gradient);
             moved.maximum_with(&own, &weight).unwrap()
-        };
-        let (numbers, tensors) = (found(false), found(true));
+        });
         assert_ne!(numbers, own.unsqueeze(0));
         // At a position between two cells either may be the nearest.
         let apart = (numbers - tensors)

@@ -227,11 +227,13 @@ mod tests {
         }
     }
 
-    fn random(maps: i64) -> WarpedMaps {
-        WarpedMaps {
+    /// Random maps, with the channels that are matched.
+    fn random(fsa: &AlignmentNetwork, maps: i64) -> WarpedMaps {
+        let whole = WarpedMaps {
             features: Tensor::randn([maps, 4, 16, 32], FLOAT),
             mask: Tensor::ones([maps, 1, 16, 32], FLOAT),
-        }
+        };
+        fsa.reduced(&whole).unwrap()
     }
 
     fn compared(fsa: &AlignmentNetwork, maps: [&WarpedMaps; 2], poses: &[Pose]) -> Displacements {
@@ -253,8 +255,7 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &near());
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
-        let reduce = |maps: &WarpedMaps| fsa.reduced(maps).unwrap();
-        let maps = [&reduce(&random(1)), &reduce(&random(2))];
+        let maps = [&random(&fsa, 1), &random(&fsa, 2)];
         let found = compared(&fsa, maps, &poses);
         assert_eq!(found.fit, Tensor::zeros([2, 6], FLOAT));
         let deltas = found.deltas;
@@ -282,13 +283,8 @@ mod tests {
                 .shallow_clone()
                 .fill_(1e6)
         });
-        let reduce = |maps: &WarpedMaps| fsa.reduced(maps).unwrap();
-        let deltas = compared(
-            &fsa,
-            [&reduce(&random(1)), &reduce(&random(1))],
-            &[Pose::IDENTITY],
-        )
-        .deltas;
+        let maps = [&random(&fsa, 1), &random(&fsa, 1)];
+        let deltas = compared(&fsa, maps, &[Pose::IDENTITY]).deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!(
             (found[0] - 3.0).abs() < 1e-6

@@ -273,11 +273,9 @@ mod tests {
         let _ = valid.get(1).fill_(0.0);
         let changed = tokens.copy();
         let _ = changed.get(1).fill_(7.0);
-        let same = |found: Tensor, again: Tensor| found.allclose(&again, 1e-5, 1e-6, false);
-        assert!(same(
-            agents.forward(&tokens, &valid).unwrap(),
-            agents.forward(&changed, &valid).unwrap()
-        ));
+        let [first, second] =
+            [&tokens, &changed].map(|tokens| agents.forward(tokens, &valid).unwrap());
+        assert!(first.allclose(&second, 1e-5, 1e-6, false));
         let _ = valid.get(0).get(1).get(3).fill_(0.0);
         let _ = changed.get(0).get(1).get(3).fill_(9.0);
         let [first, second] =
@@ -318,16 +316,17 @@ mod tests {
         let changed = tokens.copy();
         let _ = changed.narrow(2, 4, 4).fill_(3.0);
         let valid = Tensor::ones([1, 4, 8], FLOAT);
-        let left = |tokens: &Tensor| windows.forward(tokens, &valid).unwrap().narrow(2, 0, 4);
-        assert!(left(&tokens).allclose(&left(&changed), 1e-5, 1e-6, false));
+        let [left, left_again] = [&tokens, &changed]
+            .map(|tokens| windows.forward(tokens, &valid).unwrap().narrow(2, 0, 4));
+        assert!(left.allclose(&left_again, 1e-5, 1e-6, false));
     }
 
     #[test]
     fn pairs_in_the_same_relation_share_a_place() {
         let places = relative_places(3);
-        let at = |a: usize, b: usize| places[a * 9 + b];
-        assert_eq!(at(0, 1), at(4, 5));
-        assert_ne!(at(0, 1), at(1, 0));
+        let of_token: Vec<&[i64]> = places.chunks_exact(9).collect();
+        assert_eq!(of_token[0][1], of_token[4][5]);
+        assert_ne!(of_token[0][1], of_token[1][0]);
         assert!(places.iter().all(|place| (0..25).contains(place)));
     }
 }

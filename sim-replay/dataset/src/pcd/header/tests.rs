@@ -255,21 +255,20 @@ fn padding_may_repeat_and_hold_nothing() {
     );
 }
 
+/// Name and kind of the intensity among fields of four bytes.
+fn intensity_among(names: &str) -> Option<(String, IntensityKind)> {
+    let count = names.split(' ').count() + 3;
+    let [sizes, types] = ["4", "F"].map(|word| vec![word; count].join(" "));
+    let header = parsed(&format!(
+        "FIELDS x y z {names}\nSIZE {sizes}\nTYPE {types}\nWIDTH 0\nDATA ascii\n"
+    ));
+    header
+        .intensity_origin()
+        .map(|(name, kind)| (name.to_owned(), kind))
+}
+
 #[test]
 fn the_most_preferred_name_of_intensity_wins() {
-    let origin = |names: &str| {
-        let count = names.split(' ').count() + 3;
-        let repeated = |word: &str| vec![word; count].join(" ");
-        let text = format!(
-            "FIELDS x y z {names}\nSIZE {}\nTYPE {}\nWIDTH 0\nDATA ascii\n",
-            repeated("4"),
-            repeated("F")
-        );
-        let header = parsed(&text);
-        header
-            .intensity_origin()
-            .map(|(name, kind)| (name.to_owned(), kind))
-    };
     for name in [
         "intensity",
         "Intensity",
@@ -281,20 +280,22 @@ fn the_most_preferred_name_of_intensity_wins() {
         "remission",
     ] {
         assert_eq!(
-            origin(&format!("rgb {name} ring")),
+            intensity_among(&format!("rgb {name} ring")),
             Some((name.to_owned(), IntensityKind::Number))
         );
     }
     assert_eq!(
-        origin("reflectivity signal i Intensity").unwrap().0,
+        intensity_among("reflectivity signal i Intensity")
+            .unwrap()
+            .0,
         "Intensity"
     );
-    assert_eq!(origin("reflectivity signal i").unwrap().0, "i");
+    assert_eq!(intensity_among("reflectivity signal i").unwrap().0, "i");
     assert_eq!(
-        origin("rgba"),
+        intensity_among("rgba"),
         Some(("rgba".to_owned(), IntensityKind::RedByte))
     );
-    assert_eq!(origin("ring"), None);
+    assert_eq!(intensity_among("ring"), None);
     let bytes = SOUND
         .replace("rgb", "intensity")
         .replace("TYPE F F F F", "TYPE F F F U")

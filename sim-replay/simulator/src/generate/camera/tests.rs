@@ -20,6 +20,16 @@ fn block() -> SolidShape {
     )
 }
 
+/// Depth of the ray of a pixel, metres.
+fn depth_m(camera: &MountedCamera, column: f64, row: f64) -> f32 {
+    let pixel = row as usize * SIZE.width_px as usize + column as usize;
+    let (column, channel) = camera.rays[pixel];
+    let pattern = &camera.caster.pattern;
+    let column = (column as usize).min(pattern.columns - 1);
+    let channel = (channel as usize).min(pattern.channels - 1);
+    camera.caster.image.depths_m[column * pattern.channels + channel]
+}
+
 #[test]
 fn a_box_is_where_the_calibration_projects_it_in_every_camera() {
     let map = build(&RoadMapSource::Town1, 0).unwrap();
@@ -52,23 +62,16 @@ fn a_box_is_where_the_calibration_projects_it_in_every_camera() {
             .unwrap()
             .project(middle.coords.into())
             .unwrap();
-        let depth_m = |column: f64, row: f64| {
-            let pixel = row as usize * SIZE.width_px as usize + column as usize;
-            let (column, channel) = camera.rays[pixel];
-            let pattern = &camera.caster.pattern;
-            let column = (column as usize).min(pattern.columns - 1);
-            let channel = (channel as usize).min(pattern.channels - 1);
-            camera.caster.image.depths_m[column * pattern.channels + channel]
-        };
         let distance_m = middle.coords.norm() as f32;
+        let box_m = depth_m(camera, column, row);
         assert!(
-            (depth_m(column, row) - distance_m).abs() < 2.1,
-            "{number}: {} {distance_m}",
-            depth_m(column, row)
+            (box_m - distance_m).abs() < 2.1,
+            "{number}: {box_m} {distance_m}"
         );
         // Well above the box there is sky, well below ground that is nearer.
         assert!(
-            depth_m(column, row - 20.0) > 149.0 && depth_m(column, row + 12.0) < distance_m - 2.1
+            depth_m(camera, column, row - 20.0) > 149.0
+                && depth_m(camera, column, row + 12.0) < distance_m - 2.1
         );
     }
 }
@@ -78,7 +81,7 @@ fn images_are_the_same_for_the_same_arguments_and_differ_by_weather() {
     let map = build(&RoadMapSource::Town1, 0).unwrap();
     let world = World::new(&map);
     let vehicle = Placement::level([0.0, 0.0, 0.0], 0.0);
-    let images = |weather| {
+    let [sunny, again, snowy] = [Weather::Sunny, Weather::Sunny, Weather::Snow].map(|weather| {
         let surroundings = Surroundings {
             ground: &Plane(0.0),
             bodies: &[],
@@ -86,14 +89,13 @@ fn images_are_the_same_for_the_same_arguments_and_differ_by_weather() {
             weather,
         };
         CameraRig::new(SIZE).images(&vehicle, &surroundings, &mut GroundPaint::new(&world), 5)
-    };
-    let sunny = images(Weather::Sunny);
+    });
     assert_eq!(
         sunny.iter().map(|(number, _)| *number).collect::<Vec<_>>(),
         [0, 1, 2, 3]
     );
-    assert_eq!(sunny, images(Weather::Sunny));
-    assert_ne!(sunny, images(Weather::Snow));
+    assert_eq!(sunny, again);
+    assert_ne!(sunny, snowy);
     assert!(
         sunny
             .iter()

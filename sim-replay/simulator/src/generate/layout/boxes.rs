@@ -113,21 +113,18 @@ mod tests {
         assert_eq!((byte(f32::NAN), byte(2.0), byte(-1.0)), (0, 255, 0));
     }
 
+    fn point_at(elevation_deg: f32) -> [f32; 4] {
+        let (sin, cos) = elevation_deg.to_radians().sin_cos();
+        [10.0 * cos, 0.0, 10.0 * sin, 0.5]
+    }
+
     #[test]
     fn the_channel_of_a_direction() {
-        let point = |deg: f32| {
-            [
-                10.0 * deg.to_radians().cos(),
-                0.0,
-                10.0 * deg.to_radians().sin(),
-                0.5,
-            ]
-        };
         assert_eq!(
-            [-25.0, 2.0, -40.0, 80.0].map(|deg| ring(point(deg))),
+            [-25.0, 2.0, -40.0, 80.0].map(|deg| ring(point_at(deg))),
             [0, 63, 0, 63]
         );
-        assert_eq!(ring(point(-25.0 + 27.0 * 10.0 / 63.0)), 10);
+        assert_eq!(ring(point_at(-25.0 + 27.0 * 10.0 / 63.0)), 10);
     }
 
     proptest! {

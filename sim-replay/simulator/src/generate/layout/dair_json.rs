@@ -62,9 +62,9 @@ mod tests {
         let quarter = Pose::from_xyz_yaw([1.0, 2.0, 3.5], std::f64::consts::FRAC_PI_2);
         let json = transform(&quarter);
         assert_eq!(json["translation"], json!([[1.0], [2.0], [3.5]]));
-        let entry = |row: usize, column: usize| json["rotation"][row][column].as_f64().unwrap();
+        let rows: [[f64; 3]; 3] = serde_json::from_value(json["rotation"].clone()).unwrap();
         // The x axis of the source points along y of the target.
-        assert!((entry(1, 0) - 1.0).abs() < 1e-12 && (entry(0, 1) + 1.0).abs() < 1e-12);
+        assert!((rows[1][0] - 1.0).abs() < 1e-12 && (rows[0][1] + 1.0).abs() < 1e-12);
     }
 
     #[test]
@@ -82,22 +82,21 @@ mod tests {
             heading_rad: 1.5,
         };
         let label = world_label("Bus", &object, &upright);
-        let corner = |index: usize| -> Vec<f64> {
-            serde_json::from_value(label["world_8_points"][index].clone()).unwrap()
-        };
+        let corners: [[f64; 3]; 8] =
+            serde_json::from_value(label["world_8_points"].clone()).unwrap();
         // Front left of the bottom: the front is towards y, left towards -x.
         for (index, expected) in [
             (0, [9.0, 22.0, 0.5]),
             (1, [11.0, 22.0, 0.5]),
             (6, [11.0, 18.0, 1.5]),
         ] {
+            let corner = corners[index];
             assert!(
-                corner(index)
+                corner
                     .iter()
                     .zip(expected)
                     .all(|(a, b)| (a - b).abs() < 1e-12),
-                "{:?}",
-                corner(index)
+                "{corner:?}"
             );
         }
         assert_eq!(

@@ -288,6 +288,18 @@ mod tests {
         }
     }
 
+    /// The row of a table that has this token.
+    fn row<'t>(
+        tables: &'t BTreeMap<&'static str, Vec<Value>>,
+        name: &str,
+        token: &Value,
+    ) -> &'t Value {
+        tables[name]
+            .iter()
+            .find(|row| row["token"] == *token)
+            .unwrap_or_else(|| panic!("{name} {token}"))
+    }
+
     #[test]
     fn rows_refer_to_each_other() {
         let samples = [
@@ -312,68 +324,58 @@ mod tests {
             samples: &samples,
         });
         let tables = tables.into_tables();
-        let count = |name: &str| tables[name].len();
-        assert_eq!(
-            (
-                count("scene"),
-                count("sample"),
-                count("sample_data"),
-                count("ego_pose")
-            ),
-            (2, 6, 6, 6)
-        );
-        assert_eq!(
-            (
-                count("sensor"),
-                count("calibrated_sensor"),
-                count("category")
-            ),
-            (1, 2, 1)
-        );
-        assert_eq!(
-            (
-                count("instance"),
-                count("sample_annotation"),
-                count("visibility")
-            ),
-            (4, 6, 0)
-        );
-        let row = |name: &str, token: &Value| {
-            tables[name]
-                .iter()
-                .find(|row| row["token"] == *token)
-                .unwrap_or_else(|| panic!("{name} {token}"))
-                .clone()
-        };
+        for (name, rows) in [
+            ("scene", 2),
+            ("sample", 6),
+            ("sample_data", 6),
+            ("ego_pose", 6),
+            ("sensor", 1),
+            ("calibrated_sensor", 2),
+            ("category", 1),
+            ("instance", 4),
+            ("sample_annotation", 6),
+            ("visibility", 0),
+        ] {
+            assert_eq!(tables[name].len(), rows, "{name}");
+        }
         // From the scene along its samples to the second box of the first object.
-        let first = row("sample", &tables["scene"][0]["first_sample_token"]);
+        let first = row(&tables, "sample", &tables["scene"][0]["first_sample_token"]);
         assert_eq!(first["prev"], "");
-        let second = row("sample", &first["next"]);
+        let second = row(&tables, "sample", &first["next"]);
         assert_eq!(
             (second["timestamp"].as_u64(), &second["prev"]),
             (Some(100_000), &first["token"])
         );
         let instance = row(
+            &tables,
             "instance",
             &tables["sample_annotation"][0]["instance_token"],
         );
         assert_eq!(instance["nbr_annotations"], 2);
-        let last = row("sample_annotation", &instance["last_annotation_token"]);
+        let last = row(
+            &tables,
+            "sample_annotation",
+            &instance["last_annotation_token"],
+        );
         assert_eq!(
             (&last["sample_token"], &last["size"]),
             (&second["token"], &json!([2.0, 4.0, 1.5]))
         );
         assert_eq!(
-            row("category", &instance["category_token"])["name"],
+            row(&tables, "category", &instance["category_token"])["name"],
             "vehicle.car"
         );
         // The LiDAR 0.5 m behind the vehicle's origin and 2 m above.
         let sweep = &tables["sample_data"][1];
         assert_eq!(
-            row("ego_pose", &sweep["ego_pose_token"])["translation"],
+            row(&tables, "ego_pose", &sweep["ego_pose_token"])["translation"],
             json!([1.5, 0.0, 0.0])
         );
-        let mount = row("calibrated_sensor", &sweep["calibrated_sensor_token"]);
+        let mount = row(
+            &tables,
+            "calibrated_sensor",
+            &sweep["calibrated_sensor_token"],
+        );
         assert_eq!(mount["translation"], json!([-0.5, 0.0, 2.0]));
     }
 }

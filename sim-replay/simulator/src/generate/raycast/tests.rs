@@ -85,45 +85,51 @@ fn random_motion(random: &mut SplitMix64, reach_m: f64) -> Course {
     Course { start, end }
 }
 
+/// Entry and exit of a ray that is clipped at each half-space.
+fn clip(planes: &[[f64; 4]], o: &Point3<f64>, d: &Vector3<f64>) -> Option<(f64, f64)> {
+    let (mut near, mut far) = (f64::MIN, f64::MAX);
+    for p in planes {
+        let n = Vector3::new(p[0], p[1], p[2]);
+        let (inside, slope) = (p[3] - n.dot(&o.coords), n.dot(d));
+        if slope < 0.0 {
+            near = near.max(inside / slope);
+        } else if slope > 0.0 {
+            far = far.min(inside / slope);
+        } else if inside < 0.0 {
+            return None;
+        }
+    }
+    (near <= far).then_some((near, far))
+}
+
+/// Half-spaces of a box along some axes.
+fn slabs(b: &Bounds, axes: &[usize]) -> Vec<[f64; 4]> {
+    axes.iter()
+        .flat_map(|&axis| {
+            let mut up = [0.0; 4];
+            up[axis] = 1.0;
+            up[3] = f64::from(b.max_m[axis]);
+            let mut down = [0.0; 4];
+            down[axis] = -1.0;
+            down[3] = -f64::from(b.min_m[axis]);
+            [up, down]
+        })
+        .collect()
+}
+
+/// Roots of `a t^2 + 2 b t + c`.
+fn roots(a: f64, b: f64, c: f64) -> Option<(f64, f64)> {
+    let room = b * b - a * c;
+    (room >= 0.0).then(|| ((-b - room.sqrt()) / a, (-b + room.sqrt()) / a))
+}
+
 /// Entry of a ray into a part, by clipping the ray at each half-space or by the quadratic formula.
 fn enter(part: &Convex, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
-    let clip = |planes: &[[f64; 4]]| {
-        let (mut near, mut far) = (f64::MIN, f64::MAX);
-        for p in planes {
-            let n = Vector3::new(p[0], p[1], p[2]);
-            let (inside, slope) = (p[3] - n.dot(&o.coords), n.dot(d));
-            if slope < 0.0 {
-                near = near.max(inside / slope);
-            } else if slope > 0.0 {
-                far = far.min(inside / slope);
-            } else if inside < 0.0 {
-                return None;
-            }
-        }
-        (near <= far).then_some((near, far))
-    };
-    let slabs = |b: &Bounds, axes: &[usize]| -> Vec<[f64; 4]> {
-        axes.iter()
-            .flat_map(|&axis| {
-                let mut up = [0.0; 4];
-                up[axis] = 1.0;
-                up[3] = f64::from(b.max_m[axis]);
-                let mut down = [0.0; 4];
-                down[axis] = -1.0;
-                down[3] = -f64::from(b.min_m[axis]);
-                [up, down]
-            })
-            .collect()
-    };
-    let roots = |a: f64, b: f64, c: f64| {
-        let room = b * b - a * c;
-        (room >= 0.0).then(|| ((-b - room.sqrt()) / a, (-b + room.sqrt()) / a))
-    };
     match part {
-        Convex::Box(bounds) => clip(&slabs(bounds, &[0, 1, 2])).map(|(near, _)| near),
+        Convex::Box(bounds) => clip(&slabs(bounds, &[0, 1, 2]), o, d).map(|(near, _)| near),
         Convex::Hull { planes, .. } => {
             let planes: Vec<[f64; 4]> = planes.iter().map(|p| p.map(f64::from)).collect();
-            clip(&planes).map(|(near, _)| near)
+            clip(&planes, o, d).map(|(near, _)| near)
         }
         Convex::Cylinder {
             center_m, radius_m, ..
@@ -136,7 +142,7 @@ fn enter(part: &Convex, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
                 x * d.x + y * d.y,
                 x * x + y * y - r * r,
             )?;
-            let (bottom, top) = clip(&slabs(&part.bounds(), &[2]))?;
+            let (bottom, top) = clip(&slabs(&part.bounds(), &[2]), o, d)?;
             (near.max(bottom) <= far.min(top)).then(|| near.max(bottom))
         }
         Convex::Ellipsoid { center_m, radii_m } => {

@@ -257,14 +257,14 @@ mod tests {
     use super::*;
 
     fn two_lanes() -> LaneGraph {
-        let line = |from: i32, to: i32| {
-            (from..=to)
+        let [mut first, second] = [(0, 0..=20), (1, 20..=50)].map(|(id, along_m)| {
+            let line = along_m
                 .map(|x| [f64::from(x), 0.0, 0.1 * f64::from(x)])
-                .collect()
-        };
-        let mut first = Lane::new(LaneId(0), line(0, 20), 3.5, 10.0);
+                .collect();
+            Lane::new(LaneId(id), line, 3.5, 10.0)
+        });
         first.successors = vec![LaneId(1)];
-        LaneGraph::new(vec![first, Lane::new(LaneId(1), line(20, 50), 3.5, 10.0)])
+        LaneGraph::new(vec![first, second])
     }
 
     #[test]
@@ -286,11 +286,11 @@ mod tests {
 
     #[test]
     fn a_change_begins_and_ends_on_the_lanes_without_a_jump() {
-        let line = |y: f64| (0..=100).map(|x| [f64::from(x), y, 0.0]).collect();
-        let graph = LaneGraph::new(vec![
-            Lane::new(LaneId(0), line(0.0), 3.5, 10.0),
-            Lane::new(LaneId(1), line(3.5), 3.5, 10.0),
-        ]);
+        let lanes = [(0, 0.0), (1, 3.5)].map(|(id, y)| {
+            let line = (0..=100).map(|x| [f64::from(x), y, 0.0]).collect();
+            Lane::new(LaneId(id), line, 3.5, 10.0)
+        });
+        let graph = LaneGraph::new(lanes.into());
         let mut path = Path::new(LaneId(0), 20.0);
         let before = path.placement(&graph, 0.0, 3.0, 0.0);
         path.change(

@@ -112,15 +112,12 @@ mod tests {
 
     #[test]
     fn a_dead_end_is_avoided_where_a_ring_leads_on() {
-        let straight = |id| {
-            Lane::new(
-                LaneId(id),
-                (0..40).map(|x| [f64::from(x), 0.0, 0.0]).collect(),
-                3.5,
-                10.0,
-            )
-        };
-        let mut lanes = vec![straight(0), straight(1), straight(2), straight(3)];
+        let mut lanes: Vec<Lane> = (0..4)
+            .map(|id| {
+                let line = (0..40).map(|x| [f64::from(x), 0.0, 0.0]).collect();
+                Lane::new(LaneId(id), line, 3.5, 10.0)
+            })
+            .collect();
         lanes[0].successors = vec![LaneId(1), LaneId(2)];
         lanes[1].successors = vec![LaneId(0)];
         lanes[2].successors = vec![LaneId(3)];

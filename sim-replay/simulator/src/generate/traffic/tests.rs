@@ -109,11 +109,13 @@ fn vehicles_keep_a_gap_and_stop_behind_standing_ones() {
 
 /// Two lanes of one length that lead the same way, the second to the left of the first.
 fn two_lanes(length_m: i32) -> LaneGraph {
-    let line = |y: f64| (0..=length_m).map(|x| [f64::from(x), y, 0.0]).collect();
-    let lane = |id: u32| Lane::new(LaneId(id), line(3.5 * f64::from(id)), 3.5, 14.0);
-    let mut lanes = vec![lane(0), lane(1)];
+    let mut lanes = [0, 1].map(|id: u32| {
+        let y = 3.5 * f64::from(id);
+        let line = (0..=length_m).map(|x| [f64::from(x), y, 0.0]).collect();
+        Lane::new(LaneId(id), line, 3.5, 14.0)
+    });
     (lanes[0].left, lanes[1].right) = (Some(LaneId(1)), Some(LaneId(0)));
-    LaneGraph::new(lanes)
+    LaneGraph::new(lanes.into())
 }
 
 fn add_slow(traffic: &mut Traffic<'_>, lane: u32, s_m: f64, pace: f64) {
@@ -184,14 +186,9 @@ fn no_lane_change_causes_a_collision() {
                 .all(|car| car.motion.end.position_m.y > -0.3)
         );
     }
-    let ahead = |index: usize| traffic.cars[index].motion.end.position_m.x;
-    assert!(
-        ahead(0) < ahead(1) && ahead(0) < ahead(2),
-        "{} {} {}",
-        ahead(0),
-        ahead(1),
-        ahead(2)
-    );
+    let [focus, right, left] =
+        [0, 1, 2].map(|car: usize| traffic.cars[car].motion.end.position_m.x);
+    assert!(focus < right && focus < left, "{focus} {right} {left}");
 }
 
 #[test]
@@ -211,12 +208,12 @@ fn an_exploring_focus_drives_several_lanes_of_a_road() {
             traffic.step();
             driven[traffic.cars[0].path.lane().0 as usize] = true;
         }
-        let is_driven = |lane: &Option<LaneId>| lane.is_some_and(|lane| driven[lane.0 as usize]);
         both += map_model
             .lanes
             .lanes
             .iter()
-            .filter(|lane| driven[lane.id.0 as usize] && is_driven(&lane.left))
+            .filter(|lane| driven[lane.id.0 as usize])
+            .filter(|lane| lane.left.is_some_and(|left| driven[left.0 as usize]))
             .count();
     }
     assert!(both >= 4, "{both} lanes were driven beside another one");
@@ -226,7 +223,7 @@ fn an_exploring_focus_drives_several_lanes_of_a_road() {
 fn the_same_seed_drives_the_same_way() {
     let map_model = build(&RoadMapSource::Town1, 0).unwrap();
     let roads = Roads::new(&map_model.lanes);
-    let end = |seed| {
+    let [once, again, other] = [4, 4, 5].map(|seed| {
         let mut traffic = Traffic::new(&roads, &[], options(30.0), roads.spawns[10], seed);
         (0..400).for_each(|_| traffic.step());
         traffic
@@ -234,9 +231,9 @@ fn the_same_seed_drives_the_same_way() {
             .iter()
             .map(|car| (car.id, car.motion))
             .collect::<Vec<_>>()
-    };
-    assert_eq!(end(4), end(4));
-    assert_ne!(end(4), end(5));
+    });
+    assert_eq!(once, again);
+    assert_ne!(once, other);
 }
 
 #[test]
@@ -276,12 +273,12 @@ fn one_road(attributes: &str, geometry: &str, lateral: &str, lanes: &str) -> Lan
 
 #[test]
 fn vehicles_drive_on_the_side_that_the_map_gives() {
-    let lane = |id: i32| {
+    let [left, right] = [1, -1].map(|id| {
         format!(
             r#"<lane id="{id}" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>"#
         )
-    };
-    let lanes = format!("<left>{}</left><right>{}</right>", lane(1), lane(-1));
+    });
+    let lanes = format!("<left>{left}</left><right>{right}</right>");
     let line = r#"<geometry s="0" x="0" y="0" hdg="0" length="400"><line/></geometry>"#;
     for (rule, eastwards_y_m) in [("LHT", 1.75), ("RHT", -1.75)] {
         let graph = one_road(&format!(r#"length="400" rule="{rule}""#), line, "", &lanes);
@@ -325,13 +322,13 @@ fn vehicles_lean_with_a_banked_road_and_pass_side_by_side() {
         r#"{link}<lateralProfile><superelevation s="0" a="{}" b="0" c="0" d="0"/></lateralProfile>"#,
         -bank_rad
     );
-    let lane = |id: i32| {
+    let [inner, outer] = [-1, -2].map(|id| {
         format!(
             r#"<lane id="{id}" type="driving"><link><predecessor id="{id}"/><successor id="{id}"/></link>
             <width sOffset="0" a="3.4" b="0" c="0" d="0"/></lane>"#
         )
-    };
-    let lanes = format!("<right>{}{}</right>", lane(-1), lane(-2));
+    });
+    let lanes = format!("<right>{inner}{outer}</right>");
     let graph = one_road(
         &format!(r#"length="{length_m}""#),
         &geometry,

@@ -10,25 +10,19 @@ fn a_pole_on_the_lane_is_found_and_a_sign_above_it_is_not() {
     let shape = Shape::Box {
         half_m: [0.3, 0.3, 0.5],
     };
-    let solid = |y: f64, z: f64| Solid {
+    let solids = [[0.0, 5.6], [1.5, 1.0], [2.5, 1.0], [0.0, -0.6]].map(|[y, z]| Solid {
         kind: SolidKind::Sign,
         shape,
         center_m: [10.0, y, z],
         yaw_rad: 0.3,
         reflectivity: 0.5,
-    };
-    let solids = vec![
-        solid(0.0, 5.6),
-        solid(1.5, 1.0),
-        solid(2.5, 1.0),
-        solid(0.0, -0.6),
-    ];
+    });
     let ground = Ground::plane(0.0);
     let map_model = MapModel {
         name: "line".into(),
         lanes,
         ground,
-        solids,
+        solids: solids.into(),
         parking: vec![],
         findings: vec![],
     };
@@ -76,40 +70,28 @@ fn parking_spots_are_free() {
     }
 }
 
+fn count(map_model: &MapModel, kind: SolidKind) -> usize {
+    let solids = map_model.solids.iter();
+    solids.filter(|solid| solid.kind == kind).count()
+}
+
 #[test]
 fn streets_are_lined_with_buildings_trees_and_parking() {
     let map_model = build(&RoadMapSource::Town1, 4).unwrap();
-    let count = |kind| {
-        map_model
-            .solids
-            .iter()
-            .filter(|solid| solid.kind == kind)
-            .count()
-    };
-    assert!(
-        count(SolidKind::Building) > 500,
-        "{}",
-        count(SolidKind::Building)
-    );
-    assert!(
-        count(SolidKind::TreeTrunk) > 200,
-        "{}",
-        count(SolidKind::TreeTrunk)
-    );
-    assert!(count(SolidKind::Pole) > 100, "{}", count(SolidKind::Pole));
+    for (kind, most) in [
+        (SolidKind::Building, 500),
+        (SolidKind::TreeTrunk, 200),
+        (SolidKind::Pole, 100),
+    ] {
+        let found = count(&map_model, kind);
+        assert!(found > most, "{kind:?}: {found}");
+    }
     assert!(map_model.parking.len() > 200, "{}", map_model.parking.len());
 }
 
 #[test]
 fn motorways_have_barriers_walls_pillars_and_a_tunnel() {
     let map_model = build(&RoadMapSource::Town4, 4).unwrap();
-    let count = |kind| {
-        map_model
-            .solids
-            .iter()
-            .filter(|solid| solid.kind == kind)
-            .count()
-    };
     for (kind, least) in [
         (SolidKind::Barrier, 1000),
         (SolidKind::NoiseWall, 100),
@@ -117,6 +99,7 @@ fn motorways_have_barriers_walls_pillars_and_a_tunnel() {
         (SolidKind::TunnelWall, 20),
         (SolidKind::BridgeDeck, 20),
     ] {
-        assert!(count(kind) >= least, "{kind:?}: {}", count(kind));
+        let found = count(&map_model, kind);
+        assert!(found >= least, "{kind:?}: {found}");
     }
 }

@@ -308,6 +308,15 @@ mod tests {
     use crate::maps::MapMetadata;
     use crate::test_data::{redraw, uniform};
 
+    /// Cells at which two maps `[1, C, H, W]` differ.
+    fn different_cells(a: &Tensor, b: &Tensor) -> Tensor {
+        (a - b).abs().amax([1], false).gt(1e-5)
+    }
+
+    fn count(cells: &Tensor) -> i64 {
+        cells.sum(Kind::Int64).int64_value(&[])
+    }
+
     #[test]
     fn a_convolution_at_some_cells_is_that_of_all_of_them() {
         let variables = VarStore::new(Device::Cpu);
@@ -324,7 +333,6 @@ mod tests {
             .transpose(0, 1);
         let likely = uniform(5, &[1, 1, 4, 6]);
         let selection = BlendedCells::most_likely(&likely, 2, 0.5, 0.0).unwrap();
-        let of = |places: &[i64]| Tensor::from_slice(places);
         let near: Vec<i64> = selection
             .near
             .iter()
@@ -334,19 +342,11 @@ mod tests {
             .flatten(2, 3)
             .squeeze_dim(0)
             .transpose(0, 1)
-            .index_select(0, &of(&near));
-        let some = beside(
-            &convolution,
-            &shown,
-            &Around::of(&of(&selection.around).view([-1, AROUND])).unwrap(),
-        )
-        .unwrap();
-        assert!(some.allclose(
-            &all.index_select(0, &of(&selection.cells)),
-            1e-5,
-            1e-5,
-            false
-        ));
+            .index_select(0, &Tensor::from_slice(&near));
+        let around = Tensor::from_slice(&selection.around).view([-1, AROUND]);
+        let some = beside(&convolution, &shown, &Around::of(&around).unwrap()).unwrap();
+        let expected = all.index_select(0, &Tensor::from_slice(&selection.cells));
+        assert!(some.allclose(&expected, 1e-5, 1e-5, false));
     }
 
     /// The blend equals that of all cells where a vehicle is likely; elsewhere the newest map is unchanged.
@@ -369,40 +369,36 @@ mod tests {
             },
         );
         redraw(&variables, &["now", "past", "token", "step", "gate"], 0.3);
-        let maps: Vec<FullResolutionMap> = (0..3)
+        let whole: Vec<FullResolutionMap> = (0..3)
             .map(|seed| FullResolutionMap::of(&uniform(seed, &[1, 4, 16, 32]), None).unwrap())
             .collect();
         let poses = [0.0, 2.0, -1.0].map(|x_m| Pose::from_xyz_yaw([x_m, 0.3, 0.0], 0.1 * x_m));
-        let maps = || {
-            [0, 1, 1]
-                .into_iter()
-                .zip(poses)
-                .zip(&maps)
-                .map(|((step, pose), map)| (step, pose, map))
-                .collect()
-        };
+        let maps: Vec<(usize, Pose, &FullResolutionMap)> = [0, 1, 1]
+            .into_iter()
+            .zip(poses)
+            .zip(&whole)
+            .map(|((step, pose), map)| (step, pose, map))
+            .collect();
         let (now, likely) = (uniform(7, &[1, 4, 16, 32]), uniform(8, &[1, 1, 16, 32]));
         let own = now.get(0) * 0.9;
         let ego = uniform(9, &[1, 8, 16, 6]);
         let blended = |memory: &TemporalMemory| {
-            let maps: Vec<_> = maps();
             no_grad(|| memory.forward([&now, &own], &maps, &grid, &ego, &likely)).unwrap()
         };
         let few = blended(&memory);
         memory.share = 1.0;
         let everywhere = blended(&memory);
-        let differs = |a: &Tensor, b: &Tensor| (a - b).abs().amax([1], false).gt(1e-5);
-        let (changed, apart) = (differs(&few, &now), differs(&few, &everywhere));
-        let count = |cells: &Tensor| cells.sum(Kind::Int64).int64_value(&[]);
-        assert_eq!(count(&differs(&everywhere, &now)), 16 * 32);
+        let [changed, apart] = [&now, &everywhere].map(|other| different_cells(&few, other));
+        assert_eq!(count(&different_cells(&everywhere, &now)), 16 * 32);
         assert_eq!(count(&changed), 16 * 32 / 4);
         assert_eq!(count(&changed.logical_and(&apart)), 0);
     }
 
     #[test]
     fn a_correction_near_that_of_the_agents_newest_is_the_same() {
-        let of = |agent| MapMetadata::fresh(agent, Pose::IDENTITY);
-        let origins = Origins::of(&[of(0), of(7), of(0), of(7), of(7), of(3)]);
+        let newest_and_earlier =
+            [0, 7, 0, 7, 7, 3].map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY));
+        let origins = Origins::of(&newest_and_earlier);
         let corrections = [
             0.5, 0.4, 0.01, 0.3, -0.3, 0.02, 0.9, 0.1, 0.0, 1.5, 0.4, 0.03, 0.1, 0.0, 0.0,
         ];
