@@ -12,6 +12,7 @@ use super::interruption::Interruption;
 use super::run_config::{Length, RunConfig};
 use super::trainer::Trained;
 use crate::compute_device::{ComputeDevice, NoCuda};
+use crate::compute_precision::ComputePrecision;
 
 /// Options that are invalid for any training.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

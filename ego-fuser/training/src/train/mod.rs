@@ -13,8 +13,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use perception::int8::SCALES_KEY;
 use perception::compute_precision::ComputePrecision;
+use perception::int8::SCALES_KEY;
 use perception::train::{Prefetch, SaveEvery, Task, Trainer};
 use perception::weights::Weights;
 use rand::SeedableRng;
