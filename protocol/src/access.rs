@@ -39,7 +39,7 @@ pub struct Principal {
 pub enum PrincipalError {
     /// The text begins with no role.
     #[error(
-        "{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder, viewer or ros2"
+        "{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder, viewer, ros2 or ros2-<cav>"
     )]
     Role(String),
     /// The role is not followed by a vehicle.
@@ -69,6 +69,11 @@ impl Principal {
     /// Never: both parts are identifiers, and short enough.
     pub fn name(&self) -> ProcessId {
         ProcessId::new(&self.to_string()).expect("two identifiers and a hyphen make one")
+    }
+
+    /// False for the only process of a role in a run.
+    fn is_of_vehicle(&self) -> bool {
+        self.cav.as_str() != self.role.as_str()
     }
 
     /// All permissions in `runs`.
@@ -108,7 +113,12 @@ impl Principal {
             Role::Ros2 => {
                 use Stream::{Detections, Gnss, Imu, Lidar, Pose, Tracks};
                 let streams = [Lidar, Imu, Pose, Detections, Tracks];
-                publish.extend(streams_of(runs, &["*"], [Lidar, Imu, Gnss]));
+                let robot = if self.is_of_vehicle() {
+                    self.cav.as_str()
+                } else {
+                    "*"
+                };
+                publish.extend(streams_of(runs, &[robot], [Lidar, Imu, Gnss]));
                 subscribe.extend(streams_of(runs, &["*"], streams));
                 subscribe.extend(keys_of(runs, ["stats/*"]));
             }
@@ -166,6 +176,7 @@ impl Principal {
     pub(crate) fn publishes(&self, topic: &Topic) -> bool {
         match topic {
             Topic::Stream { cav, stream } => match (self.role, stream.row().sender) {
+                (Role::Ros2, Role::Replay) if self.is_of_vehicle() => *cav == self.cav,
                 (Role::Replay | Role::Ros2, sender) => sender == Role::Replay,
                 (role, sender) => role == sender && *cav == self.cav,
             },
@@ -236,10 +247,10 @@ pub(crate) fn size_limits_of<S: StreamTable>() -> impl Iterator<Item = (Vec<KeyE
 
 impl fmt::Display for Principal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.cav.as_str() == self.role.as_str() {
-            return f.write_str(self.role.as_str());
+        if self.is_of_vehicle() {
+            return write!(f, "{}-{}", self.role, self.cav);
         }
-        write!(f, "{}-{}", self.role, self.cav)
+        f.write_str(self.role.as_str())
     }
 }
 
@@ -330,6 +341,7 @@ mod tests {
             "recorder",
             "viewer",
             "ros2",
+            "ros2-4279",
         ] {
             let principal: Principal = text.parse().unwrap();
             assert_eq!(
@@ -351,7 +363,7 @@ mod tests {
 
     #[test]
     fn a_vehicle_publishes_only_under_its_own_name() {
-        for principal in ["agent-4279", "ego-4279"] {
+        for principal in ["agent-4279", "ego-4279", "ros2-4279"] {
             for keys in rights(principal, Operation::Publish) {
                 let own = [
                     "v2v/r1/4279/".to_owned(),

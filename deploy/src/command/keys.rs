@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::operate::keys::{KeyFileError, KeyPlan, make, principals_of};
-use protocol::CavId;
+use protocol::{CavId, Principal, Role};
 use serde_json::json;
 use support::output;
 
@@ -20,6 +20,9 @@ pub(crate) struct Arguments {
     /// Vehicles that fuse: each gets certificates for its ego-fuser and for the link in front of it.
     #[arg(long, value_name = "CAV,..", value_delimiter = ',')]
     egos: Vec<CavId>,
+    /// Robots with a `v2vloc ros2 --robot` of their own: each gets a certificate for it.
+    #[arg(long, value_name = "CAV,..", value_delimiter = ',')]
+    robots: Vec<CavId>,
     /// Names or addresses of the router, in addition to localhost.
     #[arg(long, value_name = "HOST,..", value_delimiter = ',')]
     hosts: Vec<String>,
@@ -41,6 +44,8 @@ impl Arguments {
         // Vehicles that are added later join a fleet whose other processes have certificates already.
         others.retain(|other| self.force || !self.out.join(other.to_string()).exists());
         principals.extend(others);
+        let robots = self.robots.iter();
+        principals.extend(robots.map(|robot| Principal::new(Role::Ros2, robot)));
         let mut plan = KeyPlan::new(&self.out, principals, self.days);
         plan.hosts.extend(self.hosts);
         plan.replace = self.force;

@@ -11,8 +11,8 @@ mod watched_run;
 use std::path::Path;
 
 use anyhow::Context;
-use bus::{BusOptions, Endpoint, Identity, malloc_settings, process_id};
-use protocol::{CavId, Role, RunId};
+use bus::{BusOptions, Endpoint, Identity, malloc_settings};
+use protocol::{Principal, Role, RunId};
 use support::cli::Outcome;
 use support::sibling_program::Sibling;
 
@@ -103,9 +103,17 @@ fn client(
     router: &Endpoint,
     keys: Option<&Path>,
 ) -> anyhow::Result<(Identity, BusOptions)> {
-    // A process without a vehicle has its role in place of the id.
-    let cav = CavId::new(role.as_str())?;
-    let identity = Identity::new(run.clone(), process_id(role, &cav), cav);
+    client_of(run, &Principal::of_role(role), router, keys)
+}
+
+/// The same for any process.
+fn client_of(
+    run: &RunId,
+    process: &Principal,
+    router: &Endpoint,
+    keys: Option<&Path>,
+) -> anyhow::Result<(Identity, BusOptions)> {
+    let identity = Identity::new(run.clone(), process.name(), process.cav.clone());
     let mut options = BusOptions::client(router.clone());
     if let Some(folder) = keys {
         options = options.with_credentials(credentials(folder, identity.process.as_str())?);

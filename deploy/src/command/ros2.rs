@@ -7,12 +7,12 @@ use anyhow::{Context, bail, ensure};
 use bus::shutdown::Stop;
 use bus::{Bus, BusOptions, Endpoint, STOP_LIMIT, open_unless};
 use dataset::IntensityScale;
-use protocol::{CavId, Role, RunId};
+use protocol::{CavId, Principal, Role, RunId};
 use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};
 use support::output;
 
-use super::client;
+use super::client_of;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -22,7 +22,11 @@ pub(crate) struct Arguments {
     /// Name of the run.
     #[arg(long)]
     run: RunId,
-    /// Folder with the node's keys, where the run has security (`v2vloc keys` writes DIR/ros2).
+    /// Robot of this node, in a run with a node per robot: the process is named ros2-AGENT, and passes sensors on to this
+    /// agent only.
+    #[arg(long, value_name = "AGENT", allow_hyphen_values = true)]
+    robot: Option<CavId>,
+    /// Folder with the node's keys, where the run has security (`v2vloc keys` writes DIR/ros2, or DIR/ros2-AGENT).
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
     /// Print a JSON summary.
@@ -122,7 +126,11 @@ impl Arguments {
         // A network that does not answer must not keep the process after Ctrl-C.
         stop.enforce(STOP_LIMIT);
         let keys = self.keys.as_deref();
-        let (identity, options) = client(&self.run, Role::Ros2, &self.connect, keys)?;
+        let process = self.robot.as_ref().map_or_else(
+            || Principal::of_role(Role::Ros2),
+            |robot| Principal::new(Role::Ros2, robot),
+        );
+        let (identity, options) = client_of(&self.run, &process, &self.connect, keys)?;
         let bus = Bus::join_unless(&stop, &options, identity)?;
         let router = self.network.ros_router.as_ref().unwrap_or(&self.connect);
         let network = BusOptions::client(router.clone());
@@ -151,7 +159,7 @@ impl Arguments {
     }
 
     fn check(&self) -> anyhow::Result<()> {
-        self.sensors.check()?;
+        self.sensors.check(self.robot.as_ref())?;
         let published = self.content.initialpose.as_ref();
         let mut starting_poses = self.sensors.starting_pose.iter();
         if let Some(AgentTopic { topic, cav }) =
@@ -189,8 +197,15 @@ impl Arguments {
 }
 
 impl Sensors {
-    /// Rejects two sensors of one kind for one vehicle, and motions of vehicles without a LiDAR.
-    fn check(&self) -> anyhow::Result<()> {
+    /// Rejects two sensors of one kind for one vehicle, motions of vehicles without a LiDAR, and LiDARs of others than the
+    /// node's `robot`.
+    fn check(&self, robot: Option<&CavId>) -> anyhow::Result<()> {
+        if let Some(robot) = robot
+            && let Some(AgentTopic { topic, cav }) = self.lidar.iter().find(|of| of.cav != *robot)
+        {
+            let message = format!("--lidar {topic}={cav}: --robot is {robot}");
+            bail!(BadInput::new(message));
+        }
         let speeds: Vec<AgentTopic> = self.odometry.iter().chain(&self.twist).cloned().collect();
         for (option, what, sources) in [
             ("--lidar", "LiDAR", &self.lidar),

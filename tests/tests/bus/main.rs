@@ -7,4 +7,5 @@ mod replay;
 mod ros2;
 mod ros2_frames;
 mod ros2_robot;
+mod ros2_robots;
 mod sessions;
