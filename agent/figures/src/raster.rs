@@ -1,12 +1,12 @@
 //! RGB image in memory: drawn on by plotters, written as a PNG.
 
-use std::fs::File;
-use std::io::{self, BufWriter};
+use std::io;
 use std::path::Path;
 
 use plotters::coord::Shift;
 use plotters::drawing::{DrawingArea, IntoDrawingArea};
 use plotters::prelude::BitMapBackend;
+use support::atomic_file;
 
 use super::{FigureError, load_font};
 use crate::Result;
@@ -42,9 +42,11 @@ pub fn render(size: (u32, u32), draw: impl FnOnce(&Image<'_>) -> Result<()>) -> 
 }
 
 fn write_png(path: &Path, (width, height): (u32, u32), rgb: &[u8]) -> io::Result<()> {
-    let mut encoder = png::Encoder::new(BufWriter::new(File::create(path)?), width, height);
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
     encoder.set_color(png::ColorType::Rgb);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(rgb)?;
-    Ok(writer.finish()?)
+    writer.finish()?;
+    atomic_file::write(path, bytes)
 }

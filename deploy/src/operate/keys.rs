@@ -232,8 +232,7 @@ fn unusable(what: String) -> impl Fn(rcgen::Error) -> KeyFileError {
 }
 
 fn make_folder(path: &Path) -> Result<(), FileError> {
-    let mut builder = fs::DirBuilder::new();
-    builder.recursive(true).mode(0o700).create(path).at(path)
+    atomic_file::create_folder_by(fs::DirBuilder::new().mode(0o700), path).at(path)
 }
 
 fn read(path: &Path) -> Result<String, FileError> {

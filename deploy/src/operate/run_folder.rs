@@ -51,7 +51,7 @@ impl RunFolder {
     pub fn create(runs: &Path, name: &RunId) -> Result<Self, RunFolderError> {
         let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
         let path = runs.join(name.as_str());
-        written(fs::create_dir_all(&runs), &runs)?;
+        written(atomic_file::create_folder(&runs), &runs)?;
         // One call that fails if the folder exists, so that two runs never share a folder.
         match fs::create_dir(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {

@@ -119,13 +119,13 @@ impl FeatureStore {
             .at(&path)?;
         // Of two trainings that start together one encodes, the other waits for it.
         file.lock().at(&path)?;
-        let starts = starts(&file).at(&path)?;
-        // A truncated message is encoded again.
-        file.set_len(starts[starts.len() - 1]).at(&path)?;
         let mut first = vec![0];
         for scenario in scenarios {
             first.push(first[first.len() - 1] + scenario.agents.len() * scenario.ticks.len());
         }
+        let starts = starts(&file, first[first.len() - 1]).at(&path)?;
+        // A truncated message is encoded again.
+        file.set_len(starts[starts.len() - 1]).at(&path)?;
         let encoder = SweepEncoder {
             encoder: ThreadEncoder::new(Arc::clone(weights)),
             scenarios: scenarios.into(),
@@ -215,13 +215,13 @@ impl FeatureStore {
 /// Bytes of the length before each message.
 const LENGTH_BYTES: u64 = 4;
 
-/// Offset of each complete message of a file, and the end of the last one.
-fn starts(file: &File) -> io::Result<Vec<u64>> {
+/// Offset of each complete message of a file, at most `all`, and the end of the last one.
+fn starts(file: &File, all: usize) -> io::Result<Vec<u64>> {
     let end = file.metadata()?.len();
     let mut starts = vec![0];
     let mut next = 0;
     // The last record is incomplete where a process ended while it wrote.
-    while next + LENGTH_BYTES <= end {
+    while starts.len() <= all && next + LENGTH_BYTES <= end {
         let mut length = [0; LENGTH_BYTES as usize];
         file.read_exact_at(&mut length, next)?;
         next += LENGTH_BYTES + u64::from(u32::from_le_bytes(length));
@@ -229,7 +229,21 @@ fn starts(file: &File) -> io::Result<Vec<u64>> {
             starts.push(next);
         }
     }
+    // A power cut may leave zeros from some place on: in the last message that is not empty, then as empty messages.
+    while let &[.., start, end] = starts.as_slice()
+        && !is_whole(file, start, end)?
+    {
+        starts.pop();
+    }
     Ok(starts)
+}
+
+/// True if the record between two offsets holds a message that can be read.
+fn is_whole(file: &File, start: u64, end: u64) -> io::Result<bool> {
+    let mut bytes = vec![0; (end - start - LENGTH_BYTES) as usize];
+    file.read_exact_at(&mut bytes, start + LENGTH_BYTES)?;
+    let decoded: Result<(Header, Bev), _> = wire::decode([bytes.as_slice()], &Limits::default());
+    Ok(decoded.is_ok())
 }
 
 /// Maps from a store, and from the encoder for sweeps that it does not hold.

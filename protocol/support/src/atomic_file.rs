@@ -1,6 +1,6 @@
 //! Atomic file writes: a file appears complete or not at all, and stays after a power cut.
 
-use std::fs::{File, Permissions};
+use std::fs::{DirBuilder, File, Permissions};
 use std::io::{self, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -89,6 +89,28 @@ pub fn sync(path: &Path) -> io::Result<()> {
     }
     file.sync_all()?;
     sync_name(path)
+}
+
+/// Creates a folder and those above it; returns when the names of the new ones are on the disk. Without that a file that
+/// is synced in a new folder may be lost with the folder.
+///
+/// # Errors
+/// The error of the system.
+pub fn create_folder(path: &Path) -> io::Result<()> {
+    create_folder_by(&mut DirBuilder::new(), path)
+}
+
+/// [`create_folder()`] with the permissions of a builder.
+///
+/// # Errors
+/// The error of the system.
+pub fn create_folder_by(builder: &mut DirBuilder, path: &Path) -> io::Result<()> {
+    let new: Vec<&Path> = path
+        .ancestors()
+        .take_while(|folder| !folder.as_os_str().is_empty() && !folder.exists())
+        .collect();
+    builder.recursive(true).create(path)?;
+    new.into_iter().rev().try_for_each(sync_name)
 }
 
 /// Returns when the name of `path` is on the disk.
@@ -286,6 +308,19 @@ mod tests {
         sync(&folder.path().join("a")).unwrap();
         sync(folder.path()).unwrap();
         assert!(sync(&folder.path().join("b")).is_err());
+    }
+
+    #[test]
+    fn a_folder_is_created_with_those_above_it() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("a/b/c");
+        for _ in 0..2 {
+            create_folder(&folder).unwrap();
+            assert!(folder.is_dir());
+        }
+        let file = root.path().join("file");
+        fs::write(&file, "").unwrap();
+        assert!(create_folder(&file.join("d")).is_err());
     }
 
     #[test]

@@ -17,7 +17,7 @@ use perception::compute_precision::ComputePrecision;
 use perception::train::{Interruption, Length, ModelCard, RunConfig, check_out};
 use support::cli::{BadInput, Outcome};
 use support::file_error::AtFile;
-use support::output;
+use support::{atomic_file, output};
 
 use super::train::options::check_folders;
 
@@ -95,7 +95,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if args.surfels_only {
         check_folders(&args.drives)?;
         check_out(&args.out, false, args.force).map_err(BadInput::of)?;
-        std::fs::create_dir_all(&args.out).at(&args.out)?;
+        atomic_file::create_folder(&args.out).at(&args.out)?;
         return Ok(args.write_surfels()?.print());
     }
     // This may execute the program again: before anything is read or written.
@@ -258,7 +258,7 @@ fn write(config: &MapConfig, report: &PlaceReport) -> anyhow::Result<()> {
     card.write(&config.run.out)?;
     let path = config.run.out.join(REPORT_FILE);
     let json = serde_json::to_string_pretty(report)? + "\n";
-    support::atomic_file::write(&path, json.as_bytes()).with_context(|| path.display().to_string())
+    atomic_file::write(&path, json.as_bytes()).with_context(|| path.display().to_string())
 }
 
 #[cfg(test)]

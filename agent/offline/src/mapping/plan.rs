@@ -109,8 +109,8 @@ impl StoredPlan {
     pub(super) fn write(&self, out: &Path) -> Result<(), Error> {
         let path = out.join(Self::FILE);
         let text = serde_json::to_string(self).expect("a plan is numbers");
-        let written =
-            fs::create_dir_all(out).and_then(|()| atomic_file::write(&path, text.as_bytes()));
+        let written = atomic_file::create_folder(out)
+            .and_then(|()| atomic_file::write(&path, text.as_bytes()));
         Ok(written.at(&path)?)
     }
 

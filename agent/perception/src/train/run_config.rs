@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use support::atomic_file;
 use support::file_error::{AtFile, FileError};
 use tch::Device;
 
@@ -71,7 +72,7 @@ impl RunConfig {
     /// [`FileError`] when the folder cannot be created, or the checkpoint not removed.
     pub fn start(&self) -> Result<(), FileError> {
         tch::manual_seed(self.seed as i64);
-        std::fs::create_dir_all(&self.out).at(&self.out)?;
+        atomic_file::create_folder(&self.out).at(&self.out)?;
         if self.resume {
             return Ok(());
         }

@@ -35,8 +35,9 @@ impl FrameFiles {
     /// An error when there are such files already, or they cannot be written.
     pub(crate) fn create(out: &Path, method: Method) -> Result<Self> {
         let folder = out.join(file_name(method));
-        let lines = fs::create_dir_all(out)
+        let lines = atomic_file::create_folder(out)
             .and_then(|()| fs::create_dir(&folder))
+            .and_then(|()| atomic_file::sync_name(&folder))
             .and_then(|()| FrameLines::create(&folder))
             .map_err(|error| match error.kind() {
                 // One that exists is the user's choice, any other is not.

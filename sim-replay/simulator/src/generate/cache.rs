@@ -130,9 +130,8 @@ pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -
         ..options.clone()
     };
     let summary = generate(&aside, progress)?;
-    // A folder with its final name has all its files, also after a power cut.
-    atomic_file::sync(&unfinished)
-        .and_then(|()| fs::rename(&unfinished, &options.out))
+    // Its files are on the disk by now: a folder with its final name has them all, also after a power cut.
+    fs::rename(&unfinished, &options.out)
         .and_then(|()| atomic_file::sync_name(&options.out))
         .at(&options.out)
         .map_err(SynthError::Write)?;

@@ -13,7 +13,7 @@ use super::layout::{
     AgentFrame, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, SweepVariant,
     locked,
 };
-use super::scenes::begin_folder;
+use super::scenes::{begin_folder, end_folder};
 use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
 
 /// Candidate lengths of a tick, nanoseconds: the step of a simulator, and resolutions of sensor clocks.
@@ -74,7 +74,7 @@ pub fn convert(
         converted.agent_frames += frames;
     }
     writer.finish()?;
-    unfinished.clear()?;
+    end_folder(&options.out, unfinished)?;
     converted.omitted = omitted.into_counts();
     converted.left_out = std::mem::take(&mut *locked(&left_out));
     Ok(converted)

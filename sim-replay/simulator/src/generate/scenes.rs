@@ -21,6 +21,8 @@ use super::sensing::{Bench, STEP_NANOS, SensingAgent, SynthScene, capture_nanos}
 use super::world::World;
 use crate::generate::Result;
 use crate::map::{self, Finding, MapModel, RoadMapSource};
+use dataset::UNFINISHED;
+use support::atomic_file;
 use support::random::derive_seed;
 
 /// Summary of generation.
@@ -82,9 +84,8 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
             })?);
         }
     }
-    // The mark goes last: until then readers report the folder as unfinished.
     writer.finish()?;
-    unfinished.clear()?;
+    end_folder(&options.out, unfinished)?;
     total.omitted = omitted.into_counts();
     Ok(total)
 }
@@ -124,6 +125,15 @@ pub(super) fn begin_folder(out: &std::path::Path, force: bool) -> Result<Unfinis
         return Err(SynthError::NotEmpty(out.to_owned()));
     }
     Unfinished::mark(out)
+}
+
+/// Removes the mark of the output folder when all its files are on the disk: until then readers report it as unfinished,
+/// also after a power cut.
+pub(super) fn end_folder(out: &std::path::Path, unfinished: Unfinished) -> Result<()> {
+    let sync = |synced: std::io::Result<()>| synced.at(out).map_err(SynthError::Write);
+    sync(atomic_file::sync(out))?;
+    unfinished.clear()?;
+    sync(atomic_file::sync_name(&out.join(UNFINISHED)))
 }
 
 impl SynthScene<'_, '_> {

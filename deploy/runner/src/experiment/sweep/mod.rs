@@ -200,7 +200,7 @@ impl ExperimentSweep {
     /// Computes the runs of `part` that are not cached.
     fn compute_missing(&self, keys: &[CellKey], part: Range<usize>, jobs: usize) -> Result<()> {
         let cells = self.cells();
-        fs::create_dir_all(&cells).with_context(|| NotWritten(cells.clone()))?;
+        atomic_file::create_folder(&cells).with_context(|| NotWritten(cells.clone()))?;
         let known = self.known(keys)?;
         let missing = missing(&known, part);
         self.print_estimate(&known, &missing, jobs)?;

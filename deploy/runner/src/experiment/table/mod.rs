@@ -5,7 +5,6 @@
 
 mod text;
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -62,7 +61,7 @@ pub fn run(
     observer: &mut dyn TableObserver,
 ) -> Result<Vec<FilledTable>> {
     let cells = out.join("cells");
-    fs::create_dir_all(&cells).with_context(|| NotWritten(cells.clone()))?;
+    atomic_file::create_folder(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
     check_scenes(experiment, data.chosen(experiment.scenarios)).map_err(BadInput::of)?;
