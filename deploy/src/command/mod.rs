@@ -12,7 +12,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use bus::{BusOptions, Endpoint, Identity, malloc_settings};
-use protocol::{Principal, Role, RunId};
+use protocol::{Principal, RunId};
 use support::cli::Outcome;
 use support::sibling_program::Sibling;
 
@@ -95,19 +95,8 @@ impl Command {
     }
 }
 
-/// Identity in a run and options of a client of its router, for the only process of a role; `keys` where the run has
-/// security.
+/// Identity of a process in a run and options of a client of its router; `keys` where the run has security.
 fn client(
-    run: &RunId,
-    role: Role,
-    router: &Endpoint,
-    keys: Option<&Path>,
-) -> anyhow::Result<(Identity, BusOptions)> {
-    client_of(run, &Principal::of_role(role), router, keys)
-}
-
-/// The same for any process.
-fn client_of(
     run: &RunId,
     process: &Principal,
     router: &Endpoint,

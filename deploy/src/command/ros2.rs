@@ -12,7 +12,7 @@ use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};
 use support::output;
 
-use super::client_of;
+use super::client;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -130,7 +130,7 @@ impl Arguments {
             || Principal::of_role(Role::Ros2),
             |robot| Principal::new(Role::Ros2, robot),
         );
-        let (identity, options) = client_of(&self.run, &process, &self.connect, keys)?;
+        let (identity, options) = client(&self.run, &process, &self.connect, keys)?;
         let bus = Bus::join_unless(&stop, &options, identity)?;
         let router = self.network.ros_router.as_ref().unwrap_or(&self.connect);
         let network = BusOptions::client(router.clone());

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use bus::{Bus, Endpoint};
-use protocol::{Role, RunId};
+use protocol::{Principal, Role, RunId};
 use support::cli::BadInput;
 
 use super::client;
@@ -41,7 +41,8 @@ impl WatchedRun {
 
     /// Session of a viewer.
     pub(crate) fn bus(&self, name: &RunId, router: &Endpoint) -> anyhow::Result<Bus> {
-        let (identity, options) = client(name, Role::Viewer, router, self.keys.as_deref())?;
+        let viewer = Principal::of_role(Role::Viewer);
+        let (identity, options) = client(name, &viewer, router, self.keys.as_deref())?;
         Ok(Bus::join(&options, identity)?)
     }
 }
