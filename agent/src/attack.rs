@@ -165,7 +165,16 @@ impl Attack {
         match self.falsification {
             Falsification::ShiftedPose | Falsification::FalseVelocity => {}
             Falsification::Noise => {
-                make_noise(&mut falsified.features, &mut self.random);
+                // Normal noise with the mean and the standard deviation of each channel.
+                let cells = falsified.features.grid.cells().max(1);
+                for channel in falsified.features.values.chunks_mut(cells) {
+                    let mean =
+                        channel.iter().map(|value| f64::from(*value)).sum::<f64>() / cells as f64;
+                    let offsets = channel.iter().map(|value| f64::from(*value) - mean);
+                    let spread =
+                        (offsets.map(|offset| offset.powi(2)).sum::<f64>() / cells as f64).sqrt();
+                    channel.fill_with(|| (mean + spread * self.random.normal()) as f32);
+                }
                 falsified.confidence.fill_with(|| self.random.unit() as f32);
                 falsified.detections = (0..2 * INVENTED).map(|_| self.random_detection()).collect();
             }
@@ -269,17 +278,6 @@ fn points_of([x, y, heading]: [f64; 3], random: &mut SplitMix64, points: &mut Ve
         let x = x + cos * along - sin * across;
         let y = y + sin * along + cos * across;
         points.push([x, y, height, 0.4].map(|value| value as f32));
-    }
-}
-
-/// Normal noise with the mean and the standard deviation of each channel.
-fn make_noise(features: &mut BevFeatures, random: &mut SplitMix64) {
-    let cells = features.grid.cells().max(1);
-    for channel in features.values.chunks_mut(cells) {
-        let mean = channel.iter().map(|value| f64::from(*value)).sum::<f64>() / cells as f64;
-        let offsets = channel.iter().map(|value| f64::from(*value) - mean);
-        let spread = (offsets.map(|offset| offset.powi(2)).sum::<f64>() / cells as f64).sqrt();
-        channel.fill_with(|| (mean + spread * random.normal()) as f32);
     }
 }
 

@@ -53,7 +53,11 @@ impl<I: Serialize, P: Serialize> InputLog<I, P> {
     /// written, which is logged.
     pub fn create(file: &InputFile, kind: &str, detector: Option<&Detector>) -> Option<Self> {
         let (path, config) = file;
-        let path = unused(path);
+        // The path, or the first `NAME.N.log` beside it that does not exist.
+        let numbered = (2..).map(|number| path.with_extension(format!("{number}.log")));
+        let mut paths = std::iter::once(path.to_owned()).chain(numbered);
+        let free = paths.find(|path| !path.exists());
+        let path = free.unwrap_or_else(|| path.to_owned());
         let start = Record::Start(Start {
             config: config.clone(),
             model_hash: detector.map(Detector::model_hash),
@@ -81,14 +85,6 @@ impl<I: Serialize, P: Serialize> InputLog<I, P> {
             *writer = None;
         }
     }
-}
-
-/// The path, or the first `NAME.N.log` beside it that does not exist.
-fn unused(path: &Path) -> PathBuf {
-    let numbered = (2..).map(|number| path.with_extension(format!("{number}.log")));
-    let mut paths = std::iter::once(path.to_owned()).chain(numbered);
-    let free = paths.find(|path| !path.exists());
-    free.unwrap_or_else(|| path.to_owned())
 }
 
 /// Recorded inputs of a process: its records after the first, up to the damage if the file is damaged.

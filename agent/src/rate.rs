@@ -106,7 +106,12 @@ impl RateControl {
         let size = config
             .message_bytes
             .map(|bytes| (bytes, LimitedBy::MessageSize));
-        let on_air_nanos = self.nanos_since_last(capture_nanos);
+        // The transmission time that belongs to a map; also where the clock of the scene jumps.
+        let last = self.last_capture_nanos.replace(capture_nanos);
+        // A repeated or earlier capture time counts as a full period.
+        let since = last.and_then(|last| capture_nanos.checked_sub(last));
+        let since = since.filter(|nanos| *nanos > 0);
+        let on_air_nanos = since.unwrap_or(u64::MAX).min(LONGEST_TRANSMISSION_NANOS);
         let rate = config.bytes_per_second;
         let rate = rate.map(|rate| (bytes_within(rate, on_air_nanos), LimitedBy::ByteRate));
         let queue = match turn.filter(|_| config.watch_queue) {
@@ -120,15 +125,6 @@ impl RateControl {
         // The tightest limit decides, and is named in the message.
         let tightest = ([size, rate, queue].into_iter().flatten()).min_by_key(|(bytes, _)| *bytes);
         Ok(tightest.map(|(bytes, by)| ByteLimit { bytes, by }))
-    }
-
-    /// The transmission time that belongs to a map; also where the clock of the scene jumps.
-    fn nanos_since_last(&mut self, capture_nanos: u64) -> u64 {
-        let last = self.last_capture_nanos.replace(capture_nanos);
-        // A repeated or earlier capture time counts as a full period.
-        let since = last.and_then(|last| capture_nanos.checked_sub(last));
-        let since = since.filter(|nanos| *nanos > 0);
-        since.unwrap_or(u64::MAX).min(LONGEST_TRANSMISSION_NANOS)
     }
 }
 

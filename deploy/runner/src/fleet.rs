@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use agent::config::{AgentSettings, FleetPlace};
 use anyhow::{Context, Result, anyhow, bail, ensure};
-use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
+use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::ground_truth::GroundTruthRule;
 use dataset::{self, OpenOptions, Problem, Scenario as Recorded, findings};
 use deploy::operate::keys::{KeyFileError, principals_of};
@@ -56,21 +56,6 @@ pub struct Fleet {
     pub findings: Vec<Problem>,
 }
 
-/// Refuses options of a protocol that a live run takes from other fields.
-fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<()> {
-    for (option, is_given) in [
-        ("agent_kinds", protocol.agent_kinds.is_some()),
-        ("ego_kind", protocol.ego_kind.is_some()),
-        ("max_agents", protocol.max_agents.is_some()),
-    ] {
-        ensure!(
-            !is_given,
-            "protocol: {option}: choose by scene.agents and ego.id instead"
-        );
-    }
-    Ok(())
-}
-
 /// Loads what the processes of a scenario load, so that faulty weights and links are refused before any starts; returns
 /// the configuration of the detector.
 fn load_models(scenario: &Scenario) -> Result<DetectorConfig> {
@@ -89,21 +74,6 @@ fn load_models(scenario: &Scenario) -> Result<DetectorConfig> {
         LinkEmulator::open(&link.model, link.seed)?;
     }
     Ok(detector)
-}
-
-/// Refuses vehicles that the recorded scenario does not have.
-fn check_vehicles(scenario: &Scenario, recorded: &Recorded) -> Result<()> {
-    let (scene, remote) = (&scenario.scene, &scenario.remote_agents);
-    let in_scene = scene.agents.iter().map(|cav| ("scene.agents", cav));
-    let egos = scenario.ego.id.iter().map(|cav| ("ego.id", cav));
-    let own = scenario.vehicles.keys().map(|cav| ("vehicles", cav));
-    let remote = remote.iter().map(|cav| ("remote_agents", cav));
-    let mut named = in_scene.chain(egos).chain(own).chain(remote);
-    if let Some((field, cav)) = named.find(|(_, cav)| !recorded.agents.contains(cav)) {
-        let (name, found) = (&recorded.name, texts(&recorded.agents));
-        bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
-    }
-    Ok(())
 }
 
 /// Refuses pose sources that need measured poses, of vehicles of which the recorded scenario has none.
@@ -139,11 +109,31 @@ impl Fleet {
             ..OpenOptions::default()
         };
         let dataset = dataset::open_with(&scene.dir, &options).context("scene")?;
-        chosen_elsewhere(&scenario.protocol)?;
+        // Refuses options of a protocol that a live run takes from other fields.
+        for (option, is_given) in [
+            ("agent_kinds", scenario.protocol.agent_kinds.is_some()),
+            ("ego_kind", scenario.protocol.ego_kind.is_some()),
+            ("max_agents", scenario.protocol.max_agents.is_some()),
+        ] {
+            ensure!(
+                !is_given,
+                "protocol: {option}: choose by scene.agents and ego.id instead"
+            );
+        }
         let protocol = scenario.protocol.resolve(dataset.layout);
         let protocol = protocol.map_err(|error| anyhow!("protocol: {error}"))?;
         let recorded = scenario_of(&dataset.scenarios, scene)?;
-        check_vehicles(&scenario, recorded)?;
+        // Refuses vehicles that the recorded scenario does not have.
+        let in_scene = scene.agents.iter().map(|cav| ("scene.agents", cav));
+        let egos = scenario.ego.id.iter().map(|cav| ("ego.id", cav));
+        let own = scenario.vehicles.keys().map(|cav| ("vehicles", cav));
+        let remote = scenario.remote_agents.iter();
+        let remote = remote.map(|cav| ("remote_agents", cav));
+        let mut named = in_scene.chain(egos).chain(own).chain(remote);
+        if let Some((field, cav)) = named.find(|(_, cav)| !recorded.agents.contains(cav)) {
+            let (name, found) = (&recorded.name, texts(&recorded.agents));
+            bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
+        }
         // An empty list stands for all vehicles of the scenario.
         let mut agents = recorded.agents.clone();
         agents.retain(|cav| scene.agents.is_empty() || scene.agents.contains(cav));

@@ -208,7 +208,15 @@ impl RecordedRun {
             .entries
             .iter()
             .partition(|at| is_result(&self.entry(**at).key.topic));
-        let reports = self.reports_until(until).into_iter();
+        // Last report of every process until then.
+        let mut last = BTreeMap::new();
+        for &index in &self.stats {
+            let entry = self.entry(index);
+            if entry.arrived_nanos <= until {
+                last.insert(&entry.key.topic, index);
+            }
+        }
+        let reports = last.into_values();
         for number in reports.chain(others).chain(results) {
             let entry = self.entry(number);
             let payload = is_wanted(&entry.key.topic)
@@ -379,18 +387,6 @@ impl RecordedRun {
 
     fn entry(&self, index: usize) -> &Entry {
         &self.recording.entries()[index]
-    }
-
-    /// Last report of every process until `nanos`.
-    fn reports_until(&self, nanos: u64) -> Vec<usize> {
-        let mut last = BTreeMap::new();
-        for &index in &self.stats {
-            let entry = self.entry(index);
-            if entry.arrived_nanos <= nanos {
-                last.insert(&entry.key.topic, index);
-            }
-        }
-        last.into_values().collect()
     }
 
     fn summary(

@@ -131,7 +131,19 @@ impl MisbehaviourDetector {
             let is_new = last.is_none_or(|(nanos, ..)| *nanos != view.capture_nanos);
             evidence.push(is_new.then(|| self.evidence(own, &mine, view, ego_from_cav, seen)));
         }
-        flag_duplicates(&mut evidence, &all);
+        // Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
+        // neither has any in its favour.
+        let log_odds = evidence.iter().map(|one| one.as_ref()?.log_odds());
+        let fits: Vec<f64> = log_odds.map(|odds| odds.unwrap_or(0.0)).collect();
+        for (index, evidence) in evidence.iter_mut().enumerate() {
+            let Some(evidence) = evidence else { continue };
+            for other in
+                (0..all.len()).filter(|&other| other != index && fits[other] >= fits[index])
+            {
+                let likeness = alike(&all[index].fingerprint, &all[other].fingerprint);
+                evidence.like_another = evidence.like_another.max(likeness);
+            }
+        }
         // Of a neighbour's map and boxes the worse counts, once: true boxes are no excuse for a false map.
         let mut judgements: BTreeMap<&CavId, Option<(f64, MisbehaviourReason)>> = BTreeMap::new();
         for ((view, _), evidence) in neighbours.iter().zip(evidence) {
@@ -255,20 +267,6 @@ impl MisbehaviourDetector {
 /// Index of the last judged message of its kind.
 fn kind(view: &View) -> usize {
     usize::from(view.content.exchange() == Exchange::Boxes)
-}
-
-/// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
-/// neither has any in its favour.
-fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[SeenMessage]) {
-    let log_odds = evidence.iter().map(|one| one.as_ref()?.log_odds());
-    let fits: Vec<f64> = log_odds.map(|odds| odds.unwrap_or(0.0)).collect();
-    for (index, evidence) in evidence.iter_mut().enumerate() {
-        let Some(evidence) = evidence else { continue };
-        for other in (0..all.len()).filter(|&other| other != index && fits[other] >= fits[index]) {
-            let likeness = alike(&all[index].fingerprint, &all[other].fingerprint);
-            evidence.like_another = evidence.like_another.max(likeness);
-        }
-    }
 }
 
 /// Similarity of two messages with enough content to be a copy: two vehicles that detect a single box may well agree.

@@ -68,17 +68,13 @@ impl RejectionLog {
             if let Ok(sample) = answer.result()
                 && let Ok(text) = sample.payload().try_to_string()
             {
-                self.note(&text);
-            }
-        }
-    }
-
-    /// Adds the counts of zenoh's metrics.
-    fn note(&mut self, metrics: &str) {
-        for (connection, count) in metrics.lines().filter_map(rejected) {
-            if self.seen.len() < MAX_REJECTIONS || self.seen.contains_key(&connection) {
-                // A count of zenoh is the total of its connection so far: it replaces the one before.
-                self.seen.insert(connection, count);
+                // Adds the counts of zenoh's metrics.
+                for (connection, count) in text.lines().filter_map(rejected) {
+                    if self.seen.len() < MAX_REJECTIONS || self.seen.contains_key(&connection) {
+                        // A count of zenoh is the total of its connection so far: it replaces the one before.
+                        self.seen.insert(connection, count);
+                    }
+                }
             }
         }
     }

@@ -71,22 +71,18 @@ impl Listener {
                 self.silence()
             }
             Pop::Item(topic, message) => {
-                self.note(&topic);
+                self.last_message = Instant::now();
+                self.is_over |= topic == Topic::Control(Verb::End);
+                self.messages += u64::from(!matches!(topic, Topic::Control(_)));
+                // Processes that outlive the replay go on with their status.
+                if !matches!(topic, Topic::Stats(_)) {
+                    self.last_data = Instant::now();
+                }
                 Ok(ListenerStep::Message(message))
             }
             Pop::Closed => Ok(ListenerStep::End),
             Pop::TimedOut if has_ended => Ok(ListenerStep::End),
             Pop::TimedOut => self.silence(),
-        }
-    }
-
-    fn note(&mut self, topic: &Topic) {
-        self.last_message = Instant::now();
-        self.is_over |= *topic == Topic::Control(Verb::End);
-        self.messages += u64::from(!matches!(topic, Topic::Control(_)));
-        // Processes that outlive the replay go on with their status.
-        if !matches!(topic, Topic::Stats(_)) {
-            self.last_data = Instant::now();
         }
     }
 

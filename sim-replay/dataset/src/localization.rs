@@ -69,7 +69,14 @@ fn is_sequence(dir: &Path) -> bool {
 
 /// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
 fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
-    let (layout, storage, points) = variant(dir);
+    // Layout, storage and folder of the points. NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day
+    // and time and more.
+    let is_nclt = dir.join(RAW).is_dir() || files::own_name(dir).len() == "2012-01-22".len();
+    let (layout, storage, points) = match (is_nclt, files::holds(&dir.join(CONVERTED), ".bin")) {
+        (true, true) => (Layout::NCLT, SweepStorage::ByName, CONVERTED),
+        (true, false) => (Layout::NCLT, SweepStorage::NcltRaw, RAW),
+        (false, _) => (Layout::OXFORD, SweepStorage::Planar, CONVERTED),
+    };
     let points_dir = dir.join(points);
     let mut stamps = BTreeMap::new();
     for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
@@ -111,17 +118,6 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
         joins: join.into_iter().collect(),
         ..sequence::scenario(layout, clouds, storage, files, options)
     })
-}
-
-/// Layout, storage and folder of the points. NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and
-/// time and more.
-fn variant(dir: &Path) -> (Layout, SweepStorage, &'static str) {
-    let is_nclt = dir.join(RAW).is_dir() || files::own_name(dir).len() == "2012-01-22".len();
-    match (is_nclt, files::holds(&dir.join(CONVERTED), ".bin")) {
-        (true, true) => (Layout::NCLT, SweepStorage::ByName, CONVERTED),
-        (true, false) => (Layout::NCLT, SweepStorage::NcltRaw, RAW),
-        (false, _) => (Layout::OXFORD, SweepStorage::Planar, CONVERTED),
-    }
 }
 
 /// The poses of the best available file, relative to the mean of the training sequences if that is known, turned to z

@@ -210,7 +210,17 @@ impl FileScan<'_> {
             match taken {
                 Ok(ControlFlow::Continue(())) => {}
                 Ok(ControlFlow::Break(stated_crc)) => {
-                    self.check_whole(begin, stated_crc, records.crc());
+                    // Verifies the checksum of all data, for files without checksums of chunks.
+                    let found = records.crc();
+                    // 0 means that no checksum was computed. After a skipped part it differs in any case.
+                    if stated_crc != 0
+                        && stated_crc != found
+                        && self.lost.is_empty()
+                        && self.holders.iter().all(|holder| !holder.is_chunk)
+                    {
+                        let reason = "the checksum of the data does not agree with them";
+                        self.lose((begin, begin), reason.into());
+                    }
                     return Ok(());
                 }
                 Err(reason) if self.lost.len() >= MAX_DAMAGED => {
@@ -312,19 +322,6 @@ impl FileScan<'_> {
                 before: self.arrivals.len(),
                 reason,
             }),
-        }
-    }
-
-    /// Verifies the checksum of all data, for files without checksums of chunks.
-    fn check_whole(&mut self, end: u64, stated: u32, found: u32) {
-        // 0 means that no checksum was computed. After a skipped part it differs in any case.
-        if stated != 0
-            && stated != found
-            && self.lost.is_empty()
-            && self.holders.iter().all(|holder| !holder.is_chunk)
-        {
-            let reason = "the checksum of the data does not agree with them";
-            self.lose((end, end), reason.into());
         }
     }
 

@@ -87,7 +87,16 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     bar.finish_and_clear();
     match result {
         Ok(summary) => {
-            print_findings(&summary);
+            // Prints the parts that were not built as the map gives them to standard error.
+            for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
+                output::note(format_args!("map: {finding}"));
+            }
+            let further = summary.findings.len().saturating_sub(PRINTED_FINDINGS);
+            if further > 0 {
+                output::note(format_args!(
+                    "map: {further} further findings; all are in data_protocol.yaml of each scenario"
+                ));
+            }
             print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
@@ -125,19 +134,6 @@ fn options(args: Args) -> Result<SynthOptions, BadInput> {
         frames: args.frames.unwrap_or(defaults.frames),
         ..defaults
     })
-}
-
-/// Prints the parts that were not built as the map gives them to standard error.
-fn print_findings(summary: &Summary) {
-    for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
-        output::note(format_args!("map: {finding}"));
-    }
-    let further = summary.findings.len().saturating_sub(PRINTED_FINDINGS);
-    if further > 0 {
-        output::note(format_args!(
-            "map: {further} further findings; all are in data_protocol.yaml of each scenario"
-        ));
-    }
 }
 
 fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) -> io::Result<()> {

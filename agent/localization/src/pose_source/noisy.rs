@@ -188,7 +188,12 @@ impl NoisyPose {
         let error = match self.config.mode {
             NoiseMode::Fixed => self.drawn.fixed(),
             NoiseMode::Autoregressive => {
-                let rho = correlation(&self.config);
+                // Correlation of an error with that of the previous step.
+                let rho = if self.config.decay_s > 0.0 {
+                    (-self.config.step_s / self.config.decay_s).exp()
+                } else {
+                    0.0
+                };
                 self.drawn.autoregressive(cav, step, rho)
             }
             // Replayed errors are those of the table.
@@ -221,15 +226,6 @@ fn replayed(row: TableRow, pose: &Pose) -> PoseEstimate {
             PoseEstimate::new(error.added_in_vehicle(pose), confidence)
         }
         TableRow::NoPose => no_pose(NoPoseReason::TooFewInliers),
-    }
-}
-
-/// Correlation of an error with that of the previous step.
-fn correlation(config: &NoisyPoseConfig) -> f64 {
-    if config.decay_s > 0.0 {
-        (-config.step_s / config.decay_s).exp()
-    } else {
-        0.0
     }
 }
 

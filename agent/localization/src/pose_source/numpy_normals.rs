@@ -57,7 +57,14 @@ impl NumpyNormals {
 
     fn word(&mut self) -> u32 {
         if self.next == WORDS {
-            self.turn();
+            for index in 0..WORDS {
+                // In place, as in the reference: where the index wraps round, the other words are new already.
+                let mixed = (self.words[index] & 0x8000_0000)
+                    | (self.words[(index + 1) % WORDS] & 0x7fff_ffff);
+                let odd = if mixed & 1 == 1 { 0x9908_b0df } else { 0 };
+                self.words[index] = self.words[(index + SHIFT) % WORDS] ^ (mixed >> 1) ^ odd;
+            }
+            self.next = 0;
         }
         let mut word = self.words[self.next];
         self.next += 1;
@@ -66,17 +73,6 @@ impl NumpyNormals {
         word ^= (word << 7) & 0x9d2c_5680;
         word ^= (word << 15) & 0xefc6_0000;
         word ^ (word >> 18)
-    }
-
-    fn turn(&mut self) {
-        for index in 0..WORDS {
-            // In place, as in the reference: where the index wraps round, the other words are new already.
-            let mixed =
-                (self.words[index] & 0x8000_0000) | (self.words[(index + 1) % WORDS] & 0x7fff_ffff);
-            let odd = if mixed & 1 == 1 { 0x9908_b0df } else { 0 };
-            self.words[index] = self.words[(index + SHIFT) % WORDS] ^ (mixed >> 1) ^ odd;
-        }
-        self.next = 0;
     }
 }
 

@@ -59,7 +59,11 @@ impl PoseTable {
         for row in CsvFile::read(path, HEADER, MAX_BYTES)?.rows() {
             let row = row.complete()?;
             let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
-            let key = sweep_key(&row)?;
+            let cav = CavId::new(row.field(1))
+                .map_err(|error| row.fault(format_args!("cav: {error}")))?;
+            let capture_nanos = row.field(2).parse::<u64>();
+            let capture_nanos = capture_nanos.map_err(|_| row.wrong(2, "integer nanoseconds"))?;
+            let key = (cav, capture_nanos);
             let estimate = match row.field(11) {
                 "" => pose(&row)?,
                 _ => no_pose(&row)?,
@@ -209,13 +213,6 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
         }
     }
     fields
-}
-
-fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey> {
-    let cav = CavId::new(row.field(1)).map_err(|error| row.fault(format_args!("cav: {error}")))?;
-    let capture_nanos = row.field(2).parse::<u64>();
-    let capture_nanos = capture_nanos.map_err(|_| row.wrong(2, "integer nanoseconds"))?;
-    Ok((cav, capture_nanos))
 }
 
 fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate> {

@@ -114,7 +114,13 @@ impl MotionFilter {
         };
         // Before the state moves: the rate is that of the interval which ends now.
         if let Some(rate) = measured {
-            self.set_yaw_rate(rate);
+            // Replaces the yaw rate by a measured one less the bias: their errors are the same, beside the noise.
+            self.state[YAW_RATE] = rate - self.state[BIAS];
+            // Error of the rate = noise - error of the bias: its covariances are those of the bias, negated.
+            let mut of_bias = -self.covariance.column(BIAS);
+            of_bias[YAW_RATE] = self.covariance[(BIAS, BIAS)] + YAW_RATE_STD * YAW_RATE_STD;
+            self.covariance.set_column(YAW_RATE, &of_bias);
+            self.covariance.set_row(YAW_RATE, &of_bias.transpose());
         }
         self.advance_plane(time_s, yaw_acceleration_std);
         self.advance_height(time_s);
@@ -169,16 +175,6 @@ impl MotionFilter {
             step * self.height_covariance * step.transpose() + lifted * lifted.transpose();
     }
 
-    /// Replaces the yaw rate by a measured one less the bias: their errors are the same, beside the noise.
-    fn set_yaw_rate(&mut self, measured_rad_s: f64) {
-        self.state[YAW_RATE] = measured_rad_s - self.state[BIAS];
-        // Error of the rate = noise - error of the bias: its covariances are those of the bias, negated.
-        let mut of_bias = -self.covariance.column(BIAS);
-        of_bias[YAW_RATE] = self.covariance[(BIAS, BIAS)] + YAW_RATE_STD * YAW_RATE_STD;
-        self.covariance.set_column(YAW_RATE, &of_bias);
-        self.covariance.set_row(YAW_RATE, &of_bias.transpose());
-    }
-
     /// Uses the speed that the vehicle measured at the time of the state.
     pub(super) fn correct_speed(&mut self, speed_mps: f64) {
         let (off, variance, selects) = self.speed_innovation(speed_mps);
@@ -230,11 +226,7 @@ impl MotionFilter {
         self.height += gain * off_m;
         self.height_covariance =
             (Matrix2::identity() - gain * RowVector2::new(1.0, 0.0)) * self.height_covariance;
-        self.correct_tilt(measurement);
-    }
-
-    /// Roll and pitch move towards the measured ones, the further the longer ago the last measurement was.
-    fn correct_tilt(&mut self, measurement: &PoseMeasurement) {
+        // Roll and pitch move towards the measured ones, the further the longer ago the last measurement was.
         let (roll_rad, pitch_rad, _) = measurement.world_from_lidar.rotation.euler_angles();
         let (before, now) = (self.measured_nanos, measurement.capture_nanos);
         let time_s = now.saturating_sub(before) as f64 * 1e-9;

@@ -23,7 +23,13 @@ pub(super) fn held_out(positions_m: &[Vector3<f64>]) -> Vec<bool> {
     }
     // One at least: a share of few sweeps rounds to none.
     let wanted = ((count as f64 * SHARE).round() as usize).max(1);
-    let piece = piece_sweeps(positions_m).min(wanted);
+    // Sweeps of a piece, from the median distance of neighbours.
+    let pairs = positions_m.windows(2);
+    let steps: Vec<f64> = pairs.map(|pair| (pair[1] - pair[0]).norm()).collect();
+    let step_m = support::statistics::median(&steps).unwrap_or(PIECE_M);
+    // A vehicle that stands has steps of 0, by which the length would be divided.
+    let piece = (PIECE_M / step_m.max(1e-3)) as usize + 1;
+    let piece = piece.min(PIECE_SWEEPS).min(wanted);
     let pieces = wanted.div_ceil(piece);
     for number in 0..pieces {
         // Pieces lie around the middles of equal parts, so both ends of a drive are trained on.
@@ -33,15 +39,6 @@ pub(super) fn held_out(positions_m: &[Vector3<f64>]) -> Vec<bool> {
         is_held_out[first..end].fill(true);
     }
     is_held_out
-}
-
-/// Sweeps of a piece, from the median distance of neighbours.
-fn piece_sweeps(positions_m: &[Vector3<f64>]) -> usize {
-    let pairs = positions_m.windows(2);
-    let steps: Vec<f64> = pairs.map(|pair| (pair[1] - pair[0]).norm()).collect();
-    let step_m = support::statistics::median(&steps).unwrap_or(PIECE_M);
-    // A vehicle that stands has steps of 0, by which the length would be divided.
-    ((PIECE_M / step_m.max(1e-3)) as usize + 1).min(PIECE_SWEEPS)
 }
 
 #[cfg(test)]

@@ -133,7 +133,10 @@ impl PairMaker {
         let turned = [anchor, partner].map(|index| {
             let stored = &self.store.sweeps[index];
             // A car rolls and pitches a little, whatever its recorded pose.
-            let turned_from_sensor = lean(rng) * yaw(rng.random_range(-PI..PI));
+            let [roll, pitch] =
+                std::array::from_fn(|_| rng.random_range(-MAX_LEAN_RAD..MAX_LEAN_RAD));
+            let turned_from_sensor = Isometry3::rotation(nalgebra::Vector3::new(roll, pitch, 0.0))
+                * yaw(rng.random_range(-PI..PI));
             let keep = rng.random_range(MIN_KEPT..1.0);
             let sweep = stored.turned_voxels(&turned_from_sensor, keep, rng, &self.config);
             let world_from_sensor = origin.inverse() * stored.world_from_sensor;
@@ -190,12 +193,6 @@ fn chosen(
         places_m,
         sensor_from_world,
     }
-}
-
-/// A small roll and pitch at random.
-fn lean(rng: &mut impl Rng) -> Isometry3<f64> {
-    let [roll, pitch] = std::array::from_fn(|_| rng.random_range(-MAX_LEAN_RAD..MAX_LEAN_RAD));
-    Isometry3::rotation(nalgebra::Vector3::new(roll, pitch, 0.0))
 }
 
 /// Up to `count` cells at random, flat ground no more than its share.

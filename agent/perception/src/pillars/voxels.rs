@@ -88,18 +88,7 @@ impl Voxeliser {
 
     /// Sorts the points of one sweep into pillars; points outside the area and points that are not finite are dropped.
     pub fn voxelise(&mut self, points: &[[f32; 4]]) -> Pillars {
-        let mut pillars = self.assign(points);
-        self.gather(points, &mut pillars);
-        // Only cells with a pillar are reset, not the whole grid.
-        for coord in &pillars.coords {
-            let [z, y, x] = coord.map(|index| index as usize);
-            self.pillar_of_cell[(z * self.grid[1] + y) * self.grid[0] + x] = NONE;
-        }
-        pillars
-    }
-
-    /// First pass: the pillar of every point, and the counts and coordinates of the pillars.
-    fn assign(&mut self, points: &[[f32; 4]]) -> Pillars {
+        // First pass: the pillar of every point, and the counts and coordinates of the pillars.
         let mut pillars = Pillars::default();
         self.pillar_of_point.clear();
         self.pillar_of_point.reserve(points.len());
@@ -109,6 +98,12 @@ impl Voxeliser {
                 None => NONE,
             };
             self.pillar_of_point.push(pillar);
+        }
+        self.gather(points, &mut pillars);
+        // Only cells with a pillar are reset, not the whole grid.
+        for coord in &pillars.coords {
+            let [z, y, x] = coord.map(|index| index as usize);
+            self.pillar_of_cell[(z * self.grid[1] + y) * self.grid[0] + x] = NONE;
         }
         pillars
     }

@@ -1,7 +1,7 @@
 //! `v2vloc sweep`.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use figures::FigureError;
 use runner::experiment::sweep::{self, ExperimentSweep, WorkerError};
@@ -76,7 +76,17 @@ impl Arguments {
             true => output::line(serde_json::to_string_pretty(&computed.runs)?)?,
             false => output::text(&computed.table)?,
         }
-        note_maps(&out.join("maps"));
+        // Prints how much space the feature maps take.
+        let maps = out.join("maps");
+        let files = fs::read_dir(&maps).into_iter().flatten().flatten();
+        let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
+        let bytes: u64 = sizes.sum();
+        if bytes > 0 {
+            let (megabytes, folder) = (bytes as f64 / 1e6, maps.display());
+            output::note(format_args!(
+                "{megabytes:.1} MB of feature maps in {folder}"
+            ));
+        }
         output::note(format_args!("all columns and the report: {folder}"));
         let runs = computed.runs.iter();
         Ok(left_out(runs.map(|run| &run.cell.metrics.left_out)))
@@ -88,18 +98,5 @@ fn blamed(error: anyhow::Error) -> anyhow::Error {
     match error.is::<WorkerError>() || error.is::<FigureError>() {
         true => error,
         false => BadInput::of(error).into(),
-    }
-}
-
-/// Prints how much space the feature maps take.
-fn note_maps(folder: &Path) {
-    let files = fs::read_dir(folder).into_iter().flatten().flatten();
-    let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
-    let bytes: u64 = sizes.sum();
-    if bytes > 0 {
-        let (megabytes, folder) = (bytes as f64 / 1e6, folder.display());
-        output::note(format_args!(
-            "{megabytes:.1} MB of feature maps in {folder}"
-        ));
     }
 }

@@ -106,7 +106,13 @@ impl Picture<'_> {
         // Rows of pixels count downwards, so the range of the y axis is reversed.
         let plane =
             map.apply_coord_spec(Cartesian2d::new(x, y, (0..width as i32, height as i32..0)));
-        self.draw_grid(&plane)?;
+        // A line every 10 m.
+        for x in tens(self.x_m) {
+            plane.draw(&PathElement::new(self.y_m.map(|y| (x, y)), GRID))?;
+        }
+        for y in tens(self.y_m) {
+            plane.draw(&PathElement::new(self.x_m.map(|x| (x, y)), GRID))?;
+        }
         // The ego last, so that its points are on top.
         for (view, colour) in self.coloured_views().rev() {
             self.draw_points(view, colour, &plane)?;
@@ -145,17 +151,6 @@ impl Picture<'_> {
         [(self.x_m, x), (self.y_m, y)]
             .into_iter()
             .all(|([low, high], value)| (low - margin_m..=high + margin_m).contains(&value))
-    }
-
-    /// A line every 10 m.
-    fn draw_grid(&self, plane: &PlanView<'_>) -> Result<()> {
-        for x in tens(self.x_m) {
-            plane.draw(&PathElement::new(self.y_m.map(|y| (x, y)), GRID))?;
-        }
-        for y in tens(self.y_m) {
-            plane.draw(&PathElement::new(self.x_m.map(|x| (x, y)), GRID))?;
-        }
-        Ok(())
     }
 
     fn draw_points(
@@ -226,7 +221,17 @@ impl Picture<'_> {
             area.draw(&Text::new(label.as_str(), (x + 18, 38), text(15, INK)))?;
             x += 18 + area.estimate_text_size(&label, &text(15, INK))?.0 as i32 + 22;
         }
-        draw_scale(area)
+        // A bar of 10 m and the axes.
+        let (left, right, y) = (14, 14 + (10.0 * PIXELS_PER_M) as i32, 68);
+        for line in [
+            [(left, y), (right, y)],
+            [(left, y - 4), (left, y + 4)],
+            [(right, y - 4), (right, y + 4)],
+        ] {
+            area.draw(&PathElement::new(line, stroke(FAINT)))?;
+        }
+        let text_line = "10 m   x to the right, y up, ego LiDAR frame";
+        Ok(area.draw(&Text::new(text_line, (right + 10, y - 8), text(14, FAINT)))?)
     }
 
     fn legend(&self) -> Vec<(String, RGBColor, bool)> {
@@ -240,20 +245,6 @@ impl Picture<'_> {
         let detected = (format!("detected ({found})"), DETECTION, true);
         cavs.chain([truth, detected]).collect()
     }
-}
-
-/// A bar of 10 m and the axes.
-fn draw_scale(area: &Image<'_>) -> Result<()> {
-    let (left, right, y) = (14, 14 + (10.0 * PIXELS_PER_M) as i32, 68);
-    for line in [
-        [(left, y), (right, y)],
-        [(left, y - 4), (left, y + 4)],
-        [(right, y - 4), (right, y + 4)],
-    ] {
-        area.draw(&PathElement::new(line, stroke(FAINT)))?;
-    }
-    let text_line = "10 m   x to the right, y up, ego LiDAR frame";
-    Ok(area.draw(&Text::new(text_line, (right + 10, y - 8), text(14, FAINT)))?)
 }
 
 fn picture_size((width, height): (u32, u32)) -> (u32, u32) {

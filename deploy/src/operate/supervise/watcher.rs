@@ -101,8 +101,9 @@ impl Watcher {
                             Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&describe(status)),
                             Ok(status) => {
                                 // A task that reports its own failure would fail again.
-                                // One that was struck down can resume.
-                                may_restart &= self.spec.life == RestartPolicy::Service || is_struck(status);
+                                // One that was struck down, by a signal or in a panic, can resume.
+                                let was_struck = matches!(status.code(), None | Some(PANIC));
+                                may_restart &= self.spec.life == RestartPolicy::Service || was_struck;
                                 describe(status)
                             }
                             Err(error) => error.to_string(),
@@ -239,11 +240,6 @@ async fn read_out<T>(report: Option<JoinHandle<()>>, status: T) -> T {
 
 fn is_done(status: ExitStatus) -> bool {
     status.success() || status.code() == Some(DATA_LOST)
-}
-
-/// True if it has not ended by itself: by a signal, or in a panic.
-fn is_struck(status: ExitStatus) -> bool {
-    matches!(status.code(), None | Some(PANIC))
 }
 
 fn describe(status: ExitStatus) -> String {

@@ -20,12 +20,6 @@ pub struct PlacedBox {
     pub pose_confidence: f64,
 }
 
-impl PlacedBox {
-    fn confidence(&self) -> f64 {
-        self.score * self.pose_confidence
-    }
-}
-
 /// The detections of a sender in the frame of the ego, the highest score first; `pose_confidence` is that of its pose.
 pub fn placed<'a>(
     detections: impl Iterator<Item = &'a Detection>,
@@ -60,7 +54,7 @@ pub(super) fn support(boxes: &[PlacedBox]) -> Vec<f64> {
                 let iou = footprint.iou(overlapping);
                 // One value per sender: a sender that repeats a box adds no further support.
                 let best: &mut f64 = by_sender.entry(other.sender).or_default();
-                *best = best.max(iou * other.confidence());
+                *best = best.max(iou * (other.score * other.pose_confidence));
             }
         }
         by_sender.values().sum::<f64>()

@@ -138,7 +138,12 @@ impl MultiScaleNetwork {
                 // Which cells an agent sends depends on the scores of its own map.
                 let alone = network.heads(&network.features_of_canvas(&canvas, false))?;
                 let masks = communication.masks(&alone.scores)?;
-                let rate = mean_rate(&masks, samples)?;
+                // The share of cells that is sent, averaged over samples as the reference does.
+                let counts: Vec<i64> = samples.iter().map(|sample| sample.agents).collect();
+                let shares = masks.f_split_with_sizes(&counts, 0)?;
+                let shares = shares.iter();
+                let means = shares.map(|sample| sample.mean(Kind::Double).double_value(&[]));
+                let rate = means.sum::<f64>() / samples.len().max(1) as f64;
                 (Some(self.without_the_exempt(&masks, samples)?), rate)
             }
             None => (None, 1.0),
@@ -207,13 +212,4 @@ impl MultiScaleNetwork {
             .f_to_device(masks.device())?;
         masks.f_maximum(&sends_all)
     }
-}
-
-/// The share of cells that is sent, averaged over samples as the reference does.
-fn mean_rate(masks: &Tensor, samples: &[MapAlignment]) -> Result<f64, TchError> {
-    let counts: Vec<i64> = samples.iter().map(|sample| sample.agents).collect();
-    let shares = masks.f_split_with_sizes(&counts, 0)?;
-    let shares = shares.iter();
-    let means = shares.map(|sample| sample.mean(Kind::Double).double_value(&[]));
-    Ok(means.sum::<f64>() / samples.len().max(1) as f64)
 }

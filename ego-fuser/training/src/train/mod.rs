@@ -54,19 +54,6 @@ fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<Sam
     }
 }
 
-/// The initial model of a training.
-fn first_model(config: &TrainConfig) -> Result<CooperativeModel> {
-    let (detector, method, device) = (&config.detector, config.method, config.run.device);
-    Ok(match (&config.init, &config.fusion) {
-        (Some(path), fusion) => {
-            let weights = Weights::load(path).map_err(ModelError::from)?;
-            CooperativeModel::from_weights(&weights, Some(method), fusion.as_ref(), device)?
-        }
-        (None, Some(fusion)) => CooperativeModel::with_fusion(detector, method, fusion, device)?,
-        (None, None) => CooperativeModel::new(detector, method, device)?,
-    })
-}
-
 struct FusionTraining<'a> {
     config: &'a TrainConfig,
     observer: &'a mut dyn TrainObserver,
@@ -91,7 +78,17 @@ impl<'a> FusionTraining<'a> {
         let run = &config.run;
         // Seeds the tensor library: before the first variable is made.
         run.start()?;
-        let mut model = first_model(config)?;
+        let (detector, method, device) = (&config.detector, config.method, config.run.device);
+        let mut model = match (&config.init, &config.fusion) {
+            (Some(path), fusion) => {
+                let weights = Weights::load(path).map_err(ModelError::from)?;
+                CooperativeModel::from_weights(&weights, Some(method), fusion.as_ref(), device)?
+            }
+            (None, Some(fusion)) => {
+                CooperativeModel::with_fusion(detector, method, fusion, device)?
+            }
+            (None, None) => CooperativeModel::new(detector, method, device)?,
+        };
         let frozen = frozen::FrozenEncoder::of(config, &model)?;
         // Before the optimizer is made, which takes the variables that are trained by then.
         if config.box_input {

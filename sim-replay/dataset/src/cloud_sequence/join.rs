@@ -25,12 +25,6 @@ impl Join {
             by,
         }
     }
-
-    /// True if at least half of the clouds have a row.
-    fn is_join(&self) -> bool {
-        let found = self.rows.iter().flatten().count();
-        2 * found >= self.rows.len() && found > 0
-    }
 }
 
 /// Joins clouds, given by the stems of their files in natural order and the keys of these, with the rows of a file of
@@ -52,7 +46,9 @@ pub(super) fn join(stems: &[&str], clouds: &Keys, poses: &PoseFile) -> Result<Jo
             (Keys::Times(clouds), Keys::Times(rows)) => by_time(clouds, rows),
             _ => continue,
         };
-        if joined.is_join() {
+        // At least half of the clouds have a row.
+        let found = joined.rows.iter().flatten().count();
+        if 2 * found >= joined.rows.len() && found > 0 {
             return Ok(joined);
         }
     }

@@ -85,7 +85,17 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
     }
     let stems = stems_of(&files);
     let keys = Keys::of_stems(&stems);
-    no_two_alike(&files, &keys)?;
+    // Refuses two clouds of one number, time or stem: one pose cannot be that of both.
+    // The files are in order, so equal keys are neighbours.
+    for ([first, second], index) in files.array_windows().zip(0..) {
+        if keys.are_equal(index, index + 1) {
+            let reason = format!(
+                "has the number, time or name of {}: a pose cannot be that of both",
+                first.display()
+            );
+            return Err(ReadError::malformed(second, reason));
+        }
+    }
     let joined =
         join(&stems, &keys, &poses).map_err(|reason| ReadError::malformed(&path, reason))?;
     faults.report("pose", problems);
@@ -127,21 +137,6 @@ fn stems_of(files: &[PathBuf]) -> Vec<&str> {
     stems
         .map(|stem| stem.and_then(|stem| stem.to_str()).unwrap_or_default())
         .collect()
-}
-
-/// Refuses two clouds of one number, time or stem: one pose cannot be that of both.
-fn no_two_alike(files: &[PathBuf], keys: &Keys) -> Result<()> {
-    // The files are in order, so equal keys are neighbours.
-    for ([first, second], index) in files.array_windows().zip(0..) {
-        if keys.are_equal(index, index + 1) {
-            let reason = format!(
-                "has the number, time or name of {}: a pose cannot be that of both",
-                first.display()
-            );
-            return Err(ReadError::malformed(second, reason));
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -137,7 +137,9 @@ impl TerrainSurface {
         });
         let [u, v] = ray.within(cell, from);
         // The diagonal of a cell separates its two triangles.
-        let diagonal = from + (v - u) / off_zero(ray.slope[0] - ray.slope[1]);
+        let slope = ray.slope[0] - ray.slope[1];
+        let slope = if slope.abs() < 1e-12 { 1e-12 } else { slope };
+        let diagonal = from + (v - u) / slope;
         let pieces: &[[f64; 2]] = if diagonal > from && diagonal < to {
             &[[from, diagonal], [diagonal, to]]
         } else {
@@ -190,10 +192,6 @@ impl GridRay {
     fn height(&self, at: f64) -> f64 {
         self.z_m + self.rise * at
     }
-}
-
-fn off_zero(value: f64) -> f64 {
-    if value.abs() < 1e-12 { 1e-12 } else { value }
 }
 
 impl Surface for TerrainSurface {

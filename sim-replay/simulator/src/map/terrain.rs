@@ -38,7 +38,17 @@ pub(crate) fn ground(surface: &RoadSurface, seed: u64) -> Ground {
     let mut grid = empty_grid(surface);
     let fixed = fix_under_roads(&mut grid, surface);
     fill_level(&mut grid.heights_m, &fixed, grid.columns, grid.rows);
-    raise_hills(&mut grid, &fixed, seed);
+    // Adds hills, the higher the farther from the roads.
+    let distances = distances(&fixed, grid.columns, grid.rows);
+    for (place, &distance) in distances.iter().enumerate() {
+        let distance_m = f64::from(distance) * grid.cell_m;
+        let share =
+            ((distance_m - HILLS_FROM_M[0]) / (HILLS_FROM_M[1] - HILLS_FROM_M[0])).clamp(0.0, 1.0);
+        let [x, y] = grid.place_m(place % grid.columns, place / grid.columns);
+        // Smoothstep: hills begin and end without a kink.
+        let rise_m = share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed);
+        grid.heights_m[place] += rise_m as f32;
+    }
     let decks = decks(&grid, surface);
     let terrain = Terrain::Grid(grid);
     Ground { terrain, decks }
@@ -81,13 +91,8 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &RoadSurface) -> Vec<bool> {
             *height = lowest;
         }
     }
-    open_under_bridges(grid, surface);
-    let heights = grid.heights_m.iter();
-    heights.map(|height| !height.is_nan()).collect()
-}
-
-/// Clears nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
-fn open_under_bridges(grid: &mut HeightGrid, surface: &RoadSurface) {
+    // Clears nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's
+    // edges.
     for patch in &surface.patches {
         let level = patch.top_m as f32;
         for (place, _) in nodes_within(grid, &patch.quad, OPENING_M) {
@@ -96,6 +101,8 @@ fn open_under_bridges(grid: &mut HeightGrid, surface: &RoadSurface) {
             }
         }
     }
+    let heights = grid.heights_m.iter();
+    heights.map(|height| !height.is_nan()).collect()
 }
 
 /// Nodes whose square of half side `reach_m` overlaps an outline, with their places in the plane.
@@ -182,20 +189,6 @@ fn smooth(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) {
             let above = heights[if has_above { place + columns } else { place }];
             heights[place] = (left + right + below + above) / 4.0;
         }
-    }
-}
-
-/// Adds hills, the higher the farther from the roads.
-fn raise_hills(grid: &mut HeightGrid, fixed: &[bool], seed: u64) {
-    let distances = distances(fixed, grid.columns, grid.rows);
-    for (place, &distance) in distances.iter().enumerate() {
-        let distance_m = f64::from(distance) * grid.cell_m;
-        let share =
-            ((distance_m - HILLS_FROM_M[0]) / (HILLS_FROM_M[1] - HILLS_FROM_M[0])).clamp(0.0, 1.0);
-        let [x, y] = grid.place_m(place % grid.columns, place / grid.columns);
-        // Smoothstep: hills begin and end without a kink.
-        let rise_m = share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed);
-        grid.heights_m[place] += rise_m as f32;
     }
 }
 

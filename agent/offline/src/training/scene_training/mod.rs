@@ -292,7 +292,10 @@ fn head_config(
     features: &Features,
 ) -> Result<SceneHeadConfig> {
     let (training, format) = (&features.training, &features.format);
-    let sweep_points = median_points(&training.points);
+    // Median of the sweeps' numbers of points.
+    let mut sorted = training.points.to_vec();
+    sorted.sort_unstable();
+    let sweep_points = sorted.get(sorted.len() / 2).copied();
     if let Some(stored) = stored {
         return Ok(SceneHeadConfig {
             sweep_points: stored.sweep_points.or(sweep_points),
@@ -316,13 +319,6 @@ fn head_config(
         refiner: refiner.transpose()?,
         sweep_points,
     })
-}
-
-/// Median of the sweeps' numbers of points.
-fn median_points(points: &[usize]) -> Option<usize> {
-    let mut sorted = points.to_vec();
-    sorted.sort_unstable();
-    sorted.get(sorted.len() / 2).copied()
 }
 
 fn mean(values: &Tensor) -> Result<f64, tch::TchError> {

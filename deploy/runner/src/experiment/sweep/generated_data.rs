@@ -43,7 +43,13 @@ pub(in crate::experiment) fn generate(experiment: &Experiment) -> Result<()> {
     let lock = lock(&path).with_context(|| path.display().to_string())?;
     // Looked at again under the lock: the other slice may have made it meanwhile.
     if !is_generated(experiment)? {
-        generate_now(&options)?;
+        let (scenes, folder) = (options.scenes, options.out.display());
+        output::note(format_args!("generating {scenes} scenarios into {folder}"));
+        let bar = progress::percent_bar(scenes);
+        let generated =
+            generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
+        bar.finish_and_clear();
+        generated.context("generate")?;
     }
     drop(lock);
     // A process that waits at the removed file still gets its lock, and finds the data then.
@@ -54,16 +60,6 @@ pub(in crate::experiment) fn generate(experiment: &Experiment) -> Result<()> {
         // Another slice has removed it.
         Ok(()) | Err(_) => Ok(()),
     }
-}
-
-fn generate_now(options: &SynthOptions) -> Result<()> {
-    let (scenes, folder) = (options.scenes, options.out.display());
-    output::note(format_args!("generating {scenes} scenarios into {folder}"));
-    let bar = progress::percent_bar(scenes);
-    let generated = generate::generate_whole(options, &|thousandths| bar.set_position(thousandths));
-    bar.finish_and_clear();
-    generated.context("generate")?;
-    Ok(())
 }
 
 /// A lock that other processes wait for, on this host and on those that share the folder, until it is dropped.

@@ -154,13 +154,6 @@ impl Dair {
         self.write_json(&path, &transform(&world_from_novatel.into()))
     }
 
-    fn write_unit_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
-        let mut pose = transform(&frame.world_from_lidar().into());
-        pose["relative_error"] = json!({ "delta_x": 0.0, "delta_y": 0.0 });
-        let path = format!("infrastructure-side/calib/virtuallidar_to_world/{id}.json");
-        self.write_json(&path, &pose)
-    }
-
     /// The label of an object that either side lists.
     fn cooperative_label(&self, kind: &str, object: &Object, vehicle: &AgentFrame) -> Value {
         match self.edition {
@@ -275,7 +268,10 @@ impl SceneWriter for Dair {
         self.write_side(&VEHICLE, &id, vehicle, omitted)?;
         self.write_side(&UNIT, &unit_id, unit, omitted)?;
         self.write_vehicle_pose(&id, vehicle)?;
-        self.write_unit_pose(&unit_id, unit)?;
+        let mut pose = transform(&unit.world_from_lidar().into());
+        pose["relative_error"] = json!({ "delta_x": 0.0, "delta_y": 0.0 });
+        let path = format!("infrastructure-side/calib/virtuallidar_to_world/{unit_id}.json");
+        self.write_json(&path, &pose)?;
         let mut labels = Vec::new();
         for object in Moment::union([vehicle, unit]) {
             match cooperative_type(object.class) {

@@ -198,7 +198,15 @@ impl TableSet {
             let moments = chain.iter().map(|(sample, ..)| sample.moment.to_string());
             let tokens = moments.map(|moment| scene_token(scene, "annotation", &[&id, &moment]));
             let tokens: Vec<String> = tokens.collect();
-            let name = category_name(chain[0].2.class);
+            // The name in the taxonomy of nuScenes, which counts vans as cars.
+            let name = match chain[0].2.class {
+                ObjectClass::Car | ObjectClass::Van => "vehicle.car",
+                ObjectClass::Truck => "vehicle.truck",
+                ObjectClass::Bus => "vehicle.bus.rigid",
+                ObjectClass::TwoWheeler => "vehicle.bicycle",
+                ObjectClass::Pedestrian => "human.pedestrian.adult",
+                ObjectClass::Other => "movable_object.debris",
+            };
             let category = token(&["category", name]);
             let row = json!({ "token": category, "name": name, "description": "" });
             self.push_once("category", row);
@@ -244,18 +252,6 @@ fn scene_token(scene: &SceneTables<'_>, kind: &str, parts: &[&str]) -> String {
 fn token(parts: &[&str]) -> String {
     let digest = Sha256::digest(parts.join("/"));
     hex(&digest[..TOKEN_BYTES])
-}
-
-/// The name in the taxonomy of nuScenes, which counts vans as cars.
-fn category_name(class: ObjectClass) -> &'static str {
-    match class {
-        ObjectClass::Car | ObjectClass::Van => "vehicle.car",
-        ObjectClass::Truck => "vehicle.truck",
-        ObjectClass::Bus => "vehicle.bus.rigid",
-        ObjectClass::TwoWheeler => "vehicle.bicycle",
-        ObjectClass::Pedestrian => "human.pedestrian.adult",
-        ObjectClass::Other => "movable_object.debris",
-    }
 }
 
 #[cfg(test)]

@@ -179,7 +179,7 @@ impl Traffic<'_> {
     fn end_of_the_way(&self, index: usize) -> Option<Obstacle> {
         let car = &self.cars[index];
         let left_m = car.path.remaining_m(self.roads.graph);
-        // `decide_ways` makes every path at least this long, unless its road ends.
+        // `Traffic::step` makes every path at least this long, unless its road ends.
         (left_m < super::DECIDED_M).then(|| Obstacle {
             gap_m: left_m - car.half_length_m(),
             speed_mps: 0.0,

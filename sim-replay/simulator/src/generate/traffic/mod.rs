@@ -73,7 +73,17 @@ impl<'t> Traffic<'t> {
         self.list_occupants();
         self.change_lanes(&mut near);
         // The look-ahead of this step needs the next lanes of every vehicle.
-        self.decide_ways();
+        // Appends lanes to paths that are too short.
+        for index in 0..self.cars.len() {
+            while self.cars[index].is_present
+                && self.cars[index].path.remaining_m(self.roads.graph) < DECIDED_M
+            {
+                let Some(next) = self.choose_next(index) else {
+                    break;
+                };
+                self.cars[index].path.push(next);
+            }
+        }
         // By rising index: a vehicle sees those before it where they are after this step.
         for index in self.present() {
             let acceleration = self.acceleration_mps2(index, &mut near);
@@ -153,20 +163,6 @@ impl<'t> Traffic<'t> {
         for lane in &mut self.occupants {
             // Ties are broken by index, so that the order does not depend on earlier steps.
             lane.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        }
-    }
-
-    /// Appends lanes to paths that are too short.
-    fn decide_ways(&mut self) {
-        for index in 0..self.cars.len() {
-            while self.cars[index].is_present
-                && self.cars[index].path.remaining_m(self.roads.graph) < DECIDED_M
-            {
-                let Some(next) = self.choose_next(index) else {
-                    break;
-                };
-                self.cars[index].path.push(next);
-            }
         }
     }
 

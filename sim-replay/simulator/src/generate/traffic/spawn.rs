@@ -163,7 +163,17 @@ impl<'t> Traffic<'t> {
             for _ in 0..TRIES.min(edge.len()) {
                 let spawn = edge[self.random.below(edge.len())];
                 if self.has_room(&self.cars[index].vehicle, spawn, index, &mut near) {
-                    self.let_in(index, spawn);
+                    let speed = self.roads.speed_mps(spawn.lane, spawn.s_m);
+                    let car = &mut self.cars[index];
+                    car.id = self.next_id;
+                    car.path = Path::new(spawn.lane, spawn.s_m);
+                    car.motion = Course::still(car.placement_after(self.roads, 0.0));
+                    car.speed_mps = 0.6 * car.driver.pace * speed;
+                    car.leader = None;
+                    car.is_present = true;
+                    car.standing_s = 0.0;
+                    self.index.insert(index as u32, car.point_m());
+                    self.next_id += 1;
                     break;
                 }
             }
@@ -190,20 +200,6 @@ impl<'t> Traffic<'t> {
             car.is_present && car.standing_s > STUCK_S && is_first
         });
         stuck.max_by(|&a, &b| self.cars[a].standing_s.total_cmp(&self.cars[b].standing_s))
-    }
-
-    fn let_in(&mut self, index: usize, spawn: Spawn) {
-        let speed = self.roads.speed_mps(spawn.lane, spawn.s_m);
-        let car = &mut self.cars[index];
-        car.id = self.next_id;
-        car.path = Path::new(spawn.lane, spawn.s_m);
-        car.motion = Course::still(car.placement_after(self.roads, 0.0));
-        car.speed_mps = 0.6 * car.driver.pace * speed;
-        car.leader = None;
-        car.is_present = true;
-        car.standing_s = 0.0;
-        self.index.insert(index as u32, car.point_m());
-        self.next_id += 1;
     }
 }
 

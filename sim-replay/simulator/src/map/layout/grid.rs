@@ -54,7 +54,17 @@ pub(super) fn grid(
         let mut graph = full_grid(plan, &y_range, calm, rng);
         leave_out(&mut graph, plan.left_out, rng);
         if let Some(port) = port {
-            attach(&mut graph, port);
+            // Ties the node nearest to `port` to it.
+            let nodes = graph.nodes.iter();
+            let distances = nodes.map(|node| (node.x - port.x).hypot(node.y - port.y));
+            let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+            let nearest = nearest.map_or(0, |(node, _)| node);
+            graph.nodes.push(StreetNode {
+                x: port.x,
+                y: port.y,
+                port: Some(port),
+            });
+            graph.edges.push([nearest, graph.nodes.len() - 1]);
         }
         // Without any jitter the grid matches its plan: accept it as it is.
         if graph.has_room() || calm < 0.05 {
@@ -102,20 +112,6 @@ fn full_grid(
         }
     }
     graph
-}
-
-/// Ties the node nearest to `port` to it.
-fn attach(graph: &mut StreetGraph, port: Pose2) {
-    let nodes = graph.nodes.iter();
-    let distances = nodes.map(|node| (node.x - port.x).hypot(node.y - port.y));
-    let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
-    let nearest = nearest.map_or(0, |(node, _)| node);
-    graph.nodes.push(StreetNode {
-        x: port.x,
-        y: port.y,
-        port: Some(port),
-    });
-    graph.edges.push([nearest, graph.nodes.len() - 1]);
 }
 
 fn leave_out(graph: &mut StreetGraph, share: f64, rng: &mut ChaCha8Rng) {

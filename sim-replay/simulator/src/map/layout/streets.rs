@@ -103,7 +103,16 @@ pub(super) fn lay_out(
     rng: &mut ChaCha8Rng,
 ) -> Vec<RoadEnd> {
     let chains = chains(graph, rng);
-    let radii = junction_radii(graph, &chains);
+    // Distance from each junction's middle at which its roads begin, metres: far enough that their edges do not
+    // overlap.
+    let mut arms: Vec<Vec<(f64, f64)>> = vec![Vec::new(); graph.nodes.len()];
+    for chain in &chains {
+        let half = chain.profile.half_width_m();
+        for [node, next] in chain.ends() {
+            arms[node].push((graph.angle(node, next), half));
+        }
+    }
+    let radii: Vec<f64> = arms.iter().map(|arms| junction_radius_m(arms)).collect();
     // Road ends by node, in the order of the chains.
     let mut ends: Vec<Vec<RoadEnd>> = vec![Vec::new(); graph.nodes.len()];
     for chain in &chains {
@@ -194,18 +203,6 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
         lanes
     });
     CrossProfile { left, right }
-}
-
-/// Distance from each junction's middle at which its roads begin, metres: far enough that their edges do not overlap.
-fn junction_radii(graph: &StreetGraph, chains: &[Chain]) -> Vec<f64> {
-    let mut arms: Vec<Vec<(f64, f64)>> = vec![Vec::new(); graph.nodes.len()];
-    for chain in chains {
-        let half = chain.profile.half_width_m();
-        for [node, next] in chain.ends() {
-            arms[node].push((graph.angle(node, next), half));
-        }
-    }
-    arms.iter().map(|arms| junction_radius_m(arms)).collect()
 }
 
 /// The same for one junction, from the directions and half widths of its arms.

@@ -37,7 +37,16 @@ pub(crate) fn lay_out(seed: u64) -> RoadLayout {
         median_m: rng.random_range(1.6..3.2),
     };
     let [inside, outside] = roundabouts(&motorway, &mut rng);
-    let link = link_road(&mut builder, &inside, &outside);
+    // The road below the motorway.
+    let lanes = vec![
+        (LaneKind::Driving, 3.5),
+        (LaneKind::Shoulder, 0.8),
+        (LaneKind::Sidewalk, 2.2),
+    ];
+    let curves = path(&[inside.port(0.0), outside.port(PI).reversed()]);
+    let (left, right) = (lanes.clone(), lanes);
+    let profile = CrossProfile { left, right };
+    let link = builder.road(curves, Profile::default(), &profile, LINK_LIMIT_MPS);
     // Arms by rising angle: 0 is away from the town inside, and away from the ring outside.
     let ramps = interchange(&mut builder, &motorway, &inside, &outside, &mut rng);
     let map_model = map_model(&mut builder, &motorway, &inside, &mut rng);
@@ -72,19 +81,6 @@ fn roundabouts(motorway: &Motorway, rng: &mut ChaCha8Rng) -> [Roundabout; 2] {
             radius_m: rng.random_range(20.0..25.0),
         }
     })
-}
-
-/// The road below the motorway.
-fn link_road(builder: &mut Builder, inside: &Roundabout, outside: &Roundabout) -> usize {
-    let lanes = vec![
-        (LaneKind::Driving, 3.5),
-        (LaneKind::Shoulder, 0.8),
-        (LaneKind::Sidewalk, 2.2),
-    ];
-    let curves = path(&[inside.port(0.0), outside.port(PI).reversed()]);
-    let (left, right) = (lanes.clone(), lanes);
-    let profile = CrossProfile { left, right };
-    builder.road(curves, Profile::default(), &profile, LINK_LIMIT_MPS)
 }
 
 /// Carriageways and ramps. Returns the ramps: off and on at the inner roundabout, off and on at the outer one.

@@ -63,21 +63,8 @@ pub(super) fn read_structures(
     for name in ["bridge", "tunnel"] {
         structures.extend(read_all(road, "objects", name, read_structure, log));
     }
-    part_tunnels(&mut structures, road_length_m);
-    structures
-}
-
-fn read_structure(element: Element) -> Result<RoadStructure> {
-    Ok(RoadStructure {
-        tunnel: element.name() == "tunnel",
-        s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
-        length_m: element.number("length", 0.0, MAX_LENGTH_M)?,
-    })
-}
-
-/// Cuts tunnels so that none reaches into the next or beyond its road, and leaves out empty ones: together they are at
-/// most as long as the road, however many a map has for its lanes.
-fn part_tunnels(structures: &mut Vec<RoadStructure>, road_length_m: f64) {
+    // Cuts tunnels so that none reaches into the next or beyond its road, and leaves out empty ones: together they are
+    // at most as long as the road, however many a map has for its lanes.
     structures.sort_by(|a, b| a.tunnel.cmp(&b.tunnel).then(a.s_m.total_cmp(&b.s_m)));
     let mut covered_m = 0.0;
     for tunnel in structures.iter_mut().filter(|structure| structure.tunnel) {
@@ -87,4 +74,13 @@ fn part_tunnels(structures: &mut Vec<RoadStructure>, road_length_m: f64) {
         covered_m = covered_m.max(end_m);
     }
     structures.retain(|structure| !structure.tunnel || structure.length_m > 0.0);
+    structures
+}
+
+fn read_structure(element: Element) -> Result<RoadStructure> {
+    Ok(RoadStructure {
+        tunnel: element.name() == "tunnel",
+        s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
+        length_m: element.number("length", 0.0, MAX_LENGTH_M)?,
+    })
 }

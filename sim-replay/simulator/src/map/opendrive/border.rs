@@ -43,7 +43,12 @@ pub(super) fn widths_from_borders(
             let border = read_border(*element, side, stretch, log)?;
             if !border.records.is_empty() {
                 lane.width = sum(&border, &times(&inner, -1.0));
-                note_overlaps(*element, &lane.width, stretch.length_m, log);
+                let looks = lane.width.samples(stretch.length_m, LOOKS);
+                let narrowest = looks.fold(f64::INFINITY, f64::min);
+                if narrowest < -ROUNDING_M {
+                    let found = format!("has <border> {:.3} m inside the inner border", -narrowest);
+                    element.note(log, &found, "width 0 there");
+                }
                 inner = border;
             }
             continue;
@@ -73,15 +78,6 @@ fn read_border(
         return Ok(times(&border, -side));
     }
     Ok(times(&border, side))
-}
-
-fn note_overlaps(element: Element, width: &Profile, length_m: f64, log: &mut FindingLog) {
-    let looks = width.samples(length_m, LOOKS);
-    let narrowest = looks.fold(f64::INFINITY, f64::min);
-    if narrowest < -ROUNDING_M {
-        let found = format!("has <border> {:.3} m inside the inner border", -narrowest);
-        element.note(log, &found, "width 0 there");
-    }
 }
 
 /// A profile over places counted from `start_m` on.

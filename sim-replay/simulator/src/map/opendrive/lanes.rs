@@ -44,24 +44,19 @@ pub(super) fn read_sections(
         let left = read_side(element, "left", 1, &stretch, log)?;
         let right = read_side(element, "right", -1, &stretch, log)?;
         let section = LaneSection { s_m, left, right };
-        check_widths(element, &section, end_m - s_m)?;
+        // Refuses sections whose width polynomials exceed the limits of a road.
+        for lane in section.left.iter().chain(&section.right) {
+            // A peak between the samples is clamped by `Road::lane_span_m`.
+            let widest = lane.width.samples(end_m - s_m, 20).fold(0.0, f64::max);
+            if widest > MAX_WIDTH_M {
+                return Err(element.error_element(&format!(
+                    "holds a lane that is {widest:.1} m wide; expected at most {MAX_WIDTH_M}"
+                )));
+            }
+        }
         sections.push(section);
     }
     Ok(sections)
-}
-
-/// Refuses sections whose width polynomials exceed the limits of a road.
-fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Result<()> {
-    for lane in section.left.iter().chain(&section.right) {
-        // A peak between the samples is clamped by `Road::lane_span_m`.
-        let widest = lane.width.samples(length_m, 20).fold(0.0, f64::max);
-        if widest > MAX_WIDTH_M {
-            return Err(element.error_element(&format!(
-                "holds a lane that is {widest:.1} m wide; expected at most {MAX_WIDTH_M}"
-            )));
-        }
-    }
-    Ok(())
 }
 
 /// Lanes of one side, from the reference line outwards. A lane whose id cannot be read is left out with all lanes
@@ -121,7 +116,16 @@ fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane> {
     if direction == Some("both") {
         element.note_value(log, "direction", "driven in the direction of its side only");
     }
-    note_heights(element, log);
+    // Reports the heights of lanes over the road (kerbs), which are not built.
+    let heights = children(element, "height").flat_map(|record| {
+        ["inner", "outer"].map(|name| record.number_or_0(name, -1e3, 1e3).unwrap_or(0.0))
+    });
+    let highest_m = heights.map(f64::abs).fold(0.0, f64::max);
+    if highest_m > 0.0 {
+        let kind = element.optional_text("type").unwrap_or_default();
+        let found = format!("type=\"{kind}\" has <height> up to {highest_m} m");
+        element.note(log, &found, "height over the road left out");
+    }
     Ok(RoadLane {
         predecessor,
         successor,
@@ -149,18 +153,5 @@ fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
             element.note_value(log, "type", "not driven on");
             LaneKind::Other
         }
-    }
-}
-
-/// Reports the heights of lanes over the road (kerbs), which are not built.
-fn note_heights(element: Element, log: &mut FindingLog) {
-    let heights = children(element, "height").flat_map(|record| {
-        ["inner", "outer"].map(|name| record.number_or_0(name, -1e3, 1e3).unwrap_or(0.0))
-    });
-    let highest_m = heights.map(f64::abs).fold(0.0, f64::max);
-    if highest_m > 0.0 {
-        let kind = element.optional_text("type").unwrap_or_default();
-        let found = format!("type=\"{kind}\" has <height> up to {highest_m} m");
-        element.note(log, &found, "height over the road left out");
     }
 }
