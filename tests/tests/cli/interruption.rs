@@ -168,7 +168,7 @@ fn a_map_stops_with_a_checkpoint_and_is_resumed() {
     let path = out.display().to_string();
     // Time enough for a first step on a busy machine; what is left of it need not be waited for.
     let map = ["agent", "map", &drives, "--out", &path, "--minutes", "5"];
-    let resume = [&map[..5], &["--minutes", "0.5", "--resume"]].concat();
+    let resume = [&map[..5], &["--minutes", "0.2", "--resume"]].concat();
 
     let early = interrupted(&map, "reading", "INT");
     assert_eq!(
