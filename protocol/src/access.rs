@@ -10,6 +10,7 @@
 //! | `recorder` | nothing | everything but previews |
 //! | `viewer` | nothing | results, descriptors, previews of sweeps, feature maps, images, statistics |
 //! | `ros2` | sweeps, motion and stated poses of every vehicle | sweeps, motion, poses, detections, tracks, statistics |
+//! | `ros2-<cav>` | sweeps, motion and stated poses of its vehicle | as `ros2` |
 //!
 //! In addition every process declares a liveliness token and publishes its readiness and its ledger, each under its own
 //! name.

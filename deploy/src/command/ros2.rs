@@ -197,14 +197,20 @@ impl Arguments {
 }
 
 impl Sensors {
-    /// Rejects two sensors of one kind for one vehicle, motions of vehicles without a LiDAR, and LiDARs of others than the
+    /// Rejects two sensors of one kind for one vehicle, motions of vehicles without a LiDAR, and sensors of others than the
     /// node's `robot`.
     fn check(&self, robot: Option<&CavId>) -> anyhow::Result<()> {
+        let motions = [&self.odometry, &self.twist, &self.imu];
+        let mut all = [&self.lidar, &self.starting_pose]
+            .into_iter()
+            .chain(motions)
+            .flatten();
         if let Some(robot) = robot
-            && let Some(AgentTopic { topic, cav }) = self.lidar.iter().find(|of| of.cav != *robot)
+            && let Some(AgentTopic { topic, cav }) = all.find(|of| of.cav != *robot)
         {
-            let message = format!("--lidar {topic}={cav}: --robot is {robot}");
-            bail!(BadInput::new(message));
+            bail!(BadInput::new(format!(
+                "{topic}={cav}: the node is that of --robot {robot}, and passes sensors on to it only"
+            )));
         }
         let speeds: Vec<AgentTopic> = self.odometry.iter().chain(&self.twist).cloned().collect();
         for (option, what, sources) in [

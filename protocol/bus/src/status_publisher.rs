@@ -132,10 +132,10 @@ impl StatusSender {
                     self.ready(shared);
                     let watchdog = lock(&shared.watchdog).clone();
                     if watchdog.is_none_or(|watchdog| watchdog.is_alive(&mut beats)) {
-                        self.stats();
+                        self.stats(Priority::Background);
                     }
                 }
-                Pop::Closed => return self.stats(),
+                Pop::Closed => return self.stats(Priority::Background),
             }
         }
     }
@@ -147,7 +147,8 @@ impl StatusSender {
         if !subscribed.is_empty() {
             // The scene may start with this answer: what was used before belongs to no frame.
             if !mem::replace(&mut self.is_start_reported, true) {
-                self.stats();
+                // Ahead of the first tick, which waits for the answer.
+                self.stats(Priority::InteractiveHigh);
             }
             let process = self.identity.process.clone();
             let key = Topic::Ready(process.clone()).in_run(&self.identity.run);
@@ -159,7 +160,7 @@ impl StatusSender {
         }
     }
 
-    fn stats(&mut self) {
+    fn stats(&mut self, priority: Priority) {
         let process = self.identity.process.clone();
         let key = Key::stats(&self.identity.run, &process);
         let stats = Stats {
@@ -170,7 +171,7 @@ impl StatusSender {
             traffic: self.stats.traffic(),
             problems: self.stats.problems(),
         };
-        self.put(&key, Priority::Background, 0, stats);
+        self.put(&key, priority, 0, stats);
     }
 
     fn put<M: Payload>(&mut self, key: &Key, priority: Priority, capture_nanos: u64, message: M) {

@@ -15,6 +15,7 @@ use deploy::operate::run_folder::{RunFolder, SWEEP_LOG, frames_csv};
 use deploy::operate::status::Phase;
 use deploy::operate::status_reporter::{Ending, StatusReporter};
 use deploy::operate::supervise::{ProcessEvent, ProcessEventKind, ProcessSpec, Supervisor};
+use deploy::operate::timeouts::Timeouts;
 use deploy::operate::{RECORDER, REPLAY};
 use deploy::report::{self, Capacity, RunReport};
 use deploy::score::metrics::Metrics;
@@ -250,20 +251,7 @@ fn watch(
     let mut offline = scorer.absent();
     watch.end();
     watch.write_status(Phase::Ending, &scorer.progress());
-    // Deadlines of the steps of the end: of the replay, of the last results, of all others. After Ctrl-C everything has
-    // to end within `stop_s`; a run that is over waits for its last results first.
-    let timeouts = &fleet.scenario.timeouts;
-    let (drain_s, stop_s) = (timeouts.drain_s, timeouts.stop_s);
-    let limits_s = match &ending {
-        // The replay has ended by itself.
-        Ending::Over => [0.0, drain_s, drain_s + stop_s],
-        Ending::Asked => [stop_s * REPLAY_SHARE, stop_s * DRAIN_SHARE, stop_s],
-        // The run has failed, so no further results are waited for.
-        Ending::Failed { .. } => [stop_s, 0.0, stop_s],
-    };
-    let now = Instant::now();
-    let [replay_until, drain_until, all_until] =
-        limits_s.map(|after_s| now + Duration::from_secs_f64(after_s));
+    let [replay_until, drain_until, all_until] = deadlines(&fleet.scenario.timeouts, &ending);
     // In the order of the data flow, so that messages on their way still arrive.
     let mut killed = supervisor.end(|name| name == REPLAY, replay_until);
     drain(&supervisor, scorer, drain_until, &mut display);
@@ -295,6 +283,21 @@ fn watch(
         failures: watch.failures(),
         causes: watch.causes(),
     })
+}
+
+/// Deadlines of the steps of the end: of the replay, of the last results, of all others. After Ctrl-C everything has to
+/// end within `stop_s`; a run that is over waits for its last results first.
+fn deadlines(timeouts: &Timeouts, ending: &Ending) -> [Instant; 3] {
+    let (drain_s, stop_s) = (timeouts.drain_s, timeouts.stop_s);
+    let limits_s = match ending {
+        // The replay has ended by itself.
+        Ending::Over => [0.0, drain_s, drain_s + stop_s],
+        Ending::Asked => [stop_s * REPLAY_SHARE, stop_s * DRAIN_SHARE, stop_s],
+        // The run has failed, so no further results are waited for.
+        Ending::Failed { .. } => [stop_s, 0.0, stop_s],
+    };
+    let now = Instant::now();
+    limits_s.map(|after_s| now + Duration::from_secs_f64(after_s))
 }
 
 /// Waits until the ego has reported every tick, or the time is over.

@@ -130,10 +130,11 @@ pub(super) fn begin_folder(out: &std::path::Path, force: bool) -> Result<Unfinis
 /// Removes the mark of the output folder when all its files are on the disk: until then readers report it as unfinished,
 /// also after a power cut.
 pub(super) fn end_folder(out: &std::path::Path, unfinished: Unfinished) -> Result<()> {
-    let sync = |synced: std::io::Result<()>| synced.at(out).map_err(SynthError::Write);
-    sync(atomic_file::sync(out))?;
+    atomic_file::sync(out).at(out).map_err(SynthError::Write)?;
     unfinished.clear()?;
-    sync(atomic_file::sync_name(&out.join(UNFINISHED)))
+    atomic_file::sync_name(&out.join(UNFINISHED))
+        .at(out)
+        .map_err(SynthError::Write)
 }
 
 impl SynthScene<'_, '_> {

@@ -72,8 +72,7 @@ impl<'t> Traffic<'t> {
         let mut near = Vec::new();
         self.list_occupants();
         self.change_lanes(&mut near);
-        // The look-ahead of this step needs the next lanes of every vehicle.
-        // Appends lanes to paths that are too short.
+        // Paths that are too short get further lanes: the look-ahead of this step needs the next ones of every vehicle.
         for index in 0..self.cars.len() {
             while self.cars[index].is_present
                 && self.cars[index].path.remaining_m(self.roads.graph) < DECIDED_M

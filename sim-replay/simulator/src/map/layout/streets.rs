@@ -205,7 +205,7 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
     CrossProfile { left, right }
 }
 
-/// The same for one junction, from the directions and half widths of its arms.
+/// Distance from a junction's middle at which its roads begin, metres, from the directions and half widths of its arms.
 fn junction_radius_m(arms: &[(f64, f64)]) -> f64 {
     let mut radius = arms.iter().map(|&(_, half)| half).fold(0.0, f64::max) + KERB_RADIUS_M;
     for (i, &(angle_a, half_a)) in arms.iter().enumerate() {

@@ -78,13 +78,13 @@ fn count(map_model: &MapModel, kind: SolidKind) -> usize {
 #[test]
 fn streets_are_lined_with_buildings_trees_and_parking() {
     let map_model = build(&RoadMapSource::Town1, 4).unwrap();
-    for (kind, most) in [
+    for (kind, fewest) in [
         (SolidKind::Building, 500),
         (SolidKind::TreeTrunk, 200),
         (SolidKind::Pole, 100),
     ] {
         let found = count(&map_model, kind);
-        assert!(found > most, "{kind:?}: {found}");
+        assert!(found > fewest, "{kind:?}: {found}");
     }
     assert!(map_model.parking.len() > 200, "{}", map_model.parking.len());
 }
