@@ -21,7 +21,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "CAV,..", value_delimiter = ',')]
     egos: Vec<CavId>,
     /// Robots with a `v2vloc ros2 --robot` of their own: each gets a certificate for it.
-    #[arg(long, value_name = "CAV,..", value_delimiter = ',')]
+    #[arg(long, value_name = "CAV,..", value_delimiter = ',', value_parser = super::robot)]
     robots: Vec<CavId>,
     /// Names or addresses of the router, in addition to localhost.
     #[arg(long, value_name = "HOST,..", value_delimiter = ',')]

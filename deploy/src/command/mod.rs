@@ -12,7 +12,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use bus::{BusOptions, Endpoint, Identity, malloc_settings};
-use protocol::{Principal, RunId};
+use protocol::{CavId, Principal, Role, RunId};
 use support::cli::Outcome;
 use support::sibling_program::Sibling;
 
@@ -93,6 +93,15 @@ impl Command {
             Self::Ros2(arguments) => arguments.run(),
         }
     }
+}
+
+/// Reads the agent of a robot's own node. The node of a whole run is named as its role, and may publish for every agent.
+fn robot(text: &str) -> Result<CavId, String> {
+    let cav = CavId::new(text).map_err(|error| error.to_string())?;
+    if Principal::new(Role::Ros2, &cav) == Principal::of_role(Role::Ros2) {
+        return Err(format!("{text} is the name of the node of a whole run"));
+    }
+    Ok(cav)
 }
 
 /// Identity of a process in a run and options of a client of its router; `keys` where the run has security.

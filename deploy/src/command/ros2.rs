@@ -12,7 +12,7 @@ use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};
 use support::output;
 
-use super::client;
+use super::{client, robot};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -24,7 +24,7 @@ pub(crate) struct Arguments {
     run: RunId,
     /// Robot of this node, in a run with a node per robot: the process is named ros2-AGENT, and passes sensors on to this
     /// agent only.
-    #[arg(long, value_name = "AGENT", allow_hyphen_values = true)]
+    #[arg(long, value_name = "AGENT", allow_hyphen_values = true, value_parser = robot)]
     robot: Option<CavId>,
     /// Folder with the node's keys, where the run has security (`v2vloc keys` writes DIR/ros2, or DIR/ros2-AGENT).
     #[arg(long, value_name = "DIR")]

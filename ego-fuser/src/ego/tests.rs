@@ -134,7 +134,7 @@ pub(crate) fn near() -> Pose {
     Pose::from_xyz_yaw([104.0, 51.0, 2.0], 0.3)
 }
 
-/// What an ego without neighbours detects.
+/// Detections of an ego without neighbours.
 fn ego_only(detector: impl Fn() -> Detector, method: Method) -> Vec<Detection> {
     let own = view_by(detector(), "a", HERE, method, 0.0);
     let mut ego = Ego::new(detector(), method).unwrap();

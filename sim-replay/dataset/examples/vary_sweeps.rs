@@ -6,6 +6,7 @@
 use std::collections::HashMap;
 use std::fmt::Write;
 use std::fs;
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use dataset::LoadOptions;
@@ -197,14 +198,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .next()
         .ok_or("which folder for the variants?")?
         .into();
-    let every = arguments
-        .next()
-        .and_then(|text| text.to_str()?.parse().ok())
-        .unwrap_or(1);
+    let every: NonZeroUsize = match arguments.next() {
+        Some(text) => text.to_str().ok_or("EVERY is no number")?.parse()?,
+        None => NonZeroUsize::MIN,
+    };
     let dataset = dataset::open(&folder)?;
     let mut sweeps = Vec::new();
     for scenario in &dataset.scenarios {
-        for tick in (0..scenario.ticks.len()).step_by(every) {
+        for tick in (0..scenario.ticks.len()).step_by(every.get()) {
             for agent in
                 (0..scenario.agents.len()).filter(|agent| scenario.is_present(*agent, tick))
             {

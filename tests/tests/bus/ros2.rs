@@ -371,15 +371,42 @@ fn ros_nodes_discover_and_receive_the_run() {
 
 /// `sensor_msgs/PointCloud2` of two points with x, y, z in single precision and intensity in 8 bits.
 pub(super) fn driver_cloud(nanos: u64, point_step: u32) -> Vec<u8> {
+    let points = [1.0f32, -1.0].map(|x| {
+        let mut point = [x, 2.0, 3.0].map(f32::to_le_bytes).concat();
+        point.extend([51, 0, 0, 0]);
+        point
+    });
+    point_cloud(nanos, UINT8, point_step, &points.concat())
+}
+
+/// `sensor_msgs/PointField::UINT8` and `FLOAT32`.
+const UINT8: u8 = 2;
+pub(super) const FLOAT32: u8 = 7;
+
+/// `sensor_msgs/PointCloud2` of points of 16 bytes: x, y, z in single precision, and intensity in a type of its own; the
+/// message states `point_step`.
+pub(super) fn point_cloud(
+    nanos: u64,
+    intensity_type: u8,
+    point_step: u32,
+    points: &[u8],
+) -> Vec<u8> {
+    let count = u32::try_from(points.len() / 16).unwrap();
     let mut bytes = vec![0, 1, 0, 0];
     let mut cdr = CdrWriter::<LittleEndian>::new(&mut bytes);
     cdr.write_i32((nanos / 1_000_000_000) as i32);
     cdr.write_u32((nanos % 1_000_000_000) as u32);
     cdr.write_string("velodyne");
-    [1, 2].into_iter().for_each(|value| cdr.write_u32(value));
-    let fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 2)];
-    cdr.write_sequence_length(fields.len());
-    for (name, offset, datatype) in fields {
+    [1, count]
+        .into_iter()
+        .for_each(|value| cdr.write_u32(value));
+    let coordinates = [("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32)];
+    cdr.write_sequence_length(coordinates.len() + 1);
+    for (name, offset, datatype) in
+        coordinates
+            .into_iter()
+            .chain([("intensity", 12, intensity_type)])
+    {
         cdr.write_string(name);
         cdr.write_u32(offset);
         cdr.write_u8(datatype);
@@ -387,15 +414,8 @@ pub(super) fn driver_cloud(nanos: u64, point_step: u32) -> Vec<u8> {
     }
     cdr.write_bool(false);
     cdr.write_u32(point_step);
-    cdr.write_u32(2 * point_step);
-    let point = |x: f32| {
-        [
-            &[x, 2.0, 3.0].map(f32::to_le_bytes).concat()[..],
-            &[51, 0, 0, 0],
-        ]
-        .concat()
-    };
-    cdr.write_bytes(&[point(1.0), point(-1.0)].concat());
+    cdr.write_u32(count * point_step);
+    cdr.write_bytes(points);
     cdr.write_bool(true);
     bytes
 }

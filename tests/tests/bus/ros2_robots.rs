@@ -15,7 +15,6 @@ use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
 use perception::model_config::DetectorConfig;
 use protocol::{Detections, Limits, PointCloud, Stream, Topic};
-use re_cdr::{CdrWriter, LittleEndian};
 use ros2::{Distribution, RosType};
 use simulator::generate::{Subset, SynthOptions, generate};
 use tests::bus::{TestRouter, wait_for};
@@ -23,7 +22,9 @@ use tests::fleet::programs;
 use tests::locks::exclusive_lock;
 use zenoh::Session;
 
-use super::ros2::{DOMAIN, announce, other_node, put, wait_for_subscriptions};
+use super::ros2::{
+    DOMAIN, FLOAT32, announce, other_node, point_cloud, put, wait_for_subscriptions,
+};
 
 /// Ticks of the scene, which every round plays once.
 const TICKS: usize = 8;
@@ -60,35 +61,9 @@ impl Drop for Processes {
 
 /// A sweep as a driver publishes it.
 fn cloud(nanos: u64, points: &PointCloud) -> Vec<u8> {
-    let count = u32::try_from(points.xyzi.len()).unwrap();
-    let mut bytes = vec![0, 1, 0, 0];
-    let mut cdr = CdrWriter::<LittleEndian>::new(&mut bytes);
-    cdr.write_i32(i32::try_from(nanos / 1_000_000_000).unwrap());
-    cdr.write_u32(u32::try_from(nanos % 1_000_000_000).unwrap());
-    cdr.write_string("velodyne");
-    [1, count]
-        .into_iter()
-        .for_each(|value| cdr.write_u32(value));
-    let fields = ["x", "y", "z", "intensity"];
-    cdr.write_sequence_length(fields.len());
-    for (name, offset) in fields.into_iter().zip((0..).step_by(4)) {
-        cdr.write_string(name);
-        cdr.write_u32(offset);
-        cdr.write_u8(7);
-        cdr.write_u32(1);
-    }
-    cdr.write_bool(false);
-    [16, 16 * count]
-        .into_iter()
-        .for_each(|value| cdr.write_u32(value));
     let values = points.xyzi.iter().flatten();
-    cdr.write_bytes(
-        &values
-            .flat_map(|value| value.to_le_bytes())
-            .collect::<Vec<u8>>(),
-    );
-    cdr.write_bool(true);
-    bytes
+    let bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();
+    point_cloud(nanos, FLOAT32, 16, &bytes)
 }
 
 /// The scene, and the ego's results so far.

@@ -261,7 +261,7 @@ mod tests {
 
     use super::*;
 
-    /// What is read from a head's file with this model.
+    /// Confidence that is read from the file of a head with this model.
     fn stored(folder: &Path, model: &ConfidenceModel) -> Result<Confidence> {
         let path = folder.join("head.safetensors");
         let metadata: BTreeMap<_, _> = [(

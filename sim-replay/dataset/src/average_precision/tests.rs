@@ -205,7 +205,7 @@ fn distance_along_x(a: &Box3d, b: &Box3d) -> f64 {
     (a.center_m[0] - b.center_m[0]).abs()
 }
 
-/// Whether two cars overlap by half, as intervals of x.
+/// True if the intervals of x of two cars have an IoU of at least a half.
 fn overlap_along_x(a: &Box3d, b: &Box3d) -> bool {
     let common = (4.0 - distance_along_x(a, b)).max(0.0);
     common / (8.0 - common) >= 0.5
