@@ -292,6 +292,10 @@ class LivePage(Checks):
         for problems, words in (([], "no result for 12 s"), ([waits], waits)):
             status = {"silent_s": 0.1, "unanswered_s": 12.3, "problems": problems, "is_over": False, "has_router": True}
             self.same("a run without results", self.tab.value(f"probe.stateOf({json.dumps(status)})"), words)
+        twice = "ego-1000: two senders use cav/1001/bev: both are rejected (for 3 s)"
+        status = {"silent_s": 0.1, "unanswered_s": 0.1, "problems": [twice], "is_over": False, "has_router": True}
+        self.same("a run with results and a problem", self.tab.value(f"probe.stateOf({json.dumps(status)})"), "live")
+        self.same("names the problem", self.tab.value(text("#problems")), twice)
 
     def other_ego(self) -> None:
         self.tab.wait("document.querySelectorAll('#ego option').length === 2", 20)
@@ -332,6 +336,11 @@ class CausesPage(Checks):
 
     def loses_router(self) -> None:
         self.becomes("says that the router is gone", "#state", "^router gone, last message", 10)
+
+    def names_outages(self, times: int) -> None:
+        count = "" if times == 1 else rf" in all \({times} times\)"
+        self.becomes("names the outage", "#problems", rf"observed: router gone for \d+\.\d s{count}$", 20)
+        self.layout()
 
 
 class ReportPage(Checks):

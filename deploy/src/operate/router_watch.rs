@@ -29,19 +29,19 @@ pub(crate) fn in_words(silence: Duration) -> String {
 
 /// Times of one kind.
 #[derive(Debug, Default)]
-struct TimeSum {
+pub(crate) struct TimeSum {
     count: usize,
     sum: Duration,
 }
 
 impl TimeSum {
-    fn add(&mut self, time: Duration) {
+    pub(crate) fn add(&mut self, time: Duration) {
         self.count += 1;
         self.sum += time;
     }
 
     /// `router gone for 4.0 s`, with the number of times where there were several.
-    fn sentence(&self, what: &str) -> Option<String> {
+    pub(crate) fn sentence(&self, what: &str) -> Option<String> {
         let times = match self.count {
             0 => return None,
             1 => String::new(),

@@ -20,6 +20,8 @@ use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 use zenoh::Wait;
 
+use crate::operate::router_watch::{LIMIT, TimeSum};
+
 use super::frame_assembler::{FrameAssembler, ReceivedMessage, decoded};
 use super::on_demand::OnDemand;
 
@@ -78,6 +80,8 @@ pub(super) struct LiveStatus {
     pub(super) unanswered_s: Option<f64>,
     /// Problems that processes report.
     pub(super) problems: Vec<String>,
+    /// Outages of the router so far, as text; `None`: there was none.
+    pub(super) router_outages: Option<String>,
     /// True if its scene has been played to the end.
     pub(super) is_over: bool,
     /// True while there is a connection to its router.
@@ -95,7 +99,29 @@ struct RunActivity {
     /// Problems that each process reports.
     problems: BTreeMap<ProcessId, Vec<String>>,
     is_over: bool,
-    has_router: bool,
+    router: RouterConnection,
+}
+
+/// Connection to the router, and the times without it.
+#[derive(Debug, Default)]
+struct RouterConnection {
+    is_there: bool,
+    /// When the last message came or the connection ended, whichever was earlier; `None`: there is one, or there was never one.
+    lost: Option<Instant>,
+    outages: TimeSum,
+}
+
+impl RouterConnection {
+    /// Takes note of whether there is a connection `now`. A router that passes nothing is gone from its last message on.
+    fn note(&mut self, is_there: bool, last_message: Option<Instant>, now: Instant) {
+        if self.is_there && !is_there {
+            let silent_since = last_message.filter(|last| now.duration_since(*last) > LIMIT);
+            self.lost = Some(silent_since.unwrap_or(now));
+        } else if is_there && let Some(lost) = self.lost.take() {
+            self.outages.add(now.duration_since(lost));
+        }
+        self.is_there = is_there;
+    }
 }
 
 impl LiveRun {
@@ -147,7 +173,8 @@ impl LiveRun {
                 .flat_map(|(name, of)| of.iter().map(move |problem| format!("{name}: {problem}")))
                 .collect(),
             is_over: activity.is_over,
-            has_router: activity.has_router,
+            router_outages: activity.router.outages.sentence("router gone"),
+            has_router: activity.router.is_there,
             images_left_out: self.shared.images.left_out(),
         }
     }
@@ -284,7 +311,10 @@ impl LiveListener {
 
     fn watch_router(&self) {
         let mut routers = self.bus.session().info().routers_zid().wait();
-        lock(&self.shared.activity).has_router = routers.next().is_some();
+        let mut activity = lock(&self.shared.activity);
+        let last_message = activity.last_message;
+        let is_there = routers.next().is_some();
+        activity.router.note(is_there, last_message, Instant::now());
     }
 
     /// Receives images only while a page shows them: they are the largest stream after sweeps.

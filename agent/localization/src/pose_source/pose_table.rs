@@ -10,6 +10,7 @@ use protocol::config::FieldError;
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use support::atomic_file;
 use support::csv_file::{CsvFile, CsvRow, CsvText};
 use support::file_error::{AtFile, FileError, Result};
 
@@ -110,7 +111,8 @@ impl PoseTable {
         rows.iter()
             .for_each(|row| text.row(fields(last_part(scenario), row)));
         let file = OpenOptions::new().create(true).append(true).open(path);
-        (file.and_then(|mut file| file.write_all(text.finish().as_bytes()))).at(path)
+        let written = file.and_then(|mut file| file.write_all(text.finish().as_bytes()));
+        written.and_then(|()| atomic_file::sync(path)).at(path)
     }
 
     /// The poses of one scenario: the requested one, or the only one there is.

@@ -53,6 +53,12 @@ async function watch() {
   }
 }
 
+/// What processes report, and outages of the router: they stay when results come again.
+function problems(texts) {
+  $("problembox").hidden = !texts.length;
+  $("problems").replaceChildren(...texts.map((text) => element("li", {}, text)));
+}
+
 /// State of the live run: going on, over, or out of reach.
 async function check() {
   const answer = await fetch("status").catch(() => null);
@@ -60,6 +66,7 @@ async function check() {
   const status = await answer.json();
   const { silent_s: silent, is_over: over, has_router: router, images_left_out: leftOut } = status;
   view.imagesLeftOut = leftOut;
+  problems([...status.problems || [], ...status.router_outages ? [`observed: ${status.router_outages}`] : []]);
   const before = isKnown(silent) ? ` ${seconds(silent)} ago` : "";
   if (over && silent > 2) state("over", `ended${before}${router ? "" : ", router gone"}`);
   else if (!router) state("ended", before ? `router gone, last message${before}` : "router gone");

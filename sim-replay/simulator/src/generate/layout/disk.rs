@@ -6,6 +6,7 @@ use std::{fs, io};
 use super::SceneHeader;
 use crate::generate::error::SynthError;
 use dataset::UNFINISHED;
+use support::atomic_file;
 use support::file_error::{AtFile, FileError};
 
 /// Writes text or bytes.
@@ -67,7 +68,10 @@ impl Unfinished {
     pub(crate) fn mark(folder: &Path) -> Result<Self, SynthError> {
         let mark = folder.join(UNFINISHED);
         let text = "This folder is being written, or the run that wrote it was interrupted.\n";
-        write_file(&mark, text)?;
+        // On the disk before the files that it speaks of.
+        atomic_file::write(&mark, text)
+            .at(&mark)
+            .map_err(SynthError::Write)?;
         Ok(Self(mark))
     }
 
