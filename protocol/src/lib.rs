@@ -137,8 +137,8 @@ pub use message::{
     DetectionsReport, EgoMotion, FrameReport, FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind,
     Lidar, Message, ModelHash, NeighbourState, NoPoseReason, ObjectTrack, Pace, Payload,
     PerceivedObject, Pinhole, PlanarCovariance, Points, PoseEstimate, ProcessUsage, Radar,
-    SkippedNeighbour, StageSummary, StageTiming, Stats, SweepArrival, TopicCount, TopicTraffic,
-    Track, Tracks, TracksReport, TrueObject, Truth,
+    SkippedNeighbour, StageSummary, StageTiming, Stats, SweepArrival, ThreadUsage, TopicCount,
+    TopicTraffic, Track, Tracks, TracksReport, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

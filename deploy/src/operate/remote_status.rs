@@ -266,6 +266,7 @@ mod tests {
             cpu_s,
             resident_bytes: 3 << 20,
             peak_resident_bytes: 3 << 20,
+            threads: vec![],
         };
         let stats = Stats {
             process: process.clone(),

@@ -92,6 +92,7 @@ mod tests {
             cpu_s: 1.5,
             resident_bytes: 1 << 20,
             peak_resident_bytes: 2 << 20,
+            threads: vec![],
         };
         let counts = BTreeMap::from([(put.clone(), 3)]);
         before.plus(&usage, &counts).write(&file).unwrap();

@@ -45,8 +45,24 @@ pub struct ProcessResources {
     /// CPU time from the first tick on, per frame: of an agent per computed sweep, of an ego per result, of others per
     /// tick, milliseconds.
     pub cpu_ms_per_frame: Option<f64>,
+    /// Time of the stages that compute, per frame, milliseconds: on an idle machine the CPU time that a stage names.
+    #[serde(default)]
+    pub stages_ms_per_frame: Option<f64>,
+    /// CPU time from the first tick on by thread, the largest first, and that of threads that have ended: the sum is
+    /// `cpu_ms_per_frame`.
+    #[serde(default)]
+    pub threads: Vec<ThreadResources>,
     /// Largest resident memory of an instance, bytes.
     pub peak_resident_bytes: u64,
+}
+
+/// CPU time of the threads of a name in a process, over all its instances.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct ThreadResources {
+    /// Name of the threads.
+    pub name: String,
+    /// CPU time from the first tick on, per frame, milliseconds.
+    pub cpu_ms_per_frame: f64,
 }
 
 /// Published messages of one stream, over all vehicles.
@@ -93,16 +109,17 @@ fn kind_of(process: &str) -> (usize, String) {
 
 /// CPU time and memory of every process, in the order of the data flow.
 pub(super) fn processes(processes: &[ProcessStats], pace: &RunPace) -> Vec<ProcessResources> {
-    let mut all = BTreeMap::<(usize, String), (ProcessResources, u64)>::new();
+    let mut all = BTreeMap::<(usize, String), (ProcessResources, ProcessTimes, u64)>::new();
     for stats in processes {
         let name = stats.process.to_string();
         let (order, kind) = kind_of(&name);
-        let (sum, frames) = all.entry((order, name.clone())).or_default();
+        let (sum, times, frames) = all.entry((order, name.clone())).or_default();
         sum.process = name;
         sum.instances += 1;
         sum.cpu_s += stats.usage.cpu_s;
-        sum.playing_cpu_s += (stats.usage.cpu_s - stats.cpu_before_s).max(0.0);
+        sum.playing_cpu_s += (stats.usage.cpu_s - stats.usage_before.cpu_s).max(0.0);
         sum.peak_resident_bytes = sum.peak_resident_bytes.max(stats.usage.peak_resident_bytes);
+        times.add(stats);
         // Sweeps add up over the instances. Answers and ticks are of the whole run already.
         *frames = match kind.as_str() {
             "agent" => *frames + sweeps(stats),
@@ -110,12 +127,66 @@ pub(super) fn processes(processes: &[ProcessStats], pace: &RunPace) -> Vec<Proce
             _ => pace.ticks,
         };
     }
-    let finished = all.into_values().map(|(sum, frames)| ProcessResources {
-        cores: (pace.seconds > 0.0).then(|| sum.playing_cpu_s / pace.seconds),
-        cpu_ms_per_frame: (frames > 0).then(|| sum.playing_cpu_s * 1e3 / frames as f64),
-        ..sum
+    let finished = all.into_values().map(|(sum, times, frames)| {
+        let per_frame = |ms: f64| (frames > 0).then(|| ms / frames as f64);
+        ProcessResources {
+            cores: (pace.seconds > 0.0).then(|| sum.playing_cpu_s / pace.seconds),
+            cpu_ms_per_frame: per_frame(sum.playing_cpu_s * 1e3),
+            stages_ms_per_frame: per_frame(times.stages_ms).filter(|ms| *ms > 0.0),
+            threads: times.threads(sum.playing_cpu_s * 1e3, per_frame),
+            ..sum
+        }
     });
     finished.collect()
+}
+
+/// Name of the threads that have ended, and of what the kernel counts for the process alone.
+const ENDED: &str = "(ended)";
+
+/// Times of the stages and threads of a process, over all its instances.
+#[derive(Default)]
+struct ProcessTimes {
+    stages_ms: f64,
+    threads_ms: BTreeMap<String, f64>,
+}
+
+impl ProcessTimes {
+    fn add(&mut self, stats: &ProcessStats) {
+        let stages = stats.stages.iter().filter(|stage| computes(&stage.stage));
+        self.stages_ms += stages.map(|stage| stage.sum_ms).sum::<f64>();
+        for thread in &stats.usage.threads {
+            let mut before = stats.usage_before.threads.iter();
+            let before_s = before.find(|one| one.name == thread.name);
+            let playing_s = thread.cpu_s - before_s.map_or(0.0, |one| one.cpu_s);
+            *self.threads_ms.entry(thread.name.clone()).or_default() += playing_s.max(0.0) * 1e3;
+        }
+    }
+
+    /// None where the system does not tell.
+    fn threads(self, all_ms: f64, per_frame: impl Fn(f64) -> Option<f64>) -> Vec<ThreadResources> {
+        let running_ms: f64 = self.threads_ms.values().sum();
+        let ended_ms = (all_ms - running_ms).max(0.0);
+        let ended = (running_ms > 0.0).then(|| (ENDED.to_owned(), ended_ms));
+        let threads = self.threads_ms.into_iter().chain(ended);
+        let threads = threads.filter_map(|(name, ms)| {
+            let cpu_ms_per_frame = per_frame(ms)?;
+            Some(ThreadResources {
+                name,
+                cpu_ms_per_frame,
+            })
+        });
+        let mut threads: Vec<_> = threads.collect();
+        threads.sort_by(|a, b| b.cpu_ms_per_frame.total_cmp(&a.cpu_ms_per_frame));
+        threads
+    }
+}
+
+/// False for stages that wait for others, and for those that are parts of another one or the sum of others.
+fn computes(stage: &str) -> bool {
+    match stage.strip_prefix("pose ") {
+        Some(part) => part == "measurement",
+        None => !matches!(stage, "agent" | "wait") && !stage.ends_with("transport"),
+    }
 }
 
 /// Published bytes by stream, the largest first.

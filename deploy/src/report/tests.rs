@@ -1,4 +1,4 @@
-use protocol::{Ledger, ProcessUsage, StageSummary, TopicTraffic};
+use protocol::{Ledger, ProcessUsage, StageSummary, ThreadUsage, TopicTraffic};
 
 use super::*;
 use crate::score::StageStamps;
@@ -34,6 +34,12 @@ fn record(tick: u64, latency_ms: Option<f64>) -> FrameRecord {
     }
 }
 
+/// One thread with this CPU time.
+fn thread(cpu_s: f64) -> Vec<ThreadUsage> {
+    let name = "main".into();
+    vec![ThreadUsage { name, cpu_s }]
+}
+
 /// A process with one stage, its CPU time in total and before the first tick, and one published topic.
 fn process(
     name: &str,
@@ -48,6 +54,7 @@ fn process(
         stages: vec![StageSummary {
             stage: stage.into(),
             count,
+            sum_ms: count as f64 * p50_ms,
             p50_ms,
             p95_ms,
             p99_ms,
@@ -57,8 +64,13 @@ fn process(
             cpu_s: cpu_s[0],
             resident_bytes: 1 << 20,
             peak_resident_bytes: 3 << 20,
+            threads: thread(0.6 * cpu_s[0]),
         },
-        cpu_before_s: cpu_s[1],
+        usage_before: ProcessUsage {
+            cpu_s: cpu_s[1],
+            threads: thread(0.6 * cpu_s[1]),
+            ..ProcessUsage::default()
+        },
         traffic: vec![TopicTraffic {
             topic: topic.parse().unwrap(),
             messages: count,
@@ -165,6 +177,14 @@ fn cpu_time_is_per_process_and_per_frame() {
     assert!(
         is_near(Some(second.playing_cpu_s), 1.0) && is_near(second.cpu_ms_per_frame, 1000.0 / 3.0)
     );
+    // Threads that have ended have the rest.
+    let [thread, ended] = &second.threads[..] else {
+        panic!("{second:?}")
+    };
+    assert!(is_near(Some(thread.cpu_ms_per_frame), 200.0) && thread.name == "main");
+    assert!(is_near(Some(ended.cpu_ms_per_frame), 400.0 / 3.0) && ended.name == "(ended)");
+    // A stage that is the sum of others is no time of its own.
+    assert!(is_near(ego.stages_ms_per_frame, 30.0) && first.stages_ms_per_frame.is_none());
     assert!(is_near(ego.cpu_ms_per_frame, 200.0) && is_near(scorer.cpu_ms_per_frame, 75.0));
 }
 

@@ -4,6 +4,7 @@ use std::fmt;
 
 use terminal::text_table::{TextTable, number};
 
+use super::resources::ThreadResources;
 use super::{RunPace, RunReport, Spread};
 use crate::operate::progress::bytes;
 
@@ -31,6 +32,7 @@ impl fmt::Display for RunReport {
         let tables = [
             (self.stages.len(), self.stage_table()),
             (self.processes.len(), self.process_table()),
+            (self.threads().count(), self.thread_table()),
             (self.streams.len(), self.stream_table()),
         ];
         for (_, table) in tables.iter().filter(|(rows, _)| *rows > 0) {
@@ -84,12 +86,12 @@ impl RunReport {
             "of these playing",
             "cores",
             "CPU ms per frame",
+            "in stages",
             "peak MiB",
         ];
         let mut table = TextTable::of(&["process"], &numbers);
         for process in &self.processes {
-            let name = match (process.process.as_str(), process.instances) {
-                ("scorer", _) => "v2vloc (scorer)".to_owned(),
+            let name = match (shown_name(&process.process), process.instances) {
                 (name, 1) => name.to_owned(),
                 (name, several) => format!("{name}, started {several} times"),
             };
@@ -99,8 +101,29 @@ impl RunReport {
                 format!("{:.2}", process.playing_cpu_s),
                 number(process.cores, 2),
                 number(process.cpu_ms_per_frame, 1),
+                number(process.stages_ms_per_frame, 1),
                 format!("{:.0}", process.peak_resident_bytes as f64 / MIB),
             ]);
+        }
+        table
+    }
+
+    /// Processes and their threads with at least a tenth of a millisecond a frame.
+    fn threads(&self) -> impl Iterator<Item = (&str, &ThreadResources)> {
+        let all = self.processes.iter();
+        all.flat_map(|of| {
+            of.threads
+                .iter()
+                .map(|thread| (of.process.as_str(), thread))
+        })
+        .filter(|(_, thread)| thread.cpu_ms_per_frame >= 0.1)
+    }
+
+    fn thread_table(&self) -> TextTable {
+        let mut table = TextTable::of(&["process", "thread"], &["CPU ms per frame"]);
+        for (process, thread) in self.threads() {
+            let ms = format!("{:.1}", thread.cpu_ms_per_frame);
+            table.row([shown_name(process).to_owned(), thread.name.clone(), ms]);
         }
         table
     }
@@ -117,6 +140,14 @@ impl RunReport {
             ]);
         }
         table
+    }
+}
+
+/// Name of a process: the scorer is a part of the program that people start.
+fn shown_name(process: &str) -> &str {
+    match process {
+        "scorer" => "v2vloc (scorer)",
+        name => name,
     }
 }
 

@@ -82,9 +82,9 @@ pub struct ProcessStats {
     /// Its CPU time and memory.
     #[serde(skip)]
     pub usage: ProcessUsage,
-    /// CPU time before the first tick, seconds: for loading models and for joining the run.
+    /// CPU time and memory before the first tick: for loading models and for joining the run.
     #[serde(skip)]
-    pub cpu_before_s: f64,
+    pub usage_before: ProcessUsage,
     /// Its published bytes, by topic.
     #[serde(skip)]
     pub traffic: Vec<TopicTraffic>,
@@ -251,7 +251,8 @@ impl ScorerNode {
             ledger: own_stats.ledger(),
             stages: own_stats.stages(),
             usage: process_usage(),
-            cpu_before_s: own.first().map_or(0.0, |own| own.cpu_before_s),
+            usage_before: { own.into_iter().next() }
+                .map_or_else(Default::default, |own| own.usage_before),
             traffic: own_stats.traffic(),
         };
         let scored = Scored {
@@ -430,16 +431,16 @@ impl ScorerWorker {
         let (name, at) = (process.to_string(), arrival.at);
         // Until the first tick: the loading of models belongs to no frame.
         let known = self.stats.get(&instance);
-        let cpu_before_s = match self.published.is_empty() {
-            true => report.usage.cpu_s,
-            false => known.map_or(0.0, |known| known.cpu_before_s),
+        let usage_before = match self.published.is_empty() {
+            true => report.usage.clone(),
+            false => known.map_or_else(Default::default, |known| known.usage_before.clone()),
         };
         let stats = ProcessStats {
             process,
             ledger: report.ledger,
             stages: report.stages,
             usage: report.usage,
-            cpu_before_s,
+            usage_before,
             traffic: report.traffic,
         };
         self.stats.insert(instance, stats);

@@ -1,6 +1,6 @@
 //! Tests of the page on a synthetic recorded and a synthetic live run.
 
-use std::io::{Read, Write};
+use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::Path;
 use std::sync::Arc;
@@ -744,6 +744,8 @@ fn another_ego_and_a_feature_map_of_a_live_run_are_shown_on_request() {
     default_view
         .write_all(b"GET /live HTTP/1.1\r\n\r\n")
         .unwrap();
+    // Read to the end: a page that takes nothing is disconnected.
+    std::thread::spawn(move || io::copy(&mut default_view, &mut io::sink()));
     wait_for("the default view is watched", || run.watchers() == 1);
     for ego in [EGO, OTHER] {
         let moments = moments_of(server.address(), &format!("frames=10&ego={ego}"));

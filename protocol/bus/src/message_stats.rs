@@ -393,6 +393,7 @@ impl MessageStats {
             StageSummary {
                 stage: stage.clone(),
                 count: timings.count,
+                sum_ms: timings.sum.as_secs_f64() * 1e3,
                 p50_ms,
                 p95_ms,
                 p99_ms,

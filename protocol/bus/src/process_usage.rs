@@ -1,8 +1,11 @@
 //! Resource usage of this process: CPU time by the system's clock, memory by `/proc`.
 
 use std::fs;
+use std::time::Duration;
 
-use protocol::ProcessUsage;
+use std::collections::BTreeMap;
+
+use protocol::{ProcessUsage, ThreadUsage};
 use rustix::time::{ClockId, clock_gettime};
 
 /// CPU time and memory of this process so far; 0 where the system does not tell.
@@ -12,6 +15,7 @@ pub fn process_usage() -> ProcessUsage {
         cpu_s: process_cpu_s(),
         resident_bytes: memory_bytes(&status, "VmRSS:").unwrap_or(0),
         peak_resident_bytes: memory_bytes(&status, "VmHWM:").unwrap_or(0),
+        threads: threads(),
     }
 }
 
@@ -19,6 +23,34 @@ pub fn process_usage() -> ProcessUsage {
 pub fn process_cpu_s() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
+}
+
+/// CPU time of the running threads by name; none where the kernel keeps no statistics of its scheduler.
+fn threads() -> Vec<ThreadUsage> {
+    let tasks = fs::read_dir("/proc/self/task").into_iter().flatten();
+    let mut by_name = BTreeMap::<String, f64>::new();
+    for task in tasks.flatten() {
+        let read = |file: &str| fs::read_to_string(task.path().join(file)).ok();
+        // A thread may end between the two.
+        if let (Some(name), Some(times)) = (read("comm"), read("schedstat"))
+            && let Some(nanos) = times.split(' ').next().and_then(|nanos| nanos.parse().ok())
+        {
+            let name = plain_name(&name);
+            *by_name.entry(name).or_default() += Duration::from_nanos(nanos).as_secs_f64();
+        }
+    }
+    let threads = by_name.into_iter();
+    threads
+        .map(|(name, cpu_s)| ThreadUsage { name, cpu_s })
+        .collect()
+}
+
+/// Name without a number at its end: `rx-3` is one of several threads.
+fn plain_name(name: &str) -> String {
+    let name = name
+        .trim_end()
+        .trim_end_matches(|letter: char| letter.is_ascii_digit());
+    name.trim_end_matches('-').to_owned()
 }
 
 /// A field of `/proc/PID/status` in kB, in bytes.
@@ -44,6 +76,9 @@ mod tests {
         }
         let after = process_usage();
         assert!(after.cpu_s > before.cpu_s, "{sum}");
+        let of_threads: f64 = after.threads.iter().map(|thread| thread.cpu_s).sum();
+        // Threads of other tests may have ended.
+        assert!((0.01..=process_cpu_s()).contains(&of_threads), "{after:?}");
         assert!(
             after.resident_bytes > 16 << 20 && after.peak_resident_bytes >= 32 << 20,
             "{after:?}"

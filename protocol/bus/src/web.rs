@@ -28,10 +28,10 @@ use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
+use rustix::net::sockopt::set_tcp_user_timeout;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::{self, Runtime};
 use tokio::sync::Semaphore;
-use tokio_io_timeout::TimeoutStream;
 
 /// Maximum number of connections; more are refused.
 const MAX_CONNECTIONS: usize = 24;
@@ -41,8 +41,8 @@ const MAX_HANDLERS: usize = 4;
 const MAX_WAITING: usize = 16 << 10;
 /// Timeout for receiving a request.
 const READ_LIMIT: Duration = Duration::from_secs(5);
-/// Timeout for a reader that takes no byte.
-const WRITE_LIMIT: Duration = Duration::from_secs(2);
+/// Timeout for a reader that takes no byte, milliseconds.
+const WRITE_LIMIT_MS: u32 = 5_000;
 /// Pause when the system has no room for another connection.
 const PAUSE: Duration = Duration::from_millis(100);
 
@@ -184,8 +184,10 @@ async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()
     // Without it the answer is late, but complete.
     let _ = connection.set_nodelay(true);
     let local = connection.local_addr();
-    let mut connection = TimeoutStream::new(connection);
-    connection.set_write_timeout(Some(WRITE_LIMIT));
+    // The system closes the connection of a reader that takes nothing, with `TimedOut`; hyper limits requests only.
+    if let Err(error) = set_tcp_user_timeout(&connection, WRITE_LIMIT_MS) {
+        tracing::debug!("a reader that takes nothing is not noticed: {error}");
+    }
     let service = service_fn(move |request| {
         answer(Arc::clone(&handler), local.as_ref().ok().copied(), request)
     });
@@ -195,7 +197,7 @@ async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()
         .max_buf_size(MAX_WAITING)
         // One request per connection: an idle browser holds no place.
         .keep_alive(false)
-        .serve_connection(TokioIo::new(Box::pin(connection)), service)
+        .serve_connection(TokioIo::new(connection), service)
         .await
 }
 

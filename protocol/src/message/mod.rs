@@ -37,7 +37,7 @@ pub use frame_report::{DetectionsReport, FrameReport, TracksReport};
 pub use gnss::{Gnss, GnssSource};
 pub use pace::Pace;
 pub use pose_estimate::{NoPoseReason, PlanarCovariance, PoseEstimate};
-pub use stats::{ProcessUsage, StageSummary, StageTiming, Stats, TopicTraffic};
+pub use stats::{ProcessUsage, StageSummary, StageTiming, Stats, ThreadUsage, TopicTraffic};
 pub use sweep::{Lidar, Points, PointsMetadata, Radar, SweepMetadata};
 pub use table::{Kind, Message};
 pub(crate) use table::{MessageSource, MessageVisitor};

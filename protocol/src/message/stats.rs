@@ -26,7 +26,7 @@ pub struct Stats {
 }
 
 /// CPU time and memory of a process, 0 where the system does not tell.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ProcessUsage {
     /// User and system time of all its threads, seconds.
     pub cpu_s: f64,
@@ -34,6 +34,17 @@ pub struct ProcessUsage {
     pub resident_bytes: u64,
     /// Largest resident memory so far, bytes.
     pub peak_resident_bytes: u64,
+    /// CPU time of the threads that it has now, by name.
+    pub threads: Vec<ThreadUsage>,
+}
+
+/// CPU time of the threads of a name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ThreadUsage {
+    /// Name of the threads, without a number at its end, at most 64 bytes.
+    pub name: String,
+    /// User and system time, seconds.
+    pub cpu_s: f64,
 }
 
 /// Messages that a process has published on one topic, each counted once for all its receivers.
@@ -63,6 +74,8 @@ pub struct StageSummary {
     pub stage: String,
     /// Number of frames.
     pub count: u64,
+    /// Sum over all frames, milliseconds.
+    pub sum_ms: f64,
     /// Median, milliseconds.
     pub p50_ms: f64,
     /// 95th percentile, milliseconds.
@@ -97,9 +110,15 @@ impl Stats {
         check_count("stages", self.stages.len(), limits.max_entries)?;
         check_count("topics", self.traffic.len(), limits.max_entries)?;
         check_count("problems", self.problems.len(), limits.max_entries)?;
+        check_count("threads", self.usage.threads.len(), limits.max_entries)?;
         check_within("cpu_s", self.usage.cpu_s, 0.0, MAX_CPU_S)?;
+        for thread in &self.usage.threads {
+            check_name("thread", &thread.name)?;
+            check_within("thread cpu_s", thread.cpu_s, 0.0, MAX_CPU_S)?;
+        }
         for summary in &self.stages {
             check_name("stage", &summary.stage)?;
+            check_within("stage sum_ms", summary.sum_ms, 0.0, MAX_CPU_S * 1e3)?;
             for time_ms in [
                 summary.p50_ms,
                 summary.p95_ms,

@@ -450,23 +450,27 @@ fn any_stats() -> impl Strategy<Value = Stats> {
     let stage = (
         "[a-z]{1,10}",
         any::<u64>(),
-        prop::array::uniform4(0.0..1e6f64),
+        prop::array::uniform5(0.0..1e6f64),
     )
         .prop_map(
-            |(stage, count, [p50_ms, p95_ms, p99_ms, max_ms])| StageSummary {
+            |(stage, count, [sum_ms, p50_ms, p95_ms, p99_ms, max_ms])| StageSummary {
                 stage,
                 count,
+                sum_ms,
                 p50_ms,
                 p95_ms,
                 p99_ms,
                 max_ms,
             },
         );
-    let usage = (0.0..1e6f64, any::<[u64; 2]>()).prop_map(
-        |(cpu_s, [resident_bytes, peak_resident_bytes])| ProcessUsage {
+    let thread = ("[a-z]{1,10}", 0.0..1e6f64).prop_map(|(name, cpu_s)| ThreadUsage { name, cpu_s });
+    let threads = prop::collection::vec(thread, 0..4);
+    let usage = (0.0..1e6f64, any::<[u64; 2]>(), threads).prop_map(
+        |(cpu_s, [resident_bytes, peak_resident_bytes], threads)| ProcessUsage {
             cpu_s,
             resident_bytes,
             peak_resident_bytes,
+            threads,
         },
     );
     let traffic =

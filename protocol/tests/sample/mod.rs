@@ -352,6 +352,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
             stages: vec![StageSummary {
                 stage: "encode".into(),
                 count: 10,
+                sum_ms: 12.0,
                 p50_ms: 1.0,
                 p95_ms: 2.0,
                 p99_ms: 3.0,
@@ -361,6 +362,10 @@ pub(crate) fn every_kind() -> Vec<Message> {
                 cpu_s: 1.5,
                 resident_bytes: 1 << 20,
                 peak_resident_bytes: 2 << 20,
+                threads: vec![ThreadUsage {
+                    name: "encode".into(),
+                    cpu_s: 1.25,
+                }],
             },
             traffic: vec![TopicTraffic {
                 topic: "4279/bev".parse().unwrap(),

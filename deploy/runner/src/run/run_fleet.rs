@@ -179,8 +179,9 @@ fn router_stats(report: &RouterReport) -> ProcessStats {
             cpu_s: report.cpu_s,
             resident_bytes: 0,
             peak_resident_bytes: report.peak_resident_bytes,
+            threads: Vec::new(),
         },
-        cpu_before_s: 0.0,
+        usage_before: ProcessUsage::default(),
         traffic: Vec::new(),
     }
 }
