@@ -4,8 +4,6 @@ use nalgebra::{Isometry3, Matrix2, Matrix6, Vector2, Vector6};
 use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
-use crate::statistics::share_limit;
-
 /// Metadata key of a head's or a surfel map's file that holds its [`CovarianceScale`], as JSON.
 pub const COVARIANCE_KEY: &str = "covariance";
 
@@ -17,8 +15,11 @@ const MIN_POSES: usize = 50;
 /// within an ellipse.
 const SHARE: f64 = 0.95;
 const SHARE_STD: [f64; 2] = [1.960, 2.448];
-/// Largest share of positions beyond their bound, by its upper 95 % confidence limit: none of 2,995 show it.
-const BEYOND_BOUND: f64 = 0.001;
+/// Fewest poses to fit a bound on: if none of them is beyond it, at most one in 1,000 of others is, with a confidence of
+/// 95 % (Wilks 1941). Of four times as many it is one in 4,000.
+const MIN_BOUND_POSES: usize = 2995;
+/// Smallest standard deviation to which a bound is a ratio, metres: maps of real places are not better than that.
+const BOUND_FLOOR_M: f64 = 0.01;
 /// Largest factor in a file.
 const MAX_FACTOR: f64 = 1e6;
 
@@ -34,8 +35,8 @@ pub struct CovarianceScale {
     pub tilt: f64,
     /// Of the rotation about z.
     pub yaw: f64,
-    /// Number of standard deviations along the worst axis of the plane that the error of at most one position in 1,000
-    /// exceeds, with a confidence of 95 %; `None` if it was fitted on fewer than 2,995 poses.
+    /// Largest error of a position of the fit, in standard deviations along the worst axis of the plane: at most one in
+    /// 1,000 exceeds it, with a confidence of 95 %. `None` if it was fitted on fewer than 2,995 poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<f64>,
 }
@@ -102,7 +103,7 @@ impl PoseSample {
 
 impl CovarianceScale {
     /// Fits the factors so that 95 % of the errors lie within the ellipse in the plane and within 1.96 standard
-    /// deviations of every other axis, and at least 99.9 % of the positions within the bound.
+    /// deviations of every other axis, and all positions within the bound.
     ///
     /// # Errors
     /// [`NoScale`] of too few poses, and where errors exceed any multiple of their covariances.
@@ -122,10 +123,11 @@ impl CovarianceScale {
         // After the factors: the bound is in scaled standard deviations.
         let ratios = samples.iter().map(|sample| {
             let off_m = sample.error[0].hypot(sample.error[1]);
-            off_m / worst_std_m(&scale.applied(&sample.covariance))
+            off_m / bounded_std_m(&scale.applied(&sample.covariance))
         });
+        let largest = (samples.len() >= MIN_BOUND_POSES).then(|| ratios.fold(0.0, f64::max));
         Ok(Self {
-            bound: tolerance_bound(ratios).filter(|bound| *bound <= MAX_FACTOR),
+            bound: largest.filter(|bound| *bound <= MAX_FACTOR),
             ..scale
         })
     }
@@ -151,7 +153,7 @@ impl CovarianceScale {
     /// Distance in the plane that at most one of 1,000 poses of this unscaled covariance exceeds, metres; `None` where it was not
     /// fitted.
     pub fn bound_m(&self, covariance: &[[f64; 6]; 6]) -> Option<f64> {
-        Some(self.bound? * worst_std_m(&self.applied(covariance)))
+        Some(self.bound? * bounded_std_m(&self.applied(covariance)))
     }
 
     /// The scaled covariance.
@@ -172,27 +174,13 @@ fn axes_factor(samples: &[PoseSample], axes: &[usize]) -> f64 {
 /// Smallest value that a new one does not exceed with a probability of `share`, if it is of the same distribution;
 /// `None` of too few values.
 fn limit(values: impl Iterator<Item = f64>, share: f64) -> Option<f64> {
-    let sorted = rising(values);
-    // A new value has each of n + 1 ranks with the same probability.
-    let rank = ((sorted.len() + 1) as f64 * share).ceil() as usize;
-    sorted.get(rank.checked_sub(1)?).copied()
-}
-
-/// Smallest value of which it is shown that at most a share [`BEYOND_BOUND`] of new ones exceeds it (Wilks 1941); `None`
-/// of too few values.
-fn tolerance_bound(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let sorted = rising(values);
-    let is_shown = |beyond: &usize| share_limit(*beyond, sorted.len()) <= BEYOND_BOUND;
-    let beyond = (0..sorted.len()).take_while(is_shown).last()?;
-    sorted.iter().rev().nth(beyond).copied()
-}
-
-fn rising(values: impl Iterator<Item = f64>) -> Vec<f64> {
     // A singular covariance states that there is no error: any error is beyond it.
     let values = values.map(|value| if value.is_nan() { f64::INFINITY } else { value });
     let mut sorted: Vec<f64> = values.collect();
     sorted.sort_by(f64::total_cmp);
-    sorted
+    // A new value has each of n + 1 ranks with the same probability.
+    let rank = ((sorted.len() + 1) as f64 * share).ceil() as usize;
+    sorted.get(rank.checked_sub(1)?).copied()
 }
 
 /// A covariance with its standard deviations times these factors.
@@ -208,9 +196,16 @@ fn planar(covariance: &[[f64; 6]; 6]) -> Matrix2<f64> {
     Matrix2::from_fn(|row, column| covariance[row][column])
 }
 
+/// Standard deviation along the worst axis of the plane, at least [`BOUND_FLOOR_M`], metres.
+fn bounded_std_m(covariance: &[[f64; 6]; 6]) -> f64 {
+    worst_std_m(covariance).hypot(BOUND_FLOOR_M)
+}
+
 /// Standard deviation along the worst axis of the plane, metres.
 fn worst_std_m(covariance: &[[f64; 6]; 6]) -> f64 {
-    planar(covariance).symmetric_eigenvalues().max().sqrt()
+    // Rounding may make the eigenvalues of a singular matrix negative.
+    let variance = planar(covariance).symmetric_eigenvalues().max();
+    variance.max(0.0).sqrt()
 }
 
 #[cfg(test)]

@@ -127,7 +127,7 @@ pub(crate) struct Args {
     #[arg(long)]
     fit_confidence: bool,
     /// Fit the size of the covariances to these sweeps and write it into the head, or with --surfel-map into that map; the
-    /// confidence stays. From 2,995 poses on also the bound that at most one of 1,000 exceeds.
+    /// confidence stays. From 2,995 poses on also the bound, which at most one of 1,000 exceeds.
     #[arg(long, conflicts_with_all = ["fit_confidence", "baseline", "icp_map", "lightloc", "retrieval", "tracked"])]
     fit_covariance: bool,
     /// Reject as few poses as leave at most this share of wrong ones, by its upper 95 % confidence limit; of too few sweeps
