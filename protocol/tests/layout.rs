@@ -22,7 +22,7 @@ const PINNED: [(&str, usize, u64); 34] = [
     ("descriptor", 207, 0x44ee_520b_ed0f_b2a8),
     ("detections", 389, 0x2be8_5fd7_c978_796b),
     ("truth", 576, 0x212b_c713_8a81_7624),
-    ("stats", 242, 0x5269_bf90_a7cd_ad79),
+    ("stats", 266, 0xd8d1_7ae8_6f6c_b5d8),
     ("bev", 2490, 0x5bf4_63b3_474e_5fbc),
     ("bev", 583, 0x4ae1_aeb2_c5a9_6c84),
     ("bev", 1338, 0x8e99_9884_4a20_688f),

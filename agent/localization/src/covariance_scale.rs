@@ -35,8 +35,8 @@ pub struct CovarianceScale {
     pub tilt: f64,
     /// Of the rotation about z.
     pub yaw: f64,
-    /// Largest error of a position of the fit, in standard deviations along the worst axis of the plane: at most one in
-    /// 1,000 exceeds it, with a confidence of 95 %. `None` if it was fitted on fewer than 2,995 poses.
+    /// Largest error of a position of the fit, in standard deviations along the worst axis of the plane (of a registered
+    /// pose with that of its start): at most one in 1,000 exceeds it, with a confidence of 95 %. `None` if it was fitted on fewer than 2,995 poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<f64>,
 }
@@ -59,6 +59,8 @@ pub struct PoseSample {
     pub error: [f64; 6],
     /// Covariance without a scale.
     pub covariance: [[f64; 6]; 6],
+    /// Standard deviation per axis of the position at which its registration began, metres; 0 without one.
+    pub start_std_m: f64,
 }
 
 impl PoseSample {
@@ -70,6 +72,7 @@ impl PoseSample {
         Self {
             error: [off.x, off.y, off.z, turned.x, turned.y, turned.z],
             covariance,
+            start_std_m: 0.0,
         }
     }
 
@@ -123,7 +126,7 @@ impl CovarianceScale {
         // After the factors: the bound is in scaled standard deviations.
         let ratios = samples.iter().map(|sample| {
             let off_m = sample.error[0].hypot(sample.error[1]);
-            off_m / bounded_std_m(&scale.applied(&sample.covariance))
+            off_m / bounded_std_m(&scale.applied(&sample.covariance), sample.start_std_m)
         });
         let largest = (samples.len() >= MIN_BOUND_POSES).then(|| ratios.fold(0.0, f64::max));
         Ok(Self {
@@ -150,10 +153,10 @@ impl CovarianceScale {
         Ok(())
     }
 
-    /// Distance in the plane that at most one of 1,000 poses of this unscaled covariance exceeds, metres; `None` where it was not
-    /// fitted.
-    pub fn bound_m(&self, covariance: &[[f64; 6]; 6]) -> Option<f64> {
-        Some(self.bound? * bounded_std_m(&self.applied(covariance)))
+    /// Distance in the plane that at most one of 1,000 poses of this unscaled covariance exceeds, whose registration began
+    /// at a pose of `start_std_m` ([`PoseSample::start_std_m`]), metres; `None` where it was not fitted.
+    pub fn bound_m(&self, covariance: &[[f64; 6]; 6], start_std_m: f64) -> Option<f64> {
+        Some(self.bound? * bounded_std_m(&self.applied(covariance), start_std_m))
     }
 
     /// The scaled covariance.
@@ -196,9 +199,11 @@ fn planar(covariance: &[[f64; 6]; 6]) -> Matrix2<f64> {
     Matrix2::from_fn(|row, column| covariance[row][column])
 }
 
-/// Standard deviation along the worst axis of the plane, at least [`BOUND_FLOOR_M`], metres.
-fn bounded_std_m(covariance: &[[f64; 6]; 6]) -> f64 {
-    worst_std_m(covariance).hypot(BOUND_FLOOR_M)
+/// What an error is compared with for a bound: the standard deviation along the worst axis of the plane, that of the
+/// start, and [`BOUND_FLOOR_M`], metres.
+fn bounded_std_m(covariance: &[[f64; 6]; 6], start_std_m: f64) -> f64 {
+    let std_m = worst_std_m(covariance).hypot(BOUND_FLOOR_M);
+    std_m.hypot(start_std_m)
 }
 
 /// Standard deviation along the worst axis of the plane, metres.
@@ -232,6 +237,7 @@ mod tests {
                     .component_mul(&Vector6::from(factors))
                     .into(),
                 covariance: covariance.data.0,
+                start_std_m: 0.0,
             }
         });
         samples.collect()
@@ -254,7 +260,7 @@ mod tests {
             };
             beyond += usize::from(stated.planar_deviations() > SHARE_STD[1]);
             let off_m = sample.error[0].hypot(sample.error[1]);
-            beyond_bound += usize::from(off_m > scale.bound_m(&sample.covariance).unwrap());
+            beyond_bound += usize::from(off_m > scale.bound_m(&sample.covariance, 0.0).unwrap());
         }
         assert!((0.03..0.07).contains(&(beyond as f64 / 4000.0)), "{beyond}");
         assert!(beyond_bound <= 4, "{beyond_bound}");
@@ -271,12 +277,20 @@ mod tests {
         let scale = CovarianceScale::fit(&all).unwrap();
         for sample in &all {
             let off_m = sample.error[0].hypot(sample.error[1]);
-            let bound_m = scale.bound_m(&sample.covariance).unwrap();
+            let bound_m = scale.bound_m(&sample.covariance, 0.0).unwrap();
             assert!(
                 off_m <= bound_m * (1.0 + 1e-9),
                 "it is that of the worst of them"
             );
         }
+        // A pose that was registered from an unsure one has a larger bound, and errors there count less.
+        let bounds_m = [0.0, 1.0].map(|start_std_m| scale.bound_m(&all[0].covariance, start_std_m));
+        assert!(bounds_m[1].unwrap() > scale.bound.unwrap() && bounds_m[0] < bounds_m[1]);
+        let mut unsure = all.clone();
+        unsure
+            .iter_mut()
+            .for_each(|sample| sample.start_std_m = 1.0);
+        assert!(CovarianceScale::fit(&unsure).unwrap().bound < scale.bound);
         // Singular covariances count as exceeded: a few do not matter, more than one in twenty cannot be fitted.
         let mut singular = samples(100, [2.0; 6], 3);
         singular[..4]

@@ -20,6 +20,7 @@ use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
 use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, MIN_POINTS, Plane, register};
+use crate::tracker::PoseMeasurement;
 
 /// Stage of a localization.
 const REGISTER: &str = "pose register";
@@ -174,6 +175,7 @@ fn judged(
     let judged = match registered {
         Some(registered) => FoundPose {
             evidence: found.evidence,
+            start_std_m: PoseMeasurement::new(0, found).position_std_m,
             ..registered
         },
         None if found.sigma >= SURE => return localization,
@@ -197,6 +199,7 @@ pub(crate) fn found_pose(fit: &IcpFit, covariance_scale: Option<CovarianceScale>
         evidence: PoseEvidence::none(),
         cell_covariance: covariance.transpose().data.0,
         is_registered: true,
+        start_std_m: 0.0,
         covariance_scale,
         sigma: 1.0 / (1.0 + covariance[(0, 0)] + covariance[(1, 1)]),
         is_rejected: false,
@@ -247,6 +250,7 @@ mod tests {
             evidence: PoseEvidence::none(),
             cell_covariance: Matrix6::identity().data.0,
             is_registered: false,
+            start_std_m: 0.0,
             covariance_scale: None,
             sigma,
             is_rejected: false,
@@ -288,6 +292,8 @@ mod tests {
         let pose = taken.found.unwrap();
         assert!(pose.is_registered && !pose.is_rejected && off_m(&pose, &truth) < 5e-3);
         assert!(pose.sigma > 0.999 && taken.estimate.world_from_cav().is_some());
+        // Its bound remembers how unsure the pose was at which the registration began.
+        assert!(pose.start_std_m > 0.3, "{}", pose.start_std_m);
         // Of too few points with a partner a sure pose stays as it was.
         let (kept, found) = localized(start, SURE, 19_000);
         assert_eq!(kept.found, Some(found));

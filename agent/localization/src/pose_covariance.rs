@@ -15,9 +15,10 @@ pub fn pose_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
     scale.map_or(unscaled, |scale| scale.applied(&unscaled))
 }
 
-/// Distance in the plane that one of 1,000 poses exceeds, metres; `None` where it was not fitted.
+/// Distance in the plane that at most one of 1,000 poses exceeds, metres; `None` where it was not fitted.
 pub fn position_bound_m(found: &FoundPose) -> Option<f64> {
-    found.covariance_scale?.bound_m(&unscaled_covariance(found))
+    let scale = found.covariance_scale?;
+    scale.bound_m(&unscaled_covariance(found), found.start_std_m)
 }
 
 /// The covariance without the fitted factors. Residuals determine its shape; its size is that of a [`PoseMeasurement`], the

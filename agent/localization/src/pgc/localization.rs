@@ -59,6 +59,7 @@ impl Localization {
             evidence: PoseEvidence::none(),
             cell_covariance: PoseStd::UNBOUNDED.covariance,
             is_registered: false,
+            start_std_m: 0.0,
             covariance_scale: None,
             sigma: f64::from(estimate.confidence()),
             is_rejected: false,

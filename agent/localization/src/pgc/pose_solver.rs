@@ -65,6 +65,9 @@ pub struct FoundPose {
     pub cell_covariance: [[f64; 6]; 6],
     /// True if the pose was registered to a map: then `cell_covariance` is that of the registration, in full.
     pub is_registered: bool,
+    /// Standard deviation per axis of the position at which that registration began, metres: a registration may end at
+    /// another place the more easily, the farther away it begins. 0: not registered, or where it began was not estimated.
+    pub start_std_m: f64,
     /// Fitted scale of its covariance.
     pub covariance_scale: Option<CovarianceScale>,
     /// Confidence, 0..=1.
@@ -142,6 +145,7 @@ impl PoseSolver {
             evidence,
             cell_covariance: std_of(coordinates, registration, second).covariance,
             is_registered: false,
+            start_std_m: 0.0,
             covariance_scale: self.covariance,
             sigma,
             is_rejected: self.confidence.rejects(sigma) || sigma < self.min_confidence,
@@ -171,6 +175,7 @@ pub(super) fn confirm(
             evidence: PoseEvidence::of_refinement(refined, start),
             cell_covariance: refined.std.covariance,
             is_registered: false,
+            start_std_m: 0.0,
             covariance_scale: None,
             sigma: 1.0 / (1.0 + error_m * error_m),
             is_rejected: false,

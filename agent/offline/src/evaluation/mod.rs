@@ -84,7 +84,11 @@ impl EvaluatedSweep {
     pub fn pose_sample(&self) -> Option<PoseSample> {
         let found = self.localization.found.filter(|found| !found.is_rejected)?;
         let (pose, truth) = (&found.world_from_sensor, self.truth.isometry());
-        Some(PoseSample::of(pose, unscaled_covariance(&found), &truth))
+        let sample = PoseSample::of(pose, unscaled_covariance(&found), &truth);
+        Some(PoseSample {
+            start_std_m: found.start_std_m,
+            ..sample
+        })
     }
 
     /// The same with the covariance that is published.
@@ -94,7 +98,7 @@ impl EvaluatedSweep {
         Some(sample)
     }
 
-    /// Error in the plane of the localizer's published pose and its bound of one in 1,000, metres, if it has one.
+    /// Error in the plane of the localizer's published pose and its bound, which at most one in 1,000 exceeds, metres, if it has one.
     fn bounded_error(&self) -> Option<(f64, f64)> {
         let bound_m = position_bound_m(&self.localization.found?)?;
         let [x, y, ..] = self.pose_sample()?.error;

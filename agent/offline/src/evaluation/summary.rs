@@ -61,7 +61,7 @@ pub struct LocalizationSummary {
     pub beyond_95: BTreeMap<&'static str, f64>,
     /// Integrity of the covariances of published poses, whose bounds are of 95 %; absent if they have none.
     pub integrity: Option<IntegritySummary>,
-    /// Integrity of the bound that one position in 1,000 exceeds; absent without a fitted bound.
+    /// Integrity of the bound that at most one position in 1,000 exceeds; absent without a fitted bound.
     pub bound: Option<IntegritySummary>,
     /// Median milliseconds by stage; `total` is that of all stages of a sweep.
     pub ms: BTreeMap<String, f64>,
