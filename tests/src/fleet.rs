@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::sync::OnceLock;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
@@ -73,6 +73,27 @@ pub fn programs() -> &'static Path {
         }
     });
     folder
+}
+
+/// Path of a file or folder in `deploy`.
+///
+/// # Panics
+/// When it is not there.
+#[must_use]
+pub fn deploy_file(name: &str) -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+    let path = path.join(name).canonicalize().unwrap();
+    path.display().to_string()
+}
+
+/// `v2vloc` with these words, run to its end.
+///
+/// # Panics
+/// When it cannot be started.
+#[must_use]
+pub fn v2vloc(words: &[&str]) -> Output {
+    let mut v2vloc = Command::new(programs().join("v2vloc"));
+    v2vloc.args(words).output().unwrap()
 }
 
 /// Writes weights of a small detector with random parameters, the same every time.

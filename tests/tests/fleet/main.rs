@@ -8,5 +8,6 @@ mod localization;
 mod pace;
 mod processes;
 mod ros2_clients;
+mod scripts;
 mod shared_encoder;
 mod simulation_time;
