@@ -36,7 +36,8 @@ pub struct CovarianceScale {
     /// Of the rotation about z.
     pub yaw: f64,
     /// Largest error of a position of the fit, in standard deviations along the worst axis of the plane (of a registered
-    /// pose with that of its start): at most one in 1,000 exceeds it, with a confidence of 95 %. `None` if it was fitted on fewer than 2,995 poses.
+    /// pose with that of its start): at most one in 1,000 exceeds it, with a confidence of 95 %. `None` if it was fitted on
+    /// fewer than 2,995 poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<f64>,
 }
@@ -126,7 +127,7 @@ impl CovarianceScale {
         // After the factors: the bound is in scaled standard deviations.
         let ratios = samples.iter().map(|sample| {
             let off_m = sample.error[0].hypot(sample.error[1]);
-            off_m / bounded_std_m(&scale.applied(&sample.covariance), sample.start_std_m)
+            off_m / bound_std_m(&scale.applied(&sample.covariance), sample.start_std_m)
         });
         let largest = (samples.len() >= MIN_BOUND_POSES).then(|| ratios.fold(0.0, f64::max));
         Ok(Self {
@@ -156,7 +157,7 @@ impl CovarianceScale {
     /// Distance in the plane that at most one of 1,000 poses of this unscaled covariance exceeds, whose registration began
     /// at a pose of `start_std_m` ([`PoseSample::start_std_m`]), metres; `None` where it was not fitted.
     pub fn bound_m(&self, covariance: &[[f64; 6]; 6], start_std_m: f64) -> Option<f64> {
-        Some(self.bound? * bounded_std_m(&self.applied(covariance), start_std_m))
+        Some(self.bound? * bound_std_m(&self.applied(covariance), start_std_m))
     }
 
     /// The scaled covariance.
@@ -199,9 +200,9 @@ fn planar(covariance: &[[f64; 6]; 6]) -> Matrix2<f64> {
     Matrix2::from_fn(|row, column| covariance[row][column])
 }
 
-/// What an error is compared with for a bound: the standard deviation along the worst axis of the plane, that of the
-/// start, and [`BOUND_FLOOR_M`], metres.
-fn bounded_std_m(covariance: &[[f64; 6]; 6], start_std_m: f64) -> f64 {
+/// Standard deviation of which a bound is a multiple, metres: root of the sum of the variance along the worst axis of the
+/// plane, that of the start and that of [`BOUND_FLOOR_M`].
+fn bound_std_m(covariance: &[[f64; 6]; 6], start_std_m: f64) -> f64 {
     let std_m = worst_std_m(covariance).hypot(BOUND_FLOOR_M);
     std_m.hypot(start_std_m)
 }

@@ -15,9 +15,13 @@ pub fn pose_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
     scale.map_or(unscaled, |scale| scale.applied(&unscaled))
 }
 
-/// Distance in the plane that at most one of 1,000 poses exceeds, metres; `None` where it was not fitted.
+/// Distance in the plane that at most one of 1,000 poses exceeds, metres; `None` where it was not fitted, and for a
+/// registered pose whose start had no standard deviation: a bound that is fitted with starts would be too small for it.
 pub fn position_bound_m(found: &FoundPose) -> Option<f64> {
     let scale = found.covariance_scale?;
+    if found.is_registered && found.start_std_m == 0.0 {
+        return None;
+    }
     scale.bound_m(&unscaled_covariance(found), found.start_std_m)
 }
 
@@ -99,5 +103,22 @@ mod tests {
         assert!((scaled[0][2] - 3.0 * unscaled[0][2]).abs() < 1e-12);
         assert_eq!(scaled[5][5], unscaled[5][5]);
         assert_eq!(position_bound_m(&found), None);
+    }
+
+    #[test]
+    fn a_registered_pose_has_a_bound_only_where_the_deviation_of_its_start_is_known() {
+        let mut found = found();
+        found.covariance_scale = Some(CovarianceScale {
+            planar: 1.0,
+            height: 1.0,
+            tilt: 1.0,
+            yaw: 1.0,
+            bound: Some(4.0),
+        });
+        assert!(position_bound_m(&found).is_some());
+        found.is_registered = true;
+        assert_eq!(position_bound_m(&found), None);
+        found.start_std_m = 0.5;
+        assert!(position_bound_m(&found).unwrap() >= 2.0);
     }
 }

@@ -252,7 +252,8 @@ impl ScorerNode {
             stages: own_stats.stages(),
             usage: process_usage(),
             usage_before: { own.into_iter().next() }
-                .map_or_else(Default::default, |own| own.usage_before),
+                .map(|own| own.usage_before)
+                .unwrap_or_default(),
             traffic: own_stats.traffic(),
         };
         let scored = Scored {
@@ -433,7 +434,9 @@ impl ScorerWorker {
         let known = self.stats.get(&instance);
         let usage_before = match self.published.is_empty() {
             true => report.usage.clone(),
-            false => known.map_or_else(Default::default, |known| known.usage_before.clone()),
+            false => known
+                .map(|known| known.usage_before.clone())
+                .unwrap_or_default(),
         };
         let stats = ProcessStats {
             process,

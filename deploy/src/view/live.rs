@@ -94,6 +94,8 @@ pub(super) struct LiveStatus {
 #[derive(Debug, Default)]
 struct RunActivity {
     last_message: Option<Instant>,
+    /// Last message of any kind while a page is open: every process reports twice a second, this one too.
+    last_received: Option<Instant>,
     /// Last result, or the first message.
     answered: Option<Instant>,
     /// Problems that each process reports.
@@ -106,16 +108,17 @@ struct RunActivity {
 #[derive(Debug, Default)]
 struct RouterConnection {
     is_there: bool,
-    /// When the last message came or the connection ended, whichever was earlier; `None`: there is one, or there was never one.
+    /// When the last message came or the connection ended, whichever was earlier; `None`: there is one, or there was never
+    /// one.
     lost: Option<Instant>,
     outages: TimeSum,
 }
 
 impl RouterConnection {
     /// Takes note of whether there is a connection `now`. A router that passes nothing is gone from its last message on.
-    fn note(&mut self, is_there: bool, last_message: Option<Instant>, now: Instant) {
+    fn note(&mut self, is_there: bool, last_received: Option<Instant>, now: Instant) {
         if self.is_there && !is_there {
-            let silent_since = last_message.filter(|last| now.duration_since(*last) > LIMIT);
+            let silent_since = last_received.filter(|last| now.duration_since(*last) > LIMIT);
             self.lost = Some(silent_since.unwrap_or(now));
         } else if is_there && let Some(lost) = self.lost.take() {
             self.outages.add(now.duration_since(lost));
@@ -280,6 +283,7 @@ impl LiveListener {
             self.watch_router();
             if !self.is_watched() {
                 (subscriptions, cameras, maps) = (None, None, None);
+                lock(&self.shared.activity).last_received = None;
                 thread::sleep(CHECK_PERIOD);
                 continue;
             }
@@ -312,9 +316,11 @@ impl LiveListener {
     fn watch_router(&self) {
         let mut routers = self.bus.session().info().routers_zid().wait();
         let mut activity = lock(&self.shared.activity);
-        let last_message = activity.last_message;
+        let last_received = activity.last_received;
         let is_there = routers.next().is_some();
-        activity.router.note(is_there, last_message, Instant::now());
+        activity
+            .router
+            .note(is_there, last_received, Instant::now());
     }
 
     /// Receives images only while a page shows them: they are the largest stream after sweeps.
@@ -378,7 +384,9 @@ impl LiveListener {
 
     /// Reports of processes are no activity: a viewer reports too, for as long as its page is open.
     fn note(&self, topic: &Topic, bytes: &[u8]) {
+        let now = Instant::now();
         let mut activity = lock(&self.shared.activity);
+        activity.last_received = Some(now);
         if let Topic::Stats(name) = topic {
             let report = decoded::<Stats>(bytes);
             let known = &mut activity.problems;
@@ -391,7 +399,6 @@ impl LiveListener {
             }
             return;
         }
-        let now = Instant::now();
         activity.last_message = Some(now);
         activity.answered.get_or_insert(now);
         match topic {
@@ -439,5 +446,34 @@ impl LiveListener {
                 frames.send_replace([len.as_slice(), &frame].concat().into());
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_outage_begins_with_the_last_message_while_a_page_is_open() {
+        let begin = Instant::now();
+        let after = |seconds: u64| begin + Duration::from_secs(seconds);
+        let mut router = RouterConnection::default();
+        let mut sentence = |is_there: bool, last_received: Option<Instant>, now: Instant| {
+            router.note(is_there, last_received, now);
+            router.outages.sentence("gone")
+        };
+        assert_eq!(sentence(true, None, begin), None);
+        // Nothing came through it for 3 s before the connection ended.
+        assert_eq!(sentence(false, Some(after(1)), after(4)), None);
+        assert_eq!(
+            sentence(true, Some(after(1)), after(6)).as_deref(),
+            Some("gone for 5.0 s")
+        );
+        // No page was open: silence says nothing.
+        sentence(false, None, after(100));
+        assert_eq!(
+            sentence(true, None, after(101)).as_deref(),
+            Some("gone for 6.0 s in all (2 times)")
+        );
     }
 }

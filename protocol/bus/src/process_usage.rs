@@ -1,9 +1,8 @@
 //! Resource usage of this process: CPU time by the system's clock, memory by `/proc`.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::time::Duration;
-
-use std::collections::BTreeMap;
 
 use protocol::{ProcessUsage, ThreadUsage};
 use rustix::time::{ClockId, clock_gettime};

@@ -98,7 +98,8 @@ impl EvaluatedSweep {
         Some(sample)
     }
 
-    /// Error in the plane of the localizer's published pose and its bound, which at most one in 1,000 exceeds, metres, if it has one.
+    /// Error in the plane of the localizer's published pose and its bound, which at most one in 1,000 exceeds, metres, if
+    /// it has one.
     fn bounded_error(&self) -> Option<(f64, f64)> {
         let bound_m = position_bound_m(&self.localization.found?)?;
         let [x, y, ..] = self.pose_sample()?.error;
