@@ -337,6 +337,10 @@ class CausesPage(Checks):
     def loses_router(self) -> None:
         self.becomes("says that the router is gone", "#state", "^router gone, last message", 10)
 
+    def names_twice(self) -> None:
+        self.becomes("names the name used twice", "#problems", r"two senders use \w+/\w+: both are rejected", 20)
+        self.layout()
+
     def names_outages(self, times: int) -> None:
         count = "" if times == 1 else rf" in all \({times} times\)"
         self.becomes("names the outage", "#problems", rf"observed: router gone for \d+\.\d s{count}$", 20)
