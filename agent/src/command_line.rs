@@ -16,6 +16,7 @@ use crate::command;
 const OFFLINE: Sibling = Sibling {
     program: "agent-offline",
     subcommands: &[
+        ("cover", "State in a scene head where its drives were"),
         (
             "eval",
             "Localize recorded sweeps and compare with their true poses",

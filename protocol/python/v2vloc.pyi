@@ -31,7 +31,8 @@ class PoseEstimate:
         """``[3, 3]`` of x, y (square metres) and yaw (square radians) in the world, where the source has one."""
     @property
     def no_pose_reason(self) -> Optional[str]:
-        """``too_few_points``, ``too_few_inliers``, ``no_source``, ``low_confidence`` or ``failed``."""
+        """``too_few_points``, ``too_few_inliers``, ``no_source``, ``low_confidence``, ``failed`` or
+        ``not_driven``."""
     @property
     def inlier_count(self) -> Optional[int]:
         """Inliers of the failed estimate."""

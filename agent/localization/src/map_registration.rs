@@ -15,6 +15,7 @@ use protocol::PointCloud;
 use support::stage_times::StageTimes;
 
 use crate::covariance_scale::CovarianceScale;
+use crate::pgc::driven_area::DrivenArea;
 use crate::pgc::pose_evidence::PoseEvidence;
 use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
@@ -163,6 +164,10 @@ impl Localize for MapRegistration {
 
     fn place(&self) -> Option<&str> {
         self.localizer.place()
+    }
+
+    fn driven_area(&self) -> Option<&DrivenArea> {
+        self.localizer.driven_area()
     }
 }
 

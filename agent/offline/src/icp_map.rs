@@ -83,10 +83,7 @@ pub fn read_map(
             let mut last: Option<(usize, Isometry3<f64>)> = None;
             for (agent, tick) in present_sweeps(&scenario) {
                 // Only the pose at first: points of sweeps that are not used need not be read.
-                let without_points = LoadOptions {
-                    points: false,
-                    ..LoadOptions::default()
-                };
+                let without_points = LoadOptions::without_points();
                 let mut load = |options: &LoadOptions| {
                     let frame = scenario.load(agent, tick, options);
                     frame

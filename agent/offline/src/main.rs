@@ -29,6 +29,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Cover(command::cover::Args),
     Eval(command::eval::Args),
     Localize(command::localize::Args),
     Locate(command::locate::Args),
@@ -46,6 +47,7 @@ fn main() -> ExitCode {
             .context("cannot execute this program again"),
     };
     let outcome = kept.and_then(|()| match command {
+        Command::Cover(args) => command::cover::run(&args),
         Command::Eval(args) => command::eval::run(&args),
         Command::Localize(args) => command::localize::run(&args),
         Command::Locate(args) => command::locate::run(&args),

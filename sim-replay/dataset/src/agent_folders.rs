@@ -51,10 +51,8 @@ fn find_below(
     problems: &mut Vec<ReadError>,
 ) {
     let below: Vec<(PathBuf, Listing)> = files::list_below(dir, listing, problems);
-    if below
-        .iter()
-        .any(|(folder, listing)| is_agent_folder(folder, listing))
-    {
+    let mut folders = below.iter();
+    if folders.any(|(folder, listing)| is_agent_folder(folder, listing)) {
         found.push(dir.to_owned());
     } else if depth > 0 {
         for (folder, listing) in &below {
@@ -71,18 +69,14 @@ pub(super) fn is_agent(dir: &Path) -> bool {
 /// True for names that are CARLA actor ids (negative for roadside units) if there is any frame; for other names if
 /// there is a complete frame and no folder below has one: a scenario may hold a stray folder.
 fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
-    if is_number(&name_of(dir)) {
-        return listing
-            .files
-            .iter()
-            .any(|name| name.ends_with(".yaml") || name.ends_with(PCD));
+    if is_number(&files::last_name(dir)) {
+        let mut names = listing.files.iter();
+        return names.any(|name| name.ends_with(".yaml") || name.ends_with(PCD));
     }
     // In this order: the second test lists every folder below.
+    let mut folders = listing.folders.iter().map(|folder| dir.join(folder));
     holds_frame(listing)
-        && !listing
-            .folders
-            .iter()
-            .any(|folder| files::list(&dir.join(folder)).is_ok_and(|below| holds_frame(&below)))
+        && !folders.any(|folder| files::list(&folder).is_ok_and(|below| holds_frame(&below)))
 }
 
 /// True if there is a complete frame.
@@ -99,14 +93,14 @@ fn is_number(name: &str) -> bool {
 fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Listing)>> {
     let mut below = files::list_below(dir, &files::list(dir)?, problems);
     below.retain(|(folder, listing)| {
-        is_number(&name_of(folder)) || is_agent_folder(folder, listing)
+        is_number(&files::last_name(folder)) || is_agent_folder(folder, listing)
     });
-    let are_numbers = below
-        .iter()
-        .any(|(folder, listing)| is_number(&name_of(folder)) && is_agent_folder(folder, listing));
+    let are_numbers = below.iter().any(|(folder, listing)| {
+        is_number(&files::last_name(folder)) && is_agent_folder(folder, listing)
+    });
     let mut agents = Vec::new();
     for (folder, listing) in below {
-        let name = name_of(&folder);
+        let name = files::last_name(&folder);
         let reason = match CavId::new(&name) {
             Ok(_) if are_numbers && !is_number(&name) => {
                 "no number as the other agents' are".to_owned()
@@ -125,11 +119,6 @@ fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Li
     Ok(agents)
 }
 
-fn name_of(folder: &Path) -> String {
-    let name = folder.file_name().unwrap_or_default();
-    name.to_string_lossy().into_owned()
-}
-
 impl ScenarioFolder {
     /// Lists the folders of all agents. Parts that have to be left out are added to `problems`.
     pub(super) fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self> {
@@ -137,9 +126,8 @@ impl ScenarioFolder {
         // Bare floats are used only where no agent has a PCD: a scenario has one kind of sweeps.
         let mut suffixes = [PCD, BIN].into_iter();
         let suffix = suffixes.find(|suffix| {
-            listed
-                .iter()
-                .any(|(_, listing)| holds_pairs(listing, suffix))
+            let mut listings = listed.iter();
+            listings.any(|(_, listing)| holds_pairs(listing, suffix))
         });
         let suffix = suffix.unwrap_or(PCD);
         let mut by_agent = BTreeMap::new();
@@ -159,9 +147,8 @@ impl ScenarioFolder {
         let mut missing = Vec::new();
         for stem in &all {
             let without = agents.iter().filter(|id| {
-                by_agent
-                    .get(id)
-                    .is_some_and(|agent| !agent.stems.contains(*stem))
+                let agent = by_agent.get(id);
+                agent.is_some_and(|agent| !agent.stems.contains(*stem))
             });
             missing.extend(without.map(|id| MissingFrame::new(id, stem)));
         }
@@ -207,16 +194,13 @@ impl ScenarioFolder {
     /// The reader of all agents' sweeps.
     pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
         let missing = self.missing.iter();
-        let missing: HashSet<(&CavId, &str)> = missing
-            .map(|frame| (&frame.agent, frame.stem.as_str()))
-            .collect();
+        let missing = missing.map(|frame| (&frame.agent, frame.stem.as_str()));
+        let missing: HashSet<(&CavId, &str)> = missing.collect();
         let sweeps = Sweeps::new(SweepStorage::ByName, options);
         self.agents.iter().fold(sweeps, |sweeps, agent| {
             // Missing files are left out first: they would use up the tries.
-            let stems = self
-                .stems
-                .iter()
-                .filter(|stem| !missing.contains(&(agent, stem.as_str())));
+            let stems = self.stems.iter();
+            let stems = stems.filter(|stem| !missing.contains(&(agent, stem.as_str())));
             let files = stems.map(|stem| self.pcd(agent, stem, None));
             sweeps.with_agent(agent.clone(), files)
         })
@@ -282,9 +266,8 @@ fn without_common_frame(
     agents: &[CavId],
     by_agent: &BTreeMap<CavId, AgentFolder>,
 ) -> Vec<ReadError> {
-    let mut stems = agents
-        .iter()
-        .filter_map(|id| Some((id, &by_agent.get(id)?.stems)));
+    let ids = agents.iter();
+    let mut stems = ids.filter_map(|id| Some((id, &by_agent.get(id)?.stems)));
     let Some((ego, of_ego)) = stems.next() else {
         return Vec::new();
     };

@@ -7,9 +7,8 @@ use imagesize::ImageSize;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion};
 use protocol::{Camera, CameraMetadata, ImageFormat, Limits, Payload, Pinhole, Pose};
 
-use super::files;
 use super::yaml::YamlField;
-use super::{ReadError, Result};
+use super::{ReadError, Result, files};
 
 /// Prefixes of the number of a camera in file names and in the YAML: OPV2V's and V2X-Real's.
 const PREFIXES: [&str; 2] = ["camera", "cam"];
@@ -29,9 +28,8 @@ pub(super) fn numbers(names: &[String]) -> BTreeSet<u8> {
 fn number(name: &str) -> Option<u8> {
     let (name, ending) = name.rsplit_once('.')?;
     let (_, camera) = name.rsplit_once('_')?;
-    let digits = PREFIXES
-        .iter()
-        .find_map(|prefix| camera.strip_prefix(prefix))?;
+    let mut prefixes = PREFIXES.iter();
+    let digits = prefixes.find_map(|prefix| camera.strip_prefix(prefix))?;
     let is_image = ENDINGS.contains(&ending);
     let is_number = digits.len() <= MAX_DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit());
     digits.parse().ok().filter(|_| is_image && is_number)
@@ -49,10 +47,8 @@ fn names_of(number: u8) -> impl Iterator<Item = String> {
 /// The image of a camera beside `dir/stem.yaml`.
 pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf> {
     let mut found = names_of(number).filter_map(|name| {
-        let mut paths = ENDINGS
-            .map(|ending| dir.join(format!("{stem}_{name}.{ending}")))
-            .into_iter();
-        paths.find(|path| path.is_file())
+        let paths = ENDINGS.map(|ending| dir.join(format!("{stem}_{name}.{ending}")));
+        paths.into_iter().find(|path| path.is_file())
     });
     let Some(image) = found.next() else {
         let path = dir.join(format!("{stem}_{}{number}.{}", PREFIXES[0], ENDINGS[0]));
@@ -94,10 +90,8 @@ pub(super) fn read(
         let Some(entry) = root.optional(&name)? else {
             continue;
         };
-        metadata.pinhole = entry
-            .optional("intrinsic")?
-            .map(|field| pinhole(&field))
-            .transpose()?;
+        let intrinsic = entry.optional("intrinsic")?;
+        metadata.pinhole = intrinsic.map(|field| pinhole(&field)).transpose()?;
         if let (Some(cords), Some(lidar)) = (entry.optional("cords")?, root.optional("lidar_pose")?)
         {
             metadata.lidar_from_camera = Some(lidar_from_camera(&pose(&lidar)?, &pose(&cords)?));
@@ -109,11 +103,9 @@ pub(super) fn read(
 }
 
 fn pinhole(field: &YamlField<'_>) -> Result<Pinhole> {
-    let rows = field.items()?;
-    let rows = rows
-        .iter()
-        .map(YamlField::numbers::<3>)
-        .collect::<Result<Vec<_>, _>>()?;
+    let items = field.items()?;
+    let rows = items.iter().map(YamlField::numbers::<3>);
+    let rows = rows.collect::<Result<Vec<_>, _>>()?;
     match rows.as_slice() {
         &[[fx_px, _, cx_px], [_, fy_px, cy_px], _] => Ok(Pinhole {
             fx_px,

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::frame::{ObjectClass, UnknownClass};
+use crate::frame::ObjectClass;
 
 /// Name of the four classes of motor vehicles together.
 const VEHICLE: &str = "vehicle";
@@ -41,12 +41,10 @@ impl ClassSet {
     fn of<'a>(names: impl IntoIterator<Item = &'a str>) -> Result<Self, String> {
         let mut set = Self(0);
         for asked in names.into_iter().map(str::trim) {
-            set.0 |= if asked == VEHICLE {
-                Self::VEHICLES.0
-            } else {
-                bit(asked
-                    .parse()
-                    .map_err(|error: UnknownClass| error.to_string())?)
+            set.0 |= match asked.parse::<ObjectClass>() {
+                Ok(class) => bit(class),
+                Err(_) if asked == VEHICLE => Self::VEHICLES.0,
+                Err(error) => return Err(error.to_string()),
             };
         }
         match set.0 {

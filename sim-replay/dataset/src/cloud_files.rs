@@ -54,10 +54,9 @@ pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile>> {
         }
     }
     let mut folders = Folders::of(found.iter().flatten());
-    found
-        .into_iter()
-        .map(|listed| listed.map(|listed| folders.source_of(listed)))
-        .collect()
+    let found = found.into_iter();
+    let sources = found.map(|listed| listed.map(|listed| folders.source_of(listed)));
+    sources.collect()
 }
 
 /// A listed file.
@@ -140,10 +139,8 @@ impl Folders {
             let frames = self.scenes.entry(scene.clone()).or_insert_with(|| {
                 // A folder may only look like a scene: then its files are read by themselves.
                 let scenarios = crate::open(&scene).map(|dataset| dataset.scenarios);
-                let frames = scenarios
-                    .unwrap_or_default()
-                    .into_iter()
-                    .flat_map(frames_of);
+                let scenarios = scenarios.unwrap_or_default().into_iter();
+                let frames = scenarios.flat_map(frames_of);
                 frames.map(|file| (canonical(&file.path), file)).collect()
             });
             // A relative path or a link may name the same file as the scene does.
@@ -171,9 +168,8 @@ fn scene_of(path: &Path) -> Option<PathBuf> {
     let folder = path.parent()?;
     let is_of_sequence = SEQUENCE_FOLDERS.iter().any(|name| folder.ends_with(name));
     let is_frame = path.with_extension("yaml").is_file();
-    (is_frame || is_of_sequence)
-        .then(|| folder.parent().map(Path::to_owned))
-        .flatten()
+    let scene = folder.parent().filter(|_| is_frame || is_of_sequence);
+    scene.map(Path::to_owned)
 }
 
 impl CloudFile {

@@ -48,9 +48,8 @@ pub(super) fn natural_order(first: &str, second: &str) -> Ordering {
 
 /// Texts and numbers of a name: a number by its length without zeros in front, and its digits.
 fn parts(name: &str) -> impl Iterator<Item = (usize, &[u8])> {
-    let parts = name
-        .as_bytes()
-        .chunk_by(|a, b| a.is_ascii_digit() == b.is_ascii_digit());
+    let bytes = name.as_bytes();
+    let parts = bytes.chunk_by(|a, b| a.is_ascii_digit() == b.is_ascii_digit());
     parts.map(|part| match part.first() {
         Some(b'0'..=b'9') => {
             // Compared by length and digits, not parsed: a number of any length is in order.
@@ -101,20 +100,16 @@ pub(super) fn holds(dir: &Path, suffix: &str) -> bool {
 
 /// The stems of the files that end in `suffix`, in the order given.
 pub(super) fn stems<'a>(files: &'a [String], suffix: &'a str) -> impl Iterator<Item = &'a str> {
-    files
-        .iter()
-        .filter_map(move |name| name.strip_suffix(suffix))
+    let names = files.iter();
+    names.filter_map(move |name| name.strip_suffix(suffix))
 }
 
 /// Paths of a folder: as given, absolute, and canonical. `.` or `00` shows little of the folders above; a symbolic link
 /// may lead to other ones.
 pub(super) fn names_of(dir: &Path) -> impl Iterator<Item = PathBuf> {
-    let others = [std::path::absolute(dir), dir.canonicalize()]
-        .into_iter()
-        .flatten();
-    std::iter::once(dir.to_owned())
-        .chain(others)
-        .filter(|name| name.file_name().is_some())
+    let others = [std::path::absolute(dir), dir.canonicalize()].into_iter();
+    let names = std::iter::once(dir.to_owned()).chain(others.flatten());
+    names.filter(|name| name.file_name().is_some())
 }
 
 /// The folders above one, by its [`names_of`].
@@ -133,8 +128,12 @@ pub(super) fn name_below(root: &Path, dir: &Path) -> String {
 
 /// The folder's own name, where `.` or a link leads to it too.
 pub(super) fn own_name(dir: &Path) -> String {
-    let canonical = dir.canonicalize().unwrap_or_default();
-    let name = canonical.file_name().unwrap_or_default();
+    last_name(&dir.canonicalize().unwrap_or_default())
+}
+
+/// The last part of a path.
+pub(super) fn last_name(dir: &Path) -> String {
+    let name = dir.file_name().unwrap_or_default();
     name.to_string_lossy().into_owned()
 }
 

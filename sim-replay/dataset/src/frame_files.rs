@@ -3,9 +3,8 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use super::ReadError;
-use super::camera_files;
 use super::files::{self, Listing};
+use super::{ReadError, camera_files};
 
 /// Text in the names of YAML files that are no frames (OpenCOOD, V2V4Real).
 const NOT_FRAMES: [&str; 2] = ["additional", "camera_gt"];

@@ -62,9 +62,8 @@ const SCENES: [&str; 3] = ["NCLT", "Oxford", "QEOxford"];
 
 /// True if a folder is a sequence.
 fn is_sequence(dir: &Path) -> bool {
-    [CONVERTED, RAW]
-        .iter()
-        .any(|name| files::holds(&dir.join(name), ".bin"))
+    let mut folders = [CONVERTED, RAW].iter();
+    folders.any(|name| files::holds(&dir.join(name), ".bin"))
 }
 
 /// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
@@ -104,9 +103,8 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
             problems.push(ReadError::malformed(dir, reason));
         }
     }
-    let join = poses
-        .as_ref()
-        .map(|_| format!("{} poses by time", stamps.len()));
+    let join = format!("{} poses by time", stamps.len());
+    let join = poses.is_some().then_some(join);
     let poses = poses.unwrap_or_default();
     let clouds = stamps.into_iter().map(|(micros, stem)| {
         let file = points_dir.join(format!("{stem}.bin"));
@@ -150,10 +148,8 @@ fn poses(
         None => Isometry3::identity(),
     };
     // z down to z up: half a turn about x.
-    let turn = Isometry3::from_parts(
-        Vector3::zeros().into(),
-        UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
-    );
+    let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+    let turn = Isometry3::from_parts(Vector3::zeros().into(), turn);
     for pose in poses.values_mut() {
         // The mean is in the axes of the file: it is subtracted before the turn.
         *pose = (turn * middle.inverse() * pose.isometry() * turn.inverse()).into();
@@ -164,9 +160,8 @@ fn poses(
 /// File of the mean position of a scene's training sequences.
 fn middle_file(dir: &Path, scene: &str) -> Option<PathBuf> {
     let name = format!("{scene}_pose_stats.txt");
-    files::above(dir)
-        .map(|above| above.join(&name))
-        .find(|path| path.is_file())
+    let mut places = files::above(dir).map(|above| above.join(&name));
+    places.find(|path| path.is_file())
 }
 
 /// Files that poses of a sequence may come from.

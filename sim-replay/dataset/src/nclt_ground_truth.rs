@@ -12,8 +12,7 @@ use protocol::text::excerpt;
 use super::faults::Faults;
 use super::trajectory::Trajectory;
 use super::{ReadError, Result, files};
-use support::csv_file;
-use support::rounding;
+use support::{csv_file, rounding};
 
 /// Largest file that is read, bytes: some two million rows.
 const MAX_BYTES: u64 = 256 << 20;

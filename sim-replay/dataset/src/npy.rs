@@ -58,9 +58,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
 
 /// Text of the header and the bytes behind it.
 fn split(bytes: &[u8]) -> Result<(&str, &[u8]), String> {
-    let rest = bytes
-        .strip_prefix(MAGIC)
-        .ok_or("it does not begin as a NumPy file")?;
+    let rest = bytes.strip_prefix(MAGIC);
+    let rest = rest.ok_or("it does not begin as a NumPy file")?;
     let (length, rest) = match rest {
         // Version 1 states the length of the header in two bytes, later ones in four.
         [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
@@ -82,10 +81,8 @@ fn entry<'a>(header: &'a str, key: &str) -> Option<&'a str> {
 }
 
 fn quoted(text: &str) -> Option<&str> {
-    let quote = text
-        .chars()
-        .next()
-        .filter(|quote| matches!(quote, '\'' | '"'))?;
+    let first = text.chars().next();
+    let quote = first.filter(|quote| matches!(quote, '\'' | '"'))?;
     text.get(1..)?.split(quote).next()
 }
 
@@ -98,10 +95,8 @@ fn shape_of(header: &str) -> Result<Vec<usize>, String> {
         .and_then(|text| text.strip_prefix('(')?.split_once(')'))
         .ok_or("no shape")?
         .0;
-    let sizes = text
-        .split(',')
-        .map(str::trim)
-        .filter(|size| !size.is_empty());
+    let words = text.split(',').map(str::trim);
+    let sizes = words.filter(|size| !size.is_empty());
     let sizes = sizes.map(|size| {
         let number = size.parse();
         number.map_err(|_| format!("shape ({text}): {size:?} is no size"))
@@ -156,10 +151,10 @@ fn fields_of(text: &str) -> Result<Vec<(String, Scalar)>, String> {
     tuples.collect()
 }
 
-fn product(one: usize, sizes: &[usize]) -> Option<usize> {
-    sizes
-        .iter()
-        .try_fold(one, |product, &size| product.checked_mul(size))
+/// The product of `one` and sizes, unless it overflows.
+pub(super) fn product(one: usize, sizes: &[usize]) -> Option<usize> {
+    let mut sizes = sizes.iter();
+    sizes.try_fold(one, |product, &size| product.checked_mul(size))
 }
 
 fn named(fields: &str, shape: &[usize]) -> Result<NpyColumns, String> {

@@ -127,11 +127,10 @@ fn header(bytes: &[u8]) -> Result<(PlyFormat, Vec<PlyElement>, &[u8]), String> {
         format!("format {format:?}, expected ascii, binary_little_endian or binary_big_endian")
     })?;
     // After all lines: `format` may come behind the elements.
-    for (_, scalar) in elements
-        .iter_mut()
-        .flat_map(|element| &mut element.properties)
-    {
-        scalar.is_big_endian = storage == PlyFormat::BinaryBigEndian;
+    for element in &mut elements {
+        for (_, scalar) in &mut element.properties {
+            scalar.is_big_endian = storage == PlyFormat::BinaryBigEndian;
+        }
     }
     Ok((storage, elements, body))
 }
@@ -162,12 +161,9 @@ fn ascii(
     let counts = before.iter().map(|element| element.count);
     let skipped = counts.fold(0, usize::saturating_add);
     let text = String::from_utf8_lossy(body);
-    let lines = text
-        .lines()
-        .filter(|line| !line.trim().is_empty())
-        .skip(skipped);
+    let lines = text.lines().filter(|line| !line.trim().is_empty());
     let mut points = Vec::new();
-    for (index, line) in lines.take(vertex.count).enumerate() {
+    for (index, line) in lines.skip(skipped).take(vertex.count).enumerate() {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         let mut point = [0.0; 4];
         for (value, column) in point.iter_mut().zip(columns) {
@@ -181,11 +177,10 @@ fn ascii(
         }
         points.push(point);
     }
-    match points.len() {
-        found if found == vertex.count => Ok(points),
-        found => Err(format!(
-            "{} vertices stated, {found} found: the file is cut off",
-            vertex.count
+    match (points.len(), vertex.count) {
+        (found, stated) if found == stated => Ok(points),
+        (found, stated) => Err(format!(
+            "{stated} vertices stated, {found} found: the file is cut off"
         )),
     }
 }

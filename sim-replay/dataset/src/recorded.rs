@@ -32,11 +32,8 @@ const IN_RUN_FOLDER: &str = "recording.mcap";
 
 /// The recording that `path` names: the file itself, or that of a run folder. A file of another program looks alike.
 pub fn recording_of(path: &Path) -> Option<PathBuf> {
-    let is_recording =
-        |file: &Path| file.is_file() && file.extension().is_some_and(|kind| kind == "mcap");
-    [path.to_path_buf(), path.join(IN_RUN_FOLDER)]
-        .into_iter()
-        .find(|file| is_recording(file))
+    let mut files = [path.to_path_buf(), path.join(IN_RUN_FOLDER)].into_iter();
+    files.find(|file| file.is_file() && file.extension().is_some_and(|kind| kind == "mcap"))
 }
 
 /// Opens the recording that a path names.
@@ -103,9 +100,8 @@ impl Recorded {
                         | Stream::Radar
                         | Stream::Camera(_)),
                 } => {
-                    sensors
-                        .entry((capture_nanos, cav.clone(), *stream))
-                        .or_insert_with(|| entry.clone());
+                    let key = (capture_nanos, cav.clone(), *stream);
+                    sensors.entry(key).or_insert_with(|| entry.clone());
                 }
                 Topic::Truth => match first_epochs.get(&capture_nanos) {
                     // In the same epoch it is the same replay: a repeated message, and nothing to report.
@@ -171,10 +167,8 @@ impl Recorded {
         let (mut ticks, mut missing) = (Vec::new(), Vec::new());
         for capture_nanos in captures {
             let stem = capture_nanos.to_string();
-            let lacking = self
-                .agents
-                .iter()
-                .filter(|cav| !self.has(cav, capture_nanos, Stream::Lidar));
+            let agents = self.agents.iter();
+            let lacking = agents.filter(|cav| !self.has(cav, capture_nanos, Stream::Lidar));
             missing.extend(lacking.map(|cav| MissingFrame::new(cav, &stem)));
             ticks.push(Tick::new(stem, capture_nanos));
         }
@@ -183,13 +177,11 @@ impl Recorded {
 
     /// Numbers of the cameras that have images.
     fn cameras(&self) -> Vec<u8> {
-        let numbers = self
-            .sensors
-            .keys()
-            .filter_map(|(_, _, stream)| match stream {
-                Stream::Camera(number) => Some(*number),
-                _ => None,
-            });
+        let keys = self.sensors.keys();
+        let numbers = keys.filter_map(|(_, _, stream)| match stream {
+            Stream::Camera(number) => Some(*number),
+            _ => None,
+        });
         numbers.collect::<BTreeSet<u8>>().into_iter().collect()
     }
 

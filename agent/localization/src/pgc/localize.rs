@@ -4,6 +4,7 @@ use nalgebra::Isometry3;
 use perception::detector::BackboneLevel;
 use protocol::PointCloud;
 
+use super::driven_area::DrivenArea;
 use super::error::LocalizerError;
 use super::localization::Localization;
 
@@ -46,6 +47,11 @@ pub trait Localize: std::fmt::Debug + Send {
 
     /// Name of the place in whose map the poses are; `None` if it is not known.
     fn place(&self) -> Option<&str> {
+        None
+    }
+
+    /// Area of the drives that it was trained on; `None` if it is not known.
+    fn driven_area(&self) -> Option<&DrivenArea> {
         None
     }
 }

@@ -15,6 +15,7 @@ use tch::{Kind, Tensor, no_grad};
 use super::cell_choice::choose_evenly;
 use super::cell_encoder::{CellEncoder, PreparedSweep};
 use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
+use super::driven_area::{DRIVEN_AREA_KEY, DrivenArea};
 use super::error::{LocalizerError, Result};
 use super::extensions::other_parts::MOST_PARTS;
 use super::head_config::SceneHeadConfig;
@@ -52,6 +53,8 @@ pub struct Localizer {
     pub(crate) most_parts: usize,
     /// Of the file, or of the encoder in a detector's file.
     pub(super) encoder_sha256: String,
+    /// Area of the drives of the head, if its file states it.
+    pub(super) driven_area: Option<DrivenArea>,
 }
 
 impl Localizer {
@@ -106,6 +109,7 @@ impl Localizer {
             solver: PoseSolver::default(),
             most_parts: MOST_PARTS,
             encoder_sha256,
+            driven_area: fitted(&weights, DRIVEN_AREA_KEY, DrivenArea::check)?,
         };
         Ok((localizer, weights))
     }

@@ -9,6 +9,7 @@ mod cell_choice;
 pub mod cell_encoder;
 pub mod confidence;
 pub(crate) mod dense;
+pub mod driven_area;
 mod encoder_config;
 pub(crate) mod error;
 pub mod extensions;
@@ -56,6 +57,7 @@ pub use scene_regression::SceneHead;
 pub use voxel_batch::VoxelBatch;
 pub use voxelise::{SweepCell, SweepVoxels};
 
+use driven_area::DrivenArea;
 use extensions::{along_street, levelling, other_parts, wider_search};
 use localization::REFINE;
 use localizer::{CELLS, SweepFeatures};
@@ -89,6 +91,10 @@ impl Localize for Localizer {
 
     fn place(&self) -> Option<&str> {
         Some(&self.head.config().scene_name)
+    }
+
+    fn driven_area(&self) -> Option<&DrivenArea> {
+        self.driven_area.as_ref()
     }
 }
 

@@ -123,6 +123,8 @@ impl PoseSettings for TrackedPoseConfig {
 
 /// Largest standard deviation of a tracked position, metres: the next good measurement is still near the prediction.
 const MAX_POSITION_STD_M: f64 = 2.0;
+/// Longest time for which the place where a lost vehicle was seen tells where it is, seconds.
+const LAST_SEEN_S: f64 = 60.0;
 /// Largest number of parts of the scene in which a sweep is sought: a lost vehicle is sought again in its next sweep, and
 /// outside the scene every sweep costs them all.
 const MOST_PARTS: usize = 4;
@@ -138,6 +140,8 @@ pub struct TrackedPose {
     /// Capture time of the last sweep that was measured, and of the last that was by the whole localizer, nanoseconds.
     measured_nanos: Option<u64>,
     global_nanos: Option<u64>,
+    /// Capture time of the last sweep with a pose, nanoseconds, and x and y of that pose, metres.
+    last_seen: Option<(u64, [f64; 2])>,
     jumps: u64,
     is_speed_refuted: bool,
     times: Vec<StageTiming>,
@@ -171,6 +175,7 @@ impl TrackedPose {
             sweeps: 0,
             measured_nanos: None,
             global_nanos: None,
+            last_seen: None,
             jumps: 0,
             is_speed_refuted: false,
             times: Vec::new(),
@@ -238,8 +243,23 @@ impl TrackedPose {
         // Without a pose the tracker has not started: what the localizer gives as the reason is published.
         match self.tracker.state() {
             Some(state) => published(&state),
+            None if self.is_undriven(input.capture_nanos) => match localization.estimate {
+                PoseEstimate::NoPose { inlier_count, .. } => {
+                    PoseEstimate::no_pose(NoPoseReason::NotDriven, inlier_count)
+                }
+                pose @ PoseEstimate::Pose { .. } => pose,
+            },
             None => localization.estimate,
         }
+    }
+
+    /// True if no drive of the head came near where the vehicle was seen a short time ago.
+    fn is_undriven(&self, capture_nanos: u64) -> bool {
+        let (Some((nanos, place_m)), Some(area)) = (self.last_seen, self.localizer.driven_area())
+        else {
+            return false;
+        };
+        (0.0..LAST_SEEN_S).contains(&seconds(nanos, capture_nanos)) && !area.is_near(place_m)
     }
 
     /// True if the sweep is one of those that are measured.
@@ -268,10 +288,12 @@ impl PoseSource for TrackedPose {
         self.sweeps += 1;
         let predicted = self.tracker.predict(input.capture_nanos, &input.motion);
         self.report_speed(input);
-        match predicted {
-            Some(state) => published(&state),
-            None => self.start(input),
-        }
+        let Some(state) = predicted else {
+            return self.start(input);
+        };
+        let place = state.world_from_lidar.translation.vector;
+        self.last_seen = Some((input.capture_nanos, [place.x, place.y]));
+        published(&state)
     }
 
     fn observe(&mut self, input: &PoseInput<'_>) -> bool {
@@ -332,6 +354,7 @@ mod tests {
     use protocol::{CavId, EgoMotion, PointCloud, Pose};
 
     use super::*;
+    use crate::pgc::driven_area::DrivenArea;
     use crate::pgc::{LocalizerInput, stopwatch};
 
     /// A vehicle that drives at 10 m/s along x; every sweep holds its number of points.
@@ -343,6 +366,7 @@ mod tests {
         carried_at: usize,
         /// Sweeps without a pose.
         blind: std::ops::Range<usize>,
+        driven: Option<DrivenArea>,
     }
 
     impl Road {
@@ -371,6 +395,10 @@ mod tests {
             };
             count.fetch_add(1, Ordering::Relaxed);
             Ok(self.result(sweep.cloud))
+        }
+
+        fn driven_area(&self) -> Option<&DrivenArea> {
+            self.driven.as_ref()
         }
     }
 
@@ -545,6 +573,23 @@ mod tests {
         assert!(
             confidence.windows(2).all(|pair| pair[1] < pair[0]),
             "{confidence:?}"
+        );
+    }
+
+    #[test]
+    fn a_vehicle_that_is_lost_where_no_drive_came_near_says_so() {
+        let reasons = [[-30.0, 0.0], [30.0, 0.0]].map(|drive_m| {
+            let blind = Road {
+                blind: 20..80,
+                driven: Some(DrivenArea::of(&[drive_m])),
+                ..road()
+            };
+            drive(blind, TrackedPoseConfig::default(), 79).0[78]
+        });
+        let expected = [NoPoseReason::NotDriven, NoPoseReason::TooFewInliers];
+        assert_eq!(
+            reasons,
+            expected.map(|reason| PoseEstimate::no_pose(reason, 3))
         );
     }
 

@@ -553,6 +553,12 @@ fn table(summary: &LocalizationSummary) -> String {
             summary.mean_ms
         ),
     ];
+    if let Some(outside) = summary.not_driven {
+        let (sweeps, no_pose) = (outside.sweeps, outside.no_pose);
+        rows.push(format!(
+            "not driven {sweeps} sweeps where no drive of the head came near, {no_pose} of them without a pose"
+        ));
+    }
     if !summary.beyond_95.is_empty() {
         let shares = summary.beyond_95.iter();
         let shares = joined(shares.map(|(axis, share)| format!("{axis} {}", percent(*share))));

@@ -170,6 +170,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
              it? Its map is {place}"
         ));
     }
+    if let Some(area) = localizer.driven_area().filter(|_| lost > 0) {
+        let area = area.text();
+        output::note(format_args!(
+            "no pose is found where no drive of the head came near: they cover {area}"
+        ));
+    }
     let folder = args.clouds.first().map_or(Path::new(""), PathBuf::as_path);
     let sweeps: Vec<&SweepFindings> = sweeps.iter().collect();
     findings::note(&findings::of_clouds(folder, &sweeps, IntensityScale::AUTO));
@@ -259,6 +265,7 @@ fn reason(estimate: &PoseEstimate) -> Option<&'static str> {
             NoPoseReason::TooFewPoints => "too few points",
             NoPoseReason::TooFewInliers => "too few inliers",
             NoPoseReason::LowConfidence => "low confidence",
+            NoPoseReason::NotDriven => "no drive came near",
             NoPoseReason::NoSource | NoPoseReason::Failed => "failed",
         }),
     }

@@ -221,7 +221,7 @@ fn text(report: &PlaceReport) -> String {
         report.place,
         report.training_text(),
         report.coverage_text(),
-        indented(&report.coverage.picture()),
+        indented(&report.coverage.area.picture()),
         report.limits_text()
     )
 }
@@ -251,7 +251,7 @@ fn write(config: &MapConfig, report: &PlaceReport) -> anyhow::Result<()> {
     let time = format!("{:.0} s", report.seconds);
     card.row("time of everything", time);
     card.paragraph(&report.limits_text());
-    let (cell_m, picture) = (report.coverage.cell_m, report.coverage.picture());
+    let (cell_m, picture) = (report.coverage.area.cell_m, report.coverage.area.picture());
     card.paragraph(&format!(
         "Cells of {cell_m:.0} m with sweeps (#), north up:\n\n```\n{picture}```"
     ));

@@ -1,5 +1,6 @@
 //! Subcommands: one file each, with its arguments and its `run`.
 
+pub(crate) mod cover;
 pub(crate) mod eval;
 pub(crate) mod localize;
 pub(crate) mod locate;

@@ -12,7 +12,8 @@ use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, fi
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{
-    CalibrationBin, IntegritySummary, LocalizationSummary, RejectionSummary, reliability_charts,
+    CalibrationBin, IntegritySummary, LocalizationSummary, NotDrivenSummary, RejectionSummary,
+    reliability_charts,
 };
 pub use table::{csv, error_table};
 
@@ -48,6 +49,8 @@ pub struct EvaluatedSweep {
     pub stem: String,
     /// True `world_from_lidar`.
     pub truth: Pose,
+    /// True if a drive of the head came near; `None` if it does not state its drives.
+    pub is_driven: Option<bool>,
     /// Result of the localizer.
     pub localization: Localization,
 }
@@ -136,9 +139,14 @@ pub fn evaluate(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    evaluate_with(options, on_sweep, |frame, _| {
+    let mut evaluated = evaluate_with(options, on_sweep, |frame, _| {
         localizer.localize(LocalizerInput::of(&frame.points))
-    })
+    })?;
+    for sweep in &mut evaluated.sweeps {
+        let [x, y, _] = sweep.truth.translation_m;
+        sweep.is_driven = localizer.driven_area().map(|area| area.is_near([x, y]));
+    }
+    Ok(evaluated)
 }
 
 /// The same for a pose source, which gets the pose of the GNSS receiver.
@@ -247,6 +255,7 @@ fn evaluate_with(
         };
         evaluated.sweeps.push(EvaluatedSweep {
             scenario: scenario.name.clone(),
+            is_driven: None,
             localization: localize(&frame, &truth)?,
             cav: frame.cav,
             stem,
@@ -264,7 +273,9 @@ fn evaluate_with(
 
 /// Name of a sweep's outcome.
 fn outcome(estimate: &PoseEstimate) -> &'static str {
-    use protocol::NoPoseReason::{Failed, LowConfidence, NoSource, TooFewInliers, TooFewPoints};
+    use protocol::NoPoseReason::{
+        Failed, LowConfidence, NoSource, NotDriven, TooFewInliers, TooFewPoints,
+    };
     let PoseEstimate::NoPose { reason, .. } = estimate else {
         return "pose";
     };
@@ -274,6 +285,7 @@ fn outcome(estimate: &PoseEstimate) -> &'static str {
         NoSource => "no_source",
         LowConfidence => "low_confidence",
         Failed => "failed",
+        NotDriven => "not_driven",
     }
 }
 
@@ -303,6 +315,7 @@ pub(crate) mod tests {
                     cav: CavId::new("7").unwrap(),
                     stem: format!("{seed:06}"),
                     truth: scene.world_from_sensor(seed).into(),
+                    is_driven: None,
                     localization: scene
                         .localize(LocalizerInput::of(&PointCloud::default()))
                         .unwrap(),

@@ -43,6 +43,8 @@ pub struct LocalizationSummary {
     pub max_deg: Option<f64>,
     /// Number of sweeps without a pose, rejected ones included.
     pub no_pose: usize,
+    /// Sweeps where no drive of the head came near; absent if it does not state its drives.
+    pub not_driven: Option<NotDrivenSummary>,
     /// Number of sweeps by outcome.
     pub outcomes: BTreeMap<&'static str, usize>,
     /// Spearman's correlation of sigma and distance error over all estimated poses, rejected ones included; -1 is
@@ -80,6 +82,15 @@ pub struct IntegritySummary {
     pub exceeded_share: f64,
     /// Median bound, metres.
     pub p50_bound_m: f64,
+}
+
+/// Sweeps where no drive of the head came near.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct NotDrivenSummary {
+    /// Number of these sweeps.
+    pub sweeps: usize,
+    /// Number of them without a pose.
+    pub no_pose: usize,
 }
 
 /// Poses of similar sigma.
@@ -157,6 +168,7 @@ impl LocalizationSummary {
             p95_deg: quantile(&degrees, 0.95),
             max_deg: degrees.last().copied(),
             no_pose: sweeps.len() - metres.len(),
+            not_driven: not_driven(sweeps),
             outcomes,
             sigma_spearman: spearman(&sigmas, &errors),
             inlier_ratio_spearman: spearman(&ratios, &errors),
@@ -170,6 +182,15 @@ impl LocalizationSummary {
             mean_ms: mean(&total_ms).unwrap_or(0.0),
         }
     }
+}
+
+fn not_driven(sweeps: &[EvaluatedSweep]) -> Option<NotDrivenSummary> {
+    let known = sweeps.iter().any(|sweep| sweep.is_driven.is_some());
+    let outside = || sweeps.iter().filter(|sweep| sweep.is_driven == Some(false));
+    known.then(|| NotDrivenSummary {
+        sweeps: outside().count(),
+        no_pose: (outside().filter(|sweep| sweep.published_error().is_none())).count(),
+    })
 }
 
 fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
@@ -357,6 +378,18 @@ mod tests {
         );
         assert_eq!(silent.rejected.bad_share, Some(1.0));
         assert!(silent.sigma_spearman.is_some());
+    }
+
+    #[test]
+    fn sweeps_where_no_drive_came_near_are_counted() {
+        let mut sweeps = evaluated(20);
+        assert_eq!(not_driven(&sweeps), None);
+        // Sweeps 9 and 19 are empty.
+        for (number, sweep) in sweeps.iter_mut().enumerate() {
+            sweep.is_driven = Some(!(8..11).contains(&number));
+        }
+        let outside = not_driven(&sweeps).unwrap();
+        assert_eq!((outside.sweeps, outside.no_pose), (3, 1));
     }
 
     #[test]

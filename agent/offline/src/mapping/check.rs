@@ -65,6 +65,7 @@ pub(super) fn check(
             cav: frame.cav,
             stem,
             truth,
+            is_driven: None,
             localization: localizer.localize(LocalizerInput::of(&cloud))?,
         };
         check.labelled.extend(sweep.labelled());

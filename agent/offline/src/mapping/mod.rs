@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use nalgebra::Vector3;
 
-pub use coverage::{Coverage, CoveredCell};
+pub use coverage::Coverage;
 pub use report::{HeldOutAccuracy, PlaceReport};
 
 use self::check::Check;

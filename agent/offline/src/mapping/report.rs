@@ -94,10 +94,10 @@ impl PlaceReport {
     pub fn coverage_text(&self) -> String {
         let coverage = &self.coverage;
         let ([x_low, y_low], [x_high, y_high]) = (coverage.low_m, coverage.high_m);
-        let (sweeps, length_m, cell_m) = (coverage.sweeps, coverage.length_m, coverage.cell_m);
+        let (sweeps, length_m, cell_m) = (coverage.sweeps, coverage.length_m, coverage.area.cell_m);
         format!(
             "{sweeps} sweeps along {length_m:.0} m, x {x_low:.0} to {x_high:.0} m, y {y_low:.0} to {y_high:.0} m, {} cells of {cell_m:.0} m (#; x to the right, y up)",
-            coverage.cells.len()
+            coverage.area.cells.len()
         )
     }
 

@@ -161,10 +161,7 @@ impl SweepList {
 
     /// Drive of each sweep, and its pose without reading points; `None` for a sweep without one.
     pub(crate) fn poses(&self) -> Vec<(usize, Option<Isometry3<f64>>)> {
-        let options = LoadOptions {
-            points: false,
-            ..LoadOptions::default()
-        };
+        let options = LoadOptions::without_points();
         let poses = self.places.iter().enumerate().map(|(index, place)| {
             let frame = self.load(index, place, &options);
             let pose = frame.and_then(|frame| frame.world_from_lidar);

@@ -23,9 +23,8 @@ use deploy::score::{
     FrameScores, ProcessStats, Progress, Scored, ScorerNode, TRACKS, offline_intervals,
 };
 use protocol::{Ledger, ProcessId, ProcessUsage, Role, RunId};
-use support::atomic_file;
-use support::output;
 use support::provenance::Provenance;
+use support::{atomic_file, output};
 
 use crate::fleet::{Fleet, SessionContext};
 use crate::run::capacity::{BUDGET, estimate, remedies};
@@ -227,11 +226,10 @@ fn watch(
         display.print_line(&line);
     }
     let restarts = fleet.scenario.timeouts.restarts;
-    display.print_line(&format!(
-        "run {run} at {endpoint}: {} processes, logs in {}",
-        specs.len(),
-        folder.log_dir().display()
-    ));
+    let (count, logs) = (specs.len(), folder.log_dir());
+    let logs = logs.display();
+    let line = format!("run {run} at {endpoint}: {count} processes, logs in {logs}");
+    display.print_line(&line);
     let everyone = specs.iter().map(|spec| spec.name.clone());
     let everyone: Vec<String> = everyone.chain([Role::Scorer.to_string()]).collect();
     // Before the processes start: to open its probe may take seconds, in which nobody would watch them.
@@ -417,9 +415,8 @@ fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
 }
 
 fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
-    let span = progress
-        .span
-        .map(|(first, last)| last.duration_since(first));
+    let span = progress.span;
+    let span = span.map(|(first, last)| last.duration_since(first));
     let seconds = span.map_or(0.0, |span| span.as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     Metrics {

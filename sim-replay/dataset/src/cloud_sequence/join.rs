@@ -58,29 +58,24 @@ pub(super) fn join(stems: &[&str], clouds: &Keys, poses: &PoseFile) -> Result<Jo
 /// Stems or names of files; the endings and folders of the rows' names do not count.
 fn by_name(stems: &[&str], names: &[String]) -> Join {
     let known: HashSet<&str> = stems.iter().copied().collect();
-    let names: Vec<&str> = names
-        .iter()
-        .map(|name| {
-            let name = name.trim_matches('"');
-            let name = name.rsplit(['/', '\\']).next().unwrap_or(name);
-            match name.rsplit_once('.') {
-                // A stem may contain a dot itself: then it has no ending to remove.
-                Some((stem, _)) if !known.contains(name) => stem,
-                _ => name,
-            }
-        })
-        .collect();
-    by_key("name", stems, &names)
+    let names = names.iter().map(|name| {
+        let name = name.trim_matches('"');
+        let name = name.rsplit(['/', '\\']).next().unwrap_or(name);
+        match name.rsplit_once('.') {
+            // A stem may contain a dot itself: then it has no ending to remove.
+            Some((stem, _)) if !known.contains(name) => stem,
+            _ => name,
+        }
+    });
+    by_key("name", stems, &names.collect::<Vec<&str>>())
 }
 
 /// Rows of equal key; a key of two rows is none.
 fn by_key<K: Eq + Hash>(by: &'static str, clouds: &[K], rows: &[K]) -> Join {
     let mut index: HashMap<&K, Option<usize>> = HashMap::with_capacity(rows.len());
     for (row, key) in rows.iter().enumerate() {
-        index
-            .entry(key)
-            .and_modify(|known| *known = None)
-            .or_insert(Some(row));
+        let known = index.entry(key).and_modify(|known| *known = None);
+        known.or_insert(Some(row));
     }
     let rows = clouds.iter().map(|key| index.get(key).copied().flatten());
     Join::new(by, rows)
@@ -98,20 +93,17 @@ fn at(sorted: &[(u64, usize)], time: u64) -> Option<usize> {
     let next = sorted.partition_point(|(row, _)| *row < time);
     let around = sorted.get(next.saturating_sub(1)..)?.iter().take(2);
     let nearest = around.min_by_key(|(row, _)| row.abs_diff(time));
-    nearest
-        .filter(|(row, _)| row.abs_diff(time) < SAME_TIME_NANOS)
-        .map(|(_, index)| *index)
+    let (_, index) = nearest.filter(|(row, _)| row.abs_diff(time) < SAME_TIME_NANOS)?;
+    Some(*index)
 }
 
 /// Two lists of equal length whose numbers differ by a constant: which of them is right cannot be known.
 fn shift(clouds: &[u64], rows: &[u64]) -> Option<String> {
     let (first, row) = (clouds.first()?, rows.first()?);
+    let mut pairs = clouds.iter().zip(rows);
     let is_shifted = first != row
         && clouds.len() == rows.len()
-        && clouds
-            .iter()
-            .zip(rows)
-            .all(|(cloud, number)| cloud.checked_sub(*first) == number.checked_sub(*row));
+        && pairs.all(|(cloud, number)| cloud.checked_sub(*first) == number.checked_sub(*row));
     is_shifted.then(|| {
         format!(
             "as many poses as clouds, but poses are numbered from {row} and clouds from {first}: number them alike, or \
@@ -197,9 +189,8 @@ fn by_line(clouds: &Keys, rows: usize) -> Option<Join> {
     };
     let (first, last) = (*numbers.first()?, *numbers.last()?);
     let is_of_rows = first <= 1 && (last + 1).checked_sub(first) == Some(rows as u64);
-    let places = numbers
-        .iter()
-        .map(|number| usize::try_from(number - first).ok());
+    let places = numbers.iter();
+    let places = places.map(|number| usize::try_from(number - first).ok());
     is_of_rows.then(|| Join::new("number of the row", places))
 }
 

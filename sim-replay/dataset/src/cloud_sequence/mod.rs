@@ -55,20 +55,16 @@ fn is_poses(name: &str, known: &str) -> bool {
 /// File of poses and clouds in natural order, if a folder has both.
 fn place_of(dir: &Path) -> Option<(PathBuf, Vec<PathBuf>)> {
     let listing = files::list(dir).ok()?;
-    let poses = POSES
-        .iter()
-        .find_map(|known| listing.files.iter().find(|name| is_poses(name, known)))?;
+    let mut usual = POSES.iter();
+    let poses = usual.find_map(|known| listing.files.iter().find(|name| is_poses(name, known)))?;
     let below = FOLDERS.iter().filter_map(|known| {
         let mut folders = listing.folders.iter();
         folders.find(|name| name.eq_ignore_ascii_case(known))
     });
     // A map that was saved beside the sweeps is none of them.
-    let folders = below
-        .map(|name| dir.join(name))
-        .chain(std::iter::once(dir.to_owned()));
-    let clouds = folders
-        .filter_map(|folder| clouds_in(&folder).ok())
-        .find(|clouds| !clouds.is_empty())?;
+    let folders = below.map(|name| dir.join(name)).chain([dir.to_owned()]);
+    let mut clouds = folders.filter_map(|folder| clouds_in(&folder).ok());
+    let clouds = clouds.find(|clouds| !clouds.is_empty())?;
     Some((dir.join(poses), clouds))
 }
 
@@ -113,9 +109,8 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
             // Without a time in its name a cloud has that of its pose.
             Keys::Numbers(_) | Keys::Names(_) => row.and_then(|row| poses.times()?.get(row)),
         };
-        let nanos = nanos
-            .copied()
-            .unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
+        let nanos = nanos.copied();
+        let nanos = nanos.unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
         let tick = Tick::new(*stem, nanos);
         let cloud = (tick, file.clone(), Some(world_from_lidar));
         // The index keeps clouds of equal times apart.
@@ -133,10 +128,8 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
 }
 
 fn stems_of(files: &[PathBuf]) -> Vec<&str> {
-    let stems = files.iter().map(|file| file.file_stem());
-    stems
-        .map(|stem| stem.and_then(|stem| stem.to_str()).unwrap_or_default())
-        .collect()
+    let stems = files.iter().map(|file| file.file_stem()?.to_str());
+    stems.map(Option::unwrap_or_default).collect()
 }
 
 #[cfg(test)]

@@ -16,15 +16,12 @@ pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
         return Some((Layout::V2XSIM, agent));
     }
     if let Some(vehicle) = channel.strip_prefix("LIDAR_FRONT_CENTER") {
-        return Some((
-            Layout::MARS,
-            vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT),
-        ));
+        let agent = vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT);
+        return Some((Layout::MARS, agent));
     }
     // Data sets of T4 (Autoware) have one cloud of all LiDARs of the vehicle.
-    ["LIDAR_TOP", "LIDAR_CONCAT"]
-        .contains(&channel)
-        .then_some((Layout::NUSCENES, ONLY_AGENT))
+    let is_single = ["LIDAR_TOP", "LIDAR_CONCAT"].contains(&channel);
+    is_single.then_some((Layout::NUSCENES, ONLY_AGENT))
 }
 
 /// True for roadside units: number 0 of V2X-Sim, and negative numbers as in other layouts.
@@ -50,10 +47,8 @@ impl QuarterTurns {
     pub(super) fn lidar_from_turned(self) -> Isometry3<f64> {
         // The inverse of the turns that `apply` gives the points.
         let angle = -f64::from(self.0) * FRAC_PI_2;
-        Isometry3::from_parts(
-            Default::default(),
-            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle),
-        )
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle);
+        Isometry3::from_parts(Default::default(), turn)
     }
 
     /// Transforms points from the LiDAR's own frame to the turned one, exactly.

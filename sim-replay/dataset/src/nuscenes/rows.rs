@@ -8,8 +8,7 @@ use protocol::Pose;
 use protocol::text::excerpt;
 
 use crate::json::JsonField;
-use crate::json_table;
-use crate::{ReadError, Result};
+use crate::{ReadError, Result, json_table};
 
 /// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
 pub(super) const MAX_BYTES: u64 = 4 << 30;

@@ -10,8 +10,7 @@ use super::annotations;
 use super::rows::{Indices, MAX_BYTES, read_all, referred, transform};
 use crate::frame::Object;
 use crate::json_table::{self, RowKeys};
-use crate::time_stamps;
-use crate::{ReadError, Result};
+use crate::{ReadError, Result, time_stamps};
 
 /// The tables that are read.
 pub(super) const NAMES: [&str; 9] = [
@@ -174,9 +173,8 @@ fn read_sweeps(
     let path = version.join("sample_data.json");
     json_table::read(&path, MAX_BYTES, problems, is_needed, |row| {
         let token = row.required("calibrated_sensor_token")?;
-        let mount = mounts
-            .get(&token.id()?)
-            .ok_or_else(|| token.error("no row of calibrated_sensor.json has it"))?;
+        let mount = mounts.get(&token.id()?);
+        let mount = mount.ok_or_else(|| token.error("no row of calibrated_sensor.json has it"))?;
         let file = row.required("filename")?;
         let name = file.text()?;
         let mut parts = Path::new(name).components();

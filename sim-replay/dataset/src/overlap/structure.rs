@@ -148,10 +148,8 @@ impl Structure {
 }
 
 fn planar(x: f32, y: f32, degrees: f32) -> Isometry3<f32> {
-    Isometry3::from_parts(
-        Translation3::new(x, y, 0.0),
-        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), degrees.to_radians()),
-    )
+    let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), degrees.to_radians());
+    Isometry3::from_parts(Translation3::new(x, y, 0.0), turn)
 }
 
 /// Raises the likelihood around a point with structure of this height.

@@ -51,12 +51,9 @@ pub(super) fn decode(header: &PcdHeader, body: &[u8]) -> Result<PcdCloud, PcdErr
             labels.push(label);
         }
     }
-    if points.len() != header.points {
-        let reason = format!(
-            "{} stated, {} found: the file is cut off",
-            header.points,
-            points.len()
-        );
+    let (stated, found) = (header.points, points.len());
+    if found != stated {
+        let reason = format!("{stated} stated, {found} found: the file is cut off");
         return Err(PcdError::of("POINTS", reason));
     }
     Ok(PcdCloud {
@@ -203,10 +200,8 @@ impl<'a> Lines<'a> {
         if self.begun.contains(&b'\n') {
             return error;
         }
-        let reason = format!(
-            "{}: the file is cut off here, after {read} of {} POINTS",
-            error.reason, self.header.points
-        );
+        let (fault, stated) = (&error.reason, self.header.points);
+        let reason = format!("{fault}: the file is cut off here, after {read} of {stated} POINTS");
         PcdError { reason, ..error }
     }
 }

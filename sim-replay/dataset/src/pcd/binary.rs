@@ -3,9 +3,8 @@
 //! The points may be followed by more bytes: PCL's writers extend files to whole pages. So lengths are checked as "at
 //! least", except for the unpacked one, which determines the positions of fields.
 
-use super::MAX_BYTES;
 use super::header::{IntensitySource, PcdField, PcdHeader};
-use super::{PcdCloud, PcdError, lzf, unpack_rgb};
+use super::{MAX_BYTES, PcdCloud, PcdError, lzf, unpack_rgb};
 use crate::scalar::ScalarKind;
 
 /// Position of a field's numbers: that of point `i` at `first + i * step`.

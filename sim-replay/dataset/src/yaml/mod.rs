@@ -22,8 +22,7 @@ pub(super) use numbers::whole;
 
 use tree::Unsound;
 
-use super::files;
-use super::{ReadError, Result};
+use super::{ReadError, Result, files};
 
 /// Largest YAML file that is read, bytes. Frames with four cameras and fifty objects have about 20 kB.
 const MAX_BYTES: u64 = 16 << 20;

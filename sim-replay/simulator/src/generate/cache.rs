@@ -6,8 +6,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::error::SynthError;
-use super::layout::PROTOCOL_FILE;
-use super::layout::{SceneLayout, remove_folder};
+use super::layout::{PROTOCOL_FILE, SceneLayout, remove_folder};
 use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
 use crate::generate::Result;

@@ -76,11 +76,9 @@ impl Pose2 {
     /// The pose that lies `u` ahead, `v` to the left and turned by `turn_rad`, seen from this one.
     pub fn moved(&self, u: f64, v: f64, turn_rad: f64) -> Self {
         let (sin, cos) = self.heading_rad.sin_cos();
-        Self::new(
-            self.x + u * cos - v * sin,
-            self.y + u * sin + v * cos,
-            wrap_angle(self.heading_rad + turn_rad),
-        )
+        let x = self.x + u * cos - v * sin;
+        let y = self.y + u * sin + v * cos;
+        Self::new(x, y, wrap_angle(self.heading_rad + turn_rad))
     }
 
     /// The pose turned round on the spot.

@@ -29,6 +29,7 @@ use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
 use crate::{Error, Result};
+use localization::pgc::driven_area::DrivenArea;
 use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
 use perception::train::{
     Curve, DataListing, Length, Means, Observe, SaveEvery, Task, Trainer, TrainingEvent,
@@ -174,8 +175,12 @@ impl<'a> SceneTraining<'a> {
             None => key_grid::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?,
         };
         let (kind, head_config) = (SceneHead::KIND, &self.head_config);
+        let mut trained = trainer.save_network(&variables, kind, head_config, self.data)?;
+        let positions_m = self.cache.positions_m();
+        let area = DrivenArea::of(&Vec::from_iter(positions_m.iter().map(|&[x, y, _]| [x, y])));
+        trained.sha256 = area.state_in(&trained.weights)?;
         Ok(SceneSummary {
-            trained: trainer.save_network(&variables, kind, head_config, self.data)?,
+            trained,
             preparing_seconds: self.preparing_seconds,
             scene_name: self.head_config.scene_name,
             sweeps: self.cache.sweep_count(),

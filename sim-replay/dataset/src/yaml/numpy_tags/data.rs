@@ -62,9 +62,8 @@ fn base64(field: &YamlField<'_>) -> Result<Vec<u8>> {
     expect_tag(field, "binary")?;
     // The lines of a block are part of the text.
     let text: String = field.text()?.split_ascii_whitespace().collect();
-    STANDARD
-        .decode(text)
-        .map_err(|error| field.error(format!("no base64: {error}")))
+    let bytes = STANDARD.decode(text);
+    bytes.map_err(|error| field.error(format!("no base64: {error}")))
 }
 
 /// Exactly `count` numbers.
@@ -75,8 +74,6 @@ pub(super) fn numbers(field: &YamlField<'_>, dtype: Scalar, count: usize) -> Res
         let reason = format!("{found} bytes for {count} numbers of {size} bytes");
         return Err(field.error(reason));
     }
-    let numbers = bytes
-        .chunks_exact(size)
-        .filter_map(|chunk| dtype.read(chunk));
-    Ok(numbers.collect())
+    let chunks = bytes.chunks_exact(size);
+    Ok(chunks.filter_map(|chunk| dtype.read(chunk)).collect())
 }

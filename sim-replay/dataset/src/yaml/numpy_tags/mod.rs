@@ -16,7 +16,7 @@ use protocol::text::excerpt;
 
 use super::field::YamlField;
 use super::node::{Value, YamlNode};
-use crate::Result;
+use crate::{Result, npy};
 use data::{binary, numbers, read_dtype};
 
 /// Prefix of tags of Python calls.
@@ -53,9 +53,8 @@ pub(crate) fn is_call(node: &YamlNode) -> bool {
 
 /// The text of a key that is a NumPy scalar; `None` if it is none.
 pub(crate) fn key_text(node: &YamlNode) -> Option<String> {
-    scalar(&YamlField::root(Path::new(""), node))
-        .ok()
-        .map(|number| number.to_string())
+    let number = scalar(&YamlField::root(Path::new(""), node)).ok()?;
+    Some(number.to_string())
 }
 
 /// Reads `_reconstruct`, `_frombuffer` and `scalar(dtype, data)`, an array without dimensions.
@@ -158,11 +157,8 @@ fn shown(tag: Option<&str>) -> String {
 }
 
 fn items<'a, const N: usize>(field: &YamlField<'a>) -> Result<[YamlField<'a>; N]> {
-    let items = field.items()?;
-    let found = items.len();
-    items
-        .try_into()
-        .map_err(|_| field.error(format!("{found} items, expected {N}")))
+    let items = <[YamlField<'a>; N]>::try_from(field.items()?);
+    items.map_err(|items| field.error(format!("{} items, expected {N}", items.len())))
 }
 
 fn tuple<'a, const N: usize>(field: &YamlField<'a>) -> Result<[YamlField<'a>; N]> {
@@ -192,9 +188,7 @@ fn read_shape(field: &YamlField<'_>) -> Result<Vec<usize>> {
     });
     let shape = sizes.collect::<Result<Vec<usize>>>()?;
     // Checked here: readers multiply the sizes without a check.
-    let count = shape
-        .iter()
-        .try_fold(1usize, |count, &size| count.checked_mul(size));
+    let count = npy::product(1, &shape);
     match count.filter(|&count| count <= MAX_NUMBERS && shape.len() <= 4) {
         Some(_) => Ok(shape),
         None => Err(field.error(format!(

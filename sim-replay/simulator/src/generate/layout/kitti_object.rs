@@ -55,9 +55,9 @@ impl SceneWriter for KittiObject {
         let split = self.root.join(SPLIT);
         if self.next_frame.is_none() {
             make_fresh_folder(&split)?;
-            ["velodyne", "calib", "label_2"]
-                .iter()
-                .try_for_each(|name| make_folder(&split.join(name)))?;
+            for name in ["velodyne", "calib", "label_2"] {
+                make_folder(&split.join(name))?;
+            }
         }
         write_origin(&self.root, scene)?;
         self.first_frame = self.next_frame.unwrap_or(0);

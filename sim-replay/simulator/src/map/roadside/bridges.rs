@@ -43,10 +43,9 @@ pub(super) fn place(site: &mut Site) {
 fn drop_m(site: &Site, cut: &CrossSection) -> f64 {
     let [low, high] = cut.paved_m;
     let quarter = 0.25 * (high - low);
-    [low, low + quarter, (low + high) / 2.0, high - quarter, high]
-        .map(|t| cut.height_m(t) - site.ground_m(cut.at(t)))
-        .into_iter()
-        .fold(0.0, f64::max)
+    let places = [low, low + quarter, (low + high) / 2.0, high - quarter, high];
+    let drops_m = places.map(|t| cut.height_m(t) - site.ground_m(cut.at(t)));
+    drops_m.into_iter().fold(0.0, f64::max)
 }
 
 fn bridge(site: &mut Site, road: usize) {
@@ -132,9 +131,8 @@ fn retaining_walls(site: &mut Site, road: usize) {
             let beside =
                 [from, to].map(|cut| site.ground_m(cut.at(cut.paved_m[side] + sign * BESIDE_M)));
             let high = beside[0].max(beside[1]);
-            let road_z = from
-                .height_m(from.paved_m[side])
-                .min(to.height_m(to.paved_m[side]));
+            let [from_z, to_z] = [from, to].map(|cut| cut.height_m(cut.paved_m[side]));
+            let road_z = from_z.min(to_z);
             if beside[0].min(beside[1]) - road_z < RETAINED_M {
                 continue;
             }

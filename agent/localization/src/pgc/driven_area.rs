@@ -1,0 +1,162 @@
+//! Driven area of a head: the cells of a grid in which there are sweeps that it was trained on.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use perception::weights::{FileError, annotate};
+use protocol::config::{FieldError, require, within};
+use serde::{Deserialize, Serialize};
+
+/// Key of the metadata of a head's file that contains its driven area.
+pub(super) const DRIVEN_AREA_KEY: &str = "driven_area";
+/// Smallest edge of a cell, metres.
+const CELL_M: f64 = 25.0;
+/// Most cells along an edge of the area.
+const MOST_CELLS: f64 = 60.0;
+/// Largest distance between a position and a cell that counts as near, metres: farther away the sweeps of the drives hardly
+/// show what is there.
+const NEAR_M: f64 = 25.0;
+
+/// Cells with sweeps in them, in the frame of the map.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DrivenArea {
+    /// Edge of a cell, metres.
+    pub cell_m: f64,
+    /// Cells with sweeps in them: south-west corner, metres, and number of sweeps.
+    pub cells: Vec<DrivenCell>,
+}
+
+/// A cell of the grid.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DrivenCell {
+    /// x and y of the south-west corner, metres.
+    pub corner_m: [f64; 2],
+    /// Number of sweeps.
+    pub sweeps: usize,
+}
+
+impl DrivenArea {
+    /// Area of positions of sweeps, metres.
+    pub fn of(positions_m: &[[f64; 2]]) -> Self {
+        let edges_m = [0, 1].map(|axis: usize| {
+            let along = positions_m.iter().map(|position| position[axis]);
+            along.clone().fold(f64::NEG_INFINITY, f64::max) - along.fold(f64::INFINITY, f64::min)
+        });
+        let edge_m = edges_m[0].max(edges_m[1]);
+        let cell_m = CELL_M.max((edge_m / MOST_CELLS / CELL_M).ceil() * CELL_M);
+        let mut counts: BTreeMap<[i64; 2], usize> = BTreeMap::new();
+        for position in positions_m {
+            // Floor, as coordinates may be negative: a cast alone rounds towards zero.
+            *counts
+                .entry(position.map(|metres| (metres / cell_m).floor() as i64))
+                .or_default() += 1;
+        }
+        let cells = counts.into_iter().map(|(cell, sweeps)| DrivenCell {
+            corner_m: cell.map(|k| k as f64 * cell_m),
+            sweeps,
+        });
+        Self {
+            cell_m,
+            cells: cells.collect(),
+        }
+    }
+
+    /// Writes the area into the file of a head; returns the digest of the file.
+    ///
+    /// # Errors
+    /// [`FileError`] when the file is missing, not a complete safetensors file or not writable.
+    pub fn state_in(&self, head: &Path) -> Result<String, FileError> {
+        let text = serde_json::to_string(self).map_err(|error| FileError::new(head, error))?;
+        annotate(head, DRIVEN_AREA_KEY, &text)
+    }
+
+    /// Checks an area that was read.
+    ///
+    /// # Errors
+    /// [`FieldError`] of the first value that is wrong.
+    pub(super) fn check(&self) -> Result<(), FieldError> {
+        within("cell_m", self.cell_m, 1.0, 1e5)?;
+        let mut corners_m = self.cells.iter().map(|cell| cell.corner_m);
+        let unknown = corners_m.find(|corner_m| !corner_m.iter().all(|metres| metres.is_finite()));
+        require(
+            unknown.is_none(),
+            "cells.corner_m",
+            unknown,
+            "must be finite",
+        )
+    }
+
+    /// True if a drive came near a position, metres.
+    pub fn is_near(&self, position_m: [f64; 2]) -> bool {
+        self.cells.iter().any(|cell| {
+            let [x, y] = [0, 1].map(|axis| {
+                let beyond_m = position_m[axis] - cell.corner_m[axis];
+                beyond_m - beyond_m.clamp(0.0, self.cell_m)
+            });
+            x.hypot(y) <= NEAR_M
+        })
+    }
+
+    /// The area in one line.
+    pub fn text(&self) -> String {
+        let (cells, cell_m) = (self.cells.len(), self.cell_m);
+        let [[west, east], [south, north]] = [0, 1].map(|axis: usize| {
+            let corners_m = self.cells.iter().map(|cell| cell.corner_m[axis]);
+            let low_m = corners_m.clone().fold(f64::INFINITY, f64::min);
+            [low_m, corners_m.fold(low_m, f64::max) + cell_m]
+        });
+        format!(
+            "{cells} cells of {cell_m:.0} m, x {west:.0} to {east:.0} m, y {south:.0} to {north:.0} m"
+        )
+    }
+
+    /// The grid as text, north up: `#` where there are sweeps, `.` where there are none.
+    pub fn picture(&self) -> String {
+        let corners_m = self.cells.iter().map(|cell| cell.corner_m);
+        let places: Vec<[i64; 2]> = corners_m
+            .map(|corner_m| corner_m.map(|metres| (metres / self.cell_m).round() as i64))
+            .collect();
+        let [xs, ys] = [0, 1].map(|axis: usize| places.iter().map(move |place| place[axis]));
+        let (west, east) = (xs.clone().min().unwrap_or(0), xs.max().unwrap_or(-1));
+        let (south, north) = (ys.clone().min().unwrap_or(0), ys.max().unwrap_or(-1));
+        let mut text = String::new();
+        for y in (south..=north).rev() {
+            text.extend((west..=east).map(|x| if places.contains(&[x, y]) { '#' } else { '.' }));
+            text.push('\n');
+        }
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_position_is_near_where_a_drive_passed() {
+        let east = (0..=10).map(|k| [f64::from(k) * 10.0, 30.0]);
+        let area = DrivenArea::of(&east.chain([[90.0, -10.0]]).collect::<Vec<_>>());
+        assert_eq!(area.picture(), "#####\n.....\n...#.\n");
+        assert_eq!(area.text(), "6 cells of 25 m, x 0 to 125 m, y -25 to 50 m");
+        let sweeps: usize = area.cells.iter().map(|cell| cell.sweeps).sum();
+        assert_eq!((area.cell_m, sweeps), (25.0, 12));
+        // The cells of the road reach from y 25 to 50, x 0 to 125.
+        let near = [[60.0, 74.0], [60.0, 76.0], [-17.0, 67.0], [-19.0, 69.0]];
+        assert_eq!(near.map(|at| area.is_near(at)), [true, false, true, false]);
+        assert!(!DrivenArea::of(&[]).is_near([0.0, 0.0]));
+    }
+
+    #[test]
+    fn cells_of_a_large_place_are_larger() {
+        let area = DrivenArea::of(&[[0.0, 0.0], [9_000.0, 0.0]]);
+        assert_eq!(area.cell_m, 150.0);
+        area.check().unwrap();
+        let mut endless = area.clone();
+        endless.cells[0].corner_m[1] = f64::NAN;
+        let error = endless.check().unwrap_err().to_string();
+        assert!(
+            error.contains("corner_m") && error.contains("NaN"),
+            "{error}"
+        );
+    }
+}
