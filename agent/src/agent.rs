@@ -52,7 +52,8 @@ pub struct Agent {
     attack: Option<Attack>,
     /// Feature map `[1, C, H, W]` of the next sweep, where its encoder computed it before.
     pub(crate) known_map: Option<Tensor>,
-    has_head: bool,
+    /// False for maps that are sent whole: neither confidence nor detections are computed.
+    pub(crate) has_head: bool,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
 }
@@ -97,12 +98,6 @@ impl Agent {
     /// True if it falsifies what it publishes.
     pub(crate) fn falsifies(&self) -> bool {
         self.attack.is_some()
-    }
-
-    /// An agent that computes neither confidence nor detections, for maps that are sent whole.
-    pub(crate) fn without_head(mut self) -> Self {
-        self.has_head = false;
-        self
     }
 
     /// The points that the vehicle shares: those that are not on its own body, whose extent its detector knows.
@@ -415,7 +410,8 @@ mod tests {
         };
         let mut agent = agent();
         let whole = agent.perceive(&cloud).unwrap();
-        let map = agent.without_head().perceive(&cloud).unwrap();
+        agent.has_head = false;
+        let map = agent.perceive(&cloud).unwrap();
         assert_eq!(map.features, whole.features);
         assert!(map.confidence.is_empty() && map.detections.is_empty());
         assert!(map.times.iter().all(|stage| stage.stage != "head"));

@@ -116,14 +116,13 @@ impl Attack {
             let [x, y] = invented_position(&mut random);
             [x, y, random.between(-0.2, 0.2)]
         });
-        let places = places.collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
         tracing::warn!(%cav, falsification = falsification.name(), "ATTACK: this vehicle falsifies its messages");
         Self {
             falsification,
+            places: places.collect(),
             random,
             offset_m,
-            places,
             captured: CapturedMessages::default(),
         }
     }

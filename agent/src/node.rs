@@ -178,6 +178,7 @@ impl<'a> AgentNode<'a> {
         let capture_nanos = arrival.header.stamp.capture_nanos;
         let input = match stream {
             Stream::Lidar => {
+                // Before the sweep is decoded.
                 let arrived_nanos = arrival.unix_nanos();
                 inbox.decode(arrival, limits).map(|Lidar { points }| {
                     LoopInput::Sweep(Sweep {

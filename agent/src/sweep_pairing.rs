@@ -62,10 +62,9 @@ impl<S> SweepPairing<S> {
     /// Adds a sweep. Returns the one that it replaces.
     pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now_nanos: u64) -> Option<S> {
         // The wait goes on: with a period shorter than the time-out, none would ever be over if each sweep began anew.
-        let superseded = self.waiting.take();
-        let waiting = superseded.as_ref();
+        let waiting = self.waiting.as_ref();
         let since = waiting.map_or(now_nanos, |(_, _, since)| *since);
-        self.waiting = Some((capture_nanos, sweep, since));
+        let superseded = self.waiting.replace((capture_nanos, sweep, since));
         superseded.map(|(_, sweep, _)| sweep)
     }
 

@@ -400,15 +400,14 @@ impl Ego {
         let boxes: Vec<PlacedBox> = (1..all.len())
             .flat_map(|sender| all[sender].boxes(sender, all[0].view, most_boxes))
             .collect();
-        let aligned: Vec<Aligned<'_>> = all.iter().filter(|one| one.has_map()).copied().collect();
-        let (mut maps, mut sent) = (Vec::new(), Vec::new());
-        for Aligned { view, .. } in &aligned {
-            let Content::Features(map) = &view.content else {
-                continue;
-            };
-            let (values, cells) = self.tensors(map, maps.is_empty())?;
-            maps.push(values);
-            sent.push(cells);
+        let (mut aligned, mut maps, mut sent) = (Vec::new(), Vec::new(), Vec::new());
+        for one in all {
+            if let Content::Features(map) = &one.view.content {
+                let (values, cells) = self.tensors(map, maps.is_empty())?;
+                aligned.push(*one);
+                maps.push(values);
+                sent.push(cells);
+            }
         }
         let numbered = aligned.iter().enumerate();
         let metadata = numbered.map(|(agent, view)| view.metadata(agent, aligned[0].view));

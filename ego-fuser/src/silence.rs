@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use protocol::CavId;
 
 /// Consecutive frames without a message after which a neighbour is not awaited any more, until its next message.
-pub(crate) const SILENT_AFTER: u32 = 3;
+const SILENT_AFTER: u32 = 3;
 
 /// Consecutive frames that were decided without a message, by neighbour.
 #[derive(Debug, Default)]

@@ -32,7 +32,7 @@ class PoseEstimate:
     @property
     def no_pose_reason(self) -> Optional[str]:
         """``too_few_points``, ``too_few_inliers``, ``no_source``, ``low_confidence``, ``failed`` or
-        ``not_driven``."""
+        ``low_coverage``."""
     @property
     def inlier_count(self) -> Optional[int]:
         """Inliers of the failed estimate."""

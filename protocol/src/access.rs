@@ -275,21 +275,14 @@ impl FromStr for Principal {
 written_as_text!(Principal);
 
 /// Runs in which permissions hold.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, strum::Display)]
 pub enum RunScope {
     /// One run.
+    #[strum(transparent)]
     One(RunId),
     /// Any run: for a router that outlives runs.
+    #[strum(to_string = "*")]
     Any,
-}
-
-impl fmt::Display for RunScope {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::One(run) => run.fmt(f),
-            Self::Any => f.write_str("*"),
-        }
-    }
 }
 
 /// Operation of a principal on keys.

@@ -117,17 +117,13 @@ pub(crate) struct PayloadReader<'a> {
 
 impl<'a> PayloadReader<'a> {
     /// Begins after the first `skip` bytes.
-    pub(crate) fn new(pieces: Vec<&'a [u8]>, mut skip: usize) -> Self {
+    pub(crate) fn new(pieces: Vec<&'a [u8]>, skip: usize) -> Self {
         let mut reader = Self {
             pieces: pieces.into_iter(),
             piece: &[],
             crc: Hasher::new(),
         };
-        while skip > 0
-            && let Some(run) = reader.next_run(skip)
-        {
-            skip -= run.len();
-        }
+        reader.read_bytes(skip);
         // What was skipped is not part of the checksum.
         reader.crc = Hasher::new();
         reader

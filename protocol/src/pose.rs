@@ -120,6 +120,12 @@ impl Pose {
         )
     }
 
+    /// The rows of the transform as a homogeneous matrix.
+    pub fn matrix_rows(&self) -> [[f64; 4]; 4] {
+        // Stored by columns.
+        self.isometry().to_homogeneous().transpose().data.0
+    }
+
     /// The same motion in a world whose y axis points the other way.
     pub fn mirrored_y(&self) -> Self {
         let ([x, y, z], [qw, qx, qy, qz]) = (self.translation_m, self.rotation_wxyz);

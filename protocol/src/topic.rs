@@ -1,6 +1,5 @@
 //! Topics: the part of a key below its run.
 
-use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
@@ -53,10 +52,13 @@ named! {
 }
 
 /// A key below its run: `4279/bev`, `truth`.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, strum::Display,
+)]
 #[serde(try_from = "String", into = "String")]
 pub enum Topic {
     /// `<cav>/<stream>`: a stream of a vehicle, published by it or by the replay on its behalf.
+    #[strum(to_string = "{cav}/{stream}")]
     Stream {
         /// The vehicle.
         cav: CavId,
@@ -64,6 +66,7 @@ pub enum Topic {
         stream: Stream,
     },
     /// `rx/<ego>/<cav>/<stream>`: the same as it reaches an ego over the emulated link.
+    #[strum(to_string = "rx/{ego}/{cav}/{stream}")]
     Received {
         /// Receiving vehicle.
         ego: CavId,
@@ -73,14 +76,19 @@ pub enum Topic {
         stream: Stream,
     },
     /// `truth`.
+    #[strum(to_string = "truth")]
     Truth,
     /// `control/<verb>`.
+    #[strum(to_string = "control/{0}")]
     Control(Verb),
     /// `ready/<process>`: routes that the process has confirmed.
+    #[strum(to_string = "ready/{0}")]
     Ready(ProcessId),
     /// `stats/<process>`.
+    #[strum(to_string = "stats/{0}")]
     Stats(ProcessId),
     /// `alive/<role>/<cav>`: a liveliness token.
+    #[strum(to_string = "alive/{role}/{cav}")]
     Alive {
         /// Role of the process.
         role: Role,
@@ -151,20 +159,6 @@ impl Topic {
             }
             [] => return None,
         })
-    }
-}
-
-impl fmt::Display for Topic {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Stream { cav, stream } => write!(f, "{cav}/{stream}"),
-            Self::Received { ego, cav, stream } => write!(f, "rx/{ego}/{cav}/{stream}"),
-            Self::Truth => f.write_str("truth"),
-            Self::Control(verb) => write!(f, "control/{verb}"),
-            Self::Ready(process) => write!(f, "ready/{process}"),
-            Self::Stats(process) => write!(f, "stats/{process}"),
-            Self::Alive { role, cav } => write!(f, "alive/{role}/{cav}"),
-        }
     }
 }
 

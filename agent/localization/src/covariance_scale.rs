@@ -203,15 +203,10 @@ fn planar(covariance: &[[f64; 6]; 6]) -> Matrix2<f64> {
 /// Standard deviation of which a bound is a multiple, metres: root of the sum of the variance along the worst axis of the
 /// plane, that of the start and that of [`BOUND_FLOOR_M`].
 fn bound_std_m(covariance: &[[f64; 6]; 6], start_std_m: f64) -> f64 {
-    let std_m = worst_std_m(covariance).hypot(BOUND_FLOOR_M);
-    std_m.hypot(start_std_m)
-}
-
-/// Standard deviation along the worst axis of the plane, metres.
-fn worst_std_m(covariance: &[[f64; 6]; 6]) -> f64 {
-    // Rounding may make the eigenvalues of a singular matrix negative.
     let variance = planar(covariance).symmetric_eigenvalues().max();
-    variance.max(0.0).sqrt()
+    // Rounding may make the eigenvalues of a singular matrix negative.
+    let worst_std_m = variance.max(0.0).sqrt();
+    worst_std_m.hypot(BOUND_FLOOR_M).hypot(start_std_m)
 }
 
 #[cfg(test)]

@@ -20,7 +20,7 @@ use crate::pgc::pose_evidence::PoseEvidence;
 use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
-use crate::registration::icp::{IcpConfig, IcpFit, IcpSource, MIN_POINTS, Plane, register};
+use crate::registration::icp::{IcpFit, IcpSource, MIN_POINTS, Plane, register};
 use crate::tracker::PoseMeasurement;
 
 /// Stage of a localization.
@@ -44,18 +44,15 @@ const LEAST_STD: [f64; 2] = [0.002, 1e-4];
 #[derive(Debug)]
 pub(crate) struct SweepOnMap<'a> {
     cloud: &'a PointCloud,
-    config: IcpConfig,
     source: IcpSource,
     planes: OnceCell<Vec<Plane>>,
 }
 
 impl<'a> SweepOnMap<'a> {
     pub(crate) fn new(cloud: &'a PointCloud) -> Self {
-        let config = SurfelMap::registration();
         Self {
             cloud,
-            source: IcpSource::of_sweep(&cloud.xyzi, &config),
-            config,
+            source: IcpSource::of_sweep(&cloud.xyzi, &SurfelMap::registration()),
             planes: OnceCell::new(),
         }
     }
@@ -68,7 +65,8 @@ impl<'a> SweepOnMap<'a> {
 
     /// The registration from `start`, if it constrains the pose and stays near.
     pub(crate) fn fit(&self, map: &SurfelMap, start: &Isometry3<f64>) -> Option<IcpFit> {
-        let fit = register(&self.source, map.target(), start, &self.config).ok()?;
+        let config = SurfelMap::registration();
+        let fit = register(&self.source, map.target(), start, &config).ok()?;
         let moved = fit.target_from_source.translation.vector - start.translation.vector;
         (moved.norm() <= MOST_MOVED_M).then_some(fit)
     }
@@ -204,10 +202,9 @@ pub(crate) fn found_pose(fit: &IcpFit, covariance_scale: Option<CovarianceScale>
         evidence: PoseEvidence::none(),
         cell_covariance: covariance.transpose().data.0,
         is_registered: true,
-        start_std_m: 0.0,
         covariance_scale,
         sigma: 1.0 / (1.0 + covariance[(0, 0)] + covariance[(1, 1)]),
-        is_rejected: false,
+        ..FoundPose::default()
     }
 }
 

@@ -28,7 +28,7 @@ pub fn place_localizer(
         }
         None => {
             let mut pgc = Localizer::load(encoder, head, inference)?;
-            pgc.set_min_confidence(min_confidence);
+            pgc.solver.min_confidence = min_confidence;
             set(&mut pgc);
             Box::new(pgc)
         }

@@ -73,10 +73,9 @@ impl LoopOptions {
         self.publish.iter().any(|stream| *stream != Stream::Points)
     }
 
-    /// True if detections are published or falsified, or confidence chooses the cells of maps.
+    /// True if detections are published, or confidence chooses the cells of maps.
     fn needs_head(&self) -> bool {
         self.publish.contains(&Stream::Boxes)
-            || self.falsification.is_some()
             || self.codec.budget_bytes.is_some()
             || self.codec.gate.is_some()
             || self.rate != RateConfig::default()
@@ -147,9 +146,7 @@ impl AgentLoop {
             let attack = Attack::new(falsification, agent.cav(), 0);
             agent = agent.with_attack(Some(attack));
         }
-        if !options.needs_head() && !agent.falsifies() {
-            agent = agent.without_head();
-        }
+        agent.has_head = options.needs_head() || agent.falsifies();
         Self {
             pairing: SweepPairing::new(POSE_TIMEOUT_NANOS),
             selection: PaceSelection::of(&options.egos),
@@ -216,7 +213,7 @@ impl AgentLoop {
             return 0;
         }
         let deadline = self.pairing.deadline_nanos().unwrap_or(u64::MAX);
-        deadline.min(self.reports.next_nanos())
+        deadline.min(self.reports.next_nanos)
     }
 
     /// True between two steps of a sweep.

@@ -22,7 +22,7 @@ pub(super) struct SweepReports {
     /// None without a detector: no ego can use the vehicle's messages.
     description: Option<Descriptor>,
     /// Time of the next report, nanoseconds.
-    next_nanos: u64,
+    pub(super) next_nanos: u64,
     /// Capture and arrival times of the sweeps since the last one, nanoseconds.
     sweeps: VecDeque<(u64, u64)>,
     /// Sweeps that are still reported at once.
@@ -51,11 +51,6 @@ impl SweepReports {
             sweeps: VecDeque::new(),
             early: EARLY_SWEEPS,
         }
-    }
-
-    /// Time of the next report, nanoseconds.
-    pub(super) fn next_nanos(&self) -> u64 {
-        self.next_nanos
     }
 
     /// Adds a sweep to the next report, which is due at once if it is one of the first.

@@ -104,10 +104,7 @@ impl Fleet {
         scenario.models.weights = weights_of(weights, scenario.method, scenario.sends_boxes())?;
         let detector = load_models(&scenario)?;
         let scene = &scenario.scene;
-        let options = OpenOptions {
-            intensity_scale: scene.intensity_scale,
-            ..OpenOptions::default()
-        };
+        let options = OpenOptions::with_intensity_scale(scene.intensity_scale);
         let dataset = dataset::open_with(&scene.dir, &options).context("scene")?;
         // Refuses options of a protocol that a live run takes from other fields.
         for (option, is_given) in [
@@ -177,8 +174,7 @@ impl Fleet {
 
     /// Number of values in one feature map of the model, as transmitted.
     pub(crate) fn map_values(&self) -> u64 {
-        let grid = self.detector.feature_grid();
-        u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
+        self.detector.feature_grid().cells() as u64 * self.detector.sent_channels() as u64
     }
 
     /// Settings of a vehicle, for its process and for simulation time alike.

@@ -121,10 +121,8 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         self.check()?;
         let domain_id = self.network.domain_id()?;
-        let stop = Stop::new();
-        stop.on_signals()?;
-        // A network that does not answer must not keep the process after Ctrl-C.
-        stop.enforce(STOP_LIMIT);
+        // Enforced: a network that does not answer must not keep the process after Ctrl-C.
+        let stop = Stop::of_process(false)?;
         let keys = self.keys.as_deref();
         let process = self.robot.as_ref().map_or_else(
             || Principal::of_role(Role::Ros2),

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use bus::shutdown::Stop;
 use bus::{
-    BusOptions, Endpoint, RejectionLog, RouterProbe, RouterRejection, STOP_LIMIT, SharedMemory,
-    open, process_usage,
+    BusOptions, Endpoint, RejectionLog, RouterProbe, RouterRejection, SharedMemory, open,
+    process_usage,
 };
 use protocol::{RunId, RunScope};
 use support::output;
@@ -79,12 +79,7 @@ impl Arguments {
             output::note(path.display());
             return Ok(Outcome::Done);
         }
-        let stop = Stop::new();
-        stop.on_signals()?;
-        if self.supervised {
-            stop.on_end_of_input()?;
-        }
-        stop.enforce(STOP_LIMIT);
+        let stop = Stop::of_process(self.supervised)?;
         // Before the session opens, whose threads it watches.
         router_panic::watch(&stop);
         let session = open(&options)?;

@@ -1,7 +1,6 @@
 //! Other nodes of the ROS 2 network whose topics or frames are those of this node.
 
 use std::collections::BTreeSet;
-use std::time::Duration;
 
 use bus::BusError;
 use ros2::endpoint::NodeName;
@@ -12,9 +11,6 @@ use zenoh::sample::SampleKind;
 
 use super::node_options::ClockMode;
 use super::session::RosSession;
-
-/// Timeout of a query for tokens.
-const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Names other nodes of this program in the log, those that are there and those that come. In one namespace every
 /// topic and frame has two publishers. Ends when the subscription is dropped.
@@ -70,12 +66,8 @@ pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<b
 /// Nodes that publish a topic, without this one.
 fn publishers(session: &RosSession, topic: &RosName) -> Result<BTreeSet<String>, BusError> {
     let (own, selector) = (session.node(), session.node().publishers_of(topic));
-    let liveliness = session.zenoh.liveliness();
-    let tokens = liveliness.get(&selector).timeout(QUERY_TIMEOUT).wait();
-    let tokens =
-        tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
-    let nodes = std::iter::from_fn(|| tokens.recv().ok())
-        .filter_map(|reply| NodeName::of_token(reply.result().ok()?.key_expr().as_str()))
+    let nodes = bus::tokens(&session.zenoh, &selector)?
+        .filter_map(|token| NodeName::of_token(&token))
         .filter(|node| node.zid != own.zid);
     Ok(nodes.map(|node| node.to_string()).collect())
 }

@@ -66,8 +66,6 @@ fn record_of<'a>(
     cav: &CavId,
     neighbours: &'a mut BTreeMap<CavId, NeighbourRecord>,
 ) -> Option<&'a mut NeighbourRecord> {
-    match neighbours.len() < MAX_NEIGHBOURS || neighbours.contains_key(cav) {
-        true => Some(neighbours.entry(cav.clone()).or_default()),
-        false => None,
-    }
+    let has_room = neighbours.len() < MAX_NEIGHBOURS || neighbours.contains_key(cav);
+    has_room.then(|| neighbours.entry(cav.clone()).or_default())
 }

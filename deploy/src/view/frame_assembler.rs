@@ -7,8 +7,8 @@ use dataset::evaluation_protocol::EvaluationProtocol;
 use nalgebra::Vector3;
 use protocol::message::AgentTruth;
 use protocol::{
-    Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload,
-    Pose, PoseEstimate, StageSummary, Stats, Stream, Topic, Tracks, TrueObject, Truth, wire,
+    Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload, Pose,
+    PoseEstimate, StageSummary, Stats, Stream, Topic, Tracks, TrueObject, Truth, wire,
 };
 
 use super::judgement::{DetectionArea, Judge, Judgement};
@@ -425,11 +425,7 @@ impl OpenFrame {
             objects.entry(object.id).or_insert(object);
         }
         let shown = objects.into_values().map(|object| ShownBox {
-            box3d: Box3d {
-                center_m: object.world_from_object.translation_m,
-                size_m: object.size_m,
-                heading_rad: object.world_from_object.yaw_rad(),
-            },
+            box3d: object.box3d(),
             id: Some(object.id),
             is_counted: judgement.found.contains_key(&object.id),
             found_score: judgement.found.get(&object.id).copied().flatten(),

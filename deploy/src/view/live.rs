@@ -148,10 +148,7 @@ impl LiveRun {
             others: BTreeMap::new(),
         };
         let thread = spawn("view", move || listener.run());
-        let thread = thread.map_err(|cause| BusError::Thread {
-            what: "the view".into(),
-            cause,
-        })?;
+        let thread = thread.map_err(BusError::thread("the view"))?;
         Ok(Self {
             run,
             shared,

@@ -220,10 +220,8 @@ impl Planar {
 
 fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S::Ok, S::Error> {
     let rows = pose.as_ref().map(|pose| {
-        let matrix = pose.isometry().to_homogeneous();
-        [0, 1]
-            .map(|row| [0, 1, 2, 3].map(|column| matrix[(row, column)]))
-            .concat()
+        let [first, second, ..] = pose.matrix_rows();
+        [first, second].concat()
     });
     rows.serialize(serializer)
 }

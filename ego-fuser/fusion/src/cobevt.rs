@@ -6,10 +6,11 @@
 //! and need not compute the others. `count_missing` restores the published behaviour.
 
 use perception::model_config::{ConfigError, DetectorConfig};
-use tch::{TchError, Tensor, nn};
+use tch::{TchError, nn};
 
+use super::f64_tensor::picked;
 use super::interface::{Fusion, FusionOutput};
-use super::maps::{AlignedMaps, MapMetadata};
+use super::maps::AlignedMaps;
 use super::padding::Padding;
 use super::settings::{FusionSettings, of_size};
 use super::spec::MethodSpec;
@@ -58,9 +59,7 @@ impl Fusion for Cobevt {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let agents = maps.count()?;
         let (window, count_missing) = (self.config.window, self.config.count_missing);
-        let order = nearest_first(&maps.metadata).to_device(maps.warped.features.device());
-        let WarpedMaps { features, mask } =
-            maps.warped.each(|map| map.f_index_select(0, &order))?;
+        let WarpedMaps { features, mask } = nearest_first(maps)?;
         // Where all maps reach every cell, neither the product with the mask nor masked attention is needed.
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let features = if sees_all { features } else { features * &mask };
@@ -82,16 +81,16 @@ impl Fusion for Cobevt {
     }
 }
 
-/// `[N]`: indices of the maps, the ego first and then by distance.
-pub(super) fn nearest_first(metadata: &[MapMetadata]) -> Tensor {
-    let mut order: Vec<i64> = (0..metadata.len() as i64).collect();
+/// The warped maps, the ego's first and then by distance.
+pub(super) fn nearest_first(maps: &AlignedMaps) -> Result<WarpedMaps, TchError> {
+    let mut order: Vec<i64> = (0..maps.metadata.len() as i64).collect();
     order.sort_by(|&one, &other| {
         let [one, other] = [one as usize, other as usize].map(|index| {
-            let [x, y, _] = metadata[index].ego_from_cav.translation_m;
+            let [x, y, _] = maps.metadata[index].ego_from_cav.translation_m;
             // Below every distance: the ego stays first beside a neighbour at the same place.
             if index == 0 { -1.0 } else { x.hypot(y) }
         });
         one.total_cmp(&other)
     });
-    Tensor::from_slice(&order)
+    maps.warped.each(|map| picked(map, &order))
 }

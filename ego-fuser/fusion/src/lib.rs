@@ -47,6 +47,7 @@ mod padding;
 mod partition;
 pub mod pastat;
 pub mod planar_fit;
+pub mod planar_pose;
 pub mod points;
 pub mod pose_graph;
 mod script;

@@ -66,11 +66,6 @@ impl Method {
         Self(spec)
     }
 
-    /// Its specification.
-    pub const fn spec(self) -> &'static MethodSpec {
-        self.0
-    }
-
     /// The name on the command line and in result files.
     pub const fn name(self) -> &'static str {
         self.0.name
@@ -246,7 +241,7 @@ impl<'de> Deserialize<'de> for FusionConfig {
         // A script is not in the table, but its settings are stored like all others.
         let known = Method::ALL
             .into_iter()
-            .map(|method| method.spec().fusion)
+            .map(|method| method.0.fusion)
             .chain([script::FUSION]);
         let fusion = known.into_iter().find(|fusion| kind == fusion.kind);
         let fusion = fusion

@@ -2,6 +2,8 @@
 
 use tch::{TchError, Tensor};
 
+use crate::warp::WarpedMaps;
+
 /// Rows below and columns right of a map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Padding {
@@ -43,13 +45,13 @@ impl Padding {
         maps.f_constant_pad_nd([0, self.right, 0, self.below, 0, 0, 0, slots])
     }
 
-    /// `maps` with zeros below and to the right, so that rows and columns are multiples of `cells`.
-    pub(super) fn to_multiples_of(cells: i64, maps: &Tensor) -> Result<Tensor, TchError> {
-        Self::to_multiples(maps, cells)?.maps(maps, 0)
+    /// Maps with rows below and columns to the right that reach nothing, so that both counts are multiples of `cells`.
+    pub(super) fn to_multiples_of(cells: i64, maps: &WarpedMaps) -> Result<WarpedMaps, TchError> {
+        maps.each(|tensor| Self::to_multiples(tensor, cells)?.maps(tensor, 0))
     }
 
-    /// The same for a mask `[N, 1, H, W]`: padded cells are invalid for neighbours and valid for the ego, as attention
-    /// needs at least one valid token.
+    /// [`Self::maps`] for a mask `[N, 1, H, W]`: padded cells are invalid for neighbours and valid for the ego, as
+    /// attention needs at least one valid token.
     pub(super) fn mask(self, mask: &Tensor, slots: i64) -> Result<Tensor, TchError> {
         if self.is_empty() && slots == 0 {
             return Ok(mask.shallow_clone());

@@ -13,7 +13,8 @@ use tch::{CModule, Device, TchError, nn};
 use zip::ZipArchive;
 
 use crate::interface::{Fusion, FusionOutput};
-use crate::maps::{AlignedMaps, MapMetadata};
+use crate::maps::AlignedMaps;
+use crate::planar_pose::planar;
 use crate::settings::{FusionConfig, FusionSettings};
 use crate::spec::{FusionSpec, MethodSpec};
 
@@ -137,7 +138,11 @@ impl Fusion for ScriptFusion {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let features = &maps.warped.features;
         let device = features.device();
-        let poses: Vec<f32> = maps.metadata.iter().flat_map(planar).collect();
+        let poses: Vec<f32> = maps
+            .metadata
+            .iter()
+            .flat_map(|map| planar(&map.ego_from_cav))
+            .collect();
         let poses = tensor(&poses, &[-1, 3], device)?;
         let about: (Vec<f32>, Vec<f32>) = maps
             .metadata
@@ -166,12 +171,6 @@ impl Fusion for ScriptFusion {
     }
 }
 
-/// Pose of the sender in the frame of the ego: x, y, heading.
-fn planar(map: &MapMetadata) -> [f32; 3] {
-    let [x, y, _] = map.ego_from_cav.translation_m;
-    [x, y, map.ego_from_cav.yaw_rad()].map(|value| value as f32)
-}
-
 /// The cause without the stack of the interpreter.
 fn first_line(error: &TchError) -> String {
     let text = error.to_string();
@@ -195,6 +194,7 @@ mod tests {
 
     use super::*;
     use crate::Method;
+    use crate::maps::MapMetadata;
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 

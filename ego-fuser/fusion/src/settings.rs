@@ -21,7 +21,7 @@ const LEAN_CHANNELS: i64 = 128;
 
 /// The settings that a method's fusion is built from.
 pub trait FusionSettings:
-    Debug + Clone + PartialEq + Serialize + DeserializeOwned + Send + Sync + 'static
+    Debug + Clone + Serialize + DeserializeOwned + Send + Sync + 'static
 {
     /// Tag in weights files.
     const KIND: &'static str;
@@ -130,8 +130,9 @@ impl FusionConfig {
 }
 
 impl PartialEq for FusionConfig {
+    /// True if weights files hold the same text for both.
     fn eq(&self, other: &Self) -> bool {
-        self.0.equals(&*other.0)
+        self.to_json() == other.to_json()
     }
 }
 
@@ -142,7 +143,6 @@ trait AnySettings: Any + Debug + Send + Sync {
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError>;
     /// `is_pretty`: over several lines.
     fn to_json(&self, is_pretty: bool) -> String;
-    fn equals(&self, other: &dyn AnySettings) -> bool;
 }
 
 #[derive(Serialize)]
@@ -175,10 +175,6 @@ impl<S: FusionSettings> AnySettings for S {
             true => serde_json::to_string_pretty(&tagged),
         };
         text.expect("settings are JSON")
-    }
-
-    fn equals(&self, other: &dyn AnySettings) -> bool {
-        (other as &dyn Any).downcast_ref::<S>() == Some(self)
     }
 }
 

@@ -18,6 +18,7 @@ use tch::{Device, Kind, Tensor, no_grad};
 use ego_fuser::ego::{Ego, EgoError};
 use fusion::method::Method;
 use fusion::model::FusionStage;
+use fusion::planar_pose::moved;
 use fusion::{MapMetadata, ReceivedMaps};
 
 /// Reason why nothing is measured.
@@ -177,13 +178,6 @@ impl AlignmentMeter {
         let values: Vec<f64> = Vec::try_from(correction.f_to_kind(Kind::Double)?.f_view([-1])?)?;
         Ok(values.first_chunk().copied())
     }
-}
-
-/// A pose shifted along the ego's axes and rotated about its own position.
-fn moved(pose: &Pose, [dx, dy, turn_rad]: [f64; 3]) -> Pose {
-    let [x, y, z] = pose.translation_m;
-    // Roll and pitch are dropped: corrections are planar.
-    Pose::from_xyz_yaw([x + dx, y + dy, z], pose.yaw_rad() + turn_rad)
 }
 
 /// Distance in the plane, metres, and angle, degrees.

@@ -17,7 +17,6 @@ use std::ops::ControlFlow;
 use agent::agent::Agent;
 use agent::agent_loop::descriptor;
 use agent::config::{AgentSettings, FleetPlace};
-use dataset::class_set::ClassSet;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
@@ -235,15 +234,14 @@ impl Evaluator {
     }
 }
 
-/// The vehicles that lie completely over the area of a detector, as annotated by all agents within 70 m.
-pub(crate) fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
+/// The rule of OPV2V over the area of a detector: the vehicles that lie completely over it, as annotated by all agents
+/// within 70 m.
+fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
     GroundTruthRule {
         x_m: [x_low, x_high],
         y_m: [y_low, y_high],
         z_m: [z_low, z_high],
-        comm_range_m: Ego::COMM_RANGE_M,
-        min_corners: 8,
-        classes: ClassSet::VEHICLES,
+        ..GroundTruthRule::OPV2V
     }
 }

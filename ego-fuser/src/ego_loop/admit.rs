@@ -100,11 +100,8 @@ impl EgoLoop {
         // A map that comes after the ego's next sweep is no reason to wait for the next one.
         let lead_nanos = self.options.pairing.max_lead_nanos;
         let latest_nanos = message.view.capture_nanos.saturating_add(lead_nanos);
-        if let Some(frames) = self.without_map.get_mut(&cav)
-            && source.1 == self.stream
-            && self.own_nanos.is_none_or(|own| own <= latest_nanos)
-        {
-            *frames = 0;
+        if source.1 == self.stream && self.own_nanos.is_none_or(|own| own <= latest_nanos) {
+            self.late_maps.reset(&cav);
         }
         if let Some(offset_s) = message.reception.clock_offset_s {
             self.clock_offsets_s.insert(cav.clone(), offset_s);
@@ -118,10 +115,8 @@ impl EgoLoop {
 
     /// Records that a neighbour publishes a stream.
     fn note_stream(&mut self, cav: &CavId, stream: Stream) {
-        if stream == Stream::Boxes {
-            self.box_senders.insert(cav.clone());
-        } else if stream == self.stream {
-            self.without_map.entry(cav.clone()).or_default();
+        if stream == Stream::Boxes || stream == self.stream {
+            self.published.insert((cav.clone(), stream));
         }
     }
 
@@ -235,8 +230,8 @@ impl EgoLoop {
         self.members.remove(cav);
         self.silence.reset(cav);
         self.models.forget(cav);
-        self.box_senders.remove(cav);
-        self.without_map.remove(cav);
+        self.published.retain(|(sender, _)| sender != cav);
+        self.late_maps.reset(cav);
         self.clocks.forget(cav);
         self.clock_offsets_s.remove(cav);
         self.ended.remove(cav);

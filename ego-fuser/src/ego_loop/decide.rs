@@ -3,12 +3,11 @@
 use std::time::Duration;
 
 use protocol::message::{FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming};
-use protocol::{CavId, Detections, DropReason, Stream};
+use protocol::{Detections, DropReason, Stream};
 
 use super::{EgoLoop, Output, OwnFrame, Source};
 use crate::ego::{Ego, Skipped, View};
 use crate::misbehaviour::Assessment;
-use crate::silence::SILENT_AFTER;
 
 /// The neighbours' messages for a frame, and the neighbours without one.
 #[derive(Default)]
@@ -68,27 +67,22 @@ impl EgoLoop {
 
     fn is_complete(&self, capture_nanos: u64) -> bool {
         self.members.iter().all(|cav| {
+            let [maps, boxes] = [self.stream, Stream::Boxes].map(|stream| (cav.clone(), stream));
             let is_other = self.models.is_other(cav);
             // Its feature maps came before the ego's next sweep lately.
-            let without_map = self.without_map.get(cav);
-            let is_in_time = without_map.is_some_and(|frames| *frames < SILENT_AFTER);
+            let is_in_time = self.published.contains(&maps) && self.late_maps.is_awaited(cav);
             // Boxes end the wait for maps that are of another network, or not in time.
             let boxes_do =
-                self.reads_boxes && self.box_senders.contains(cav) && (is_other || !is_in_time);
+                self.reads_boxes && self.published.contains(&boxes) && (is_other || !is_in_time);
             !self.silence.is_awaited(cav)
                 || self.ended.contains(cav)
-                || self.has_reached(cav, self.stream, capture_nanos)
+                || self.pairing.has_reached(&maps, capture_nanos)
                 || if boxes_do {
-                    self.has_reached(cav, Stream::Boxes, capture_nanos)
+                    self.pairing.has_reached(&boxes, capture_nanos)
                 } else {
                     is_other
                 }
         })
-    }
-
-    fn has_reached(&self, cav: &CavId, stream: Stream, capture_nanos: u64) -> bool {
-        let source = (cav.clone(), stream);
-        self.pairing.has_reached(&source, capture_nanos)
     }
 
     fn fuse(&mut self, ego: &mut Ego, frame: OwnFrame, now_nanos: u64) {
@@ -185,10 +179,9 @@ impl EgoLoop {
         }
         for cav in &self.members {
             let source = (cav.clone(), self.stream);
-            if let Some(frames) = self.without_map.get_mut(cav)
-                && !self.pairing.has_reached(&source, capture_nanos)
+            if self.published.contains(&source) && !self.pairing.has_reached(&source, capture_nanos)
             {
-                *frames = frames.saturating_add(1);
+                self.late_maps.missed(cav);
             }
             // One message of any stream is enough: the neighbour is neither silent nor left out.
             if choice.views.iter().any(|view| view.cav == *cav) {

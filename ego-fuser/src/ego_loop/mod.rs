@@ -102,10 +102,10 @@ pub struct EgoLoop {
     stream: Stream,
     /// True if neighbours may send boxes in place of that stream, or beside it.
     reads_boxes: bool,
-    /// Neighbours that send boxes in place of it or beside it.
-    box_senders: BTreeSet<CavId>,
-    /// Consecutive frames that were decided before the feature map of their time, of each neighbour that sends maps.
-    without_map: BTreeMap<CavId, u32>,
+    /// Streams of perception that vehicles send: that stream, and boxes in place of it or beside it.
+    published: BTreeSet<Source>,
+    /// Frames that were decided before the feature map of their time, by neighbour.
+    late_maps: Silence,
     /// Capture time of the newest message of its stream that was fused, by neighbour, nanoseconds.
     fused_nanos: BTreeMap<CavId, u64>,
     options: LoopOptions,
@@ -144,8 +144,8 @@ impl EgoLoop {
             cav: cav.clone(),
             stream,
             reads_boxes: ego.reads_boxes(),
-            box_senders: BTreeSet::new(),
-            without_map: BTreeMap::new(),
+            published: BTreeSet::new(),
+            late_maps: Silence::default(),
             fused_nanos: BTreeMap::new(),
             waits: Waits::new(cav, ego.method().name(), stream, ego.reads_boxes()),
             options,

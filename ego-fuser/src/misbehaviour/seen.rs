@@ -91,14 +91,6 @@ impl SeenMessage {
         }
     }
 
-    #[cfg(test)]
-    pub(super) fn of_cells(grid: BevGrid, sure: Vec<f32>) -> Self {
-        Self {
-            sure: Sure::Cells(grid, sure),
-            ..Self::of_boxes(Vec::new())
-        }
-    }
-
     /// From a map `[1, C, H, W]`, of which the `sent` cells were received; all where absent.
     fn in_map(
         map: &Tensor,
@@ -210,6 +202,15 @@ mod tests {
     use tch::nn::VarStore;
 
     use super::*;
+
+    impl SeenMessage {
+        pub(in crate::misbehaviour) fn of_cells(grid: BevGrid, sure: Vec<f32>) -> Self {
+            Self {
+                sure: Sure::Cells(grid, sure),
+                ..Self::of_boxes(Vec::new())
+            }
+        }
+    }
 
     #[test]
     fn cells_around_a_place_are_found_and_none_outside() {

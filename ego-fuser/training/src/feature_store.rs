@@ -19,7 +19,7 @@ use perception::train::Prefetch;
 use perception::weights::Weights;
 use protocol::message::Bev;
 use protocol::text::hex;
-use protocol::{Dtype, Header, Limits, WIRE_VERSION, wire};
+use protocol::{Dtype, Limits, WIRE_VERSION, WireError, wire};
 use sha2::{Digest, Sha256};
 use support::file_digests::FileDigests;
 use support::file_error::AtFile;
@@ -185,16 +185,12 @@ impl FeatureStore {
         let Some(&[start, end]) = self.starts.get(place..place + 2) else {
             return Ok(None);
         };
-        let start = start + LENGTH_BYTES;
         // An empty message stands for a sweep that could not be read or computed.
-        if start == end {
+        if start + LENGTH_BYTES == end {
             return Ok(None);
         }
-        let mut bytes = vec![0; (end - start) as usize];
-        // At an offset of its own: threads share the file without moving a common position.
-        self.file.read_exact_at(&mut bytes, start).at(&self.path)?;
-        let decoded = wire::decode([bytes.as_slice()], &Limits::default());
-        let (_, message): (Header, Bev) = decoded.at(&self.path)?;
+        let message = message_between(&self.file, start, end).at(&self.path)?;
+        let message = message.at(&self.path)?;
         let decoded = message.features.decode(&Limits::default());
         let features = decoded.at(&self.path)?.features;
         let (channels, grid) = (features.channels, features.grid);
@@ -231,19 +227,20 @@ fn starts(file: &File, all: usize) -> io::Result<Vec<u64>> {
     }
     // A power cut may leave zeros from some place on: in the last message that is not empty, then as empty messages.
     while let &[.., start, end] = starts.as_slice()
-        && !is_whole(file, start, end)?
+        && message_between(file, start, end)?.is_err()
     {
         starts.pop();
     }
     Ok(starts)
 }
 
-/// True if the record between two offsets holds a message that can be read.
-fn is_whole(file: &File, start: u64, end: u64) -> io::Result<bool> {
+/// The message in the record between two offsets; an inner error where the record holds none that can be read.
+fn message_between(file: &File, start: u64, end: u64) -> io::Result<Result<Bev, WireError>> {
     let mut bytes = vec![0; (end - start - LENGTH_BYTES) as usize];
+    // At an offset of its own: threads share the file without moving a common position.
     file.read_exact_at(&mut bytes, start + LENGTH_BYTES)?;
-    let decoded: Result<(Header, Bev), _> = wire::decode([bytes.as_slice()], &Limits::default());
-    Ok(decoded.is_ok())
+    let decoded = wire::decode([bytes.as_slice()], &Limits::default());
+    Ok(decoded.map(|(_, message)| message))
 }
 
 /// Maps from a store, and from the encoder for sweeps that it does not hold.

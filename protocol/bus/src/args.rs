@@ -21,9 +21,6 @@ use super::{
     process_id,
 };
 
-/// Maximum duration of a shutdown after the request: within the 5 s of a whole fleet.
-pub const STOP_LIMIT: Duration = Duration::from_secs(4);
-
 /// Connection of a process to the router of its run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
@@ -144,13 +141,7 @@ impl BusConfig {
     /// # Errors
     /// When handlers or threads cannot be installed.
     pub fn stop(&self) -> std::io::Result<Stop> {
-        let stop = Stop::new();
-        stop.on_signals()?;
-        if self.supervised {
-            stop.on_end_of_input()?;
-        }
-        stop.enforce(STOP_LIMIT);
-        Ok(stop)
+        Stop::of_process(self.supervised)
     }
 }
 

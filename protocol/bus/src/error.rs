@@ -122,25 +122,23 @@ impl BusError {
 
     /// True if the input is at fault, so that a retry has no effect.
     pub fn is_bad_input(&self) -> bool {
-        if let Self::Metrics { cause, .. } = self {
-            return matches!(
+        match self {
+            Self::Metrics { cause, .. } => matches!(
                 cause.kind(),
                 ErrorKind::AddrInUse | ErrorKind::AddrNotAvailable | ErrorKind::PermissionDenied
-            );
-        }
-        matches!(
-            self,
+            ),
             Self::Endpoint(_)
-                | Self::PortInUse { .. }
-                | Self::Keys { .. }
-                | Self::NoKeys(_)
-                | Self::SharedMemory { .. }
-                | Self::NameTaken { .. }
-        )
+            | Self::PortInUse { .. }
+            | Self::Keys { .. }
+            | Self::NoKeys(_)
+            | Self::SharedMemory { .. }
+            | Self::NameTaken { .. } => true,
+            _ => false,
+        }
     }
 
     /// The error of a thread that cannot be spawned.
-    pub(crate) fn thread(what: impl Into<String>) -> impl FnOnce(std::io::Error) -> Self {
+    pub fn thread(what: impl Into<String>) -> impl FnOnce(std::io::Error) -> Self {
         let what = what.into();
         move |cause| Self::Thread { what, cause }
     }

@@ -71,7 +71,7 @@ mod watchdog;
 pub mod web;
 
 pub use access_control::AccessControl;
-pub use args::{BusConfig, InboxConfig, STOP_LIMIT, log_to_stderr};
+pub use args::{BusConfig, InboxConfig, log_to_stderr};
 pub use bus::{Bus, Identity};
 pub use clock_offset::{LINK_TRANSIT_S, NETWORK_TRANSIT_S, is_same_clock};
 pub use credentials::{
@@ -82,7 +82,7 @@ pub use error::{BusError, Result};
 pub use frame_stats::FrameStats;
 pub use heartbeat::Heartbeat;
 pub use inbox_limits::InboxLimits;
-pub use liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
+pub use liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present, tokens};
 pub use membership::Membership;
 pub use message_stats::{MessageStats, SharedMemoryUse};
 pub use metrics::MetricsPeer;
@@ -95,4 +95,5 @@ pub use rejection_log::{RejectionLog, RouterRejection};
 pub use router_probe::RouterProbe;
 pub use session::{BusOptions, Role as SessionRole, SharedMemory, free_address, open, open_unless};
 pub use shared_pool::check_room;
+pub use shutdown::STOP_LIMIT;
 pub use subscriber::{Arrival, Event, Inbox, Subscription};

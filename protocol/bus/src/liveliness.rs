@@ -36,14 +36,21 @@ impl LivelinessToken {
 /// # Errors
 /// [`BusError::Zenoh`] when the session is closed.
 pub fn present(session: &Session, selector: &str) -> Result<BTreeSet<ProcessId>> {
+    let holders = tokens(session, selector)?.filter_map(|token| holder(&token));
+    Ok(holders.map(|(role, cav)| process_id(role, &cav)).collect())
+}
+
+/// Keys of the liveliness tokens that `selector` matches, of this project and of others.
+///
+/// # Errors
+/// [`BusError::Zenoh`] when the session is closed.
+pub fn tokens(session: &Session, selector: &str) -> Result<impl Iterator<Item = String>> {
     let liveliness = session.liveliness();
     let tokens = liveliness.get(selector).timeout(QUERY_TIMEOUT).wait();
     let tokens =
         tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
-    Ok(std::iter::from_fn(|| tokens.recv().ok())
-        .filter_map(|reply| holder(reply.result().ok()?.key_expr().as_str()))
-        .map(|(role, cav)| process_id(role, &cav))
-        .collect())
+    let replies = std::iter::from_fn(move || tokens.recv().ok());
+    Ok(replies.filter_map(|reply| Some(reply.result().ok()?.key_expr().to_string())))
 }
 
 /// Role and vehicle of the process that holds a token; `None` for a token outside this key grammar.

@@ -452,10 +452,8 @@ impl MessageStats {
 
 impl CounterState {
     fn peer(&mut self, cav: &CavId) -> Option<&mut Peer> {
-        if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
-            return None;
-        }
-        Some(self.peers.entry(cav.clone()).or_default())
+        let has_room = self.peers.len() < MAX_PEERS || self.peers.contains_key(cav);
+        has_room.then(|| self.peers.entry(cav.clone()).or_default())
     }
 
     fn pass(&mut self, account: Account, messages: u64) {

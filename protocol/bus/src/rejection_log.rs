@@ -105,10 +105,7 @@ const DROPPED: &str = "zenoh_rx_network_message_dropped_payload_per_transport_by
 /// `zenoh_rx_network_message_dropped_payload_per_transport_bytes_count{message="put",reason="access-control",remote_cn="agent-1"}
 /// 3`.
 fn rejected(line: &str) -> Option<((RouterRejection, String), u64)> {
-    let (name, rest) = line.split_once('{')?;
-    if name != DROPPED {
-        return None;
-    }
+    let rest = line.strip_prefix(DROPPED)?.strip_prefix('{')?;
     let (labels, count) = rest.rsplit_once('}')?;
     let reason = label(labels, "reason")
         .filter(|reason| reason == "access-control" || reason == "low-pass")?;

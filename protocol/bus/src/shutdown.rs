@@ -7,6 +7,9 @@ use std::time::{Duration, Instant};
 
 use support::sync::{lock, spawn};
 
+/// Maximum duration of a shutdown after the request: within the 5 s of a whole fleet.
+pub const STOP_LIMIT: Duration = Duration::from_secs(4);
+
 #[derive(Default)]
 struct StopState {
     requested: bool,
@@ -21,6 +24,21 @@ impl Stop {
     /// A request that has not been made.
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// The request of a process: made by signals and, under a supervisor, by the end of standard input; enforced after
+    /// [`STOP_LIMIT`].
+    ///
+    /// # Errors
+    /// When handlers or threads cannot be installed.
+    pub fn of_process(is_supervised: bool) -> std::io::Result<Self> {
+        let stop = Self::new();
+        stop.on_signals()?;
+        if is_supervised {
+            stop.on_end_of_input()?;
+        }
+        stop.enforce(STOP_LIMIT);
+        Ok(stop)
     }
 
     /// Requests the stop; the first request runs the reactions.
@@ -105,7 +123,7 @@ impl Stop {
     ///
     /// # Errors
     /// When the thread that waits for it cannot be started.
-    pub fn on_end_of_input(&self) -> std::io::Result<()> {
+    fn on_end_of_input(&self) -> std::io::Result<()> {
         let stop = self.clone();
         spawn("parent-death", move || {
             // A broken pipe is an end of input too.
@@ -117,7 +135,7 @@ impl Stop {
 
     /// Ends the process with exit code 1 if it has not ended by itself `limit` after the first request: a stalled
     /// network must not keep it.
-    pub fn enforce(&self, limit: Duration) {
+    fn enforce(&self, limit: Duration) {
         self.on_request(move || {
             // Without a thread for it, the operator can still press Ctrl-C a second time.
             let _ = spawn("enforcer", move || {

@@ -31,12 +31,8 @@ const MAX_NOTICE_BYTES: usize = 16 << 10;
 pub enum Event {
     /// A message with a checked header.
     Message(Arrival),
-    /// The publisher of `topic` has ended.
+    /// The publisher of the topic has ended.
     End {
-        /// Its topic.
-        topic: Topic,
-        /// Its epoch.
-        epoch: u64,
         /// Number of messages that it sent.
         sent: u64,
     },
@@ -276,7 +272,7 @@ impl IngressFilter {
             Err(error) => return self.refuse(&topic, &error),
         };
         if is_notice(&topic, &header) {
-            return self.note(topic, &header, payload);
+            return self.note(&topic, payload);
         }
         let at = Instant::now();
         if has_notifications(&topic) {
@@ -327,19 +323,14 @@ impl IngressFilter {
         self.inbox.stats.rejected(topic, error);
     }
 
-    fn note(&self, topic: Topic, header: &Header, payload: &ZBytes) {
+    fn note(&self, topic: &Topic, payload: &ZBytes) {
         match wire::decode(payload.slices(), &Limits::DEFAULT) {
-            Ok((_, Control::Probe)) => self.status.probed(&topic),
+            Ok((_, Control::Probe)) => self.status.probed(topic),
             Ok((_, Control::End { ticks: sent, .. })) => {
-                let end = Event::End {
-                    topic: topic.clone(),
-                    epoch: header.stamp.epoch,
-                    sent,
-                };
-                self.inbox.deliver(&topic, end, None);
+                self.inbox.deliver(topic, Event::End { sent }, None);
             }
             Ok(_) => {}
-            Err(error) => self.refuse(&topic, &error),
+            Err(error) => self.refuse(topic, &error),
         }
     }
 

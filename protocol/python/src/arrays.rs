@@ -28,7 +28,7 @@ pub(crate) fn rows<T: numpy::Element, const COLUMNS: usize>(
 
 /// A transform as `[4, 4]`.
 pub(crate) fn pose(py: Python<'_>, pose: &Pose) -> PyResult<Matrix> {
-    rows(py, matrix_rows(pose).into())
+    rows(py, pose.matrix_rows().into())
 }
 
 /// Matrices as `[N, 4, 4]`.
@@ -41,12 +41,6 @@ pub(crate) fn matrices<T: numpy::Element>(
     Ok(PyArray1::from_vec(py, values.into_flattened())
         .reshape(shape)?
         .unbind())
-}
-
-/// Rows of a transform.
-pub(crate) fn matrix_rows(pose: &Pose) -> [[f64; 4]; 4] {
-    let matrix = pose.isometry().to_homogeneous();
-    std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
 }
 
 /// Boxes as `[N, 7]`: centre, full sizes, heading.

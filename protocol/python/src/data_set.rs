@@ -83,11 +83,8 @@ impl DataSet {
 
     fn __getitem__(&self, py: Python<'_>, index: isize) -> PyResult<FleetFrame> {
         let count = self.count;
-        let wanted = if index < 0 {
-            count.checked_add_signed(index)
-        } else {
-            usize::try_from(index).ok()
-        };
+        let counted_from = if index < 0 { count } else { 0 };
+        let wanted = counted_from.checked_add_signed(index);
         let frame = wanted.map(|index| self.frame(py, index)).transpose()?;
         let frame = frame.flatten();
         frame.ok_or_else(|| PyIndexError::new_err(format!("frame {index} of {count}")))

@@ -3,7 +3,7 @@
 use dataset::frame::{Frame, Object};
 use dataset::ground_truth::{GroundTruth, upright_box};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
-use protocol::{Box3d, Codec, DecodedFeatures, Detection};
+use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose};
 use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyList};
 use pyo3::{Py, PyAny, PyResult, Python, pyclass, pymethods};
 
@@ -335,7 +335,7 @@ impl Objects {
             ids: column(py, objects, |object| object.id),
             classes: PyList::new(py, objects.iter().map(|object| object.class.name()))?.unbind(),
             boxes: optional(boxes, |boxes| arrays::boxes(py, boxes.iter()))?,
-            world_from_object: arrays::matrices(py, poses.map(arrays::matrix_rows))?,
+            world_from_object: arrays::matrices(py, poses.map(Pose::matrix_rows))?,
             sizes_m: arrays::rows(py, objects.iter().map(|object| object.size_m).collect())?,
             // NaN where unknown: an array of numbers has no `None`.
             speeds_mps: column(py, objects, |object| object.speed_mps.unwrap_or(f64::NAN)),

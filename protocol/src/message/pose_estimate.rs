@@ -85,8 +85,8 @@ pub enum NoPoseReason {
     LowConfidence,
     /// The localizer failed to compute.
     Failed,
-    /// No drive that the head was trained on came near where the vehicle was last seen.
-    NotDriven,
+    /// Where the vehicle was last seen, the head was trained on few sweeps or none.
+    LowCoverage,
 }
 
 impl PoseEstimate {

@@ -1,7 +1,7 @@
 //! File error: the path of a file and what is wrong with it.
 
 use std::any::Any;
-use std::fmt::{self, Display};
+use std::fmt::Display;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
@@ -10,6 +10,7 @@ pub type Result<T, E = FileError> = std::result::Result<T, E>;
 
 /// A file that cannot be read, written or used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}{}: {problem}", .path.display(), .line.map(|line| format!(":{line}")).unwrap_or_default())]
 pub struct FileError {
     /// Path of the file.
     pub path: PathBuf,
@@ -52,16 +53,6 @@ impl FileError {
             line: Some(line),
             ..Self::new(path, problem)
         }
-    }
-}
-
-impl Display for FileError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.path.display())?;
-        if let Some(line) = self.line {
-            write!(f, ":{line}")?;
-        }
-        write!(f, ": {}", self.problem)
     }
 }
 

@@ -12,11 +12,18 @@ pub struct OpenOptions {
     pub intensity_scale: IntensityScale,
 }
 
-impl Default for OpenOptions {
-    fn default() -> Self {
+impl OpenOptions {
+    /// The defaults, with another divisor of intensities.
+    pub fn with_intensity_scale(intensity_scale: IntensityScale) -> Self {
         Self {
             period_nanos: 100_000_000,
-            intensity_scale: IntensityScale::AUTO,
+            intensity_scale,
         }
+    }
+}
+
+impl Default for OpenOptions {
+    fn default() -> Self {
+        Self::with_intensity_scale(IntensityScale::AUTO)
     }
 }

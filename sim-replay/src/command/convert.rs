@@ -38,10 +38,7 @@ pub(crate) struct Args {
 
 /// Converts and prints a summary to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let open = OpenOptions {
-        intensity_scale: args.intensity.scale,
-        ..OpenOptions::default()
-    };
+    let open = OpenOptions::with_intensity_scale(args.intensity.scale);
     let input = match dataset::open_with(&args.from, &open) {
         Ok(input) => input,
         Err(error) => return refuse(&error),

@@ -51,10 +51,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     // The bar hides itself if stderr is no terminal.
     let bar = progress::bar(0, "frames");
-    let options = OpenOptions {
-        intensity_scale: args.intensity_scale,
-        ..OpenOptions::default()
-    };
+    let options = OpenOptions::with_intensity_scale(args.intensity_scale);
     let report = inspect(&args.dir, &options, &args.protocol, &|done, total| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);

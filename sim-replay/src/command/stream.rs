@@ -56,10 +56,7 @@ pub(crate) fn run(args: ProcessArgs<ReplayConfig>) -> anyhow::Result<Outcome> {
 }
 
 fn open(scene: &SceneConfig) -> anyhow::Result<Scenario> {
-    let options = OpenOptions {
-        intensity_scale: scene.intensity_scale,
-        ..OpenOptions::default()
-    };
+    let options = OpenOptions::with_intensity_scale(scene.intensity_scale);
     let dataset = dataset::open_with(&scene.dir, &options)?;
     for problem in &dataset.problems {
         tracing::warn!("{problem}");

@@ -126,10 +126,7 @@ fn options(args: Args) -> Result<SynthOptions, BadInput> {
         cameras: args.cameras,
         period_s: args.period_s,
         force: args.force,
-        threads: args
-            .threads
-            .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
-            .max(1),
+        threads: args.threads.unwrap_or(defaults.threads).max(1),
         agents: args.vehicles.unwrap_or_else(|| defaults.agents.clone()),
         frames: args.frames.unwrap_or(defaults.frames),
         ..defaults

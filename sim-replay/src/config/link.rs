@@ -73,13 +73,6 @@ fn link_help() -> String {
     format!("A YAML file with the stages of the link, or a preset:{presets}\n")
 }
 
-impl LinkSelection {
-    /// True if the model is a preset, and no file.
-    pub fn is_preset(&self) -> bool {
-        PRESETS.iter().any(|(name, _)| *name == self.model)
-    }
-}
-
 impl ProcessConfig for LinkProcessConfig {
     const REQUIRED: &'static [&'static str] = &["run", "ego"];
 

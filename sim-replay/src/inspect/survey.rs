@@ -149,9 +149,8 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey,
     let mut survey = FrameSurvey::default();
     // The sweep is read by `survey_points`, which also counts the points that are not finite.
     let without_points = dataset::LoadOptions {
-        points: false,
         cameras: true,
-        ..Default::default()
+        ..dataset::LoadOptions::without_points()
     };
     let frame = scenario.load(agent, tick, &without_points);
     let frame = or_problem(frame, &mut survey.problems);

@@ -8,7 +8,7 @@ use protocol::{NoPoseReason, PointCloud};
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, Tensor};
 
-use super::regressed_pose::{PoseRegressor, RegressPose, localization, no_pose};
+use super::regressed_pose::{PoseRegressor, RegressPose, localization};
 use super::tokens::{RINGS, SECTORS};
 use crate::pgc::localization::{ENCODE, SOLVE};
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
@@ -125,7 +125,7 @@ impl Localize for PolarRetrieval {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = stopwatch();
         let Some(descriptor) = self.describe.polar(sweep.cloud, &mut times)? else {
-            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+            return Ok(Localization::no_pose(NoPoseReason::TooFewPoints, times));
         };
         let pose = self.nearest(&descriptor)?;
         times.lap(SOLVE);

@@ -143,7 +143,7 @@ impl<N: RegressPose> Localize for PoseRegressor<N> {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = stopwatch();
         let Some(tokens) = self.tokens(sweep.cloud, &mut times)? else {
-            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+            return Ok(Localization::no_pose(NoPoseReason::TooFewPoints, times));
         };
         let tokens = tokens.f_unsqueeze(0)?;
         let found = no_grad(|| self.network.poses(&tokens, &self.places, Kind::Float))?;
@@ -159,12 +159,8 @@ impl<N: RegressPose> Localize for PoseRegressor<N> {
 pub(super) fn localization(pose: Option<Isometry3<f64>>, times: StageTimes) -> Localization {
     match pose {
         Some(pose) => Localization::from_estimate(PoseEstimate::new(pose.into(), 1.0), times),
-        None => no_pose(NoPoseReason::Failed, times),
+        None => Localization::no_pose(NoPoseReason::Failed, times),
     }
-}
-
-pub(super) fn no_pose(reason: NoPoseReason, times: StageTimes) -> Localization {
-    Localization::from_estimate(PoseEstimate::no_pose(reason, 0), times)
 }
 
 /// Shortest vector of cosine and sine that is a direction.

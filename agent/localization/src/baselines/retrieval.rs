@@ -5,7 +5,7 @@
 use nalgebra::Isometry3;
 use protocol::NoPoseReason;
 
-use super::regressed_pose::{localization, no_pose};
+use super::regressed_pose::localization;
 use crate::pgc::localization::SOLVE;
 use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput, stopwatch};
 
@@ -86,7 +86,7 @@ impl Localize for Retrieval {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = stopwatch();
         let Some(descriptor) = self.localizer.sweep_features(sweep.cloud, &mut times)? else {
-            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+            return Ok(Localization::no_pose(NoPoseReason::TooFewPoints, times));
         };
         let pose = self.database.nearest(&descriptor);
         times.lap(SOLVE);

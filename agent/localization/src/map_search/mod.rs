@@ -13,8 +13,8 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use perception::weights::FileError;
+use protocol::NoPoseReason;
 use protocol::config::within;
-use protocol::{NoPoseReason, PoseEstimate};
 use support::file_error::AtFile;
 
 use self::branch_and_bound::{BranchAndBound, PoseCandidate};
@@ -171,20 +171,17 @@ impl Localize for MapSearch {
         }
         let enough = on_map.planes().len() >= MIN_POINTS;
         times.lap(VOXELISE);
+        if !enough {
+            return Ok(Localization::no_pose(NoPoseReason::TooFewPoints, times));
+        }
         // The tracker asks from time to time without a prediction: only then the whole map is searched.
-        if !enough || sweep.predicted.is_some() {
-            let reason = match enough {
-                true => NoPoseReason::TooFewInliers,
-                false => NoPoseReason::TooFewPoints,
-            };
-            let none = PoseEstimate::no_pose(reason, 0);
-            return Ok(Localization::from_estimate(none, times));
+        if sweep.predicted.is_some() {
+            return Ok(Localization::no_pose(NoPoseReason::TooFewInliers, times));
         }
         let best = self.best_pose(&on_map);
         times.lap(SOLVE);
         let Some(best) = best else {
-            let none = PoseEstimate::no_pose(NoPoseReason::TooFewInliers, 0);
-            return Ok(Localization::from_estimate(none, times));
+            return Ok(Localization::no_pose(NoPoseReason::TooFewInliers, times));
         };
         let mut found = found_pose(&best.fit, self.map.covariance_scale);
         found.evidence.inlier_ratio = best.agreement;
@@ -202,7 +199,7 @@ impl Localize for MapSearch {
 mod tests {
     use std::path::PathBuf;
 
-    use protocol::PointCloud;
+    use protocol::{PointCloud, PoseEstimate};
 
     use super::*;
     use crate::registration::icp::IcpTarget;

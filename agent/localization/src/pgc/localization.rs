@@ -1,6 +1,6 @@
 //! Localization of one sweep: its pose or the reason why there is none, with evidence and time per stage.
 
-use protocol::PoseEstimate;
+use protocol::{NoPoseReason, PoseEstimate};
 use support::stage_times::StageTimes;
 
 use super::pose_evidence::PoseEvidence;
@@ -52,17 +52,19 @@ impl Localization {
         }
     }
 
+    /// Result without a pose and without inliers.
+    pub(crate) fn no_pose(reason: NoPoseReason, times: StageTimes) -> Self {
+        Self::from_estimate(PoseEstimate::no_pose(reason, 0), times)
+    }
+
     /// Result of a method without cells: its estimate is the only evidence.
     pub fn from_estimate(estimate: PoseEstimate, times: StageTimes) -> Self {
         let found = estimate.world_from_cav().map(|world_from_cav| FoundPose {
             world_from_sensor: world_from_cav.isometry(),
             evidence: PoseEvidence::none(),
             cell_covariance: PoseStd::UNBOUNDED.covariance,
-            is_registered: false,
-            start_std_m: 0.0,
-            covariance_scale: None,
             sigma: f64::from(estimate.confidence()),
-            is_rejected: false,
+            ..FoundPose::default()
         });
         let inlier_count = match estimate {
             PoseEstimate::Pose { .. } => 0,

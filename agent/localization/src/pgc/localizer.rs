@@ -48,7 +48,7 @@ pub(super) struct SweepFeatures {
 pub struct Localizer {
     pub(super) encoder: CellEncoder,
     pub(super) head: SceneHead,
-    pub(super) solver: PoseSolver,
+    pub(crate) solver: PoseSolver,
     /// Largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
     pub(crate) most_parts: usize,
     /// Of the file, or of the encoder in a detector's file.
@@ -218,11 +218,6 @@ impl Localizer {
             epsilon_m,
             origin_m: self.head.config().origin_m,
         })
-    }
-
-    /// Sets the confidence below which poses are rejected, beside the threshold of the head.
-    pub fn set_min_confidence(&mut self, least: f64) {
-        self.solver.min_confidence = least;
     }
 
     /// Sets another search.

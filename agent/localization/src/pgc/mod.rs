@@ -86,7 +86,7 @@ impl Localize for Localizer {
     }
 
     fn detector_encoder(&self) -> Option<&str> {
-        self.encoder.takes_levels().then_some(&self.encoder_sha256)
+        matches!(self.encoder.format(), SweepFormat::Bev(_)).then_some(&self.encoder_sha256)
     }
 
     fn place(&self) -> Option<&str> {

@@ -53,7 +53,7 @@ pub struct PoseSolver {
 }
 
 /// A pose with its evidence.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct FoundPose {
     /// Pose of the LiDAR in the world.
     pub world_from_sensor: Isometry3<f64>,
@@ -144,11 +144,10 @@ impl PoseSolver {
             world_from_sensor: Translation3::from(coordinates.origin_m) * last.target_from_source,
             evidence,
             cell_covariance: std_of(coordinates, registration, second).covariance,
-            is_registered: false,
-            start_std_m: 0.0,
             covariance_scale: self.covariance,
             sigma,
             is_rejected: self.confidence.rejects(sigma) || sigma < self.min_confidence,
+            ..FoundPose::default()
         }
     }
 }
@@ -174,11 +173,8 @@ pub(super) fn confirm(
             world_from_sensor: Translation3::from(origin_m) * origin_from_sensor,
             evidence: PoseEvidence::of_refinement(refined, start),
             cell_covariance: refined.std.covariance,
-            is_registered: false,
-            start_std_m: 0.0,
-            covariance_scale: None,
             sigma: 1.0 / (1.0 + error_m * error_m),
-            is_rejected: false,
+            ..FoundPose::default()
         }
     })
 }

@@ -182,20 +182,18 @@ impl SceneHead {
     /// # Errors
     /// [`QuantiseError`] names the activation whose scale is missing.
     pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
-        let (mut before, mut blocks) = (scales.get(INWARD)?, Vec::with_capacity(self.blocks.len()));
+        let (mut input, mut blocks) = (scales.get(INWARD)?, Vec::with_capacity(self.blocks.len()));
         for (number, [first, second, third]) in self.blocks.iter().enumerate() {
             let inner = scales.get(&block_activation(number, "0"))?;
             let innermost = scales.get(&block_activation(number, "1"))?;
-            let output = scales.get(&block_activation(number, "output"))?;
             let layers = [
-                first.int8(LayerFormat::hidden(before, inner))?,
+                first.int8(LayerFormat::hidden(input, inner))?,
                 second.int8(LayerFormat::hidden(inner, innermost))?,
                 // In floating point, since the skip connection is added before the ReLU.
                 third.int8(LayerFormat::last(innermost))?,
             ];
-            let input = before;
             blocks.push(Int8Block { input, layers });
-            before = output;
+            input = scales.get(&block_activation(number, "output"))?;
         }
         self.int8 = Some(blocks);
         Ok(())

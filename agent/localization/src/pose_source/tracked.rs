@@ -243,9 +243,9 @@ impl TrackedPose {
         // Without a pose the tracker has not started: what the localizer gives as the reason is published.
         match self.tracker.state() {
             Some(state) => published(&state),
-            None if self.is_undriven(input.capture_nanos) => match localization.estimate {
+            None if self.is_hardly_covered(input.capture_nanos) => match localization.estimate {
                 PoseEstimate::NoPose { inlier_count, .. } => {
-                    PoseEstimate::no_pose(NoPoseReason::NotDriven, inlier_count)
+                    PoseEstimate::no_pose(NoPoseReason::LowCoverage, inlier_count)
                 }
                 pose @ PoseEstimate::Pose { .. } => pose,
             },
@@ -253,13 +253,13 @@ impl TrackedPose {
         }
     }
 
-    /// True if no drive of the head came near where the vehicle was seen a short time ago.
-    fn is_undriven(&self, capture_nanos: u64) -> bool {
+    /// True if the drives of the head hardly cover where the vehicle was seen a short time ago.
+    fn is_hardly_covered(&self, capture_nanos: u64) -> bool {
         let (Some((nanos, place_m)), Some(area)) = (self.last_seen, self.localizer.driven_area())
         else {
             return false;
         };
-        (0.0..LAST_SEEN_S).contains(&seconds(nanos, capture_nanos)) && !area.is_near(place_m)
+        (0.0..LAST_SEEN_S).contains(&seconds(nanos, capture_nanos)) && !area.covers(place_m)
     }
 
     /// True if the sweep is one of those that are measured.
@@ -577,16 +577,16 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_is_lost_where_no_drive_came_near_says_so() {
-        let reasons = [[-30.0, 0.0], [30.0, 0.0]].map(|drive_m| {
+    fn a_vehicle_that_is_lost_in_low_coverage_says_so() {
+        let reasons = [-60.0, 30.0].map(|x| {
             let blind = Road {
                 blind: 20..80,
-                driven: Some(DrivenArea::of(&[drive_m])),
+                driven: Some(DrivenArea::of(&[[x, 0.0], [x + 30.0, 0.0]])),
                 ..road()
             };
             drive(blind, TrackedPoseConfig::default(), 79).0[78]
         });
-        let expected = [NoPoseReason::NotDriven, NoPoseReason::TooFewInliers];
+        let expected = [NoPoseReason::LowCoverage, NoPoseReason::TooFewInliers];
         assert_eq!(
             reasons,
             expected.map(|reason| PoseEstimate::no_pose(reason, 3))

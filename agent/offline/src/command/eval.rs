@@ -553,10 +553,10 @@ fn table(summary: &LocalizationSummary) -> String {
             summary.mean_ms
         ),
     ];
-    if let Some(outside) = summary.not_driven {
-        let (sweeps, no_pose) = (outside.sweeps, outside.no_pose);
+    if let Some(low) = summary.low_coverage {
+        let (sweeps, no_pose) = (low.sweeps, low.no_pose);
         rows.push(format!(
-            "not driven {sweeps} sweeps where no drive of the head came near, {no_pose} of them without a pose"
+            "coverage   {sweeps} sweeps where the drives of the head hardly came, {no_pose} of them without a pose"
         ));
     }
     if !summary.beyond_95.is_empty() {

@@ -173,7 +173,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(area) = localizer.driven_area().filter(|_| lost > 0) {
         let area = area.text();
         output::note(format_args!(
-            "no pose is found where no drive of the head came near: they cover {area}"
+            "few poses are found where the drives of the head hardly came: they cover {area}"
         ));
     }
     let folder = args.clouds.first().map_or(Path::new(""), PathBuf::as_path);
@@ -265,7 +265,7 @@ fn reason(estimate: &PoseEstimate) -> Option<&'static str> {
             NoPoseReason::TooFewPoints => "too few points",
             NoPoseReason::TooFewInliers => "too few inliers",
             NoPoseReason::LowConfidence => "low confidence",
-            NoPoseReason::NotDriven => "no drive came near",
+            NoPoseReason::LowCoverage => "low coverage",
             NoPoseReason::NoSource | NoPoseReason::Failed => "failed",
         }),
     }

@@ -12,7 +12,7 @@ use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, fi
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{
-    CalibrationBin, IntegritySummary, LocalizationSummary, NotDrivenSummary, RejectionSummary,
+    CalibrationBin, CoverageSummary, IntegritySummary, LocalizationSummary, RejectionSummary,
     reliability_charts,
 };
 pub use table::{csv, error_table};
@@ -49,8 +49,8 @@ pub struct EvaluatedSweep {
     pub stem: String,
     /// True `world_from_lidar`.
     pub truth: Pose,
-    /// True if a drive of the head came near; `None` if it does not state its drives.
-    pub is_driven: Option<bool>,
+    /// True if the drives of the head cover the place; `None` if it does not state its drives.
+    pub is_covered: Option<bool>,
     /// Result of the localizer.
     pub localization: Localization,
 }
@@ -144,7 +144,7 @@ pub fn evaluate(
     })?;
     for sweep in &mut evaluated.sweeps {
         let [x, y, _] = sweep.truth.translation_m;
-        sweep.is_driven = localizer.driven_area().map(|area| area.is_near([x, y]));
+        sweep.is_covered = localizer.driven_area().map(|area| area.covers([x, y]));
     }
     Ok(evaluated)
 }
@@ -255,7 +255,7 @@ fn evaluate_with(
         };
         evaluated.sweeps.push(EvaluatedSweep {
             scenario: scenario.name.clone(),
-            is_driven: None,
+            is_covered: None,
             localization: localize(&frame, &truth)?,
             cav: frame.cav,
             stem,
@@ -274,7 +274,7 @@ fn evaluate_with(
 /// Name of a sweep's outcome.
 fn outcome(estimate: &PoseEstimate) -> &'static str {
     use protocol::NoPoseReason::{
-        Failed, LowConfidence, NoSource, NotDriven, TooFewInliers, TooFewPoints,
+        Failed, LowConfidence, LowCoverage, NoSource, TooFewInliers, TooFewPoints,
     };
     let PoseEstimate::NoPose { reason, .. } = estimate else {
         return "pose";
@@ -285,7 +285,7 @@ fn outcome(estimate: &PoseEstimate) -> &'static str {
         NoSource => "no_source",
         LowConfidence => "low_confidence",
         Failed => "failed",
-        NotDriven => "not_driven",
+        LowCoverage => "low_coverage",
     }
 }
 
@@ -315,7 +315,7 @@ pub(crate) mod tests {
                     cav: CavId::new("7").unwrap(),
                     stem: format!("{seed:06}"),
                     truth: scene.world_from_sensor(seed).into(),
-                    is_driven: None,
+                    is_covered: None,
                     localization: scene
                         .localize(LocalizerInput::of(&PointCloud::default()))
                         .unwrap(),

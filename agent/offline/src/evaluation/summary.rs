@@ -43,8 +43,8 @@ pub struct LocalizationSummary {
     pub max_deg: Option<f64>,
     /// Number of sweeps without a pose, rejected ones included.
     pub no_pose: usize,
-    /// Sweeps where no drive of the head came near; absent if it does not state its drives.
-    pub not_driven: Option<NotDrivenSummary>,
+    /// Sweeps where the drives of the head hardly came; absent if it does not state its drives.
+    pub low_coverage: Option<CoverageSummary>,
     /// Number of sweeps by outcome.
     pub outcomes: BTreeMap<&'static str, usize>,
     /// Spearman's correlation of sigma and distance error over all estimated poses, rejected ones included; -1 is
@@ -84,9 +84,9 @@ pub struct IntegritySummary {
     pub p50_bound_m: f64,
 }
 
-/// Sweeps where no drive of the head came near.
+/// Sweeps where the drives of the head hardly came.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct NotDrivenSummary {
+pub struct CoverageSummary {
     /// Number of these sweeps.
     pub sweeps: usize,
     /// Number of them without a pose.
@@ -168,7 +168,7 @@ impl LocalizationSummary {
             p95_deg: quantile(&degrees, 0.95),
             max_deg: degrees.last().copied(),
             no_pose: sweeps.len() - metres.len(),
-            not_driven: not_driven(sweeps),
+            low_coverage: low_coverage(sweeps),
             outcomes,
             sigma_spearman: spearman(&sigmas, &errors),
             inlier_ratio_spearman: spearman(&ratios, &errors),
@@ -184,10 +184,14 @@ impl LocalizationSummary {
     }
 }
 
-fn not_driven(sweeps: &[EvaluatedSweep]) -> Option<NotDrivenSummary> {
-    let known = sweeps.iter().any(|sweep| sweep.is_driven.is_some());
-    let outside = || sweeps.iter().filter(|sweep| sweep.is_driven == Some(false));
-    known.then(|| NotDrivenSummary {
+fn low_coverage(sweeps: &[EvaluatedSweep]) -> Option<CoverageSummary> {
+    let known = sweeps.iter().any(|sweep| sweep.is_covered.is_some());
+    let outside = || {
+        sweeps
+            .iter()
+            .filter(|sweep| sweep.is_covered == Some(false))
+    };
+    known.then(|| CoverageSummary {
         sweeps: outside().count(),
         no_pose: (outside().filter(|sweep| sweep.published_error().is_none())).count(),
     })
@@ -381,14 +385,14 @@ mod tests {
     }
 
     #[test]
-    fn sweeps_where_no_drive_came_near_are_counted() {
+    fn sweeps_of_low_coverage_are_counted() {
         let mut sweeps = evaluated(20);
-        assert_eq!(not_driven(&sweeps), None);
+        assert_eq!(low_coverage(&sweeps), None);
         // Sweeps 9 and 19 are empty.
         for (number, sweep) in sweeps.iter_mut().enumerate() {
-            sweep.is_driven = Some(!(8..11).contains(&number));
+            sweep.is_covered = Some(!(8..11).contains(&number));
         }
-        let outside = not_driven(&sweeps).unwrap();
+        let outside = low_coverage(&sweeps).unwrap();
         assert_eq!((outside.sweeps, outside.no_pose), (3, 1));
     }
 

@@ -65,7 +65,7 @@ pub(super) fn check(
             cav: frame.cav,
             stem,
             truth,
-            is_driven: None,
+            is_covered: None,
             localization: localizer.localize(LocalizerInput::of(&cloud))?,
         };
         check.labelled.extend(sweep.labelled());

@@ -1,6 +1,6 @@
 //! 2D convolution layer with batch norm and ReLU.
 
-use tch::nn::{self, BatchNormConfig, Init};
+use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
 use crate::int8::{ConvGeometry, Int8Convolution, LayerFormat, Quantisation, Scale};
@@ -37,20 +37,11 @@ impl Norm {
 
     /// A batch norm with another epsilon and momentum.
     pub fn with_eps(path: &nn::Path<'_>, channels: i64, eps: f64, momentum: f64) -> Self {
-        let config = BatchNormConfig {
-            eps,
-            momentum,
-            ws_init: Init::Const(1.0),
-            bs_init: Init::Const(0.0),
-            ..Default::default()
-        };
-        let norm = nn::batch_norm2d(path, channels, config);
-        let affine = "an affine batch norm has weight and bias";
         Self {
-            weight: norm.ws.expect(affine),
-            bias: norm.bs.expect(affine),
-            running_mean: norm.running_mean,
-            running_var: norm.running_var,
+            weight: path.var("weight", &[channels], Init::Const(1.0)),
+            bias: path.var("bias", &[channels], Init::Const(0.0)),
+            running_mean: path.zeros_no_train("running_mean", &[channels]),
+            running_var: path.ones_no_train("running_var", &[channels]),
             eps,
             momentum,
         }
@@ -141,14 +132,10 @@ impl ConvLayer {
     }
 
     fn down(path: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64, bias: bool) -> Self {
-        let config = nn::ConvConfig {
-            bias,
-            ..Default::default()
-        };
-        let conv = nn::conv2d(path, io[0], io[1], kernel, config);
+        let shape = [io[1], io[0], kernel, kernel];
         Self {
-            weight: conv.ws,
-            bias: conv.bs,
+            weight: path.var("weight", &shape, nn::init::DEFAULT_KAIMING_UNIFORM),
+            bias: bias.then(|| path.var("bias", &[io[1]], Init::Const(0.0))),
             stride,
             padding: kernel / 2,
             direction: ConvDirection::Down,

@@ -153,14 +153,11 @@ impl TrainingOptions {
 /// [`OptionsError::Trained`] and [`OptionsError::NoCheckpoint`].
 pub fn check_out(out: &Path, resume: bool, force: bool) -> Result<(), OptionsError> {
     let [weights, checkpoint] = ["weights.safetensors", CHECKPOINT_FILE].map(|name| out.join(name));
-    if resume {
-        return match checkpoint.exists() {
-            true => Ok(()),
-            false => Err(OptionsError::NoCheckpoint(checkpoint)),
-        };
+    if resume && !checkpoint.exists() {
+        return Err(OptionsError::NoCheckpoint(checkpoint));
     }
     match [weights, checkpoint].into_iter().find(|file| file.exists()) {
-        Some(file) if !force => Err(OptionsError::Trained(file)),
+        Some(file) if !resume && !force => Err(OptionsError::Trained(file)),
         _ => Ok(()),
     }
 }

@@ -135,7 +135,6 @@ impl Arguments {
         let options = SynthOptions {
             frames: self.frames,
             agents: vehicles..=vehicles,
-            threads: std::thread::available_parallelism().map_or(1, usize::from),
             ..SynthOptions::new(Subset::V2vdet, self.seed, folder.clone())
         };
         if generate::are_kept(&options).map_err(BadInput::of)? {

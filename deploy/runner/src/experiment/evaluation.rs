@@ -77,10 +77,7 @@ impl OpenedData {
     /// # Errors
     /// An error when it cannot be read, or the protocol contradicts itself.
     pub fn open(trial: &Trial) -> Result<Self> {
-        let options = OpenOptions {
-            intensity_scale: trial.intensity_scale,
-            ..OpenOptions::default()
-        };
+        let options = OpenOptions::with_intensity_scale(trial.intensity_scale);
         let dataset = dataset::open_with(&trial.dataset, &options)?;
         let protocol = trial.protocol.resolve(dataset.layout);
         let protocol = protocol.map_err(|error| anyhow!("evaluation protocol: {error}"))?;

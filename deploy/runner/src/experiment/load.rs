@@ -32,10 +32,8 @@ impl Experiment {
             *place = folder.join(&place);
         }
         // A name that is no preset is the path of a file.
-        if let Some(link) = self
-            .link
-            .as_mut()
-            .filter(|it| LinkConfig::preset(it).is_err())
+        if let Some(link) = &mut self.link
+            && LinkConfig::preset(link).is_err()
         {
             *link = folder.join(&link).to_string_lossy().into_owned();
         }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use agent::config::AgentSettings;
 use bus::config_file;
+use link::LinkConfig;
 use support::file_error::{AtFile, FileError};
 
 use super::{FieldOverride, Scenario};
@@ -61,7 +62,9 @@ impl Scenario {
         for own in scenario.vehicles.values_mut() {
             own.change(|settings| with_files(settings, path, folder))?;
         }
-        if let Some(link) = scenario.link.as_mut().filter(|link| !link.is_preset()) {
+        if let Some(link) = &mut scenario.link
+            && LinkConfig::preset(&link.model).is_err()
+        {
             let model = without_dots(&folder.join(&link.model));
             link.model = model.to_string_lossy().into_owned();
         }

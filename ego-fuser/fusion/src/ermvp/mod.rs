@@ -170,9 +170,8 @@ impl Ermvp {
 
 impl Fusion for Ermvp {
     fn fuse(&self, aligned: &AlignedMaps) -> Result<FusionOutput, TchError> {
-        let (warped, is_training) = (&aligned.warped, aligned.is_training);
-        let order = nearest_first(&aligned.metadata).to_device(warped.features.device());
-        let WarpedMaps { features, mask } = warped.each(|map| map.f_index_select(0, &order))?;
+        let is_training = aligned.is_training;
+        let WarpedMaps { features, mask } = nearest_first(aligned)?;
         // Global queries come from a map reduced by REDUCTION, which needs whole windows too.
         let padding = Padding::to_multiples(&features, self.window * REDUCTION)?;
         let maps = padding.maps(&features, 0)?.f_permute([0, 2, 3, 1])?;

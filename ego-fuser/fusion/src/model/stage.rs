@@ -1,7 +1,6 @@
 //! Fusion stage: orientation-conditioned channel mixing, warp (Eq. 2) and fusion of several vehicles' feature maps.
 //! Training and the ego run the same code.
 
-use std::borrow::Cow;
 use std::cell::RefCell;
 
 use perception::int8::ScaleSearch;
@@ -283,7 +282,7 @@ impl FusionStage {
         earlier: Option<ReceivedMaps>,
         metadata: &[MapMetadata],
     ) -> Result<AlignedMaps, WarpError> {
-        let mut metadata = self.of_network(metadata).into_owned();
+        let mut metadata = self.of_network(metadata);
         let count = newest.maps.size4()?.0;
         let (mut maps, poses) = (count, metadata.len());
         if let Some(earlier) = &earlier {
@@ -371,16 +370,15 @@ impl FusionStage {
     }
 
     /// Metadata in the frame of the network: a mirrored network has mirrored poses.
-    fn of_network<'a>(&self, metadata: &'a [MapMetadata]) -> Cow<'a, [MapMetadata]> {
+    fn of_network(&self, metadata: &[MapMetadata]) -> Vec<MapMetadata> {
+        let mut metadata = metadata.to_vec();
         // y to the left is the convention of all poses: nothing to mirror.
-        if self.y_axis == YAxis::Left {
-            return Cow::Borrowed(metadata);
+        if self.y_axis == YAxis::Right {
+            for map in &mut metadata {
+                map.ego_from_cav = map.ego_from_cav.mirrored_y();
+            }
         }
-        let mirrored = metadata.iter().map(|map| MapMetadata {
-            ego_from_cav: map.ego_from_cav.mirrored_y(),
-            ..*map
-        });
-        Cow::Owned(mirrored.collect())
+        metadata
     }
 }
 

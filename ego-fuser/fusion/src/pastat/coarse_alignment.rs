@@ -92,10 +92,10 @@ impl CoarseAlignment {
         let earlier = earlier.as_ref().filter(|_| !earlier_entries.is_empty());
         let earlier = earlier.map(|earlier| {
             let entries = rows_of(&earlier.warped, &earlier_entries)?;
-            padded(&entries, self.earlier_padding_cells)
+            Padding::to_multiples_of(self.earlier_padding_cells, &entries)
         });
         Ok(CoarseMaps {
-            newest: padded(&rows_of(warped, &newest)?, self.padding_cells)?,
+            newest: Padding::to_multiples_of(self.padding_cells, &rows_of(warped, &newest)?)?,
             received: rows_of(&received_maps, &newest)?,
             received_cells: FullResolutionMap::shallow_clones(cells),
             earlier: earlier.transpose()?,
@@ -159,9 +159,4 @@ fn rows_of(maps: &WarpedMaps, entries: &[i64]) -> Result<WarpedMaps, TchError> {
         true => tensor.f_to_kind(Kind::Float),
         false => picked(tensor, entries)?.f_to_kind(Kind::Float),
     })
-}
-
-/// With rows below and columns to the right that reach nothing, so that both counts are multiples of `cells`.
-fn padded(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
-    maps.each(|tensor| Padding::to_multiples_of(cells, tensor))
 }

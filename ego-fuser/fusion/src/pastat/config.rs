@@ -162,7 +162,6 @@ impl PastatConfig {
             dim: channels,
             heads: 8,
             depth: 3,
-            windows: vec![4, 8],
             map_refinement: Some(channels),
             temporal_memory: None,
             earlier_cells: 1,

@@ -182,7 +182,7 @@ impl Fusion for TrafAlign {
         let present = warped.each(|map| picked(map, &entries)?.f_to_kind(Kind::Float))?;
         let (_, _, height, width) = present.features.size4()?;
         // The U-Net halves the resolution of the tokens once.
-        let padded = present.each(|map| Padding::to_multiples_of(2 * self.config.patch, map))?;
+        let padded = Padding::to_multiples_of(2 * self.config.patch, &present)?;
         let mut tokens = self.over_time(&padded, &agents, maps.is_training)?;
         let points = self.trajectories.points(&tokens, maps.is_training)?;
         for layer in &self.layers {

@@ -152,7 +152,7 @@ impl Arguments {
         data: &[EvalSet],
         left_out: &mut LeftOut,
     ) -> Result<Value> {
-        let (mut tally, mut lost) = (MethodTotals::default(), LeftOut::default());
+        let mut tally = MethodTotals::default();
         let mut name = "";
         for data in data {
             let mut setup = Setup {
@@ -175,9 +175,8 @@ impl Arguments {
                 })?;
             }
             bar.finish_and_clear();
-            lost.merge(evaluator.left_out());
+            left_out.merge(evaluator.left_out());
         }
-        left_out.merge(&lost);
         Ok(self.row(&tally, name)?)
     }
 

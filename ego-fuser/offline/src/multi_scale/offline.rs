@@ -46,11 +46,6 @@ impl OfflineDetector {
         })
     }
 
-    /// The network.
-    pub fn network(&self) -> &MultiScaleNetwork {
-        &self.network
-    }
-
     /// Configuration of its encoder and head.
     pub fn config(&self) -> &DetectorConfig {
         &self.network.network().config

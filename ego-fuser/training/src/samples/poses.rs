@@ -4,6 +4,7 @@ use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
 use dataset::frame::Frame;
+use fusion::planar_pose::moved;
 use localization::pose_source::{NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
 use protocol::config::within;
 use protocol::{CavId, Pose, PoseEstimate};
@@ -99,8 +100,8 @@ pub(super) struct DrawnError {
 struct Lost {
     /// Selects the neighbour.
     draw: usize,
-    shift_m: [f64; 2],
-    turn_rad: f64,
+    /// Along x and y, metres, and about its own position, radians.
+    offset: [f64; 3],
 }
 
 impl Lost {
@@ -115,8 +116,7 @@ impl Lost {
         Self {
             // The number of neighbours is not known yet: reduced to it later.
             draw: rng.random_range(0..usize::MAX),
-            shift_m: [distance_m * cos, distance_m * sin],
-            turn_rad,
+            offset: [distance_m * cos, distance_m * sin, turn_rad],
         }
     }
 }
@@ -141,10 +141,7 @@ impl DrawnError {
         let (Some(lost), Some((pose, confidence))) = (lost, known(&noisy)) else {
             return noisy;
         };
-        let ([x, y, z], [shift_x, shift_y]) = (pose.translation_m, lost.shift_m);
-        let heading_rad = pose.yaw_rad() + lost.turn_rad;
-        let pose = Pose::from_xyz_yaw([x + shift_x, y + shift_y, z], heading_rad);
-        PoseEstimate::new(pose, confidence)
+        PoseEstimate::new(moved(&pose, lost.offset), confidence)
     }
 
     fn noisy(

@@ -47,10 +47,8 @@ pub(super) fn fleet_exposition(own: &str, others: &[MetricsPeer]) -> String {
 
 fn series_of(peer: &MetricsPeer) -> Option<String> {
     let (status, body) = web::fetch_within(peer.address, "/metrics", WAIT_LIMIT).ok()?;
-    if !status.contains(" 200 ") {
-        return None;
-    }
-    String::from_utf8(body).ok()
+    let is_found = status.contains(" 200 ");
+    String::from_utf8(body).ok().filter(|_| is_found)
 }
 
 /// Several documents as one: OpenMetrics wants the samples of a family together, described once.

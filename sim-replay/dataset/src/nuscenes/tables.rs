@@ -34,7 +34,7 @@ pub(super) struct Scene {
 }
 
 /// A sample of a drive, with the sweeps of all LiDARs.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct SceneSample {
     /// Index of the scene.
     pub(super) scene: usize,
@@ -145,9 +145,7 @@ fn read_samples(
         stamps.push(stamp);
         samples.push(SceneSample {
             scene,
-            micros: 0,
-            sweeps: HashMap::new(),
-            objects: Vec::new(),
+            ..SceneSample::default()
         });
         Ok(())
     })?;

@@ -35,7 +35,9 @@ const OTHER_RAD: f32 = 0.035;
 const NEAR_M: f64 = 3.0;
 /// Share of the structure that sweeps of one place have in common at least.
 const LEAST_OVERLAP: f32 = 0.2;
-/// The same for sweeps that are farther apart than the search reaches.
+/// Share of the stated motion below which the best one may be that of traffic that drives along.
+const ALONGSIDE: f64 = 0.4;
+/// The same overlap for sweeps that are farther apart than the search reaches.
 const FAR_OVERLAP: f32 = 0.1;
 
 /// Two sweeps of an agent, by their ticks.
@@ -171,14 +173,19 @@ fn judge(scenario: &Scenario, agent: usize, pair: SweepPair) -> Option<Option<Co
     let is_better = best.overlap > CLEAR.max(BETTER_RATIO * overlap).max(overlap + BETTER_BY);
     // The search does not reach a long motion: sweeps this far apart look alike at a wrong motion, too.
     let is_judged = moved_m <= SEARCH_M[1] || overlap < FAR_OVERLAP;
+    // Traffic that drives along stands still in the sweeps. What does not move coincides at the stated motion then.
+    let best_m = f64::from(best.first_from_second.translation.vector.norm());
+    let is_traffic = best_m < ALONGSIDE * moved_m && overlap >= LEAST_OVERLAP;
     // No motion overlaps, although the poses are close: the sweeps are of two places.
     let is_elsewhere = moved_m < NEAR_M && overlap.max(best.overlap) < LEAST_OVERLAP;
     Some(
-        ((is_better && is_other && is_judged) || is_elsewhere).then_some(Contradiction {
-            pair,
-            overlap,
-            best,
-        }),
+        ((is_better && is_other && is_judged && !is_traffic) || is_elsewhere).then_some(
+            Contradiction {
+                pair,
+                overlap,
+                best,
+            },
+        ),
     )
 }
 

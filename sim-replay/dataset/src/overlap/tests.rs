@@ -47,24 +47,28 @@ fn drive() -> Vec<Isometry3<f64>> {
         .collect()
 }
 
-/// Clouds as they are seen from `seen`, with the poses `stated`.
-fn write(dir: &Path, seen: &[Isometry3<f64>], stated: &[Isometry3<f64>]) {
+/// Cars that drive along, in the LiDAR frame: beside, ahead and behind on four lanes.
+fn alongside(cars: u32) -> impl Iterator<Item = Point3<f64>> {
+    (0..cars).flat_map(|car| {
+        let ahead_m = [6.0, -14.0, 18.0, -24.0][car as usize / 4 % 4];
+        let left_m = [-3.0, 4.0, -7.0, 8.0][car as usize % 4];
+        (0..200).map(move |index| {
+            let [x, z] = [index % 20, index / 20].map(f64::from);
+            Point3::new(ahead_m + 0.2 * x, left_m, 0.15 * z - 1.6)
+        })
+    })
+}
+
+/// Clouds as they are seen from `seen` among cars, with the poses `stated`.
+fn write(dir: &Path, seen: &[Isometry3<f64>], stated: &[Isometry3<f64>], cars: u32) {
     fs::create_dir_all(dir.join("clouds")).unwrap();
     let world = street();
     for (frame, pose) in seen.iter().enumerate() {
-        // A car that drives along.
-        let car = (0..200).map(|index| {
-            let [x, z] = [
-                f64::from(index % 20) * 0.2,
-                f64::from(index / 20) * 0.15 - 1.6,
-            ];
-            Point3::new(6.0 + x, -3.0, z)
-        });
         let points = world
             .iter()
             .map(|point| pose.inverse_transform_point(point));
         let bytes: Vec<u8> = points
-            .chain(car)
+            .chain(alongside(cars))
             .flat_map(|point| [point.x, point.y, point.z, 0.5])
             .flat_map(|value| (value as f32).to_le_bytes())
             .collect();
@@ -81,8 +85,12 @@ fn write(dir: &Path, seen: &[Isometry3<f64>], stated: &[Isometry3<f64>]) {
 }
 
 fn problems(seen: &[Isometry3<f64>], stated: &[Isometry3<f64>]) -> Vec<String> {
+    problems_among(1, seen, stated)
+}
+
+fn problems_among(cars: u32, seen: &[Isometry3<f64>], stated: &[Isometry3<f64>]) -> Vec<String> {
     let dir = tempfile::tempdir().unwrap();
-    write(dir.path(), seen, stated);
+    write(dir.path(), seen, stated, cars);
     let dataset = crate::open(dir.path()).unwrap();
     assert_eq!(
         (dataset.scenarios[0].ticks.len(), dataset.problems.len()),
@@ -121,6 +129,14 @@ fn sound_poses_have_no_problem() {
     let elsewhere = Isometry3::new(Vector3::new(4e5, 5e6, 100.0), Vector3::new(0.0, 0.0, 2.0));
     let poses_elsewhere = moved(&poses, |pose| elsewhere * pose);
     assert_eq!(problems(&poses, &poses_elsewhere), Vec::<String>::new());
+}
+
+#[test]
+fn dense_traffic_that_drives_along_is_no_problem_of_the_poses() {
+    let poses = drive();
+    assert_eq!(problems_among(16, &poses, &poses), Vec::<String>::new());
+    let backwards: Vec<_> = poses.iter().rev().copied().collect();
+    assert_eq!(problems_among(16, &poses, &backwards).len(), 1);
 }
 
 #[test]

@@ -152,10 +152,9 @@ fn write_moments(
 /// The frames of a capture time. No layout can hold sweeps without a pose.
 fn read(scenario: &Scenario, index: usize) -> LoadedTick {
     let options = LoadOptions {
-        lidar_variant: None,
-        points: true,
         radar: true,
         cameras: true,
+        ..LoadOptions::default()
     };
     let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
     let frames = &mut loaded.frames;

@@ -70,7 +70,7 @@ pub struct SynthOptions {
 }
 
 impl SynthOptions {
-    /// The defaults of a subset.
+    /// The defaults of a subset, with a thread per core.
     pub fn new(subset: Subset, seed: u64, out: PathBuf) -> Self {
         Self {
             subset,
@@ -87,7 +87,7 @@ impl SynthOptions {
             frames: if subset == Subset::V2vdet { 60 } else { 2000 },
             period_s: 0.1,
             force: false,
-            threads: 1,
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
         }
     }
 

@@ -98,7 +98,7 @@ pub struct LaneSection {
 }
 
 /// One lane of a section.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct RoadLane {
     /// Use of the lane.
     pub kind: LaneKind,
@@ -130,17 +130,13 @@ impl RoadLane {
         Self {
             kind,
             width,
-            predecessor: None,
-            successor: None,
-            speed_limit_mps: None,
-            level: false,
-            reversed: false,
+            ..Self::default()
         }
     }
 }
 
 /// Use of a lane.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum LaneKind {
     /// Motor traffic, ramps included.
     Driving,
@@ -153,6 +149,7 @@ pub enum LaneKind {
     /// Between carriageways.
     Median,
     /// Anything else: cycle lanes, verges, kerbs.
+    #[default]
     Other,
 }
 

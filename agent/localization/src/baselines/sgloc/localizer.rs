@@ -8,7 +8,6 @@ use protocol::NoPoseReason;
 use tch::{Device, Kind, no_grad};
 
 use super::SgLoc;
-use crate::baselines::regressed_pose::no_pose;
 use crate::pgc::localization::{ENCODE, REGRESS, SOLVE, VOXELISE};
 use crate::pgc::pose_refinement::SweepCells;
 use crate::pgc::pose_solver::{MIN_CELLS, PoseSolver};
@@ -82,7 +81,7 @@ impl Localize for SgLocLocalizer {
         let sweep = SweepVoxels::new(cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]), config);
         times.lap(VOXELISE);
         if sweep.cells().len() < MIN_CELLS {
-            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+            return Ok(Localization::no_pose(NoPoseReason::TooFewPoints, times));
         }
         let batch = VoxelBatch::new(&[&sweep], config, self.device)?;
         let features = self.network.encoder().encode(&batch, Kind::Float)?;

@@ -144,11 +144,6 @@ impl CellEncoder {
         }
     }
 
-    /// True if it takes the levels of a detector's backbone.
-    pub(super) fn takes_levels(&self) -> bool {
-        matches!(self.network, CellNetwork::Backbone(_))
-    }
-
     /// Computes in integers from here on, if its scales are stored with the head: a detector has its own.
     ///
     /// # Errors

@@ -142,15 +142,13 @@ impl ConfidenceModel {
         let accepted = sigmas.iter().filter(|(sigma, _)| *sigma >= below);
         let wrong = accepted.clone().filter(|(_, is_good)| !is_good).count();
         let bad = sigmas.iter().filter(|(_, is_good)| !is_good).count();
-        let good_rejected = sigmas
-            .iter()
-            .filter(|(sigma, is_good)| *is_good && *sigma < below);
+        let (accepted, bad_rejected) = (accepted.count(), bad - wrong);
         Ok(FitReport {
             sweeps: sigmas.len(),
             bad,
-            bad_rejected: bad - wrong,
-            good_rejected: good_rejected.count(),
-            wrong_limit: share_limit(wrong, accepted.count()),
+            bad_rejected,
+            good_rejected: sigmas.len() - accepted - bad_rejected,
+            wrong_limit: share_limit(wrong, accepted),
         })
     }
 }

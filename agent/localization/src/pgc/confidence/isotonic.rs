@@ -24,9 +24,11 @@ impl MonotoneMap {
     /// at least `smallest` samples.
     pub fn fit(mut samples: Vec<(f64, f64)>, groups: usize, smallest: usize) -> Self {
         samples.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let size = (samples.len() / groups.max(1)).max(smallest).max(1);
+        let count = samples.len();
+        // Too few samples for a group of the smallest size are one group all the same.
+        let size = (count / groups.max(1)).max(smallest).min(count).max(1);
         let mut pools: Vec<Pool> = Vec::new();
-        let (whole, rest) = samples.split_at(samples.len() - samples.len() % size);
+        let (whole, rest) = samples.split_at(count - count % size);
         for (index, group) in whole.chunks(size).enumerate() {
             // The remainder joins the last group: alone it would be a group of too few samples.
             let is_last = (index + 1) * size == whole.len();
@@ -42,9 +44,6 @@ impl MonotoneMap {
                 pools.pop();
             }
             pools.push(pool);
-        }
-        if pools.is_empty() && !rest.is_empty() {
-            pools.push(Pool::of(rest));
         }
         let knots = pools.iter().map(|pool| (pool.x / pool.count, pool.mean()));
         Self::falling(knots.collect())

@@ -19,7 +19,6 @@ fn generator(experiment: &Experiment) -> Option<SynthOptions> {
         frames: generate.frames,
         scenes: generate.scenes,
         agents: fewest..=most,
-        threads: std::thread::available_parallelism().map_or(1, usize::from),
         ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
     })
 }

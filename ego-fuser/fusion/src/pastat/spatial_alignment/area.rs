@@ -4,6 +4,7 @@ use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
 
 use super::correlation::PARTS;
+use crate::planar_pose::planar;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
 /// The area of a padded map, metres.
@@ -102,10 +103,7 @@ pub(crate) fn own_sampling_grid(
 
 /// `[N, 3]`: x and y, metres, and yaw, radians.
 fn planar_poses(ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
-    let values = ego_from_cav.iter().flat_map(|pose| {
-        let [x, y, _] = pose.translation_m;
-        [x, y, pose.yaw_rad()].map(|value| value as f32)
-    });
+    let values = ego_from_cav.iter().flat_map(planar);
     Tensor::f_from_slice(&values.collect::<Vec<f32>>())?.f_view([-1, 3])
 }
 
@@ -133,13 +131,6 @@ fn places(
     Tensor::f_affine_grid_generator(&affine, [pose.size2()?.0, 1, size[0], size[1]], false)
 }
 
-/// A sender's pose corrected by a `delta`, see [`sampling_grid`].
-pub(crate) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
-    let [x, y, z] = ego_from_cav.translation_m;
-    let yaw_rad = ego_from_cav.yaw_rad() + delta[2];
-    Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], yaw_rad)
-}
-
 /// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `sampling_grid`. Cells beyond their edges are
 /// invalid; the values of invalid cells are not zero.
 pub(crate) fn resample(
@@ -160,6 +151,7 @@ mod tests {
     use tch::Device;
 
     use super::*;
+    use crate::planar_pose::moved;
     use crate::test_data::uniform;
     use crate::warp::warp_to_ego;
 
@@ -205,7 +197,7 @@ mod tests {
     fn a_map_sampled_as_received_equals_one_warped_by_the_right_pose() {
         let maps = uniform(3, &[1, 2, 16, 32]);
         let (pose, delta) = (Pose::from_xyz_yaw([2.3, -1.2, 0.0], 0.7), [0.8, -0.3, 0.1]);
-        let by_pose = warp_to_ego(&maps, None, &[moved(&pose, &delta)], &GRID).unwrap();
+        let by_pose = warp_to_ego(&maps, None, &[moved(&pose, delta)], &GRID).unwrap();
         let deltas = Tensor::from_slice(&delta).to_kind(Kind::Float).view([1, 3]);
         // Padded rows and columns contain the ego's cells, and more.
         let padded = Area::new(&GRID, [20, 40], 4);

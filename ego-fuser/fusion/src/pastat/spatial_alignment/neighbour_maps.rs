@@ -34,13 +34,6 @@ impl NeighbourMaps {
         self.maps.count()
     }
 
-    /// The maps after alignment.
-    #[cfg(test)]
-    pub(crate) fn maps(&self) -> &WarpedMaps {
-        assert!(self.places.is_none(), "they are not read yet");
-        &self.maps
-    }
-
     /// Of maps as received, to be sampled at `places`; `cells` are the same in plain floats, where there are such.
     pub(crate) fn at(
         maps: WarpedMaps,
@@ -100,6 +93,14 @@ mod tests {
     use super::super::area::{Area, own_sampling_grid};
     use super::*;
     use crate::test_data::uniform;
+
+    impl NeighbourMaps {
+        /// The maps after alignment.
+        pub(crate) fn maps(&self) -> &WarpedMaps {
+            assert!(self.places.is_none(), "they are not read yet");
+            &self.maps
+        }
+    }
 
     #[test]
     fn numbers_and_tensors_find_the_same_maximum() {

@@ -1,7 +1,7 @@
 //! Delayed delivery: messages between the agents and an ego in simulation time, handed over ahead, submitted to the
 //! link in order of time, and counted.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use bus::process_id;
 use link::{Delivery, LinkEmulator, Packet, PacketOutcome};
@@ -32,13 +32,9 @@ impl Envelope {
     }
 }
 
-/// A message that was handed over; of a pose only the size is needed.
-struct Kept {
-    topic: Topic,
-    /// Reason for its format, if it is a feature map that had to keep within a limit.
-    adapted: Option<RateReason>,
-    envelope: Option<Envelope>,
-}
+/// A message that was handed over, with the reason for its format, if it is a feature map that had to keep within a
+/// limit; of a pose only the size is needed.
+type Pending = (Packet, Option<RateReason>, Option<Envelope>);
 
 /// Delivers the neighbours' messages to the ego.
 pub(super) struct DelayedDelivery {
@@ -48,9 +44,9 @@ pub(super) struct DelayedDelivery {
     /// Time 0 of the link on the scene's clock.
     began_nanos: u64,
     /// Messages to be submitted, by time and number.
-    pending: BTreeMap<(u64, u64), Packet>,
-    /// Messages that were handed over and neither arrived nor were lost yet.
-    kept: BTreeMap<u64, Kept>,
+    pending: BTreeMap<(u64, u64), Pending>,
+    /// Messages that were submitted and neither arrived nor were lost yet.
+    kept: BTreeMap<u64, (Topic, Option<Envelope>)>,
     next_id: u64,
     /// The message accounting.
     pub(super) ledger: Ledger,
@@ -130,15 +126,9 @@ impl DelayedDelivery {
         packet.id = self.next_id;
         packet.submitted_nanos = packet.submitted_nanos.saturating_sub(self.began_nanos);
         self.next_id += 1;
-        let kept = Kept {
-            topic: Topic::stream(&packet.from, packet.stream),
-            adapted,
-            envelope,
-        };
-        self.kept.insert(packet.id, kept);
         // By time, then by number: messages of one time keep their order.
-        self.pending
-            .insert((packet.submitted_nanos, packet.id), packet);
+        let place = (packet.submitted_nanos, packet.id);
+        self.pending.insert(place, (packet, adapted, envelope));
     }
 
     /// Arrivals by `nanos`, in order of time. All messages that are sent until then have been handed over.
@@ -147,13 +137,15 @@ impl DelayedDelivery {
         while let Some(entry) = self.pending.first_entry()
             && entry.key().0 <= nanos
         {
-            let packet = entry.remove();
-            let account = Account::published(Topic::stream(&packet.from, packet.stream));
+            let (packet, adapted, envelope) = entry.remove();
+            let topic = Topic::stream(&packet.from, packet.stream);
+            let account = Account::published(topic.clone());
             self.ledger.sent(&account);
-            if let Some(reason) = self.kept.get(&packet.id).and_then(|kept| kept.adapted) {
+            if let Some(reason) = adapted {
                 self.ledger.adapted(&account, reason);
             }
             self.sent_bytes += packet.bytes;
+            self.kept.insert(packet.id, (topic, envelope));
             self.link.submit(packet);
         }
         let outcomes = self.link.advance(nanos).into_iter();
@@ -176,19 +168,17 @@ impl DelayedDelivery {
                 // The copy counts as one more message.
                 self.ledger.sent(&account);
                 let kept = self.kept.get(&packet.id);
-                kept.and_then(|kept| kept.envelope.clone())
+                kept.and_then(|(_, envelope)| envelope.clone())
             }
-            Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.envelope),
+            Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.1),
         };
-        // A pose has no envelope: its arrival is only counted.
-        if envelope.is_none() {
+        let Some(mut envelope) = envelope else {
+            // A pose has no envelope: its arrival is only counted.
             self.ledger.received(&account);
-        }
-        let nanos = outcome.nanos.saturating_add(self.began_nanos);
-        envelope.map(|mut envelope| {
-            envelope.message.reception.arrived_nanos = nanos;
-            envelope
-        })
+            return None;
+        };
+        envelope.message.reception.arrived_nanos = outcome.nanos.saturating_add(self.began_nanos);
+        Some(envelope)
     }
 
     /// The ego has used a message. That of its own agent takes no link.
@@ -211,10 +201,9 @@ impl DelayedDelivery {
     /// were never used.
     pub(super) fn close(&mut self, (cav, stream): &Source, waiting: u64) {
         // Handed over ahead but not submitted by the end: these count as not sent.
-        let not_sent: BTreeSet<u64> = self.pending.values().map(|packet| packet.id).collect();
         let topic = Topic::stream(cav, *stream);
-        let of_stream = self.kept.iter().filter(|(_, kept)| kept.topic == topic);
-        let under_way = of_stream.filter(|(id, _)| !not_sent.contains(*id)).count() as u64;
+        let of_stream = self.kept.values().filter(|(of, _)| *of == topic);
+        let under_way = of_stream.count() as u64;
         let account = Account::towards(topic, &self.receiver);
         self.ledger.set_in_flight(&account, under_way + waiting);
     }

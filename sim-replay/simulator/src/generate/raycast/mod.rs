@@ -21,7 +21,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use column::ColumnRays;
 use footprint::{RaySpan, SensorFrames};
-use part::greater;
+use part::{greater, shorten};
 
 /// [`RangeImage::hits`] of a ray without a hit.
 pub(crate) const MISS: u32 = u32::MAX;
@@ -106,9 +106,7 @@ impl Surface for Plane {
         for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
             // A ray along the plane gives an infinite distance or NaN, and neither is nearer.
             let at = drop / (rays.forward.z * cos + rays.up.z * sin);
-            let nearer = (at > 0.0) & (at < *depth);
-            *depth = if nearer { at } else { *depth };
-            *hit = if nearer { GROUND } else { *hit };
+            shorten(at, true, depth, hit, GROUND);
         }
     }
 }
@@ -213,7 +211,7 @@ impl Caster {
         let channels = span.channels.clone();
         let (cos, sin) = (&self.cos[channels.clone()], &self.sin[channels.clone()]);
         // Most bodies stand still: one frame serves all columns.
-        let still = body.motion.is_still().then(|| body.frame(1.0, &anchor));
+        let still = (body.motion.start == body.motion.end).then(|| body.frame(1.0, &anchor));
         for column in span.first_column..span.first_column + span.columns as i64 {
             // A span may reach over the seam of a full turn.
             let column = column.rem_euclid(count) as usize;

@@ -131,7 +131,7 @@ impl Convex {
 ///
 /// Written with selects instead of a branch so that the loops around it become vector code.
 #[inline(always)]
-fn shorten(enter: f32, is_hit: bool, depth: &mut f32, hit: &mut u32, id: u32) {
+pub(super) fn shorten(enter: f32, is_hit: bool, depth: &mut f32, hit: &mut u32, id: u32) {
     // Entries behind the origin do not count: a sensor inside a solid does not see it.
     let nearer = is_hit & (enter > 0.0) & (enter < *depth);
     *depth = if nearer { enter } else { *depth };

@@ -75,11 +75,6 @@ impl Course {
         }
     }
 
-    /// True if start and end are the same.
-    pub(crate) fn is_still(&self) -> bool {
-        self.start == self.end
-    }
-
     /// The placement at a time between 0 (start) and 1 (end).
     pub fn at(&self, time: f64) -> Placement {
         // The short way round, also across the step from pi to -pi.

@@ -24,7 +24,7 @@ use crate::pastat::coarse_alignment::{CoarseMaps, Origins};
 use crate::pastat::config::{MemoryConfig, PastatConfig};
 use crate::pastat::patches::channels_last;
 use crate::pastat::spatial_alignment::FineMaps;
-use crate::pastat::spatial_alignment::area::moved;
+use crate::planar_pose::moved;
 use crate::warp::SUM;
 
 /// FSA compares earlier maps with larger cells than the newest, so the correction of a well-placed one errs by a few
@@ -93,7 +93,7 @@ impl TemporalMemory {
             let step = origins.steps_back[first + index].checked_sub(1)?;
             let map = maps.get(entry as usize)?;
             let pose = &origins.ego_from_cav[first + index];
-            let correction = corrections.as_ref().map(|all| &all[index]);
+            let correction = corrections.as_ref().map(|all| all[index]);
             let pose = correction.map_or(*pose, |delta| moved(pose, delta));
             (step < steps).then_some((step, pose, map))
         });
