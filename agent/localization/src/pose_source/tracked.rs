@@ -577,7 +577,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_is_lost_in_low_coverage_says_so() {
+    fn a_vehicle_that_is_lost_in_low_coverage_reports_it() {
         let reasons = [-60.0, 30.0].map(|x| {
             let blind = Road {
                 blind: 20..80,
