@@ -13,9 +13,11 @@ pub(super) const DRIVEN_AREA_KEY: &str = "driven_area";
 const CELL_M: f64 = 25.0;
 /// Most cells along an edge of the area.
 const MOST_CELLS: f64 = 60.0;
-/// Typical cells whose sweeps the surroundings of a place have at least if it is covered. On validation drives of town 4 in
-/// sunshine and snow each sweep without a pose is where they have fewer, in fog none.
-const LEAST_CELLS: usize = 2;
+/// Fewest sweeps around a covered place, in multiples of those of the median cell. On validation drives of town 4 in
+/// sunshine and snow each sweep without a pose has fewer around it, in fog none.
+const LEAST_RATIO: usize = 2;
+/// Most sweeps of an area: counts cannot overflow.
+const MAX_SWEEPS: usize = 1 << 31;
 
 /// Cells with sweeps in them, in the frame of the map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -76,6 +78,9 @@ impl DrivenArea {
     /// [`FieldError`] of the first value that is wrong.
     pub(super) fn check(&self) -> Result<(), FieldError> {
         within("cell_m", self.cell_m, 1.0, 1e5)?;
+        let counts = self.cells.iter().map(|cell| cell.sweeps);
+        let sweeps = counts.fold(0, usize::saturating_add);
+        within("cells.sweeps", sweeps, 0, MAX_SWEEPS)?;
         let mut corners_m = self.cells.iter().map(|cell| cell.corner_m);
         let unknown = corners_m.find(|corner_m| !corner_m.iter().all(|metres| metres.is_finite()));
         require(
@@ -99,7 +104,7 @@ impl DrivenArea {
         let mut counts: Vec<usize> = self.cells.iter().map(|cell| cell.sweeps).collect();
         let middle = counts.len() / 2;
         let sweeps: usize = around.map(|cell| cell.sweeps).sum();
-        !counts.is_empty() && sweeps >= LEAST_CELLS * *counts.select_nth_unstable(middle).1
+        !counts.is_empty() && sweeps >= LEAST_RATIO * *counts.select_nth_unstable(middle).1
     }
 
     /// The area in one line.
@@ -164,5 +169,12 @@ mod tests {
             error.contains("corner_m") && error.contains("NaN"),
             "{error}"
         );
+        let mut crowded = area;
+        crowded
+            .cells
+            .iter_mut()
+            .for_each(|cell| cell.sweeps = usize::MAX);
+        let error = crowded.check().unwrap_err().to_string();
+        assert!(error.contains("cells.sweeps"), "{error}");
     }
 }
