@@ -4,10 +4,10 @@
 use std::ops::Range;
 
 use perception::tensor_values::tensor;
+use serde::Serialize;
 use tch::nn::{self, Init, LinearConfig, Module};
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::encoder_training::EncoderAccuracy;
 use super::pairs::Pair;
 use localization::pgc::{SceneEncoder, VoxelBatch};
 
@@ -22,6 +22,15 @@ const NEITHER_M: f64 = 3.0;
 const OFFSET_WEIGHT: f64 = 0.5;
 /// Logit of excluded candidates.
 const NEVER: f64 = -1e4;
+
+/// Accuracy of the matching of cells.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct EncoderAccuracy {
+    /// Share of cells whose most similar candidate is their match.
+    pub top1: f64,
+    /// Mean L1 error of the offset between two views of one spot, metres.
+    pub offset_m: f64,
+}
 
 /// Layers that are trained beside the encoder and discarded afterwards.
 #[derive(Debug)]

@@ -5,11 +5,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
-use serde::Serialize;
 use tch::nn::VarStore;
 use tch::{Device, Tensor, no_grad};
 
-use super::contrast::Contrast;
+use super::contrast::{Contrast, EncoderAccuracy};
 use super::pairs::{Pair, PairMaker};
 use super::sweep_store::SweepStore;
 use crate::Error;
@@ -34,15 +33,6 @@ pub struct EncoderTrainConfig {
     pub run: RunConfig,
     /// Steps between two validations and checkpoints.
     pub validate_every: u64,
-}
-
-/// Accuracy of the matching of cells.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct EncoderAccuracy {
-    /// Share of cells whose most similar candidate is their match.
-    pub top1: f64,
-    /// Mean L1 error of the offset between two views of one spot, metres.
-    pub offset_m: f64,
 }
 
 /// Result of a training of an encoder.

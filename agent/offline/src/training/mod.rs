@@ -14,7 +14,8 @@ mod sgloc_training;
 mod sweep_store;
 mod turned_sweep;
 
-pub use encoder_training::{EncoderAccuracy, EncoderSummary, EncoderTrainConfig, train_encoder};
+pub use contrast::EncoderAccuracy;
+pub use encoder_training::{EncoderSummary, EncoderTrainConfig, train_encoder};
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
 pub(crate) use kmeans::kmeans;

@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, Point3};
 use protocol::PointCloud;
 
 use super::rows::{Indices, read_all, referred, transform};
-use super::tables::SceneSample;
+use super::samples::SceneSample;
 use crate::frame::{Object, ObjectClass};
 use crate::json::JsonField;
 use crate::{ReadError, Result, classes};

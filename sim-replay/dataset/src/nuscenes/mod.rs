@@ -8,6 +8,7 @@
 mod annotations;
 mod rig;
 mod rows;
+mod samples;
 mod tables;
 #[cfg(test)]
 mod tests;
@@ -20,7 +21,8 @@ use nalgebra::Isometry3;
 use protocol::{CavId, Handedness};
 
 use self::rig::QuarterTurns;
-use self::tables::{SampleSweep, Scene, SceneSample};
+use self::samples::{SampleSweep, SceneSample};
+use self::tables::Scene;
 use super::layout::{LayoutReader, LayoutRow, opened};
 use super::points::{SweepStorage, Sweeps};
 use super::{

@@ -8,7 +8,7 @@ use nalgebra::Isometry3;
 
 use super::annotations;
 use super::rows::{Indices, MAX_BYTES, read_all, referred, transform};
-use crate::frame::Object;
+use super::samples::{SampleSweep, SceneSample};
 use crate::json_table::{self, RowKeys};
 use crate::{ReadError, Result, time_stamps};
 
@@ -31,27 +31,6 @@ pub(super) struct Scene {
     pub(super) name: String,
     /// Vehicles in the order of the data set, where it names them (Open MARS).
     pub(super) vehicles: Vec<String>,
-}
-
-/// A sample of a drive, with the sweeps of all LiDARs.
-#[derive(Debug, Default)]
-pub(super) struct SceneSample {
-    /// Index of the scene.
-    pub(super) scene: usize,
-    pub(super) micros: u64,
-    /// By channel, for example `LIDAR_TOP`.
-    pub(super) sweeps: HashMap<String, SampleSweep>,
-    /// Annotated objects.
-    pub(super) objects: Vec<Object>,
-}
-
-/// File of a sweep, and the pose of its LiDAR.
-#[derive(Debug, Clone)]
-pub(super) struct SampleSweep {
-    /// Path below the root of the data set.
-    pub(super) file: String,
-    pub(super) world_from_vehicle: Isometry3<f64>,
-    pub(super) vehicle_from_lidar: Isometry3<f64>,
 }
 
 /// A LiDAR on a vehicle.
