@@ -85,7 +85,7 @@ pub enum NoPoseReason {
     LowConfidence,
     /// The localizer failed to compute.
     Failed,
-    /// Where the vehicle was last seen, the head was trained on few sweeps or none.
+    /// The localizer was trained on few or no sweeps near the last pose of the vehicle.
     LowCoverage,
 }
 

@@ -420,3 +420,49 @@ fn a_map_of_a_drive_finds_its_sweeps_and_reports_where_it_was_driven() {
     assert_eq!(again.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&again.stderr).contains("it already holds a training"));
 }
+
+#[test]
+fn a_head_gets_the_area_of_its_drives_and_other_files_stay_as_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let drives = drive(&folder.path().join("drives"), 3, 1.0);
+    let drives = drives.to_str().unwrap();
+    let [head, detector] = ["pgc-town1.safetensors", "lean-none.safetensors"].map(|name| {
+        let path = folder.path().join(name);
+        fs::copy(weights(name), &path).unwrap();
+        path.display().to_string()
+    });
+    let output = agent(&["cover", "--dataset", drives, "--head", &head]);
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    assert!(
+        text.contains("cells of 25 m") && text.contains('#'),
+        "{text}"
+    );
+    assert_ne!(
+        fs::read(&head).unwrap(),
+        fs::read(weights("pgc-town1.safetensors")).unwrap()
+    );
+    // The head is read as before, and knows the area.
+    let encoder = weights("pgc-encoder.safetensors");
+    let options = [
+        "eval",
+        "--dataset",
+        drives,
+        "--head",
+        &head,
+        "--encoder",
+        &encoder,
+        "--json",
+    ];
+    let summary: Value = serde_json::from_slice(&agent(&options).stdout).unwrap();
+    assert_eq!(summary["low_coverage"]["sweeps"], 0, "{summary}");
+
+    let refused = agent(&["cover", "--dataset", drives, "--head", &detector]);
+    let error = String::from_utf8_lossy(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(2), "{error}");
+    assert!(error.contains("lean-none.safetensors"), "{error}");
+    assert_eq!(
+        fs::read(&detector).unwrap(),
+        fs::read(weights("lean-none.safetensors")).unwrap()
+    );
+}

@@ -16,8 +16,6 @@ const MOST_CELLS: f64 = 60.0;
 /// Fewest sweeps around a covered place, in multiples of those of the median cell. On validation drives of town 4 in
 /// sunshine and snow each sweep without a pose has fewer around it, in fog none.
 const LEAST_RATIO: usize = 2;
-/// Most sweeps of an area: counts cannot overflow.
-const MAX_SWEEPS: usize = 1 << 31;
 
 /// Cells with sweeps in them, in the frame of the map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -80,7 +78,8 @@ impl DrivenArea {
         within("cell_m", self.cell_m, 1.0, 1e5)?;
         let counts = self.cells.iter().map(|cell| cell.sweeps);
         let sweeps = counts.fold(0, usize::saturating_add);
-        within("cells.sweeps", sweeps, 0, MAX_SWEEPS)?;
+        // So that sums of counts cannot overflow.
+        within("cells.sweeps", sweeps, 1, 1 << 31)?;
         let mut corners_m = self.cells.iter().map(|cell| cell.corner_m);
         let unknown = corners_m.find(|corner_m| !corner_m.iter().all(|metres| metres.is_finite()));
         require(
@@ -102,9 +101,11 @@ impl DrivenArea {
             [x, y].iter().all(|cells| (-1.0..2.0).contains(cells))
         });
         let mut counts: Vec<usize> = self.cells.iter().map(|cell| cell.sweeps).collect();
-        let middle = counts.len() / 2;
+        counts.sort_unstable();
         let sweeps: usize = around.map(|cell| cell.sweeps).sum();
-        !counts.is_empty() && sweeps >= LEAST_RATIO * *counts.select_nth_unstable(middle).1
+        // A small place has all its sweeps around each of them.
+        let median = counts.get(counts.len() / 2);
+        median.is_some_and(|median| sweeps >= (LEAST_RATIO * median).min(counts.iter().sum()))
     }
 
     /// The area in one line.
@@ -154,6 +155,10 @@ mod tests {
         let places = [[60.0, 74.0], [60.0, 76.0], [-17.0, 30.0], [90.0, -20.0]];
         let covered = [true, false, false, false];
         assert_eq!(places.map(|place| area.covers(place)), covered);
+        assert!(
+            DrivenArea::of(&[[1.0, 2.0]; 3]).covers([5.0, 0.0]),
+            "one cell"
+        );
         assert!(!DrivenArea::of(&[]).covers([0.0, 0.0]));
     }
 
@@ -169,6 +174,8 @@ mod tests {
             error.contains("corner_m") && error.contains("NaN"),
             "{error}"
         );
+        let error = DrivenArea::of(&[]).check().unwrap_err().to_string();
+        assert!(error.contains("cells.sweeps"), "{error}");
         let mut crowded = area;
         crowded
             .cells

@@ -123,8 +123,8 @@ impl PoseSettings for TrackedPoseConfig {
 
 /// Largest standard deviation of a tracked position, metres: the next good measurement is still near the prediction.
 const MAX_POSITION_STD_M: f64 = 2.0;
-/// Longest time for which the place where a lost vehicle was seen tells where it is, seconds.
-const LAST_SEEN_S: f64 = 60.0;
+/// Longest time for which the last pose of a lost vehicle tells where it is, seconds.
+const LAST_PLACE_S: f64 = 60.0;
 /// Largest number of parts of the scene in which a sweep is sought: a lost vehicle is sought again in its next sweep, and
 /// outside the scene every sweep costs them all.
 const MOST_PARTS: usize = 4;
@@ -141,7 +141,7 @@ pub struct TrackedPose {
     measured_nanos: Option<u64>,
     global_nanos: Option<u64>,
     /// Capture time of the last sweep with a pose, nanoseconds, and x and y of that pose, metres.
-    last_seen: Option<(u64, [f64; 2])>,
+    last_place: Option<(u64, [f64; 2])>,
     jumps: u64,
     is_speed_refuted: bool,
     times: Vec<StageTiming>,
@@ -175,7 +175,7 @@ impl TrackedPose {
             sweeps: 0,
             measured_nanos: None,
             global_nanos: None,
-            last_seen: None,
+            last_place: None,
             jumps: 0,
             is_speed_refuted: false,
             times: Vec::new(),
@@ -243,23 +243,22 @@ impl TrackedPose {
         // Without a pose the tracker has not started: what the localizer gives as the reason is published.
         match self.tracker.state() {
             Some(state) => published(&state),
-            None if self.is_hardly_covered(input.capture_nanos) => match localization.estimate {
-                PoseEstimate::NoPose { inlier_count, .. } => {
-                    PoseEstimate::no_pose(NoPoseReason::LowCoverage, inlier_count)
-                }
-                pose @ PoseEstimate::Pose { .. } => pose,
-            },
+            None if localization.found.is_none_or(|found| found.is_rejected)
+                && self.has_low_coverage(input.capture_nanos) =>
+            {
+                PoseEstimate::no_pose(NoPoseReason::LowCoverage, localization.inlier_count)
+            }
             None => localization.estimate,
         }
     }
 
-    /// True if the drives of the head hardly cover where the vehicle was seen a short time ago.
-    fn is_hardly_covered(&self, capture_nanos: u64) -> bool {
-        let (Some((nanos, place_m)), Some(area)) = (self.last_seen, self.localizer.driven_area())
+    /// True if the head was trained on few or no sweeps near the last pose of the vehicle, and that is recent.
+    fn has_low_coverage(&self, capture_nanos: u64) -> bool {
+        let (Some((nanos, place_m)), Some(area)) = (self.last_place, self.localizer.driven_area())
         else {
             return false;
         };
-        (0.0..LAST_SEEN_S).contains(&seconds(nanos, capture_nanos)) && !area.covers(place_m)
+        (0.0..LAST_PLACE_S).contains(&seconds(nanos, capture_nanos)) && !area.covers(place_m)
     }
 
     /// True if the sweep is one of those that are measured.
@@ -292,7 +291,7 @@ impl PoseSource for TrackedPose {
             return self.start(input);
         };
         let place = state.world_from_lidar.translation.vector;
-        self.last_seen = Some((input.capture_nanos, [place.x, place.y]));
+        self.last_place = Some((input.capture_nanos, [place.x, place.y]));
         published(&state)
     }
 

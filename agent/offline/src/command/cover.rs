@@ -3,8 +3,10 @@
 use std::path::PathBuf;
 
 use dataset::LeftOut;
+use localization::pgc::SceneHead;
 use localization::pgc::driven_area::DrivenArea;
 use localization::pgc::head_files::head_file;
+use perception::weights::Weights;
 use support::cli::{BadInput, Outcome};
 use support::output;
 
@@ -25,6 +27,9 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let mut left_out = LeftOut::default();
     let head = head_file(&args.head).map_err(BadInput::of)?;
+    // Another kind of file is not changed.
+    let weights = Weights::load(&head).map_err(BadInput::of)?;
+    weights.check_kind(SceneHead::KIND).map_err(BadInput::of)?;
     let poses = positions(&args.dataset, &mut left_out)?;
     let places = poses.iter().map(|pose| pose.translation.vector);
     let area = DrivenArea::of(&Vec::from_iter(places.map(|place| [place.x, place.y])));

@@ -556,7 +556,7 @@ fn table(summary: &LocalizationSummary) -> String {
     if let Some(low) = summary.low_coverage {
         let (sweeps, no_pose) = (low.sweeps, low.no_pose);
         rows.push(format!(
-            "coverage   {sweeps} sweeps where the drives of the head hardly came, {no_pose} of them without a pose"
+            "coverage   {sweeps} sweeps of low coverage (few training sweeps nearby), {no_pose} of them without a pose"
         ));
     }
     if !summary.beyond_95.is_empty() {

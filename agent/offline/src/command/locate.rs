@@ -173,7 +173,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(area) = localizer.driven_area().filter(|_| lost > 0) {
         let area = area.text();
         output::note(format_args!(
-            "few poses are found where the drives of the head hardly came: they cover {area}"
+            "few poses are found where the head was trained on few sweeps: its training drives cover {area}"
         ));
     }
     let folder = args.clouds.first().map_or(Path::new(""), PathBuf::as_path);

@@ -43,7 +43,7 @@ pub struct LocalizationSummary {
     pub max_deg: Option<f64>,
     /// Number of sweeps without a pose, rejected ones included.
     pub no_pose: usize,
-    /// Sweeps where the drives of the head hardly came; absent if it does not state its drives.
+    /// Sweeps with few or no training sweeps of the head nearby; absent if it does not state its drives.
     pub low_coverage: Option<CoverageSummary>,
     /// Number of sweeps by outcome.
     pub outcomes: BTreeMap<&'static str, usize>,
@@ -84,7 +84,7 @@ pub struct IntegritySummary {
     pub p50_bound_m: f64,
 }
 
-/// Sweeps where the drives of the head hardly came.
+/// Sweeps with few or no training sweeps of the head nearby.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct CoverageSummary {
     /// Number of these sweeps.

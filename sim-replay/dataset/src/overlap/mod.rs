@@ -35,7 +35,7 @@ const OTHER_RAD: f32 = 0.035;
 const NEAR_M: f64 = 3.0;
 /// Share of the structure that sweeps of one place have in common at least.
 const LEAST_OVERLAP: f32 = 0.2;
-/// Share of the stated motion below which the best one may be that of traffic that drives along.
+/// Share of the stated motion below which the best one may be that of vehicles moving as the sensor does.
 const ALONGSIDE: f64 = 0.4;
 /// The same overlap for sweeps that are farther apart than the search reaches.
 const FAR_OVERLAP: f32 = 0.1;
@@ -173,7 +173,7 @@ fn judge(scenario: &Scenario, agent: usize, pair: SweepPair) -> Option<Option<Co
     let is_better = best.overlap > CLEAR.max(BETTER_RATIO * overlap).max(overlap + BETTER_BY);
     // The search does not reach a long motion: sweeps this far apart look alike at a wrong motion, too.
     let is_judged = moved_m <= SEARCH_M[1] || overlap < FAR_OVERLAP;
-    // Traffic that drives along stands still in the sweeps. What does not move coincides at the stated motion then.
+    // Vehicles that move as the sensor does suggest no motion; static structure still overlaps at the stated motion.
     let best_m = f64::from(best.first_from_second.translation.vector.norm());
     let is_traffic = best_m < ALONGSIDE * moved_m && overlap >= LEAST_OVERLAP;
     // No motion overlaps, although the poses are close: the sweeps are of two places.
