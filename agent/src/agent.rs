@@ -11,7 +11,7 @@ use support::stage_times::StageTimes;
 use tch::Tensor;
 
 use crate::agent_output::{AgentOutput, Perception};
-use crate::attack::{Attack, CapturedMessages};
+use crate::attack::Attack;
 use localization::pose_source::{PoseInput, PoseSource};
 use localization::tracker::PoseMeasurement;
 use perception::boxes::postprocess::{PostprocessConfig, detections};
@@ -49,7 +49,7 @@ pub struct Agent {
     detector: Option<Detector>,
     object_tracker: Tracker,
     /// Falsifies everything that is published.
-    attack: Option<Attack>,
+    pub(crate) attack: Option<Attack>,
     /// Feature map `[1, C, H, W]` of the next sweep, where its encoder computed it before.
     pub(crate) known_map: Option<Tensor>,
     /// False for maps that are sent whole: neither confidence nor detections are computed.
@@ -86,18 +86,6 @@ impl Agent {
     /// The same with an attack on everything that it publishes.
     pub fn with_attack(self, attack: Option<Attack>) -> Self {
         Self { attack, ..self }
-    }
-
-    /// Passes on the last messages of another vehicle, which an attack may replay.
-    pub(crate) fn capture(&mut self, captured: impl FnOnce() -> CapturedMessages) {
-        if let Some(attack) = &mut self.attack {
-            attack.capture(captured());
-        }
-    }
-
-    /// True if it falsifies what it publishes.
-    pub(crate) fn falsifies(&self) -> bool {
-        self.attack.is_some()
     }
 
     /// The points that the vehicle shares: those that are not on its own body, whose extent its detector knows.

@@ -283,8 +283,5 @@ impl<'a> AgentNode<'a> {
 }
 
 fn topic(agent: &Agent, stream: Stream) -> Topic {
-    Topic::Stream {
-        cav: agent.cav().clone(),
-        stream,
-    }
+    Topic::stream(agent.cav(), stream)
 }

@@ -109,6 +109,9 @@ impl Ego {
         device: Device,
     ) -> Result<Self, EgoError> {
         let method = Method::of_weights(weights, method)?;
+        if !method.is_script() {
+            method.check_training(weights)?;
+        }
         let detector = Detector::from_weights(weights, &weights.detector_config()?, device)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config(), device)?;
         Ok(Self::assembled(detector, method, fusion))
@@ -272,7 +275,7 @@ impl Ego {
             let others = chosen.aligned[1..].iter();
             let others: Vec<_> = others.map(|one| (one.view, one.ego_from_cav)).collect();
             let found = no_grad(|| trust.judge(own, &others, &mut self.detector))?;
-            let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
+            let is_out: Vec<bool> = found.iter().map(|one| one.misbehaviour.is_some()).collect();
             beliefs = chosen.fused.iter().copied().zip(found).collect();
             chosen.leave_out(&is_out, DropReason::Misbehaviour);
             stages.lap("trust");

@@ -26,24 +26,15 @@ pub enum WireError {
         /// Bytes found.
         found: u64,
     },
-    /// Not a message of this program.
-    #[error("message starts with {found:02x?}, not with {MAGIC:02x?}")]
-    Magic {
-        /// The first four bytes.
-        found: [u8; 4],
-    },
+    /// Not a message of this program, by its first four bytes.
+    #[error("message starts with {0:02x?}, not with {MAGIC:02x?}")]
+    Magic([u8; 4]),
     /// A message of another wire version.
-    #[error("message is of wire version {found}, this program supports {WIRE_VERSION}")]
-    Version {
-        /// Version found.
-        found: u16,
-    },
+    #[error("message is of wire version {0}, this program supports {WIRE_VERSION}")]
+    Version(u16),
     /// A number that is no message kind.
-    #[error("message is of the unknown kind {found}")]
-    UnknownKind {
-        /// Number found.
-        found: u8,
-    },
+    #[error("message is of the unknown kind {0}")]
+    UnknownKind(u8),
     /// A message of another kind than this key carries.
     #[error("message is of kind {found}, expected {expected}")]
     Kind {
@@ -155,12 +146,9 @@ pub enum WireError {
         /// Size of an empty selection.
         needed: u64,
     },
-    /// Cells cannot be selected without a confidence for each.
-    #[error("a byte budget needs a confidence map, one value for each of {cells} cells")]
-    NoConfidence {
-        /// Cells of the map.
-        cells: u64,
-    },
+    /// Cells of a map, of this number, cannot be selected without a confidence for each.
+    #[error("a byte budget needs a confidence map, one value for each of {0} cells")]
+    NoConfidence(u64),
 }
 
 impl WireError {
@@ -178,19 +166,19 @@ impl WireError {
         match self {
             Self::Truncated { .. }
             | Self::TrailingBytes { .. }
-            | Self::Magic { .. }
-            | Self::UnknownKind { .. }
+            | Self::Magic(_)
+            | Self::UnknownKind(_)
             | Self::Kind { .. }
             | Self::Metadata { .. }
             | Self::Compression { .. } => DropReason::Decode,
-            Self::Version { .. } => DropReason::Version,
+            Self::Version(_) => DropReason::Version,
             Self::Cav(_) | Self::Identity { .. } => DropReason::Identity,
             Self::HeaderChecksum { .. } | Self::Checksum { .. } => DropReason::Checksum,
             Self::Limit { .. }
             | Self::Shape { .. }
             | Self::Grid { .. }
             | Self::Budget { .. }
-            | Self::NoConfidence { .. } => DropReason::Shape,
+            | Self::NoConfidence(_) => DropReason::Shape,
             Self::Value { .. } | Self::Pose { .. } => DropReason::NotFinite,
         }
     }

@@ -118,12 +118,12 @@ impl Header {
     pub fn from_bytes(bytes: &[u8; HEADER_LEN]) -> Result<Self, WireError> {
         let magic = take::<4>(bytes, 0);
         if magic != MAGIC {
-            return Err(WireError::Magic { found: magic });
+            return Err(WireError::Magic(magic));
         }
         // Before the checksum: another version may keep its checksum elsewhere.
         let version = u16::from_le_bytes(take(bytes, 4));
         if version != WIRE_VERSION {
-            return Err(WireError::Version { found: version });
+            return Err(WireError::Version(version));
         }
         let found = u32::from_le_bytes(take(bytes, CRC_OFFSET));
         let expected = crc32fast::hash(&bytes[..CRC_OFFSET]);
@@ -255,15 +255,12 @@ mod tests {
     fn errors_state_the_cause() {
         assert!(matches!(
             resealed(|b| b[0] = b'X'),
-            Err(WireError::Magic { found: [b'X', ..] })
+            Err(WireError::Magic([b'X', ..]))
         ));
-        assert!(matches!(
-            resealed(|b| b[4] = 8),
-            Err(WireError::Version { found: 8 })
-        ));
+        assert!(matches!(resealed(|b| b[4] = 8), Err(WireError::Version(8))));
         assert!(matches!(
             resealed(|b| b[6] = 99),
-            Err(WireError::UnknownKind { found: 99 })
+            Err(WireError::UnknownKind(99))
         ));
         assert!(matches!(resealed(|b| b[7] = 33), Err(WireError::Cav(_))));
         assert!(matches!(resealed(|b| b[7] = 0), Err(WireError::Cav(_))));

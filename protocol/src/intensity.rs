@@ -29,15 +29,15 @@ pub enum IntensityKind {
     Number,
 }
 
-/// Divisor that brings intensities of up to `largest` to 0..1: 1 for 1 and less, else the smallest 2^n - 1 from 255 on
-/// that is not less.
-pub fn intensity_divisor(largest: f32) -> f32 {
-    if largest <= 1.0 {
+/// Divisor that brings intensities of up to `upper`, the upper end of their range, to 0..1: 1 for 1 and less, else the
+/// smallest 2^n - 1 from 255 on that is not less.
+pub fn intensity_divisor(upper: f32) -> f32 {
+    if upper <= 1.0 {
         return 1.0;
     }
     // 2^9 - 1 and so on have no more than 24 bits up to 2^24 - 1, and are rounded up from there.
     (8..=32)
         .map(|bits| ((1_u64 << bits) - 1) as f32)
-        .find(|&limit| largest <= limit)
+        .find(|&limit| upper <= limit)
         .unwrap_or(u32::MAX as f32)
 }

@@ -31,18 +31,12 @@ pub(crate) const MAX_KEY_BYTES: usize = 256;
 /// Error of a text that is not a key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum KeyError {
-    /// No key of this program has that form.
-    #[error("{text:?} is no key of the form {KEY_ROOT}/<run>/...")]
-    Unknown {
-        /// The beginning of the text.
-        text: String,
-    },
-    /// Wildcards name many keys, a message has one.
-    #[error("{text:?} holds a wildcard")]
-    Wildcard {
-        /// The beginning of the text.
-        text: String,
-    },
+    /// No key of this program has the form of a text with this beginning.
+    #[error("{0:?} is no key of the form {KEY_ROOT}/<run>/...")]
+    Unknown(String),
+    /// Wildcards, in a text with this beginning, name many keys, a message has one.
+    #[error("{0:?} holds a wildcard")]
+    Wildcard(String),
     /// A chunk of the key is not an identifier.
     #[error("key {text:?}: {source}")]
     Id {
@@ -60,7 +54,7 @@ impl KeyError {
     }
 
     pub(crate) fn unknown(text: &str) -> Self {
-        Self::Unknown { text: shown(text) }
+        Self::Unknown(shown(text))
     }
 }
 
@@ -328,7 +322,7 @@ mod tests {
         }
         assert!(matches!(
             "v2v/r1/*/bev".parse::<Key>(),
-            Err(KeyError::Wildcard { .. })
+            Err(KeyError::Wildcard(_))
         ));
     }
 

@@ -229,6 +229,25 @@ impl Ledger {
         self.accounts.is_empty()
     }
 
+    /// The account of every receiver, with the counts of its topic's senders, which hold for each receiver.
+    pub(crate) fn deliveries(&self) -> impl Iterator<Item = (&Account, Counts)> {
+        let receivers = self.iter().filter(|(account, _)| account.to.is_some());
+        receivers.map(|(account, counts)| {
+            let mut counts = counts.clone();
+            if let Some(published) = self.get(&Account::published(account.topic.clone())) {
+                counts.add(published);
+            }
+            (account, counts)
+        })
+    }
+
+    /// Sum over all receivers: a message to two of them counts as sent twice, one to none does not count.
+    pub fn delivered(&self) -> Counts {
+        let mut total = Counts::default();
+        self.deliveries().for_each(|(_, counts)| total.add(&counts));
+        total
+    }
+
     /// Sum of all accounts. A topic with two receivers counts as sent once and received twice.
     pub fn total(&self) -> Counts {
         let mut total = Counts::default();
@@ -379,6 +398,16 @@ mod tests {
             ),
             (11, 6, 1, 4)
         );
+    }
+
+    #[test]
+    fn a_message_to_two_receivers_counts_twice_and_one_to_none_does_not_count() {
+        let mut ledger = sum(&ledgers());
+        let second = Account::towards(bev(), &process("ego-4288"));
+        (0..10).for_each(|_| ledger.received(&second));
+        ledger.sent(&Account::published("4288/descriptor".parse().unwrap()));
+        let delivered = ledger.delivered();
+        assert_eq!((delivered.sent, delivered.missing()), (21, 0));
     }
 
     #[test]

@@ -105,7 +105,6 @@ mod metadata;
 mod misbehaviour_reason;
 mod point_cloud;
 mod pose;
-mod pose_error;
 mod reconciliation;
 pub mod rotated_iou;
 mod stream;
@@ -142,8 +141,7 @@ pub use message::{
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};
-pub use pose::{InvalidPose, Pose};
-pub use pose_error::PoseError;
+pub use pose::{InvalidPose, Pose, PoseError};
 pub use reconciliation::{Discrepancy, Reconciliation, UnreceivedTopic};
 pub use stream::Stream;
 pub use topic::{Role, Topic, Verb};

@@ -1,6 +1,6 @@
 //! Binary encoding of metadata, the small structured part of a message.
 //!
-//! The only file that depends on the format: bincode 2.0.1, little-endian, variable-length integers, a hard limit of
+//! The only file of the wire that depends on the format: bincode 2.0.1, little-endian, variable-length integers, a hard limit of
 //! bytes read by a decoder. bincode is no longer maintained, so this interface is limited to two functions.
 
 use bincode::config::{Configuration, Limit, LittleEndian, Varint};

@@ -51,23 +51,20 @@ impl Reconciliation {
             .iter()
             .filter_map(|(account, _)| account.to.as_ref().map(|_| &account.topic))
             .collect();
+        for (account, counts) in ledger.deliveries() {
+            balance.push_difference(account, counts);
+        }
         for (account, counts) in ledger.iter() {
-            let mut counts = counts.clone();
-            if account.to.is_some() {
-                // Counts without a receiver hold for each receiver.
-                if let Some(published) = ledger.get(&Account::published(account.topic.clone())) {
-                    counts.add(published);
-                }
-                balance.push_difference(account, counts);
-            } else if !received.contains(&account.topic) {
-                match u64::try_from(counts.missing()) {
-                    Ok(0) => {}
-                    Ok(messages) => balance.unreceived.push(UnreceivedTopic {
-                        topic: account.topic.clone(),
-                        messages,
-                    }),
-                    Err(_) => balance.push_difference(account, counts),
-                }
+            if received.contains(&account.topic) {
+                continue;
+            }
+            match u64::try_from(counts.missing()) {
+                Ok(0) => {}
+                Ok(messages) => balance.unreceived.push(UnreceivedTopic {
+                    topic: account.topic.clone(),
+                    messages,
+                }),
+                Err(_) => balance.push_difference(account, counts.clone()),
             }
         }
         balance

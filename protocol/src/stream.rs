@@ -143,6 +143,11 @@ impl Stream {
     pub fn kind(self) -> Option<Kind> {
         self.row().kind
     }
+
+    /// Role of the process that publishes them: the vehicle's agent or ego, or the replay.
+    pub fn sender(self) -> Role {
+        self.row().sender
+    }
 }
 
 /// True if the chunks are those of a name, whose number may be any text.

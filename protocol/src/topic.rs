@@ -171,7 +171,7 @@ impl FromStr for Topic {
         }
         // `$` and `#` mean something to zenoh too.
         if text.contains(['*', '$', '#', '?']) {
-            return Err(KeyError::Wildcard { text: shown(text) });
+            return Err(KeyError::Wildcard(shown(text)));
         }
         let chunks: Vec<&str> = text.split('/').collect();
         Self::from_chunks(&chunks)

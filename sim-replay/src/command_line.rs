@@ -36,7 +36,7 @@ enum Command {
     Recover(command::recover::Args),
     /// Publish a scene as if its vehicles were driving now.
     ///
-    /// The clock starts when all expected routes have carried a probe. While it runs, it obeys control messages
+    /// The clock starts when all expected routes have carried a probe. While it runs, it applies control messages
     /// (`pause`, `resume`, `step`, `seek`, `start` with another rate).
     ///
     /// With a rate above 0 and without lockstep, a newer sweep replaces one that still waits for the network: the

@@ -99,12 +99,11 @@ impl GuardedRouter {
         // Another process may take the port between the two calls.
         let opened = (0..20).find_map(|_| {
             let options = BusOptions::router(Endpoint::loopback(free_port()));
-            let options = options
-                .with_credentials(credentials.clone())
-                .with_access_control(guard.clone());
+            let mut options = options.with_credentials(credentials.clone());
+            options.guard = Some(guard.clone());
             bus::open(&options)
                 .ok()
-                .map(|session| (options.endpoint().clone(), session))
+                .map(|session| (options.endpoint.clone(), session))
         });
         let (endpoint, session) = opened.expect("a free port on loopback");
         Self {

@@ -16,18 +16,18 @@
 //! ```
 
 mod chart;
-mod raster;
 mod scale;
 
 use std::io;
 use std::path::{Path, PathBuf};
 
+use plotters::coord::Shift;
 use plotters::drawing::{DrawingArea, DrawingAreaErrorKind, IntoDrawingArea};
-use plotters::prelude::{DrawingBackend, SVGBackend};
+use plotters::prelude::{BitMapBackend, DrawingBackend, SVGBackend};
 use plotters::style::{FontStyle, RGBColor, register_font};
+use support::atomic_file;
 
 pub use chart::{Axis, Chart, Mark, Series};
-pub use raster::{Image, render, save_image};
 
 /// The only font: DejaVu Sans in images; the viewer's own font in SVG.
 pub const FONT: &str = "sans-serif";
@@ -37,6 +37,9 @@ const PAPER: RGBColor = RGBColor(255, 255, 255);
 
 /// Result of drawing or writing a figure: a [`FigureError`] if nothing else is named.
 pub type Result<T, E = FigureError> = std::result::Result<T, E>;
+
+/// Area of an image; x to the right and y down, pixels.
+pub type Image<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
 
 /// Error of drawing or writing a figure.
 #[derive(Debug, thiserror::Error)]
@@ -68,6 +71,43 @@ pub fn save_png(charts: &[Chart], path: &Path) -> Result<(), FigureError> {
     save_image(path, size(charts), |image| draw(charts, image))
 }
 
+/// Draws an image of `size` (width and height, pixels) and writes it as a PNG.
+///
+/// # Errors
+/// [`FigureError`] of `draw`, or when the file cannot be written.
+pub fn save_image(
+    path: &Path,
+    size: (u32, u32),
+    draw: impl FnOnce(&Image<'_>) -> Result<()>,
+) -> Result<()> {
+    let rgb = render(size, draw)?;
+    write_png(path, size, &rgb).map_err(|source| FigureError::Write {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Pixels of a drawn image, row by row from the top, three bytes each.
+///
+/// # Errors
+/// [`FigureError`] of `draw`.
+pub fn render(size: (u32, u32), draw: impl FnOnce(&Image<'_>) -> Result<()>) -> Result<Vec<u8>> {
+    load_font()?;
+    let mut rgb = vec![0; 3 * size.0 as usize * size.1 as usize];
+    draw(&BitMapBackend::with_buffer(&mut rgb, size).into_drawing_area())?;
+    Ok(rgb)
+}
+
+fn write_png(path: &Path, (width, height): (u32, u32), rgb: &[u8]) -> io::Result<()> {
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(png::ColorType::Rgb);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(rgb)?;
+    writer.finish()?;
+    atomic_file::write(path, bytes)
+}
+
 /// Charts side by side as the text of an SVG: sharp at any size, with text that can be searched.
 ///
 /// # Errors
@@ -86,7 +126,7 @@ fn size(charts: &[Chart]) -> (u32, u32) {
 
 fn draw<DB: DrawingBackend>(
     charts: &[Chart],
-    area: &DrawingArea<DB, plotters::coord::Shift>,
+    area: &DrawingArea<DB, Shift>,
 ) -> Result<(), FigureError> {
     area.fill(&PAPER)?;
     let parts = area.split_evenly((1, charts.len().max(1)));

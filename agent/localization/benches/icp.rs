@@ -53,7 +53,7 @@ fn icp(criterion: &mut Criterion) {
     let truth = here.inv_mul(&there);
     let start = truth * Isometry3::new(Vector3::new(0.9, -0.7, 0.1), Vector3::z() * 0.03);
     let planes = IcpTarget::of_sweep(&target, &config);
-    let decimate = IcpSource::of_sweep(&source, &config);
+    let decimate = IcpSource::of_sweep(&source);
     let fit = register(&decimate, &planes, &start, &config).expect("a street constrains a pose");
     let off = truth.inv_mul(&fit.target_from_source);
     assert!(off.translation.vector.norm() < 0.1, "{off}");
@@ -67,7 +67,7 @@ fn icp(criterion: &mut Criterion) {
         bencher.iter(|| IcpTarget::of_sweep(black_box(&target), &config))
     });
     criterion.bench_function("icp/source", |bencher| {
-        bencher.iter(|| IcpSource::of_sweep(black_box(&source), &config))
+        bencher.iter(|| IcpSource::of_sweep(black_box(&source)))
     });
     criterion.bench_function("icp/register", |bencher| {
         bencher.iter(|| register(black_box(&decimate), &planes, &start, &config));

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub const COVARIANCE_KEY: &str = "covariance";
 
 /// Largest variance, square metres or radians: that of a pose that nothing constrains.
-pub(crate) const MAX_VARIANCE: f64 = 1e6;
+pub const MAX_VARIANCE: f64 = 1e6;
 /// Fewest poses to fit a scale on.
 const MIN_POSES: usize = 50;
 /// Share of the errors within the fitted limits, and that many standard deviations of a Gaussian: along one axis, and
@@ -65,15 +65,19 @@ pub struct PoseSample {
 }
 
 impl PoseSample {
-    /// Sample of a pose of a sweep that was taken at `truth`.
-    pub fn of(pose: &Isometry3<f64>, covariance: [[f64; 6]; 6], truth: &Isometry3<f64>) -> Self {
+    /// Sample of a pose of a sweep that was taken at `truth`; its registration began with `start_std_m`.
+    pub fn of(
+        (pose, start_std_m): (&Isometry3<f64>, f64),
+        covariance: [[f64; 6]; 6],
+        truth: &Isometry3<f64>,
+    ) -> Self {
         let off = pose.translation.vector - truth.translation.vector;
         // On the left: the axis is in the world's frame, as that of the covariance.
         let turned = (pose.rotation * truth.rotation.inverse()).scaled_axis();
         Self {
             error: [off.x, off.y, off.z, turned.x, turned.y, turned.z],
             covariance,
-            start_std_m: 0.0,
+            start_std_m,
         }
     }
 

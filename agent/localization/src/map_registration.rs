@@ -20,7 +20,7 @@ use crate::pgc::pose_evidence::PoseEvidence;
 use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
-use crate::registration::icp::{IcpFit, IcpSource, MIN_POINTS, Plane, register};
+use crate::registration::icp::{IcpFit, IcpSource, MIN_POINTS, Plane, is_level, register};
 use crate::tracker::PoseMeasurement;
 
 /// Stage of a localization.
@@ -30,6 +30,10 @@ const CONFIRMED: f64 = 0.2;
 /// Least share of the sweep's planes that agree with the map, with which one is taken that is not confirmed so: in fog
 /// scattered returns count among the points above the ground, and make no planes. Chosen on validation drives.
 pub(crate) const AGREED: f64 = 0.55;
+/// Radius around a sensor in which its ground is measured, metres.
+const NEAR_M: f64 = 12.0;
+/// Fewest level planes within it that tell of the ground.
+const LEAST_LEVEL: usize = 10;
 /// Confidence of the localizer with which a pose stays that the map does not confirm.
 const SURE: f64 = 0.8;
 /// Largest distance of a registered pose from its start, metres: a step beyond is no refinement.
@@ -52,7 +56,7 @@ impl<'a> SweepOnMap<'a> {
     pub(crate) fn new(cloud: &'a PointCloud) -> Self {
         Self {
             cloud,
-            source: IcpSource::of_sweep(&cloud.xyzi, &SurfelMap::registration()),
+            source: IcpSource::of_sweep(&cloud.xyzi),
             planes: OnceCell::new(),
         }
     }
@@ -61,6 +65,14 @@ impl<'a> SweepOnMap<'a> {
     pub(crate) fn planes(&self) -> &[Plane] {
         self.planes
             .get_or_init(|| SurfelMap::planes_of_sweep(&self.cloud.xyzi))
+    }
+
+    /// The level planes near the sensor: those below it and those above it, in its frame.
+    pub(crate) fn level_planes(&self) -> (Vec<Plane>, Vec<Plane>) {
+        let planes = self.planes().iter().copied();
+        let level = planes.filter(|plane| is_level(&plane.normal));
+        let near = level.filter(|plane| plane.centre_m.xy().norm() < NEAR_M);
+        near.partition(|plane| plane.centre_m.z < 0.0)
     }
 
     /// The registration from `start`, if it constrains the pose and stays near.
@@ -74,14 +86,17 @@ impl<'a> SweepOnMap<'a> {
     /// Share of the planes that agree with the map; 0 of too few, which agree by chance.
     pub(crate) fn agreement(&self, map: &SurfelMap, fit: &IcpFit) -> f64 {
         let planes = self.planes();
-        match map.target().agreement(planes, &fit.target_from_source) {
+        match map
+            .target()
+            .agreement(planes, &fit.target_from_source, false)
+        {
             [_, ..MIN_POINTS] => 0.0,
             [agreed, count] => agreed as f64 / count as f64,
         }
     }
 
     /// The pose of that registration, if the map confirms it.
-    pub(crate) fn registered(&self, map: &SurfelMap, start: &Isometry3<f64>) -> Option<FoundPose> {
+    fn registered(&self, map: &SurfelMap, start: &Isometry3<f64>) -> Option<FoundPose> {
         let fit = self.fit(map, start)?;
         self.confirms(map, &fit)
             .then(|| found_pose(&fit, map.covariance_scale))
@@ -97,6 +112,15 @@ impl<'a> SweepOnMap<'a> {
         let found = predicted.and_then(|start| self.registered(map, &start));
         times.lap(REGISTER);
         found.map(|found| Localization::new(&Ok(found), times.clone()))
+    }
+
+    /// True unless the ground below the sensor is not that of the map, or is above it: walls fit an upside-down sweep too.
+    /// Not asked near a prediction, which follows from a pose that was: the planes take as long as the registration.
+    pub(crate) fn stands_on(&self, map: &SurfelMap, world_from_sensor: &Isometry3<f64>) -> bool {
+        let (below, above) = self.level_planes();
+        let is_upright = below.len() >= LEAST_LEVEL || above.len() < LEAST_LEVEL;
+        let [agreed, count] = map.target().agreement(&below, world_from_sensor, true);
+        is_upright && (count < LEAST_LEVEL || 2 * agreed >= count)
     }
 
     /// True if enough of the sweep lies on the map.
@@ -121,7 +145,11 @@ impl MapRegistration {
         if map.as_os_str().is_empty() {
             return Ok(localizer);
         }
-        let surfels = SurfelMap::load(map)?;
+        let mut surfels = SurfelMap::load(map)?;
+        // Its bound was fitted to poses that began where a fitted confidence gave their deviation.
+        if !localizer.is_calibrated() {
+            surfels.covariance_scale = None;
+        }
         match (localizer.place(), surfels.place()) {
             (Some(head), place) if !place.is_empty() && place != head => {
                 let problem = format_args!("a surfel map of {place:?}, the head is of {head:?}");
@@ -149,7 +177,10 @@ impl Localize for MapRegistration {
         localization.times.add(REGISTER, registering);
         let published = localization.found.filter(|found| !found.is_rejected);
         if let Some(found) = published {
-            let registered = on_map.registered(&self.map, &found.world_from_sensor);
+            let start = &found.world_from_sensor;
+            let registered = on_map.registered(&self.map, start);
+            let registered =
+                registered.filter(|found| on_map.stands_on(&self.map, &found.world_from_sensor));
             localization = judged(localization, &found, registered);
             localization.times.lap(REGISTER);
         }
@@ -211,9 +242,12 @@ pub(crate) fn found_pose(fit: &IcpFit, covariance_scale: Option<CovarianceScale>
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
+    use perception::weights::annotate;
     use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 
     use super::*;
+    use crate::covariance_scale::COVARIANCE_KEY;
+    use crate::registration::icp::IcpTarget;
     use crate::registration::icp::surfel_map::tests::{stored, yard};
 
     /// A localizer of a place that always finds one pose.
@@ -308,6 +342,41 @@ mod tests {
         assert_eq!(reason, NoPoseReason::LowConfidence);
     }
 
+    /// A yard with its ground at a height above the sensor, metres, and a steep roof, which holds the height without ground.
+    fn yard_with_roof(ground_m: f32) -> Vec<[f32; 4]> {
+        let (ground, walls) = (yard().into_iter().take(6400), yard().into_iter().skip(6400));
+        let roof = (0..6400).map(|k| {
+            let up = (k / 80) as f32 * 0.1;
+            [(k % 80) as f32 * 0.3 - 12.0, up - 10.0, up + 4.0, 0.1]
+        });
+        let ground = ground.map(|[x, y, _, intensity]| [x, y, ground_m, intensity]);
+        ground.chain(walls).chain(roof).collect()
+    }
+
+    #[test]
+    fn a_pose_beside_the_ground_of_the_map_or_below_it_is_not_taken() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("surfels.safetensors");
+        let mut target = IcpTarget::new(&SurfelMap::building(0.5));
+        target.add(&yard_with_roof(-2.0), &Isometry3::identity());
+        target.fit();
+        SurfelMap::write(&file, "yard", &target).unwrap();
+        let map = SurfelMap::load(&file).unwrap();
+        for (ground_m, is_taken) in [(-2.0, true), (-0.5, false), (2.0, false)] {
+            let xyzi = yard_with_roof(ground_m);
+            let cloud = PointCloud { xyzi };
+            let sweep = SweepOnMap::new(&cloud);
+            let found = sweep.registered(&map, &Isometry3::identity()).unwrap();
+            let off_m = found.world_from_sensor.translation.vector.norm();
+            assert!(
+                off_m < 0.05,
+                "{ground_m}: the walls and the roof fit, {off_m} m"
+            );
+            let stands = sweep.stands_on(&map, &found.world_from_sensor);
+            assert_eq!(stands, is_taken, "ground at {ground_m} m");
+        }
+    }
+
     #[test]
     fn a_predicted_pose_that_the_map_confirms_needs_no_localizer() {
         let (_folder, _, truth) = stored();
@@ -317,6 +386,40 @@ mod tests {
         assert!(off_m(&found_near(registration.as_mut(), near), &truth) < 5e-3);
         // A prediction without planes falls back on the localizer, whose pose has no planes either.
         assert_eq!(found_near(registration.as_mut(), elsewhere), found);
+    }
+
+    /// The same localizer without a fitted confidence.
+    #[derive(Debug)]
+    struct Uncalibrated(Fixed);
+
+    impl Localize for Uncalibrated {
+        fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+            self.0.localize(sweep)
+        }
+
+        fn is_calibrated(&self) -> bool {
+            false
+        }
+    }
+
+    #[test]
+    fn behind_a_confidence_that_is_not_fitted_the_scale_of_the_map_is_not_used() {
+        let (_folder, file, truth) = stored();
+        let factors = r#"{"planar":2.0,"height":2.0,"tilt":2.0,"yaw":2.0,"bound":4.0}"#;
+        annotate(&file, COVARIANCE_KEY, factors).unwrap();
+        let (_, found) = registration(truth, 0.9);
+        let fixed = || Fixed {
+            found,
+            place: "yard",
+        };
+        let localizers: [Box<dyn Localize>; 2] =
+            [Box::new(fixed()), Box::new(Uncalibrated(fixed()))];
+        let scaled = localizers.map(|localizer| {
+            let mut registration = MapRegistration::of(localizer, &file).unwrap();
+            let found = found_near(registration.as_mut(), truth);
+            found.covariance_scale.is_some()
+        });
+        assert_eq!(scaled, [true, false]);
     }
 
     #[test]

@@ -4,7 +4,7 @@
 //! the vehicle and a receiver has to give the start.
 
 use crate::Error;
-use crate::sweep_database::present_sweeps;
+use crate::sweep_database::{posed, present_sweeps};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ impl PoseSource for IcpMapPose {
         let Some(start) = input.measured else {
             return NO_SOURCE;
         };
-        let source = IcpSource::of_sweep(&input.cloud.xyzi, &self.config);
+        let source = IcpSource::of_sweep(&input.cloud.xyzi);
         match icp::register(&source, &self.map, &start.isometry(), &self.config) {
             Ok(fit) => {
                 let confidence = fit.overlap.clamp(0.0, 1.0) as f32;
@@ -63,10 +63,10 @@ pub fn check_spacing(spacing_m: f64) -> Result<(), Error> {
 }
 
 /// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path. Sweeps that
-/// cannot be read are left out and counted in `left_out`.
+/// cannot be read or have no pose are left out and counted in `left_out`.
 ///
 /// # Errors
-/// [`Error`] names the drive that cannot be opened, or of which no sweep has a pose; or the distance is not valid.
+/// [`Error`] names the drive that cannot be opened, or all drives if no sweep has a pose; or the distance is not valid.
 pub fn read_map(
     folders: &[impl AsRef<Path>],
     spacing_m: f64,
@@ -75,8 +75,8 @@ pub fn read_map(
 ) -> Result<IcpTarget, Error> {
     check_spacing(spacing_m)?;
     let mut map = IcpTarget::new(config);
+    let mut sweeps = 0;
     for folder in folders {
-        let mut sweeps = 0;
         let drives = dataset::open(folder.as_ref())?;
         left_out.add_files(&drives.problems);
         for scenario in drives.scenarios {
@@ -85,13 +85,12 @@ pub fn read_map(
                 // Only the pose at first: points of sweeps that are not used need not be read.
                 let without_points = LoadOptions::without_points();
                 let mut load = |options: &LoadOptions| {
-                    let frame = scenario.load(agent, tick, options);
-                    frame
+                    let sweep = posed(&scenario, agent, tick, options);
+                    sweep
                         .map_err(|error| left_out.add_unreadable(agent, Problem::from(&error)))
                         .ok()
                 };
-                let Some(pose) = load(&without_points).and_then(|frame| frame.world_from_lidar)
-                else {
+                let Some((_, pose)) = load(&without_points) else {
                     continue;
                 };
                 let pose = pose.isometry();
@@ -100,7 +99,7 @@ pub fn read_map(
                     .filter(|(of, _)| *of == agent)
                     .map(|(_, last)| (last.translation.vector - pose.translation.vector).norm());
                 if way_m.is_none_or(|way_m| way_m >= spacing_m)
-                    && let Some(frame) = load(&LoadOptions::default())
+                    && let Some((frame, _)) = load(&LoadOptions::default())
                 {
                     map.add(&frame.points.xyzi, &pose);
                     last = Some((agent, pose));
@@ -108,17 +107,10 @@ pub fn read_map(
                 }
             }
         }
-        if sweeps == 0 {
-            let folder = folder.as_ref().display();
-            let reasons = left_out.reasons();
-            let because = match reasons.is_empty() {
-                true => "",
-                false => "; left out: ",
-            };
-            return Err(Error::Input(format!(
-                "{folder}: no sweep has a true pose to put it on the map with{because}{reasons}"
-            )));
-        }
+    }
+    if sweeps == 0 {
+        let folders = folders.iter().map(|folder| folder.as_ref().to_owned());
+        return Err(Error::NoSweeps(folders.collect(), left_out.reasons()));
     }
     map.fit();
     Ok(map)
@@ -127,6 +119,7 @@ pub fn read_map(
 #[cfg(test)]
 mod tests {
     use protocol::{CavId, PointCloud, Pose};
+    use simulator::generate::{Subset, SynthOptions, generate};
 
     use super::*;
 
@@ -155,6 +148,38 @@ mod tests {
         PointCloud {
             xyzi: ground.chain(wall).collect(),
         }
+    }
+
+    #[test]
+    fn sweeps_without_a_pose_are_named_and_fail_only_where_there_are_no_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let [without, with] = ["without", "with"].map(|name| {
+            let out = folder.path().join(name);
+            let options = SynthOptions {
+                frames: 2,
+                ..SynthOptions::new(Subset::Town1loc, 11, out.clone())
+            };
+            generate(&options, &|_| {}).unwrap();
+            out
+        });
+        let scenario = dataset::open(&without).unwrap().scenarios.swap_remove(0);
+        for tick in 0..2 {
+            let points = scenario.points_path(0, tick, None).unwrap();
+            let file = points.with_extension("yaml");
+            let text = std::fs::read_to_string(&file).unwrap();
+            std::fs::write(&file, text.replace("lidar_pose", "other_pose")).unwrap();
+        }
+        let config = IcpConfig::default();
+        let mut left_out = LeftOut::default();
+        let map = read_map(&[&without, &with], 0.0, &config, &mut left_out).unwrap();
+        assert!(map.planes() > 0 && left_out.ticks == 2, "{left_out}");
+        let problems = left_out.reasons();
+        assert!(
+            problems.contains("there is no pose for this sweep"),
+            "{problems}"
+        );
+        let none = read_map(&[&without], 0.0, &config, &mut left_out).unwrap_err();
+        assert!(matches!(none, Error::NoSweeps(..)), "{none}");
     }
 
     #[test]

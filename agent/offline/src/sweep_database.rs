@@ -3,10 +3,11 @@
 use crate::{Error, Result};
 use std::path::PathBuf;
 
+use dataset::frame::Frame;
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use localization::pgc::LocalizerError;
 use nalgebra::Isometry3;
-use protocol::PointCloud;
+use protocol::{PointCloud, Pose};
 
 /// Descriptor and pose of each sweep of the drives that `describe` gives a descriptor; `progress` gets the number of
 /// sweeps done and of all. Sweeps that cannot be read or have no pose are left out and counted in `left_out`.
@@ -31,13 +32,12 @@ pub fn described_sweeps<D, E: Into<LocalizerError>>(
     let mut sweeps = Vec::new();
     for (place, &(scenario, (agent, tick))) in all.iter().enumerate() {
         progress(place + 1, all.len());
-        match posed(scenario, agent, tick) {
-            Ok((cloud, pose)) => {
-                let described = describe(&cloud).map_err(Into::into)?;
-                sweeps.extend(described.map(|described| (described, pose)));
+        match posed(scenario, agent, tick, &LoadOptions::default()) {
+            Ok((frame, pose)) => {
+                let described = describe(&frame.points).map_err(Into::into)?;
+                sweeps.extend(described.map(|described| (described, pose.isometry())));
             }
-            Err(Error::Read(error)) => left_out.add_unreadable(agent, Problem::from(&error)),
-            Err(error) => return Err(error),
+            Err(error) => left_out.add_unreadable(agent, Problem::from(&error)),
         }
     }
     match sweeps.is_empty() {
@@ -53,12 +53,20 @@ pub(crate) fn present_sweeps(scenario: &Scenario) -> impl Iterator<Item = (usize
     all.filter(move |&(agent, tick)| scenario.is_present(agent, tick))
 }
 
-/// Points and true pose of a sweep.
-fn posed(scenario: &Scenario, agent: usize, tick: usize) -> Result<(PointCloud, Isometry3<f64>)> {
-    let frame = scenario.load(agent, tick, &LoadOptions::default())?;
+/// A sweep and its true pose.
+pub(crate) fn posed(
+    scenario: &Scenario,
+    agent: usize,
+    tick: usize,
+    options: &LoadOptions,
+) -> Result<(Frame, Pose), ReadError> {
+    let frame = scenario.load(agent, tick, options)?;
     let Some(pose) = frame.world_from_lidar else {
         let path = scenario.points_path(agent, tick, None)?;
-        return Err(ReadError::malformed(&path, "there is no pose for this sweep").into());
+        return Err(ReadError::malformed(
+            &path,
+            "there is no pose for this sweep",
+        ));
     };
-    Ok((frame.points, pose.isometry()))
+    Ok((frame, pose))
 }

@@ -146,7 +146,7 @@ impl AgentLoop {
             let attack = Attack::new(falsification, agent.cav(), 0);
             agent = agent.with_attack(Some(attack));
         }
-        agent.has_head = options.needs_head() || agent.falsifies();
+        agent.has_head = options.needs_head() || agent.attack.is_some();
         Self {
             pairing: SweepPairing::new(POSE_TIMEOUT_NANOS),
             selection: PaceSelection::of(&options.egos),
@@ -178,7 +178,9 @@ impl AgentLoop {
 
     /// Passes on the last messages of another vehicle, which an attack may replay.
     pub fn capture(&mut self, captured: impl FnOnce() -> CapturedMessages) {
-        self.agent.capture(captured);
+        if let Some(attack) = &mut self.agent.attack {
+            attack.capture(captured());
+        }
     }
 
     /// Takes an input in at `now_nanos`, which does not decrease. Only [`LoopInput::Wake`] computes, and one step at most:

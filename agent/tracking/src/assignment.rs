@@ -49,13 +49,6 @@ struct AssignmentSolver<'a> {
     column_of: Vec<Option<usize>>,
 }
 
-/// Cheapest paths from a free row to the columns.
-struct Paths {
-    cost: Vec<f64>,
-    from_row: Vec<usize>,
-    is_final: Vec<bool>,
-}
-
 impl<'a> AssignmentSolver<'a> {
     fn new(costs: &'a DMatrix<f64>) -> Self {
         let (rows, columns) = costs.shape();
@@ -80,20 +73,30 @@ impl<'a> AssignmentSolver<'a> {
     /// Connects a free row, with other columns for other rows where that is cheaper.
     fn connect(&mut self, free_row: usize) {
         let columns = self.costs.ncols();
-        let mut paths = Paths {
-            cost: vec![f64::INFINITY; columns],
-            from_row: vec![free_row; columns],
-            is_final: vec![false; columns],
-        };
+        // Cheapest paths from the free row to the columns.
+        let mut path_cost = vec![f64::INFINITY; columns];
+        let mut from_row = vec![free_row; columns];
+        let mut is_final = vec![false; columns];
         // Step: cheapest path to a free column, by Dijkstra's algorithm on the reduced costs.
         let (mut row, mut reached) = (free_row, 0.0);
         let end = loop {
-            let Some(nearest) = self.extend(&mut paths, row, reached) else {
-                // Only costs that are not finite reach no column.
-                return;
-            };
-            reached = paths.cost[nearest];
-            paths.is_final[nearest] = true;
+            // Extends the paths by the edges of the row; finds the cheapest column that is not final.
+            let (mut nearest, mut lowest) = (None, f64::INFINITY);
+            for column in (0..columns).filter(|&column| !is_final[column]) {
+                let reduced =
+                    self.costs[(row, column)] - self.row_price[row] - self.column_price[column];
+                if reached + reduced < path_cost[column] {
+                    path_cost[column] = reached + reduced;
+                    from_row[column] = row;
+                }
+                if path_cost[column] < lowest {
+                    (nearest, lowest) = (Some(column), path_cost[column]);
+                }
+            }
+            // Only costs that are not finite reach no column.
+            let Some(nearest) = nearest else { return };
+            reached = lowest;
+            is_final[nearest] = true;
             match self.row_of[nearest] {
                 Some(owner) => row = owner,
                 None => break nearest,
@@ -101,40 +104,19 @@ impl<'a> AssignmentSolver<'a> {
         };
         // Step: prices that keep reduced costs non-negative and those of pairs at zero.
         self.row_price[free_row] += reached;
-        for column in (0..columns).filter(|&column| paths.is_final[column]) {
+        for column in (0..columns).filter(|&column| is_final[column]) {
             if let Some(owner) = self.row_of[column] {
-                self.row_price[owner] += reached - paths.cost[column];
-                self.column_price[column] -= reached - paths.cost[column];
+                self.row_price[owner] += reached - path_cost[column];
+                self.column_price[column] -= reached - path_cost[column];
             }
         }
         // Step: back along the path, each row gives up its column for the next one.
         let mut next = Some(end);
         while let Some(column) = next {
-            let row = paths.from_row[column];
+            let row = from_row[column];
             self.row_of[column] = Some(row);
             next = self.column_of[row].replace(column);
         }
-    }
-
-    /// Extends the paths by the edges of a row that is reached at a cost; returns the cheapest column that is not final.
-    fn extend(&self, paths: &mut Paths, row: usize, reached: f64) -> Option<usize> {
-        let mut nearest = None;
-        let mut lowest = f64::INFINITY;
-        for column in 0..self.costs.ncols() {
-            if paths.is_final[column] {
-                continue;
-            }
-            let reduced =
-                self.costs[(row, column)] - self.row_price[row] - self.column_price[column];
-            if reached + reduced < paths.cost[column] {
-                paths.cost[column] = reached + reduced;
-                paths.from_row[column] = row;
-            }
-            if paths.cost[column] < lowest {
-                (nearest, lowest) = (Some(column), paths.cost[column]);
-            }
-        }
-        nearest
     }
 }
 

@@ -62,13 +62,8 @@ impl ConstantVelocity {
             elapsed_s.powi(3) / 2.0,
             elapsed_s.powi(2),
         ];
-        let mut noise = Matrix4::zeros();
-        for axis in 0..2 {
-            noise[(axis, axis)] = of_position * variance;
-            noise[(axis, axis + 2)] = mixed * variance;
-            noise[(axis + 2, axis)] = mixed * variance;
-            noise[(axis + 2, axis + 2)] = of_velocity * variance;
-        }
+        let of_axis = Matrix2::new(of_position, mixed, mixed, of_velocity) * variance;
+        let noise = of_axis.kronecker(&Matrix2::identity());
         self.state = transition * self.state;
         self.covariance = transition * self.covariance * transition.transpose() + noise;
     }

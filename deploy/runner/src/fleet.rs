@@ -76,15 +76,16 @@ fn load_models(scenario: &Scenario) -> Result<DetectorConfig> {
     Ok(detector)
 }
 
-/// Refuses pose sources that need measured poses, of vehicles of which the recorded scenario has none.
+/// Refuses pose sources that need measured poses, of vehicles of which the recorded scenario has none at any tick.
 fn check_poses(scenario: &Scenario, recorded: &Recorded, agents: &[CavId]) -> Result<()> {
-    let (name, seek) = (&recorded.name, scenario.scene.seek);
+    let (name, ticks) = (&recorded.name, scenario.scene.seek..recorded.ticks.len());
     for cav in agents {
         let pose = scenario.settings_of(cav).pose;
         let place = recorded.agents.iter().position(|known| known == cav);
         ensure!(
             !pose.needs_measured_pose()
-                || place.is_none_or(|place| recorded.has_poses(place, seek)),
+                || place
+                    .is_none_or(|place| ticks.clone().any(|tick| recorded.has_poses(place, tick))),
             "vehicle {cav}: pose is {}, but scenario {name} has no poses of it (no lidar_pose); choose pose: pgc, \
              which finds them",
             pose.name()
@@ -118,7 +119,7 @@ impl Fleet {
             );
         }
         let protocol = scenario.protocol.resolve(dataset.layout);
-        let protocol = protocol.map_err(|error| anyhow!("protocol: {error}"))?;
+        let mut protocol = protocol.map_err(|error| anyhow!("protocol: {error}"))?;
         let recorded = scenario_of(&dataset.scenarios, scene)?;
         // Refuses vehicles that the recorded scenario does not have.
         let in_scene = scene.agents.iter().map(|cav| ("scene.agents", cav));
@@ -131,10 +132,21 @@ impl Fleet {
             let (name, found) = (&recorded.name, texts(&recorded.agents));
             bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
         }
-        // An empty list stands for all vehicles of the scenario.
+        // An empty list stands for the agents of the protocol; an ego that is named takes part too.
+        let arranged = protocol.arrange(recorded).map(|arranged| arranged.agents);
+        let named = match &scene.agents[..] {
+            [] => arranged.unwrap_or_default(),
+            named => named.to_vec(),
+        };
         let mut agents = recorded.agents.clone();
-        agents.retain(|cav| scene.agents.is_empty() || scene.agents.contains(cav));
-        let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
+        agents.retain(|cav| named.contains(cav) || scenario.ego.id.as_ref() == Some(cav));
+        // What is printed is what runs, also where more are named.
+        protocol.max_agents = protocol.max_agents.max(agents.len());
+        let ego = scenario.ego.id.clone().or_else(|| agents.first().cloned());
+        let ego = ego.with_context(|| {
+            let (name, found) = (&protocol.name, texts(&recorded.agents));
+            format!("protocol {name}: none of the agents {found:?} is of a kind that takes part")
+        })?;
         check_poses(&scenario, recorded, &agents)?;
         let scene = &mut scenario.scene;
         // No underflow: scenario_of has refused a seek beyond the last tick.

@@ -13,7 +13,8 @@ use serde::Serialize;
 
 /// The files; the first error of writing is kept.
 pub(crate) struct FrameLines {
-    folder: PathBuf,
+    /// Their folder.
+    pub(crate) folder: PathBuf,
     detections: BufWriter<File>,
     truth: BufWriter<File>,
     /// Created with the first tracks.

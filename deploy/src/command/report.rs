@@ -6,7 +6,7 @@ use crate::operate::status::RunStatus;
 use crate::report::{Comparison, RunReport, TrackReport, track_table};
 use serde::Serialize;
 use support::cli::{BadInput, Outcome};
-use support::file_error::FileError;
+use support::file_error::Result;
 use support::output;
 
 #[derive(Debug, clap::Args)]
@@ -33,20 +33,25 @@ impl Arguments {
         let runs = self.named.iter().cloned().map(Some).chain(newest);
         let folders = runs.map(|run| RunStatus::folder(run, &self.runs).map_err(BadInput::of));
         let folders = folders.collect::<Result<Vec<_>, _>>()?;
-        match (self.tracks, self.json, &folders[..]) {
-            (true, true, folders) => print_json(&read(folders, TrackReport::read)?)?,
-            (true, false, folders) => {
-                output::text(track_table(&read(folders, TrackReport::read)?))?
+        if self.tracks {
+            let reports = read(&folders, TrackReport::read)?;
+            match self.json {
+                true => print_json(&reports)?,
+                false => output::text(track_table(&reports))?,
             }
-            (false, true, folders) => print_json(&read(folders, RunReport::read)?)?,
-            (false, false, [folder]) => {
+            let is_lossy = reports.iter().any(TrackReport::has_left_out_ticks);
+            return Ok(Outcome::of(is_lossy));
+        }
+        match (self.json, &folders[..]) {
+            (true, folders) => print_json(&read(folders, RunReport::read)?)?,
+            (false, [folder]) => {
                 let report = RunReport::read(folder).map_err(BadInput::of)?;
                 output::text(format_args!(
                     "run       {}, {} with {} poses, {} clock\n{report}",
                     report.run, report.method, report.pose_source, report.clock
                 ))?;
             }
-            (false, false, several) => {
+            (false, several) => {
                 output::text(Comparison::read(several).map_err(BadInput::of)?)?;
             }
         }
@@ -55,10 +60,7 @@ impl Arguments {
 }
 
 /// Reads the reports of some runs.
-fn read<T>(
-    folders: &[PathBuf],
-    read: impl Fn(&Path) -> Result<T, FileError>,
-) -> Result<Vec<T>, BadInput> {
+fn read<T>(folders: &[PathBuf], read: impl Fn(&Path) -> Result<T>) -> Result<Vec<T>, BadInput> {
     let reports = folders.iter().map(|folder| read(folder));
     reports.collect::<Result<_, _>>().map_err(BadInput::of)
 }

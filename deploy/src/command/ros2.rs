@@ -55,7 +55,7 @@ struct NetworkOptions {
     namespace: Option<RosName>,
     /// Distribution of the other nodes: humble writes no type hashes into keys; jazzy stands for all later ones.
     #[arg(long, value_enum, default_value_t)]
-    distro: Distro,
+    distro: Distribution,
 }
 
 /// Published messages.
@@ -106,16 +106,6 @@ struct Sensors {
     starting_pose: Vec<AgentTopic>,
 }
 
-/// Distributions of ROS 2 by what their rmw_zenoh writes into keys.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
-enum Distro {
-    /// Without type hashes.
-    Humble,
-    /// With type hashes.
-    #[default]
-    Jazzy,
-}
-
 impl Arguments {
     /// Connects the run with the ROS 2 network until Ctrl-C.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
@@ -137,10 +127,7 @@ impl Arguments {
             session,
             domain_id,
             self.network.namespace.clone(),
-            match self.network.distro {
-                Distro::Humble => Distribution::Humble,
-                Distro::Jazzy => Distribution::Jazzy,
-            },
+            self.network.distro,
         )?;
         output::note(format_args!(
             "run {} on domain {domain_id} of the ROS 2 network at {router} (Ctrl-C ends it)",

@@ -83,7 +83,7 @@ impl Arguments {
         // Before the session opens, whose threads it watches.
         router_panic::watch(&stop);
         let session = open(&options)?;
-        let endpoint = options.endpoint();
+        let endpoint = &options.endpoint;
         output::note(format_args!("routing at {endpoint} (Ctrl-C ends it)"));
         let mut reporter = self.reporter(&options);
         let mut report_at = Instant::now() + REPORT_ROUND;
@@ -128,7 +128,7 @@ impl Arguments {
         });
         let guard = options.guard.as_ref();
         Reporter {
-            log: guard.map(|_| RejectionLog::of(options.endpoint())),
+            log: guard.map(|_| RejectionLog::of(&options.endpoint)),
             refused: BTreeMap::new(),
             file,
         }
@@ -137,7 +137,7 @@ impl Arguments {
     /// A second session that has to receive what the router's own publishes; `None`, with a warning, if the router cannot
     /// be reached at its address.
     fn probe(&self, router: &Session, options: &BusOptions) -> Option<RouterProbe> {
-        let probe = from_here(options.endpoint()).and_then(|endpoint| {
+        let probe = from_here(&options.endpoint).and_then(|endpoint| {
             let client = BusOptions {
                 connect_timeout: PROBE_LIMIT,
                 credentials: options.credentials.clone(),

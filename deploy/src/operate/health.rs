@@ -34,7 +34,6 @@ pub enum State {
     /// Running, but without a report for a while.
     Silent,
     /// Crashed, about to be restarted.
-    #[serde(rename = "fallen")]
     Crashed,
     /// Ended as expected.
     Ended,
@@ -56,7 +55,7 @@ pub struct ProcessStatus {
     /// Number of restarts.
     pub restarts: u32,
     /// Description of its last crash.
-    pub last_fall: Option<String>,
+    pub last_exit: Option<String>,
     /// Description of its failure, for a process that has failed in its task.
     pub failure: Option<String>,
     /// Problems that it reports while it runs.
@@ -125,12 +124,12 @@ impl Health {
             }
             ProcessEventKind::Crashed { how, restart, .. } => {
                 (status.state, status.pid, status.restarts) = (State::Crashed, None, *restart);
-                status.last_fall = Some(how.clone());
+                status.last_exit = Some(how.clone());
             }
             ProcessEventKind::Logged { .. } => {}
             ProcessEventKind::GaveUp { how, .. } | ProcessEventKind::Failed { how } => {
                 (status.state, status.pid) = (State::Down, None);
-                status.last_fall = Some(how.clone());
+                status.last_exit = Some(how.clone());
             }
             ProcessEventKind::Done { .. } => (status.state, status.pid) = (State::Ended, None),
         }
@@ -200,14 +199,14 @@ impl Health {
     /// Processes that crashed at least once.
     pub(crate) fn crashed(&self) -> Vec<String> {
         let statuses = self.processes.values().map(|noted| &noted.status);
-        let crashed = statuses.filter(|status| status.last_fall.is_some());
+        let crashed = statuses.filter(|status| status.last_exit.is_some());
         crashed.map(|status| status.name.clone()).collect()
     }
 
     /// Ends of processes that were unexpected, as text: `agent-4288 was ended by signal 9`.
     pub(crate) fn ends(&self) -> Vec<String> {
         let ends = self.processes.iter().filter_map(|(name, noted)| {
-            let how = noted.status.last_fall.as_ref()?;
+            let how = noted.status.last_exit.as_ref()?;
             let times = match noted.status.restarts {
                 0 | 1 => String::new(),
                 restarts => format!(", restarted {restarts} times"),
@@ -352,7 +351,7 @@ mod tests {
         );
         let status = health.statuses(&Progress::default(), began).remove(0);
         assert_eq!(
-            (status.state, status.restarts, status.last_fall.as_deref()),
+            (status.state, status.restarts, status.last_exit.as_deref()),
             (State::Crashed, 1, Some("hung"))
         );
     }

@@ -87,7 +87,7 @@ impl RouterEndpoint {
         let options = as_scorer(BusOptions::client(from_here(endpoint)?), keys)?;
         Ok(Self {
             session: open_unless(stop, &options)?,
-            endpoint: options.endpoint().clone(),
+            endpoint: options.endpoint,
         })
     }
 
@@ -97,7 +97,7 @@ impl RouterEndpoint {
         let options = BusOptions::client(self.endpoint.clone());
         let reports = Key::stats(run, &process_id(Role::Scorer, &scorer_cav()));
         let probe = as_scorer(options, keys)
-            .and_then(|options| RouterProbe::of_key(&options, &KeyExpr::one(&reports)));
+            .and_then(|options| RouterProbe::of_key(&options, KeyExpr::one(&reports).as_str()));
         probe
             .inspect_err(|error| tracing::warn!("the router is not watched: {error}"))
             .ok()
@@ -159,7 +159,7 @@ fn free_endpoint(listen: &str, has_keys: bool) -> Result<Endpoint, BusError> {
         // If another program takes the port in between, the router's log has the error.
         (Ok(free), Some(place)) => Endpoint::new(&format!("{place}:{}", free.port())),
         (Err(error), _) if error.kind() == ErrorKind::AddrInUse => {
-            Err(BusError::PortInUse { endpoint })
+            Err(BusError::PortInUse(endpoint))
         }
         // What else is wrong with an address the router says.
         _ => Ok(endpoint),

@@ -8,8 +8,9 @@ use std::{fs, io};
 use protocol::RunId;
 use serde::Serialize;
 use support::atomic_file;
+use support::cli::BadInput;
 use support::csv_file::CsvText;
-use support::file_error::{AtFile, FileError};
+use support::file_error::{AtFile, FileError, check_folder};
 use time::UtcDateTime;
 
 use crate::score::{FrameRecord, ms_between};
@@ -20,6 +21,9 @@ pub enum RunFolderError {
     /// A run of that name has a folder already.
     #[error("{} exists already: choose another --name, or remove it", .0.display())]
     Taken(PathBuf),
+    /// A file has the name of the folder of the run folders.
+    #[error("--runs {0}")]
+    NoFolder(#[source] BadInput),
     /// A file or folder cannot be written.
     #[error("cannot write {0}")]
     Write(#[source] FileError),
@@ -49,6 +53,7 @@ impl RunFolder {
     /// # Errors
     /// [`RunFolderError`] when it is there already or cannot be created.
     pub fn create(runs: &Path, name: &RunId) -> Result<Self, RunFolderError> {
+        check_folder(runs).map_err(|error| RunFolderError::NoFolder(BadInput::of(error)))?;
         let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
         let path = runs.join(name.as_str());
         written(atomic_file::create_folder(&runs), &runs)?;
@@ -245,6 +250,20 @@ mod tests {
         assert!(error.contains("r1 exists already"), "{error}");
         folder.remove();
         RunFolder::create(&runs.path().join("deeper"), &name).unwrap();
+    }
+
+    #[test]
+    fn a_file_in_place_of_the_folder_of_runs_is_bad_input() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("base.yaml");
+        fs::write(&file, "").unwrap();
+        let error = RunFolder::create(&file, &RunId::new("r1").unwrap()).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            format!("--runs {}: is a file, must be a folder", file.display())
+        );
+        let source = std::error::Error::source(&error).unwrap();
+        assert!(source.is::<BadInput>());
     }
 
     #[test]

@@ -64,8 +64,10 @@ impl RunKeys {
 pub(crate) fn guarded(options: BusOptions, folder: &Path, runs: RunScope) -> Result<BusOptions> {
     let credentials = credentials(folder, ROUTER)?;
     let members = credentials.members()?;
-    let options = options.with_credentials(credentials);
-    Ok(options.with_access_control(AccessControl { members, runs }))
+    Ok(BusOptions {
+        guard: Some(AccessControl { members, runs }),
+        ..options.with_credentials(credentials)
+    })
 }
 
 /// Credentials in a folder, of the process of that name.

@@ -263,7 +263,7 @@ pub(super) fn table_with_note(texts: &[&str], numbers: &[&str], note: &str) -> T
 fn why(process: &ProcessStatus) -> Option<String> {
     let problems = (!process.problems.is_empty()).then(|| process.problems.join("; "));
     let failure = process.failure.clone().or(problems);
-    failure.or_else(|| process.last_fall.clone())
+    failure.or_else(|| process.last_exit.clone())
 }
 
 /// Name of a value as in the file.
@@ -379,7 +379,7 @@ mod tests {
             pid: Some(77),
             up_s: 12.3,
             restarts: 2,
-            last_fall: Some("was ended by signal 9".into()),
+            last_exit: Some("was ended by signal 9".into()),
             failure: (state == State::Failing).then(|| "recording cut".into()),
             problems: vec![],
             silent_s: Some(0.2),

@@ -3,6 +3,8 @@
 use std::fmt;
 use std::path::Path;
 
+use bus::config_file;
+use serde_json::{Value, json};
 use support::file_error::FileError;
 use terminal::text_table::{Side, TextTable, number};
 
@@ -10,9 +12,9 @@ use super::{RunReport, read_json};
 use crate::operate::progress::bytes;
 use crate::score::metrics::{self, Metrics};
 
-/// Runs that are compared.
+/// Runs that are compared, each with its conditions.
 #[derive(Debug)]
-pub struct Comparison(Vec<(RunReport, Metrics)>);
+pub struct Comparison(Vec<(RunReport, Metrics, Value)>);
 
 /// Name of a quantity, and its value in a run.
 type ReportRow = (&'static str, fn(&RunReport, &Metrics) -> String);
@@ -55,34 +57,65 @@ const ROWS: [ReportRow; 16] = [
     }),
 ];
 
+/// What the precisions of a run depend on besides its settings.
+fn conditions(folder: &Path, metrics: &Metrics) -> Result<Value, FileError> {
+    let scenario: Value = config_file::read(&folder.join("scenario.yaml"))?;
+    let data = metrics.provenance.as_ref().map(|of| &of.data_sha256);
+    let (ego, ticks, protocol) = (&scenario["ego"]["id"], metrics.ticks, &metrics.protocol);
+    Ok(json!({"SHA-256 of the data": data, "ego": ego, "protocol": protocol, "ticks": ticks}))
+}
+
 impl Comparison {
-    /// Reads report and metrics in the folders of runs.
+    /// Reads report, metrics and conditions in the folders of runs.
     ///
     /// # Errors
     /// [`FileError`] as that of [`RunReport::read`].
     pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, FileError> {
         let runs = folders.iter().map(|folder| {
-            let metrics = read_json(folder.as_ref().join(metrics::FILE));
-            Ok((RunReport::read(folder.as_ref())?, metrics?))
+            let report = RunReport::read(folder.as_ref())?;
+            let metrics = read_json(folder.as_ref().join(metrics::FILE))?;
+            let conditions = conditions(folder.as_ref(), &metrics)?;
+            Ok((report, metrics, conditions))
         });
         runs.collect::<Result<_, _>>().map(Self)
+    }
+
+    /// Adds a line for each field of some values, one of each run, that differs.
+    fn add_differences(&self, name: &str, values: &[&Value], lines: &mut Vec<String>) {
+        if let Some(Value::Object(fields)) = values.first() {
+            for field in fields.keys() {
+                let values: Vec<&Value> = values.iter().map(|of| &of[field]).collect();
+                self.add_differences(&format!("{name} {field}"), &values, lines);
+            }
+        } else if values.windows(2).any(|pair| pair[0] != pair[1]) {
+            let runs = self.0.iter().zip(values);
+            let values = runs.map(|((report, ..), value)| format!("{} {value}", report.run));
+            let values: Vec<String> = values.collect();
+            lines.push(format!("Runs differ in{name}: {}", values.join(", ")));
+        }
     }
 }
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let runs = self.0.iter();
-        let runs = runs.map(|(report, _)| (report.run.as_str(), Side::Right));
+        let runs = runs.map(|(report, ..)| (report.run.as_str(), Side::Right));
         let mut table = TextTable::new([("run", Side::Left)].into_iter().chain(runs));
         for (name, value) in ROWS {
             let runs = self.0.iter();
-            let values = runs.map(|(report, metrics)| value(report, metrics));
+            let values = runs.map(|(report, metrics, _)| value(report, metrics));
             table.row([name.to_owned()].into_iter().chain(values));
         }
         write!(f, "{table}")?;
-        let mut answered = self.0.iter().map(|(_, metrics)| metrics.answered);
+        let conditions: Vec<&Value> = self.0.iter().map(|(.., of)| of).collect();
+        let mut differences = Vec::new();
+        self.add_differences("", &conditions, &mut differences);
+        let mut answered = self.0.iter().map(|(_, metrics, _)| metrics.answered);
         let first = answered.next();
-        if answered.any(|answered| Some(answered) != first) {
+        if !differences.is_empty() {
+            let hint = "The precisions of these runs cannot be compared.";
+            writeln!(f, "\n{}\n{hint}", differences.join("\n"))?;
+        } else if answered.any(|answered| Some(answered) != first) {
             let hint =
                 "Runs answered different numbers of ticks: compare \"AP@0.5 all\" and sAP@0.5.";
             writeln!(f, "\n{hint}")?;

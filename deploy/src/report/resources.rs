@@ -46,7 +46,6 @@ pub struct ProcessResources {
     /// tick, milliseconds.
     pub cpu_ms_per_frame: Option<f64>,
     /// Time of the stages that compute, per frame, milliseconds: on an idle machine the CPU time that a stage names.
-    #[serde(default)]
     pub stages_ms_per_frame: Option<f64>,
     /// CPU time from the first tick on by thread, the largest first, and that of threads that have ended: the sum is
     /// `cpu_ms_per_frame`.

@@ -1,4 +1,6 @@
+use dataset::evaluation_protocol::{ApOrder, EvaluationProtocol};
 use protocol::{Ledger, ProcessUsage, StageSummary, ThreadUsage, TopicTraffic};
+use support::provenance::Provenance;
 
 use super::*;
 use crate::score::StageStamps;
@@ -263,28 +265,31 @@ fn a_run_without_processes_has_pace_and_latency_only() {
     insta::assert_snapshot!(text);
 }
 
+/// Writes report, metrics and scenario of a run of this name.
+fn write_run(folder: &Path, metrics: &Metrics, scenario: &str) {
+    std::fs::create_dir(folder).unwrap();
+    let report = RunReport {
+        run: folder.file_name().unwrap().to_string_lossy().into_owned(),
+        ..report()
+    };
+    let report = serde_json::to_string(&report).unwrap();
+    std::fs::write(folder.join(FILE), report).unwrap();
+    let metrics = serde_json::to_string(metrics).unwrap();
+    std::fs::write(folder.join(crate::score::metrics::FILE), metrics).unwrap();
+    std::fs::write(folder.join("scenario.yaml"), scenario).unwrap();
+}
+
 #[test]
 fn runs_are_compared_column_by_column() {
     let runs = tempfile::tempdir().unwrap();
     let folders = ["one", "two"].map(|name| runs.path().join(name));
     for (folder, answered) in folders.iter().zip([3, 4]) {
-        std::fs::create_dir(folder).unwrap();
-        let name = folder.file_name().unwrap().to_string_lossy().into_owned();
-        let report = RunReport {
-            run: name,
-            ..report()
-        };
         let metrics = Metrics {
             ticks: 4,
             answered,
             ..metrics("pastat")
         };
-        std::fs::write(folder.join(FILE), serde_json::to_string(&report).unwrap()).unwrap();
-        std::fs::write(
-            folder.join(crate::score::metrics::FILE),
-            serde_json::to_string(&metrics).unwrap(),
-        )
-        .unwrap();
+        write_run(folder, &metrics, "ego: {id: '7'}");
     }
     let text = Comparison::read(&folders).unwrap().to_string();
     insta::assert_snapshot!(text);
@@ -292,4 +297,65 @@ fn runs_are_compared_column_by_column() {
     std::fs::remove_file(folders[1].join(crate::score::metrics::FILE)).unwrap();
     let message = Comparison::read(&folders).unwrap_err().to_string();
     assert!(message.contains("two/metrics.json"), "{message}");
+}
+
+#[test]
+fn what_differs_between_runs_whose_precisions_cannot_be_compared_is_named() {
+    let runs = tempfile::tempdir().unwrap();
+    let folders = ["one", "two", "three"].map(|name| runs.path().join(name));
+    let protocol = EvaluationProtocol::preset("opv2v").unwrap();
+    let narrow = EvaluationProtocol {
+        max_agents: 2,
+        ap_order: ApOrder::Frame,
+        ..protocol.clone()
+    };
+    let conditions = [
+        (4, Some(narrow), "aa", "ego: {id: '7'}"),
+        (4, Some(protocol), "aa", "ego: {id: '7'}"),
+        (
+            12,
+            None,
+            "bb",
+            "scene: {dir: a}\nego: {id: '8', trust: true}",
+        ),
+    ];
+    for (folder, (ticks, protocol, data, scenario)) in folders.iter().zip(conditions) {
+        let provenance = Provenance {
+            data_sha256: data.into(),
+            ..Provenance::default()
+        };
+        let metrics = Metrics {
+            ticks,
+            answered: ticks,
+            protocol,
+            provenance: Some(provenance),
+            ..metrics("pastat")
+        };
+        write_run(folder, &metrics, scenario);
+    }
+    let notes_of = |folders: &[PathBuf]| {
+        let text = Comparison::read(folders).unwrap().to_string();
+        let notes = text.split_once("\n\n").map(|(_, notes)| notes.to_owned());
+        notes.unwrap_or_default()
+    };
+    assert_eq!(notes_of(&folders[..1]), "");
+    assert_eq!(
+        notes_of(&folders[..2]),
+        "Runs differ in protocol ap_order: one \"frame\", two \"global\"\n\
+         Runs differ in protocol max_agents: one 2, two 7\n\
+         The precisions of these runs cannot be compared.\n"
+    );
+    let notes = notes_of(&folders[1..]);
+    assert!(notes.contains(", three null\n"), "no protocol: {notes}");
+    for line in [
+        "Runs differ in SHA-256 of the data: two \"aa\", three \"bb\"\n",
+        "Runs differ in ego: two \"7\", three \"8\"\n",
+        "Runs differ in ticks: two 4, three 12\n",
+    ] {
+        assert!(notes.contains(line), "{line}: {notes}");
+    }
+    assert!(!notes.contains("AP@0.5 all"), "{notes}");
+    std::fs::write(folders[0].join("scenario.yaml"), "ego: [").unwrap();
+    let message = Comparison::read(&folders).unwrap_err().to_string();
+    assert!(message.contains("one/scenario.yaml"), "{message}");
 }

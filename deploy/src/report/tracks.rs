@@ -40,6 +40,8 @@ pub struct TrackReport {
     pub without_pose: usize,
     /// Results without a line in `truth.jsonl`, which are left out.
     pub without_truth: usize,
+    /// Answered ticks without a line in `tracks.jsonl`, though the ego tracked: they are left out.
+    pub without_tracks: usize,
     /// Detections that are left out, because a number is none or there are too many.
     pub rejected_detections: u64,
     /// True if the tracks are those of the ego, false if they are made from its detections.
@@ -120,7 +122,27 @@ impl TrackReport {
         Ok(report)
     }
 
-    /// Takes a tick of the ground truth, its result, and its recorded tracks.
+    /// True if a tick is left out because a line of it is missing: the metrics are those of the other ticks.
+    pub fn has_left_out_ticks(&self) -> bool {
+        self.without_truth + self.without_tracks > 0
+    }
+
+    /// A line for each count that is not zero.
+    fn notes(&self) -> impl Iterator<Item = String> {
+        let rejected = self.rejected_detections as usize;
+        [
+            (self.without_pose, "ticks without_pose: no tracks"),
+            (self.without_truth, "results without_truth: left out"),
+            (self.without_tracks, "ticks without_tracks: left out"),
+            (rejected, "rejected_detections: left out"),
+        ]
+        .into_iter()
+        .filter(|(count, _)| *count > 0)
+        .map(|(count, what)| format!("{}: {count} {what}\n", self.run))
+    }
+
+    /// Takes a tick of the ground truth, its result, and its recorded tracks. An answered tick whose recorded tracks are
+    /// missing is left out; an unanswered one has no tracks.
     fn follow(
         &mut self,
         followed: &mut Vec<Followed>,
@@ -153,13 +175,17 @@ impl TrackReport {
         one.last_nanos = line.capture_nanos;
         self.ticks += 1;
         self.answered += usize::from(result.is_some());
+        if self.recorded && result.is_some() && recorded.is_none() {
+            self.without_tracks += 1;
+            return Ok(());
+        }
         let pose = result.as_ref().map(|of| of.result.pose.world_from_cav());
         let is_unposed = pose.is_some_and(|pose| pose.is_none_or(|pose| pose.validate().is_err()));
         self.without_pose += usize::from(is_unposed);
-        let tracks = match result {
-            Some(of) if !self.recorded => Some(one.tracker.follow(line.capture_nanos, &of.result)),
-            _ => recorded.map(|line| line.result),
-        };
+        let tracks = result.and_then(|of| match self.recorded {
+            true => recorded.map(|line| line.result),
+            false => Some(one.tracker.follow(line.capture_nanos, &of.result)),
+        });
         let (tracks, left_out) =
             tracks.map_or_else(Default::default, |of| (of.tracks, of.left_out));
         self.rejected_detections += u64::from(left_out);
@@ -227,8 +253,8 @@ fn for_each_line<T: DeserializeOwned>(
     Ok(())
 }
 
-/// A table with a row for each run.
-pub fn track_table(reports: &[TrackReport]) -> TextTable {
+/// A table with a row for each run, and below it a line for each count of what could not be used.
+pub fn track_table(reports: &[TrackReport]) -> String {
     let numbers = [
         "answered", "AMOTA", "AMOTP, m", "MOTA", "MOTP, m", "recall", "IDS", "FRAG", "MT", "ML",
         "HOTA", "DetA", "AssA", "IDF1",
@@ -259,7 +285,8 @@ pub fn track_table(reports: &[TrackReport]) -> TextTable {
             number(quality.idf1, 3),
         ]);
     }
-    table
+    let notes: String = reports.iter().flat_map(TrackReport::notes).collect();
+    format!("{table}{notes}")
 }
 
 #[cfg(test)]
@@ -395,8 +422,9 @@ mod tests {
         assert_eq!((quality.amota, quality.idf1), (Some(1.0), Some(1.0)));
         assert_eq!((quality.ids, quality.mt), (Some(0), Some(2)));
         assert!(quality.hota > Some(0.99), "{quality:?}");
-        let text = track_table(&[report]).to_string();
+        let text = track_table(&[report]);
         assert!(text.contains("pastat") && text.contains("20/20"), "{text}");
+        assert_eq!(text.lines().count(), 2, "nothing was left out: {text}");
     }
 
     #[test]
@@ -440,10 +468,31 @@ mod tests {
         assert!(read.recorded && !made.recorded);
         assert_eq!(rounded_numbers(&read), rounded_numbers(&made));
         // What the ego has tracked counts, whatever its detections are.
-        let read = read_all(&truths, &results, &lines[..10]).unwrap();
-        assert!(read.quality.recall < made.quality.recall, "{read:?}");
+        let empty: Vec<String> = (0..20)
+            .map(|tick| result(tick, posed(tick as f64), &[]))
+            .collect();
+        let read = read_all(&truths, &empty, &lines).unwrap();
+        assert_eq!(rounded_numbers(&read), rounded_numbers(&made));
         // A file without a line is that of an ego that did not track.
         assert_eq!(read_all(&truths, &results, &[]).unwrap(), made);
+        // Without lines of tracks the metrics are those of the other ticks, and the others are counted.
+        let cut = read_all(&truths, &results, &lines[..10]).unwrap();
+        let whole = read_all(&truths[..10], &results[..10], &lines[..10]).unwrap();
+        assert_eq!(cut.quality, whole.quality);
+        assert_eq!((cut.ticks, cut.answered, cut.without_tracks), (20, 20, 10));
+        assert!(cut.has_left_out_ticks() && !whole.has_left_out_ticks());
+        let text = track_table(&[whole, cut]);
+        assert!(
+            text.ends_with("\nrun: 10 ticks without_tracks: left out\n"),
+            "{text}"
+        );
+        // A tick without a result has no tracks, whatever the file of tracks says.
+        let cut = read_all(&truths, &results[..10], &lines).unwrap();
+        let unanswered = read_all(&truths, &results[..10], &[]).unwrap();
+        assert_eq!(rounded_numbers(&cut), rounded_numbers(&unanswered));
+        assert!(!cut.has_left_out_ticks());
+        let cut = read_all(&truths[..10], &results, &lines).unwrap();
+        assert!(cut.without_truth == 10 && cut.has_left_out_ticks());
     }
 
     #[test]

@@ -2,9 +2,9 @@
 
 use std::str::FromStr;
 
+use protocol::CavId;
 use protocol::text::excerpt;
-use protocol::{CavId, IdError};
-use ros2::{NameError, RosName};
+use ros2::RosName;
 
 /// A topic and the vehicle whose sensor publishes it, written `/points=1000`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,10 +24,8 @@ impl FromStr for AgentTopic {
             format!("{shown:?} is not TOPIC=AGENT, for example /velodyne_points=1000")
         })?;
         Ok(Self {
-            topic: topic
-                .parse()
-                .map_err(|error: NameError| error.to_string())?,
-            cav: cav.parse().map_err(|error: IdError| error.to_string())?,
+            topic: RosName::from_str(topic).map_err(|error| error.to_string())?,
+            cav: CavId::from_str(cav).map_err(|error| error.to_string())?,
         })
     }
 }

@@ -11,7 +11,7 @@ use bus::shutdown::Stop;
 use bus::{Bus, BusError, Publisher, PublisherOptions, unix_nanos};
 use dataset::{LiveIntensities, Plausibility};
 use protocol::{CavId, Lidar, Limits, Stream, Topic};
-use ros2::{Qos, RosName, RosSweep, RosType, SweepLimits, read_point_cloud};
+use ros2::{Qos, RosName, RosSweep, RosType, read_point_cloud};
 use serde::Serialize;
 use zenoh::bytes::ZBytes;
 
@@ -23,12 +23,6 @@ use super::robot_frames::RobotFrames;
 use super::session::{RosSession, RosSubscription};
 use super::stamp_check::{NoTime, OddStamp, StampCheck};
 use super::starting_pose::StartingPose;
-
-/// Limits of a receiver of the run.
-const LIMITS: SweepLimits = SweepLimits {
-    max_points: Limits::DEFAULT.max_points,
-    max_abs_value: Limits::DEFAULT.max_abs_value,
-};
 
 /// Messages of LiDARs, counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
@@ -157,7 +151,7 @@ impl LidarInputs {
         for input in self.inputs.into_values() {
             input.publisher.finish();
             if let Some(starting_pose) = input.starting_pose {
-                starting_pose.finish();
+                starting_pose.publisher.finish();
             }
             motions.extend(input.motion.map(MotionInput::finish).unwrap_or_default());
         }
@@ -168,7 +162,7 @@ impl LidarInputs {
 
 impl LidarInput {
     fn take(&mut self, bytes: &[u8], report: &mut LidarReport) {
-        let sweep = match read_point_cloud(bytes, LIMITS) {
+        let sweep = match read_point_cloud(bytes, &Limits::DEFAULT) {
             Ok(sweep) => sweep,
             Err(error) => {
                 report.unreadable += 1;

@@ -147,7 +147,7 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
         let mount = options.mount.unwrap_or_default();
         let initial_pose = options.initial_pose_of.clone();
         let initial_pose = initial_pose.map(|cav| InitialPose::of(cav, mount));
-        let names = FrameNames::within(session.node().namespace.as_ref());
+        let names = FrameNames::within(session.node.namespace.as_ref());
         let translator = Translator::new(&bus.identity().run)
             .with_frames(names.clone(), options.robots().collect());
         let publishes_clock = publishes_clock(session, options.clock)?;
@@ -340,7 +340,7 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
 
     fn publish(&mut self, topic: RosTopic, cdr: Vec<u8>) -> Result<()> {
         self.declare(topic.clone())?;
-        let name = topic.name(self.session.node().namespace.as_ref());
+        let name = topic.name(self.session.node.namespace.as_ref());
         *self.report.published.entry(name.to_string()).or_default() += 1;
         let publisher = self.publishers.get_mut(&topic);
         publisher.map_or(Ok(()), |publisher| publisher.publish(cdr))

@@ -15,8 +15,8 @@ use super::session::RosSession;
 /// Names other nodes of this program in the log, those that are there and those that come. In one namespace every
 /// topic and frame has two publishers. Ends when the subscription is dropped.
 pub(super) fn watch_namesakes(session: &RosSession) -> Result<Subscriber<()>, BusError> {
-    let (own, domain_id) = (session.node().name_in_network(), session.node().domain_id);
-    let selector = session.node().namesakes();
+    let (own, domain_id) = (session.node.name_in_network(), session.node.domain_id);
+    let selector = session.node.namesakes();
     let liveliness = session.zenoh.liveliness();
     let builder = liveliness.declare_subscriber(&selector).history(true);
     let subscriber = builder.callback(move |sample| {
@@ -65,7 +65,7 @@ pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<b
 
 /// Nodes that publish a topic, without this one.
 fn publishers(session: &RosSession, topic: &RosName) -> Result<BTreeSet<String>, BusError> {
-    let (own, selector) = (session.node(), session.node().publishers_of(topic));
+    let (own, selector) = (&session.node, session.node.publishers_of(topic));
     let nodes = bus::tokens(&session.zenoh, &selector)?
         .filter_map(|token| NodeName::of_token(&token))
         .filter(|node| node.zid != own.zid);

@@ -113,9 +113,7 @@ impl RobotFrames {
 
     /// The frame of a robot's LiDAR.
     pub(super) fn note_lidar(&self, cav: &CavId, frame: &str) {
-        if let Some(robot) = lock(&self.state).robots.get_mut(cav)
-            && robot.lidar.as_deref() != Some(frame)
-        {
+        if let Some(robot) = lock(&self.state).robots.get_mut(cav) {
             robot.lidar = Some(frame.to_owned());
         }
     }
@@ -177,13 +175,11 @@ impl RobotFrames {
             return mount.base_from_lidar.isometry();
         }
         let state = lock(&self.state);
-        let frames = state.robots.get(cav).and_then(|robot| {
+        let found = state.robots.get(cav).and_then(|robot| {
             let [_, base] = robot.odom_and_base.as_ref()?;
-            Some((base, robot.lidar.as_ref()?))
+            state.tree.at(nanos, base, robot.lidar.as_ref()?).ok()
         });
-        frames
-            .and_then(|(base, lidar)| state.tree.at(nanos, base, lidar).ok())
-            .unwrap_or_else(Isometry3::identity)
+        found.unwrap_or_else(Isometry3::identity)
     }
 
     /// Poses so far for which there were no transforms.

@@ -4,7 +4,7 @@ use std::any::Any;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use bus::BusError;
-use ros2::endpoint::{EndpointKind, Node, RosEndpoint, gid};
+use ros2::endpoint::{EndpointKind, Node, gid};
 use ros2::{Distribution, Qos, RosName, RosTopic, RosType};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::sample::{Locality, Sample};
@@ -20,7 +20,8 @@ const NODE_NAME: &str = "v2vloc";
 pub struct RosSession {
     /// The session.
     pub(super) zenoh: Session,
-    node: Node,
+    /// The node.
+    pub(super) node: Node,
     /// Number of the last endpoint.
     endpoints: AtomicU32,
     _token: LivelinessToken,
@@ -60,19 +61,14 @@ impl RosSession {
         })
     }
 
-    /// The node.
-    pub fn node(&self) -> &Node {
-        &self.node
-    }
-
     /// Declares a publisher of `topic`.
     pub(super) fn publisher(&self, topic: &RosTopic) -> Result<RosPublisher, BusError> {
         let name = topic.name(self.node.namespace.as_ref());
-        let key = self.node.key(&name, topic.ros_type());
-        let token =
-            self.endpoint_token(EndpointKind::Publisher, name, topic.ros_type(), topic.qos());
+        let (ros_type, qos) = (topic.ros_type(), topic.qos());
+        let key = self.node.key(&name, ros_type);
+        let token = self.endpoint_token(EndpointKind::Publisher, &name, ros_type, qos);
         let declared = declare_token(&self.zenoh, &token)?;
-        RosPublisher::declare(&self.zenoh, &key, topic.qos(), (gid(&token), declared))
+        RosPublisher::declare(&self.zenoh, &key, qos, (gid(&token), declared))
     }
 
     /// Calls `receive` for every message of a topic, on zenoh's receive thread: it must not wait.
@@ -96,7 +92,7 @@ impl RosSession {
             Box::new(builder.wait().map_err(refused)?)
         };
         // The token shows the subscription to other nodes, so it follows once messages are received.
-        let token = self.endpoint_token(EndpointKind::Subscription, topic.clone(), ros_type, qos);
+        let token = self.endpoint_token(EndpointKind::Subscription, topic, ros_type, qos);
         Ok(RosSubscription {
             _subscriber: subscriber,
             _token: declare_token(&self.zenoh, &token)?,
@@ -106,18 +102,12 @@ impl RosSession {
     fn endpoint_token(
         &self,
         kind: EndpointKind,
-        topic: RosName,
+        topic: &RosName,
         ros_type: RosType,
         qos: Qos,
     ) -> String {
         let id = self.endpoints.fetch_add(1, Ordering::Relaxed) + 1;
-        self.node.endpoint_token(&RosEndpoint {
-            id,
-            kind,
-            topic,
-            ros_type,
-            qos,
-        })
+        self.node.endpoint_token(id, kind, topic, ros_type, qos)
     }
 }
 

@@ -15,7 +15,7 @@ use super::session::{RosSession, RosSubscription};
 /// Stated poses of one vehicle. Each waits for the next sweep, whose capture time it gets.
 pub(super) struct StartingPose {
     stated: Arc<Mutex<Option<StatedPose>>>,
-    publisher: Publisher,
+    pub(super) publisher: Publisher,
     _subscription: RosSubscription,
 }
 
@@ -63,10 +63,5 @@ impl StartingPose {
             };
             self.publisher.submit(capture_nanos, pose);
         }
-    }
-
-    /// Ends the stream.
-    pub(super) fn finish(self) {
-        self.publisher.finish();
     }
 }

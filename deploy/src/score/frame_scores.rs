@@ -7,7 +7,7 @@ use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use protocol::{CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
 use super::frame_record::{FrameRecord, JudgedFrame};
-use super::live_precision::{LivePrecision, TickAnswer, TickTruth};
+use super::live_precision::{EgoTick, LivePrecision, TickAnswer};
 use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTick, OpenTicks};
 use super::precision::{FrameCounts, by_iou, by_part, precision_recall_csv};
@@ -30,6 +30,7 @@ pub struct FrameScores {
     records: Vec<FrameRecord>,
     pub(super) pose_errors: Vec<PoseError>,
     pub(super) no_pose: u64,
+    unplaced: Vec<u64>,
     pub(super) bytes: Vec<(u64, u64)>,
     pub(super) ages_ms: Vec<f64>,
     pub(super) neighbours: BTreeMap<CavId, NeighbourRecord>,
@@ -50,6 +51,7 @@ impl FrameScores {
             records: Vec::new(),
             pose_errors: Vec::new(),
             no_pose: 0,
+            unplaced: Vec::new(),
             bytes: Vec::new(),
             ages_ms: Vec::new(),
             neighbours: BTreeMap::new(),
@@ -117,6 +119,11 @@ impl FrameScores {
         self.live.ticks()
     }
 
+    /// Ticks whose result counts in no precision, as the recording has no true pose of the ego.
+    pub fn unplaced(&self) -> &[u64] {
+        &self.unplaced
+    }
+
     /// Number of ticks without a result of the ego.
     pub fn missed(&self) -> u64 {
         let (ticks, answered) = self.live.ticks();
@@ -131,7 +138,7 @@ impl FrameScores {
     /// Average precision over the answered ticks, ordered by score over all frames, and ordered by frame.
     pub fn average_precision(&self) -> (ByIou, ByIou) {
         let [global, frame] =
-            [Ordering::Global, Ordering::Frame].map(|by| by_iou(&self.scorer, by));
+            [Ordering::Global, Ordering::Frame].map(|by| by_iou(self.scorer.tallies(), by));
         (global, frame)
     }
 
@@ -176,6 +183,9 @@ impl FrameScores {
         if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
             // The ego takes no part at this tick, so no result is missing.
             return;
+        }
+        if tick.result.is_some() && !is_there {
+            self.unplaced.push(truth.tick);
         }
         let objects = ground_truth(&truth, &self.ego, &self.rule);
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
@@ -225,11 +235,10 @@ impl FrameScores {
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         let world_from_ego = true_pose(&world_from_lidar, &self.ego).copied();
-        let truth = TickTruth {
-            tick,
+        let ego_tick = EgoTick {
+            number: tick,
             began_nanos,
             world_from_ego,
-            truth: objects,
         };
         let published = answer.as_ref().map(|(_, nanos, result)| TickAnswer {
             published_nanos: *nanos,
@@ -239,7 +248,7 @@ impl FrameScores {
             tick,
             capture_nanos,
             truth: objects.objects.len(),
-            streamed: self.live.add(&truth, published),
+            streamed: self.live.add(ego_tick, objects, published),
             ..FrameRecord::default()
         };
         let Some((stamps, _, result)) = answer else {

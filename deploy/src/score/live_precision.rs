@@ -25,25 +25,22 @@ pub(super) struct LivePrecision {
     is_untimed: bool,
 }
 
-/// Detections, their time of publication, and tick and pose of the ego at their capture.
+/// Detections, their time of publication, and the tick of their capture.
 struct PublishedAnswer {
     nanos: u64,
-    tick: u64,
-    began_nanos: u64,
-    world_from_ego: Option<Pose>,
+    tick: EgoTick,
     detections: Vec<Detection>,
 }
 
-/// Ground truth of a tick.
-pub(super) struct TickTruth<'a> {
+/// A tick and the ego at it.
+#[derive(Clone, Copy)]
+pub(super) struct EgoTick {
     /// Tick of the scene.
-    pub(super) tick: u64,
+    pub(super) number: u64,
     /// Time of publication of the tick, nanoseconds.
     pub(super) began_nanos: u64,
     /// True pose of the ego's LiDAR.
     pub(super) world_from_ego: Option<Pose>,
-    /// Objects in the ego's LiDAR frame.
-    pub(super) truth: &'a GroundTruth,
 }
 
 /// Detections of a tick.
@@ -55,21 +52,22 @@ pub(super) struct TickAnswer<'a> {
 }
 
 impl LivePrecision {
-    /// Adds a tick and its detections, if there are some; returns the detections that were newest at that time, with
-    /// their score.
+    /// Adds a tick, the objects in the ego's LiDAR frame at it, and its detections, if there are some; returns the
+    /// detections that were newest at that time, with their score.
     pub(super) fn add(
         &mut self,
-        truth: &TickTruth<'_>,
+        tick: EgoTick,
+        truth: &GroundTruth,
         answer: Option<TickAnswer<'_>>,
     ) -> Option<StreamedResult> {
         self.ticks += 1;
         self.answered += u64::from(answer.is_some());
         let detections = answer.as_ref().map_or(&[][..], |answer| answer.detections);
-        self.all_ticks.add(detections, truth.truth);
+        self.all_ticks.add(detections, truth);
         // Before the result of this tick is added: it is published after the tick.
-        let known = self.newest(truth);
+        let known = self.newest(&tick);
         let moved = known.as_ref().map_or(&[][..], |(.., moved)| moved);
-        let verdicts = self.streaming.add(moved, truth.truth);
+        let verdicts = self.streaming.add(moved, truth);
         let FrameCounts { detected, found } = FrameCounts::of(&self.streaming, &verdicts);
         let streamed = known.map(|(tick, age_ms, _)| StreamedResult {
             tick,
@@ -86,9 +84,7 @@ impl LivePrecision {
         };
         self.published.push_back(PublishedAnswer {
             nanos,
-            tick: truth.tick,
-            began_nanos: truth.began_nanos,
-            world_from_ego: truth.world_from_ego,
+            tick,
             detections: answer.detections.to_vec(),
         });
         if self.published.len() > MOST_KEPT {
@@ -109,23 +105,24 @@ impl LivePrecision {
 
     /// Average precision ordered by score; a tick without a result is a frame without detections.
     pub(super) fn unanswered_empty(&self) -> ByIou {
-        by_iou(&self.all_ticks, Ordering::Global)
+        by_iou(self.all_ticks.tallies(), Ordering::Global)
     }
 
     /// Streaming average precision, ordered by score; `None` if results have no time of publication.
     pub(super) fn streaming(&self) -> Option<ByIou> {
-        (self.ticks > 0 && !self.is_untimed).then(|| by_iou(&self.streaming, Ordering::Global))
+        let is_timed = self.ticks > 0 && !self.is_untimed;
+        is_timed.then(|| by_iou(self.streaming.tallies(), Ordering::Global))
     }
 
     /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick, behind
     /// their own tick and their age in ms. Older ones are dropped.
-    fn newest(&mut self, truth: &TickTruth<'_>) -> Option<(u64, f64, Vec<Detection>)> {
+    fn newest(&mut self, tick: &EgoTick) -> Option<(u64, f64, Vec<Detection>)> {
         let mut published = self.published.iter();
-        let index = published.rposition(|published| published.nanos <= truth.began_nanos)?;
+        let index = published.rposition(|published| published.nanos <= tick.began_nanos)?;
         self.published.drain(..index);
         let newest = self.published.front()?;
         // Without both poses the motion is unknown, and the boxes stay where they are.
-        let now_from_then = match (truth.world_from_ego, newest.world_from_ego) {
+        let now_from_then = match (tick.world_from_ego, newest.tick.world_from_ego) {
             (Some(now), Some(then)) => now.from_world(&then).isometry(),
             _ => Pose::IDENTITY.isometry(),
         };
@@ -133,8 +130,8 @@ impl LivePrecision {
             box3d: found.box3d.transformed(&now_from_then),
             ..found.clone()
         });
-        let age_ms = truth.began_nanos.saturating_sub(newest.began_nanos) as f64 * 1e-6;
-        Some((newest.tick, age_ms, moved.collect()))
+        let age_nanos = tick.began_nanos.saturating_sub(newest.tick.began_nanos);
+        Some((newest.tick.number, age_nanos as f64 * 1e-6, moved.collect()))
     }
 }
 
@@ -185,15 +182,12 @@ mod tests {
                 published_nanos,
                 detections: &found,
             });
-            live.add(
-                &TickTruth {
-                    tick,
-                    began_nanos,
-                    world_from_ego,
-                    truth: &truth,
-                },
-                answer,
-            )
+            let tick = EgoTick {
+                number: tick,
+                began_nanos,
+                world_from_ego,
+            };
+            live.add(tick, &truth, answer)
         });
         let streamed = streamed.collect();
         (live, streamed)
@@ -261,15 +255,12 @@ mod tests {
                 published_nanos: Some(began_nanos),
                 detections: &found,
             });
-            live.add(
-                &TickTruth {
-                    tick,
-                    began_nanos,
-                    world_from_ego,
-                    truth,
-                },
-                answer,
-            );
+            let tick = EgoTick {
+                number: tick,
+                began_nanos,
+                world_from_ego,
+            };
+            live.add(tick, truth, answer);
         }
         assert_eq!(
             live.streaming.tallies()[0].matched,
@@ -290,19 +281,16 @@ mod tests {
             score: 0.9,
             source: None,
         }];
-        let truth = TickTruth {
-            tick: 0,
+        let tick = EgoTick {
+            number: 0,
             began_nanos: 0,
             world_from_ego: None,
-            truth: &truth,
         };
-        live.add(
-            &truth,
-            Some(TickAnswer {
-                published_nanos: None,
-                detections: &found,
-            }),
-        );
+        let answer = TickAnswer {
+            published_nanos: None,
+            detections: &found,
+        };
+        live.add(tick, &truth, Some(answer));
         assert_eq!(
             (live.streaming(), live.unanswered_empty().at_70),
             (None, Some(1.0))

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use dataset::LeftOut;
 use dataset::evaluation_protocol::EvaluationProtocol;
-use protocol::{CavId, Counts, DropReason, Ledger, PoseError};
+use protocol::{CavId, Counts, DropReason, Ledger, PoseError, Topic};
 use serde::{Deserialize, Serialize};
 use support::provenance::Provenance;
 use support::statistics::{mean, quantile, sorted};
@@ -106,6 +106,13 @@ impl Metrics {
         let [ap_by_distance, ap_by_class] = scores.average_precision_by_part();
         let latencies_ms = records.filter_map(|record| record.latency_ms);
         let (ticks, answered) = scores.ticks();
+        // In an evaluation, where all bytes are known, the own agent has no account, and the ego of one scenario may be a
+        // neighbour in another.
+        let ego = sent_bytes.is_none().then_some(&scores.ego);
+        let messages = match ego {
+            Some(_) => Messages::of_run(ledger),
+            None => Messages::of_evaluation(ledger, |_| true),
+        };
         Self {
             frames: answered,
             ticks,
@@ -127,9 +134,9 @@ impl Metrics {
             },
             age_ms: Percentiles::of(&scores.ages_ms),
             comm: Communication::of(&scores.bytes, scores.nominal_values),
-            contribution: Contribution::of(answered, fused, &scores.ego, ledger, sent_bytes),
+            contribution: Contribution::of(answered, fused, ego, ledger, sent_bytes),
             neighbours: scores.neighbours.clone(),
-            messages: Messages::of(&ledger.total()),
+            messages,
             ..Self::default()
         }
     }
@@ -228,6 +235,9 @@ pub struct Messages {
     pub in_flight: u64,
     /// Not used, by reason.
     pub dropped: BTreeMap<DropReason, u64>,
+    /// Published on topics without a receiver: in none of the others.
+    #[serde(default)]
+    pub unreceived: u64,
 }
 
 impl Percentiles {
@@ -242,15 +252,38 @@ impl Percentiles {
     }
 }
 
-impl Messages {
-    /// Totals of a ledger.
-    pub fn of(total: &Counts) -> Self {
+impl From<Counts> for Messages {
+    fn from(counts: Counts) -> Self {
         Self {
-            sent: total.sent,
-            received: total.received,
-            in_flight: total.in_flight,
-            dropped: total.dropped.clone(),
+            sent: counts.sent,
+            received: counts.received,
+            in_flight: counts.in_flight,
+            dropped: counts.dropped,
+            unreceived: 0,
         }
+    }
+}
+
+impl Messages {
+    /// Sums over the receivers of a run.
+    pub fn of_run(ledger: &Ledger) -> Self {
+        let unreceived = ledger.balance().unreceived;
+        Self {
+            unreceived: unreceived.iter().map(|topic| topic.messages).sum(),
+            ..ledger.delivered().into()
+        }
+    }
+
+    /// Sums of an evaluation, over the topics that `is_counted` selects: each message has one receiver, the ego of its
+    /// scenario.
+    pub fn of_evaluation(ledger: &Ledger, is_counted: impl Fn(&Topic) -> bool) -> Self {
+        let mut total = Counts::default();
+        for (account, counts) in ledger.iter() {
+            if is_counted(&account.topic) {
+                total.add(counts);
+            }
+        }
+        total.into()
     }
 
     /// True if most of the messages that were sent neither arrived nor were lost: then the link carries next to

@@ -1,6 +1,6 @@
 //! Scorer process on the bus: receives truth, detections, tracks, poses and the ledgers of all processes, and keeps the scores.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -22,7 +22,7 @@ use support::sync::{lock, spawn};
 use zenoh::Session;
 
 use super::FrameScores;
-use super::numbered_results::NumberedResults;
+use super::numbered_results::{RecentTick, numbered};
 use super::result_lines::ResultLines;
 use super::stage_stamps::ms_between;
 use crate::score::offline_intervals::OfflineIntervals;
@@ -185,9 +185,9 @@ impl ScorerNode {
             detections,
             truth_lines,
             tracks,
-            numbered: NumberedResults::default(),
-            numbered_tracks: NumberedResults::default(),
-            published: BTreeMap::new(),
+            waiting: VecDeque::new(),
+            waiting_tracks: VecDeque::new(),
+            recent: BTreeMap::new(),
         };
         let thread = spawn(SCORER, move || worker.run());
         let thread = thread.map_err(io("the scorer's thread".into()))?;
@@ -291,10 +291,11 @@ struct ScorerWorker {
     detections: ResultLines,
     truth_lines: ResultLines,
     tracks: Option<ResultLines>,
-    numbered: NumberedResults<Detections>,
-    numbered_tracks: NumberedResults<Tracks>,
-    // Time of publication of each recent tick, by capture time: for the latency that is displayed during the run.
-    published: BTreeMap<u64, u64>,
+    /// Results that wait for their ticks, and tracks.
+    waiting: VecDeque<FrameReport<Detections>>,
+    waiting_tracks: VecDeque<FrameReport<Tracks>>,
+    /// Recent ticks, by capture time: for results, and for the latency that is displayed during the run.
+    recent: BTreeMap<u64, RecentTick>,
 }
 
 impl ScorerWorker {
@@ -340,13 +341,14 @@ impl ScorerWorker {
     fn truth(&mut self, arrival: &Arrival) -> Option<()> {
         let truth: Truth = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        let (capture_nanos, publish_nanos) = (stamp.capture_nanos, stamp.publish_nanos);
-        self.published.insert(capture_nanos, publish_nanos);
-        while self.published.len() > PLACES {
-            self.published.pop_first();
+        let tick = RecentTick {
+            tick: truth.tick,
+            publish_nanos: stamp.publish_nanos,
+        };
+        self.recent.insert(stamp.capture_nanos, tick);
+        while self.recent.len() > PLACES {
+            self.recent.pop_first();
         }
-        self.numbered.tick(capture_nanos, truth.tick);
-        self.numbered_tracks.tick(capture_nanos, truth.tick);
         if let Some(line) = self.scores.truth_line(stamp, &truth) {
             self.truth_lines.add(line.to_json());
         }
@@ -361,10 +363,10 @@ impl ScorerWorker {
         let result: Detections = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
         let report = FrameReport::new(stamp, None, result.clone());
-        self.numbered.result(report);
+        self.waiting.push_back(report);
         self.write_results(false);
-        let began = self.published.get(&stamp.capture_nanos);
-        let latency_ms = began.map(|began| ms_between(*began, stamp.publish_nanos));
+        let tick = self.recent.get(&stamp.capture_nanos);
+        let latency_ms = tick.map(|tick| ms_between(tick.publish_nanos, stamp.publish_nanos));
         let neighbours = result.neighbours.clone();
         let fused = result.fused.len();
         let wire_bytes = result.fused.iter().map(|neighbour| neighbour.wire_bytes);
@@ -388,18 +390,18 @@ impl ScorerWorker {
     fn tracks(&mut self, arrival: &Arrival) -> Option<()> {
         let tracks: Tracks = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let report = FrameReport::new(&arrival.header.stamp, None, tracks);
-        self.numbered_tracks.result(report);
+        self.waiting_tracks.push_back(report);
         self.write_results(false);
         Some(())
     }
 
     /// Writes the results whose tick is known, or will not be.
     fn write_results(&mut self, is_over: bool) {
-        while let Some(report) = self.numbered.next(is_over) {
+        while let Some(report) = numbered(&mut self.waiting, &self.recent, is_over) {
             self.detections.add(report.to_json());
         }
         if let Some(lines) = &mut self.tracks {
-            while let Some(report) = self.numbered_tracks.next(is_over) {
+            while let Some(report) = numbered(&mut self.waiting_tracks, &self.recent, is_over) {
                 lines.add(report.to_json());
             }
         }
@@ -432,7 +434,7 @@ impl ScorerWorker {
         let (name, at) = (process.to_string(), arrival.at);
         // Until the first tick: the loading of models belongs to no frame.
         let known = self.stats.get(&instance);
-        let usage_before = match self.published.is_empty() {
+        let usage_before = match self.recent.is_empty() {
             true => report.usage.clone(),
             false => known
                 .map(|known| known.usage_before.clone())

@@ -4,53 +4,35 @@ use std::collections::{BTreeMap, VecDeque};
 
 use protocol::FrameReport;
 
-/// Largest number of results that wait for their truth, and of ticks that are remembered.
+/// Largest number of results that wait for their truth.
 const PLACES: usize = 256;
 
-/// Results that wait to be written. They keep their order, and wait only while their truth may still arrive.
-pub(super) struct NumberedResults<T> {
-    /// Tick by capture time.
-    ticks: BTreeMap<u64, u64>,
-    waiting: VecDeque<FrameReport<T>>,
+/// A recent tick of the scene.
+pub(super) struct RecentTick {
+    /// Its number, counted from 0.
+    pub(super) tick: u64,
+    /// Time of its publication, Unix nanoseconds.
+    pub(super) publish_nanos: u64,
 }
 
-impl<T> Default for NumberedResults<T> {
-    fn default() -> Self {
-        Self {
-            ticks: BTreeMap::new(),
-            waiting: VecDeque::new(),
-        }
+/// The next of the results that wait to be written whose tick is known, or will not be: a later truth has arrived, too
+/// many wait, or the run `is_over`. They keep their order, and wait only while their truth may still arrive; `ticks` are
+/// by capture time.
+pub(super) fn numbered<T>(
+    waiting: &mut VecDeque<FrameReport<T>>,
+    ticks: &BTreeMap<u64, RecentTick>,
+    is_over: bool,
+) -> Option<FrameReport<T>> {
+    let capture_nanos = waiting.front()?.capture_nanos;
+    let tick = ticks.get(&capture_nanos).map(|known| known.tick);
+    let newest = ticks.last_key_value();
+    // Ticks are published in order, so behind a later truth an earlier one is lost.
+    let is_past = newest.is_some_and(|(newest, _)| *newest > capture_nanos);
+    if tick.is_none() && !is_past && !is_over && waiting.len() <= PLACES {
+        return None;
     }
-}
-
-impl<T> NumberedResults<T> {
-    /// Records the tick of a capture time.
-    pub(super) fn tick(&mut self, capture_nanos: u64, tick: u64) {
-        self.ticks.insert(capture_nanos, tick);
-        if self.ticks.len() > PLACES {
-            self.ticks.pop_first();
-        }
-    }
-
-    /// Appends a result.
-    pub(super) fn result(&mut self, report: FrameReport<T>) {
-        self.waiting.push_back(report);
-    }
-
-    /// The next result whose tick is known, or will not be: a later truth has arrived, too many wait, or the run
-    /// `is_over`.
-    pub(super) fn next(&mut self, is_over: bool) -> Option<FrameReport<T>> {
-        let capture_nanos = self.waiting.front()?.capture_nanos;
-        let tick = self.ticks.get(&capture_nanos).copied();
-        let newest = self.ticks.last_key_value();
-        // Ticks are published in order, so behind a later truth an earlier one is lost.
-        let is_past = newest.is_some_and(|(newest, _)| *newest > capture_nanos);
-        if tick.is_none() && !is_past && !is_over && self.waiting.len() <= PLACES {
-            return None;
-        }
-        let report = self.waiting.pop_front()?;
-        Some(FrameReport { tick, ..report })
-    }
+    let report = waiting.pop_front()?;
+    Some(FrameReport { tick, ..report })
 }
 
 #[cfg(test)]
@@ -85,35 +67,57 @@ mod tests {
         FrameReport::new(&stamp, None, result)
     }
 
-    fn ticks(results: &mut NumberedResults<Detections>, is_over: bool) -> Vec<(u64, Option<u64>)> {
-        std::iter::from_fn(|| results.next(is_over))
-            .map(|report| (report.capture_nanos, report.tick))
-            .collect()
+    /// Results that wait, and the ticks that are known.
+    #[derive(Default)]
+    struct Results {
+        waiting: VecDeque<FrameReport<Detections>>,
+        known: BTreeMap<u64, RecentTick>,
+    }
+
+    impl Results {
+        fn tick(&mut self, capture_nanos: u64, tick: u64) {
+            let publish_nanos = 0;
+            let known = RecentTick {
+                tick,
+                publish_nanos,
+            };
+            self.known.insert(capture_nanos, known);
+        }
+
+        fn result(&mut self, capture_nanos: u64) {
+            self.waiting.push_back(report(capture_nanos));
+        }
+
+        fn ticks(&mut self, is_over: bool) -> Vec<(u64, Option<u64>)> {
+            std::iter::from_fn(|| numbered(&mut self.waiting, &self.known, is_over))
+                .map(|report| (report.capture_nanos, report.tick))
+                .collect()
+        }
     }
 
     #[test]
     fn results_carry_the_tick_of_their_capture_time_whichever_comes_first() {
-        let mut results = NumberedResults::default();
+        let mut results = Results::default();
         results.tick(100, 7);
-        results.result(report(100));
-        results.result(report(200));
-        assert_eq!(ticks(&mut results, false), [(100, Some(7))]);
+        results.result(100);
+        results.result(200);
+        assert_eq!(results.ticks(false), [(100, Some(7))]);
         results.tick(200, 8);
         results.tick(300, 9);
-        assert_eq!(ticks(&mut results, false), [(200, Some(8))]);
+        assert_eq!(results.ticks(false), [(200, Some(8))]);
     }
 
     #[test]
     fn a_lost_truth_delays_no_other_result() {
-        let mut results = NumberedResults::default();
-        results.result(report(100));
-        results.result(report(200));
-        assert_eq!(ticks(&mut results, false), []);
+        let mut results = Results::default();
+        results.result(100);
+        results.result(200);
+        assert_eq!(results.ticks(false), []);
         results.tick(200, 8);
-        assert_eq!(ticks(&mut results, false), [(100, None), (200, Some(8))]);
-        results.result(report(300));
-        assert_eq!(ticks(&mut results, true), [(300, None)]);
-        (0..=PLACES as u64).for_each(|k| results.result(report(400 + k)));
-        assert_eq!(ticks(&mut results, false), [(400, None)]);
+        assert_eq!(results.ticks(false), [(100, None), (200, Some(8))]);
+        results.result(300);
+        assert_eq!(results.ticks(true), [(300, None)]);
+        (0..=PLACES as u64).for_each(|k| results.result(400 + k));
+        assert_eq!(results.ticks(false), [(400, None)]);
     }
 }

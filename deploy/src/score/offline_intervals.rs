@@ -4,27 +4,20 @@
 //! offline process, or over a connection that breaks, arrives nowhere. Such accounts are exempt, by name, in the ledger
 //! and in the report; all others have to balance.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 
 use bus::{Bus, BusError, LivelinessEvent, LivelinessSubscription, process_id};
-use protocol::{Account, Role, Stream, Topic};
+use protocol::{Account, Role, Topic};
 use support::sync::lock;
 
 const ROLES: [Role; 4] = [Role::Agent, Role::Ego, Role::Link, Role::Replay];
 
 /// Records the processes that leave and rejoin.
 pub(crate) struct OfflineIntervals {
-    state: Arc<Mutex<Departures>>,
+    /// Processes that have left, each with whether it has rejoined since.
+    departed: Arc<Mutex<BTreeMap<String, bool>>>,
     _watches: Vec<LivelinessSubscription>,
-}
-
-#[derive(Default)]
-struct Departures {
-    /// Offline now.
-    gone: BTreeSet<String>,
-    /// Were offline and rejoined.
-    returned: BTreeSet<String>,
 }
 
 impl OfflineIntervals {
@@ -33,36 +26,35 @@ impl OfflineIntervals {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub(crate) fn watch(bus: &Bus) -> Result<Self, BusError> {
-        let state = Arc::<Mutex<Departures>>::default();
+        let departed = Arc::<Mutex<BTreeMap<_, _>>>::default();
         let watches = ROLES.into_iter().map(|role| {
-            let state = Arc::clone(&state);
-            bus.watch(role, move |event| {
-                let mut state = lock(&state);
-                match event {
-                    LivelinessEvent::Left { role, cav } => {
-                        state.gone.insert(process_id(role, &cav).to_string());
-                    }
-                    LivelinessEvent::Joined { role, cav } => {
-                        let name = process_id(role, &cav).to_string();
-                        let rejoined = state.gone.take(&name);
-                        state.returned.extend(rejoined);
-                    }
+            let departed = Arc::clone(&departed);
+            bus.watch(role, move |event| match event {
+                LivelinessEvent::Left { role, cav } => {
+                    let name = process_id(role, &cav).to_string();
+                    lock(&departed).entry(name).or_insert(false);
+                }
+                LivelinessEvent::Joined { role, cav } => {
+                    let name = process_id(role, &cav).to_string();
+                    lock(&departed)
+                        .entry(name)
+                        .and_modify(|rejoined| *rejoined = true);
                 }
             })
         });
         Ok(Self {
             _watches: watches.collect::<Result<_, _>>()?,
-            state,
+            departed,
         })
     }
 
     /// Processes that were offline so far. One that does not return counts too, except the replay, which leaves when
     /// the scene is over.
     pub(crate) fn so_far(&self) -> BTreeSet<String> {
-        let state = lock(&self.state);
-        let replay = Role::Replay.to_string();
-        let gone = state.gone.iter().filter(|name| **name != replay);
-        state.returned.iter().chain(gone).cloned().collect()
+        let departed = lock(&self.departed);
+        let mut counted = departed.clone();
+        counted.retain(|name, rejoined| *rejoined || name != Role::Replay.as_str());
+        counted.into_keys().collect()
     }
 }
 
@@ -70,21 +62,11 @@ impl OfflineIntervals {
 pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
     let mut concerned: Vec<String> = match &account.topic {
-        Topic::Stream {
-            stream: Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_),
-            ..
-        }
-        | Topic::Truth => vec![replay],
-        Topic::Stream {
-            cav,
-            stream:
-                Stream::Detections
-                | Stream::DetectionsJson
-                | Stream::Tracks
-                | Stream::TracksJson
-                | Stream::Pace,
-        } => vec![process_id(Role::Ego, cav).to_string()],
-        Topic::Stream { cav, .. } => vec![process_id(Role::Agent, cav).to_string()],
+        Topic::Truth => vec![replay],
+        Topic::Stream { cav, stream } => match stream.sender() {
+            Role::Replay => vec![replay],
+            role => vec![process_id(role, cav).to_string()],
+        },
         Topic::Received { ego, cav, .. } => vec![
             process_id(Role::Agent, cav).to_string(),
             process_id(Role::Link, ego).to_string(),

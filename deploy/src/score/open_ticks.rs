@@ -23,7 +23,7 @@ pub(super) struct OpenTick {
 /// Incomplete ticks, by capture time.
 #[derive(Default)]
 pub(super) struct OpenTicks {
-    open: BTreeMap<u64, OpenTick>,
+    pub(super) open: BTreeMap<u64, OpenTick>,
     closed_until: Option<u64>,
 }
 
@@ -50,10 +50,5 @@ impl OpenTicks {
         let (capture_nanos, tick) = self.open.pop_first()?;
         self.closed_until = Some(capture_nanos);
         Some((capture_nanos, tick))
-    }
-
-    #[cfg(test)]
-    pub(super) fn len(&self) -> usize {
-        self.open.len()
     }
 }

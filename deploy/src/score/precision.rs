@@ -11,11 +11,7 @@ use crate::score::metrics::{ByIou, PartPrecision};
 const FOUND_IOU: f64 = 0.5;
 
 /// AP at the three IoU thresholds; `None` without a true object.
-pub(super) fn by_iou(scorer: &Scorer, ordering: Ordering) -> ByIou {
-    of_tallies(scorer.tallies(), ordering)
-}
-
-fn of_tallies(tallies: &[Tally], ordering: Ordering) -> ByIou {
+pub(super) fn by_iou(tallies: &[Tally], ordering: Ordering) -> ByIou {
     let [at_30, at_50, at_70] = [0, 1, 2].map(|index: usize| {
         let tally = tallies.get(index).filter(|tally| tally.objects > 0);
         tally.map(|tally| tally.curve(ordering).average_precision)
@@ -36,7 +32,7 @@ pub(super) fn by_part(scorer: &Scorer) -> [BTreeMap<String, PartPrecision>; 2] {
         if objects > 0 {
             let precision = PartPrecision {
                 objects,
-                ap: of_tallies(tallies, Ordering::Global),
+                ap: by_iou(tallies, Ordering::Global),
             };
             match part {
                 Breakdown::Distance(_) => distances.insert(part.to_string(), precision),

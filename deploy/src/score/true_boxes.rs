@@ -4,7 +4,7 @@ use dataset::frame::Frame;
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use protocol::{CavId, Truth};
 
-/// Ground truth of the ego, in its LiDAR frame; without objects where it takes no part.
+/// Ground truth of the ego, in its LiDAR frame; without its true pose there is none, and no detection counts.
 pub(crate) fn ground_truth(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> GroundTruth {
     let frames: Vec<Frame> = truth.agents.iter().map(Frame::of_truth).collect();
     let ego_index = frames.iter().position(|frame| frame.cav == *ego);

@@ -27,6 +27,9 @@ const MOST_LEDGERS: usize = 1024;
 /// Largest number of vehicles that are shown: twice as many as an ego accepts.
 const MOST_VEHICLES: usize = 128;
 
+/// Ledger and stages of each process, by name.
+type Ledgers = BTreeMap<String, (Ledger, Vec<StageSummary>)>;
+
 /// A captured message.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ReceivedMessage<'a> {
@@ -47,7 +50,7 @@ pub(crate) struct FrameAssembler {
     shown_until: Option<u64>,
     /// Epoch of the replay that publishes the truth.
     replay_epoch: Option<u64>,
-    ledgers: BTreeMap<String, (Ledger, Vec<StageSummary>)>,
+    ledgers: Ledgers,
     /// Vehicles with at least one message.
     vehicles: BTreeSet<CavId>,
     pace: PaceCounter,
@@ -227,7 +230,7 @@ impl FrameAssembler {
             Topic::Stream { cav, stream } => (cav, *stream),
             Topic::Received { ego, cav, stream } => {
                 if self.ego.as_ref().is_none_or(|shown| shown == ego) {
-                    self.arrived(at, cav, *stream, 2, seen);
+                    self.arrived(cav, *stream, 2, seen);
                 }
                 return false;
             }
@@ -263,25 +266,19 @@ impl FrameAssembler {
             }
             _ => {}
         }
-        self.arrived(at, cav, stream, 0, seen);
+        self.arrived(cav, stream, 0, seen);
         false
     }
 
-    fn arrived(
-        &mut self,
-        at: u64,
-        cav: &CavId,
-        stream: Stream,
-        rank: u8,
-        seen: &ReceivedMessage<'_>,
-    ) {
+    fn arrived(&mut self, cav: &CavId, stream: Stream, rank: u8, seen: &ReceivedMessage<'_>) {
         let rank = match stream {
             Stream::Bev | Stream::Boxes | Stream::Points => rank + 1,
             Stream::Pose => rank,
             _ => return,
         };
-        let latency_ms = ms_between(seen.header.stamp.publish_nanos, seen.arrived_nanos);
-        let arrivals = &mut self.frame(at).arrivals;
+        let stamp = &seen.header.stamp;
+        let latency_ms = ms_between(stamp.publish_nanos, seen.arrived_nanos);
+        let arrivals = &mut self.frame(stamp.capture_nanos).arrivals;
         // Of equal rank the later message counts.
         if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
             let arrival = LatestArrival {
@@ -317,12 +314,7 @@ impl OpenFrame {
         }
     }
 
-    fn frame(
-        &self,
-        capture_nanos: u64,
-        ledgers: &BTreeMap<String, (Ledger, Vec<StageSummary>)>,
-        judgement: &Judgement,
-    ) -> SceneFrame {
+    fn frame(&self, capture_nanos: u64, ledgers: &Ledgers, judgement: &Judgement) -> SceneFrame {
         let result = self.result();
         let (vehicles, points) = self.vehicles();
         let began = self.truth.as_ref().map(|(began, _)| *began);
@@ -414,7 +406,7 @@ impl OpenFrame {
                 (Vector3::from(found.translation_m) - Vector3::from(truth.translation_m)).norm()
             }),
             // Points of a vehicle without an estimate are shown where it truly is.
-            world_from_lidar: pose.or(truth).copied(),
+            world_from_lidar: pose.or(truth).map(|pose| pose.matrix_rows()[..2].concat()),
             points: sweep.len() / POINT_BYTES,
         }
     }

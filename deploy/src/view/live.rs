@@ -10,7 +10,7 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use bytes::Bytes;
 use dataset::evaluation_protocol::EvaluationProtocol;
-use futures_util::{Stream as Pieces, stream};
+use futures_util::stream::{self, BoxStream, StreamExt};
 use protocol::{
     Camera, CavId, ImageFormat, KeyExpr, Kind, ProcessId, RunId, Stats, Stream, Topic, Verb, wire,
 };
@@ -46,8 +46,10 @@ const MAX_REPORTERS: usize = 128;
 /// Interval at which the thread checks for open pages.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
 
+/// Format and content of an image.
+pub(super) type Image = (ImageFormat, Bytes);
 /// Newest image of each camera.
-type NewestImages = OnDemand<(CavId, u8), (ImageFormat, Bytes)>;
+type NewestImages = OnDemand<(CavId, u8), Image>;
 /// Newest feature map of each vehicle, as a message.
 type NewestMaps = OnDemand<CavId, Bytes>;
 /// Newest scene frame, after its length, of each ego that a page shows; of no name: the first with results. Empty: none
@@ -58,16 +60,18 @@ type NewestFrames = BTreeMap<Option<CavId>, watch::Sender<Bytes>>;
 /// closed page costs nothing. Points are those of previews, which are sent only while they have a subscriber.
 pub struct LiveRun {
     run: RunId,
-    shared: Arc<LiveState>,
+    pub(super) shared: Arc<LiveState>,
     thread: Option<JoinHandle<()>>,
 }
 
 /// State of a live run: the thread writes it, pages read it.
-struct LiveState {
+pub(super) struct LiveState {
     newest: Mutex<NewestFrames>,
     activity: Mutex<RunActivity>,
-    images: NewestImages,
-    maps: NewestMaps,
+    /// Newest images of the cameras.
+    pub(super) images: NewestImages,
+    /// Newest feature maps of the vehicles.
+    pub(super) maps: NewestMaps,
     ending: AtomicBool,
 }
 
@@ -179,16 +183,6 @@ impl LiveRun {
         }
     }
 
-    /// Newest images of the cameras.
-    pub(super) fn images(&self) -> &NewestImages {
-        &self.shared.images
-    }
-
-    /// Newest feature maps of the vehicles.
-    pub(super) fn maps(&self) -> &NewestMaps {
-        &self.shared.maps
-    }
-
     /// Number of open pages.
     #[cfg(test)]
     pub(crate) fn watchers(&self) -> usize {
@@ -199,11 +193,7 @@ impl LiveRun {
     /// Scene frames of an ego (`None`: the first with results) for one page, each after its length (32 bits,
     /// little-endian; 0: nothing new): the newest whenever the page has taken the previous one, until `limit` of them or
     /// the end of the run.
-    pub fn moments(
-        &self,
-        limit: Option<u64>,
-        ego: Option<CavId>,
-    ) -> impl Pieces<Item = Bytes> + Send + use<> {
+    pub fn moments(&self, limit: Option<u64>, ego: Option<CavId>) -> BoxStream<'static, Bytes> {
         let newest = self.subscribe(ego);
         let begun = (newest, limit, Duration::ZERO);
         stream::unfold(begun, |(mut newest, left, pause)| async move {
@@ -224,6 +214,7 @@ impl LiveRun {
                 }
             }
         })
+        .boxed()
     }
 
     /// Beyond [`MOST_EGOS`], those of the first ego with results.

@@ -3,11 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use bytes::Bytes;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{
-    Camera, CavId, Descriptor, Detections, ImageFormat, Payload, PoseEstimate, Stream, Topic,
-    Tracks, Truth,
+    Camera, CavId, Descriptor, Detections, Payload, PoseEstimate, Stream, Topic, Tracks, Truth,
 };
 use recording::{Entry, Recording, RecordingError, Result};
 use serde::Serialize;
@@ -16,6 +14,7 @@ use super::frame_assembler::{FrameAssembler, ReceivedMessage, decoded};
 use super::heat_map::HeatMap;
 use super::judgement::{DetectionArea, Judge};
 use super::link_series::{LinkSeries, LinkTraffic};
+use super::live::Image;
 use super::pace_counter::PaceCounter;
 use super::scene_frame::{SceneFrame, ShownTrack};
 use super::trails::Trails;
@@ -46,7 +45,6 @@ const SHOWN_SCORE: f32 = 0.2;
 /// A run in a file.
 pub struct RecordedRun {
     recording: Recording,
-    name: String,
     moments: Vec<RecordedMoment>,
     /// One for each ego, in the order of their first results; one for a run without results.
     timelines: Vec<Timeline>,
@@ -118,8 +116,6 @@ impl RecordedRun {
         if recording.entries().is_empty() {
             return Err(ViewError::OtherVersion(file));
         }
-        let first = recording.entries().first();
-        let name = first.map_or(String::new(), |entry| entry.key.run.to_string());
         let mut moments = BTreeMap::<u64, Vec<usize>>::new();
         let (mut stats, mut areas) = (Vec::new(), BTreeMap::new());
         for (index, entry) in recording.entries().iter().enumerate() {
@@ -142,7 +138,6 @@ impl RecordedRun {
             support::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
         let mut run = Self {
             recording,
-            name,
             moments: Vec::new(),
             timelines: Vec::new(),
             arrivals,
@@ -159,7 +154,7 @@ impl RecordedRun {
         if run.moments.is_empty() {
             return Err(ViewError::Empty(file));
         }
-        let egos = run.egos();
+        let egos = run.egos_with_results();
         let no_ego = egos.is_empty().then_some(None);
         run.timelines = egos
             .into_iter()
@@ -172,17 +167,13 @@ impl RecordedRun {
 
     /// Name of the run.
     pub fn name(&self) -> &str {
-        &self.name
+        let first = self.recording.entries().first();
+        first.map_or("", |entry| entry.key.run.as_str())
     }
 
-    /// Number of scene frames.
-    pub fn len(&self) -> usize {
+    /// Number of scene frames, at least one.
+    pub fn count(&self) -> usize {
         self.moments.len()
-    }
-
-    /// Always false: an empty recording cannot be opened.
-    pub fn is_empty(&self) -> bool {
-        self.moments.is_empty()
     }
 
     /// Entries of the timeline of an ego, or of the first ego.
@@ -240,12 +231,7 @@ impl RecordedRun {
     ///
     /// # Errors
     /// [`RecordingError`] when the file has changed.
-    pub(super) fn image(
-        &self,
-        index: usize,
-        cav: &CavId,
-        number: u8,
-    ) -> Result<Option<(ImageFormat, Bytes)>> {
+    pub(super) fn image(&self, index: usize, cav: &CavId, number: u8) -> Result<Option<Image>> {
         let bytes = self.message(index, cav, Stream::Camera(number))?;
         let camera = bytes.and_then(|bytes| decoded::<Camera>(&bytes));
         Ok(camera.map(|Camera { metadata, image }| (metadata.format, image.into())))
@@ -270,15 +256,25 @@ impl RecordedRun {
 
     /// Numbers of the cameras of any vehicle.
     pub(super) fn cameras(&self) -> BTreeSet<u8> {
-        let mut numbers = BTreeSet::new();
-        for entry in self.recording.entries() {
-            if let Topic::Stream { stream, .. } = entry.key.topic
-                && let Stream::Camera(number) = stream
-            {
-                numbers.insert(number);
-            }
-        }
-        numbers
+        let numbers = self.streams().filter_map(|(_, stream)| match stream {
+            Stream::Camera(number) => Some(number),
+            _ => None,
+        });
+        numbers.collect()
+    }
+
+    /// All egos, in the order of their first results.
+    pub(super) fn egos(&self) -> impl Iterator<Item = &CavId> + Clone {
+        self.timelines.iter().filter_map(|of| of.ego.as_ref())
+    }
+
+    /// Vehicle and stream of each message that a vehicle published.
+    pub(super) fn streams(&self) -> impl Iterator<Item = (&CavId, Stream)> + Clone {
+        let entries = self.recording.entries().iter();
+        entries.filter_map(|entry| match &entry.key.topic {
+            Topic::Stream { cav, stream } => Some((cav, *stream)),
+            _ => None,
+        })
     }
 
     fn shown(&self, ego: Option<&CavId>) -> Option<&Timeline> {
@@ -288,7 +284,7 @@ impl RecordedRun {
     }
 
     /// All egos, in the order of their first results.
-    pub(super) fn egos(&self) -> Vec<CavId> {
+    fn egos_with_results(&self) -> Vec<CavId> {
         let mut egos = Vec::new();
         let moments = self.moments.iter();
         for entry in moments.flat_map(|moment| self.entries_of(moment)) {
@@ -354,14 +350,12 @@ impl RecordedRun {
         });
         let swept_ms = times.map(|(began, arrived)| ms_between(began, arrived));
         let summary = timeline.summaries.get(index);
-        let timelines = self.timelines.iter();
-        let egos = timelines.filter_map(|timeline| timeline.ego.clone());
         SceneFrame {
             swept_ms,
             tracks: self.tracks_at(index, timeline),
             pace: timeline.pace.pace(),
             ap_50: summary.and_then(|summary| summary.ap_50),
-            egos: egos.collect(),
+            egos: self.egos().cloned().collect(),
             ..frame
         }
     }

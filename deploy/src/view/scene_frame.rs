@@ -6,7 +6,7 @@ use protocol::{
     Box3d, CavId, DropReason, MisbehaviourReason, NoPoseReason, PointCloud, Pose, StageSummary,
     StageTiming,
 };
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 
 use super::judgement::DetectionArea;
 use super::pace_counter::ShownPace;
@@ -86,9 +86,8 @@ pub struct ShownVehicle {
     pub truth: Option<Planar>,
     /// Distance between the two, metres.
     pub error_m: Option<f64>,
-    /// Transform of its points; the page gets the first two rows of it.
-    #[serde(serialize_with = "first_two_rows")]
-    pub world_from_lidar: Option<Pose>,
+    /// The first two rows of the transform of its points.
+    pub world_from_lidar: Option<Vec<f64>>,
     /// Number of its points that follow.
     pub points: usize,
 }
@@ -201,10 +200,8 @@ impl SceneFrame {
     /// Never: every field has a spelling in JSON.
     pub fn to_bytes(&self) -> Vec<u8> {
         let json = serde_json::to_vec(self).expect("plain structs, texts and numbers");
-        let mut bytes = (json.len() as u32).to_le_bytes().to_vec();
-        bytes.extend(json);
-        bytes.extend(&self.points);
-        bytes
+        let length = (json.len() as u32).to_le_bytes();
+        [&length, json.as_slice(), &self.points].concat()
     }
 }
 
@@ -216,14 +213,6 @@ impl Planar {
             yaw_rad: pose.yaw_rad(),
         }
     }
-}
-
-fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S::Ok, S::Error> {
-    let rows = pose.as_ref().map(|pose| {
-        let [first, second, ..] = pose.matrix_rows();
-        [first, second].concat()
-    });
-    rows.serialize(serializer)
 }
 
 /// The points of a sweep as sent to the page, evenly decimated if there are many.

@@ -1,17 +1,18 @@
 //! Web server of the page and of its data.
 
+use std::collections::BTreeSet;
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use bus::web::{Answer, Request, WebServer};
 use bytes::Bytes;
-use futures_util::StreamExt;
 use protocol::{CavId, ImageFormat};
 use recording::RecordingError;
 use serde_json::json;
 
 use super::heat_map::HeatMap;
+use super::live::Image;
 use super::{LiveRun, RecordedRun};
 
 const HTML: &str = include_str!("page/index.html");
@@ -41,17 +42,18 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
     WebServer::start(address, move |request| match request.path.as_str() {
         "/run" => document(&json!({"mode": "live", "run": run.name()})),
         "/live" => {
-            let frames = run.moments(number_of("frames", &request.query), ego_of(&request.query));
+            let limit = text_of("frames", &request.query).and_then(|limit| limit.parse().ok());
+            let frames = run.moments(limit, ego_of(&request.query));
             Answer::Stream {
                 content_type: BINARY,
-                pieces: frames.boxed(),
+                pieces: frames,
             }
         }
         "/status" => document(&json!(run.status())),
         path => match (camera(path), mapped(path)) {
-            (Some(camera), _) => image(run.images().get(&camera)),
+            (Some(camera), _) => image(run.shared.images.get(&camera)),
             (None, Some(cav)) => {
-                let message = run.maps().get(&cav);
+                let message = run.shared.maps.get(&cav);
                 heat_map(message.and_then(|message| HeatMap::of(&message)))
             }
             (None, None) => asset(request),
@@ -65,32 +67,67 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
 /// [`io::Error`] when the address cannot be listened at.
 pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<WebServer> {
     WebServer::start(address, move |request| {
-        let ego = ego_of(&request.query);
-        if request.path == "/run" {
-            let timeline = run.timeline(ego.as_ref());
-            let (egos, cameras) = (run.egos(), run.cameras());
-            return document(&json!({"mode": "recorded", "run": run.name(), "egos": egos,
-                "timeline": timeline, "cameras": cameras}));
-        }
-        let index = number_of("at", &request.query).unwrap_or(0) as usize;
-        if let Some((cav, number)) = camera(&request.path) {
-            return run.image(index, &cav, number).map_or_else(not_found, image);
-        }
-        if let Some(cav) = mapped(&request.path) {
-            return run.heat_map(index, &cav).map_or_else(not_found, heat_map);
-        }
-        let Some(index) = request.path.strip_prefix("/frame/") else {
-            return asset(request);
-        };
-        match index.parse().map(|index| run.frame(index, ego.as_ref())) {
-            Ok(Ok(Some(frame))) => page(BINARY, frame.to_bytes()),
-            Ok(Ok(None)) => {
-                Answer::NotFound(format!("there are {} moments, counted from 0", run.len()))
-            }
-            Ok(Err(error)) => not_found(error),
-            Err(error) => Answer::NotFound(format!("{index:?} is no number: {error}")),
-        }
+        recorded(&run, request).unwrap_or_else(Answer::NotFound)
     })
+}
+
+/// Answer of a recorded run.
+///
+/// # Errors
+/// What there is in place of an ego, a vehicle or a moment that there is not.
+fn recorded(run: &RecordedRun, request: &Request) -> Result<Answer, String> {
+    let (path, query) = (request.path.as_str(), request.query.as_str());
+    let ego = ego_of(query);
+    if path == "/run" {
+        // Of an ego without results those of the first one: the page goes on with that.
+        let (timeline, cameras) = (run.timeline(ego.as_ref()), run.cameras());
+        let about = json!({"mode": "recorded", "run": run.name(), "timeline": timeline,
+            "cameras": cameras, "egos": Vec::from_iter(run.egos())});
+        return Ok(document(&about));
+    }
+    let no_answer = |error: RecordingError| error.to_string();
+    let (pictured, mapped) = (camera(path), mapped(path));
+    let vehicle = pictured.as_ref().map(|(cav, _)| cav).or(mapped.as_ref());
+    if let Some(cav) = vehicle {
+        let publishers = run.streams().map(|(cav, _)| cav);
+        check_known("vehicle", cav.as_str(), publishers)?;
+        let index = moment(text_of("at", query).unwrap_or("0"), run)?;
+        let found = match pictured {
+            Some((_, number)) => run.image(index, cav, number).map(image),
+            None => run.heat_map(index, cav).map(heat_map),
+        };
+        return found.map_err(no_answer);
+    }
+    let Some(index) = path.strip_prefix("/frame/") else {
+        return Ok(asset(request));
+    };
+    if let Some(asked) = text_of("ego", query) {
+        check_known("ego", asked, run.egos())?;
+    }
+    let frame = run.frame(moment(index, run)?, ego.as_ref());
+    let frame = frame.map_err(no_answer)?.ok_or("nothing is shown here")?;
+    Ok(page(BINARY, frame.to_bytes()))
+}
+
+/// Refuses an id that is none of those known.
+fn check_known<'a>(
+    kind: &str,
+    asked: &str,
+    mut known: impl Iterator<Item = &'a CavId> + Clone,
+) -> Result<(), String> {
+    let all = known.clone();
+    if known.any(|id| id.as_str() == asked) {
+        return Ok(());
+    }
+    let all: BTreeSet<&str> = all.map(CavId::as_str).collect();
+    Err(format!("there is no {kind} {asked:?}, only {all:?}"))
+}
+
+/// Index of a moment of a run.
+fn moment(text: &str, run: &RecordedRun) -> Result<usize, String> {
+    let (index, count) = (text.parse::<usize>().ok(), run.count());
+    let index = index.filter(|index| *index < count);
+    index.ok_or_else(|| format!("there is no moment {text:?}, only {count}, counted from 0"))
 }
 
 /// Vehicle and number of `/camera/<cav>/<number>`.
@@ -109,12 +146,7 @@ fn heat_map(found: Option<HeatMap>) -> Answer {
     page(BINARY, found.map_or(Vec::new(), |map| map.to_bytes()))
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "the error of a result")]
-fn not_found(error: RecordingError) -> Answer {
-    Answer::NotFound(error.to_string())
-}
-
-fn image(found: Option<(ImageFormat, Bytes)>) -> Answer {
+fn image(found: Option<Image>) -> Answer {
     match found {
         Some((ImageFormat::Png, image)) => page("image/png", image),
         Some((ImageFormat::Jpeg, image)) => page("image/jpeg", image),
@@ -142,11 +174,6 @@ fn asset(request: &Request) -> Answer {
 
 fn document(value: &serde_json::Value) -> Answer {
     page("application/json", value.to_string())
-}
-
-/// Number that a query has for `name`.
-fn number_of(name: &str, query: &str) -> Option<u64> {
-    text_of(name, query)?.parse().ok()
 }
 
 /// Ego whose results are asked for.

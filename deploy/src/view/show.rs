@@ -23,7 +23,8 @@ pub fn show_recorded(recording: &Path, listen: SocketAddr) -> anyhow::Result<()>
         ViewError::Recording(_) => anyhow::Error::from(error),
         _ => BadInput::of(error).into(),
     })?;
-    output::note(format_args!("{} moments of run {}", run.len(), run.name()));
+    let (count, name) = (run.count(), run.name());
+    output::note(format_args!("{count} moments of run {name}"));
     until_stopped(listen, |address| serve_recorded(address, Arc::new(run)))
 }
 
@@ -37,8 +38,11 @@ pub fn until_stopped(
 ) -> anyhow::Result<()> {
     let stop = Stop::new();
     stop.on_signals()?;
-    let server = serve(listen)
-        .map_err(|error| BadInput::new(format!("cannot serve at {listen}: {error}")))?;
+    let server = serve(listen).map_err(|error| {
+        BadInput::new(format!(
+            "cannot serve at {listen}: {error}; choose another one with --page"
+        ))
+    })?;
     let address = server.address();
     output::note(format_args!("http://{address}/ (Ctrl-C ends it)"));
     // The wait needs a deadline, the loop makes it endless.

@@ -343,7 +343,7 @@ fn check(frame: &Value, points: usize) {
 fn a_recorded_run_is_shown_in_any_order() {
     let folder = tempfile::tempdir().unwrap();
     let run = record(folder.path(), false);
-    assert_eq!((run.len(), run.name()), (TICKS as usize, "test"));
+    assert_eq!((run.count(), run.name()), (TICKS as usize, "test"));
     for index in [3, 0, 4, 3] {
         let (frame, points) = parsed(&run.frame(index, None).unwrap().unwrap().to_bytes());
         assert_eq!(frame["tick"], index);
@@ -443,8 +443,8 @@ fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
     let folder = tempfile::tempdir().unwrap();
     let run = record(folder.path(), true);
     assert_eq!(
-        run.egos(),
-        [cav(EGO), cav(OTHER)],
+        Vec::from_iter(run.egos()),
+        [&cav(EGO), &cav(OTHER)],
         "in the order of their results"
     );
     for (ego, latency_ms) in [
@@ -488,6 +488,21 @@ fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
     assert_eq!(about["timeline"][0]["latency_ms"], 30.0);
     assert_eq!(&map[map.len() - 8..], [0, 0, 0, 0, 0, 85, 170, 255]);
     assert!(no_map.is_empty(), "it has published none");
+    for (path, known) in [
+        ("/frame/0?ego=9999", [EGO, OTHER]),
+        ("/frame/0?ego=A/B", [EGO, OTHER]),
+        ("/map/9999?at=0", [EGO, OTHER]),
+        ("/camera/9999/0?at=0", [EGO, OTHER]),
+        ("/frame/5", ["only 5", "from 0"]),
+        ("/frame/x", ["only 5", "from 0"]),
+        ("/map/4288?at=x", ["only 5", "from 0"]),
+        ("/camera/4288/0?at=5", ["only 5", "from 0"]),
+    ] {
+        let (status, body) = fetch(server.address(), path).unwrap();
+        let body = String::from_utf8_lossy(&body);
+        assert!(status.contains("404"), "{path}: {status}");
+        assert!(known.iter().all(|part| body.contains(part)), "{body}");
+    }
 }
 
 /// The frame that a message of a replay with this epoch completes.

@@ -57,7 +57,7 @@ impl Cobevt {
 
 impl Fusion for Cobevt {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
-        let agents = maps.count()?;
+        let agents = maps.warped.count()?;
         let (window, count_missing) = (self.config.window, self.config.count_missing);
         let WarpedMaps { features, mask } = nearest_first(maps)?;
         // Where all maps reach every cell, neither the product with the mask nor masked attention is needed.

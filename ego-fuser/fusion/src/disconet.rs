@@ -116,7 +116,7 @@ impl DiscoNet {
 impl Fusion for DiscoNet {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let features = &maps.warped.features;
-        if maps.count()? == 1 {
+        if maps.warped.count()? == 1 {
             return Ok(features.f_get(0)?.into());
         }
         let scores = self.scores(features, maps.is_training)?;

@@ -102,7 +102,8 @@ impl ReceivedMaps {
 /// Missing agents are either absent or have a mask of zeros: both are equivalent for every method.
 #[derive(Debug)]
 pub struct AlignedMaps {
-    /// `N` maps on the ego's grid; the mask is 1 everywhere for the ego.
+    /// `N` maps on the ego's grid, one of each agent, or of any age where earlier ones are not separate; the mask is 1
+    /// everywhere for the ego.
     pub warped: WarpedMaps,
     /// The same maps in the frames of their senders but in the axes of the ego, for methods that warp them themselves.
     pub received: ReceivedMaps,
@@ -140,14 +141,6 @@ impl AlignedMaps {
     pub(crate) fn earlier_full_resolution(&self) -> Option<&(Vec<FullResolutionMap>, Classes)> {
         self.earlier.as_ref()?.full_resolution.as_ref()
     }
-
-    /// Number of agents with a newest map, or of maps of any age where earlier ones are not separate.
-    ///
-    /// # Errors
-    /// [`TchError`] when the features have not four dimensions.
-    pub fn count(&self) -> Result<i64, TchError> {
-        Ok(self.warped.features.size4()?.0)
-    }
 }
 
 /// Aligned maps from before the newest of their agents.
@@ -181,18 +174,6 @@ fn sum_of_every(maps: &Tensor, dim: i64, count: i64) -> Result<Tensor, TchError>
     (1..count).try_fold(maps.f_slice(dim, 0_i64, None, count)?, |sum, first| {
         sum.f_add(&maps.f_slice(dim, first, None, count)?)
     })
-}
-
-/// The grid of pooled maps.
-pub(crate) fn with_cells_of(grid: &BevGrid, cells: i64) -> BevGrid {
-    let cells = cells as u32;
-    let (width, height) = (grid.width.div_ceil(cells), grid.height.div_ceil(cells));
-    BevGrid {
-        cell_m: grid.cell_m * f64::from(cells),
-        width,
-        height,
-        ..*grid
-    }
 }
 
 /// Indices of the entries of `mask` `[N, 1, H, W]` that reach any cell; `with_ego`: the first is always one.

@@ -10,7 +10,7 @@ use std::str::FromStr;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser, ValueParserFactory};
 use clap::{Arg, Command};
 use perception::model_config::DetectorConfig;
-use perception::weights::{METHOD_KEY, Weights};
+use perception::weights::{FileError, METHOD_KEY, Weights};
 use protocol::ConfidenceGate;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Error;
@@ -105,6 +105,27 @@ impl Method {
             [] => vec![self.name()],
             names => names.to_vec(),
         }
+    }
+
+    /// Checks that a weights file, if it names a method, was trained for one whose weights this method runs with.
+    ///
+    /// # Errors
+    /// [`FileError`] with both methods.
+    pub fn check_training(self, weights: &Weights) -> Result<(), FileError> {
+        let names = self.weights_names();
+        match weights.metadata(METHOD_KEY) {
+            Some(trained) if !names.contains(&trained) => {
+                let needed = format_args!("method {self} needs weights trained for {}", names[0]);
+                let problem = format_args!("trained for {trained}, and {needed}");
+                Err(FileError::new(weights.path(), problem))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// True if it is the TorchScript file of a user, which may stand on any encoder.
+    pub fn is_script(self) -> bool {
+        self.0.fusion.kind == script::FUSION.kind
     }
 
     /// The method to run with a weights file: `named`, or else the one that the file names.

@@ -63,14 +63,12 @@ pub enum AnchorGridError {
         /// Anchors of a cell.
         per_cell: usize,
     },
-    /// Centres do not increase with row and column, so objects cannot be looked up.
+    /// Centres do not increase with row and column, so objects cannot be looked up; holds the flat index of the first
+    /// anchor that breaks the order.
     #[error(
-        "anchor {index} breaks the order of the grid: x must increase with the column only, y with the row only"
+        "anchor {0} breaks the order of the grid: x must increase with the column only, y with the row only"
     )]
-    NotSeparable {
-        /// Flat index of the first anchor that breaks the order.
-        index: usize,
-    },
+    NotSeparable(usize),
 }
 
 /// Assigns the objects of a frame to the anchors of a head.
@@ -116,10 +114,10 @@ impl TargetAssigner {
             anchor.center_m[0] != column_x[column] || anchor.center_m[1] != row_y[row]
         });
         if let Some(index) = off_lattice {
-            return Err(AnchorGridError::NotSeparable { index });
+            return Err(AnchorGridError::NotSeparable(index));
         }
         if !column_x.is_sorted_by(|a, b| a < b) || !row_y.is_sorted_by(|a, b| a < b) {
-            return Err(AnchorGridError::NotSeparable { index: 0 });
+            return Err(AnchorGridError::NotSeparable(0));
         }
         let reach = anchors
             .iter()
@@ -374,6 +372,6 @@ mod tests {
         assert!(matches!(error, AnchorGridError::Count { found: 40, .. }));
         anchors[13].center_m[0] += 0.1;
         let error = TargetAssigner::new(anchors, [4, 5, 2], TargetRule::default()).unwrap_err();
-        assert_eq!(error, AnchorGridError::NotSeparable { index: 13 });
+        assert_eq!(error, AnchorGridError::NotSeparable(13));
     }
 }

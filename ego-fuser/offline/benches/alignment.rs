@@ -5,7 +5,7 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
+use ego_fuser_offline::alignment::free_align::MIN_MATCHES;
 use ego_fuser_offline::alignment::{align_boxes, box_icp};
 use nalgebra::{Isometry3, Vector3};
 use protocol::Box3d;
@@ -31,8 +31,7 @@ fn alignment(criterion: &mut Criterion) {
     let moved = common.iter().map(|node| node.transformed(&truth.inverse()));
     let neighbour: Vec<_> = moved.chain(boxes(10)).collect();
     let ego: Vec<_> = common.iter().copied().chain(boxes(10)).collect();
-    let config = FreeAlignConfig::default();
-    let found = align_boxes(&ego, &neighbour, &config).expect("12 boxes in common");
+    let found = align_boxes(&ego, &neighbour, MIN_MATCHES).expect("12 boxes in common");
     assert!(
         truth
             .inv_mul(&found.ego_from_neighbour)
@@ -42,7 +41,7 @@ fn alignment(criterion: &mut Criterion) {
             < 0.5
     );
     criterion.bench_function("alignment/free_align/22x22", |bencher| {
-        bencher.iter(|| align_boxes(black_box(&ego), black_box(&neighbour), &config));
+        bencher.iter(|| align_boxes(black_box(&ego), black_box(&neighbour), MIN_MATCHES));
     });
     criterion.bench_function("alignment/box_icp/22x22", |bencher| {
         bencher.iter(|| {

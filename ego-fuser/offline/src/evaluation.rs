@@ -37,6 +37,7 @@ pub use error::EvaluateError;
 use participant::Participant;
 pub use setup::{AgentPool, EmulatedLink, Setup};
 use stepped::{ComputeTimes, RemotePool};
+pub use sweeps::without_true_pose;
 
 /// One frame of the ego with all data for its evaluation.
 #[derive(Debug, Clone)]
@@ -129,8 +130,8 @@ impl Evaluator {
         self.sent_bytes
     }
 
-    /// The same with maps that its encoder computed before, stored at least as exactly as in messages: the messages are
-    /// then the same.
+    /// The same with maps that its encoder computed before. Maps that are stored at least as exactly as in messages give
+    /// the same messages; boxes of single vehicles (`none`, `late`) are the same only if they are kept in 32 bits.
     pub fn with_maps(mut self, maps: MapSource) -> Self {
         self.maps = Some(maps);
         self
@@ -158,8 +159,9 @@ impl Evaluator {
     }
 
     /// Runs over a scenario; `on_frame` may end it. Frames that cannot be read are left out and counted
-    /// ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick. So are frames that
-    /// cannot be computed, but a tick of the ego has no result then ([`EvaluatedFrame::failure`]).
+    /// ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick. So are ticks without the
+    /// ego's true pose, though it drives on, and frames that cannot be computed, but a tick of the ego has no result
+    /// then ([`EvaluatedFrame::failure`]).
     ///
     /// # Errors
     /// [`EvaluateError`] when the pipeline reports an error.

@@ -9,7 +9,7 @@
 //! The ego's process does not link this crate, and with it none of the data-set readers.
 //!
 //! ```
-//! use ego_fuser_offline::alignment::{align_boxes, free_align::FreeAlignConfig};
+//! use ego_fuser_offline::alignment::{align_boxes, free_align::MIN_MATCHES};
 //! use protocol::Box3d;
 //!
 //! # fn main() -> Result<(), ego_fuser_offline::alignment::NoAlignment> {
@@ -19,7 +19,7 @@
 //!     let size_m = [4.5, 1.9, 1.6];
 //!     cars.map(|[x, y]| Box3d { center_m: [x + ahead_m, y, -1.0], size_m, heading_rad: 0.0 })
 //! };
-//! let aligned = align_boxes(&boxes(0.0), &boxes(20.0), &FreeAlignConfig::default())?;
+//! let aligned = align_boxes(&boxes(0.0), &boxes(20.0), MIN_MATCHES)?;
 //! assert!((aligned.ego_from_neighbour.translation.vector.x + 20.0).abs() < 0.01);
 //! # Ok(())
 //! # }

@@ -17,7 +17,9 @@ use terminal::command_line::parse_behind;
     name = "ego-fuser",
     bin_name = "ego-fuser",
     version,
-    arg_required_else_help = true
+    arg_required_else_help = true,
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 data could not be used and were left out, 130 \
+                  a training was stopped by Ctrl-C."
 )]
 struct CommandLine {
     #[command(subcommand)]

@@ -39,16 +39,16 @@ pub fn search_scales(
         }
     }
     drop((network, detector));
-    let mut setup = Setup::default();
+    let mut setup = Setup {
+        frames: Some(frames),
+        ..Setup::default()
+    };
     setup.models.precision = precision;
     setup.models.weights = weights.to_owned();
     let mut evaluator = Evaluator::new(setup)?;
     evaluator.ego_mut().fusion_mut().start_scale_search();
     for scenario in scenarios {
-        let _ = evaluator.run(scenario, &mut |frame| match frame.tick + 1 < frames {
-            true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(()),
-        })?;
+        let _ = evaluator.run(scenario, &mut |_| ControlFlow::Continue(()))?;
     }
     if let Some(fusion) = evaluator.ego_mut().fusion_mut().take_scale_search() {
         search.merge(fusion);

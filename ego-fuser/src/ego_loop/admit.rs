@@ -1,6 +1,6 @@
 //! Messages of an ego's loop: decoded, dated and queued.
 
-use protocol::message::{Bev, Boxes, Descriptor, Payload, Points};
+use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{CavId, DropReason, HEADER_LEN, Header, Kind, Limits, Stream, WireError, wire};
 
 use super::{EgoLoop, Message, Output, OwnFrame, Reception, Source};
@@ -47,15 +47,15 @@ impl EgoLoop {
         }
         let (pose, content) = match stream {
             Stream::Boxes => {
-                let boxes: Boxes = payload(pieces, limits)?;
+                let boxes: Boxes = wire::decode(pieces, limits)?.1;
                 (boxes.pose, Content::Boxes(boxes.into_objects()))
             }
             Stream::Points => {
-                let Points { pose, points } = payload(pieces, limits)?;
+                let Points { pose, points } = wire::decode(pieces, limits)?.1;
                 (pose, Content::Points(points))
             }
             _ => {
-                let Bev { pose, features } = payload(pieces, limits)?;
+                let Bev { pose, features } = wire::decode(pieces, limits)?.1;
                 // `decode` consumes the map, and a map that is malformed is reported as that first.
                 let fits = self.models.check(&features);
                 let map = features.decode(limits)?;
@@ -278,11 +278,4 @@ impl EgoLoop {
             self.drop_message(source.clone(), reason);
         }
     }
-}
-
-fn payload<'a, M: Payload>(
-    pieces: impl IntoIterator<Item = &'a [u8]>,
-    limits: &Limits,
-) -> Result<M, WireError> {
-    wire::decode(pieces, limits).map(|(_, message)| message)
 }

@@ -76,13 +76,6 @@ pub struct Assessment {
     pub misbehaviour: Option<MisbehaviourReason>,
 }
 
-impl Assessment {
-    /// True if it is left out.
-    pub fn is_out(&self) -> bool {
-        self.misbehaviour.is_some()
-    }
-}
-
 impl MisbehaviourDetector {
     /// Starts with all neighbours trusted.
     pub(crate) fn new(detector: &mut Detector) -> Result<Self, DetectorError> {
@@ -314,22 +307,30 @@ mod tests {
                 false,
             )
         };
-        assert!(!assess(None).is_out(), "left out only with evidence");
+        assert!(
+            assess(None).misbehaviour.is_none(),
+            "left out only with evidence"
+        );
         assert_eq!(
             assess(Some(-3.0)).misbehaviour,
             Some(MisbehaviourReason::Duplicated),
             "strong evidence counts at once"
         );
-        assert!(assess(None).is_out(), "the same message is no new evidence");
-        let returns = (0..20).position(|_| !assess(Some(1.5)).is_out()).unwrap();
+        assert!(
+            assess(None).misbehaviour.is_some(),
+            "the same message is no new evidence"
+        );
+        let returns = (0..20)
+            .position(|_| assess(Some(1.5)).misbehaviour.is_none())
+            .unwrap();
         assert!((1..6).contains(&returns), "after {returns} frames");
         assert!(
-            !assess(Some(-1.0)).is_out(),
+            assess(Some(-1.0)).misbehaviour.is_none(),
             "one frame with weak evidence is tolerated"
         );
         assert!((0..20).map(|_| assess(Some(4.0))).last().unwrap().trust > 0.97);
         assert!(
-            assess(Some(-8.0)).is_out(),
+            assess(Some(-8.0)).misbehaviour.is_some(),
             "a clear attack is rejected whatever the trust"
         );
     }
@@ -343,16 +344,17 @@ mod tests {
             Some(MisbehaviourReason::Probation)
         );
         assert!(
-            !trust
+            trust
                 .add_up(
                     0,
                     &cav,
                     Some((2.0, MisbehaviourReason::PositionMismatch)),
                     true
                 )
-                .is_out()
+                .misbehaviour
+                .is_none()
         );
-        assert!(!trust.add_up(0, &cav, None, true).is_out());
+        assert!(trust.add_up(0, &cav, None, true).misbehaviour.is_none());
     }
 
     #[test]
@@ -377,20 +379,22 @@ mod tests {
             .collect();
         let attack = Some((-9.0, MisbehaviourReason::ImplausibleMotion));
         for cav in &names[..MAX_PEERS] {
-            assert!(trust.add_up(0, cav, attack, false).is_out());
+            assert!(trust.add_up(0, cav, attack, false).misbehaviour.is_some());
         }
         let newcomer = &names[MAX_PEERS];
         trust.forget_absent(FORGOTTEN_NANOS, [newcomer].into_iter());
         assert!(
-            !trust
+            trust
                 .add_up(FORGOTTEN_NANOS, newcomer, attack, false)
-                .is_out(),
+                .misbehaviour
+                .is_none(),
             "the state is full"
         );
         assert!(
             trust
                 .add_up(FORGOTTEN_NANOS, &names[0], None, false)
-                .is_out(),
+                .misbehaviour
+                .is_some(),
             "it has not washed itself"
         );
         let later = FORGOTTEN_NANOS + 1;
@@ -398,7 +402,10 @@ mod tests {
         let known: Vec<&CavId> = trust.peers.keys().collect();
         assert_eq!(known, [&names[0], &names[1]]);
         assert!(
-            trust.add_up(later, newcomer, attack, false).is_out(),
+            trust
+                .add_up(later, newcomer, attack, false)
+                .misbehaviour
+                .is_some(),
             "a newcomer is judged"
         );
     }

@@ -102,7 +102,7 @@ impl Bus {
             sequence: 0,
             is_start_reported: false,
         })?;
-        let (pool, contact) = (SharedPool::none(), RouterContact::watch(&session)?);
+        let (pool, contact) = (SharedPool::default(), RouterContact::watch(&session)?);
         Ok(Self {
             session,
             identity,

@@ -41,14 +41,11 @@ pub enum BusError {
         /// The value that zenoh has set.
         found: String,
     },
-    /// Another process uses the port.
+    /// Another process uses the port of the router's endpoint.
     #[error(
-        "cannot listen at {endpoint}: the port is in use; end the other process or choose another port"
+        "cannot listen at {0}: the port is in use; end the other process or choose another port"
     )]
-    PortInUse {
-        /// Endpoint of the router.
-        endpoint: Endpoint,
-    },
+    PortInUse(Endpoint),
     /// No router answers at the endpoint.
     #[error(
         "no router at {endpoint} after {waited_s:.1} s; start it first (v2vloc up, or zenohd) or correct the endpoint{}",
@@ -128,7 +125,7 @@ impl BusError {
                 ErrorKind::AddrInUse | ErrorKind::AddrNotAvailable | ErrorKind::PermissionDenied
             ),
             Self::Endpoint(_)
-            | Self::PortInUse { .. }
+            | Self::PortInUse(_)
             | Self::Keys { .. }
             | Self::NoKeys(_)
             | Self::SharedMemory { .. }

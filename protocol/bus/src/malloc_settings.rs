@@ -66,4 +66,10 @@ mod tests {
         assert_eq!(missing(&settings, |name| name == "A"), [("B", "2")]);
         assert!(missing(&settings, |_| true).is_empty());
     }
+
+    #[test]
+    fn tests_have_the_threads_of_a_router() {
+        let (name, threads) = ROUTER_THREADS;
+        assert_eq!(env::var(name).as_deref(), Ok(threads));
+    }
 }

@@ -414,7 +414,7 @@ pub fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Resul
 
 /// Head and body concatenated, without copying the body.
 pub(super) fn payload(encoded: Encoded) -> ZBytes {
-    SharedPool::none().payload(encoded)
+    SharedPool::default().payload(encoded)
 }
 
 /// Current time on the Unix clock, nanoseconds.
@@ -452,7 +452,7 @@ mod tests {
             &session,
             (&key, &cav),
             1,
-            (&stats, &SharedPool::none()),
+            (&stats, &SharedPool::default()),
             PublisherOptions::POSE,
         )
         .unwrap();

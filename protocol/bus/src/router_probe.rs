@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::KeyExpr;
 use support::sync::{lock, spawn};
 use zenoh::{Session, Wait};
 
@@ -38,29 +37,7 @@ impl RouterProbe {
     ///
     /// # Errors
     /// [`BusError`], as [`open`].
-    pub fn of_key(client: &BusOptions, key: &KeyExpr) -> Result<Self, BusError> {
-        Self::begin(client, key.as_str())
-    }
-
-    /// A probe of the router in this process, `router`, which it reaches with the `client` options: it publishes too.
-    ///
-    /// # Errors
-    /// [`BusError`], as [`open`].
-    pub fn of_router(router: &Session, client: &BusOptions) -> Result<Self, BusError> {
-        let probe = Self::begin(client, PROBE_KEY)?;
-        // A weak reference: the thread ends with the probe instead of keeping it alive.
-        let (router, alive) = (router.clone(), Arc::downgrade(&probe.arrived));
-        // On a thread: at a router that fails it waits for ever.
-        let thread = spawn("router-probe", move || {
-            while alive.strong_count() > 0 && router.put(PROBE_KEY, [0_u8; 1]).wait().is_ok() {
-                thread::sleep(PERIOD);
-            }
-        });
-        thread.map_err(BusError::thread("router-probe"))?;
-        Ok(probe)
-    }
-
-    fn begin(client: &BusOptions, key: &str) -> Result<Self, BusError> {
+    pub fn of_key(client: &BusOptions, key: &str) -> Result<Self, BusError> {
         let session = open(client)?;
         let now = Instant::now();
         let arrived = Arc::new(Mutex::new(now));
@@ -72,6 +49,24 @@ impl RouterProbe {
             looked: (now, now, Duration::ZERO),
             connection: (session, subscriber),
         })
+    }
+
+    /// A probe of the router in this process, `router`, which it reaches with the `client` options: it publishes too.
+    ///
+    /// # Errors
+    /// [`BusError`], as [`open`].
+    pub fn of_router(router: &Session, client: &BusOptions) -> Result<Self, BusError> {
+        let probe = Self::of_key(client, PROBE_KEY)?;
+        // A weak reference: the thread ends with the probe instead of keeping it alive.
+        let (router, alive) = (router.clone(), Arc::downgrade(&probe.arrived));
+        // On a thread: at a router that fails it waits for ever.
+        let thread = spawn("router-probe", move || {
+            while alive.strong_count() > 0 && router.put(PROBE_KEY, [0_u8; 1]).wait().is_ok() {
+                thread::sleep(PERIOD);
+            }
+        });
+        thread.map_err(BusError::thread("router-probe"))?;
+        Ok(probe)
     }
 
     /// Time at `now` for which nothing has come through the router while this program ran. To be asked for five times a
@@ -105,6 +100,8 @@ impl RouterProbe {
 mod tests {
     use std::net::TcpListener;
 
+    use protocol::KeyExpr;
+
     use super::*;
     use crate::Endpoint;
 
@@ -116,7 +113,7 @@ mod tests {
         let client = BusOptions::client(endpoint);
         let mut probe = RouterProbe::of_router(&router, &client).unwrap();
         let key = KeyExpr::stats(&"r1".parse().unwrap());
-        let mut nothing = RouterProbe::of_key(&client, &key).unwrap();
+        let mut nothing = RouterProbe::of_key(&client, key.as_str()).unwrap();
         let began = Instant::now();
         let mut longest = Duration::ZERO;
         while nothing.silence(Instant::now()) < 3 * PERIOD {

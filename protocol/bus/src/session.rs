@@ -119,18 +119,6 @@ impl BusOptions {
         self
     }
 
-    /// The same as a router with access control.
-    #[must_use]
-    pub fn with_access_control(mut self, guard: AccessControl) -> Self {
-        self.guard = Some(guard);
-        self
-    }
-
-    /// Endpoint at which this end listens or to which it connects.
-    pub fn endpoint(&self) -> &Endpoint {
-        &self.endpoint
-    }
-
     /// The same as a configuration for a separate `zenohd`.
     pub fn for_zenohd(&self) -> Value {
         let mut whole = json!({});
@@ -255,11 +243,11 @@ pub fn open(options: &BusOptions) -> Result<Session, BusError> {
     let began = Instant::now();
     // Before zenoh tries, which would print a warning of its own first; it fails too if another process is faster.
     if options.role == Role::Router && port_in_use(&endpoint) {
-        return Err(BusError::PortInUse { endpoint });
+        return Err(BusError::PortInUse(endpoint));
     }
     let opened = zenoh::open(config).wait();
     opened.map_err(|cause| match options.role {
-        Role::Router if port_in_use(&endpoint) => BusError::PortInUse { endpoint },
+        Role::Router if port_in_use(&endpoint) => BusError::PortInUse(endpoint),
         Role::Router => BusError::zenoh(format!("listening at {endpoint}"), &cause),
         Role::Client => BusError::Unreachable {
             endpoint,
@@ -414,7 +402,10 @@ mod tests {
             members,
             runs: protocol::RunScope::Any,
         };
-        let options = BusOptions::router(Endpoint::loopback(7447)).with_access_control(guard);
+        let options = BusOptions {
+            guard: Some(guard),
+            ..BusOptions::router(Endpoint::loopback(7447))
+        };
         config(&options).unwrap();
         assert_eq!(
             options.for_zenohd()["transport"]["link"]["protocols"],

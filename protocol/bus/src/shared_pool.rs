@@ -23,8 +23,8 @@ const SMALL_BYTES: usize = 16 << 10;
 /// Folder in which the system keeps shared memory.
 const FOLDER: &str = "/dev/shm";
 
-/// The pool of a process, or none. Clones share it.
-#[derive(Clone)]
+/// The pool of a process; by default none: all messages take the socket. Clones share it.
+#[derive(Clone, Default)]
 pub(super) struct SharedPool(Option<Arc<ShmPool>>);
 
 struct ShmPool {
@@ -34,11 +34,6 @@ struct ShmPool {
 }
 
 impl SharedPool {
-    /// No pool: all messages take the socket.
-    pub(super) fn none() -> Self {
-        Self(None)
-    }
-
     /// The pool for the messages of `session`; none without bytes.
     ///
     /// # Errors
@@ -49,7 +44,7 @@ impl SharedPool {
         stats: &MessageStats,
     ) -> Result<Self> {
         let SharedMemory::Pool(bytes @ 1..) = memory else {
-            return Ok(Self::none());
+            return Ok(Self::default());
         };
         check_room(bytes)?;
         let provider = ShmProviderBuilder::default_backend(bytes).wait();

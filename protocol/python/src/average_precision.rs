@@ -20,15 +20,11 @@ pub(crate) fn average_precision<'py>(
     iou: Option<&Bound<'py, PyAny>>,
     ordering: &str,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let ordering = match ordering {
-        "global" => Ordering::Global,
-        "frame" => Ordering::Frame,
-        other => {
-            return Err(error(format!(
-                "ordering: {other:?}, expected \"global\" or \"frame\""
-            )));
-        }
-    };
+    let ordering: Ordering = serde_json::from_value(ordering.into()).map_err(|_| {
+        error(format!(
+            "ordering: {ordering:?}, expected \"global\" or \"frame\""
+        ))
+    })?;
     let frames = frames(detections, truth)?;
     let single = iou.map_or(Some(0.5), |iou| iou.extract::<f64>().ok());
     let thresholds: Vec<f64> = match (single, iou) {

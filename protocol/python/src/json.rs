@@ -17,6 +17,5 @@ pub(crate) fn to_python(py: Python<'_>, value: &impl Serialize) -> PyResult<Py<P
 /// The name that a variant has in JSON.
 pub(crate) fn name(variant: &impl Serialize) -> PyResult<String> {
     let value = serde_json::to_value(variant).map_err(error)?;
-    let text = value.as_str().map(str::to_owned);
-    Ok(text.unwrap_or_else(|| value.to_string()))
+    serde_json::from_value(value).map_err(error)
 }

@@ -41,6 +41,7 @@ pub(crate) struct Listener {
     last_data: Instant,
     messages: u64,
     undecodable: u64,
+    #[pyo3(get)]
     problems: Vec<String>,
     /// The replay has published its end.
     is_over: bool,
@@ -133,7 +134,7 @@ impl Listener {
 
     fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<FleetFrame>> {
         loop {
-            if let Some(parts) = self.frames.next() {
+            if let Some(parts) = self.frames.ready.pop_front() {
                 return FleetFrame::new(py, parts).map(Some);
             }
             // A loop that is slow finds messages in the queue that belong to frames which look complete.
@@ -149,7 +150,7 @@ impl Listener {
                 ListenerStep::Message(_) | ListenerStep::Waiting => {}
                 ListenerStep::End => {
                     self.frames.finish();
-                    let last = self.frames.next();
+                    let last = self.frames.ready.pop_front();
                     return last.map(|parts| FleetFrame::new(py, parts)).transpose();
                 }
             }
@@ -178,11 +179,6 @@ impl Listener {
     #[getter]
     fn run(&self) -> &str {
         &self.frames.run
-    }
-
-    #[getter]
-    fn problems(&self) -> Vec<String> {
-        self.problems.clone()
     }
 
     #[getter]

@@ -19,7 +19,8 @@ pub(crate) struct LiveFrames {
     /// Time without a message after which a frame is complete.
     pub(crate) settle: Duration,
     pending: BTreeMap<u64, Pending>,
-    ready: VecDeque<FrameParts>,
+    /// Frames that are complete, in order.
+    pub(crate) ready: VecDeque<FrameParts>,
     handed_over: Option<u64>,
     replay_epoch: Option<u64>,
     /// Messages whose frame has been handed over.
@@ -74,11 +75,6 @@ impl LiveFrames {
             self.hand_over_oldest();
         }
         added
-    }
-
-    /// The next frame that is complete.
-    pub(crate) fn next(&mut self) -> Option<FrameParts> {
-        self.ready.pop_front()
     }
 
     /// True if the oldest frame has had no message for a while.

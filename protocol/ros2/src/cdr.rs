@@ -29,21 +29,11 @@ pub(crate) fn time(cdr: &mut Cdr<'_>, nanos: u64) {
     cdr.write_u32((nanos % 1_000_000_000) as u32);
 }
 
-/// `geometry_msgs/Point` or `Vector3`.
-pub(crate) fn xyz(cdr: &mut Cdr<'_>, values: [f64; 3]) {
-    f64s(cdr, &values);
-}
-
 /// `geometry_msgs/Pose` or `Transform`.
 pub(crate) fn pose(cdr: &mut Cdr<'_>, pose: &Pose) {
     let [w, x, y, z] = pose.rotation_wxyz;
-    xyz(cdr, pose.translation_m);
+    f64s(cdr, &pose.translation_m);
     f64s(cdr, &[x, y, z, w]);
-}
-
-/// `float64[36]`: rows of x, y, z, and of the rotations about them.
-pub(crate) fn covariance(cdr: &mut Cdr<'_>, rows: &[[f64; 6]; 6]) {
-    f64s(cdr, rows.as_flattened());
 }
 
 /// `float64[N]`.

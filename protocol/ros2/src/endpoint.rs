@@ -72,21 +72,6 @@ impl std::fmt::Display for NodeName {
     }
 }
 
-/// One publisher or subscription of a [`Node`].
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RosEndpoint {
-    /// Number of the endpoint in its session; the node is number 0.
-    pub id: u32,
-    /// Publisher or subscription.
-    pub kind: EndpointKind,
-    /// Its topic.
-    pub topic: RosName,
-    /// Type of the messages.
-    pub ros_type: RosType,
-    /// Quality of service that it offers or requests.
-    pub qos: Qos,
-}
-
 impl Node {
     /// Liveliness token of the node.
     pub fn token(&self) -> String {
@@ -116,17 +101,23 @@ impl Node {
         format!("{TOKEN_ROOT}/{domain}/*/*/*/MP/*/*/*/{topic}/**")
     }
 
-    /// Liveliness token of one of its endpoints.
-    pub fn endpoint_token(&self, endpoint: &RosEndpoint) -> String {
-        let RosEndpoint { id, qos, .. } = endpoint;
+    /// Liveliness token of the endpoint `id` of its session (the node is number 0), which offers or requests `qos`.
+    pub fn endpoint_token(
+        &self,
+        id: u32,
+        kind: EndpointKind,
+        topic: &RosName,
+        ros_type: RosType,
+        qos: Qos,
+    ) -> String {
         let (domain, zid) = (self.domain_id, &self.zid);
-        let kind = match endpoint.kind {
+        let kind = match kind {
             EndpointKind::Publisher => "MP",
             EndpointKind::Subscription => "MS",
         };
-        let (identity, topic) = (self.identity(), mangled(endpoint.topic.as_str()));
-        let name = endpoint.ros_type.dds_name();
-        let hash = endpoint.ros_type.hash(self.distribution);
+        let (identity, topic) = (self.identity(), mangled(topic.as_str()));
+        let name = ros_type.dds_name();
+        let hash = ros_type.hash(self.distribution);
         format!("{TOKEN_ROOT}/{domain}/{zid}/0/{id}/{kind}/{identity}/{topic}/{name}/{hash}/{qos}")
     }
 
@@ -223,14 +214,13 @@ mod tests {
         }
     }
 
-    fn points() -> RosEndpoint {
-        RosEndpoint {
-            id: 3,
-            kind: EndpointKind::Publisher,
-            topic: name("/cav_1/points"),
-            ros_type: RosType::PointCloud2,
-            qos: Qos::SENSOR_DATA,
-        }
+    fn points() -> RosName {
+        name("/cav_1/points")
+    }
+
+    fn publisher_token(node: &Node) -> String {
+        let (kind, ros_type) = (EndpointKind::Publisher, RosType::PointCloud2);
+        node.endpoint_token(3, kind, &points(), ros_type, Qos::SENSOR_DATA)
     }
 
     const HASH: &str = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5";
@@ -241,21 +231,21 @@ mod tests {
         assert_eq!(root.token(), "@ros2_lv/7/a1b2/0/0/NN/%/%/v2vloc");
         assert_eq!(fleet.token(), "@ros2_lv/7/a1b2/0/0/NN/%/%fleet%a/v2vloc");
         assert_eq!(
-            fleet.endpoint_token(&points()),
+            publisher_token(&fleet),
             format!(
                 "@ros2_lv/7/a1b2/0/3/MP/%/%fleet%a/v2vloc/%cav_1%points/sensor_msgs::msg::dds_::PointCloud2_/{HASH}/2::,5:,:,:,,"
             )
         );
         let key = "7/cav_1/points/sensor_msgs::msg::dds_::PointCloud2_";
         assert_eq!(
-            root.key(&points().topic, RosType::PointCloud2),
+            root.key(&points(), RosType::PointCloud2),
             format!("{key}/{HASH}")
         );
         assert_eq!(
-            root.any_hash(&points().topic, RosType::PointCloud2),
+            root.any_hash(&points(), RosType::PointCloud2),
             format!("{key}/*")
         );
-        let other = NodeName::of_token(&fleet.endpoint_token(&points())).unwrap();
+        let other = NodeName::of_token(&publisher_token(&fleet)).unwrap();
         assert_eq!(other, fleet.name_in_network());
         assert_eq!(other.to_string(), "/fleet/a/v2vloc");
         assert_eq!(
@@ -268,7 +258,7 @@ mod tests {
             ..root
         };
         assert_eq!(
-            humble.key(&points().topic, RosType::PointCloud2),
+            humble.key(&points(), RosType::PointCloud2),
             format!("{key}/TypeHashNotSupported")
         );
     }
@@ -281,10 +271,7 @@ mod tests {
             0xaa, 0x99,
         ];
         assert_eq!(gid(""), empty);
-        assert_ne!(
-            gid(&node(None).endpoint_token(&points())),
-            gid(&node(None).token())
-        );
+        assert_ne!(gid(&publisher_token(&node(None))), gid(&node(None).token()));
     }
 
     #[test]

@@ -50,7 +50,7 @@ pub use encode::{
 };
 pub use motion::{MotionError, MotionType, TimedMotion};
 pub use names::{FrameNames, NameError, RosName};
-pub use point_cloud::{PointCloudError, RosSweep, SweepLimits, read_point_cloud};
+pub use point_cloud::{PointCloudError, RosSweep, read_point_cloud};
 pub use qos::Qos;
 pub use read::ReadError;
 pub use ros_type::RosType;

@@ -279,7 +279,7 @@ mod tests {
             assert!(cut.contains(" at byte "), "{cut}");
             assert!(matches!(
                 ty.read(&[9; 40]),
-                Err(MotionError::Message(ReadError::Encoding { .. }))
+                Err(MotionError::Message(ReadError::Encoding(_)))
             ));
         }
     }

@@ -11,16 +11,13 @@ const MAX_BYTES: usize = 247;
 /// Frame of the world.
 pub const MAP_FRAME: &str = "map";
 
-/// Error of a text that is no absolute ROS 2 name.
+/// Error of a text that is no absolute ROS 2 name; holds its beginning.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{text:?} is no ROS 2 name: at most {MAX_BYTES} bytes, '/' before each part, each part of a-z, A-Z, 0-9 and '_', not \
+    "{0:?} is no ROS 2 name: at most {MAX_BYTES} bytes, '/' before each part, each part of a-z, A-Z, 0-9 and '_', not \
      beginning with a digit"
 )]
-pub struct NameError {
-    /// Beginning of the text.
-    text: String,
-}
+pub struct NameError(String);
 
 /// An absolute name of ROS 2, for example `/velodyne/points`; a topic or a namespace.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -60,9 +57,7 @@ impl FromStr for RosName {
             Some(tokens) if text.len() <= MAX_BYTES && tokens.split('/').all(is_token) => {
                 Ok(Self(text.into()))
             }
-            _ => Err(NameError {
-                text: text.chars().take(MAX_BYTES).collect(),
-            }),
+            _ => Err(NameError(text.chars().take(MAX_BYTES).collect())),
         }
     }
 }

@@ -5,7 +5,7 @@
 //! in many (organised). Points without coordinates, as organised clouds
 //! have them for rays without a return, are left out.
 
-use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS, IntensityKind, PointCloud};
+use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS, IntensityKind, Limits, PointCloud};
 use re_cdr::{BigEndian, ByteOrder, LittleEndian};
 
 use crate::read::{ReadError, Reader};
@@ -80,21 +80,13 @@ pub enum PointCloudError {
     },
 }
 
-/// Limits of a reader.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SweepLimits {
-    /// Points of a sweep, those without return included.
-    pub max_points: u64,
-    /// Largest absolute coordinate and intensity.
-    pub max_abs_value: f32,
-}
-
 /// Reads a `sensor_msgs/PointCloud2` in CDR, with its encapsulation header. No more memory is allocated than the message
-/// has bytes for.
+/// has bytes for. Of the limits those of points count, points without return included, and of the largest absolute
+/// coordinate and intensity.
 ///
 /// # Errors
 /// [`PointCloudError`] names the field and both values.
-pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<RosSweep, PointCloudError> {
+pub fn read_point_cloud(bytes: &[u8], limits: &Limits) -> Result<RosSweep, PointCloudError> {
     let mut message = Reader::of(bytes)?;
     let (capture_nanos, frame_id) = message.header()?;
     let (height, width) = (message.u32("height")?, message.u32("width")?);
@@ -269,24 +261,22 @@ fn column<'a>(
     allowed: &'static str,
     is_allowed: impl Fn(Datatype) -> bool,
 ) -> Result<Option<(&'a str, PointColumn)>, PointCloudError> {
-    let Some(&RosField {
-        name: found,
-        offset,
-        datatype,
-        count,
-    }) = fields
+    let Some(field) = fields
         .iter()
         .find(|field| field.name.eq_ignore_ascii_case(name))
     else {
         return Ok(None);
     };
-    match Datatype::of(datatype).filter(|datatype| is_allowed(*datatype)) {
+    match Datatype::of(field.datatype).filter(|datatype| is_allowed(*datatype)) {
         // Some drivers leave the count at 0.
-        Some(datatype) if count <= 1 => Ok(Some((found, PointColumn { offset, datatype }))),
+        Some(datatype) if field.count <= 1 => {
+            let offset = field.offset;
+            Ok(Some((field.name, PointColumn { offset, datatype })))
+        }
         _ => Err(PointCloudError::FieldType {
             name,
-            datatype,
-            count,
+            datatype: field.datatype,
+            count: field.count,
             allowed,
         }),
     }
@@ -316,7 +306,7 @@ impl CloudLayout {
         &self,
         columns: &PointColumns<'_>,
         data_len: usize,
-        limits: SweepLimits,
+        limits: &Limits,
     ) -> Result<(), PointCloudError> {
         let points = u64::from(self.height) * u64::from(self.width);
         at_most("height x width", points, limits.max_points)?;

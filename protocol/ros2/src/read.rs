@@ -6,12 +6,9 @@ use re_cdr::{BigEndian, CdrReader, LittleEndian};
 /// Error of a message that cannot be read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ReadError {
-    /// The encapsulation header names another encoding.
-    #[error("encoding {found:?}, not 00 00 or 00 01 (CDR)")]
-    Encoding {
-        /// First bytes of the message.
-        found: Vec<u8>,
-    },
+    /// The encapsulation header, the first bytes of the message, names another encoding.
+    #[error("encoding {0:?}, not 00 00 or 00 01 (CDR)")]
+    Encoding(Vec<u8>),
     /// The message ends early, or a text or flag in it is malformed.
     #[error("{field} at byte {at} of {len}: {cause}")]
     Cdr {
@@ -54,7 +51,7 @@ impl<'a> Reader<'a> {
             Some(([0, 1, _, _], body)) => (AnyCdr::LittleEndian(CdrReader::new(body)), body.len()),
             _ => {
                 let found = bytes.iter().take(4).copied().collect();
-                return Err(ReadError::Encoding { found });
+                return Err(ReadError::Encoding(found));
             }
         };
         Ok(Self { cdr, len })

@@ -26,11 +26,8 @@ pub enum StatedPoseError {
     #[error(transparent)]
     Message(#[from] ReadError),
     /// The pose is in another frame.
-    #[error("header.frame_id is {found:?}, not {MAP_FRAME:?}")]
-    Frame {
-        /// The frame.
-        found: String,
-    },
+    #[error("header.frame_id is {0:?}, not {MAP_FRAME:?}")]
+    Frame(String),
     /// The numbers are no pose.
     #[error("pose: {0}")]
     Pose(#[from] InvalidPose),
@@ -53,8 +50,7 @@ impl StatedPose {
         let mut message = Reader::of(bytes)?;
         let (_, frame_id) = message.header()?;
         if frame_id.trim_start_matches('/') != MAP_FRAME {
-            let found = frame_id.to_owned();
-            return Err(StatedPoseError::Frame { found });
+            return Err(StatedPoseError::Frame(frame_id.to_owned()));
         }
         let world_from_base = message.pose("pose")?;
         world_from_base.validate()?;
@@ -94,7 +90,7 @@ mod tests {
         cdr::message(|cdr| {
             cdr::header(cdr, 7, frame);
             cdr::pose(cdr, &Pose::from_xyz_yaw([1.0, 2.0, 0.0], 0.5));
-            cdr::covariance(cdr, &covariance);
+            cdr::f64s(cdr, covariance.as_flattened());
         })
     }
 

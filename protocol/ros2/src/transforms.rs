@@ -108,7 +108,7 @@ mod tests {
                 cdr.write_string(child);
             }
             cdr::pose(cdr, &POSE);
-            cdr::covariance(cdr, &[[0.0; 6]; 6]);
+            cdr::f64s(cdr, &[0.0; 36]);
         })
     }
 

@@ -27,12 +27,12 @@ const NESTED: u8 = 1;
 const ARRAY: u8 = 48;
 const SEQUENCE: u8 = 144;
 
-/// Distributions of ROS 2 by what their rmw_zenoh writes in place of a type hash.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+/// Distributions of ROS 2 by what their rmw_zenoh writes into keys; Jazzy stands for all later ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub enum Distribution {
-    /// Humble: no hashes.
+    /// Without type hashes.
     Humble,
-    /// Jazzy and later.
+    /// With type hashes.
     #[default]
     Jazzy,
 }

@@ -23,7 +23,7 @@ const MAX_KERNEL: u32 = 63;
 pub struct ConfidenceGate {
     /// Smoothed confidence that a cell must exceed. Below zero every cell passes.
     pub threshold: f32,
-    /// Smoothing of the confidence before the threshold; `None`: no smoothing.
+    /// Smoothing of the confidence before the threshold; absent or `null`: no smoothing.
     pub smoothing: Option<Smoothing>,
 }
 

@@ -176,7 +176,7 @@ pub fn encode_features(
         return encode_selected(features, dense, None, config.zstd_level);
     }
     let cells = layout.cells as u64;
-    let confidence = confidence.ok_or(WireError::NoConfidence { cells })?;
+    let confidence = confidence.ok_or(WireError::NoConfidence(cells))?;
     selection::check_confidence(confidence, layout.cells)?;
     let gated = config.gate.map(|gate| gate.cells(confidence, &grid));
     let selected = match (gated.transpose()?, budget) {
@@ -434,7 +434,7 @@ mod tests {
             ..config
         };
         let error = encode_features(map(vec![1.0; 8]), &smaller, None).unwrap_err();
-        assert_eq!(error, WireError::NoConfidence { cells: 8 });
+        assert_eq!(error, WireError::NoConfidence(8));
         let sparse = encode_features(map(vec![1.0; 8]), &smaller, Some(&[0.5; 8])).unwrap();
         // One byte of mask, two bytes per cell.
         assert_eq!(
@@ -488,7 +488,7 @@ mod tests {
         let encoded = encode_features(map(values.clone()), &wide, Some(&confidence)).unwrap();
         assert_eq!(encoded.codec.selection, Selection::TopK { cells: 3 });
         let error = encode_features(map(values), &config, None).unwrap_err();
-        assert_eq!(error, WireError::NoConfidence { cells: 8 });
+        assert_eq!(error, WireError::NoConfidence(8));
     }
 
     #[test]

@@ -72,8 +72,9 @@ impl PlanarCovariance {
 }
 
 /// Reason why an agent has no pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, strum::IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
 pub enum NoPoseReason {
     /// The sweep has too few points.
     TooFewPoints,

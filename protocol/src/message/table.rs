@@ -43,7 +43,7 @@ macro_rules! messages {
 
             /// Kind of a number on the wire.
             pub(crate) fn from_wire(found: u8) -> Result<Self, WireError> {
-                Self::ALL.into_iter().find(|kind| *kind as u8 == found).ok_or(WireError::UnknownKind { found })
+                Self::ALL.into_iter().find(|kind| *kind as u8 == found).ok_or(WireError::UnknownKind(found))
             }
         }
 
@@ -188,10 +188,7 @@ mod tests {
             (Kind::Ping, 1, "ping")
         );
         assert_eq!(Kind::from_wire(200).unwrap(), Kind::Ping);
-        assert!(matches!(
-            Kind::from_wire(1),
-            Err(WireError::UnknownKind { found: 1 })
-        ));
+        assert!(matches!(Kind::from_wire(1), Err(WireError::UnknownKind(1))));
         let bytes = ping.clone().visit(MetadataBytes);
         assert_eq!(Message::read(Kind::Ping, FromBytes(bytes)).unwrap(), ping);
     }

@@ -56,6 +56,17 @@ impl FileError {
     }
 }
 
+/// Refuses a file in place of a folder, or of one above it; the folder need not exist.
+///
+/// # Errors
+/// [`FileError`] names the file.
+pub fn check_folder(path: &Path) -> Result<()> {
+    match path.ancestors().find(|folder| folder.is_file()) {
+        Some(file) => Err(FileError::new(file, "is a file, must be a folder")),
+        None => Ok(()),
+    }
+}
+
 /// Results whose error gets the path of its file.
 pub trait AtFile<T> {
     /// The result with an error that names the file.
@@ -77,6 +88,22 @@ impl<T, E: Display + 'static> AtFile<T> for Result<T, E> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_file_is_refused_in_place_of_a_folder() {
+        let root = tempfile::tempdir().unwrap();
+        let file = root.path().join("a.yaml");
+        std::fs::write(&file, "").unwrap();
+        for path in [&file, &file.join("runs/b")] {
+            let message = check_folder(path).unwrap_err().to_string();
+            assert!(
+                message.ends_with("/a.yaml: is a file, must be a folder"),
+                "{message}"
+            );
+        }
+        check_folder(root.path()).unwrap();
+        check_folder(&root.path().join("none")).unwrap();
+    }
 
     #[test]
     fn an_error_begins_with_its_file() {

@@ -8,6 +8,7 @@ use protocol::CavId;
 
 use super::files::Listing;
 use super::frame_files::{AgentFolder, BIN, PCD, holds_pairs};
+use super::keys::Keys;
 use super::points::{SweepStorage, Sweeps};
 use super::yaml::{self, YamlField};
 use super::{MissingFrame, OpenOptions, ReadError, Result, Tick, files};
@@ -206,30 +207,38 @@ impl ScenarioFolder {
         })
     }
 
-    /// Capture times of all stems. Stems count simulator ticks and are no clock: if `data_protocol.yaml` gives the
-    /// length of a tick, time is tick times length; else the smallest step between stems is one `period_nanos`, from 0
-    /// on.
+    /// Capture times of all stems. Stems that are times give them, from the first on. Others count simulator ticks: if
+    /// `data_protocol.yaml` gives the length of a tick, time is tick times length; else the smallest step between stems
+    /// is one `period_nanos`, from 0 on.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
             problems.push(error);
             None
         });
-        let numbers: Option<Vec<u64>> = self.stems.iter().map(|stem| stem.parse().ok()).collect();
-        let (numbers, first, step, nanos) = match (numbers, tick_nanos) {
-            (Some(numbers), Some(nanos)) => (numbers, 0, 1, nanos),
-            (numbers, _) => {
-                let numbers = numbers.unwrap_or_else(|| (0..self.stems.len() as u64).collect());
+        let stems: Vec<&str> = self.stems.iter().map(String::as_str).collect();
+        let keys = Keys::of_stems(&stems);
+        let numbers = match &keys {
+            Keys::Times(nanos) => nanos.clone(),
+            _ => (0..stems.len()).map(|index| keys.count(index)).collect(),
+        };
+        let first = numbers.iter().min().copied().unwrap_or(0);
+        let (first, step, nanos) = match (&keys, tick_nanos) {
+            (Keys::Times(_), _) => (first, 1, 1),
+            (Keys::Numbers(_), Some(nanos)) => (0, 1, nanos),
+            _ => {
                 let steps = numbers.array_windows().map(|[a, b]| b.saturating_sub(*a));
                 let step = steps.filter(|&step| step > 0).min().unwrap_or(1);
-                let first = numbers.first().copied().unwrap_or(0);
-                (numbers, first, step, period_nanos)
+                (first, step, period_nanos)
             }
         };
-        let ticks = self.stems.iter().zip(numbers).map(|(stem, number)| {
+        let ticks = stems.into_iter().zip(numbers).map(|(stem, number)| {
             let steps = number.saturating_sub(first) / step;
             Tick::new(stem, steps.saturating_mul(nanos))
         });
-        ticks.collect()
+        let mut ticks: Vec<Tick> = ticks.collect();
+        // Natural order compares fractions as whole numbers: 1.5 would come before 1.25.
+        ticks.sort_by_key(|tick| tick.capture_nanos);
+        ticks
     }
 
     /// The file that may state the length of a tick.
@@ -452,6 +461,39 @@ mod tests {
         let variants: Vec<&String> = agent.variants.iter().collect();
         assert_eq!(variants, ["fog_0.060", "snow_2.5_2.0"]);
         assert!(agent.has_radar && problems.is_empty(), "{problems:?}");
+    }
+
+    #[test]
+    fn capture_times_are_those_of_the_stems_where_these_are_times() {
+        for (stems, expected) in [
+            (
+                [
+                    "1626155123000000000",
+                    "1626155123092000000",
+                    "1626155125200000000",
+                ],
+                [0, 92, 2200],
+            ),
+            (
+                ["1626155123.25", "1626155123.5", "1626155124"],
+                [0, 250, 750],
+            ),
+        ] {
+            let dir = tempfile::tempdir().unwrap();
+            for stem in stems {
+                touch(
+                    dir.path(),
+                    &[&format!("1/{stem}.yaml"), &format!("1/{stem}.pcd")],
+                );
+            }
+            let mut problems = Vec::new();
+            let ticks = scan(dir.path()).0.ticks(100_000_000, &mut problems);
+            let times = ticks.iter();
+            let times = times.map(|tick| (tick.capture_nanos + 500_000) / 1_000_000);
+            assert_eq!(times.collect::<Vec<u64>>(), expected, "{stems:?}");
+            let found: Vec<&str> = ticks.iter().map(|tick| tick.stem.as_str()).collect();
+            assert_eq!((found, problems.len()), (stems.to_vec(), 0));
+        }
     }
 
     #[test]

@@ -44,7 +44,7 @@ impl ClassSet {
             set.0 |= match asked.parse::<ObjectClass>() {
                 Ok(class) => bit(class),
                 Err(_) if asked == VEHICLE => Self::VEHICLES.0,
-                Err(error) => return Err(error.to_string()),
+                Err(error) => return Err(error),
             };
         }
         match set.0 {

@@ -17,52 +17,30 @@ pub enum ReadError {
         /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The folder has no supported layout.
-    #[error("{}: {reason}", path.display())]
-    Layout {
-        /// The folder.
-        path: PathBuf,
-        /// Expected and found contents.
-        reason: String,
-    },
-    /// A file has invalid content.
+    /// A file has invalid content, or a folder no supported layout.
     #[error("{}{}: {}{reason}", path.display(), shown(":", *line, ""), shown("", field.as_ref(), ": "))]
     Malformed {
-        /// The file.
+        /// The file or folder.
         path: PathBuf,
         /// The line, from 1, if the file has lines.
         line: Option<u64>,
         /// The field, for example `vehicles.4335.extent`.
         field: Option<String>,
-        /// Found and expected value.
+        /// Found and expected value or contents.
         reason: String,
     },
     /// The agent has no frame at the tick: it joined later, has left, or its files are missing.
-    #[error("scenario {scenario}: agent {agent} has no frame at tick {tick}")]
-    Absent {
-        /// The scenario.
-        scenario: String,
-        /// The agent.
-        agent: String,
-        /// Stem of the tick.
-        tick: String,
-    },
-    /// The requested agent, tick or variant does not exist in the scenario.
-    #[error("scenario {scenario}: {what} {asked} does not exist ({available})")]
-    NoSuch {
-        /// The scenario.
-        scenario: String,
-        /// `agent`, `tick` or `LiDAR variant`.
-        what: &'static str,
-        /// Requested name or index.
-        asked: String,
-        /// Available names or indices.
-        available: String,
-    },
+    /// The message names scenario, agent and tick.
+    #[error("{0}")]
+    Absent(String),
+    /// The requested agent, tick or variant does not exist in the scenario. The message names what was requested and
+    /// what is available.
+    #[error("{0}")]
+    NoSuch(String),
 }
 
 impl ReadError {
-    /// A [`ReadError::Malformed`] of a whole file.
+    /// A [`ReadError::Malformed`] of a whole file or folder.
     pub fn malformed(path: &Path, reason: impl Into<String>) -> Self {
         Self::malformed_at(path, None, None, reason)
     }
@@ -82,14 +60,6 @@ impl ReadError {
         }
     }
 
-    /// The error of a folder whose layout is not supported.
-    pub(crate) fn layout(path: &Path, reason: impl Into<String>) -> Self {
-        Self::Layout {
-            path: path.to_owned(),
-            reason: reason.into(),
-        }
-    }
-
     /// A [`ReadError::Io`].
     pub fn io(path: &Path, source: std::io::Error) -> Self {
         Self::Io {
@@ -101,7 +71,7 @@ impl ReadError {
     /// The same error with its consequence at the end of the reason.
     #[must_use]
     pub(crate) fn with_consequence(mut self, consequence: &str) -> Self {
-        if let Self::Malformed { reason, .. } | Self::Layout { reason, .. } = &mut self {
+        if let Self::Malformed { reason, .. } = &mut self {
             *reason = format!("{reason}: {consequence}");
         }
         self
@@ -110,16 +80,14 @@ impl ReadError {
     /// The file or folder at fault, if the error concerns one.
     pub fn path(&self) -> Option<&Path> {
         match self {
-            Self::Io { path, .. } | Self::Layout { path, .. } | Self::Malformed { path, .. } => {
-                Some(path)
-            }
-            Self::NoSuch { .. } | Self::Absent { .. } => None,
+            Self::Io { path, .. } | Self::Malformed { path, .. } => Some(path),
+            Self::NoSuch(_) | Self::Absent(_) => None,
         }
     }
 
     /// True if the only fault is that the agent has no frame at the tick.
     pub fn is_absent(&self) -> bool {
-        matches!(self, Self::Absent { .. })
+        matches!(self, Self::Absent(_))
     }
 }
 

@@ -7,6 +7,9 @@ use std::{fs, io};
 use super::{ReadError, Result};
 use support::bounded_file;
 
+/// The mark with which some editors begin a text in UTF-8.
+pub(super) const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
+
 /// A folder's entries that are not hidden, in text order.
 #[derive(Debug, Default)]
 pub(super) struct Listing {
@@ -85,10 +88,13 @@ pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
     })
 }
 
-/// Reads a text file of at most `max_bytes`. Bytes that are no UTF-8 become replacement characters, which no number
-/// contains.
+/// Reads a text file of at most `max_bytes`, without its byte order mark. Bytes that are no UTF-8 become replacement
+/// characters, which no number contains.
 pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String> {
-    let bytes = read_limited(path, max_bytes)?;
+    let mut bytes = read_limited(path, max_bytes)?;
+    if bytes.starts_with(BYTE_ORDER_MARK) {
+        bytes.drain(..BYTE_ORDER_MARK.len());
+    }
     Ok(String::from_utf8(bytes)
         .unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))
 }

@@ -15,7 +15,7 @@ use crate::{Problem, Result};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[derive(EnumString, IntoStaticStr, VariantArray)]
-#[strum(serialize_all = "snake_case", parse_err_ty = UnknownClass, parse_err_fn = UnknownClass::from)]
+#[strum(serialize_all = "snake_case", parse_err_ty = String, parse_err_fn = unknown_class)]
 pub enum ObjectClass {
     /// A passenger car; also every object of data sets without types.
     Car,
@@ -46,17 +46,10 @@ impl ObjectClass {
     }
 }
 
-/// A text that names no class.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{0:?} is no class: expected vehicle, car, van, truck, bus, two_wheeler, pedestrian or other"
-)]
-pub struct UnknownClass(String);
-
-impl From<&str> for UnknownClass {
-    fn from(text: &str) -> Self {
-        Self(text.to_owned())
-    }
+/// The fault of a text that names no class.
+fn unknown_class(text: &str) -> String {
+    let known = "vehicle, car, van, truck, bus, two_wheeler, pedestrian or other";
+    format!("{text:?} is no class: expected {known}")
 }
 
 /// An annotated object.

@@ -43,8 +43,18 @@ pub struct GroundTruth {
 }
 
 impl GroundTruth {
-    /// The ground truth of a tick for an ego, see [`merge`].
+    /// The ground truth of a tick for an ego, see [`merge`]. Without a true pose of the ego nothing tells where the true
+    /// objects are: then no detection counts.
     pub fn of_tick(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule) -> Self {
+        let ego = frames_of_tick.get(ego_index);
+        if ego.is_none_or(|ego| ego.world_from_lidar.is_none()) {
+            return Self {
+                objects: Vec::new(),
+                ignored: Vec::new(),
+                // Nothing lies in this range.
+                area_m: [f64::MAX, f64::MAX, f64::MIN, f64::MIN],
+            };
+        }
         let ([x_low, x_high], [y_low, y_high]) = (rule.x_m, rule.y_m);
         // Without the test of the range: an object at its border still excuses a detection.
         let ignored = select(

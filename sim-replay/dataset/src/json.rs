@@ -24,6 +24,7 @@ pub(super) fn read(path: &Path) -> Result<Value> {
 /// Parses JSON in which bare words may stand that are no JSON: `NaN` and `Infinity`, as Python writes them, or numbers
 /// beyond all floats. Each is read as a text of its letters, so that only the object that needs it is lost, and named.
 pub(super) fn parse(bytes: &[u8]) -> serde_json::Result<Value> {
+    let bytes = bytes.strip_prefix(files::BYTE_ORDER_MARK).unwrap_or(bytes);
     // Sound files are parsed once. Only others pay for the search of bare words.
     serde_json::from_slice(bytes).or_else(|error| {
         let mended = with_quoted_words(bytes);
@@ -211,6 +212,11 @@ mod tests {
 
     fn message(result: Result<impl fmt::Debug, ReadError>) -> String {
         result.unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_byte_order_mark_is_skipped() {
+        assert_eq!(parse("\u{feff}[1]".as_bytes()).unwrap(), json!([1]));
     }
 
     #[test]

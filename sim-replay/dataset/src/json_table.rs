@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::json::{self, JsonField};
-use super::{ReadError, Result};
+use super::{ReadError, Result, files};
 use support::bounded_file;
 
 /// Bytes read at once.
@@ -104,6 +104,10 @@ fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])
     }
     // The limit also holds for a file that grows while it is read.
     let mut reader = BufReader::with_capacity(BUFFER_BYTES, file.take(max_bytes));
+    let first = reader.fill_buf();
+    if first.is_ok_and(|bytes| bytes.starts_with(files::BYTE_ORDER_MARK)) {
+        reader.consume(files::BYTE_ORDER_MARK.len());
+    }
     let mut list = RowSplitter::default();
     loop {
         let bytes = reader.fill_buf();

@@ -12,6 +12,7 @@ use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
 use super::layout::{LayoutReader, LayoutRow};
 use super::points::{SweepStorage, Sweeps};
+use super::poses::box_angle_rad;
 use super::{
     FrameSource, Layout, OpenOptions, Problem, ReadError, Result, Scenario, Tick, classes, files,
     single_vehicle,
@@ -151,6 +152,10 @@ fn object(
     let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(&field), numbers)?;
     // KITTI has height, width, length. Sizes here are length, width, height.
     let [.., height, width, length, x, y, z, rotation_y] = values;
+    let rotation_y = box_angle_rad(rotation_y).map_err(|reason| {
+        let reason = format!("rotation_y: {reason}");
+        kitti_text::malformed(path, line, Some(&field), reason)
+    })?;
     let size_m = [length, width, height];
     if size_m.iter().any(|&size| size <= 0.0 || size > MAX_SIZE_M) {
         let reason = format!("{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m");
@@ -256,6 +261,11 @@ mod tests {
                 "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1e9 9.7 0",
                 "Car",
                 "within 1e7: the object is left out",
+            ),
+            (
+                "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 -90",
+                "Car",
+                "rotation_y: -90 rad, expected -2 pi to 2 pi: degrees?: the object is left out",
             ),
             (
                 "\u{fffd}\u{1}",

@@ -11,8 +11,8 @@ use super::faults::Faults;
 use super::kitti_text::{self, Calibration};
 use super::layout::{LayoutReader, LayoutRow};
 use super::points::SweepStorage;
+use super::time_stamps::Unit;
 use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence};
-use support::rounding;
 
 /// KITTI odometry.
 pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
@@ -52,19 +52,16 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
         let pose = poses.as_ref().and_then(|poses| *poses.get(scan)?);
         (Tick::new(stem, capture_nanos), file, pose)
     });
-    let mut clouds: Vec<(Tick, PathBuf, Option<Pose>)> = clouds.collect();
-    // Names without leading zeros are listed in another order than their numbers.
-    clouds.sort_by_key(|(tick, ..)| tick.capture_nanos);
     let (layout, storage) = (Layout::KITTI_ODOMETRY, SweepStorage::ByName);
     let files = ["calib.txt", "times.txt"].map(|name| dir.join(name));
     let files = files.into_iter().chain(poses_path(dir)).collect();
     Ok(Scenario {
         joins,
-        ..sequence::scenario(layout, clouds, storage, files, options)
+        ..sequence::scenario(layout, clouds.collect(), storage, files, options)
     })
 }
 
-/// Number and stem of the scans. Files of other names are left out.
+/// Number and stem of the scans, in order. Files of other names are left out, and further ones of one number.
 fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, String)>> {
     let mut strays = Faults::default();
     let listing = files::list(velodyne)?;
@@ -75,7 +72,17 @@ fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, S
         });
         Some((strays.take(number)?, stem.to_owned()))
     });
-    let scans = scans.collect();
+    let mut scans: Vec<(usize, String)> = scans.collect();
+    // Of one number, the name with zeros in front comes first.
+    scans.sort_unstable();
+    scans.dedup_by(|(scan, stem), (before, kept)| {
+        if scan == before {
+            let path = velodyne.join(format!("{stem}.bin"));
+            let reason = format!("scan {scan} is {kept}.bin already");
+            strays.push(ReadError::malformed(&path, reason));
+        }
+        scan == before
+    });
     strays.report("file", problems);
     Ok(scans)
 }
@@ -166,7 +173,7 @@ fn poses(
     poses.map(Some)
 }
 
-/// `times.txt`, seconds from the first scan, one per line, in nanoseconds.
+/// `times.txt`, one per line, in nanoseconds. Those that are not above all before are reported: a clock was set back.
 fn times(
     dir: &Path,
     scans: &[(usize, String)],
@@ -177,14 +184,15 @@ fn times(
         return Ok(None);
     }
     let times = of_lines(&path, scans, problems, |line, text| {
-        let [seconds] = kitti_text::numbers(&path, line, None, text)?;
-        // A NaN is in no range, so it is refused too.
-        if !(0.0..=1e9).contains(&seconds) {
-            let reason = format!("{seconds} s, expected 0 to 1e9");
+        let [time] = kitti_text::numbers(&path, line, None, text)?;
+        if time < 0.0 {
+            let reason = format!("{time}, expected a time from 0");
             return Err(kitti_text::malformed(&path, line, None, reason));
         }
-        Ok(rounding::to_u64(seconds * 1e9))
+        Ok(time)
     })?;
+    let known: Vec<f64> = times.iter().copied().flatten().collect();
+    let unit = Unit::of_file(&path, &known, problems);
     let needed = scans.iter().map(|(scan, _)| scan + 1).max().unwrap_or(0);
     if times.len() > needed {
         let reason = format!(
@@ -193,7 +201,20 @@ fn times(
         );
         problems.push(ReadError::malformed(&path, reason));
     }
-    Ok(Some(times))
+    let (mut faults, mut latest) = (Faults::default(), -1.0);
+    let later = (1..).zip(times).map(|(line, time)| {
+        let time = time?;
+        if time <= latest {
+            let reason = format!("{time}, expected a time above {latest}, that of the scan before");
+            faults.push(kitti_text::malformed(&path, line, None, reason));
+            return None;
+        }
+        latest = time;
+        Some(unit.nanos(time))
+    });
+    let later = later.collect();
+    faults.report("scan", problems);
+    Ok(Some(later))
 }
 
 #[cfg(test)]
@@ -324,6 +345,76 @@ mod tests {
                 (kept, vec![expected.to_owned()])
             );
         }
+    }
+
+    /// Capture times of the scans, milliseconds, and the problems, of `times` of three scans.
+    fn millis(times: &str) -> (Vec<u64>, Vec<String>) {
+        let dir = tempfile::tempdir().unwrap();
+        build(
+            dir.path(),
+            ".",
+            "poses.txt",
+            &"1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(3),
+        );
+        fs::write(dir.path().join("velodyne/000002.bin"), [0; 16]).unwrap();
+        fs::write(dir.path().join("times.txt"), times).unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        let ticks = dataset.scenarios[0].ticks.iter();
+        let millis = ticks.map(|tick| (tick.capture_nanos + 500_000) / 1_000_000);
+        (millis.collect(), problems_below(dir.path(), &dataset))
+    }
+
+    #[test]
+    fn times_have_the_unit_that_the_list_shows() {
+        for (times, expected) in [
+            ("0\n0.1\n0.2\n", [0, 100, 200]),
+            ("\u{feff}0\n0.1\n0.2\n", [0, 100, 200]),
+            ("0.000\n100.000\n200.000\n", [0, 100, 200]),
+            (
+                "1600000000\n1600000000.1\n1600000000.2\n",
+                [1_600_000_000_000, 1_600_000_000_100, 1_600_000_000_200],
+            ),
+        ] {
+            assert_eq!(millis(times), (expected.to_vec(), vec![]), "{times}");
+        }
+        let (kept, problems) = millis("0\n0.0001\n0.0002\n");
+        assert_eq!((kept.len(), problems.len()), (3, 1));
+        assert!(
+            problems[0].starts_with("/times.txt: taken as times from 0.000 s to 0.000 s"),
+            "{problems:?}"
+        );
+    }
+
+    #[test]
+    fn scans_whose_time_is_not_later_are_left_out() {
+        for (times, kept, expected) in [
+            (
+                "5\n4.1\n5.1\n",
+                [5000, 5100],
+                "/times.txt:2: 4.1, expected a time above 5, that of the scan before: the scan is left out",
+            ),
+            (
+                "5\n5.1\n5.1\n",
+                [5000, 5100],
+                "/times.txt:3: 5.1, expected a time above 5.1, that of the scan before: the scan is left out",
+            ),
+        ] {
+            assert_eq!(millis(times), (kept.to_vec(), vec![expected.to_owned()]));
+        }
+    }
+
+    #[test]
+    fn two_files_of_one_scan_are_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2);
+        build(dir.path(), ".", "poses.txt", &poses);
+        fs::write(dir.path().join("velodyne/1.bin"), [0; 16]).unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!(stems(&dataset), ["000000", "000001"]);
+        assert_eq!(
+            problems_below(dir.path(), &dataset),
+            ["/velodyne/1.bin: scan 1 is 000001.bin already: the file is left out"]
+        );
     }
 
     #[test]

@@ -88,7 +88,7 @@ pub(super) fn opened(
             1 => Err(problems.swap_remove(0)),
             _ => {
                 let reason = format!("nothing can be opened: {}", listed(&problems));
-                Err(ReadError::layout(dir, reason))
+                Err(ReadError::malformed(dir, reason))
             }
         },
     }

@@ -139,7 +139,7 @@ impl fmt::Display for LeftOut {
     /// One line, empty if nothing is missing.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counts = [
-            (self.ticks, "ticks (the ego's frame cannot be read)"),
+            (self.ticks, "ticks (the ego's frame cannot be used)"),
             (self.frames, "frames of other agents that cannot be read"),
             (self.parts, "objects or other parts of frames"),
             (self.failed, "frames that could not be computed"),
@@ -209,7 +209,7 @@ mod tests {
             ),
             (1, 1, 2, 4)
         );
-        let expected = "left out: 1 ticks (the ego's frame cannot be read), 1 frames of other agents that cannot be read, \
+        let expected = "left out: 1 ticks (the ego's frame cannot be used), 1 frames of other agents that cannot be read, \
                         2 objects or other parts of frames; absent agents: 2 frames";
         assert_eq!(left_out.to_string(), expected);
     }

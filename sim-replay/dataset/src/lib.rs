@@ -42,6 +42,7 @@ pub mod hdf5_file;
 mod hdf5_poses;
 mod json;
 mod json_table;
+mod keys;
 mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
@@ -78,6 +79,7 @@ mod written_pose;
 mod yaml;
 
 use std::collections::BTreeSet;
+use std::fmt::Display;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -331,12 +333,8 @@ impl Scenario {
         if let Some(asked) = variant
             && !self.lidar_variants.iter().any(|known| known == asked)
         {
-            return Err(ReadError::NoSuch {
-                scenario: self.name.clone(),
-                what: "LiDAR variant",
-                asked: asked.to_owned(),
-                available: format!("there are {:?}", self.lidar_variants),
-            });
+            let available = format_args!("{:?}", self.lidar_variants);
+            return Err(self.no_such("LiDAR variant", asked, available));
         }
         self.source.points(agent, tick, variant)
     }
@@ -357,26 +355,25 @@ impl Scenario {
 
     fn frame_of(&self, agent_index: usize, tick_index: usize) -> Result<(&CavId, &Tick)> {
         let agent = self.agents.get(agent_index);
-        let agent = agent.ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
+        let agent = agent.ok_or_else(|| self.out_of("agent", agent_index, self.agents.len()))?;
         let tick = self.ticks.get(tick_index);
-        let tick = tick.ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+        let tick = tick.ok_or_else(|| self.out_of("tick", tick_index, self.ticks.len()))?;
         if !self.is_present(agent_index, tick_index) {
-            return Err(ReadError::Absent {
-                scenario: self.name.clone(),
-                agent: agent.to_string(),
-                tick: tick.stem.clone(),
-            });
+            let (scenario, tick) = (&self.name, &tick.stem);
+            let missing = format!("scenario {scenario}: agent {agent} has no frame at tick {tick}");
+            return Err(ReadError::Absent(missing));
         }
         Ok((agent, tick))
     }
 
-    fn no_such(&self, what: &'static str, index: usize, count: usize) -> ReadError {
-        ReadError::NoSuch {
-            scenario: self.name.clone(),
-            what,
-            asked: index.to_string(),
-            available: format!("there are {count}, counted from 0"),
-        }
+    fn out_of(&self, what: &str, index: usize, count: usize) -> ReadError {
+        self.no_such(what, index, format_args!("{count}, counted from 0"))
+    }
+
+    fn no_such(&self, what: &str, asked: impl Display, available: impl Display) -> ReadError {
+        let scenario = &self.name;
+        let asked = format!("{what} {asked} does not exist (there are {available})");
+        ReadError::NoSuch(format!("scenario {scenario}: {asked}"))
     }
 }
 

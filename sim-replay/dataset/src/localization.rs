@@ -21,6 +21,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::hdf5_poses::{self, RowOrder};
+use super::keys::Keys;
 use super::kitti_text::{lines, numbers};
 use super::layout::{LayoutReader, LayoutRow};
 use super::points::SweepStorage;
@@ -106,10 +107,19 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
     let join = format!("{} poses by time", stamps.len());
     let join = poses.is_some().then_some(join);
     let poses = poses.unwrap_or_default();
-    let clouds = stamps.into_iter().map(|(micros, stem)| {
+    let stems: Vec<&str> = stamps.values().map(String::as_str).collect();
+    let micros = stamps.keys();
+    let times = match Keys::of_stems(&stems) {
+        Keys::Times(nanos) => nanos,
+        // Few digits: they count microseconds, as the layout states.
+        _ => micros.map(|micros| micros.saturating_mul(1000)).collect(),
+    };
+    let clouds = stamps.into_iter().zip(times);
+    let clouds = clouds.map(|((stamp, stem), nanos)| {
         let file = points_dir.join(format!("{stem}.bin"));
-        let tick = Tick::new(stem, micros.saturating_mul(1000));
-        (tick, file, poses.get(&micros).copied())
+        // To the microsecond: doubles keep times to a quarter of one.
+        let tick = Tick::new(stem, nanos.saturating_add(500) / 1000 * 1000);
+        (tick, file, poses.get(&stamp).copied())
     });
     let (clouds, files) = (clouds.collect(), pose_files(dir));
     Ok(Scenario {
@@ -286,6 +296,19 @@ mod tests {
             (pose.yaw_rad() + 0.1).abs() < 1e-9,
             "to the right is negative"
         );
+    }
+
+    #[test]
+    fn names_in_nanoseconds_are_times_too() {
+        let dir = tempfile::tempdir().unwrap();
+        for step in [0, 50_000_000] {
+            let name = format!("sequence-01/velodyne_left/{}.bin", T0 * 1000 + step);
+            write(dir.path(), &name, &floats(&[1.0; 4]));
+        }
+        let dataset = open(dir.path());
+        let ticks = dataset.scenarios[0].ticks.iter();
+        let times: Vec<u64> = ticks.map(|tick| tick.capture_nanos).collect();
+        assert_eq!(times, [T0 * 1000, T0 * 1000 + 50_000_000]);
     }
 
     #[test]

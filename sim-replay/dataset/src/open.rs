@@ -33,7 +33,7 @@ pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset> {
     // The folders and files of the kernel's file systems have no end.
     if kernels.any(|kernel| canonical.starts_with(kernel)) {
         let reason = "no data set: a folder of the kernel";
-        return Err(ReadError::layout(dir, reason));
+        return Err(ReadError::malformed(dir, reason));
     }
     let mut dataset = open_among(&LAYOUTS, dir, options)?;
     unfinished::report(dir, &mut dataset);
@@ -109,7 +109,7 @@ fn unknown(dir: &Path) -> ReadError {
             layouts.trim_end()
         )
     };
-    ReadError::layout(dir, reason)
+    ReadError::malformed(dir, reason)
 }
 
 fn has_below(dir: &Path, path: &str) -> bool {

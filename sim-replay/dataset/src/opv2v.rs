@@ -16,7 +16,7 @@ use super::yaml::{self, YamlField};
 use super::{FrameSource, Problem, Result, Tick, camera_files, points};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Frame;
-use crate::pcd::PcdCloud;
+use crate::pcd::{self, PcdCloud};
 
 /// A scenario of the family.
 #[derive(Debug)]
@@ -53,7 +53,7 @@ impl FrameSource for Opv2v {
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud> {
-        points::read_pcd(&self.points_path(agent, tick, Some(RADAR)))
+        points::read_with(&self.points_path(agent, tick, Some(RADAR)), pcd::decode)
             .map(|cloud| self.right_handed(cloud))
     }
 

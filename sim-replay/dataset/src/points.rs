@@ -18,7 +18,7 @@ pub use intensity::{IntensityOption, IntensityScale, LiveIntensities};
 pub use plausibility::Plausibility;
 
 use floats::FloatForm;
-use intensity::SAMPLES;
+use intensity::{SAMPLES, upper_intensity};
 
 use super::{OpenOptions, ReadError, Result, files, npy, ply};
 use crate::pcd::{self, IntensityKind, IntensityOrigin, MAX_BYTES, PcdCloud};
@@ -170,10 +170,10 @@ pub(super) fn divisor_of_first(clouds: impl Iterator<Item = PcdCloud>, path: &Pa
     let clouds = clouds
         .filter(|cloud| !cloud.points.is_empty())
         .take(SAMPLES);
-    let points = clouds.flat_map(|cloud| cloud.points.xyzi);
-    let largest = points.map(|point| point[3]).fold(0.0, f32::max);
-    let divisor = intensity_divisor(largest);
-    if let Some(finding) = IntensityScale::AUTO.unusual(divisor, largest) {
+    let uppers = clouds.map(|cloud| upper_intensity(&cloud.points));
+    let upper = uppers.fold(0.0, f32::max);
+    let divisor = intensity_divisor(upper);
+    if let Some(finding) = IntensityScale::AUTO.unusual(divisor, upper) {
         tracing::warn!("{} and those after it: {finding}", path.display());
     }
     divisor
@@ -222,12 +222,9 @@ fn read_described(
     decode(&bytes).map_err(|reason| ReadError::malformed(path, reason))
 }
 
-/// Reads a PCD file that is no LiDAR sweep: the fourth value is as stored, or the red byte of a colour from 0 to 1.
-pub(super) fn read_pcd(path: &Path) -> Result<PcdCloud> {
-    read_with(path, pcd::decode)
-}
-
-fn read_with(
+/// Reads a PCD file. With [`pcd::decode`], for one that is no LiDAR sweep, the fourth value is as stored, or the red byte
+/// of a colour from 0 to 1.
+pub(super) fn read_with(
     path: &Path,
     decode: fn(&[u8]) -> Result<PcdCloud, pcd::PcdError>,
 ) -> Result<PcdCloud> {

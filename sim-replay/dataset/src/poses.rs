@@ -1,5 +1,7 @@
 //! Poses in the numbers of files, and the check that a scenario has poses, for operations that need them.
 
+use std::f64::consts::TAU;
+
 use nalgebra::{Isometry3, Matrix4, Quaternion};
 use protocol::{InvalidPose, Pose};
 
@@ -9,6 +11,13 @@ use super::{LoadOptions, Scenario};
 const UNIT_TOLERANCE: f64 = 0.01;
 /// Frames that are tried, since the first of them may be damaged.
 const FRAMES_TO_TRY: usize = 10;
+
+/// An angle of a box in radians, or a sentence for more than a whole turn.
+pub(super) fn box_angle_rad(angle: f64) -> Result<f64, String> {
+    let is_angle = angle.abs() <= TAU + 0.01;
+    let reason = || format!("{angle} rad, expected -2 pi to 2 pi: degrees?");
+    is_angle.then_some(angle).ok_or_else(reason)
+}
 
 /// The pose of a 3x4 matrix, row by row.
 pub(super) fn of_rows(rows: &[f64; 12]) -> Result<Pose, InvalidPose> {

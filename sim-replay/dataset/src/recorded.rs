@@ -274,7 +274,7 @@ pub(super) fn as_read_error(error: RecordingError) -> ReadError {
         RecordingError::Foreign { ref path, .. } => ReadError::malformed(path, error.to_string()),
         RecordingError::Io { path, source } => ReadError::Io { path, source },
         RecordingError::NotOurs { path, reason } | RecordingError::Ended { path, reason } => {
-            ReadError::Layout { path, reason }
+            ReadError::malformed(&path, reason)
         }
         RecordingError::Malformed {
             path,

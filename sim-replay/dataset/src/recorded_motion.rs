@@ -1,10 +1,13 @@
-//! Recorded speed against recorded poses: motion that the poses contradict is not used.
+//! Recorded speed and yaw rate against recorded poses: motion that the poses contradict is not used.
 
 use std::ops::RangeInclusive;
 
+use nalgebra::Vector3;
+use protocol::Pose;
 use rayon::prelude::*;
 use support::statistics;
 
+use super::frame::Frame;
 use super::{Dataset, LoadOptions, ReadError, Scenario};
 
 /// Stretches of each agent that are compared, evenly spread.
@@ -12,22 +15,24 @@ const STRETCHES: usize = 8;
 /// Length of a stretch, and the shortest and longest where frames are few or rare, nanoseconds.
 const STRETCH_NANOS: u64 = 2_000_000_000;
 const LENGTHS_NANOS: RangeInclusive<u64> = 300_000_000..=4_000_000_000;
-/// Smallest speed that is compared, m/s: below it, noise of poses counts.
-const LEAST_MPS: f64 = 1.5;
-/// Smallest difference that counts, m/s.
-const LEAST_DIFFERENCE_MPS: f64 = 1.0;
-/// Largest ratio of two speeds that agree. Miles and kilometres per hour differ by 1.6.
-const MOST_RATIO: f64 = 1.5;
+/// Share of the distance that leads against the vehicle's x axis where it reverses; less may be a turn.
+const BACKWARD: f64 = 0.7;
 
-/// Mean speeds over a stretch, m/s.
+/// Smallest value that is compared (below it, noise of poses counts), smallest difference that counts, and largest ratio
+/// of two values that agree. Speeds, m/s: miles and kilometres per hour differ by 1.6. Yaw rates, degrees/s, change more
+/// within a stretch.
+const SPEED_LIMITS: [f64; 3] = [1.5, 1.0, 1.5];
+const YAW_RATE_LIMITS: [f64; 3] = [2.0, 2.0, 2.5];
+
+/// Means of speed or yaw rate over a stretch, m/s or degrees/s.
 #[derive(Clone, Copy)]
-struct Speeds {
+struct Means {
     recorded: f64,
     of_poses: f64,
 }
 
 /// Compares all agents. The recorded motion of an agent whose poses contradict it is not used from here on, and a
-/// problem of the data set names both speeds.
+/// problem of the data set names both values.
 pub(super) fn check(dataset: &mut Dataset) {
     let scenarios = dataset.scenarios.par_iter_mut();
     let problems: Vec<ReadError> = scenarios.flat_map_iter(check_scenario).collect();
@@ -37,47 +42,56 @@ pub(super) fn check(dataset: &mut Dataset) {
 fn check_scenario(scenario: &mut Scenario) -> Vec<ReadError> {
     let mut problems = Vec::new();
     for (agent, id) in scenario.agents.clone().into_iter().enumerate() {
-        let stretches: Vec<Speeds> = stretches(scenario, agent)
+        let (speeds, yaw_rates): (Vec<_>, Vec<_>) = stretches(scenario, agent)
             .into_iter()
-            .filter_map(|ticks| speeds(scenario, agent, ticks))
-            .collect();
-        let Some(Speeds { recorded, of_poses }) = contradiction(&stretches) else {
-            continue;
-        };
-        let path = scenario.points_path(agent, 0, None).unwrap_or_default();
-        let reason = format!(
-            "agent {id}: the recorded speed is {recorded:.2} m/s where the recorded poses give {of_poses:.2} m/s: the \
-             recorded motion is not used"
-        );
-        problems.push(ReadError::malformed(path.parent().unwrap_or(&path), reason));
-        scenario.contradicted.insert(id);
+            .filter_map(|ticks| means(scenario, agent, ticks))
+            .unzip();
+        let mut quantities = [
+            ("speed", "m/s", SPEED_LIMITS, speeds),
+            ("yaw rate", "degrees/s", YAW_RATE_LIMITS, yaw_rates),
+        ]
+        .into_iter();
+        let contradiction = quantities.find_map(|(quantity, unit, limits, means)| {
+            let means: Vec<Means> = means.into_iter().flatten().collect();
+            let Means { recorded, of_poses } = contradiction(&means, limits)?;
+            Some(format!(
+                "agent {id}: the recorded {quantity} is {recorded:.2} {unit} where the recorded poses give \
+                 {of_poses:.2} {unit}: the recorded motion is not used"
+            ))
+        });
+        if let Some(reason) = contradiction {
+            let path = scenario.points_path(agent, 0, None).unwrap_or_default();
+            problems.push(ReadError::malformed(path.parent().unwrap_or(&path), reason));
+            scenario.contradicted.insert(id);
+        }
     }
     problems
 }
 
-/// Medians of the speeds that disagree, if those are most of the stretches in which the agent moves.
-fn contradiction(stretches: &[Speeds]) -> Option<Speeds> {
+/// Medians of the means that disagree, if those are most of the stretches in which the agent moves.
+fn contradiction(stretches: &[Means], limits: [f64; 3]) -> Option<Means> {
+    let [least, least_difference, most_ratio] = limits;
     let moving = stretches
         .iter()
-        .filter(|speeds| speeds.recorded.max(speeds.of_poses) >= LEAST_MPS);
+        .filter(|means| means.recorded.abs().max(means.of_poses.abs()) >= least);
     let (recorded, of_poses): (Vec<f64>, Vec<f64>) = (moving.clone())
-        .filter(|speeds| !speeds.agree())
-        .map(|speeds| (speeds.recorded, speeds.of_poses))
+        .filter(|means| !means.agree(least_difference, most_ratio))
+        .map(|means| (means.recorded, means.of_poses))
         .unzip();
     // A quarter of all stretches as well: an agent that hardly moves is not judged by a single one.
     let is_most = 2 * recorded.len() > moving.count() && 4 * recorded.len() >= stretches.len();
-    is_most.then_some(Speeds {
+    is_most.then_some(Means {
         recorded: statistics::median(&recorded)?,
         of_poses: statistics::median(&of_poses)?,
     })
 }
 
-impl Speeds {
-    fn agree(self) -> bool {
-        // Infinite or NaN where the poses stand still: then the difference alone decides.
+impl Means {
+    fn agree(self, least_difference: f64, most_ratio: f64) -> bool {
+        // Infinite or NaN where the poses stand still: then the difference alone decides. Negative for other signs.
         let ratio = self.recorded / self.of_poses;
-        (self.recorded - self.of_poses).abs() < LEAST_DIFFERENCE_MPS
-            || (1.0 / MOST_RATIO..=MOST_RATIO).contains(&ratio)
+        (self.recorded - self.of_poses).abs() < least_difference
+            || (1.0 / most_ratio..=most_ratio).contains(&ratio)
     }
 }
 
@@ -107,33 +121,44 @@ fn stretches(scenario: &Scenario, agent: usize) -> Vec<[usize; 3]> {
     found
 }
 
-/// `None` if a frame cannot be read, or has no pose or no speed.
-fn speeds(scenario: &Scenario, agent: usize, ticks: [usize; 3]) -> Option<Speeds> {
+/// Speed, m/s, and yaw rate, degrees/s, where they are recorded. `None` if a frame cannot be read, or has no pose.
+fn means(
+    scenario: &Scenario,
+    agent: usize,
+    ticks: [usize; 3],
+) -> Option<(Option<Means>, Option<Means>)> {
     let options = LoadOptions::without_points();
-    let mut frames = Vec::with_capacity(ticks.len());
-    for tick in ticks {
-        let frame = scenario.load(agent, tick, &options).ok()?;
-        frames.push((
-            // The distance between poses has no sign: reversing is motion too.
-            frame.speed_mps?.abs(),
-            frame.world_from_lidar?.isometry().translation.vector,
-            frame.capture_nanos,
-        ));
-    }
-    let [(first, start, from), (middle, ..), (last, end, to)] = frames[..] else {
+    let frames = ticks.map(|tick| scenario.load(agent, tick, &options).ok());
+    let [Some(first), Some(middle), Some(last)] = &frames else {
         return None;
     };
-    let seconds = to.checked_sub(from).filter(|nanos| *nanos > 0)? as f64 * 1e-9;
-    // Simpson's rule, or the trapezoidal one for two frames.
-    let recorded = match ticks[0] == ticks[1] {
-        true => f64::midpoint(first, last),
-        false => (first + 4.0 * middle + last) / 6.0,
+    let nanos = last.capture_nanos.checked_sub(first.capture_nanos);
+    let seconds = nanos.filter(|nanos| *nanos > 0)? as f64 * 1e-9;
+    let mean = |value: fn(&Frame) -> Option<f64>| {
+        let (first, middle, last) = (value(first)?, value(middle)?, value(last)?);
+        // Simpson's rule, or the trapezoidal one for two frames.
+        Some(match ticks[0] == ticks[1] {
+            true => f64::midpoint(first, last),
+            false => (first + 4.0 * middle + last) / 6.0,
+        })
     };
-    Some(Speeds {
-        recorded,
-        // The straight distance, which is shorter than the path of a turn.
-        of_poses: (end - start).norm() / seconds,
-    })
+    let [start, end] = [first, last].map(|frame| frame.world_from_lidar);
+    let (start, end) = (start?.isometry(), end?.isometry());
+    // The straight way, which is shorter than the path of a turn.
+    let way = end.translation.vector - start.translation.vector;
+    let vehicle = (first.world_from_vehicle).map_or(start, |pose| pose.isometry());
+    let ahead = way.dot(&(vehicle * Vector3::x()));
+    let distance = match ahead < -BACKWARD * way.norm() {
+        true => -way.norm(),
+        false => way.norm(),
+    };
+    let turn_rad = Pose::from(start.inv_mul(&end)).yaw_rad();
+    let means = |recorded, of_poses| Means { recorded, of_poses };
+    Some((
+        mean(|frame| frame.speed_mps).map(|speed| means(speed, distance / seconds)),
+        mean(|frame| Some(frame.yaw_rate_rad_s?.to_degrees()))
+            .map(|yaw_rate| means(yaw_rate, turn_rad.to_degrees() / seconds)),
+    ))
 }
 
 #[cfg(test)]
@@ -177,6 +202,43 @@ mod tests {
                  motion is not used"
             );
             assert!(message.ends_with(&expected), "{message}");
+        }
+    }
+
+    /// Problems of thirty frames at 10 m/s along x that turn to the right by 30 degrees/s, with this recorded motion.
+    fn problems_of_turn(imu: &str) -> Vec<String> {
+        let dir = tempfile::tempdir().unwrap();
+        for frame in 0..30 {
+            let yaw = 3 * frame;
+            let yaml = format!(
+                "lidar_pose: [{frame}, 0, 2, 0, {yaw}, 0]\nimu: {{{imu}}}\nvehicles: {{}}\n"
+            );
+            let name = format!("1/{frame:06}");
+            write_frame(dir.path(), &name, &yaml, &[[1.0, 2.0, 3.0, 0.5]]);
+        }
+        let problems = crate::open(dir.path()).unwrap().problems;
+        problems.iter().map(ToString::to_string).collect()
+    }
+
+    #[test]
+    fn yaw_rates_and_signs_of_speeds_that_the_poses_contradict_are_named() {
+        let sound = problems_of_turn("speed_mps: 10, yaw_rate_degps: 30");
+        assert_eq!(sound, Vec::<String>::new());
+        for (imu, expected) in [
+            (
+                "speed_mps: 10, yaw_rate_degps: -30",
+                "the recorded yaw rate is 30.00 degrees/s where the recorded poses give -30.00 degrees/s",
+            ),
+            (
+                "speed_mps: -10, yaw_rate_degps: 30",
+                "the recorded speed is -10.00 m/s where the recorded poses give 10.00 m/s",
+            ),
+        ] {
+            let problems = problems_of_turn(imu);
+            assert!(
+                problems.len() == 1 && problems[0].contains(expected),
+                "{problems:?}"
+            );
         }
     }
 

@@ -1,5 +1,6 @@
 //! Numbers of binary point files: type, size and byte order.
 
+use half::f16;
 use protocol::IntensityKind;
 
 /// Type of one stored number.
@@ -48,7 +49,7 @@ impl Scalar {
         }
         let bits = u64::from_le_bytes(little);
         match (self.kind, self.size) {
-            (ScalarKind::Float, 2) => Some(half(bits as u16)),
+            (ScalarKind::Float, 2) => Some(f16::from_bits(bits as u16).to_f64()),
             (ScalarKind::Float, 4) => Some(f64::from(f32::from_bits(bits as u32))),
             (ScalarKind::Float, 8) => Some(f64::from_bits(bits)),
             (ScalarKind::Unsigned, 1 | 2 | 4 | 8) => Some(bits as f64),
@@ -97,19 +98,6 @@ pub(super) fn read_point(bytes: &[u8], places: &[Option<(usize, Scalar)>; 4]) ->
         let value = place.and_then(|(first, scalar)| scalar.read(bytes.get(first..)?));
         value.map_or(0.0, |value| value as f32)
     })
-}
-
-/// IEEE 754 binary16.
-fn half(bits: u16) -> f64 {
-    let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };
-    let (exponent, fraction) = (i32::from(bits >> 10 & 0x1f), f64::from(bits & 0x3ff));
-    sign * match exponent {
-        // Subnormal numbers have no leading one, and the exponent -14 with ten bits of fraction.
-        0 => fraction * 2f64.powi(-24),
-        0x1f if fraction == 0.0 => f64::INFINITY,
-        0x1f => f64::NAN,
-        _ => (1.0 + fraction / 1024.0) * 2f64.powi(exponent - 15),
-    }
 }
 
 #[cfg(test)]
@@ -193,6 +181,7 @@ mod tests {
 
     #[test]
     fn halves_are_those_of_ieee() {
+        let half = |bits: u16| Scalar::new(ScalarKind::Float, 2, false).read(&bits.to_le_bytes());
         for (bits, expected) in [
             (0x3c00, 1.0),
             (0xc000, -2.0),
@@ -200,9 +189,9 @@ mod tests {
             (0x0001, 2f64.powi(-24)),
             (0x3555, 0.333_251_953_125),
         ] {
-            assert_eq!(half(bits), expected);
+            assert_eq!(half(bits), Some(expected));
         }
-        assert_eq!(half(0xfc00), f64::NEG_INFINITY);
-        assert!(half(0x7e00).is_nan());
+        assert_eq!(half(0xfc00), Some(f64::NEG_INFINITY));
+        assert!(half(0x7e00).is_some_and(f64::is_nan));
     }
 }

@@ -1,42 +1,109 @@
-//! Time stamps in tables: microseconds, unless the numbers of a file show another unit.
+//! Times in files: their unit, which the list as a whole decides.
 
-use support::rounding;
+use std::ops::{Range, RangeInclusive};
+use std::path::Path;
 
-/// Above this, stamps count nanoseconds: as microseconds they would be beyond the year 5000.
-const LEAST_NANOS: f64 = 1e17;
-/// Stamps with fractions below this count milliseconds: as microseconds they would be before 1974.
-const MOST_MILLIS: f64 = 1e14;
-/// Stamps with fractions below this count seconds.
-const MOST_SECONDS: f64 = 1e11;
+use strum::IntoEnumIterator;
+use support::{rounding, statistics};
 
-/// Microseconds in one unit of the stamps of a file, which are finite. All of them decide: one may be whole by chance.
-pub(super) fn micros_per_unit(stamps: impl IntoIterator<Item = f64>) -> f64 {
-    let (mut largest, mut has_fractions) = (0.0_f64, false);
-    for stamp in stamps {
-        largest = largest.max(stamp);
-        has_fractions |= stamp.fract() != 0.0;
+use super::ReadError;
+
+/// Times since an epoch, seconds: of the years 2001 to 2286.
+const EPOCH_S: Range<f64> = 1e9..1e10;
+/// Largest median step of these, seconds.
+const MOST_EPOCH_STEP_S: f64 = 3600.0;
+/// Median steps of the times of a LiDAR, seconds: from 200 Hz to rare key frames.
+const LIDAR_STEP_S: RangeInclusive<f64> = 0.005..=5.0;
+/// Largest median step of other times, seconds.
+const MOST_STEP_S: f64 = 60.0;
+
+/// Unit of a time.
+#[derive(Debug, Clone, Copy, PartialEq, strum::EnumIter)]
+pub(super) enum Unit {
+    Seconds,
+    Milliseconds,
+    Microseconds,
+    Nanoseconds,
+}
+
+impl Unit {
+    fn seconds(self) -> f64 {
+        match self {
+            Self::Seconds => 1.0,
+            Self::Milliseconds => 1e-3,
+            Self::Microseconds => 1e-6,
+            Self::Nanoseconds => 1e-9,
+        }
     }
-    match largest {
-        largest if largest > LEAST_NANOS => 1e-3,
-        largest if has_fractions && largest < MOST_SECONDS => 1e6,
-        largest if has_fractions && largest < MOST_MILLIS => 1e3,
-        // Whole stamps are microseconds however small, as those of a clock that starts at 0.
-        _ => 1.0,
+
+    /// The unit of times from 0 in their order: by their size if they count from an epoch, else the first in which their
+    /// median step is that of a LiDAR, else the first in which it is a minute at most.
+    pub(super) fn of(times: &[f64]) -> Option<Self> {
+        let step = median_step(times);
+        let least = times.iter().copied().fold(f64::INFINITY, f64::min);
+        let most = times.iter().copied().fold(0.0, f64::max);
+        let fits = |unit: &Self, most_step_s: f64| {
+            most * unit.seconds() < EPOCH_S.end && step * unit.seconds() <= most_step_s
+        };
+        let since_epoch =
+            |unit: &Self| least * unit.seconds() >= EPOCH_S.start && fits(unit, MOST_EPOCH_STEP_S);
+        let of_lidar = |unit: &Self| LIDAR_STEP_S.contains(&(step * unit.seconds()));
+        (Self::iter().find(since_epoch))
+            .or_else(|| Self::iter().find(of_lidar))
+            .or_else(|| Self::iter().find(|unit| fits(unit, MOST_STEP_S)))
+    }
+
+    /// The unit of the times of a file, as [`Self::of`]; microseconds if none fits. An unusual step is a problem.
+    pub(super) fn of_file(path: &Path, times: &[f64], problems: &mut Vec<ReadError>) -> Self {
+        let unit = Self::of(times).unwrap_or(Self::Microseconds);
+        let nanos: Vec<u64> = times.iter().map(|time| unit.nanos(*time)).collect();
+        problems.extend(step_problem(path, &nanos));
+        unit
+    }
+
+    /// A time from 0 in this unit as whole microseconds.
+    pub(super) fn micros(self, time: f64) -> u64 {
+        rounding::to_u64(time * (self.seconds() * 1e6))
+    }
+
+    /// The same as nanoseconds. Doubles keep times since 1970 to a quarter of a microsecond.
+    pub(super) fn nanos(self, time: f64) -> u64 {
+        rounding::to_u64(time * (self.seconds() * 1e9))
     }
 }
 
-/// A stamp from 0 as whole microseconds.
-pub(super) fn micros(stamp: f64, micros_per_unit: f64) -> u64 {
-    rounding::to_u64(stamp * micros_per_unit)
+/// The problem that times since a start, nanoseconds, do not follow one another as those of a LiDAR do.
+pub(super) fn step_problem(path: &Path, nanos: &[u64]) -> Option<ReadError> {
+    let times_s: Vec<f64> = nanos.iter().map(|nanos| *nanos as f64 * 1e-9).collect();
+    let (first, last) = (times_s.first()?, times_s.last()?);
+    let step_s = median_step(&times_s);
+    let is_usual = step_s == 0.0 || LIDAR_STEP_S.contains(&step_s) || *first >= EPOCH_S.start;
+    (!is_usual).then(|| {
+        let reason = format!(
+            "taken as times from {first:.3} s to {last:.3} s with a median step of {step_s:.6} s, expected 0.005 to 5 s: \
+             their unit is doubtful"
+        );
+        ReadError::malformed(path, reason)
+    })
+}
+
+/// The median of the steps that are not 0: neither a pause in the drive nor equal times decide. 0 without any.
+fn median_step(times: &[f64]) -> f64 {
+    let steps = times.array_windows();
+    let steps = steps.map(|[time, next]| (next - time).abs());
+    let steps: Vec<f64> = steps.filter(|step| *step > 0.0).collect();
+    statistics::median(&steps).unwrap_or(0.0)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn micros_of_file(stamps: &[f64]) -> Vec<u64> {
-        let unit = micros_per_unit(stamps.iter().copied());
-        stamps.iter().map(|&stamp| micros(stamp, unit)).collect()
+    fn micros_of_file(times: &[f64]) -> Vec<u64> {
+        let mut problems = Vec::new();
+        let unit = Unit::of_file(Path::new("a"), times, &mut problems);
+        assert_eq!(problems.len(), 0, "{problems:?}");
+        times.iter().map(|&time| unit.micros(time)).collect()
     }
 
     #[test]
@@ -63,5 +130,36 @@ mod tests {
         );
         assert_eq!(micros_of_file(&[0.0, 0.1]), [0, 100_000]);
         assert_eq!(micros_of_file(&[0.0, 100_000.0]), [0, 100_000]);
+    }
+
+    #[test]
+    fn times_since_an_epoch_have_the_unit_of_their_size() {
+        for (unit, per_second) in Unit::iter().zip([1.0, 1e3, 1e6, 1e9]) {
+            for step_s in [0.0001, 0.1, 9.0, 1000.0] {
+                let times = [1.6e9, 1.6e9 + step_s].map(|time| time * per_second);
+                assert_eq!(Unit::of(&times), Some(unit), "{step_s} s");
+            }
+        }
+    }
+
+    #[test]
+    fn times_since_a_start_have_the_unit_in_which_a_lidar_has_their_step() {
+        for (unit, per_second) in Unit::iter().zip([1.0, 1e3, 1e6, 1e9]) {
+            // A clock that started hours ago, 20 Hz, 10 Hz, key frames every two seconds.
+            for (start_s, step_s) in [(0.0, 0.05), (0.0, 0.1), (0.0, 2.0), (5000.0, 0.05)] {
+                let times = [0.0, 1.0, 2.0].map(|step| (start_s + step * step_s) * per_second);
+                assert_eq!(Unit::of(&times), Some(unit), "{start_s} s, {step_s} s");
+            }
+        }
+    }
+
+    #[test]
+    fn a_step_that_no_lidar_has_is_a_problem() {
+        let mut problems = Vec::new();
+        let unit = Unit::of_file(Path::new("a"), &[0.0, 0.001, 0.002], &mut problems);
+        let shown: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        let expected = "a: taken as times from 0.000 s to 0.002 s with a median step of 0.001000 s, expected 0.005 to 5 s: \
+                        their unit is doubtful";
+        assert_eq!((unit, shown), (Unit::Seconds, vec![expected.to_owned()]));
     }
 }

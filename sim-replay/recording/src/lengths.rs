@@ -69,18 +69,14 @@ fn behind(record: &[u8], head: usize, count: usize) -> Option<&[u8]> {
     Some(rest)
 }
 
-/// True if a chunk of `len` bytes begins here: its compression is known, and its records fill the rest.
-pub(super) fn is_chunk_head(bytes: &[u8], len: u64) -> bool {
-    let Some((compression, rest)) = bytes.get(CHUNK_HEAD..).and_then(text) else {
-        return false;
-    };
-    let Some((&records_len, _)) = rest.split_first_chunk() else {
-        return false;
-    };
+/// The length of a chunk whose head is here, with the records that fill the rest; `None` if its compression is not known.
+pub(super) fn chunk_len(bytes: &[u8]) -> Option<u64> {
+    let (compression, rest) = text(bytes.get(CHUNK_HEAD..)?)?;
+    let (&records_len, _) = rest.split_first_chunk()?;
     // 4 and 8 are the lengths written before the compression and before the records.
     let head_len = (CHUNK_HEAD + 4 + compression.len() + 8) as u64;
-    COMPRESSIONS.contains(&compression)
-        && u64::from_le_bytes(records_len).checked_add(head_len) == Some(len)
+    let len = u64::from_le_bytes(records_len).checked_add(head_len);
+    len.filter(|_| COMPRESSIONS.contains(&compression))
 }
 
 /// The channel of a message, and its payload.

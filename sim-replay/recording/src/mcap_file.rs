@@ -198,7 +198,7 @@ impl FileScan<'_> {
         loop {
             let begin = records.at;
             let taken = match records.next()? {
-                Ok(Some(record)) => self.take(&record),
+                Ok(Some(record)) => self.take(begin, &record),
                 // A damaged part that reaches the end of the file is reported already.
                 Ok(None) if self.lost.last().is_some_and(|lost| lost.end == size) => return Ok(()),
                 Ok(None) => {
@@ -246,9 +246,9 @@ impl FileScan<'_> {
         self.channels.has_chunks.or(first).unwrap_or(false)
     }
 
-    /// Processes the next record of the file; ends with the checksum of the data section.
-    fn take(&mut self, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
-        let (begin, body) = (record.begin, record.body);
+    /// Processes the next record of the file, which starts at byte `begin`; ends with the checksum of the data section.
+    fn take(&mut self, begin: u64, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
+        let body = record.body;
         match record.opcode {
             op::DATA_END => {
                 let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));

@@ -18,8 +18,6 @@ const KNOWN_BY: usize = RECORD_HEAD + lengths::MESSAGE_HEAD + HEADER_LEN;
 
 /// A record in the file.
 pub(super) struct RawRecord<'a> {
-    /// Its start, bytes.
-    pub(super) begin: u64,
     pub(super) opcode: u8,
     pub(super) body: &'a [u8],
 }
@@ -104,7 +102,6 @@ impl<'a> Records<'a> {
         }
         self.at = begin + (RECORD_HEAD + len) as u64;
         Ok(Ok(Some(RawRecord {
-            begin,
             opcode,
             body: &self.body,
         })))
@@ -170,7 +167,7 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
         return false;
     }
     match opcode {
-        op::CHUNK => lengths::is_chunk_head(body, len),
+        op::CHUNK => lengths::chunk_len(body) == Some(len),
         op::MESSAGE => lengths::message(body).is_some_and(|(channel, payload)| {
             let payload_len = len.saturating_sub(lengths::MESSAGE_HEAD as u64);
             is_own(channel) && lengths::own_message(payload) == Some(payload_len)

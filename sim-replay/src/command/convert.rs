@@ -3,7 +3,7 @@
 use std::path::{Component, Path, PathBuf};
 
 use dataset::{self, IntensityOption, OpenOptions};
-use simulator::generate::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
+use simulator::generate::{Converted, SceneLayout, SynthError, convert};
 use support::output;
 use terminal::progress;
 
@@ -50,15 +50,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
     }
     let bar = progress::bar(0, "frames");
-    let options = ConvertOptions {
-        out: args.out.clone(),
-        layout: args.layout,
-        force: args.force,
-    };
-    let result = convert(&input, &options, &|done, total| {
+    let advance = |done: usize, total: usize| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
-    });
+    };
+    let result = convert(&input, &args.out, args.layout, args.force, &advance);
     bar.finish_and_clear();
     match result {
         Ok(converted) => {

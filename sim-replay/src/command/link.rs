@@ -29,7 +29,11 @@ impl clap::Args for Args {
             .value_name("PRESET|FILE")
             .exclusive(true);
         let help = "Print a link as YAML, every field with its value, and exit: a start for a file of one's own";
-        ForwardArgs::augment_args(command).arg(print.help(help))
+        let about = "Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost";
+        // Last: the settings bring a description of their own.
+        ForwardArgs::augment_args(command)
+            .arg(print.help(help))
+            .about(about)
     }
 
     fn augment_args_for_update(command: Command) -> Command {

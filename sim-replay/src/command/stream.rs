@@ -27,7 +27,7 @@ pub(crate) fn run(args: ProcessArgs<ReplayConfig>) -> anyhow::Result<Outcome> {
         Ok(replay) => replay,
         // Faults of the input, exit code 2. All other errors are failures of the run.
         Err(
-            error @ (StreamError::NoAgent { .. }
+            error @ (StreamError::NoAgent(_)
             | StreamError::NoTick { .. }
             | StreamError::Rate(_)
             | StreamError::Checkpoint(_)

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use protocol::CavId;
-use protocol::config::{FieldError, within};
+use protocol::config::{FieldError, require, within};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -21,7 +21,7 @@ pub struct SceneConfig {
     #[arg(long, value_name = "NAME")]
     #[serde(default)]
     pub scenario: Option<String>,
-    /// Vehicles that take part. None named: all.
+    /// Vehicles that take part. None named: those of the evaluation protocol, in `sim-replay stream` all.
     #[arg(long, value_name = "IDS", value_delimiter = ',')]
     #[arg(allow_hyphen_values = true)]
     #[serde(default)]
@@ -42,7 +42,7 @@ pub struct SceneConfig {
     #[arg(long)]
     #[serde(default)]
     pub cameras: bool,
-    /// Seconds of the scene per second; 0: as fast as the subscribers accept it, without drops.
+    /// Seconds of the scene per second; 0, in `sim-replay stream` alone: as fast as the subscribers accept it, without drops.
     #[arg(long, value_name = "TIMES")]
     #[serde(default = "SceneConfig::recorded_rate")]
     pub rate: f64,
@@ -74,6 +74,11 @@ impl SceneConfig {
     /// # Errors
     /// [`FieldError`] for the first invalid value.
     pub fn validate(&self) -> Result<(), FieldError> {
+        for (place, cav) in self.agents.iter().enumerate() {
+            let is_first = !self.agents[..place].contains(cav);
+            let rule = "must name each vehicle once";
+            require(is_first, "scene.agents", cav.as_str(), rule)?;
+        }
         within("scene.rate", self.rate, 0.0, 1e3)?;
         within("scene.frames", self.frames.unwrap_or(1), 1, usize::MAX)
     }

@@ -115,8 +115,10 @@ impl CountSummary {
 pub struct TickReport {
     /// Scenario.
     pub scenario: String,
-    /// Stem of the tick.
-    pub tick: String,
+    /// Index of the tick in the scenario, as `--seek` takes it.
+    pub tick: usize,
+    /// Stem of its files.
+    pub stem: String,
     /// Agent whose LiDAR frame and range apply.
     pub ego: CavId,
     /// Agents whose annotations were merged, the ego first.

@@ -54,10 +54,8 @@ pub fn inspect(
         return report;
     };
     report.layout = Some(dataset.layout);
-    let protocol = protocol.resolve(dataset.layout).map_err(|reason| {
-        let path = dir.to_owned();
-        ReadError::Layout { path, reason }
-    });
+    let protocol = protocol.resolve(dataset.layout);
+    let protocol = protocol.map_err(|reason| ReadError::malformed(dir, reason));
     let Some(protocol) = or_problem(protocol, &mut report.problems) else {
         return report;
     };
@@ -236,7 +234,8 @@ fn merged_counts(
         }
         merged.extend(counts.into_iter().map(|(agents, merged_boxes)| TickReport {
             scenario: scenario.name.clone(),
-            tick: scenario.ticks[tick].stem.clone(),
+            tick,
+            stem: scenario.ticks[tick].stem.clone(),
             ego: ego.cav.clone(),
             agents,
             merged_boxes,

@@ -95,15 +95,9 @@ impl StreamOptions {
 #[derive(Debug, thiserror::Error)]
 pub enum StreamError {
     /// A vehicle that the scenario does not have.
-    #[error("scenario {scenario} has no agent {asked}; it has {available}")]
-    NoAgent {
-        /// The scenario.
-        scenario: String,
-        /// The requested agent.
-        asked: CavId,
-        /// The available agents.
-        available: String,
-    },
+    /// The message names the scenario, the requested agent and the available ones.
+    #[error("{0}")]
+    NoAgent(String),
     /// A tick that the scenario does not have.
     #[error("scenario {scenario} has {ticks} ticks, counted from 0; there is no tick {asked}")]
     NoTick {
@@ -507,11 +501,9 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
         let found = agents.iter().position(|agent| agent == cav);
         found.ok_or_else(|| {
             let available: Vec<&str> = agents.iter().map(CavId::as_str).collect();
-            StreamError::NoAgent {
-                scenario: scenario.name.clone(),
-                asked: cav.clone(),
-                available: available.join(", "),
-            }
+            let (name, available) = (&scenario.name, available.join(", "));
+            let reason = format!("scenario {name} has no agent {cav}; it has {available}");
+            StreamError::NoAgent(reason)
         })
     });
     indices.collect()

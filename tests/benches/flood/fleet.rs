@@ -223,9 +223,8 @@ impl Place {
                 members: credentials.members()?,
                 runs: RunScope::Any,
             };
-            options = options
-                .with_credentials(credentials)
-                .with_access_control(guard);
+            options = options.with_credentials(credentials);
+            options.guard = Some(guard);
         }
         let session = open(&options)?;
         print("ready")?;

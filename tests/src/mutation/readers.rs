@@ -14,7 +14,7 @@ use localization::registration::icp::surfel_map::SurfelMap;
 use perception::weights::Weights;
 use protocol::{Limits, wire};
 use recording::Recording;
-use ros2::{MotionType, SweepLimits, read_point_cloud};
+use ros2::{MotionType, read_point_cloud};
 use runner::experiment::spec::Experiment;
 use runner::scenario::Scenario;
 use safetensors::tensor::{Dtype, TensorView, serialize};
@@ -81,14 +81,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
             pcd::decode(bytes).is_ok()
         }),
         in_memory("ros2 cloud", vec![seeds::ros2_cloud()], |_, bytes| {
-            read_point_cloud(
-                bytes,
-                SweepLimits {
-                    max_points: 1 << 20,
-                    max_abs_value: 1e6,
-                },
-            )
-            .is_ok()
+            read_point_cloud(bytes, &Limits::DEFAULT).is_ok()
         }),
         in_memory("ros2 motion", seeds::ros2_motions(), |_, bytes| {
             // One byte in front selects the type.

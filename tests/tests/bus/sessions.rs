@@ -503,7 +503,7 @@ fn a_port_in_use_and_a_missing_router_are_named() {
     let router = TestRouter::open();
     let error = bus::open(&BusOptions::router(router.endpoint.clone())).unwrap_err();
     assert!(
-        matches!(&error, BusError::PortInUse { endpoint } if *endpoint == router.endpoint),
+        matches!(&error, BusError::PortInUse(endpoint) if *endpoint == router.endpoint),
         "{error}"
     );
     assert!(error.to_string().contains("the port is in use"), "{error}");

@@ -1,7 +1,7 @@
 //! `v2vloc eval`: a fusion from a TorchScript file beside the built-in one, offline, and the files of the frames.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::GroundTruth;
@@ -136,6 +136,101 @@ fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_fr
     );
 }
 
+/// Evaluates `late` on a scene; exit code, metrics and notes.
+fn evaluated(scene: &Path) -> (Option<i32>, Value, String) {
+    let (scene, weights) = (scene.to_str().unwrap(), deploy_file("weights"));
+    let arguments = [
+        "--dataset",
+        scene,
+        "--weights",
+        &weights,
+        "--method",
+        "late",
+    ];
+    let output = v2vloc(&[&["eval", "--json"][..], &arguments].concat());
+    let metrics = serde_json::from_slice(&output.stdout).unwrap_or_default();
+    let notes = String::from_utf8_lossy(&output.stderr).into_owned();
+    (output.status.code(), metrics, notes)
+}
+
+#[test]
+fn a_tick_without_the_true_pose_of_the_ego_is_left_out_as_if_it_were_not_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene");
+    let options = SynthOptions {
+        frames: FRAMES,
+        ..SynthOptions::new(Subset::V2vdet, 905, scene.clone())
+    };
+    generate(&options, &|_| {}).unwrap();
+    let ego = dataset::open(&scene).unwrap().scenarios[0].points_path(0, 0, None);
+    let sweep = ego.unwrap();
+    let yaml = sweep.with_extension("yaml");
+    let text = fs::read_to_string(&yaml).unwrap();
+    // The first tick, so that the scenario is not judged by it.
+    fs::write(&yaml, text.replace("lidar_pose:", "no_pose:")).unwrap();
+    let (code, unposed, notes) = evaluated(&scene);
+    assert_eq!(code, Some(3), "{notes}");
+    let finding = format!("{}: lidar_pose: no true pose of the ego", sweep.display());
+    assert!(notes.contains(&finding), "{notes}");
+    assert_eq!(
+        (&unposed["frames"], &unposed["left_out"]["ticks"]),
+        (&(FRAMES - 1).into(), &1.into())
+    );
+    fs::remove_file(sweep).unwrap();
+    fs::remove_file(yaml).unwrap();
+    let (_, without, _) = evaluated(&scene);
+    assert_eq!(unposed["ap_global"], without["ap_global"]);
+}
+
+#[test]
+fn kept_feature_maps_change_no_result_and_wrong_weights_are_found_before_the_first_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    let options = SynthOptions {
+        frames: 1,
+        ..SynthOptions::new(Subset::V2vdet, 905, at("scene").into())
+    };
+    generate(&options, &|_| {}).unwrap();
+    let eval = |out: &str, weights: &str, more: &[&str]| {
+        let (scene, out) = (at("scene"), at(out));
+        let files = ["--dataset", &scene, "--weights", weights, "--out", &out];
+        v2vloc(&[&["eval"][..], &files, more].concat())
+    };
+    let (weights, maps) = (deploy_file("weights"), at("maps"));
+    // The boxes of `late` are those of single vehicles, whose maps are not sent.
+    let sent = ["--method", "late,max", "--dtype", "i8"];
+    let computed = eval("computed", &weights, &sent);
+    let kept = eval(
+        "kept",
+        &weights,
+        &[&sent[..], &["--feature-maps", &maps]].concat(),
+    );
+    assert!(
+        computed.status.success() && kept.status.success(),
+        "{kept:?}"
+    );
+    for method in ["late", "max"] {
+        let [computed, kept] = ["computed", "kept"].map(|out| {
+            let file = folder
+                .path()
+                .join(out)
+                .join(method)
+                .join("detections.jsonl");
+            lines(file).remove(0)["detections"].take()
+        });
+        assert!(!computed.as_array().unwrap().is_empty());
+        assert_eq!(computed, kept, "{method}");
+    }
+
+    let of_max = deploy_file("weights/lean-max.safetensors");
+    let refused = eval("refused", &of_max, &["--method", "max,pastat"]);
+    assert_eq!(refused.status.code(), Some(2), "{refused:?}");
+    assert!(
+        !folder.path().join("refused").exists(),
+        "nothing is evaluated"
+    );
+}
+
 #[test]
 fn the_bench_states_every_stage_in_milliseconds_and_in_units() {
     let folder = tempfile::tempdir().unwrap();
@@ -151,6 +246,8 @@ fn the_bench_states_every_stage_in_milliseconds_and_in_units() {
     );
     let needed_ms = 2.0 * of("agent_ms") + of("fuse_ms") + of("messages_ms");
     assert!((of("needed_ms") - needed_ms).abs() < 1e-9, "{all}");
+    let units = of("frame_units") * of("unit_ms");
+    assert!((units - needed_ms).abs() < 1e-9 && of("agent_units") > 0.0 && of("ego_units") > 0.0);
     let stages = |process: usize| -> Vec<&str> {
         let stages = all[0]["stages"][process].as_array().unwrap();
         stages

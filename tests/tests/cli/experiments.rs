@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::SystemTime;
@@ -114,6 +115,116 @@ fn cells_of(out: &Path) -> BTreeMap<PathBuf, SystemTime> {
             (path, written)
         })
         .collect()
+}
+
+/// Answer of a worker of the sweep to the request of a run.
+fn answer_of_worker(experiment: &Path, out: &Path, request: &Value) -> String {
+    let mut command = Command::new(programs().join("v2vloc"));
+    command.arg("sweep").arg(experiment).arg("--out").arg(out);
+    let mut worker = command
+        .arg("--worker")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    // The end of the requests ends the worker.
+    writeln!(worker.stdin.take().unwrap(), "{request}").unwrap();
+    let output = worker.wait_with_output().unwrap();
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn a_worker_refuses_a_run_of_an_experiment_that_was_changed_meanwhile() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene");
+    let options = SynthOptions {
+        frames: 1,
+        ..SynthOptions::new(Subset::V2vdet, 1202, scene.clone())
+    };
+    generate(&options, &|_| {}).unwrap();
+    let grid = json!({"method": ["late"]});
+    let mut experiment =
+        json!({"name": "changed", "dataset": scene, "weights": WEIGHTS, "grid": grid});
+    let file = folder.path().join("changed.yaml");
+    fs::write(&file, experiment.to_string()).unwrap();
+    let out = folder.path().join("out");
+    assert!(is_done(start_smoke(&file, &out, &[])));
+    let cell = cells_of(&out).into_keys().next().unwrap();
+    let text = fs::read_to_string(&cell).unwrap();
+    let key = serde_json::from_str::<Value>(&text).unwrap()["key"].take();
+    fs::remove_file(&cell).unwrap();
+
+    experiment["ego"] = json!({"max_age_ms": 100});
+    fs::write(&file, experiment.to_string()).unwrap();
+    let answer = answer_of_worker(&file, &out, &json!([0, key]));
+    let file = file.display();
+    let expected = format!("refused {file} or a file that it names was changed");
+    assert!(answer.starts_with(&expected), "{answer}");
+    assert!(
+        !cell.exists(),
+        "no result under the key of another experiment"
+    );
+}
+
+#[test]
+fn figures_of_an_axis_that_left_the_experiment_are_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene");
+    let options = SynthOptions {
+        frames: 1,
+        ..SynthOptions::new(Subset::V2vdet, 1202, scene.clone())
+    };
+    generate(&options, &|_| {}).unwrap();
+    let (file, out) = (folder.path().join("e.yaml"), folder.path().join("out"));
+    let sweep = |grid: Value| {
+        let experiment = json!({"name": "e", "dataset": scene, "weights": WEIGHTS, "grid": grid});
+        fs::write(&file, experiment.to_string()).unwrap();
+        assert!(is_done(start_smoke(&file, &out, &[])));
+        ["ap_loss.svg", "ap_loss.png", "own.svg"].map(|name| out.join(name).exists())
+    };
+    let both = sweep(json!({"method": ["late"], "loss": [0, 1]}));
+    assert_eq!(both, [true, true, false]);
+    fs::write(out.join("own.svg"), "").unwrap();
+    let one = sweep(json!({"method": ["late"], "loss": [0]}));
+    assert_eq!(one, [false, false, true], "files of others stay");
+}
+
+#[test]
+fn a_table_is_checked_against_the_scenarios_that_it_evaluates() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("data");
+    fs::create_dir(&data).unwrap();
+    for (scenario, agents) in [("a", &["1", "2", "3"][..]), ("b", &["1", "2"])] {
+        tests::scene::write(folder.path(), agents, 1);
+        fs::rename(folder.path().join("scene"), data.join(scenario)).unwrap();
+    }
+    let weights = folder.path().join("weights.safetensors");
+    tests::fleet::write_weights(&weights);
+    let file = folder.path().join("tables.yaml");
+    let tables = |of_table: usize| {
+        let rows = json!([{"method": "none", "vehicles": 3}]);
+        let table =
+            json!({"name": "t", "scenarios": of_table, "rows": rows, "columns": [{"name": "c"}]});
+        let experiment =
+            json!({"dataset": data, "weights": weights, "scenarios": 1, "tables": [table]});
+        fs::write(&file, experiment.to_string()).unwrap();
+        let mut command = Command::new(programs().join("v2vloc"));
+        command.args(["eval", "--table"]).arg(&file).arg("--out");
+        let output = command.arg(folder.path().join("out")).output().unwrap();
+        (
+            output.status.code(),
+            String::from_utf8(output.stderr).unwrap(),
+        )
+    };
+    let (code, messages) = tables(2);
+    let problem = "table \"t\": vehicles is 3, but scenario ";
+    let expected = format!("{}: {problem}", file.display());
+    assert!(
+        code == Some(2) && messages.contains(&expected),
+        "{messages}"
+    );
+    let (code, messages) = tables(1);
+    assert_eq!(code, Some(0), "{messages}");
 }
 
 #[test]

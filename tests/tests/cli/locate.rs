@@ -438,6 +438,18 @@ fn a_head_gets_the_area_of_its_drives_and_other_files_stay_as_they_are() {
         text.contains("cells of 25 m") && text.contains('#'),
         "{text}"
     );
+    let notes = String::from_utf8_lossy(&output.stderr);
+    assert!(notes.contains("cells is replaced by one of"), "{notes}");
+    let town4 = folder.path().join("pgc-town4.safetensors");
+    fs::copy(weights("pgc-town4.safetensors"), &town4).unwrap();
+    let town4 = town4.to_str().unwrap();
+    let refused = agent(&["cover", "--dataset", drives, "--head", town4]);
+    let error = String::from_utf8_lossy(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(2), "{error}");
+    assert!(
+        error.contains("a head of town4, the drives are through town1"),
+        "{error}"
+    );
     assert_ne!(
         fs::read(&head).unwrap(),
         fs::read(weights("pgc-town1.safetensors")).unwrap()

@@ -15,7 +15,7 @@ type Row = (&'static str, i32, &'static str);
 const EVAL: &str = "v2vloc eval --dataset {s} --weights {w} --method max";
 
 /// Mistakes in options of an evaluation: what follows [`EVAL`].
-const OF_AN_EVALUATION: [Row; 26] = [
+const OF_AN_EVALUATION: [Row; 28] = [
     (
         "--noise-position-std-m 2",
         2,
@@ -48,15 +48,21 @@ const OF_AN_EVALUATION: [Row; 26] = [
     ("--gate 2", 2, "codec.gate.threshold is 2: must be below"),
     ("--seed 3", 2, "--link"),
     ("--attackers 2", 2, "--attack"),
+    ("--attack noise --attackers 0", 2, "attackers is 0"),
+    (
+        "--delay-ms 20000",
+        2,
+        "delay_ms is 20000, must be 0 to 10000",
+    ),
     (
         "--method late --boxes only",
         2,
-        "--boxes is for methods that exchange feature maps: late",
+        "boxes is for methods that exchange feature maps: late",
     ),
     (
         "--box-alignment",
         2,
-        "--box-alignment is for boxes of neighbours",
+        "box_alignment is for boxes of neighbours",
     ),
     ("--latency-ms -3", 2, "latency is -3"),
     ("--link nolink", 2, "neither a preset of a link"),
@@ -80,7 +86,7 @@ const OF_AN_EVALUATION: [Row; 26] = [
     ),
 ];
 
-const MISTAKES: [Row; 35] = [
+const MISTAKES: [Row; 37] = [
     (
         "v2vloc eval --dataset {d}/none --weights {w} --method max",
         2,
@@ -118,6 +124,16 @@ const MISTAKES: [Row; 35] = [
     ),
     ("v2vloc up {d}/typo.yaml", 2, "unknown field `metod`"),
     ("v2vloc up {d}/none.yaml", 2, "none.yaml: No such file"),
+    (
+        "v2vloc up {d}/scenario.yaml --runs {d}/scenario.yaml",
+        2,
+        "scenario.yaml: is a file, must be a folder",
+    ),
+    (
+        "sim-replay synth --subset v2vdet --seed 1 --frames 1 --out {d}/scenario.yaml",
+        2,
+        "scenario.yaml: is a file, must be a folder",
+    ),
     (
         "v2vloc up {d}/scenario.yaml --runs {d}/runs --metrics 127.0.0.1:{p}",
         2,

@@ -7,7 +7,6 @@ use std::sync::Arc;
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use dataset::pcd;
 use dataset::{self, LeftOut, LoadOptions};
-use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
 use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, GivenPose, Poses};
 use ego_fuser_offline::evaluation::alignment::table::PairTally;
 use ego_fuser_offline::evaluation::alignment::{self, BoxSource, PairOutcome};
@@ -49,7 +48,7 @@ fn overlap(target: &PointCloud, source: &PointCloud, target_from_source: &Isomet
 fn follow(target: &PointCloud, source: &PointCloud, known: &Isometry3<f64>) {
     let config = IcpConfig::default();
     let planes = IcpTarget::of_sweep(&target.xyzi, &config);
-    let decimate = IcpSource::of_sweep(&source.xyzi, &config);
+    let decimate = IcpSource::of_sweep(&source.xyzi);
     let found = icp::register(&decimate, &planes, &Isometry3::identity(), &config)
         .unwrap()
         .target_from_source;
@@ -149,17 +148,17 @@ fn approaches_meet_on_generated_scenes() {
     no_map_of_nothing(folder.path());
     let map = Arc::new(read_map(&[&scenes], 1.0, &config, &mut LeftOut::default()).unwrap());
     assert!(map.planes() > 1000);
-    let source = IcpMapPose::new(map, config.clone());
+    let source = IcpMapPose::new(map, config);
     let methods = [
         Poses::spec("true", GivenPose::True, || Ok(Box::new(RecordedPose))),
         Poses::spec("gnss", GivenPose::Gnss, || Ok(Box::new(RecordedPose))),
         Poses::spec("icp-map", GivenPose::Gnss, move || {
             Ok(Box::new(source.clone()) as Box<dyn PoseSource>)
         }),
-        CloudIcp::spec(config.clone(), false),
-        CloudIcp::spec(config, true),
+        CloudIcp::spec(false),
+        CloudIcp::spec(true),
         BoxIcp::spec(),
-        FreeAlign::spec(FreeAlignConfig::default()),
+        FreeAlign::spec(),
     ];
     let found = outcomes(&scenes, &methods);
     let rows: Vec<_> = (methods.iter().enumerate())

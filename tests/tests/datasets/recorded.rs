@@ -394,7 +394,7 @@ fn inspect_counts_21_and_26_and_finds_nothing_wrong() {
             .ticks
             .iter()
             .find(of_agents)
-            .map(|tick| (tick.ego.as_str(), tick.tick.as_str(), tick.merged_boxes))
+            .map(|tick| (tick.ego.as_str(), tick.stem.as_str(), tick.merged_boxes))
     };
     assert_eq!(merged(&["4279"]), Some(("4279", "000069", 21)));
     assert_eq!(merged(&["4279", "4288"]), Some(("4279", "000069", 26)));

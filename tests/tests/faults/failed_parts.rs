@@ -191,7 +191,9 @@ fn a_scene_without_poses_is_played_to_those_who_find_theirs() {
         .arg(weights);
     let (code, output) = outcome(&mut eval);
     assert!(
-        code == Some(2) && output.contains("no true poses of the ego 4279"),
+        code == Some(2)
+            && output.contains("there is no frame in it that can be evaluated")
+            && output.contains("lidar_pose: no true pose of the ego 4279"),
         "{output}"
     );
 }
@@ -225,9 +227,32 @@ fn sweeps_without_poses_are_localised_and_no_sweep_is_an_error() {
     let table = folder.path().join("poses.csv");
     let (code, output) = outcome(agent("localize", &scene).arg("--out").arg(&table));
     assert!(code == Some(0) && output.contains("2 sweeps, "), "{output}");
+    // A head without a confidence: it is named.
+    assert!(
+        output.contains("head.safetensors: no \"confidence\" in its metadata"),
+        "{output}"
+    );
+    // Done is what the same networks computed from the same data.
+    let (code, output) = outcome(agent("localize", &scene).arg("--out").arg(&table));
+    assert!(code == Some(0) && output.contains("0 sweeps, "), "{output}");
+    let other = folder.path().join("other");
+    tests::scene::write(&other, &["4279"], 2);
+    let same_name = other.join("scene");
+    for (data, refused) in [
+        (vec![&same_name], "are of other networks or data"),
+        (vec![&scene, &same_name], "both have a scenario scene"),
+    ] {
+        let mut localize = agent("localize", data[0]);
+        localize.arg("--out").arg(&table);
+        for more in &data[1..] {
+            localize.arg("--dataset").arg(more);
+        }
+        let (code, output) = outcome(&mut localize);
+        assert!(code == Some(2) && output.contains(refused), "{output}");
+    }
     let (code, output) = outcome(&mut agent("eval", &scene));
     assert!(
-        code == Some(2) && output.contains("no true pose to compare with"),
+        code == Some(2) && output.contains("there is no pose for this sweep"),
         "{output}"
     );
     let empty = folder.path().join("empty/1");

@@ -13,7 +13,8 @@ use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{AgentPool, EmulatedLink, EvaluatedFrame, Evaluator, Setup};
 use fusion::Method;
 use link::{ClockStep, DeviceClock, LatencyModel, LinkConfig, LossModel};
-use protocol::{DropReason, Dtype};
+use protocol::{CavId, DropReason, Dtype};
+use runner::fleet::Fleet;
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
 use serde_json::Value;
@@ -24,6 +25,8 @@ use tests::fleet::{
 use tests::locks::exclusive_lock;
 
 pub(super) const TICKS: usize = 8;
+/// One vehicle more than the protocol of the layout lets take part.
+const EIGHT: [&str; 8] = ["11", "12", "13", "14", "15", "16", "17", "18"];
 /// A method that comes with the programs.
 const ATTENTION: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
@@ -56,6 +59,28 @@ fn in_half_precision() -> Setup {
     let mut setup = Setup::default();
     setup.agents.codec.dtype = Dtype::F16;
     setup
+}
+
+#[test]
+fn as_many_vehicles_run_as_the_protocol_allows_or_the_scene_names() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = write_scenario(folder.path(), 1, "", "");
+    fs::remove_dir_all(folder.path().join("scene")).unwrap();
+    tests::scene::write(folder.path(), &EIGHT, 1);
+    let scenario = Scenario::read(&file).unwrap();
+    let planned = |ego: Option<&str>, named: &[&str]| {
+        let mut scenario = scenario.clone();
+        scenario.ego.id = ego.map(|ego| CavId::new(ego).unwrap());
+        scenario.scene.agents = named.iter().map(|cav| CavId::new(cav).unwrap()).collect();
+        let fleet = Fleet::plan(&scenario).unwrap();
+        let agents: Vec<String> = fleet.agents.iter().map(ToString::to_string).collect();
+        (agents.join(" "), fleet.protocol.max_agents)
+    };
+    let seven = EIGHT[..7].join(" ");
+    assert_eq!(planned(None, &[]), (seven, 7));
+    let eight = EIGHT.join(" ");
+    assert_eq!(planned(Some("18"), &[]), (eight.clone(), 8));
+    assert_eq!(planned(None, &EIGHT), (eight, 8));
 }
 
 /// The frames of a scene in `folder`, and the ledger.

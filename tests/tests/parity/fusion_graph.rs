@@ -1,7 +1,7 @@
 //! V2VNet, DiscoNet, Where2comm and CoAlign against the reference implementations.
 
 use ego_fuser_offline::multi_scale::{
-    Levels, MapAlignment, MultiScaleConfig, MultiScaleNetwork, Senders, fuse_levels,
+    MapAlignment, MultiScaleConfig, MultiScaleNetwork, Senders, fuse_levels,
 };
 use fusion::disconet::{DiscoNet, DiscoNetConfig};
 use fusion::v2vnet::{self, Incoming, V2vNet, V2vNetConfig};
@@ -560,18 +560,7 @@ fn fused_levels(
     let variables = VarStore::new(Device::Cpu);
     let backbone = BevBackbone::new(&(variables.root() / "backbone"), &config);
     load(&variables, golden, "");
-    no_grad(|| {
-        fuse_levels(
-            &backbone,
-            &canvas,
-            &Levels {
-                samples,
-                aggregation,
-                sent: Some(sent),
-            },
-        )
-    })
-    .unwrap()
+    no_grad(|| fuse_levels(&backbone, &canvas, samples, aggregation, Some(sent))).unwrap()
 }
 
 fn gate(config: &Value, threshold: &str) -> ConfidenceGate {

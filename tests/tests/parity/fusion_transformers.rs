@@ -71,7 +71,7 @@ fn check_v2xvit(name: &str) {
         let tokens = case.order.tokens(&maps).unwrap();
         let unseen = unseen(&mask.get(sample).narrow(0, 0, agents).unsqueeze(1)).unwrap();
         let unseen = case.order.tokens(&unseen).unwrap().squeeze_dim(2);
-        let block = &case.encoder.layers()[0].blocks()[0];
+        let block = &case.encoder.layers[0].blocks[0];
         let one = block
             .across_agents(&tokens, Some(&unseen), &types, agents as usize, false)
             .unwrap()
@@ -207,7 +207,7 @@ fn golden_c6_hmsa_mswin() {
             )
         };
         let merged = each(&|x| cells.forward(x, false).unwrap());
-        let branch = each(&|x| cells.branches()[1].forward(x).unwrap());
+        let branch = each(&|x| cells.branches[1].forward(x).unwrap());
         for (found, tokens) in found.iter_mut().zip([all, merged, branch]) {
             found.push(
                 order
@@ -334,7 +334,7 @@ impl<'a> EncoderCase<'a> {
 
     /// `[L, H, W, C]` with the code of each slot's delay.
     fn with_delay(&self, features: &Tensor, prior: &Tensor) -> Tensor {
-        let Some(temporal) = self.encoder.temporal() else {
+        let Some(temporal) = &self.encoder.temporal else {
             return features.shallow_clone();
         };
         let slots = features.size()[0];

@@ -315,7 +315,7 @@ fn poses(file: &Path, scenario: &Scenario) {
             });
         }
     }
-    PoseTable::append(file, &scenario.name, &rows).unwrap();
+    PoseTable::append(file, &scenario.name, "", &rows).unwrap();
 }
 
 #[test]

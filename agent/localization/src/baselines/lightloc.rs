@@ -39,4 +39,8 @@ impl Localize for LightLoc {
     fn place(&self) -> Option<&str> {
         self.localizer.place()
     }
+
+    fn is_calibrated(&self) -> bool {
+        false
+    }
 }

@@ -8,8 +8,6 @@ use crate::registration::icp::{Plane, is_level};
 
 /// Side of a cell of the ground, metres.
 const CELL_M: f64 = 8.0;
-/// Radius around a sensor in which its ground is measured, metres.
-const NEAR_M: f64 = 12.0;
 
 /// Sums over level planes.
 #[derive(Debug, Clone, Copy, Default)]
@@ -21,13 +19,10 @@ pub(super) struct LevelSums {
 }
 
 impl LevelSums {
-    /// Sums over the level planes near a sensor and below it, in its frame.
-    pub(super) fn below_sensor(planes: &[Plane]) -> Self {
+    /// Sums over level planes.
+    pub(super) fn of(planes: &[Plane]) -> Self {
         let mut sums = Self::default();
-        let below = planes.iter().filter(|plane| plane.centre_m.z < 0.0);
-        below
-            .filter(|plane| is_level(&plane.normal) && plane.centre_m.xy().norm() < NEAR_M)
-            .for_each(|plane| sums.add(plane));
+        planes.iter().for_each(|plane| sums.add(plane));
         sums
     }
 

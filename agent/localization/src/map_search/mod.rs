@@ -86,7 +86,8 @@ impl MapSearch {
 
     /// The registered pose with the largest agreement; `None` where no candidate can be registered.
     fn best_pose(&self, sweep: &SweepOnMap<'_>) -> Option<BestPose> {
-        let below = LevelSums::below_sensor(sweep.planes());
+        let (ground, _) = sweep.level_planes();
+        let below = LevelSums::of(&ground);
         let levelled = below.levelled();
         let height_m = -below.height_m().unwrap_or(-USUAL_HEIGHT_M);
         let planes = planes_to_match(sweep.planes(), &levelled);
@@ -185,7 +186,9 @@ impl Localize for MapSearch {
         };
         let mut found = found_pose(&best.fit, self.map.covariance_scale);
         found.evidence.inlier_ratio = best.agreement;
-        let is_confirmed = best.agreement >= MIN_AGREEMENT && on_map.confirms(&self.map, &best.fit);
+        let is_confirmed = best.agreement >= MIN_AGREEMENT
+            && on_map.stands_on(&self.map, &found.world_from_sensor)
+            && on_map.confirms(&self.map, &best.fit);
         found.is_rejected = !is_confirmed || !best.is_unique || found.sigma < self.min_confidence;
         Ok(Localization::new(&Ok(found), times))
     }

@@ -40,7 +40,11 @@ impl Dense {
 }
 
 /// Features of length 1 along the last dimension.
-pub(crate) fn of_unit_length(x: &Tensor) -> tch::Result<Tensor> {
+///
+/// # Errors
+/// Those of the tensor library.
+pub fn of_unit_length(x: &Tensor) -> tch::Result<Tensor> {
     let squares = x.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
+    // The small number is added under the root, whose gradient is infinite at 0.
     x.f_div(&squares.f_add_scalar(1e-12)?.f_sqrt()?)
 }

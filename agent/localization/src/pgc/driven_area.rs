@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use perception::weights::{FileError, annotate};
+use perception::weights::{FileError, Weights, annotate};
 use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
@@ -59,6 +59,11 @@ impl DrivenArea {
             cell_m,
             cells: cells.collect(),
         }
+    }
+
+    /// The area that a head states, if it states one.
+    pub fn of_head(head: &Weights) -> Option<Self> {
+        head.metadata_json(DRIVEN_AREA_KEY).ok()
     }
 
     /// Writes the area into the file of a head; returns the digest of the file.

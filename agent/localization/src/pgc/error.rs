@@ -22,28 +22,6 @@ pub enum LocalizerError {
     /// The parts of a localizer do not fit together.
     #[error("localizer: {0}")]
     Config(String),
-    /// Fitted numbers in a head's file are not valid.
-    #[error("{head}: {key}: {reason}")]
-    Fitted {
-        /// Path of the head.
-        head: String,
-        /// Their key in the file's metadata.
-        key: &'static str,
-        /// Field and value that are wrong.
-        reason: FieldError,
-    },
-    /// The head was trained on the features of another encoder.
-    #[error("{head}: trained on encoder {expected}, but {encoder} is {found} (SHA-256)")]
-    OtherEncoder {
-        /// Path of the head.
-        head: String,
-        /// SHA-256 of the encoder that the head was trained with.
-        expected: String,
-        /// Path of the encoder.
-        encoder: String,
-        /// SHA-256 of this encoder.
-        found: String,
-    },
     /// The detector whose encoder is used failed.
     #[error(transparent)]
     Detector(Box<DetectorError>),

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
+use perception::weights::FileError;
 use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
-
-use super::error::{LocalizerError, Result};
+use support::file_error::Result;
 
 /// Largest number of values of a key grid.
 const MAX_KEY_GRID: i64 = 64_000_000;
@@ -130,20 +130,25 @@ impl RefinerConfig {
 }
 
 impl SceneHeadConfig {
+    /// South-west and north-east corner of the scene, metres in the world; `None` without a refiner.
+    pub fn corners_m(&self) -> Option<[[f64; 2]; 2]> {
+        let refiner = self.refiner.as_ref()?;
+        let world = |corner_m: [f64; 2]| [0, 1].map(|axis| self.origin_m[axis] + corner_m[axis]);
+        Some([refiner.low_m, refiner.high_m].map(world))
+    }
+
     /// Rejects the head of a file for an encoder that it was not trained with.
     ///
     /// # Errors
-    /// [`LocalizerError::OtherEncoder`] with both digests.
+    /// [`FileError`] with both digests.
     pub fn check_encoder(&self, head: &Path, encoder: &Path, sha256: &str) -> Result<()> {
-        if self.encoder_sha256 == sha256 {
+        let (expected, encoder) = (&self.encoder_sha256, encoder.display());
+        if expected == sha256 {
             return Ok(());
         }
-        Err(LocalizerError::OtherEncoder {
-            head: head.display().to_string(),
-            expected: self.encoder_sha256.clone(),
-            encoder: encoder.display().to_string(),
-            found: sha256.to_owned(),
-        })
+        let problem =
+            format_args!("trained on encoder {expected}, but {encoder} is {sha256} (SHA-256)");
+        Err(FileError::new(head, problem))
     }
 
     /// Checks that a network can be built.

@@ -62,7 +62,7 @@ impl Localization {
         let found = estimate.world_from_cav().map(|world_from_cav| FoundPose {
             world_from_sensor: world_from_cav.isometry(),
             evidence: PoseEvidence::none(),
-            cell_covariance: PoseStd::UNBOUNDED.covariance,
+            cell_covariance: PoseStd::unbounded().covariance,
             sigma: f64::from(estimate.confidence()),
             ..FoundPose::default()
         });

@@ -50,6 +50,11 @@ pub trait Localize: std::fmt::Debug + Send {
         None
     }
 
+    /// True if the confidence of its poses was fitted: bounds behind a map rely on it.
+    fn is_calibrated(&self) -> bool {
+        true
+    }
+
     /// Area of the drives that it was trained on; `None` if it is not known.
     fn driven_area(&self) -> Option<&DrivenArea> {
         None

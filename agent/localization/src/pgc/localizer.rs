@@ -9,6 +9,7 @@ use perception::weights::{FileError, Weights};
 use protocol::PointCloud;
 use protocol::config::FieldError;
 use serde::de::DeserializeOwned;
+use support::output;
 use support::stage_times::StageTimes;
 use tch::{Kind, Tensor, no_grad};
 
@@ -16,13 +17,13 @@ use super::cell_choice::choose_evenly;
 use super::cell_encoder::{CellEncoder, PreparedSweep};
 use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
 use super::driven_area::{DRIVEN_AREA_KEY, DrivenArea};
-use super::error::{LocalizerError, Result};
+use super::error::Result;
 use super::extensions::other_parts::MOST_PARTS;
 use super::head_config::SceneHeadConfig;
 use super::localization::{ENCODE, REGRESS, VOXELISE, stopwatch};
 use super::localize::LocalizerInput;
 use super::pose_refinement::SweepCells;
-use super::pose_solver::{PoseSolver, Solver};
+use super::pose_solver::PoseSolver;
 use super::scene_coordinates::SceneCoordinates;
 use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
@@ -48,7 +49,8 @@ pub(super) struct SweepFeatures {
 pub struct Localizer {
     pub(super) encoder: CellEncoder,
     pub(super) head: SceneHead,
-    pub(crate) solver: PoseSolver,
+    /// Search for a pose, and judgement of it.
+    pub solver: PoseSolver,
     /// Largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
     pub(crate) most_parts: usize,
     /// Of the file, or of the encoder in a detector's file.
@@ -61,12 +63,12 @@ impl Localizer {
     /// Reads encoder and head.
     ///
     /// # Errors
-    /// [`LocalizerError`] when a file is missing, truncated or of another kind, when its confidence model is not valid,
-    /// or when the head was trained on the features of another encoder.
+    /// [`LocalizerError`](super::LocalizerError) when a file is missing, truncated or of another kind, when its confidence
+    /// model is not valid, or when the head was trained on the features of another encoder.
     pub fn load(encoder: &Path, head: &Path, inference: Inference) -> Result<Self> {
         let (mut localizer, weights) = Self::open(encoder, head, inference)?;
-        localizer.solver.confidence = stored_confidence(&weights)?;
-        localizer.solver.covariance = fitted(&weights, COVARIANCE_KEY, CovarianceScale::check)?;
+        let solver = &mut localizer.solver;
+        (solver.confidence, solver.covariance) = stored_fits(&weights)?;
         Ok(localizer)
     }
 
@@ -117,7 +119,7 @@ impl Localizer {
     /// Adds the activations of a sweep to a search for their scales; a sweep without cells has none.
     ///
     /// # Errors
-    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    /// [`LocalizerError::Tensor`](super::LocalizerError::Tensor) when the tensor library fails.
     pub fn observe(&self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<()> {
         let Some(encoded) = self.encode(LocalizerInput::of(cloud), &mut stopwatch())? else {
             return Ok(());
@@ -138,7 +140,7 @@ impl Localizer {
     /// First steps: voxels, features, scene coordinates.
     ///
     /// # Errors
-    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    /// [`LocalizerError::Tensor`](super::LocalizerError::Tensor) when the tensor library fails.
     pub fn scene_coordinates(
         &self,
         sweep: LocalizerInput<'_>,
@@ -154,7 +156,7 @@ impl Localizer {
     /// Features of a whole sweep, `[sweep_channels]`, to compare sweeps by; `None` for a sweep without cells.
     ///
     /// # Errors
-    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    /// [`LocalizerError::Tensor`](super::LocalizerError::Tensor) when the tensor library fails.
     pub fn sweep_features(
         &self,
         cloud: &PointCloud,
@@ -219,20 +221,30 @@ impl Localizer {
             origin_m: self.head.config().origin_m,
         })
     }
-
-    /// Sets another search.
-    pub fn set_solver(&mut self, solver: Solver) {
-        self.solver.solver = solver;
-    }
 }
 
 /// The confidence model in a head's file; the plain confidence if there is none.
 ///
 /// # Errors
-/// [`LocalizerError`] names the file and the value that is wrong.
+/// [`LocalizerError`](super::LocalizerError) names the file and the value that is wrong.
 pub fn stored_confidence(weights: &Weights) -> Result<Confidence> {
     let model = fitted(weights, CONFIDENCE_KEY, ConfidenceModel::check)?;
     Ok(model.map_or(Confidence::Plain, Confidence::Calibrated))
+}
+
+/// Confidence and covariance scale in a head's file. The scale was fitted to a calibrated confidence: without one it is not
+/// used, and a note names the file.
+fn stored_fits(weights: &Weights) -> Result<(Confidence, Option<CovarianceScale>)> {
+    let confidence = stored_confidence(weights)?;
+    if confidence == Confidence::Plain {
+        let head = weights.path().display();
+        output::note(format_args!(
+            "{head}: no {CONFIDENCE_KEY:?} in its metadata: wrong poses are not rejected (agent eval --fit-confidence)"
+        ));
+        return Ok((confidence, None));
+    }
+    let scale = fitted(weights, COVARIANCE_KEY, CovarianceScale::check)?;
+    Ok((confidence, scale))
 }
 
 /// Fitted numbers in the metadata `key` of a head's file, checked; `None` if it has none.
@@ -245,8 +257,8 @@ fn fitted<T: DeserializeOwned>(
         return Ok(None);
     }
     let fitted = weights.metadata_json(key)?;
-    let head = weights.path().display().to_string();
-    check(&fitted).map_err(|reason| LocalizerError::Fitted { head, key, reason })?;
+    check(&fitted)
+        .map_err(|reason| FileError::new(weights.path(), format_args!("{key}: {reason}")))?;
     Ok(Some(fitted))
 }
 
@@ -260,14 +272,11 @@ mod tests {
 
     use super::*;
 
-    /// Confidence that is read from the file of a head with this model.
-    fn stored(folder: &Path, model: &ConfidenceModel) -> Result<Confidence> {
+    /// The file of a head with this metadata.
+    fn head(folder: &Path, metadata: &[(&str, String)]) -> Weights {
         let path = folder.join("head.safetensors");
-        let metadata: BTreeMap<_, _> = [(
-            CONFIDENCE_KEY.to_owned(),
-            serde_json::to_string(model).unwrap(),
-        )]
-        .into();
+        let metadata = metadata.iter().cloned();
+        let metadata: BTreeMap<_, _> = metadata.map(|(key, text)| (key.into(), text)).collect();
         weights::save(
             &path,
             &VarStore::new(Device::Cpu),
@@ -275,7 +284,26 @@ mod tests {
             Precision::Single,
         )
         .unwrap();
-        stored_confidence(&Weights::load(&path).unwrap())
+        Weights::load(&path).unwrap()
+    }
+
+    /// Confidence that is read from the file of a head with this model.
+    fn stored(folder: &Path, model: &ConfidenceModel) -> Result<Confidence> {
+        let text = serde_json::to_string(model).unwrap();
+        stored_confidence(&head(folder, &[(CONFIDENCE_KEY, text)]))
+    }
+
+    #[test]
+    fn without_a_confidence_the_covariance_scale_is_not_used() {
+        let folder = tempfile::tempdir().unwrap();
+        let factors = r#"{"planar":2.0,"height":2.0,"tilt":2.0,"yaw":2.0,"bound":4.0}"#;
+        let covariance = (COVARIANCE_KEY, factors.to_owned());
+        let plain = head(folder.path(), std::slice::from_ref(&covariance));
+        assert_eq!(stored_fits(&plain).unwrap(), (Confidence::Plain, None));
+        let model = serde_json::to_string(&ConfidenceModel::example()).unwrap();
+        let calibrated = head(folder.path(), &[(CONFIDENCE_KEY, model), covariance]);
+        let (_, scale) = stored_fits(&calibrated).unwrap();
+        assert_eq!(scale.unwrap().bound, Some(4.0));
     }
 
     #[test]

@@ -42,6 +42,7 @@ use tch::{Kind, Tensor};
 
 pub(crate) use cell_choice::choose_evenly;
 pub use cell_encoder::{CellEncoder, EncodedCells, PreparedSweep, SweepFormat};
+pub use dense::of_unit_length;
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use error::LocalizerError;
 pub(crate) use error::Result;
@@ -57,6 +58,7 @@ pub use scene_regression::SceneHead;
 pub use voxel_batch::VoxelBatch;
 pub use voxelise::{SweepCell, SweepVoxels};
 
+use confidence::Confidence;
 use driven_area::DrivenArea;
 use extensions::{along_street, levelling, other_parts, wider_search};
 use localization::REFINE;
@@ -91,6 +93,10 @@ impl Localize for Localizer {
 
     fn place(&self) -> Option<&str> {
         Some(&self.head.config().scene_name)
+    }
+
+    fn is_calibrated(&self) -> bool {
+        self.solver.confidence != Confidence::Plain
     }
 
     fn driven_area(&self) -> Option<&DrivenArea> {

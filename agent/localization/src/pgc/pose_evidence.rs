@@ -98,9 +98,10 @@ impl PoseEvidence {
 
     /// Evidence of a pose that was not estimated from cells.
     pub(crate) fn none() -> Self {
+        let unbounded = PoseStd::unbounded();
         Self {
-            position_std_m: PoseStd::UNBOUNDED.position_m,
-            rotation_std_rad: PoseStd::UNBOUNDED.rotation_rad,
+            position_std_m: unbounded.position_m,
+            rotation_std_rad: unbounded.rotation_rad,
             ..Self::default()
         }
     }
@@ -214,7 +215,7 @@ mod tests {
             registration: sharper,
             epsilon_m: vec![0.0; pairs.len()],
             residual_quartile_m: 0.1,
-            std: PoseStd::UNBOUNDED,
+            std: PoseStd::unbounded(),
             information_per_m2: 400.0,
         };
         let evidence = PoseEvidence::gather(&coordinates, &found, Some(&second));
@@ -229,7 +230,7 @@ mod tests {
         let evidence = PoseEvidence::gather(&coordinates, &nothing, None);
         assert_eq!(
             (evidence.position_std_m, evidence.plain_sigma()),
-            (PoseStd::UNBOUNDED.position_m, 0.0)
+            (PoseStd::unbounded().position_m, 0.0)
         );
     }
 }

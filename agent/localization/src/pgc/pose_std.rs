@@ -19,12 +19,14 @@ pub(super) struct PoseStd {
 
 impl PoseStd {
     /// Value for cells that do not constrain the pose.
-    pub(super) const UNBOUNDED: Self = Self {
-        position_m: 1e3,
-        worst_axis_m: 1e3,
-        rotation_rad: 1e3,
-        covariance: diagonal(1e6),
-    };
+    pub(super) fn unbounded() -> Self {
+        Self {
+            position_m: 1e3,
+            worst_axis_m: 1e3,
+            rotation_rad: 1e3,
+            covariance: Matrix6::from_diagonal_element(1e6).data.0,
+        }
+    }
 
     /// Standard deviations of the weighted fit of `target_from_source` to pairs, each with its weight there.
     ///
@@ -49,8 +51,9 @@ impl PoseStd {
             let gradient = jacobian.transpose() * residual * weight;
             gradients += gradient * gradient.transpose();
         }
+        let unbounded = Self::unbounded();
         let Some(inverse) = information.try_inverse() else {
-            return Self::UNBOUNDED;
+            return unbounded;
         };
         let covariance = inverse * gradients * inverse;
         let [position_m2, rotation_rad2] =
@@ -60,26 +63,15 @@ impl PoseStd {
         let is_finite = position.iter().all(|entry| entry.is_finite());
         let worst_axis = is_finite.then(|| position.into_owned().symmetric_eigenvalues().max());
         Self {
-            position_m: bounded_std(position_m2, Self::UNBOUNDED.position_m),
-            worst_axis_m: bounded_std(worst_axis.unwrap_or(f64::NAN), Self::UNBOUNDED.worst_axis_m),
-            rotation_rad: bounded_std(rotation_rad2, Self::UNBOUNDED.rotation_rad),
+            position_m: bounded_std(position_m2, unbounded.position_m),
+            worst_axis_m: bounded_std(worst_axis.unwrap_or(f64::NAN), unbounded.worst_axis_m),
+            rotation_rad: bounded_std(rotation_rad2, unbounded.rotation_rad),
             covariance: match covariance.iter().all(|entry| entry.is_finite()) {
                 true => covariance.transpose().data.0,
-                false => Self::UNBOUNDED.covariance,
+                false => unbounded.covariance,
             },
         }
     }
-}
-
-/// A matrix with the same value along its diagonal.
-const fn diagonal(value: f64) -> [[f64; 6]; 6] {
-    let mut matrix = [[0.0; 6]; 6];
-    let mut row = 0;
-    while row < 6 {
-        matrix[row][row] = value;
-        row += 1;
-    }
-    matrix
 }
 
 fn bounded_std(variance: f64, most: f64) -> f64 {
@@ -159,7 +151,7 @@ mod tests {
     fn no_pairs_constrain_nothing() {
         assert_eq!(
             PoseStd::of(&Isometry3::identity(), std::iter::empty()),
-            PoseStd::UNBOUNDED
+            PoseStd::unbounded()
         );
     }
 }

@@ -25,8 +25,8 @@ pub struct VoxelBatch {
     pub(super) plane_edge: i64,
     /// Rows of the last level by sweep.
     pub(super) coarse_rows: Vec<Range<i64>>,
-    /// Cells by sweep.
-    pub(super) cell_rows: Vec<Range<i64>>,
+    /// Rows of the cells by sweep.
+    pub cell_rows: Vec<Range<i64>>,
 }
 
 impl VoxelBatch {
@@ -67,16 +67,6 @@ impl VoxelBatch {
             coarse_rows,
             cell_rows: ranges(sweeps.iter().map(|sweep| sweep.cells.len())),
         })
-    }
-
-    /// Number of sweeps.
-    pub fn sweeps(&self) -> i64 {
-        self.cell_rows.len() as i64
-    }
-
-    /// The rows of a sweep's cells.
-    pub fn cell_rows(&self, sweep: usize) -> Range<i64> {
-        self.cell_rows[sweep].clone()
     }
 }
 

@@ -138,6 +138,10 @@ impl PoseSettings for BaselinePoseConfig {
 }
 
 impl PoseSource for LocalizedPose {
+    fn begin(&mut self) {
+        self.motion_gate.clear();
+    }
+
     /// Ignores the measured pose.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();

@@ -70,6 +70,9 @@ impl<'a> PoseInput<'a> {
 
 /// Source of an agent's pose.
 pub trait PoseSource: std::fmt::Debug + Send {
+    /// Begins another vehicle or another drive: what is known of the last one is forgotten.
+    fn begin(&mut self) {}
+
     /// The pose of one sweep with its confidence, or the reason why there is none.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate;
 

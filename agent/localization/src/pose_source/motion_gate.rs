@@ -80,6 +80,12 @@ impl MotionGate {
         }
     }
 
+    /// Forgets all poses.
+    pub(crate) fn clear(&mut self) {
+        self.accepted.clear();
+        self.elsewhere.clear();
+    }
+
     /// Stores a pose. Returns the factor on its confidence: the penalty of a jump; 1 if it can be reached from the last
     /// accepted one, if there is none, or if it is the last of several jumps that agree, which are accepted now.
     pub(crate) fn judge(&mut self, capture_nanos: u64, world_from_lidar: Isometry3<f64>) -> f64 {
@@ -284,6 +290,12 @@ mod tests {
         assert_eq!(
             motion_gate.judge(60_000_000_000, at(0.0, 0.0, 90.0)),
             ACCEPTED
+        );
+        motion_gate.clear();
+        assert_eq!(
+            motion_gate.judge(60_100_000_000, at(900.0, 0.0, 0.0)),
+            ACCEPTED,
+            "another vehicle"
         );
     }
 }

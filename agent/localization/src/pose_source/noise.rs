@@ -7,6 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 use sha2::{Digest, Sha256};
 
+use super::NoisyPoseConfig;
 use super::numpy_normals::NumpyNormals;
 
 /// Random words reserved for one draw; four normals take about eight.
@@ -48,33 +49,17 @@ impl PlanarError {
 }
 
 /// Normal errors with the same standard deviations throughout.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct PoseNoise {
-    position_std_m: f64,
-    yaw_std_rad: f64,
-    seed: u64,
-}
-
-impl PoseNoise {
-    /// Errors with these standard deviations, metres per axis and radians.
-    pub(crate) fn new(position_std_m: f64, yaw_std_rad: f64, seed: u64) -> Self {
-        Self {
-            position_std_m,
-            yaw_std_rad,
-            seed,
-        }
-    }
-
+impl NoisyPoseConfig {
     /// The constant error of all vehicles: to the digit the draw of OpenCOOD with this seed at every call. Of six
     /// normals, three are of the position, the fifth of the heading.
-    pub(crate) fn fixed(&self) -> PlanarError {
+    pub(super) fn fixed(&self) -> PlanarError {
         let mut random = NumpyNormals::new(self.seed);
         let [x, y, z, _, yaw] = std::array::from_fn(|_| random.normal());
         self.scaled([x, y, z, yaw])
     }
 
     /// The error of a vehicle at a step of time, independent of all others.
-    pub(crate) fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
+    pub(super) fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
         self.scaled(draw(&self.random(cav), step))
     }
 
@@ -82,7 +67,7 @@ impl PoseNoise {
     ///
     /// `e_k = rho e_{k-1} + sqrt(1 - rho^2) n_k`, written out as the sum of the innovations `n` back to where they have
     /// decayed: so it depends on no earlier call, and frames may be lost, repeated or started anywhere.
-    pub(crate) fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
+    pub(super) fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
         let random = self.random(cav);
         // 0 without correlation, whose logarithm is minus infinity.
         let depth = (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64;
@@ -103,7 +88,7 @@ impl PoseNoise {
     fn scaled(&self, [x, y, z, yaw]: [f64; 4]) -> PlanarError {
         PlanarError {
             position_m: [x, y, z].map(|normal| normal * self.position_std_m),
-            yaw_rad: yaw * self.yaw_std_rad,
+            yaw_rad: yaw * self.heading_std_deg.to_radians(),
         }
     }
 
@@ -137,6 +122,15 @@ mod tests {
         CavId::new(name).unwrap()
     }
 
+    fn normal(position_std_m: f64, heading_std_deg: f64, seed: u64) -> NoisyPoseConfig {
+        NoisyPoseConfig {
+            position_std_m,
+            heading_std_deg,
+            seed,
+            ..NoisyPoseConfig::default()
+        }
+    }
+
     /// Correlation of values with the next ones, and their spread.
     fn correlation(values: impl Iterator<Item = f64>) -> (f64, f64) {
         let values: Vec<f64> = values.collect();
@@ -150,7 +144,7 @@ mod tests {
 
     #[test]
     fn the_fixed_error_is_that_of_opencood() {
-        let error = PoseNoise::new(1.0, 1f64.to_radians(), 20).fixed();
+        let error = normal(1.0, 1.0, 20).fixed();
         let off = error
             .position_m
             .iter()
@@ -164,14 +158,14 @@ mod tests {
 
     #[test]
     fn the_fixed_error_is_the_same_for_all() {
-        let noise = PoseNoise::new(0.2, 0.01, 25);
+        let noise = normal(0.2, 0.5, 25);
         assert_eq!(noise.fixed(), noise.fixed());
-        assert_ne!(noise.fixed(), PoseNoise::new(0.2, 0.01, 26).fixed());
+        assert_ne!(noise.fixed(), normal(0.2, 0.5, 26).fixed());
     }
 
     #[test]
     fn independent_errors_have_the_configured_spread_and_no_correlation() {
-        let noise = PoseNoise::new(0.5, 0.02, 1);
+        let noise = normal(0.5, 1.0, 1);
         let errors = (0..=4000).map(|step| noise.independent(&cav("a"), step));
         let (correlation, spread) = correlation(errors.map(|error| error.position_m[0]));
         assert!(
@@ -184,7 +178,7 @@ mod tests {
 
     #[test]
     fn autoregressive_errors_are_correlated_by_rho() {
-        let noise = PoseNoise::new(0.5, 0.02, 1);
+        let noise = normal(0.5, 1.0, 1);
         let errors = (0..=4000).map(|step| noise.autoregressive(&cav("a"), step, 0.9));
         let (correlation, spread) = correlation(errors.map(|error| error.position_m[0]));
         assert!(

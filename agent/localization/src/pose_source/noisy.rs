@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::error_table::{ErrorTable, TableRow};
-use super::noise::{self, PoseNoise};
+use super::noise;
 use super::settings::{PoseBasis, PoseSettings};
 use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError, no_pose};
 
@@ -155,7 +155,6 @@ impl NoiseMode {
 #[derive(Debug, Clone)]
 pub struct NoisyPose {
     config: NoisyPoseConfig,
-    drawn: PoseNoise,
     /// Errors that are replayed in place of drawn ones.
     table: Option<ErrorTable>,
 }
@@ -167,11 +166,9 @@ impl NoisyPose {
     /// [`PoseSourceError`] names the field or the file.
     pub fn new(config: &NoisyPoseConfig) -> Result<Self, PoseSourceError> {
         config.validate()?;
-        let yaw_std_rad = config.heading_std_deg.to_radians();
         // Checked above: there is a table where errors are replayed, and only there.
         let table = config.table.as_deref().map(ErrorTable::read);
         Ok(Self {
-            drawn: PoseNoise::new(config.position_std_m, yaw_std_rad, config.seed),
             table: table.transpose()?,
             config: config.clone(),
         })
@@ -186,7 +183,7 @@ impl NoisyPose {
             return replayed(table.row(self.first_row(cav), step), pose);
         }
         let error = match self.config.mode {
-            NoiseMode::Fixed => self.drawn.fixed(),
+            NoiseMode::Fixed => self.config.fixed(),
             NoiseMode::Autoregressive => {
                 // Correlation of an error with that of the previous step.
                 let rho = if self.config.decay_s > 0.0 {
@@ -194,10 +191,10 @@ impl NoisyPose {
                 } else {
                     0.0
                 };
-                self.drawn.autoregressive(cav, step, rho)
+                self.config.autoregressive(cav, step, rho)
             }
             // Replayed errors are those of the table.
-            NoiseMode::Independent | NoiseMode::Replayed => self.drawn.independent(cav, step),
+            NoiseMode::Independent | NoiseMode::Replayed => self.config.independent(cav, step),
         };
         // Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
         let confidence = 1.0 / (1.0 + error.distance_m().powi(2));

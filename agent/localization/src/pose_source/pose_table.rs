@@ -20,6 +20,8 @@ use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError};
 /// The first line of a table.
 const HEADER: &str =
     "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers";
+/// First field of a row with the origin of a scenario's poses.
+const ORIGIN: &str = "#";
 /// Largest file that is read, bytes: two million sweeps.
 const MAX_BYTES: u64 = 256 << 20;
 
@@ -29,11 +31,14 @@ type SweepKey = (CavId, u64);
 /// Poses of scenarios, sweep by sweep; a sweep without a pose has a reason.
 ///
 /// The file is text: a header, then per sweep the last part of the scenario's name, vehicle, capture time, translation,
-/// quaternion and confidence, or the reason for no pose and the number of inliers.
+/// quaternion and confidence, or the reason for no pose and the number of inliers. A row that begins with `#` states what the
+/// poses of a scenario were computed from.
 #[derive(Debug, Clone, Default)]
 pub struct PoseTable {
     path: PathBuf,
     scenarios: HashMap<String, HashMap<SweepKey, PoseEstimate>>,
+    /// By scenario.
+    origins: HashMap<String, String>,
 }
 
 /// One row to write.
@@ -58,6 +63,11 @@ impl PoseTable {
             ..Self::default()
         };
         for row in CsvFile::read(path, HEADER, MAX_BYTES)?.rows() {
+            if row.field(0) == ORIGIN {
+                let [scenario, origin] = [1, 2].map(|column| row.field(column).to_owned());
+                table.origins.insert(scenario, origin);
+                continue;
+            }
             let row = row.complete()?;
             let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
             let cav = CavId::new(row.field(1))
@@ -78,9 +88,17 @@ impl PoseTable {
         Ok(table)
     }
 
-    /// True if there are poses of a scenario, by its name or the path that ends in it.
-    pub fn has(&self, scenario: &str) -> bool {
-        self.scenarios.contains_key(last_part(scenario))
+    /// What the poses of a scenario (its name, or the path that ends in it) were computed from: empty if that is not stated,
+    /// `None` if there are none.
+    pub fn origin(&self, scenario: &str) -> Option<&str> {
+        let name = Self::key(scenario);
+        self.scenarios.get(name)?;
+        Some(self.origins.get(name).map_or("", String::as_str))
+    }
+
+    /// Scenarios are identified by the name of their folder, wherever that folder lies.
+    pub fn key(scenario: &str) -> &str {
+        scenario.rsplit('/').next().unwrap_or(scenario)
     }
 
     /// Number of rows.
@@ -95,21 +113,22 @@ impl PoseTable {
 
     /// Estimate of a sweep.
     pub fn get(&self, scenario: &str, cav: &CavId, capture_nanos: u64) -> Option<&PoseEstimate> {
-        (self.scenarios.get(last_part(scenario))?).get(&(cav.clone(), capture_nanos))
+        (self.scenarios.get(Self::key(scenario))?).get(&(cav.clone(), capture_nanos))
     }
 
-    /// Appends the rows of a scenario to a file, which gets its header where it is new.
+    /// Appends the rows of a scenario, computed from `origin`, to a file, which gets its header where it is new.
     ///
     /// # Errors
     /// [`FileError`] when the file cannot be written.
-    pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<()> {
+    pub fn append(path: &Path, scenario: &str, origin: &str, rows: &[PoseRow<'_>]) -> Result<()> {
         let is_begun = fs::metadata(path).is_ok_and(|file| file.len() > 0);
         let mut text = match is_begun {
             true => CsvText::headless(),
             false => CsvText::new(HEADER),
         };
-        rows.iter()
-            .for_each(|row| text.row(fields(last_part(scenario), row)));
+        let scenario = Self::key(scenario);
+        text.row([ORIGIN, scenario, origin]);
+        rows.iter().for_each(|row| text.row(fields(scenario, row)));
         let file = OpenOptions::new().create(true).append(true).open(path);
         let written = file.and_then(|mut file| file.write_all(text.finish().as_bytes()));
         written.and_then(|()| atomic_file::sync(path)).at(path)
@@ -121,7 +140,7 @@ impl PoseTable {
     /// [`FileError`] when there is none, or several and none is requested.
     fn of_scenario(mut self, scenario: Option<&str>) -> Result<HashMap<SweepKey, PoseEstimate>> {
         let wrong = match (scenario, self.scenarios.len()) {
-            (Some(name), _) => match self.scenarios.remove(last_part(name)) {
+            (Some(name), _) => match self.scenarios.remove(Self::key(name)) {
                 Some(poses) => return Ok(poses),
                 None => format!("there is no pose of scenario {name} in it"),
             },
@@ -184,11 +203,6 @@ impl PoseSource for CachedPose {
     }
 }
 
-/// Scenarios are identified by the name of their folder, wherever that folder lies.
-fn last_part(scenario: &str) -> &str {
-    scenario.rsplit('/').next().unwrap_or(scenario)
-}
-
 fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
     let mut fields: [String; 13] = Default::default();
     fields[0] = scenario.to_owned();
@@ -209,8 +223,7 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
             reason,
             inlier_count,
         } => {
-            let reason = serde_json::to_value(reason).unwrap_or_default();
-            fields[11] = reason.as_str().unwrap_or_default().to_owned();
+            fields[11] = <&str>::from(reason).to_owned();
             fields[12] = inlier_count.to_string();
         }
     }
@@ -287,15 +300,15 @@ mod tests {
         PoseTable::append(
             &file,
             "towns/one",
+            "head 1, data 2",
             &[row(&a, 100, found()), row(&b, 100, LOST)],
         )
         .unwrap();
-        PoseTable::append(&file, "two", &[row(&a, 100, LOST)]).unwrap();
+        PoseTable::append(&file, "two", "", &[row(&a, 100, LOST)]).unwrap();
         let table = PoseTable::read(&file).unwrap();
-        assert_eq!(
-            (table.len(), table.has("elsewhere/one"), table.has("three")),
-            (3, true, false)
-        );
+        let origins = ["elsewhere/one", "two", "three"].map(|name| table.origin(name));
+        let expected = [Some("head 1, data 2"), Some(""), None];
+        assert_eq!((table.len(), origins), (3, expected));
         let PoseEstimate::Pose {
             world_from_cav,
             confidence,

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use perception::inference::Inference;
 use protocol::config::{FieldError, within};
-use protocol::{EgoMotion, NoPoseReason, PlanarCovariance, PoseEstimate, StageTiming};
+use protocol::{CavId, EgoMotion, NoPoseReason, PlanarCovariance, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ use super::{PoseInput, PoseSource, PoseSourceError, no_pose};
 use crate::pgc::{Localization, Localize, LocalizerError};
 use crate::place_localizer::place_localizer;
 use crate::tracker::{
-    Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits, seconds,
+    Correction, MotionContradiction, PoseMeasurement, PoseTracker, TrackedState, seconds,
 };
 
 /// Networks of PGC and settings of the tracker.
@@ -121,8 +121,6 @@ impl PoseSettings for TrackedPoseConfig {
     }
 }
 
-/// Largest standard deviation of a tracked position, metres: the next good measurement is still near the prediction.
-const MAX_POSITION_STD_M: f64 = 2.0;
 /// Longest time for which the last pose of a lost vehicle tells where it is, seconds.
 const LAST_PLACE_S: f64 = 60.0;
 /// Largest number of parts of the scene in which a sweep is sought: a lost vehicle is sought again in its next sweep, and
@@ -143,7 +141,8 @@ pub struct TrackedPose {
     /// Capture time of the last sweep with a pose, nanoseconds, and x and y of that pose, metres.
     last_place: Option<(u64, [f64; 2])>,
     jumps: u64,
-    is_speed_refuted: bool,
+    /// True of the speed, and of the yaw rate, if it was named as one that is not used.
+    is_reported: [bool; 2],
     times: Vec<StageTiming>,
 }
 
@@ -164,20 +163,16 @@ impl TrackedPose {
 
     /// Follows a vehicle with another localizer.
     pub fn new(localizer: Box<dyn Localize>, config: TrackedPoseConfig) -> Self {
-        let limits = TrackerLimits {
-            max_coast_s: config.max_coast_s,
-            max_position_std_m: MAX_POSITION_STD_M,
-        };
         Self {
             localizer,
+            tracker: PoseTracker::new(config.max_coast_s),
             config,
-            tracker: PoseTracker::new(limits),
             sweeps: 0,
             measured_nanos: None,
             global_nanos: None,
             last_place: None,
             jumps: 0,
-            is_speed_refuted: false,
+            is_reported: [false; 2],
             times: Vec::new(),
         }
     }
@@ -219,19 +214,20 @@ impl TrackedPose {
         }
     }
 
-    /// Names a speed that is not used from here on, once.
-    fn report_speed(&mut self, input: &PoseInput<'_>) {
-        let refuted = self.tracker.refuted_speed();
-        let Some(refuted) = refuted.filter(|_| !self.is_speed_refuted) else {
-            return;
-        };
-        self.is_speed_refuted = true;
-        tracing::warn!(
-            cav = %input.cav,
-            "the vehicle measures a speed of {:.1} m/s where its poses give {:.1} m/s: its speed is not used from here on",
-            refuted.measured_mps,
-            refuted.of_poses_mps
-        );
+    /// Names a speed or a yaw rate that is not used from here on, once.
+    fn report_refuted(&mut self, cav: &CavId) {
+        let refuted = self.tracker.refuted().into_iter();
+        let of = [("speed", "m/s"), ("yaw rate", "rad/s")];
+        for ((refuted, is_reported), (name, unit)) in refuted.zip(&mut self.is_reported).zip(of) {
+            let news = refuted.filter(|_| !std::mem::replace(is_reported, true));
+            if let Some(MotionContradiction { measured, of_poses }) = news {
+                tracing::warn!(
+                    %cav,
+                    "the vehicle measures a {name} of {measured:.2} {unit} where its poses give {of_poses:.2} {unit}: its \
+                     {name} is not used from here on"
+                );
+            }
+        }
     }
 
     /// Localizes a vehicle that is lost.
@@ -262,8 +258,11 @@ impl TrackedPose {
     }
 
     /// True if the sweep is one of those that are measured.
-    fn is_due(&self, motion: &EgoMotion) -> bool {
-        let interval = u64::from(self.config.measuring_interval(motion));
+    fn is_due(&self, mut motion: EgoMotion) -> bool {
+        if let [_, Some(_)] = self.tracker.refuted() {
+            motion.yaw_rate_rad_s = None;
+        }
+        let interval = u64::from(self.config.measuring_interval(&motion));
         // Sweeps count from 1: with phase 0 the first one is due.
         let turn = self.sweeps + interval - 1 + u64::from(self.config.phase);
         self.tracker.needs_measurement() || turn.is_multiple_of(interval)
@@ -281,12 +280,18 @@ impl TrackedPose {
 }
 
 impl PoseSource for TrackedPose {
+    fn begin(&mut self) {
+        self.tracker.begin();
+        (self.sweeps, self.is_reported) = (0, [false; 2]);
+        (self.measured_nanos, self.global_nanos, self.last_place) = (None, None, None);
+    }
+
     /// Ignores the measured pose; uses speed and yaw rate where there are such.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();
         self.sweeps += 1;
         let predicted = self.tracker.predict(input.capture_nanos, &input.motion);
-        self.report_speed(input);
+        self.report_refuted(input.cav);
         let Some(state) = predicted else {
             return self.start(input);
         };
@@ -298,7 +303,7 @@ impl PoseSource for TrackedPose {
     fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let is_measured = self.measured_nanos == Some(input.capture_nanos);
         let state = self.tracker.state();
-        let Some(state) = state.filter(|_| !is_measured && self.is_due(&input.motion)) else {
+        let Some(state) = state.filter(|_| !is_measured && self.is_due(input.motion)) else {
             return false;
         };
         let predicted = (!self.is_global_due(input.capture_nanos)).then_some(&state);
@@ -350,7 +355,7 @@ mod tests {
     use std::sync::atomic::{AtomicU64, Ordering};
 
     use nalgebra::Isometry3;
-    use protocol::{CavId, EgoMotion, PointCloud, Pose};
+    use protocol::{PointCloud, Pose};
 
     use super::*;
     use crate::pgc::driven_area::DrivenArea;
@@ -642,6 +647,26 @@ mod tests {
         let found: Vec<[f64; 2]> = found.collect();
         let [x, y] = found[7];
         assert!((x - 19.0).abs() < 0.2 && y.abs() < 0.1, "{found:?}");
+    }
+
+    #[test]
+    fn another_vehicle_begins_without_the_track_of_the_last_one() {
+        let mut source = TrackedPose::new(Box::new(road()), TrackedPoseConfig::default());
+        for sweep in 0..10 {
+            step(&mut source, sweep, None);
+        }
+        // The road is blind there: any pose would be one of the track.
+        source.localizer = Box::new(Road {
+            blind: 0..100,
+            ..road()
+        });
+        assert!(
+            step(&mut source, 10, None).world_from_cav().is_some(),
+            "the same"
+        );
+        source.begin();
+        assert_eq!(step(&mut source, 11, None).world_from_cav(), None);
+        assert_eq!((source.sweeps, source.last_place), (1, None));
     }
 
     #[test]

@@ -7,13 +7,15 @@
 mod measurement;
 mod motion_filter;
 mod track;
+mod yaw_rate_trust;
 
 use nalgebra::Isometry3;
 use protocol::{EgoMotion, PlanarCovariance};
 
 pub use measurement::PoseMeasurement;
-pub use track::SpeedContradiction;
+pub use track::MotionContradiction;
 use track::{SpeedTrust, VehicleTrack};
+use yaw_rate_trust::YawRateTrust;
 
 /// Number of rejected measurements in a row that have to agree on another place.
 const AGREEING: usize = 3;
@@ -25,15 +27,9 @@ const SLACK_M: f64 = 2.5;
 const SPEED_STD_MPS: f64 = 3.0;
 /// Longest time between two poses that a speed is computed from, seconds.
 const SPEED_BASE_S: f64 = 1.0;
-
-/// Limits after which a vehicle counts as lost.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TrackerLimits {
-    /// Longest time without an accepted measurement, seconds.
-    pub max_coast_s: f64,
-    /// Largest standard deviation of the position along its worst direction, metres.
-    pub max_position_std_m: f64,
-}
+/// Largest standard deviation of a tracked position along its worst direction, metres: the next good measurement is still
+/// near the prediction. Beyond it the vehicle counts as lost.
+const MAX_POSITION_STD_M: f64 = 2.0;
 
 /// Tracked pose at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -60,28 +56,37 @@ pub enum Correction {
 /// Follows one vehicle.
 #[derive(Debug, Clone)]
 pub struct PoseTracker {
-    limits: TrackerLimits,
+    /// Longest time without an accepted measurement, seconds.
+    max_coast_s: f64,
     track: Option<VehicleTrack>,
     speed_trust: SpeedTrust,
+    yaw_rate_trust: YawRateTrust,
     /// Last accepted measurement.
     accepted: Option<PoseMeasurement>,
     /// Rejected measurements in a row that can be reached from each other.
     rejected: Vec<PoseMeasurement>,
-    /// Distance between the last rejected measurement and the prediction, metres.
-    contradiction_m: f64,
+    /// Distance between the last rejected measurement and the prediction, metres and radians.
+    contradiction: [f64; 2],
 }
 
 impl PoseTracker {
-    /// Tracker of a vehicle whose place is not known.
-    pub fn new(limits: TrackerLimits) -> Self {
+    /// Tracker of a vehicle whose place is not known, and which counts as lost after `max_coast_s` seconds without an
+    /// accepted measurement.
+    pub fn new(max_coast_s: f64) -> Self {
         Self {
-            limits,
+            max_coast_s,
             track: None,
             speed_trust: SpeedTrust::default(),
+            yaw_rate_trust: YawRateTrust::default(),
             accepted: None,
             rejected: Vec::new(),
-            contradiction_m: 0.0,
+            contradiction: [0.0; 2],
         }
+    }
+
+    /// Begins with another vehicle, of which nothing is known.
+    pub fn begin(&mut self) {
+        *self = Self::new(self.max_coast_s);
     }
 
     /// Moves the state to the capture time of a sweep. `None`: the vehicle is lost, or the clock went back.
@@ -91,9 +96,10 @@ impl PoseTracker {
             self.rejected.clear();
         }
         let track = self.track.as_mut()?;
-        track.advance(capture_nanos, motion, &mut self.speed_trust);
+        let (speed, yaw_rate) = (&mut self.speed_trust, &mut self.yaw_rate_trust);
+        track.advance(capture_nanos, motion, speed, yaw_rate);
         let covariance = track.filter.planar_covariance();
-        if covariance.worst_variance_m2() > self.limits.max_position_std_m.powi(2) {
+        if covariance.worst_variance_m2() > MAX_POSITION_STD_M.powi(2) {
             self.track = None;
         }
         self.state()
@@ -101,7 +107,7 @@ impl PoseTracker {
 
     fn can_predict(&self, capture_nanos: u64) -> bool {
         let is_recent = self.accepted.as_ref().is_some_and(|accepted| {
-            seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s
+            seconds(accepted.capture_nanos, capture_nanos) <= self.max_coast_s
         });
         let track = self.track.as_ref();
         let is_ahead = track.is_some_and(|track| track.filter.capture_nanos <= capture_nanos);
@@ -114,9 +120,10 @@ impl PoseTracker {
         let mut covariance = track.filter.planar_covariance();
         if self.is_contradicted() {
             // Two places that are equally likely.
-            let variance = (self.contradiction_m / 2.0).powi(2) as f32;
-            covariance.xx_m2 += variance;
-            covariance.yy_m2 += variance;
+            let [place, yaw] = self.contradiction.map(|off| (off / 2.0).powi(2) as f32);
+            covariance.xx_m2 += place;
+            covariance.yy_m2 += place;
+            covariance.yaw_rad2 += yaw;
         }
         Some(TrackedState {
             world_from_lidar: track.filter.world_from_lidar(),
@@ -136,13 +143,17 @@ impl PoseTracker {
             return Correction::Started;
         };
         if track.correct(measurement) {
+            // What a wrong yaw rate did to the state is undone.
+            if self.yaw_rate_trust.refutes(measurement) {
+                self.start(measurement);
+            }
             self.accepted = Some(*measurement);
             self.rejected.clear();
             return Correction::Accepted;
         }
-        let off = track.filter.world_from_lidar().translation.vector
-            - measurement.world_from_lidar.translation.vector;
-        self.contradiction_m = off.norm();
+        let predicted = track.filter.world_from_lidar();
+        let off = predicted.inv_mul(&measurement.world_from_lidar);
+        self.contradiction = [off.translation.vector.norm(), off.rotation.angle()];
         self.reject(measurement)
     }
 
@@ -175,6 +186,7 @@ impl PoseTracker {
         let speed = before.map(|before| [speed_mps(&before, measurement), SPEED_STD_MPS]);
         self.track = Some(VehicleTrack::at(measurement, speed));
         self.rejected.clear();
+        self.yaw_rate_trust.refutes(measurement);
     }
 
     /// True if a measurement is needed now: the last one was rejected, or the speed is not known well.
@@ -184,9 +196,10 @@ impl PoseTracker {
             || track.is_none_or(|track| track.unaided.speed_std_mps() > SPEED_STD_MPS)
     }
 
-    /// The speed that is not used any more, since measured poses contradict it.
-    pub fn refuted_speed(&self) -> Option<SpeedContradiction> {
-        self.speed_trust.refuted
+    /// Speed and yaw rate that are not used any more, since measured poses contradict them.
+    pub fn refuted(&self) -> [Option<MotionContradiction>; 2] {
+        let yaw_rate = &self.yaw_rate_trust.contradictions;
+        [self.speed_trust.0.refuted, yaw_rate.refuted]
     }
 }
 

@@ -18,7 +18,7 @@ const ACCELERATION_STD: f64 = 2.0;
 /// Standard deviation of the yaw acceleration where the yaw rate is not measured, radians per second squared.
 const YAW_ACCELERATION_STD: f64 = 0.8;
 /// The same where it is: what a mean rate does not show, or one that is of the end of the interval alone.
-const RESIDUAL_YAW_ACCELERATION_STD: f64 = 0.25;
+pub(super) const RESIDUAL_YAW_ACCELERATION_STD: f64 = 0.25;
 /// Standard deviation of the side slip after one second, metres.
 const SLIP_STD_M: f64 = 0.05;
 /// Standard deviation of the vertical acceleration beside that of the slope, metres per second squared.
@@ -32,7 +32,7 @@ const SCALE_DRIFT_STD: f64 = 0.001;
 /// Standard deviation of a measured yaw rate without its bias, radians per second: 0.1 degrees/s, as of a MEMS gyroscope.
 const YAW_RATE_STD: f64 = 0.002;
 /// Standard deviation of the gyroscope's unknown bias, radians per second: 0.6 degrees/s, not calibrated.
-const BIAS_STD: f64 = 0.01;
+pub(super) const BIAS_STD: f64 = 0.01;
 /// Standard deviation of the change of that bias after one second, radians per second.
 const BIAS_DRIFT_STD: f64 = 0.0002;
 /// Standard deviation of the LiDAR's unknown place ahead of the rear axle, metres.
@@ -103,11 +103,10 @@ impl MotionFilter {
         }
     }
 
-    /// Moves the state to a later capture time, at the yaw rate that the gyroscope measured until then, if there is one.
-    pub(super) fn advance(&mut self, capture_nanos: u64, measured_yaw_rate_rad_s: Option<f64>) {
+    /// Moves the state to a later capture time, at the yaw rate (rad/s) that the gyroscope measured until then, if there is one.
+    pub(super) fn advance(&mut self, capture_nanos: u64, measured: Option<f64>) {
         let time_s = capture_nanos.saturating_sub(self.capture_nanos) as f64 * 1e-9;
         self.capture_nanos = capture_nanos;
-        let measured = measured_yaw_rate_rad_s.filter(|rate| rate.is_finite());
         let yaw_acceleration_std = match measured {
             Some(_) => RESIDUAL_YAW_ACCELERATION_STD,
             None => YAW_ACCELERATION_STD,
@@ -296,6 +295,6 @@ impl MotionFilter {
 }
 
 /// The same angle between -pi and pi.
-fn wrapped_rad(angle_rad: f64) -> f64 {
+pub(super) fn wrapped_rad(angle_rad: f64) -> f64 {
     (angle_rad + PI).rem_euclid(TAU) - PI
 }

@@ -8,10 +8,7 @@ use rand_distr::{Distribution, Normal};
 use super::*;
 
 const TENTH_NANOS: u64 = 100_000_000;
-const LIMITS: TrackerLimits = TrackerLimits {
-    max_coast_s: 3.0,
-    max_position_std_m: 2.0,
-};
+const MAX_COAST_S: f64 = 3.0;
 
 /// Pose of the rear axle on a drive at 10 m/s through bends, 500 km from the origin.
 fn truth(sweep: u64) -> Isometry3<f64> {
@@ -53,7 +50,7 @@ fn motion(sweep: u64, bias_rad_s: f64) -> EgoMotion {
 /// Largest position error (metres) and yaw error (radians) of the predictions of sweeps 60 to 200, a fourth of which are
 /// measured, of a LiDAR ahead of the rear axle.
 fn worst(motion: impl Fn(u64) -> EgoMotion, lever_m: f64) -> [f64; 2] {
-    let mut tracker = PoseTracker::new(LIMITS);
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
     let mut worst: [f64; 2] = [0.0; 2];
     for sweep in 0..200 {
         let state = tracker.predict(sweep * TENTH_NANOS, &motion(sweep));
@@ -108,7 +105,7 @@ fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
 fn predictions_are_about_as_good_as_measurements_and_stay_within_their_bounds() {
     let (mut errors, mut exceeded) = (Vec::new(), 0);
     for seed in 0..20 {
-        let results = followed(&mut PoseTracker::new(LIMITS), 0..100, seed);
+        let results = followed(&mut PoseTracker::new(MAX_COAST_S), 0..100, seed);
         // One pose says nothing of the speed: the second measurement starts again, with it.
         assert_eq!(results.len(), 98);
         let settled = &results[20..];
@@ -133,7 +130,7 @@ fn predictions_are_about_as_good_as_measurements_and_stay_within_their_bounds() 
 
 /// Error of the prediction after one measurement, metres.
 fn second_error_m(motion: &EgoMotion) -> Option<f64> {
-    let mut tracker = PoseTracker::new(LIMITS);
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
     tracker.predict(0, motion);
     tracker.correct(&measured(0, [0.0; 2], 0.05));
     tracker
@@ -200,7 +197,7 @@ fn a_gyroscope_that_fails_does_not_lose_the_vehicle() {
 
 #[test]
 fn a_wrong_pose_does_not_pull_the_state_off() {
-    let mut tracker = PoseTracker::new(LIMITS);
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
     followed(&mut tracker, 0..40, 1);
     let predicted = tracker
         .predict(40 * TENTH_NANOS, &EgoMotion::default())
@@ -223,11 +220,19 @@ fn a_wrong_pose_does_not_pull_the_state_off() {
         Correction::Accepted
     );
     assert!(tracker.state().unwrap().covariance.bound_95_m() < 1.0);
+    tracker
+        .predict(42 * TENTH_NANOS, &EgoMotion::default())
+        .unwrap();
+    let mut turned = measured(42, [0.0; 2], 0.1);
+    turned.world_from_lidar.rotation *= UnitQuaternion::from_euler_angles(0.0, 0.0, 1.0);
+    assert_eq!(tracker.correct(&turned), Correction::Rejected);
+    let yaw_std_rad = tracker.state().unwrap().covariance.yaw_rad2.sqrt();
+    assert!((0.4..0.6).contains(&yaw_std_rad), "{yaw_std_rad} rad");
 }
 
 #[test]
 fn a_vehicle_that_was_carried_away_is_found_again() {
-    let mut tracker = PoseTracker::new(LIMITS);
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
     followed(&mut tracker, 0..40, 1);
     let corrections: Vec<Correction> = (40..43)
         .map(|sweep| {
@@ -263,7 +268,7 @@ fn a_vehicle_that_was_carried_away_is_found_again() {
 
 #[test]
 fn without_measurements_the_bound_grows_until_the_vehicle_is_lost() {
-    let mut tracker = PoseTracker::new(LIMITS);
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
     followed(&mut tracker, 0..40, 1);
     let mut bounds = Vec::new();
     for sweep in 40..80 {
@@ -285,7 +290,7 @@ fn without_measurements_the_bound_grows_until_the_vehicle_is_lost() {
 
 #[test]
 fn a_tunnel_and_a_restarted_scene_end_the_track() {
-    let mut tracker = PoseTracker::new(LIMITS);
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
     followed(&mut tracker, 0..40, 1);
     assert_eq!(
         tracker.predict(140 * TENTH_NANOS, &EgoMotion::default()),
@@ -314,7 +319,7 @@ fn driven_at_speeds(
     measures_mps: impl Fn(f64) -> f64,
     seed: u64,
 ) -> (Vec<(f64, f64)>, PoseTracker) {
-    let mut tracker = PoseTracker::new(LIMITS);
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let noise = Normal::new(0.0, 0.03).unwrap();
     let mut results = Vec::new();
@@ -370,12 +375,61 @@ fn a_speed_that_poses_contradict_is_named_and_one_of_a_slightly_wrong_scale_is_n
         (1.3, false),
         (0.0, true),
         (3.6, true),
+        (-1.0, true),
     ] {
         let (_, tracker) = driven_at_speeds(|speed| scale * speed, 1);
-        let refuted = tracker.refuted_speed();
+        let [refuted, _] = tracker.refuted();
         assert_eq!(refuted.is_some(), is_refuted, "{scale}: {refuted:?}");
         if let Some(refuted) = refuted {
-            assert!((refuted.of_poses_mps - 10.0).abs() < 1.0, "{refuted:?}");
+            assert!((refuted.of_poses - 10.0).abs() < 1.0, "{refuted:?}");
         }
+    }
+}
+
+/// Follows the drive with a measurement in every fourth sweep, at the yaw rate that `measures` makes of the true one
+/// (radians per second). Yaw errors of all predictions, radians, and the tracker at the end.
+fn driven_at_yaw_rates(measures: impl Fn(f64) -> f64) -> (Vec<f64>, PoseTracker) {
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
+    let mut errors = Vec::new();
+    for sweep in 0..120 {
+        let right = motion(sweep, 0.0);
+        let motion = EgoMotion {
+            yaw_rate_rad_s: right.yaw_rate_rad_s.map(&measures),
+            ..right
+        };
+        if let Some(state) = tracker.predict(sweep * TENTH_NANOS, &motion) {
+            let off = truth(sweep).inv_mul(&state.world_from_lidar);
+            errors.push(off.rotation.angle());
+        }
+        if sweep % 4 == 0 || tracker.needs_measurement() {
+            tracker.correct(&measured(sweep, [0.0; 2], 0.03));
+        }
+    }
+    (errors, tracker)
+}
+
+#[test]
+fn a_yaw_rate_that_poses_contradict_is_named_and_not_used() {
+    type Measured = fn(f64) -> f64;
+    let rates: [(Measured, bool); 6] = [
+        (|rate| rate, false),
+        (|rate| rate + 0.01, false),
+        (|rate| 1.05 * rate, false),
+        (|rate| -rate, true),
+        (f64::to_degrees, true),
+        (f64::to_radians, true),
+    ];
+    for (measures, is_refuted) in rates {
+        let (errors, mut tracker) = driven_at_yaw_rates(measures);
+        let [speed, yaw_rate] = tracker.refuted();
+        assert_eq!(
+            (speed, yaw_rate.is_some()),
+            (None, is_refuted),
+            "{yaw_rate:?}"
+        );
+        let worst = errors[60..].iter().copied().fold(0.0, f64::max);
+        assert!(worst < 0.03, "{worst} rad, {yaw_rate:?}");
+        tracker.begin();
+        assert_eq!(tracker.refuted(), [None; 2], "another vehicle");
     }
 }

@@ -4,6 +4,8 @@ use protocol::EgoMotion;
 
 use super::measurement::PoseMeasurement;
 use super::motion_filter::MotionFilter;
+use super::seconds;
+use super::yaw_rate_trust::YawRateTrust;
 
 /// Squared Mahalanobis distance between a measured speed and that of the poses from which on they contradict each other:
 /// four standard deviations, since a vehicle that brakes hard is ahead of the poses.
@@ -13,40 +15,50 @@ const POSE_GATE: f64 = 16.27;
 /// Contradictions in a row after which a speed is not used any more: a second of sweeps, longer than wheels slip.
 const MOST_CONTRADICTIONS: u32 = 10;
 
-/// Speed that poses contradict.
+/// Speed (metres per second) or yaw rate (radians per second) that poses contradict.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SpeedContradiction {
-    /// Speed that the vehicle measures, metres per second.
-    pub measured_mps: f64,
-    /// Speed that the poses of its sweeps give, metres per second.
-    pub of_poses_mps: f64,
+pub struct MotionContradiction {
+    /// Value that the vehicle measures.
+    pub measured: f64,
+    /// Value that the poses of its sweeps give.
+    pub of_poses: f64,
 }
 
-/// Trust in the speed that a vehicle measures, over all its tracks.
+/// Contradictions in a row of a measured quantity, over all tracks of a vehicle.
 #[derive(Debug, Clone, Default)]
-pub(super) struct SpeedTrust {
+pub(super) struct Contradictions {
     in_a_row: u32,
-    pub(super) refuted: Option<SpeedContradiction>,
+    pub(super) refuted: Option<MotionContradiction>,
 }
+
+impl Contradictions {
+    /// Counts the comparison of a measured value with that of the poses; `most` contradictions in a row refute it.
+    pub(super) fn count(
+        &mut self,
+        is_contradicted: bool,
+        most: u32,
+        [measured, of_poses]: [f64; 2],
+    ) {
+        self.in_a_row = (self.in_a_row + 1) * u32::from(is_contradicted);
+        if self.in_a_row >= most {
+            self.refuted = Some(MotionContradiction { measured, of_poses });
+        }
+    }
+}
+
+/// Trust in the speed that a vehicle measures.
+#[derive(Debug, Clone, Default)]
+pub(super) struct SpeedTrust(pub(super) Contradictions);
 
 impl SpeedTrust {
     /// Judges a speed by a filter that has not used it; true if it can be used.
     fn admits(&mut self, unaided: &MotionFilter, measured_mps: f64) -> bool {
-        if self.refuted.is_some() {
-            return false;
+        let is_admitted = unaided.speed_distance_squared(measured_mps) <= SPEED_GATE;
+        if self.0.refuted.is_none() {
+            let speeds = [measured_mps, unaided.speed_mps()];
+            self.0.count(!is_admitted, MOST_CONTRADICTIONS, speeds);
         }
-        if unaided.speed_distance_squared(measured_mps) <= SPEED_GATE {
-            self.in_a_row = 0;
-            return true;
-        }
-        self.in_a_row += 1;
-        if self.in_a_row >= MOST_CONTRADICTIONS {
-            self.refuted = Some(SpeedContradiction {
-                measured_mps,
-                of_poses_mps: unaided.speed_mps(),
-            });
-        }
-        false
+        is_admitted && self.0.refuted.is_none()
     }
 }
 
@@ -77,9 +89,12 @@ impl VehicleTrack {
         capture_nanos: u64,
         motion: &EgoMotion,
         trust: &mut SpeedTrust,
+        yaw_rate_trust: &mut YawRateTrust,
     ) {
+        let time_s = seconds(self.filter.capture_nanos, capture_nanos);
+        let yaw_rate_rad_s = yaw_rate_trust.admitted(time_s, motion.yaw_rate_rad_s);
         for filter in [&mut self.filter, &mut self.unaided] {
-            filter.advance(capture_nanos, motion.yaw_rate_rad_s);
+            filter.advance(capture_nanos, yaw_rate_rad_s);
         }
         match motion.speed_mps.filter(|speed| speed.is_finite()) {
             Some(speed) if trust.admits(&self.unaided, speed) => self.filter.correct_speed(speed),

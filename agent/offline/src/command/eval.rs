@@ -58,7 +58,7 @@ const TRACKER_OPTIONS: [&str; 4] = [
 #[command(group = ArgGroup::new("tracker").args(TRACKER_OPTIONS).multiple(true).requires("tracked"))]
 pub(crate) struct Args {
     /// Data sets, splits or scenarios of the heads' scenes; the layout is detected.
-    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    #[arg(long, alias = "scene", value_name = "DIR", num_args = 1.., required = true)]
     dataset: Vec<PathBuf>,
     /// Weights of the encoder, or of a detector that has it [default: those that each head names].
     #[arg(long, value_name = "FILE")]
@@ -74,7 +74,7 @@ pub(crate) struct Args {
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence.
     #[arg(long, conflicts_with_all = ["baseline", "fit_confidence", "tracked"])]
     lightloc: bool,
-    /// Answer with the pose of the sweep of these drives that looks most alike (--by), the floor of every regression.
+    /// Answer with the pose of the sweep of these drives that is most similar (--by): a lower baseline.
     #[arg(
         long,
         value_name = "DIR",
@@ -94,7 +94,7 @@ pub(crate) struct Args {
         conflicts_with_all = ["encoder", "head", "baseline", "lightloc", "retrieval", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
-    /// Register the poses of PGC to a surfel map of the place (`agent map`) or a released one (town1, town4): poses to the millimetre.
+    /// Register the poses of PGC to a surfel map of the place (`agent map`) or a released one (town1): poses to the millimetre.
     #[arg(long, value_name = "FILE|NAME", conflicts_with_all = ["baseline", "lightloc", "retrieval", "icp_map", "fit_confidence"])]
     surfel_map: Option<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
@@ -357,7 +357,7 @@ impl Args {
         if !drives.is_empty() {
             return retrieval::by_encoder(drives, localizer, left_out);
         }
-        localizer.set_solver(solver);
+        localizer.solver.solver = solver;
         self.registered(Box::new(localizer))
     }
 
@@ -522,7 +522,8 @@ fn table(summary: &LocalizationSummary) -> String {
     let [mean_deg, p95_deg] = numbers([summary.mean_deg, summary.p95_deg], 2);
     let [p50_m, p50_deg] = numbers([summary.p50_m, summary.p50_deg], 3);
     let total_ms = ms.get("total").copied();
-    let [max_m, max_deg, total_ms] = numbers([summary.max_m, summary.max_deg, total_ms], 1);
+    let [max_m, max_deg] = numbers([summary.max_m, summary.max_deg], 2);
+    let [total_ms] = numbers([total_ms], 1);
     let [sigma, ratio] = numbers([summary.sigma_spearman, summary.inlier_ratio_spearman], 2);
     let [calibration] = numbers([summary.calibration_error], 3);
     let shares = [rejected.bad_share, rejected.good_share];

@@ -1,5 +1,7 @@
 //! `agent localize`: writes the poses of recorded sweeps to a table.
 
+use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use agent_offline::evaluation::estimate_pose;
@@ -7,9 +9,10 @@ use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, Scenario, fin
 use indicatif::ProgressBar;
 use localization::pgc::head_files::encoder_or_named;
 use localization::pgc::wrong_place::wrong_place_hint;
-use localization::pose_source::{LocalizedPose, PgcConfig, PoseRow, PoseTable};
+use localization::pose_source::{LocalizedPose, PgcConfig, PoseRow, PoseSource, PoseTable};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
+use support::file_digests::FileDigests;
 use support::output;
 use terminal::progress;
 
@@ -36,7 +39,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
-    /// wrote, or a released one (town1, town4) [default: none].
+    /// wrote, or a released one (town1) [default: none].
     #[arg(long, value_name = "FILE|NAME")]
     surfel_map: Option<PathBuf>,
     /// Number format in which networks are computed.
@@ -54,17 +57,41 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         true => PoseTable::read(&args.out).map_err(BadInput::of)?,
         false => PoseTable::default(),
     };
-    let mut scenarios = Vec::new();
+    let (mut scenarios, mut folders) = (Vec::new(), BTreeMap::new());
     for folder in &args.dataset {
-        scenarios.extend(dataset::open(folder).map_err(BadInput::of)?.scenarios);
+        for scenario in dataset::open(folder).map_err(BadInput::of)?.scenarios {
+            let name = PoseTable::key(&scenario.name).to_owned();
+            if let Some(other) = folders.insert(name, folder.display()) {
+                let (folder, name) = (folder.display(), scenario.name);
+                return Err(BadInput::new(format!(
+                    "{other} and {folder} both have a scenario {name}: a table has one of a name"
+                ))
+                .into());
+            }
+            scenarios.push(scenario);
+        }
     }
-    scenarios.retain(|scenario| !done.has(&scenario.name));
     // All heads are found before any is computed with.
     let files = with_files(&args.head)?;
-    let heads = scenarios.iter().map(|scenario| head_of(&files, scenario));
-    let heads: Vec<&Path> = heads.collect::<Result<_, _>>()?;
-    let first_head = heads.first().copied();
-    let sweeps: usize = scenarios.iter().map(frames).sum();
+    let digests = FileDigests::default();
+    let mut tasks = Vec::new();
+    for scenario in &scenarios {
+        let config = args.config(head_of(&files, scenario)?)?;
+        let origin = origin(scenario, &config, &digests).map_err(BadInput::of)?;
+        match done.origin(&scenario.name) {
+            None => tasks.push((scenario, config, origin)),
+            Some(before) if before == origin => {}
+            Some(before) => {
+                let (out, name) = (args.out.display(), &scenario.name);
+                return Err(BadInput::new(format!(
+                    "{out}: its poses of {name} are of other networks or data ({before:?}) than these ({origin:?}): --out another \
+                     file"
+                ))
+                .into());
+            }
+        }
+    }
+    let sweeps: usize = tasks.iter().map(|(scenario, ..)| frames(scenario)).sum();
     if sweeps == 0 && done.is_empty() {
         return Err(BadInput::new(format!("no sweep in {:?}", args.dataset)).into());
     }
@@ -72,12 +99,21 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let mut found = 0;
     let mut left_out = LeftOut::default();
     left_out.add_findings(findings::sampled(&scenarios, IntensityScale::AUTO));
-    for (scenario, head) in scenarios.iter().zip(heads) {
-        found += args.localize(scenario, head, &mut left_out, &bar)?;
+    let inference = Inference::new(Device::Cpu, args.precision);
+    for of_head in tasks.chunk_by(|(_, one, _), (_, next, _)| one == next) {
+        let mut source = LocalizedPose::pgc(&of_head[0].1, inference).map_err(BadInput::of)?;
+        for (scenario, _, origin) in of_head {
+            let rows = localized(&mut source, scenario, &mut left_out, &bar);
+            // Appended as a whole: an interrupted scenario is not in the table and is done again.
+            PoseTable::append(&args.out, &scenario.name, origin, &rows)?;
+            let poses = rows.iter().map(|row| row.estimate.world_from_cav());
+            found += poses.flatten().count();
+        }
     }
     bar.finish_and_clear();
-    if let (0, 1.., Some(head), Some(scenario)) = (found, sweeps, first_head, scenarios.first()) {
+    if let (0, 1.., Some((scenario, config, _))) = (found, sweeps, tasks.first()) {
         let map = scenario.generated_map().ok().map(|map| map.to_string());
+        let head = &config.head;
         output::note(wrong_place_hint(sweeps as u64, head, map.as_deref()));
     }
     output::line(format_args!(
@@ -89,45 +125,60 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 impl Args {
-    /// Localizes a scenario, vehicle by vehicle in the order of time, and appends it; the number of sweeps with a pose.
-    fn localize(
-        &self,
-        scenario: &Scenario,
-        head: &Path,
-        left_out: &mut LeftOut,
-        bar: &ProgressBar,
-    ) -> anyhow::Result<usize> {
-        let config = PgcConfig {
+    fn config(&self, head: &Path) -> Result<PgcConfig, BadInput> {
+        Ok(PgcConfig {
             encoder: encoder_or_named(self.encoder.as_deref(), head).map_err(BadInput::of)?,
             head: head.to_owned(),
             surfel_map: surfel_map(self.surfel_map.as_deref())?,
             ..PgcConfig::default()
-        };
-        let mut rows: Vec<PoseRow<'_>> = Vec::new();
-        let inference = Inference::new(Device::Cpu, self.precision);
-        for (agent, cav) in scenario.agents.iter().enumerate() {
-            let mut source = LocalizedPose::pgc(&config, inference).map_err(BadInput::of)?;
-            for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
-                bar.inc(1);
-                let frame = match scenario.load(agent, tick, &LoadOptions::default()) {
-                    Ok(frame) => frame,
-                    Err(error) => {
-                        left_out.add_unreadable(agent, Problem::from(&error));
-                        continue;
-                    }
-                };
-                rows.push(PoseRow {
-                    cav,
-                    capture_nanos: frame.capture_nanos,
-                    estimate: estimate_pose(&mut source, &frame, None),
-                });
-            }
-        }
-        // Appended as a whole: an interrupted scenario is not in the table and is done again.
-        PoseTable::append(&self.out, &scenario.name, &rows)?;
-        let poses = rows.iter().map(|row| row.estimate.world_from_cav());
-        Ok(poses.flatten().count())
+        })
     }
+}
+
+/// Digests of all that the poses of a scenario are computed from.
+fn origin(scenario: &Scenario, config: &PgcConfig, digests: &FileDigests) -> io::Result<String> {
+    let mut unnamed = scenario.clone();
+    // The name depends on the folder that was opened.
+    unnamed.name.clear();
+    let data = dataset::content_sha256([&unnamed], None, digests);
+    let mut text = format!("data {data}");
+    let (head, encoder, map) = (&config.head, &config.encoder, &config.surfel_map);
+    let files = [("head", head), ("encoder", encoder), ("surfel map", map)];
+    for (name, file) in files {
+        if !file.as_os_str().is_empty() {
+            text += &format!(" {name} {}", digests.sha256(file)?);
+        }
+    }
+    Ok(text)
+}
+
+/// Localizes a scenario, vehicle by vehicle in the order of time.
+fn localized<'a>(
+    source: &mut LocalizedPose,
+    scenario: &'a Scenario,
+    left_out: &mut LeftOut,
+    bar: &ProgressBar,
+) -> Vec<PoseRow<'a>> {
+    let mut rows = Vec::new();
+    for (agent, cav) in scenario.agents.iter().enumerate() {
+        source.begin();
+        for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
+            bar.inc(1);
+            let frame = match scenario.load(agent, tick, &LoadOptions::default()) {
+                Ok(frame) => frame,
+                Err(error) => {
+                    left_out.add_unreadable(agent, Problem::from(&error));
+                    continue;
+                }
+            };
+            rows.push(PoseRow {
+                cav,
+                capture_nanos: frame.capture_nanos,
+                estimate: estimate_pose(source, &frame, None),
+            });
+        }
+    }
+    rows
 }
 
 /// Number of frames of a scenario.

@@ -15,8 +15,8 @@ use localization::place_localizer::place_localizer;
 use localization::pose_covariance::{pose_covariance, position_bound_m};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
+use protocol::PoseEstimate;
 use protocol::config::within;
-use protocol::{NoPoseReason, PoseEstimate};
 use serde::Serialize;
 use support::cli::{BadInput, Outcome};
 use support::output;
@@ -51,7 +51,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
-    /// wrote, or a released one (town1, town4) [default: none].
+    /// wrote, or a released one (town1) [default: none].
     #[arg(long, value_name = "FILE|NAME")]
     surfel_map: Option<PathBuf>,
     /// Least confidence of a pose, 0 to 1: others are rejected, beside those that the head rejects.
@@ -89,7 +89,7 @@ struct Located {
     /// Pose of the LiDAR in the map.
     pose: Option<LocatedPose>,
     /// Reason for the missing pose.
-    no_pose: Option<&'static str>,
+    no_pose: Option<String>,
     /// The fault of a file that cannot be read.
     error: Option<String>,
     /// Number of cells that agree with the pose.
@@ -258,16 +258,10 @@ fn published(localization: &Localization) -> Option<FoundPose> {
     localization.found.filter(|found| !found.is_rejected)
 }
 
-fn reason(estimate: &PoseEstimate) -> Option<&'static str> {
+fn reason(estimate: &PoseEstimate) -> Option<String> {
     match estimate {
         PoseEstimate::Pose { .. } => None,
-        PoseEstimate::NoPose { reason, .. } => Some(match reason {
-            NoPoseReason::TooFewPoints => "too few points",
-            NoPoseReason::TooFewInliers => "too few inliers",
-            NoPoseReason::LowConfidence => "low confidence",
-            NoPoseReason::LowCoverage => "low coverage",
-            NoPoseReason::NoSource | NoPoseReason::Failed => "failed",
-        }),
+        PoseEstimate::NoPose { reason, .. } => Some(<&str>::from(reason).replace('_', " ")),
     }
 }
 
@@ -305,7 +299,7 @@ impl Located {
             false => "",
         };
         let Some(pose) = &self.pose else {
-            let reason = self.no_pose.unwrap_or("failed");
+            let reason = self.no_pose.as_deref().unwrap_or("failed");
             return format!("{cloud}: no pose, {reason} ({inliers} inliers, {points} points)");
         };
         let ([x, y, z], [roll, pitch, yaw]) = (pose.position_m, pose.roll_pitch_yaw_deg);
@@ -327,7 +321,7 @@ mod tests {
         Located {
             cloud: "a.pcd".into(),
             map: "town".into(),
-            no_pose: pose.is_none().then_some("too few inliers"),
+            no_pose: pose.is_none().then(|| "too few inliers".to_owned()),
             pose,
             error: error.map(str::to_owned),
             inliers: 12,

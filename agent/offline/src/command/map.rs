@@ -124,9 +124,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(left_out) = &report.left_out {
         output::note(format_args!("left out: {left_out}"));
     }
-    // What is left out here is left out of the report too.
-    args.write_surfels()?;
-    Ok(Outcome::of(report.left_out.is_some()))
+    // The training may have read some of the sweeps only: what the others lack is named here.
+    let surfels = args.write_surfels()?.print();
+    Ok(report.left_out.map_or(surfels, |_| Outcome::DataLost))
 }
 
 impl Args {

@@ -33,8 +33,9 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(1);
     let encoder = encoder_or_named(args.encoder.as_deref(), &args.head).map_err(BadInput::of)?;
-    let localizer =
-        Localizer::load(&encoder, &args.head, Inference::FLOAT).map_err(BadInput::of)?;
+    // The confidence of a new head is fitted after this: its absence is no news.
+    let localizer = Localizer::load_without_confidence(&encoder, &args.head, Inference::FLOAT);
+    let localizer = localizer.map_err(BadInput::of)?;
     let (mut search, mut left_out, mut observed) = (ScaleSearch::default(), LeftOut::default(), 0);
     for folder in &args.dataset {
         for scenario in dataset::open(folder).map_err(BadInput::of)?.scenarios {

@@ -4,7 +4,7 @@ mod summary;
 mod table;
 
 use crate::Error;
-use crate::sweep_database::present_sweeps;
+use crate::sweep_database::{posed, present_sweeps};
 use std::path::PathBuf;
 
 use dataset::frame::Frame;
@@ -17,7 +17,7 @@ pub use summary::{
 };
 pub use table::{csv, error_table};
 
-use localization::covariance_scale::PoseSample;
+use localization::covariance_scale::{MAX_VARIANCE, PoseSample};
 use localization::pgc::confidence::{Confidence, Labelled};
 use localization::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use localization::pose_covariance::{pose_covariance, position_bound_m, unscaled_covariance};
@@ -83,15 +83,16 @@ impl EvaluatedSweep {
         found.is_some_and(|found| found.is_registered)
     }
 
-    /// Sample for the fit of a covariance: a pose that is published.
+    /// Sample for the fit of a covariance: a pose that is published, and that its method constrains.
     pub fn pose_sample(&self) -> Option<PoseSample> {
         let found = self.localization.found.filter(|found| !found.is_rejected)?;
-        let (pose, truth) = (&found.world_from_sensor, self.truth.isometry());
-        let sample = PoseSample::of(pose, unscaled_covariance(&found), &truth);
-        Some(PoseSample {
-            start_std_m: found.start_std_m,
-            ..sample
-        })
+        let covariance = Some(unscaled_covariance(&found));
+        let covariance = covariance.filter(|covariance| covariance[0][0] < MAX_VARIANCE)?;
+        Some(PoseSample::of(
+            (&found.world_from_sensor, found.start_std_m),
+            covariance,
+            &self.truth.isometry(),
+        ))
     }
 
     /// The same with the covariance that is published.
@@ -132,14 +133,14 @@ pub struct Evaluated {
 /// Localizes every sweep of the scenes in turn; `on_sweep` gets the number done and the number of all.
 ///
 /// # Errors
-/// [`Error`] when a data set cannot be opened, and at the first sweep without a true pose. Sweeps that cannot
-/// be read are left out and counted.
+/// [`Error`] when a data set cannot be opened, and where no sweep is left. Sweeps that cannot be read or have no true pose
+/// are left out and counted.
 pub fn evaluate(
     localizer: &mut dyn Localize,
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    let mut evaluated = evaluate_with(options, on_sweep, |frame, _| {
+    let mut evaluated = evaluate_with(options, on_sweep, |frame, _, _| {
         localizer.localize(LocalizerInput::of(&frame.points))
     })?;
     for sweep in &mut evaluated.sweeps {
@@ -158,7 +159,10 @@ pub fn evaluate_source(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    evaluate_with(options, on_sweep, |frame, _| {
+    evaluate_with(options, on_sweep, |frame, _, is_first| {
+        if is_first {
+            source.begin();
+        }
         let measured = frame.gnss_world_from_lidar();
         let mut times = stopwatch();
         let estimate = estimate_pose(source, frame, measured.as_ref());
@@ -196,7 +200,7 @@ pub fn evaluate_nearest(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    evaluate_with(options, on_sweep, |_, truth| {
+    evaluate_with(options, on_sweep, |_, truth, _| {
         let truth = truth.isometry().translation.vector;
         let nearest = world_from_sensor.iter().min_by(|a, b| {
             let [a, b] = [a, b].map(|pose| (pose.translation.vector - truth).norm_squared());
@@ -207,10 +211,11 @@ pub fn evaluate_nearest(
     })
 }
 
+/// Calls `localize` with each sweep, its true pose and whether it is the first of a vehicle in a scenario.
 fn evaluate_with(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
-    mut localize: impl FnMut(&Frame, &Pose) -> Result<Localization, LocalizerError>,
+    mut localize: impl FnMut(&Frame, &Pose, bool) -> Result<Localization, LocalizerError>,
 ) -> Result<Evaluated, Error> {
     let datasets = options.scenes.iter().map(|dir| dataset::open(dir));
     let datasets = datasets.collect::<Result<Vec<_>, _>>()?;
@@ -221,14 +226,12 @@ fn evaluate_with(
         all.extend(used.map(|sweep| (scenario, sweep)));
     }
     let chosen = evenly_spread(&all, options.sweeps.unwrap_or(usize::MAX));
-    if chosen.is_empty() {
-        return Err(Error::Input(format!("no sweep in {:?}", options.scenes)));
-    }
     let load = LoadOptions {
         lidar_variant: options.variant.clone(),
         ..LoadOptions::default()
     };
     let mut evaluated = Evaluated::default();
+    let mut last = None;
     for dataset in &datasets {
         evaluated.left_out.add_files(&dataset.problems);
         let findings = findings::sampled(&dataset.scenarios, IntensityScale::AUTO);
@@ -236,8 +239,8 @@ fn evaluate_with(
     }
     for (place, &(scenario, (agent, tick))) in chosen.iter().enumerate() {
         on_sweep(place + 1, chosen.len());
-        let frame = match scenario.load(agent, tick, &load) {
-            Ok(frame) => frame,
+        let (frame, truth) = match posed(scenario, agent, tick, &load) {
+            Ok(posed) => posed,
             // A variant that does not exist is missing from every sweep: the option is wrong, not the data.
             Err(error @ ReadError::NoSuch { .. }) => return Err(error.into()),
             Err(error) => {
@@ -247,45 +250,29 @@ fn evaluate_with(
             }
         };
         let stem = scenario.ticks[tick].stem.clone();
-        let Some(truth) = frame.world_from_lidar else {
-            return Err(Error::Input(format!(
-                "{}: {} at {stem}: there is no true pose to compare with (agent localize finds poses without)",
-                scenario.name, frame.cav
-            )));
-        };
+        let vehicle = (std::ptr::from_ref(scenario), agent);
+        let is_first = last.replace(vehicle) != Some(vehicle);
         evaluated.sweeps.push(EvaluatedSweep {
             scenario: scenario.name.clone(),
             is_covered: None,
-            localization: localize(&frame, &truth)?,
+            localization: localize(&frame, &truth, is_first)?,
             cav: frame.cav,
             stem,
             truth,
         });
     }
     if evaluated.sweeps.is_empty() {
-        let (scenes, reasons) = (&options.scenes, evaluated.left_out.reasons());
-        return Err(Error::Input(format!(
-            "no sweep that can be evaluated in {scenes:?}{reasons}"
-        )));
+        let (scenes, reasons) = (options.scenes.clone(), evaluated.left_out.reasons());
+        return Err(Error::NoSweeps(scenes, reasons));
     }
     Ok(evaluated)
 }
 
 /// Name of a sweep's outcome.
 fn outcome(estimate: &PoseEstimate) -> &'static str {
-    use protocol::NoPoseReason::{
-        Failed, LowConfidence, LowCoverage, NoSource, TooFewInliers, TooFewPoints,
-    };
-    let PoseEstimate::NoPose { reason, .. } = estimate else {
-        return "pose";
-    };
-    match reason {
-        TooFewPoints => "too_few_points",
-        TooFewInliers => "too_few_inliers",
-        NoSource => "no_source",
-        LowConfidence => "low_confidence",
-        Failed => "failed",
-        LowCoverage => "low_coverage",
+    match estimate {
+        PoseEstimate::Pose { .. } => "pose",
+        PoseEstimate::NoPose { reason, .. } => reason.into(),
     }
 }
 
@@ -294,6 +281,7 @@ pub(crate) mod tests {
     use super::*;
     use localization::pgc::test_scene::SyntheticScene;
     use protocol::PointCloud;
+    use simulator::generate::{Subset, SynthOptions, generate};
 
     /// Sweeps of a scene of increasing difficulty; every tenth is empty.
     pub(crate) fn evaluated(count: u64) -> Vec<EvaluatedSweep> {
@@ -339,6 +327,59 @@ pub(crate) mod tests {
             (Some(found), None)
         );
         assert_eq!(outcome(&sweep.localization.estimate), "low_confidence");
+    }
+
+    #[test]
+    fn a_pose_without_a_covariance_is_no_sample_of_one() {
+        let mut sweep = evaluated(10).swap_remove(0);
+        assert!(sweep.pose_sample().is_some());
+        let estimate = PoseEstimate::new(sweep.truth, 0.9);
+        sweep.localization = Localization::from_estimate(estimate, stopwatch());
+        assert_eq!(sweep.pose_sample(), None);
+        let summary = LocalizationSummary::of(&[sweep]);
+        assert!(summary.beyond_95.is_empty(), "{summary:?}");
+    }
+
+    /// A source that counts its sweeps since the last beginning.
+    #[derive(Debug, Default)]
+    struct Counting(Vec<usize>);
+
+    impl PoseSource for Counting {
+        fn begin(&mut self) {
+            self.0.push(0);
+        }
+
+        fn estimate(&mut self, _: &PoseInput<'_>) -> PoseEstimate {
+            *self.0.last_mut().unwrap() += 1;
+            NO_SOURCE
+        }
+    }
+
+    #[test]
+    fn a_source_begins_with_every_vehicle_and_drive_and_sweeps_without_a_pose_are_left_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let scenes = [11_u64, 12].map(|seed| {
+            let out = folder.path().join(seed.to_string());
+            let options = SynthOptions {
+                frames: 3,
+                ..SynthOptions::new(Subset::Town1loc, seed, out.clone())
+            };
+            generate(&options, &|_| {}).unwrap();
+            out
+        });
+        let last = dataset::open(&scenes[1]).unwrap().scenarios.swap_remove(0);
+        let file = last.points_path(0, 0, None).unwrap().with_extension("yaml");
+        let text = std::fs::read_to_string(&file).unwrap();
+        std::fs::write(&file, text.replace("lidar_pose", "other_pose")).unwrap();
+        let options = SweepSelection {
+            scenes: scenes.to_vec(),
+            variant: None,
+            every: 1,
+            sweeps: None,
+        };
+        let mut source = Counting::default();
+        let evaluated = evaluate_source(&mut source, &options, &mut |_, _| ()).unwrap();
+        assert_eq!((source.0, evaluated.left_out.ticks), (vec![3, 2], 1));
     }
 
     #[test]

@@ -24,22 +24,19 @@ impl Coverage {
     /// Coverage of drives, each the positions of its sweeps in the order of time, metres; `None` without sweeps.
     pub(super) fn of(drives: &[Vec<Vector3<f64>>]) -> Option<Self> {
         let all = drives.iter().flatten();
-        let first = all.clone().next()?;
-        let (mut low_m, mut high_m) = ([first.x, first.y], [first.x, first.y]);
-        for position in all.clone() {
-            for axis in 0..2 {
-                low_m[axis] = low_m[axis].min(position[axis]);
-                high_m[axis] = high_m[axis].max(position[axis]);
-            }
-        }
-        let positions_m: Vec<[f64; 2]> = all.clone().map(|place| [place.x, place.y]).collect();
+        let mut places = all.clone().map(|position| position.xy());
+        let positions_m: Vec<[f64; 2]> = places.clone().map(Into::into).collect();
+        let first = places.next()?;
+        let (low_m, high_m) = places.fold((first, first), |(low, high), place| {
+            (low.inf(&place), high.sup(&place))
+        });
         let steps = drives.iter().flat_map(|drive| drive.windows(2));
         let length_m = steps.map(|pair| (pair[1] - pair[0]).norm()).sum();
         Some(Self {
             sweeps: all.count(),
             length_m,
-            low_m,
-            high_m,
+            low_m: low_m.into(),
+            high_m: high_m.into(),
             area: DrivenArea::of(&positions_m),
         })
     }

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use dataset::reasons;
 use nalgebra::Vector3;
 
 pub use coverage::Coverage;
@@ -167,14 +168,7 @@ impl MapMaking<'_> {
     }
 
     fn no_poses(&self, list: &SweepList) -> Error {
-        let first = list.data().problems.into_iter().next();
-        let first = first.map(|first| format!("; first fault: {first}"));
-        Error::Input(format!(
-            "{:?}: none of {} sweeps has a pose{}",
-            self.config.drives,
-            list.len(),
-            first.unwrap_or_default()
-        ))
+        Error::NoSweeps(self.config.drives.clone(), reasons(list.data().problems))
     }
 
     /// Reads the poses and holds sweeps out.

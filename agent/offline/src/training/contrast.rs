@@ -9,7 +9,7 @@ use tch::nn::{self, Init, LinearConfig, Module};
 use tch::{Device, Kind, TchError, Tensor};
 
 use super::pairs::Pair;
-use localization::pgc::{SceneEncoder, VoxelBatch};
+use localization::pgc::{SceneEncoder, VoxelBatch, of_unit_length};
 
 /// Channels of the embedding in which similarity is measured.
 const EMBEDDING: i64 = 64;
@@ -77,7 +77,7 @@ impl Contrast {
         let chosen = |of: Range<usize>| {
             let mut rows = Vec::new();
             for side in of {
-                let first = batch.cell_rows(side).start;
+                let first = batch.cell_rows[side].start;
                 rows.extend(sides[side].rows.iter().map(|&row| first + row as i64));
             }
             let rows = tensor(&rows, &[-1], device)?;
@@ -86,7 +86,8 @@ impl Contrast {
         let anchors = chosen(0..pairs.len())?;
         let partners = chosen(pairs.len()..2 * pairs.len())?;
         let matches = matches(pairs, device)?;
-        let (queries, keys) = (self.embed(&anchors)?, self.embed(&partners)?);
+        let queries = of_unit_length(&self.embedding.forward(&anchors))?;
+        let keys = of_unit_length(&self.embedding.forward(&partners))?;
         let similarities = queries.f_matmul(&keys.f_tr()?)? / TEMPERATURE;
         let logits = similarities + neither(pairs, device)?;
         let log_shares = logits.f_log_softmax(1, Kind::Float)?;
@@ -103,14 +104,6 @@ impl Contrast {
             offset_m: offset.f_double_value(&[])?,
         };
         Ok((total, accuracy))
-    }
-
-    fn embed(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let y = self.embedding.forward(x);
-        let squares = y.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?;
-        // The small number is added under the root, whose gradient is infinite at 0.
-        let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
-        Ok(y / norm)
     }
 
     fn offset_error(

@@ -22,8 +22,8 @@ pub(crate) use kmeans::kmeans;
 pub use pose_regression::{
     PoseRegressionConfig, PoseRegressionSummary, RegressionAccuracy, train_diffloc, train_hypliloc,
 };
+pub use redundancy::LeaveOut;
 pub(crate) use redundancy::Redundancy;
-pub use redundancy::{LeaveOut, RedundancyConfig};
 pub(crate) use scene_training::train_scene_on;
 pub use scene_training::{SceneSummary, SceneTrainConfig, train_scene};
 pub use scene_validation::SceneAccuracy;

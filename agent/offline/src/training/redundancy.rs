@@ -3,44 +3,21 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Choice of the sweeps that are left out.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+/// Choice of the sweeps that are left out: a quarter after each of two windows; the last sixth of the training uses all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum LeaveOut {
     /// Those whose losses vary least (RSD).
-    #[default]
     EvenLoss,
     /// Random ones, as many: the control of RSD.
     Random,
 }
 
-/// Windows of observation and share of sweeps that are left out.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RedundancyConfig {
-    /// Choice of the sweeps.
-    pub leave_out: LeaveOut,
-    /// Seed of a random choice.
-    pub seed: u64,
-    /// Share of each cluster's sweeps that is dropped at the end of a window.
-    pub drop: f64,
-    /// The two windows in which losses are recorded, start and end as shares of the training.
-    pub windows: [[f64; 2]; 2],
-    /// Share of the training from which all sweeps are used again.
-    pub all_from: f64,
-}
-
-impl Default for RedundancyConfig {
-    /// A quarter after each of two windows; the last sixth of the training uses all.
-    fn default() -> Self {
-        Self {
-            leave_out: LeaveOut::EvenLoss,
-            seed: 0,
-            drop: 0.25,
-            windows: [[0.1, 0.25], [0.35, 0.5]],
-            all_from: 0.84,
-        }
-    }
-}
-
+/// Share of each cluster's sweeps that is dropped at the end of a window.
+const DROP: f64 = 0.25;
+/// The two windows in which losses are recorded, start and end as shares of the training.
+const WINDOWS: [[f64; 2]; 2] = [[0.1, 0.25], [0.35, 0.5]];
+/// Share of the training from which all sweeps are used again.
+const ALL_FROM: f64 = 0.84;
 /// Number of passes over a sweep in a window that its variance is computed from, at least.
 const ENOUGH_PASSES: usize = 2;
 
@@ -50,7 +27,9 @@ const ENOUGH_PASSES: usize = 2;
 /// of a window that it has observed long enough itself.
 #[derive(Debug)]
 pub(crate) struct Redundancy {
-    config: RedundancyConfig,
+    leave_out: LeaveOut,
+    /// [`WINDOWS`], but for tests.
+    pub(crate) windows: [[f64; 2]; 2],
     class_of_sweep: Vec<usize>,
     /// Weight of each sweep; 0: not used.
     pub(crate) weights: Vec<f32>,
@@ -61,12 +40,13 @@ pub(crate) struct Redundancy {
 }
 
 impl Redundancy {
-    /// Nothing dropped yet.
-    pub(crate) fn new(config: RedundancyConfig, class_of_sweep: Vec<usize>) -> Self {
+    /// Nothing dropped yet. The seed is that of a random choice.
+    pub(crate) fn new(leave_out: LeaveOut, seed: u64, class_of_sweep: Vec<usize>) -> Self {
         let count = class_of_sweep.len();
         Self {
-            rng: ChaCha8Rng::seed_from_u64(config.seed),
-            config,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+            leave_out,
+            windows: WINDOWS,
             class_of_sweep,
             weights: vec![1.0; count],
             recorded: vec![Vec::new(); count],
@@ -76,7 +56,7 @@ impl Redundancy {
 
     /// True if losses are recorded when this share of the training is done.
     pub(crate) fn watches(&self, share_done: f64) -> bool {
-        let window = self.config.windows.get(self.windows_done);
+        let window = self.windows.get(self.windows_done);
         window.is_some_and(|[from, to]| (*from..*to).contains(&share_done))
     }
 
@@ -97,18 +77,18 @@ impl Redundancy {
 
     /// True if sweeps that were left out are to be used again now, without waiting for the end of a pass.
     pub(crate) fn is_time_for_all(&self, share_done: f64) -> bool {
-        share_done >= self.config.all_from && self.weights.iter().any(|&weight| weight != 1.0)
+        share_done >= ALL_FROM && self.weights.iter().any(|&weight| weight != 1.0)
     }
 
     /// Updates the selection at the end of a pass. True if it has changed.
     pub(crate) fn advance(&mut self, share_done: f64) -> bool {
-        if share_done >= self.config.all_from {
+        if share_done >= ALL_FROM {
             let changes = self.is_time_for_all(share_done);
             self.weights.fill(1.0);
-            self.windows_done = self.config.windows.len();
+            self.windows_done = self.windows.len();
             return changes;
         }
-        let window = self.config.windows.get(self.windows_done);
+        let window = self.windows.get(self.windows_done);
         let is_over = window.is_some_and(|[_, to]| share_done >= *to);
         if is_over {
             let mut recorded = self.recorded.iter();
@@ -128,7 +108,7 @@ impl Redundancy {
     /// others grow. A sweep of unknown variance stays, however many that leaves.
     fn drop_redundant(&mut self) {
         let mut order: Vec<f32> = self.recorded.iter().map(|of| variance(of)).collect();
-        if self.config.leave_out == LeaveOut::Random {
+        if self.leave_out == LeaveOut::Random {
             // A random choice has the same chances: among sweeps of known variance.
             let known = order.iter_mut().filter(|variance| **variance < f32::MAX);
             known.for_each(|place| *place = self.rng.random());
@@ -142,7 +122,7 @@ impl Redundancy {
             // Sweeps of equal variance stay in their order.
             members.sort_by(|&a, &b| order[a].total_cmp(&order[b]));
             let known = members.partition_point(|&sweep| order[sweep] < f32::MAX);
-            let dropped = ((members.len() as f64 * self.config.drop) as usize).min(known);
+            let dropped = ((members.len() as f64 * DROP) as usize).min(known);
             // What stays weighs more, so that each class keeps its share of the loss.
             let kept = (members.len() - dropped) as f32 / members.len().max(1) as f32;
             for (place, &sweep) in members.iter().enumerate() {
@@ -171,7 +151,7 @@ mod tests {
 
     #[test]
     fn the_most_even_quarter_is_left_out_and_the_others_gain_weight() {
-        let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 8]);
+        let mut redundancy = Redundancy::new(LeaveOut::EvenLoss, 0, vec![0; 8]);
         assert!(redundancy.watches(0.2) && !redundancy.watches(0.3));
         for pass in 0..3 {
             let losses: Vec<(usize, f32)> = (0..8)
@@ -199,12 +179,7 @@ mod tests {
 
     /// The sweeps that a random choice leaves out.
     fn left_out(seed: u64) -> Vec<usize> {
-        let config = RedundancyConfig {
-            leave_out: LeaveOut::Random,
-            seed,
-            ..RedundancyConfig::default()
-        };
-        let mut redundancy = Redundancy::new(config, vec![0; 8]);
+        let mut redundancy = Redundancy::new(LeaveOut::Random, seed, vec![0; 8]);
         for _ in 0..2 {
             redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| {
                 (sweep, sweep as f32)
@@ -231,7 +206,7 @@ mod tests {
 
     #[test]
     fn sweeps_that_were_never_observed_stay() {
-        let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0, 0, 0, 0, 1]);
+        let mut redundancy = Redundancy::new(LeaveOut::EvenLoss, 0, vec![0, 0, 0, 0, 1]);
         redundancy.record(&[(0, 1.0), (1, 1.0)]);
         redundancy.record(&[(0, 1.0), (1, 2.0)]);
         redundancy.advance(0.25);
@@ -241,7 +216,7 @@ mod tests {
 
     #[test]
     fn one_pass_gives_no_variance() {
-        let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 8]);
+        let mut redundancy = Redundancy::new(LeaveOut::EvenLoss, 0, vec![0; 8]);
         redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| {
             (sweep, sweep as f32)
         }));

@@ -16,20 +16,11 @@ pub struct BackboneLevel {
 }
 
 impl BackboneLevel {
-    /// Levels in single precision.
-    pub(super) fn in_float(maps: Vec<Tensor>) -> Vec<Self> {
-        let levels = maps.into_iter().map(|values| Self {
-            values,
-            quantisation: None,
-        });
-        levels.collect()
-    }
-
-    /// A level of quantised values.
-    pub(super) fn in_integers(values: Tensor, quantisation: Quantisation) -> Self {
+    /// A level of quantised values; without a quantisation in single precision.
+    pub(super) fn new(values: Tensor, quantisation: Option<Quantisation>) -> Self {
         Self {
             values,
-            quantisation: Some(quantisation),
+            quantisation,
         }
     }
 
@@ -102,7 +93,7 @@ mod tests {
         for (exponent, is_saturated) in [(-3, false), (-4, true), (-5, true), (-12, true)] {
             let quantisation = Quantisation::unsigned(Scale::of_exponent(exponent));
             let values = quantisation.quantise(&map).unwrap();
-            let level = BackboneLevel::in_integers(values, quantisation);
+            let level = BackboneLevel::new(values, Some(quantisation));
             assert_eq!(level.is_saturated().unwrap(), is_saturated, "{exponent}");
         }
     }
@@ -114,13 +105,10 @@ mod tests {
             scale: Scale::of_exponent(-1),
             zero_point: 4,
         };
-        let quantised =
-            BackboneLevel::in_integers(quantisation.quantise(&map).unwrap(), quantisation);
+        let values = quantisation.quantise(&map).unwrap();
+        let quantised = BackboneLevel::new(values, Some(quantisation));
         let cells = Tensor::from_slice(&[5_i64, 0]);
-        for level in [
-            &BackboneLevel::in_float(vec![map.shallow_clone()])[0],
-            &quantised,
-        ] {
+        for level in [BackboneLevel::new(map.shallow_clone(), None), quantised] {
             let expected = Tensor::from_slice2(&[[5.0_f32, 17.0], [0.0, 12.0]]);
             assert_eq!(level.of_cells(&cells).unwrap(), expected);
             assert_eq!(

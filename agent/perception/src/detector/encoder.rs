@@ -113,7 +113,8 @@ impl BevEncoder {
     pub(super) fn levels(&self, canvas: &Tensor) -> tch::Result<Vec<BackboneLevel>> {
         match &self.layers {
             Layers::Float { backbone, .. } => {
-                Ok(BackboneLevel::in_float(backbone.levels_of(canvas, false)))
+                let maps = backbone.levels_of(canvas, false).into_iter();
+                Ok(maps.map(|map| BackboneLevel::new(map, None)).collect())
             }
             Layers::Int8 { backbone, .. } => backbone.levels(canvas),
         }

@@ -56,14 +56,11 @@ pub enum DetectorError {
     /// A detected box that a message refuses.
     #[error("a detected box: {0}")]
     Box(WireError),
-    /// Most values of a level of the backbone are the largest that 8 bits hold.
+    /// Most values of a level of the backbone, by its number from 0, are the largest that 8 bits hold.
     #[error(
-        "most values of level {level} of the backbone exceed 8 bits: the scales of its activations are too small"
+        "most values of level {0} of the backbone exceed 8 bits: the scales of its activations are too small"
     )]
-    Saturated {
-        /// Number of the level, from 0.
-        level: usize,
-    },
+    Saturated(usize),
     /// The output of the head does not fit the anchors.
     #[error(transparent)]
     Decode(#[from] DecodeError),
@@ -77,7 +74,7 @@ impl DetectorError {
     pub fn is_of_frame(&self) -> bool {
         matches!(
             self,
-            Self::NoPoints { .. } | Self::Values { .. } | Self::Box(_) | Self::Saturated { .. }
+            Self::NoPoints { .. } | Self::Values { .. } | Self::Box(_) | Self::Saturated(_)
         )
     }
 }

@@ -75,7 +75,7 @@ impl Int8Backbone {
         let mut levels = Vec::with_capacity(self.blocks.len());
         for (block, &quantisation) in self.blocks.iter().zip(&self.quantisations) {
             x = through(block, x)?;
-            levels.push(BackboneLevel::in_integers(x.shallow_clone(), quantisation));
+            levels.push(BackboneLevel::new(x.shallow_clone(), Some(quantisation)));
         }
         Ok(levels)
     }

@@ -231,7 +231,7 @@ impl Detector {
         // A scale that is far too small leaves the map finite, and wrong.
         for (level, values) in encoded.levels.iter().enumerate() {
             if values.is_saturated()? {
-                return Err(DetectorError::Saturated { level });
+                return Err(DetectorError::Saturated(level));
             }
         }
         Ok(encoded)
@@ -569,7 +569,7 @@ mod tests {
         assert!(encoded_in_integers(0).is_ok());
         let error = encoded_in_integers(10).unwrap_err();
         assert!(
-            matches!(error, DetectorError::Saturated { level: 0 }) && error.is_of_frame(),
+            matches!(error, DetectorError::Saturated(0)) && error.is_of_frame(),
             "{error:?}"
         );
         let message = error.to_string();

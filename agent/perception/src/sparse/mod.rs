@@ -7,11 +7,9 @@
 //! if its cell of 2x2x2 sites has one.
 
 mod conv;
-mod int8_conv;
 mod rulebook;
 mod sites;
 
-pub use conv::SparseConv;
-pub use int8_conv::Int8SparseConv;
+pub use conv::{Int8SparseConv, SparseConv};
 pub use rulebook::{GatherIndex, KERNEL_VOLUME, Rulebook, rows};
 pub use sites::Sites;

@@ -113,7 +113,7 @@ impl Trainer {
         };
         if run.resume {
             let stored: CheckpointState =
-                checkpoint::restore(&checkpoint_path(run), variables, &mut optimizer)?;
+                checkpoint::restore(&run.out.join(CHECKPOINT_FILE), variables, &mut optimizer)?;
             stored.check(&progress)?;
             progress = stored;
         }
@@ -196,7 +196,7 @@ impl Trainer {
     /// [`FileError`] when the file cannot be written.
     pub fn checkpoint(&mut self) -> Result<(), FileError> {
         self.progress.seconds = self.seconds();
-        let path = checkpoint_path(&self.run);
+        let path = self.run.out.join(CHECKPOINT_FILE);
         checkpoint::save(&path, &self.variables, &self.optimizer, &self.progress)
     }
 
@@ -253,10 +253,6 @@ impl Trainer {
             parameters: variables.variables().values().map(Tensor::numel).sum(),
         })
     }
-}
-
-fn checkpoint_path(run: &RunConfig) -> PathBuf {
-    run.out.join(CHECKPOINT_FILE)
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use fusion::Method;
 use runner::fleet::Fleet;
 use runner::run::capacity::estimate;
 use runner::scenario::{FieldOverride, Scenario};
+use serde::Serialize;
 use support::cli::{BadInput, Outcome};
 use support::output;
 use terminal::text_table::TextTable;
@@ -61,12 +62,34 @@ impl Arguments {
             if !self.json {
                 print(&capacity, all.is_empty())?;
             }
-            all.push(capacity);
+            all.push(Costs::of(capacity));
         }
         if self.json {
             output::line(serde_json::to_string_pretty(&all)?)?;
         }
         Ok(Outcome::Done)
+    }
+}
+
+/// Costs of a method, as printed in JSON: in milliseconds, and in units.
+#[derive(Debug, Serialize)]
+struct Costs {
+    #[serde(flatten)]
+    capacity: Capacity,
+    agent_units: f64,
+    ego_units: f64,
+    frame_units: f64,
+}
+
+impl Costs {
+    fn of(capacity: Capacity) -> Self {
+        let in_units = |ms: f64| ms / capacity.unit_ms;
+        Self {
+            agent_units: in_units(capacity.agent_ms),
+            ego_units: in_units(capacity.fuse_ms),
+            frame_units: in_units(capacity.needed_ms),
+            capacity,
+        }
     }
 }
 

@@ -5,19 +5,20 @@ use std::path::{Path, PathBuf};
 use agent::attack::{AttackConfig, Falsification};
 use agent::config::{AgentSettings, ModelConfig, SentBoxes, Threads};
 use agent::rate::RateConfig;
+use anyhow::Context;
 use clap::ArgGroup;
 use dataset::IntensityOption;
 use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{EmulatedLink, Setup};
-use fusion::{Exchange, Method};
+use fusion::Method;
 use indicatif::ProgressBar;
 use link::{CapacityConfig, LatencyModel};
 use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
-use protocol::CodecConfig;
 use protocol::config::Section;
+use protocol::{CodecConfig, Dtype};
 use runner::experiment::evaluation::{OpenedData, Trial, evaluate};
 use runner::experiment::report;
 use runner::experiment::spec::Experiment;
@@ -94,7 +95,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     neighbour_weights: Option<PathBuf>,
     /// Delay of the messages of neighbours, milliseconds.
-    #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
+    #[arg(long, value_name = "MS", default_value_t = 0)]
     delay_ms: u64,
     /// Link emulation between neighbours and ego, in simulation time: a preset of `sim-replay link`, or a file.
     #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay_ms")]
@@ -179,6 +180,10 @@ impl Arguments {
         }
         let trial = self.trial()?;
         let data = OpenedData::open(&trial).map_err(BadInput::of)?;
+        // Before the first is evaluated: weights that are wrong must not cost the results of others.
+        for &method in &self.method {
+            trial.evaluator(&data, method).map_err(BadInput::of)?;
+        }
         let frames = self.method.len() * data.frame_count(trial.scenarios);
         let bar = progress::bar(frames, "frames");
         let mut all = Vec::new();
@@ -207,13 +212,12 @@ impl Arguments {
     fn trial(&self) -> Result<Trial, BadInput> {
         self.pose.0.validate().map_err(BadInput::of)?;
         self.codec.0.validate().map_err(BadInput::of)?;
-        self.check_methods()?;
         if self.rate.0.watch_queue && !self.emulates_link() {
             let reason = "--watch-queue: without --link there is no queue to watch";
             return Err(BadInput::new(reason));
         }
         let intensity_scale = self.intensity.scale;
-        Ok(Trial {
+        let trial = Trial {
             // Required unless --table is given, which does not come here.
             dataset: self.dataset.clone().unwrap_or_default(),
             scenarios: self.scenarios.map(at_most),
@@ -247,43 +251,16 @@ impl Arguments {
             },
             maps: self.feature_maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
-                dtype: self.codec.0.dtype,
+                // Whatever is sent: the cache changes no result.
+                dtype: Dtype::F32,
                 // The folder was asked for by name, so its size has no limit.
                 limit_bytes: u64::MAX,
                 intensity_scale,
             }),
             out: self.out.clone(),
-        })
-    }
-
-    /// Refuses options for messages that none of the methods sends.
-    fn check_methods(&self) -> Result<(), BadInput> {
-        let methods: Vec<&str> = self.method.iter().map(|method| method.name()).collect();
-        let methods = methods.join(", ");
-        let encodes =
-            self.codec.0 != CodecConfig::default() || self.rate.0 != RateConfig::default();
-        let listens = self.attack.is_some() || self.trust || self.delay_ms > 0;
-        let contents: Vec<Exchange> = self.method.iter().map(|one| one.exchange()).collect();
-        let maps = contents.contains(&Exchange::Features);
-        let boxes = contents.contains(&Exchange::Boxes) || self.boxes.is_some();
-        let messages = contents.iter().any(|one| *one != Exchange::Nothing);
-        // With --feature-maps the codec also sets the format of kept maps, whatever is sent.
-        let rule = if encodes && self.feature_maps.is_none() && !maps {
-            "options of the codec and of the rate are for feature maps: METHODS sends none"
-        } else if self.boxes.is_some() && !maps {
-            "--boxes is for methods that exchange feature maps: METHODS does not"
-        } else if self.neighbour_weights.is_some() && !messages {
-            "--neighbour-weights is for messages of neighbours: METHODS receives none"
-        } else if self.box_alignment && !boxes {
-            "--box-alignment is for boxes of neighbours: METHODS receives none"
-        } else if self.attack == Some(Falsification::FalseVelocity) && !boxes {
-            "--attack false_velocity is for boxes of neighbours: METHODS receives none"
-        } else if listens && !messages {
-            "--attack, --trust and --delay-ms are for messages of neighbours: METHODS uses none"
-        } else {
-            return Ok(());
         };
-        Err(BadInput::new(rule.replace("METHODS", &methods)))
+        trial.check(&self.method).map_err(BadInput::of)?;
+        Ok(trial)
     }
 
     fn emulates_link(&self) -> bool {
@@ -349,7 +326,9 @@ fn tables(file: &Path, out: &Path, slices: &SliceArgs) -> anyhow::Result<Outcome
     }
     let slice = slices.slice()?;
     let mut progress = TableProgress(progress::spinner("frames"));
-    let filled = table::run(&experiment, out, slice, &mut progress).map_err(BadInput::of)?;
+    let filled = table::run(&experiment, out, slice, &mut progress)
+        .with_context(|| file.display().to_string())
+        .map_err(BadInput::of)?;
     progress.0.finish_and_clear();
     if let Some(slice) = slice {
         output::note(format_args!(

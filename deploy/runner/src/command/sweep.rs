@@ -21,7 +21,7 @@ pub(crate) struct Arguments {
     /// Number of compute processes, each with one thread. The results do not depend on it.
     #[arg(long, default_value_t = 1, conflicts_with = "print", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: u16,
-    /// Only print the number of runs and the time that they will take; nothing is written.
+    /// Only print the number of runs, and the time that they will take where the data set exists; nothing is written.
     #[arg(long, conflicts_with_all = ["slice", "print"])]
     dry_run: bool,
     /// Keep the feature maps of all sweeps after the last run: a grid that is extended later needs no encoding again.

@@ -6,10 +6,11 @@ use anyhow::{Result, anyhow, bail, ensure};
 use bus::InboxConfig;
 use dataset::Scenario;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
-use fusion::Exchange;
+use fusion::{Exchange, Method};
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 
-use super::spec::{CodecSpec, Experiment, Grid};
+use super::evaluation::Trial;
+use super::spec::{CodecSpec, Experiment, Grid, Table};
 use super::sweep::grid::{count, sizes};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
@@ -83,11 +84,33 @@ fn tables(experiment: &Experiment) -> Result<()> {
             let field = format!("table {name:?}: vehicles");
             number(&field, vehicles as f64, 1.0, 64.0)?;
         }
+        check_effects(experiment, table)?;
         let is_late = table.columns.iter().any(|column| column.delay_ms > 0);
         ensure!(
             experiment.link.is_none() || !is_late,
             "table {name:?}: delay_ms and link contradict each other"
         );
+    }
+    Ok(())
+}
+
+/// Refuses settings of a row that have no effect with its method, and settings of a column that have none in any row.
+fn check_effects(experiment: &Experiment, table: &Table) -> Result<()> {
+    let name = &table.name;
+    for row in &table.rows {
+        let mut trial = Trial::default();
+        row.apply(&mut trial.setup);
+        let checked = trial.check(&[row.method]);
+        checked.map_err(|problem| anyhow!("table {name:?}, row {}: {problem}", row.label()))?;
+    }
+    let methods: Vec<Method> = table.rows.iter().map(|row| row.method).collect();
+    for column in &table.columns {
+        let mut trial = Trial::default();
+        trial.setup.ego = experiment.ego.clone();
+        trial.setup.agents.boxes = table.rows.iter().find_map(|row| row.boxes);
+        column.apply(&mut trial.setup);
+        let checked = trial.check(&methods);
+        checked.map_err(|problem| anyhow!("table {name:?}, column {}: {problem}", column.name))?;
     }
     Ok(())
 }
@@ -104,23 +127,19 @@ fn check_name(field: &str, name: &str) -> Result<()> {
     Ok(())
 }
 
-/// Checks everything that depends on the data.
-pub(super) fn check_scenes<'a>(
-    experiment: &Experiment,
+/// Refuses a number of vehicles among `asked` that one of the scenarios does not have.
+pub(super) fn check_vehicles<'a>(
+    field: &str,
+    asked: impl Iterator<Item = usize>,
     scenarios: impl IntoIterator<Item = &'a Scenario>,
 ) -> Result<()> {
-    for scenario in scenarios {
-        let found = scenario.agents.len();
-        let rows = experiment.tables.iter().flat_map(|table| &table.rows);
-        let of_rows = rows.filter_map(|row| Some(("a row's vehicles", row.vehicles?)));
-        let of_grid = experiment.grid.vehicles.iter().flatten();
-        let mut asked = of_grid
-            .map(|count| ("grid.vehicles", *count))
-            .chain(of_rows);
-        if let Some((field, asked)) = asked.find(|(_, asked)| *asked > found) {
-            let name = &scenario.name;
-            bail!("{field} is {asked}, but scenario {name} has {found} vehicles");
-        }
+    let asked = asked.max().unwrap_or(0);
+    for Scenario { name, agents, .. } in scenarios {
+        let found = agents.len();
+        ensure!(
+            asked <= found,
+            "{field} is {asked}, but scenario {name} has {found} vehicles"
+        );
     }
     Ok(())
 }
@@ -207,10 +226,14 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
     );
     let has_seeds = grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1);
     ensure!(
-        !has_seeds || is_random(grid, link),
+        !has_seeds || is_random(experiment, link),
         "grid.seed has several values, but nothing in the experiment is random"
     );
-    Ok(())
+    let mut trial = Trial::default();
+    trial.setup.ego = experiment.ego.clone();
+    let mut codecs = grid.codec.iter().flatten();
+    trial.setup.agents.boxes = codecs.find_map(|codec| codec.boxes);
+    trial.check(&[&grid.method[..], &grid.reference].concat())
 }
 
 /// Contradictions between the axes of a link, its own settings, and the times of the ego.
@@ -250,19 +273,31 @@ fn link_axes(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
     Ok(())
 }
 
-/// True if a seed makes a difference, by the axes of the grid or by the link.
-fn is_random(grid: &Grid, link: &LinkConfig) -> bool {
+/// True if a seed makes a difference, by the axes of the grid, the pose source or the link.
+fn is_random(Experiment { grid, poses, .. }: &Experiment, link: &LinkConfig) -> bool {
     let (mut loss, mut noise) = (grid.loss.iter().flatten(), grid.pose_noise.iter().flatten());
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
     // A loss of 0 or 1 is certain, whatever the seed.
     let loses = loss.any(|share| *share > 0.0 && *share < 1.0);
     let errs = noise.any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
+    let is_noisy = match poses {
+        PoseSourceConfig::Noisy(noisy) if noisy.mode == NoiseMode::Replayed => true,
+        PoseSourceConfig::Noisy(noisy) => noisy.position_std_m.max(noisy.heading_std_deg) > 0.0,
+        _ => false,
+    };
     let is_steady = matches!(
         link.latency,
         LatencyModel::None | LatencyModel::ConstantMs(_) | LatencyModel::Trace
     );
     let (has_loss, reorders) = (link.loss != LossModel::None, link.reorder.is_some());
-    jitters || loses || errs || !is_steady || has_loss || reorders || link.duplicate > 0.0
+    jitters
+        || loses
+        || errs
+        || is_noisy
+        || !is_steady
+        || has_loss
+        || reorders
+        || link.duplicate > 0.0
 }
 
 /// Checks each value of an axis: at least one, and no duplicates.
@@ -281,7 +316,7 @@ fn values<T: PartialEq + Debug>(
     Ok(())
 }
 
-fn number(field: &str, value: f64, low: f64, high: f64) -> Result<()> {
+pub(super) fn number(field: &str, value: f64, low: f64, high: f64) -> Result<()> {
     // NaN is in no range, so it is refused here.
     let is_allowed = (low..=high).contains(&value);
     ensure!(is_allowed, "{field} is {value}, must be {low} to {high}");
@@ -375,6 +410,58 @@ mod tests {
             let problem = problem(text);
             assert!(problem.contains(message), "{text}: {problem}");
         }
+    }
+
+    #[test]
+    fn a_table_refuses_what_an_evaluation_refuses() {
+        let of = |rows: &str, column: &str| {
+            problem(&format!(
+                "tables: [{{name: t, rows: [{rows}], columns: [{{name: c{column}}}]}}]"
+            ))
+        };
+        let late = ", delay_ms: 100, trust: true";
+        assert_eq!(of("{method: none}, {method: max, boxes: only}", late), "");
+        for (rows, column, message) in [
+            (
+                "{method: max}",
+                ", attack: {falsification: false_velocity}",
+                "table \"t\", column c: attack false_velocity is for boxes",
+            ),
+            (
+                "{method: max}",
+                ", delay_ms: 20000",
+                "table \"t\", column c: delay_ms is 20000, must be 0 to 10000",
+            ),
+            (
+                "{method: max}",
+                ", attack: {falsification: noise, attackers: 0}",
+                "attackers is 0, must be 1 or more",
+            ),
+            (
+                "{method: max}, {method: none, boxes: only}",
+                "",
+                "row none: boxes is for methods that exchange feature maps: none does not",
+            ),
+            ("{method: late, boxes: only}", "", "row late: boxes is for"),
+            ("{method: none}", late, "none uses none"),
+        ] {
+            let problem = of(rows, column);
+            assert!(problem.contains(message), "{rows} {column}: {problem}");
+        }
+        let of_sweep = problem("ego: {trust: true}\ngrid: {method: [none]}");
+        assert!(of_sweep.contains("none uses none"), "{of_sweep}");
+    }
+
+    #[test]
+    fn noisy_poses_are_random() {
+        let of = |std_m: f64| {
+            let poses = format!("{{noisy: {{position_std_m: {std_m}, heading_std_deg: 0}}}}");
+            problem(&format!(
+                "poses: {poses}\ngrid: {{method: [max], seed: [1, 2]}}"
+            ))
+        };
+        assert_eq!(of(0.5), "");
+        assert!(of(0.0).contains("nothing in the experiment is random"));
     }
 
     #[test]

@@ -2,12 +2,15 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::ops::ControlFlow;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use agent::attack::Falsification;
 use agent::config::AgentSettings;
-use anyhow::{Context, Result, anyhow, ensure};
+use agent::rate::RateConfig;
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario, findings};
 use deploy::score::FrameScores;
@@ -15,9 +18,8 @@ use deploy::score::metrics::{Messages, Metrics};
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{Evaluator, Setup};
 use fusion::{Exchange, Method};
-use perception::int8::InferencePrecision;
 use perception::weights::Weights;
-use protocol::{Counts, Stream, Topic};
+use protocol::{CodecConfig, Stream, Topic};
 use support::cli::NotWritten;
 use support::file_digests::FileDigests;
 use support::provenance::Provenance;
@@ -27,6 +29,7 @@ use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
+use crate::experiment::check::number;
 use crate::experiment::frame_files::{self, FrameFiles};
 use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
@@ -121,26 +124,6 @@ impl OpenedData {
 }
 
 impl Trial {
-    fn metrics(
-        &self,
-        scores: &FrameScores,
-        evaluator: &Evaluator,
-        provenance: Provenance,
-        began: Instant,
-    ) -> Metrics {
-        // Over a link the time of the scene passes. Without one only the time of computing is known.
-        let (clock, seconds) = match self.setup.link {
-            Some(_) => ("stepped", scores.seconds()),
-            None => ("offline", began.elapsed().as_secs_f64()),
-        };
-        let poses = self.setup.agents.pose.name();
-        let metrics = metrics(scores, evaluator, clock, poses, seconds);
-        Metrics {
-            provenance: Some(provenance.with_command()),
-            ..metrics
-        }
-    }
-
     /// Identity of the result of a method: these settings, and the digests of all that they are applied to.
     ///
     /// # Errors
@@ -169,6 +152,62 @@ impl Trial {
         })
     }
 
+    /// Refuses settings that have no effect with any of these methods, and values out of range.
+    ///
+    /// # Errors
+    /// An error that names the setting.
+    pub fn check(&self, methods: &[Method]) -> Result<()> {
+        let setup = &self.setup;
+        let attackers = setup.attack.map(|attack| attack.attackers);
+        ensure!(attackers != Some(0), "attackers is 0, must be 1 or more");
+        number("delay_ms", setup.delay_ms as f64, 0.0, 10_000.0)?;
+        let names: Vec<&str> = methods.iter().map(|method| method.name()).collect();
+        let contents: Vec<Exchange> = methods.iter().map(|one| one.exchange()).collect();
+        let maps = contents.contains(&Exchange::Features);
+        let boxes = contents.contains(&Exchange::Boxes) || setup.agents.boxes.is_some();
+        let messages = contents.iter().any(|one| *one != Exchange::Nothing);
+        let listens = setup.attack.is_some() || setup.ego.trust || setup.delay_ms > 0;
+        let falsified = setup.attack.map(|attack| attack.falsification);
+        let AgentSettings { codec, rate, .. } = &setup.agents;
+        let encodes = *codec != CodecConfig::default() || *rate != RateConfig::default();
+        let rule = if encodes && !maps {
+            "options of the codec and of the rate are for feature maps: METHODS sends none"
+        } else if setup.agents.boxes.is_some() && !maps {
+            "boxes is for methods that exchange feature maps: METHODS does not"
+        } else if setup.agents.weights.is_some() && !messages {
+            "neighbour_weights is for messages of neighbours: METHODS receives none"
+        } else if setup.ego.box_alignment && !boxes {
+            "box_alignment is for boxes of neighbours: METHODS receives none"
+        } else if falsified == Some(Falsification::FalseVelocity) && !boxes {
+            "attack false_velocity is for boxes of neighbours: METHODS receives none"
+        } else if listens && !messages {
+            "attack, trust and delay_ms are for messages of neighbours: METHODS uses none"
+        } else {
+            return Ok(());
+        };
+        bail!(rule.replace("METHODS", &names.join(", ")))
+    }
+
+    /// The evaluator of a method, with its weights.
+    ///
+    /// # Errors
+    /// An error that names the file that is missing, cannot be read, or is of another method.
+    pub fn evaluator(&self, data: &OpenedData, method: Method) -> Result<Evaluator> {
+        let mut setup = Setup {
+            method: Some(method),
+            protocol: Some(data.protocol.clone()),
+            ..self.setup.clone()
+        };
+        setup.models.weights = self.weights(method)?;
+        Ok(Evaluator::new(setup)?)
+    }
+
+    /// File of the weights of a method.
+    fn weights(&self, method: Method) -> Result<PathBuf> {
+        let weights = &self.setup.models.weights;
+        Ok(weights_of(weights, method, self.sends_boxes())?)
+    }
+
     /// Settings of all vehicles, then those of single ones.
     fn settings(&self) -> impl Iterator<Item = &AgentSettings> {
         std::iter::once(&self.setup.agents).chain(self.setup.vehicles.values())
@@ -184,8 +223,7 @@ impl Trial {
         let setup = &self.setup;
         let link = setup.link.as_ref();
         let link = link.map(|link| (&link.config, link.folder.as_path()));
-        let weights = weights_of(&setup.models.weights, method, self.sends_boxes())?;
-        let files = files_of(method, weights, self.settings(), link);
+        let files = files_of(method, self.weights(method)?, self.settings(), link);
         let data_sha256 = data.sha256(self.scenarios, setup.lidar_variant.as_deref());
         let (commit, digests) = (env!("V2VLOC_COMMIT"), &data.digests);
         let collected = Provenance::collect(&[], data_sha256, files, commit, digests);
@@ -194,7 +232,8 @@ impl Trial {
 }
 
 /// Evaluates one method over the chosen scenarios, the first vehicle of each being the ego; `on_frame` is called after
-/// every frame. Frames and parts that cannot be read are left out and counted in [`Metrics::left_out`].
+/// every frame. Frames and parts that cannot be read, and ticks without the ego's true pose, are left out and counted in
+/// [`Metrics::left_out`].
 ///
 /// # Errors
 /// An error when no frame can be evaluated.
@@ -204,10 +243,7 @@ pub fn evaluate(
     method: Method,
     on_frame: &mut dyn FnMut(),
 ) -> Result<Metrics> {
-    let began = Instant::now();
-    let (scores, evaluator) = judged(trial, data, method, on_frame)?;
-    let provenance = trial.provenance(data, method)?;
-    let metrics = trial.metrics(&scores, &evaluator, provenance, began);
+    let metrics = compute(trial, data, trial.key(data, method)?, on_frame)?.metrics;
     if let Some(out) = &trial.out {
         frame_files::write_metrics(out, method, &metrics)?;
     }
@@ -226,21 +262,23 @@ pub fn compute(
 ) -> Result<Cell> {
     let began = Instant::now();
     let (scores, evaluator) = judged(trial, data, key.method, on_frame)?;
-    let mut messages = Counts::default();
-    for (account, counts) in evaluator.ledger().iter() {
-        let is_pose =
-            matches!(&account.topic, Topic::Stream { stream, .. } if *stream == Stream::Pose);
-        if !is_pose {
-            messages.add(counts);
-        }
-    }
+    let is_pose =
+        |topic: &Topic| matches!(topic, Topic::Stream { stream, .. } if *stream == Stream::Pose);
+    let messages = Messages::of_evaluation(evaluator.ledger(), |topic| !is_pose(topic));
     let used = scores.records().iter().map(|record| record.fused as u64);
-    let provenance = key.provenance.clone();
+    // Over a link the time of the scene passes. Without one only the time of computing is known.
+    let (clock, seconds) = match trial.setup.link {
+        Some(_) => ("stepped", scores.seconds()),
+        None => ("offline", began.elapsed().as_secs_f64()),
+    };
+    let poses = trial.setup.agents.pose.name();
+    let mut metrics = metrics(&scores, &evaluator, clock, poses, seconds);
+    metrics.provenance = Some(key.provenance.clone().with_command());
     Ok(Cell {
         key,
-        metrics: trial.metrics(&scores, &evaluator, provenance, began),
+        metrics,
         used: used.sum(),
-        messages: Messages::of(&messages),
+        messages,
         wall_seconds: began.elapsed().as_secs_f64(),
     })
 }
@@ -252,20 +290,11 @@ fn judged(
     method: Method,
     on_frame: &mut dyn FnMut(),
 ) -> Result<(FrameScores, Evaluator)> {
-    let weights = &trial.setup.models.weights;
-    let weights = weights_of(weights, method, trial.sends_boxes())?;
-    let mut setup = Setup {
-        method: Some(method),
-        protocol: Some(data.protocol.clone()),
-        ..trial.setup.clone()
-    };
-    setup.models.weights.clone_from(&weights);
-    let precision = setup.models.precision;
-    let mut evaluator = Evaluator::new(setup)?;
+    let mut evaluator = trial.evaluator(data, method)?;
     let kept = trial.maps.as_ref();
     // Early fusion encodes merged clouds, for which maps of single sweeps are of no use.
     if let Some(kept) = kept.filter(|_| method.exchange() != Exchange::Points) {
-        evaluator = evaluator.with_maps(maps(kept, &weights, precision, data)?);
+        evaluator = evaluator.with_maps(maps(trial, kept, data, method)?);
     }
     let findings = findings::sampled(&data.scenarios, trial.intensity_scale);
     evaluator.add_data_set(&data.problems, findings);
@@ -281,16 +310,15 @@ fn judged(
         let Some(ego) = scenario.agents.first() else {
             continue;
         };
-        ensure!(
-            scenario.has_poses(0, 0),
-            "scenario {} has no true poses of the ego {ego}: its results cannot be evaluated",
-            scenario.name
-        );
         // One set of scores over all scenarios: AP orders the detections of all frames together.
         let scores = scores
             .get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
         scores.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
+            // It is counted as left out.
+            if frame.frames[0].world_from_lidar.is_none() {
+                return ControlFlow::Continue(());
+            }
             let mut files = files.iter_mut();
             let written = files.try_for_each(|files| files.add(&scenario.name, &frame));
             judge(scores, frame, is_timed);
@@ -312,13 +340,9 @@ fn judged(
 }
 
 /// Feature maps of all sweeps, from the cache or encoded now.
-fn maps(
-    kept: &KeptMaps,
-    weights: &Path,
-    precision: InferencePrecision,
-    data: &OpenedData,
-) -> Result<MapSource> {
-    let weights = Arc::new(Weights::load(weights)?.with_precision(precision));
+fn maps(trial: &Trial, kept: &KeptMaps, data: &OpenedData, method: Method) -> Result<MapSource> {
+    let weights = Weights::load(&trial.weights(method)?)?;
+    let weights = Arc::new(weights.with_precision(trial.setup.models.precision));
     fs::create_dir_all(&kept.folder).with_context(|| NotWritten(kept.folder.clone()))?;
     let (scenarios, digests) = (&data.scenarios, &data.digests);
     let store = FeatureStore::open(kept, &weights, scenarios, digests, 1, &mut |_, _| {})?;

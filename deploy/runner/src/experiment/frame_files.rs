@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io::ErrorKind;
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, Result};
 
@@ -14,7 +14,8 @@ use deploy::score::metrics::{self, Metrics};
 use ego_fuser_offline::evaluation::EvaluatedFrame;
 use fusion::Method;
 use support::atomic_file;
-use support::cli::NotWritten;
+use support::cli::{BadInput, NotWritten};
+use support::file_error::check_folder;
 
 use crate::experiment::cell::file_name;
 use crate::frame_lines::FrameLines;
@@ -22,7 +23,6 @@ use crate::frame_lines::FrameLines;
 /// Files of one method in a folder of its own: `detections.jsonl`, `tracks.jsonl`, `truth.jsonl`, `frames.csv`,
 /// `precision_recall.csv` and, at the end, `metrics.json`. The first three are those of a run, with the name of the scenario.
 pub(crate) struct FrameFiles {
-    folder: PathBuf,
     lines: FrameLines,
     /// Scenario of each frame so far.
     scenarios: Vec<String>,
@@ -34,6 +34,7 @@ impl FrameFiles {
     /// # Errors
     /// An error when there are such files already, or they cannot be written.
     pub(crate) fn create(out: &Path, method: Method) -> Result<Self> {
+        check_folder(out).map_err(|error| BadInput::new(format!("--out {error}")))?;
         let folder = out.join(file_name(method));
         let lines = atomic_file::create_folder(out)
             .and_then(|()| fs::create_dir(&folder))
@@ -47,7 +48,6 @@ impl FrameFiles {
                 _ => anyhow::Error::from(error).context(NotWritten(folder.clone())),
             })?;
         Ok(Self {
-            folder,
             lines,
             scenarios: Vec::new(),
         })
@@ -64,7 +64,7 @@ impl FrameFiles {
     /// # Errors
     /// An error with the first error of the operating system.
     pub(crate) fn finish(self, scores: &FrameScores) -> Result<()> {
-        let folder = self.folder;
+        let folder = self.lines.folder.clone();
         let frames = frames_csv(scores.records(), &BTreeMap::new(), Some(&self.scenarios));
         let curve = scores.precision_recall_csv();
         self.lines

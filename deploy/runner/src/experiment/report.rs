@@ -83,8 +83,7 @@ pub fn run_notes(result: &RunResult) -> String {
         count => format!("{count} accounts do not add up, see ledger.json"),
     };
     lines.push(format!("ledger    {verdict}"));
-    let unreceived = result.balance.unreceived.iter();
-    let unreceived: u64 = unreceived.map(|topic| topic.messages).sum();
+    let unreceived = messages.unreceived;
     if unreceived > 0 {
         lines.push(format!(
             "topics    {unreceived} messages on topics without a receiver, see ledger.json"

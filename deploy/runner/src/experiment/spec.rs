@@ -9,7 +9,7 @@ use dataset::IntensityScale;
 use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
-use ego_fuser_offline::evaluation::{EmulatedLink, Setup};
+use ego_fuser_offline::evaluation::{AgentPool, EmulatedLink, Setup};
 use fusion::Method;
 use link::LinkError;
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
@@ -287,11 +287,12 @@ impl Experiment {
         self.link.as_deref().or(of_grid)
     }
 
-    /// A cache of feature maps in this folder.
-    pub(super) fn kept_maps(&self, folder: &Path, dtype: Dtype) -> KeptMaps {
+    /// A cache of feature maps in this folder. Kept in 32 bits whatever is sent, so that it changes no result and serves
+    /// all encodings.
+    pub(super) fn kept_maps(&self, folder: &Path) -> KeptMaps {
         KeptMaps {
             folder: folder.to_owned(),
-            dtype,
+            dtype: Dtype::F32,
             limit_bytes: (self.feature_maps_limit_gb * 1e9) as u64,
             intensity_scale: IntensityScale::AUTO,
         }
@@ -320,7 +321,24 @@ impl Experiment {
     }
 }
 
+impl Column {
+    /// Sets what the column states beside poses; what the experiment has switched on stays on.
+    pub(super) fn apply(&self, setup: &mut Setup) {
+        setup.delay_ms = self.delay_ms;
+        setup.attack = self.attack;
+        setup.ego.trust |= self.trust;
+    }
+}
+
 impl Row {
+    /// The same for the row.
+    pub(super) fn apply(&self, setup: &mut Setup) {
+        setup.pool = self.vehicles.map_or(AgentPool::All, AgentPool::First);
+        setup.agents.boxes = self.boxes;
+        setup.agents.weights.clone_from(&self.neighbour_weights);
+        setup.ego.box_alignment |= self.box_alignment;
+    }
+
     /// First column of the row.
     pub fn label(&self) -> String {
         let name = self.name.as_deref();

@@ -21,13 +21,16 @@ use sim_replay::config::{
 use super::Fleet;
 use crate::scenario::Clock;
 
+/// Result of planning: a [`RunFolderError`] if nothing else is named.
+type Result<T, E = RunFolderError> = std::result::Result<T, E>;
+
 /// Session context of the processes: run, router endpoint, program folder and run folder.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct SessionContext<'a> {
     /// The run that they join.
     pub run: &'a RunId,
     /// Endpoint of the router.
-    pub endpoint: &'a Endpoint,
+    pub endpoint: Endpoint,
     /// Keys of the processes, if the run has security.
     pub keys: Option<&'a RunKeys>,
     /// Folder of the programs.
@@ -41,10 +44,7 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn processes(
-        &self,
-        context: &SessionContext<'_>,
-    ) -> Result<Vec<ProcessSpec>, RunFolderError> {
+    pub fn processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>> {
         let mut planner = self.planner(context)?;
         let (ego, link) = (format!("ego-{}", self.ego), format!("link-{}", self.ego));
         planner.plan(ego, "ego-fuser run", RestartPolicy::Service, |bus| {
@@ -76,19 +76,11 @@ impl Fleet {
         Ok(planner.specs)
     }
 
-    /// The agents that this run starts. Writes their configurations.
+    /// A plan of the agents that this run starts, for further processes. Writes their configurations.
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub(crate) fn agent_processes(
-        &self,
-        context: &SessionContext<'_>,
-    ) -> Result<Vec<ProcessSpec>, RunFolderError> {
-        Ok(self.planner(context)?.specs)
-    }
-
-    /// A plan of the agents that this run starts, for further processes.
-    fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Result<Planner<'a>, RunFolderError> {
+    pub(crate) fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Result<Planner<'a>> {
         let wanted_mib = self.scenario.network.shared_memory_mib;
         // At most: agents, ego and replay, and link and recorder where there are such.
         let recorders = usize::from(self.scenario.record.is_some());
@@ -208,12 +200,13 @@ impl Fleet {
 }
 
 /// Processes planned so far, and the settings that the next one shares with them.
-struct Planner<'a> {
+pub(crate) struct Planner<'a> {
     context: &'a SessionContext<'a>,
     bus: BusConfig,
     /// Metrics address of the previous process; the next one takes the port after it.
     metrics: Option<SocketAddr>,
-    specs: Vec<ProcessSpec>,
+    /// The processes.
+    pub(crate) specs: Vec<ProcessSpec>,
 }
 
 impl Planner<'_> {
@@ -224,7 +217,7 @@ impl Planner<'_> {
         command: &str,
         life: RestartPolicy,
         config: impl FnOnce(BusConfig) -> C,
-    ) -> Result<(), RunFolderError> {
+    ) -> Result<()> {
         self.metrics = self.metrics.and_then(|previous| {
             let port = previous.port().checked_add(1)?;
             Some(SocketAddr::new(previous.ip(), port))

@@ -23,16 +23,15 @@ impl Fleet {
             method: Some(scenario.method),
             agents: scenario.agents.clone(),
             vehicles: vehicles.collect(),
-            attack: None,
             ego: scenario.ego.clone(),
             link: Some(EmulatedLink::open(&link.model, link.seed)?),
-            delay_ms: 0,
             compute: compute.unwrap_or_default(),
             protocol: Some(self.protocol.clone()),
             pool: AgentPool::Named(pool.cloned().collect()),
             seek: scenario.scene.seek,
             frames: self.ticks,
             lidar_variant: scenario.scene.variant.clone(),
+            ..Setup::default()
         })
     }
 }

@@ -45,9 +45,9 @@ impl AgentProcesses {
         programs: &Path,
     ) -> Result<(Self, RemotePool), RunError> {
         let keys = fleet.keys(folder)?;
-        let context = SessionContext {
+        let mut context = SessionContext {
             run,
-            endpoint: &fleet.scenario.network.endpoint(keys.is_some())?,
+            endpoint: fleet.scenario.network.endpoint(keys.is_some())?,
             keys: keys.as_ref(),
             programs,
             folder,
@@ -55,11 +55,8 @@ impl AgentProcesses {
         let (events, happened) = channel();
         let stop = Stop::new();
         // A restarted router has lost messages, and the result would depend on the time of the crash.
-        let router = Router::start(&fleet.scenario.network, &context, 0, &events, &stop)?;
-        let specs = fleet.agent_processes(&SessionContext {
-            endpoint: &router.place.endpoint,
-            ..context
-        })?;
+        let router = Router::start(&fleet.scenario.network, &mut context, 0, &events, &stop)?;
+        let specs = fleet.planner(&context)?.specs;
         // Before any process starts: receivers reject the messages of two fleets of one name.
         check_free(&router.place, &fleet.scenario.network, run, &specs)?;
         let process = ProcessId::new(NAME).expect("lower-case letters");

@@ -26,6 +26,9 @@ pub(crate) const BUDGET: Duration = Duration::from_millis(600);
 /// ([`Capacity::unit_ms`]): 58 ms for 5.0 MB where a unit takes 19.4 ms (EPYC 7003, AVX2). The report of a run shows the
 /// parts.
 const UNITS_PER_MB: f64 = 0.6;
+/// Share of all cores' time that a run can use: the processes of a frame wait for each other. Without it eight runs near
+/// or above a machine's limit answered 1 to 19 % fewer frames than expected, with it 10 % fewer to 5 % more.
+const USABLE_SHARE: f64 = 0.9;
 
 /// Compute times of a fleet's processes on this machine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -193,7 +196,7 @@ fn capacity_of(
     // Neither an agent nor the ego computes two frames at once.
     // CPU time divided by the free share is the time that passes.
     let longest_ms = agent_ms.max(fuse_ms) / free_share;
-    let expected_share = (available_ms / needed_ms)
+    let expected_share = (USABLE_SHARE * available_ms / needed_ms)
         .min(period_ms / longest_ms)
         .min(1.0);
     Capacity {
@@ -295,13 +298,19 @@ mod tests {
         assert_eq!(map_bytes(&settings, values), 0);
     }
 
-    /// Measured on two cores of an EPYC 7003, AVX2, while both compute: an agent takes 42 ms and the ego 89; a run took
-    /// 240 ms of CPU per frame of 200 ms.
+    /// Measured on two cores of an EPYC 7003, AVX2, while both compute: an agent takes 42 ms and the ego 89.
     #[test]
-    fn a_run_that_needs_240_of_200_ms_answers_50_of_60_frames() {
+    fn a_run_that_needs_232_of_200_ms_answers_47_of_60_frames() {
         let capacity = capacity_with(2, [42.3, 89.1, 1.0], 5.0, 19.4);
         assert!((capacity.needed_ms - 232.0).abs() < 1.0, "{capacity:?}");
-        assert_eq!((60.0 * capacity.expected_share).round(), 52.0);
+        assert_eq!((60.0 * capacity.expected_share).round(), 47.0);
+    }
+
+    #[test]
+    fn a_machine_without_reserve_does_not_keep_up() {
+        // 2 x 60 + 70 + 10 ms in 2 x 100 ms.
+        let capacity = capacity(2, 60.0, 70.0, 1.0);
+        assert!((capacity.expected_share - 0.9).abs() < 1e-9 && !capacity.keeps_up());
     }
 
     #[test]
@@ -326,10 +335,10 @@ mod tests {
     fn all_cores_together_and_each_process_alone_limit_the_pace() {
         // 2 x 100 + 100 + 10 ms in 2 x 100 ms.
         let together = capacity(2, 100.0, 100.0, 1.0);
-        assert!((together.expected_share - 200.0 / 310.0).abs() < 1e-9 && !together.keeps_up());
-        assert!((together.relative_rate() - 0.6).abs() < 1e-9);
+        assert!((together.expected_share - 180.0 / 310.0).abs() < 1e-9 && !together.keeps_up());
+        assert!((together.relative_rate() - 0.55).abs() < 1e-9);
         // Other programs leave 60 % of the cores.
-        assert!((capacity(2, 100.0, 100.0, 0.6).expected_share - 120.0 / 310.0).abs() < 1e-9);
+        assert!((capacity(2, 100.0, 100.0, 0.6).expected_share - 108.0 / 310.0).abs() < 1e-9);
         // Many cores do not help an agent that needs 160 ms for a sweep.
         assert!((capacity(16, 160.0, 50.0, 1.0).expected_share - 100.0 / 160.0).abs() < 1e-9);
     }

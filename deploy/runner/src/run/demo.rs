@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context, Result};
 use dataset::LoadOptions;
 use deploy::score::{FrameScores, JudgedFrame};
 use protocol::{CavId, Pose};
@@ -23,12 +24,9 @@ pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> 
     }
 }
 
-fn try_draw(
-    fleet: &Fleet,
-    frame: &JudgedFrame,
-    path: &Path,
-) -> Result<(), Box<dyn std::error::Error>> {
-    let world_from_ego = pose_of(frame, &fleet.ego).ok_or("the truth names no pose of the ego")?;
+fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<()> {
+    let world_from_ego =
+        pose_of(frame, &fleet.ego).context("the truth names no pose of the ego")?;
     let scenario = &fleet.recorded;
     let options = LoadOptions {
         lidar_variant: fleet.scenario.scene.variant.clone(),

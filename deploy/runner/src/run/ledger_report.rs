@@ -8,17 +8,17 @@ use protocol::{Counts, Ledger, Reconciliation};
 use serde::Serialize;
 
 /// Message accounting of a run.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Default, Serialize)]
 pub(crate) struct LedgerReport {
     /// True if every message that was sent is received, dropped for a reason, or in flight.
     pub balances: bool,
     /// Discrepancies, and topics without subscribers.
     pub balance: Reconciliation,
     /// Processes that were offline for some time.
-    pub away: BTreeSet<String>,
+    pub offline: BTreeSet<String>,
     /// Number of messages that are exempt from reconciliation, because one of those was offline.
     pub exempted: u64,
-    /// Sum over all accounts.
+    /// Sum over all receivers.
     pub total: Counts,
     /// Sum over all processes, by topic and receiver.
     pub sum: Ledger,
@@ -30,27 +30,4 @@ pub(crate) struct LedgerReport {
     pub causes: Vec<String>,
     /// Last report of each process; a restarted one has an entry per instance.
     pub processes: Vec<ProcessStats>,
-}
-
-impl LedgerReport {
-    /// Report on `ledgers`, whose sum is `sum`; processes that were offline, and the number of messages exempt for
-    /// that.
-    pub(crate) fn new(
-        ledgers: &[ProcessStats],
-        sum: &Ledger,
-        balance: &Reconciliation,
-        (away, exempted): (&BTreeSet<String>, u64),
-    ) -> Self {
-        Self {
-            balances: balance.is_exact(),
-            balance: balance.clone(),
-            away: away.clone(),
-            exempted,
-            total: sum.total(),
-            sum: sum.clone(),
-            refused: Vec::new(),
-            causes: Vec::new(),
-            processes: ledgers.to_vec(),
-        }
-    }
 }

@@ -13,4 +13,5 @@ mod run_error;
 pub mod run_fleet;
 pub mod stepped;
 
+pub(crate) use run_error::Result;
 pub use run_error::RunError;

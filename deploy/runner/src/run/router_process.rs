@@ -37,14 +37,15 @@ struct RouterProcess {
 }
 
 impl Router {
-    /// Starts a router at the endpoint of `context`, unless the scenario names one, and connects to it. It is restarted
-    /// at most `restarts` times; its events go to `events`.
+    /// Starts a router at the endpoint of `context`, unless the scenario names one, and connects to it; the endpoint of
+    /// `context` is then the one that the other processes are given. The router is restarted at most `restarts` times;
+    /// its events go to `events`.
     ///
     /// # Errors
     /// [`RunError`] when the router does not start or does not answer, or `stop` is requested.
     pub(crate) fn start(
         network: &Network,
-        context: &SessionContext<'_>,
+        context: &mut SessionContext<'_>,
         restarts: u32,
         events: &Sender<ProcessEvent>,
         stop: &Stop,
@@ -59,8 +60,11 @@ impl Router {
         let process = is_own
             .then(|| RouterProcess::start(network, context, restarts, events.clone(), &wait))
             .transpose()?;
-        match RouterEndpoint::open(context.endpoint, context.keys, &wait) {
-            Ok(place) => Ok(Self { place, process }),
+        match RouterEndpoint::open(&context.endpoint, context.keys, &wait) {
+            Ok(place) => {
+                context.endpoint = place.endpoint.clone();
+                Ok(Self { place, process })
+            }
             Err(error) => Err(match (process, error) {
                 (Some(process), BusError::Unreachable { .. } | BusError::Stopped { .. })
                     if !stop.requested() =>

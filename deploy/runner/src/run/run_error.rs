@@ -10,6 +10,9 @@ use deploy::score::ScorerError;
 use ego_fuser_offline::evaluation::EvaluateError;
 use protocol::{ProcessId, RunId};
 
+/// Result of a step of a run: a [`RunError`] if nothing else is named.
+pub(crate) type Result<T, E = RunError> = std::result::Result<T, E>;
+
 /// Reason why a run failed.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {

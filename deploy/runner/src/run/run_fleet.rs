@@ -22,6 +22,7 @@ use deploy::score::metrics::Metrics;
 use deploy::score::{
     FrameScores, ProcessStats, Progress, Scored, ScorerNode, TRACKS, offline_intervals,
 };
+use ego_fuser_offline::evaluation::without_true_pose;
 use protocol::{Ledger, ProcessId, ProcessUsage, Role, RunId};
 use support::provenance::Provenance;
 use support::{atomic_file, output};
@@ -31,7 +32,7 @@ use crate::run::capacity::{BUDGET, estimate, remedies};
 use crate::run::common::{check_free, in_folder};
 use crate::run::ledger_report::LedgerReport;
 use crate::run::router_process::Router;
-use crate::run::{RunError, stepped};
+use crate::run::{Result, RunError, stepped};
 use crate::scenario::{Clock, Scenario};
 
 pub use crate::run::common::{RunOptions, RunResult};
@@ -53,7 +54,7 @@ const LINES: [&str; 3] = ["detections.jsonl", "truth.jsonl", TRACKS];
 ///
 /// # Errors
 /// [`RunError`] when the run cannot start, or a process stays down.
-pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
+pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult> {
     if scenario.clock == Clock::Stepped {
         return stepped::run_scenario(scenario, options);
     }
@@ -79,12 +80,7 @@ fn announce_capacity(fleet: &Fleet, programs: &Path) -> Option<Capacity> {
 }
 
 /// Runs a fleet under the given run name in the given folder.
-fn go(
-    fleet: &Fleet,
-    options: &RunOptions,
-    run: &RunId,
-    folder: &RunFolder,
-) -> Result<RunResult, RunError> {
+fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
     // Before anything else of the run takes the cores.
@@ -94,9 +90,9 @@ fn go(
     let fingerprint = std::thread::spawn(move || hashed.provenance(&programs));
 
     let keys = fleet.keys(folder)?;
-    let context = SessionContext {
+    let mut context = SessionContext {
         run,
-        endpoint: &fleet.scenario.network.endpoint(keys.is_some())?,
+        endpoint: fleet.scenario.network.endpoint(keys.is_some())?,
         keys: keys.as_ref(),
         programs: &options.programs,
         folder,
@@ -104,11 +100,7 @@ fn go(
     let (events, happened) = channel();
     let network = &fleet.scenario.network;
     let restarts = fleet.scenario.timeouts.restarts;
-    let router = Router::start(network, &context, restarts, &events, &stop)?;
-    let context = SessionContext {
-        endpoint: &router.place.endpoint,
-        ..context
-    };
+    let router = Router::start(network, &mut context, restarts, &events, &stop)?;
     let specs = fleet.processes(&context)?;
     check_free(&router.place, &fleet.scenario.network, run, &specs)?;
     let scorer = start_scorer(fleet, &context, &router, &specs)?;
@@ -149,7 +141,7 @@ fn start_scorer(
     context: &SessionContext<'_>,
     router: &Router,
     specs: &[ProcessSpec],
-) -> Result<ScorerNode, RunError> {
+) -> Result<ScorerNode> {
     let (ego, agents) = (&fleet.ego, &fleet.agents);
     let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let [detections, truth, tracks] = LINES.map(|name| context.folder.file(name));
@@ -176,9 +168,8 @@ fn router_stats(report: &RouterReport) -> ProcessStats {
         stages: Vec::new(),
         usage: ProcessUsage {
             cpu_s: report.cpu_s,
-            resident_bytes: 0,
             peak_resident_bytes: report.peak_resident_bytes,
-            threads: Vec::new(),
+            ..ProcessUsage::default()
         },
         usage_before: ProcessUsage::default(),
         traffic: Vec::new(),
@@ -218,8 +209,8 @@ fn watch(
     (events, happened): (&Sender<ProcessEvent>, &Receiver<ProcessEvent>),
     scorer: &ScorerNode,
     stop: &Stop,
-) -> Result<Watched, RunError> {
-    let (run, folder, endpoint) = (context.run, context.folder, context.endpoint);
+) -> Result<Watched> {
+    let (run, folder, endpoint) = (context.run, context.folder, &context.endpoint);
     let mut display = Display::new(fleet.ticks);
     if let Some(address) = fleet.scenario.network.metrics {
         let line = format!("metrics of all processes at http://{address}/metrics");
@@ -337,46 +328,44 @@ fn write(
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
     capacity: Option<Capacity>,
 ) -> RunResult {
-    let Scored {
-        scores: board,
-        stats,
-        progress,
-        unwritten: lines,
-    } = scored;
-    let mut unwritten = sync_lines(&folder, lines);
+    let board = &scored.scores;
+    let mut unwritten = sync_lines(&folder, scored.unwritten);
     let mut sum = Ledger::default();
-    let ledgers = stats.iter().map(|process| &process.ledger);
+    let ledgers = scored.stats.iter().map(|process| &process.ledger);
     ledgers.for_each(|ledger| sum.merge(ledger));
     // Before the balance, which accounts of offline processes cannot meet.
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
     let balance = sum.balance();
-    let missed = missed(fleet, &board, &watched.ending);
+    let missed = missed(fleet, board, &watched.ending);
     let collected = fingerprint.join().ok();
     let provenance = collected.and_then(|collected| {
         collected
             .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))
             .ok()
     });
-    let mut metrics = metrics(fleet, &board, &progress, &sum);
+    let mut metrics = metrics(fleet, board, &scored.progress, &sum);
     metrics.left_out.add_findings(fleet.findings.clone());
-    let metrics = Metrics {
-        ticks: metrics.answered + missed,
-        provenance: provenance.clone().map(Provenance::with_command),
-        ..metrics
-    };
+    metrics.ticks = metrics.answered + missed;
+    metrics.provenance = provenance.clone().map(Provenance::with_command);
     let mut written = vec![folder.write_json(deploy::score::metrics::FILE, &metrics)];
     let remedies = remedies(fleet, capacity.as_ref());
     let run_report = RunReport {
         causes: watched.causes.clone(),
-        ..RunReport::new(run, &metrics, board.records(), &stats, capacity)
+        ..RunReport::new(run, &metrics, board.records(), &scored.stats, capacity)
     };
     written.push(folder.write_json(report::FILE, &run_report));
     let frames = frames_csv(board.records(), &swept(&folder.file(SWEEP_LOG)), None);
     written.push(folder.write("frames.csv", &frames));
     let report = LedgerReport {
+        balances: balance.is_exact(),
+        balance: balance.clone(),
+        offline: watched.offline.clone(),
+        exempted,
+        total: sum.delivered(),
+        sum,
         refused,
         causes: watched.causes.clone(),
-        ..LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted))
+        processes: scored.stats,
     };
     written.push(folder.write_json("ledger.json", &report));
     let resolved = Scenario {
@@ -385,9 +374,9 @@ fn write(
         ..fleet.scenario.clone()
     };
     written.push(folder.write("scenario.yaml", &resolved.to_yaml()));
-    let errors = written.into_iter().filter_map(Result::err);
+    let errors = written.into_iter().filter_map(|written| written.err());
     unwritten.extend(errors.map(|error| error.to_string()));
-    let picture = crate::run::demo::draw(fleet, &board, &folder.file("frame.png"));
+    let picture = crate::run::demo::draw(fleet, board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
     RunResult {
         folder,
@@ -419,8 +408,13 @@ fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger
     let span = span.map(|(first, last)| last.duration_since(first));
     let seconds = span.map_or(0.0, |span| span.as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
-    Metrics {
+    let mut metrics = Metrics {
         protocol: Some(fleet.applied_protocol()),
         ..Metrics::of(board, "wall", names, seconds, sum, None)
+    };
+    for &tick in board.unplaced() {
+        let problem = without_true_pose(&fleet.recorded, tick as usize, &fleet.ego);
+        metrics.left_out.add_unreadable(0, problem);
     }
+    metrics
 }

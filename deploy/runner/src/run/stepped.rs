@@ -3,13 +3,12 @@
 //! The run folder is that of a live run. Only `scenario.yaml` and `log/` depend on machine, load, time of day and
 //! number of processes.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use dataset::findings;
 use deploy::operate::run_folder::{RunFolder, RunFolderError, frames_csv};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
-use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::RunId;
 use support::file_error::AtFile;
@@ -19,17 +18,17 @@ use terminal::progress;
 use crate::evaluated_frame::{judge, metrics};
 use crate::fleet::Fleet;
 use crate::frame_lines::FrameLines;
-use crate::run::RunError;
 use crate::run::agent_pool::AgentProcesses;
 use crate::run::common::{RunOptions, RunResult, in_folder};
 use crate::run::ledger_report::LedgerReport;
+use crate::run::{Result, RunError};
 use crate::scenario::Scenario;
 
 /// Runs a scenario in simulation time to its end.
 ///
 /// # Errors
 /// [`RunError`] when no fleet can be built from the scenario, or a frame cannot be read or computed.
-pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
+pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult> {
     let mut fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
     fleet.scenario.models.threads.apply();
@@ -54,7 +53,7 @@ fn go(
     evaluator: &mut Evaluator,
     (run, folder): (&RunId, &RunFolder),
     options: &RunOptions,
-) -> Result<RunResult, RunError> {
+) -> Result<RunResult> {
     let mut running = None;
     if { fleet.scenario.stepped }.is_some_and(|stepped| stepped.processes) {
         let (processes, remote) = AgentProcesses::start(fleet, run, folder, &options.programs)?;
@@ -69,11 +68,7 @@ fn go(
 }
 
 /// Computes all ticks; detections are appended to their file.
-fn play(
-    fleet: &Fleet,
-    evaluator: &mut Evaluator,
-    folder: &RunFolder,
-) -> Result<FrameScores, RunError> {
+fn play(fleet: &Fleet, evaluator: &mut Evaluator, folder: &RunFolder) -> Result<FrameScores> {
     let (rule, map_values) = (fleet.ground_truth_rule(), fleet.map_values());
     let mut board = FrameScores::new(fleet.ego.clone(), rule, map_values);
     let lines = FrameLines::create(folder.path()).at(folder.path());
@@ -97,7 +92,7 @@ fn write(
     board: &FrameScores,
     (run, folder): (&RunId, RunFolder),
     options: &RunOptions,
-) -> Result<RunResult, RunError> {
+) -> Result<RunResult> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
     let (poses, seconds) = (fleet.pose_source(), board.seconds());
@@ -107,18 +102,21 @@ fn write(
         .provenance(&options.programs)
         .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"));
     let provenance = provenance.ok();
-    let metrics = Metrics {
-        provenance: provenance.clone().map(Provenance::with_command),
-        ..metrics
-    };
+    metrics.provenance = provenance.clone().map(Provenance::with_command);
     folder.write_json(deploy::score::metrics::FILE, &metrics)?;
     // Times of processes on the wall clock say nothing here, so none are reported.
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
     let frames = frames_csv(board.records(), &BTreeMap::new(), None);
     folder.write("frames.csv", &frames)?;
-    let ledger = LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0));
-    folder.write_json("ledger.json", &ledger)?;
+    let accounts = LedgerReport {
+        balances: balance.is_exact(),
+        balance: balance.clone(),
+        total: ledger.delivered(),
+        sum: ledger.clone(),
+        ..LedgerReport::default()
+    };
+    folder.write_json("ledger.json", &accounts)?;
     let resolved = Scenario {
         provenance,
         ..fleet.scenario.clone()

@@ -5,11 +5,15 @@ use std::str::FromStr;
 
 use serde_json::{Map, Value};
 
+use super::Scenario;
+
 /// `scene.lockstep=true`: the path of a field and its value in YAML.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldOverride {
     path: Vec<String>,
     value: Value,
+    /// The value for a field that is a text or a list of texts: `5` is a number, `"5"` may be meant.
+    text: Value,
 }
 
 impl FromStr for FieldOverride {
@@ -24,9 +28,12 @@ impl FromStr for FieldOverride {
         if path.iter().any(String::is_empty) {
             return Err(format!("{text:?}: a part of the field's name is empty"));
         }
-        let value = serde_saphyr::from_str(value)
+        let texts = serde_saphyr::from_str::<Vec<String>>(value).map(Value::from);
+        let text = texts.or_else(|_| serde_saphyr::from_str(value).map(Value::String));
+        let value: Value = serde_saphyr::from_str(value)
             .map_err(|error| format!("{value:?} is no YAML: {error}"))?;
-        Ok(Self { path, value })
+        let text = text.unwrap_or_else(|_| value.clone());
+        Ok(Self { path, value, text })
     }
 }
 
@@ -37,18 +44,29 @@ impl fmt::Display for FieldOverride {
 }
 
 impl FieldOverride {
+    /// A scenario with the field set, to a text where its type accepts nothing else.
+    ///
+    /// # Errors
+    /// The error of the value in YAML.
+    pub(super) fn applied_to(&self, scenario: &Scenario) -> serde_json::Result<Scenario> {
+        let document = serde_json::to_value(scenario)?;
+        let with = |value| serde_json::from_value(self.set(document.clone(), value));
+        with(&self.value).or_else(|error| with(&self.text).map_err(|_| error))
+    }
+
     /// Sets the field in a document; sections on the way that are missing or have no fields are made.
-    pub(super) fn apply(&self, document: &mut Value) {
+    fn set(&self, mut document: Value, value: &Value) -> Value {
         let Some((field, sections)) = self.path.split_last() else {
-            return;
+            return document;
         };
-        let mut place = document;
+        let mut place = &mut document;
         for section in sections {
             place = fields_of(place)
                 .entry(section.as_str())
                 .or_insert(Value::Null);
         }
-        fields_of(place).insert(field.clone(), self.value.clone());
+        fields_of(place).insert(field.clone(), value.clone());
+        document
     }
 }
 
@@ -73,7 +91,8 @@ mod tests {
             "agents.codec.dtype=i8",
             "vehicles.4279.pose={noisy: {position_std_m: 1}}",
         ] {
-            text.parse::<FieldOverride>().unwrap().apply(&mut document);
+            let field: FieldOverride = text.parse().unwrap();
+            document = field.set(document, &field.value);
         }
         let expected = json!({
             "scene": {"dir": "a", "rate": 0.5},

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use agent::config::AgentSettings;
 use bus::config_file;
 use link::LinkConfig;
-use support::file_error::{AtFile, FileError};
+use support::file_error::{AtFile, FileError, Result};
 
 use super::{FieldOverride, Scenario};
 
@@ -14,7 +14,7 @@ impl Scenario {
     ///
     /// # Errors
     /// [`FileError`] names the file, the line or field, and what is wrong.
-    pub fn load(path: &Path) -> Result<Self, FileError> {
+    pub fn load(path: &Path) -> Result<Self> {
         let scenario = Self::read(path)?;
         scenario.check(path)?;
         Ok(scenario)
@@ -32,7 +32,7 @@ impl Scenario {
     ///
     /// # Errors
     /// [`FileError`] when the file cannot be read or is no scenario.
-    pub fn read(path: &Path) -> Result<Self, FileError> {
+    pub fn read(path: &Path) -> Result<Self> {
         Self::read_with(path, &[])
     }
 
@@ -40,11 +40,13 @@ impl Scenario {
     ///
     /// # Errors
     /// As [`Self::read`]; also when a field that is set is not one of a scenario.
-    pub fn read_with(path: &Path, overrides: &[FieldOverride]) -> Result<Self, FileError> {
+    pub fn read_with(path: &Path, overrides: &[FieldOverride]) -> Result<Self> {
         // Read as it is first: errors of the file have lines.
         let mut scenario: Self = config_file::read(path)?;
-        if !overrides.is_empty() {
-            scenario = overridden(path, overrides)?;
+        for field in overrides {
+            // One by one, so that an error names the field.
+            scenario = (field.applied_to(&scenario))
+                .map_err(|error| FileError::new(path, format_args!("--set {field}: {error}")))?;
         }
         let file = std::path::absolute(path).at(path)?;
         let folder = file.parent().unwrap_or(Path::new("/"));
@@ -73,11 +75,7 @@ impl Scenario {
 }
 
 /// Settings with their files found in `folder`, and the networks; errors name `path`.
-fn with_files(
-    settings: AgentSettings,
-    path: &Path,
-    folder: &Path,
-) -> Result<AgentSettings, FileError> {
+fn with_files(settings: AgentSettings, path: &Path, folder: &Path) -> Result<AgentSettings> {
     let pose = settings
         .pose
         .map_files(|file| without_dots(&folder.join(file)));
@@ -91,18 +89,6 @@ fn with_files(
             .map(|weights| without_dots(&folder.join(weights))),
         ..settings
     })
-}
-
-/// The scenario of a file with other values for some fields.
-fn overridden(path: &Path, overrides: &[FieldOverride]) -> Result<Scenario, FileError> {
-    let mut document: serde_json::Value = config_file::read(path)?;
-    for field in overrides {
-        field.apply(&mut document);
-        // One by one, so that an error names the field.
-        serde_json::from_value::<Scenario>(document.clone())
-            .map_err(|error| FileError::new(path, format_args!("--set {field}: {error}")))?;
-    }
-    serde_json::from_value(document).at(path)
 }
 
 /// The path without `.` and `a/..`, for readable messages and resolved copies.
@@ -192,6 +178,50 @@ mod tests {
         );
         let error = read_with_overrides(&file, &["scene.lock=true"]).unwrap_err();
         assert!(error.to_string().contains("unknown field `lock`"));
+    }
+
+    #[test]
+    fn a_field_is_set_in_every_spelling_that_a_file_may_have() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("s.yaml");
+        // Texts that are numbers in YAML; and options that are absent.
+        let text = "scene: {dir: ../scene, scenario: 2021_08_21_17_30_41, intensity_scale: 255}\n\
+                    models: {weights: w.safetensors}\nego: {id: 0100}\n";
+        std::fs::write(&file, text).unwrap();
+        let plain = Scenario::read(&file).unwrap();
+        let mut expected = plain.clone();
+        expected.scene.lockstep = true;
+        let set = read_with_overrides(&file, &["scene.lockstep=true"]).unwrap();
+        assert_eq!(set, expected);
+        let id = |text| CavId::new(text).unwrap();
+        assert_eq!(set.ego.id, Some(id("0100")));
+        assert!(set.link.is_none() && set.record.is_none() && set.security.is_none());
+        let set = read_with_overrides(
+            &file,
+            &[
+                "scene.scenario=2021_08_21_17_30_42",
+                "scene.agents=[0100, 1010]",
+                "scene.intensity_scale=1",
+                "ego.id=1010",
+                "run=5",
+                "vehicles.0100.weights=8",
+            ],
+        )
+        .unwrap();
+        assert_eq!(set.scene.scenario.as_deref(), Some("2021_08_21_17_30_42"));
+        assert_eq!(set.scene.agents, [id("0100"), id("1010")]);
+        assert_eq!(set.scene.intensity_scale.to_string(), "1");
+        assert_eq!(set.ego.id, Some(id("1010")));
+        assert_eq!(set.run.as_ref().map(|run| run.as_str()), Some("5"));
+        assert_eq!(
+            set.settings_of(&id("0100")).weights,
+            Some(folder.path().join("8"))
+        );
+        assert_eq!(set.scene.dir, plain.scene.dir);
+        let message = read_with_overrides(&file, &["scene.rate=[1]"])
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("--set scene.rate=[1]: "), "{message}");
     }
 
     #[test]
@@ -358,6 +388,10 @@ mod tests {
             (
                 "scene: {dir: .}\nmodels: {weights: s.yaml, threads: 0}",
                 "models.threads is 0: must be 1 to 256",
+            ),
+            (
+                "scene: {dir: ., agents: [1, 2, 1]}",
+                "scene.agents is \"1\": must name each vehicle once",
             ),
             (
                 "scene: {dir: .}\nclock: stepped\nmodels: {weights: s.yaml, device: cuda}",

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use fusion::method::Exchange;
 use fusion::{Method, box_input};
-use perception::weights::{METHOD_KEY, Weights};
-use support::file_error::{AtFile, FileError};
+use perception::weights::Weights;
+use support::file_error::{AtFile, FileError, Result};
 
 /// File name of the weights of a training.
 const TRAINED_FILE: &str = "weights.safetensors";
@@ -21,11 +21,7 @@ const TRAINED_FILE: &str = "weights.safetensors";
 /// # Errors
 /// [`FileError`] when the folder does not hold exactly one, and with `reads_boxes` when a method that fuses feature maps
 /// would leave boxes out.
-pub(crate) fn weights_of(
-    path: &Path,
-    method: Method,
-    reads_boxes: bool,
-) -> Result<PathBuf, FileError> {
+pub(crate) fn weights_of(path: &Path, method: Method, reads_boxes: bool) -> Result<PathBuf> {
     // Only a method that fuses feature maps needs a box input beside them.
     if !reads_boxes || method.exchange() != Exchange::Features {
         return one_of(path, method);
@@ -49,7 +45,7 @@ pub(crate) fn weights_of(
 }
 
 /// The weights of a method where neighbours send what it fuses.
-fn one_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
+fn one_of(path: &Path, method: Method) -> Result<PathBuf> {
     if !path.is_dir() {
         return Ok(path.to_path_buf());
     }
@@ -67,7 +63,8 @@ fn one_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
     }
     let (trained, found) = (path.join(TRAINED_FILE), found.len());
     if found == 0 && trained.is_file() {
-        return trained_for(trained, method, &candidates);
+        method.check_training(&Weights::load(&trained)?)?;
+        return Ok(trained);
     }
     let files = format!("*-{name}.safetensors or {name}/{TRAINED_FILE}");
     let problem =
@@ -75,23 +72,7 @@ fn one_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
     Err(FileError::new(path, problem))
 }
 
-/// The weights of a training of a method that `method` can run with.
-fn trained_for(file: PathBuf, method: Method, candidates: &[&str]) -> Result<PathBuf, FileError> {
-    let weights = Weights::load(&file)?;
-    match weights.metadata(METHOD_KEY) {
-        Some(trained) if !candidates.contains(&trained) => {
-            let needed = format!(
-                "method {method} needs weights trained for {}",
-                candidates[0]
-            );
-            let problem = format!("trained for {trained}, and {needed}");
-            Err(FileError::new(file, problem))
-        }
-        _ => Ok(file),
-    }
-}
-
-fn files_of(folder: &Path, name: &str) -> Result<Vec<PathBuf>, FileError> {
+fn files_of(folder: &Path, name: &str) -> Result<Vec<PathBuf>> {
     let ending = format!("-{name}.safetensors");
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).at(folder)? {
@@ -109,7 +90,7 @@ fn files_of(folder: &Path, name: &str) -> Result<Vec<PathBuf>, FileError> {
 mod tests {
     use std::collections::BTreeMap;
 
-    use perception::weights::{Precision, save};
+    use perception::weights::{METHOD_KEY, Precision, save};
     use tch::Device;
     use tch::nn::{Init, VarStore};
 

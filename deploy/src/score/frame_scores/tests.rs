@@ -232,6 +232,37 @@ fn the_three_precisions_differ_in_what_they_count() {
 }
 
 #[test]
+fn a_result_without_the_true_pose_of_the_ego_counts_in_no_precision() {
+    let [known, with_unknown] = [2, 4].map(|ticks| {
+        let mut scores = scores();
+        for tick in 0..ticks {
+            let mut truth = truth(tick);
+            // At tick 2 the neighbour alone has a pose, at tick 3 nobody.
+            truth
+                .agents
+                .drain(..(tick as usize).saturating_sub(1).min(2));
+            let began_ms = began_ms(tick);
+            scores.truth(&stamp("replay", tick, began_ms), truth);
+            let result = result(tick, &[10.0, 20.0]);
+            scores.result(&stamp("e", tick, began_ms + 50), result);
+        }
+        scores.close();
+        scores
+    });
+    assert_eq!(known.average_precision(), with_unknown.average_precision());
+    let [before, after] = [&known, &with_unknown].map(|scores| scores.live.unanswered_empty());
+    assert_eq!(before, after);
+    let [before, after] = [&known, &with_unknown].map(|scores| scores.live.streaming());
+    assert_eq!(before, after);
+    assert_eq!(
+        (known.unplaced(), with_unknown.unplaced()),
+        (&[][..], &[2, 3][..])
+    );
+    let last = &with_unknown.records()[3];
+    assert_eq!((last.latency_ms, last.detected), (Some(50.0), 0));
+}
+
+#[test]
 fn poses_of_all_vehicles_are_judged() {
     let mut scores = scores();
     scores.pose(
@@ -280,7 +311,7 @@ fn a_long_run_keeps_few_ticks_open() {
         scores.truth(&stamp("replay", tick, 0), truth(tick));
         scores.result(&stamp("e", tick, 50), result(tick, &[10.0]));
     }
-    assert!(scores.open.len() <= MOST_OPEN && scores.records().len() >= 1_000 - MOST_OPEN);
+    assert!(scores.open.open.len() <= MOST_OPEN && scores.records().len() >= 1_000 - MOST_OPEN);
     scores.result(&stamp("e", 3, 50), result(3, &[]));
     scores.close();
     assert_eq!(

@@ -19,12 +19,12 @@ pub struct Contribution {
 }
 
 impl Contribution {
-    /// Summarises the ledger of a run of `ego`: in `frames` frames `fused` neighbours were fused. `sent_bytes` is the
-    /// size of all messages that were sent, if known.
+    /// Summarises a ledger: in `frames` frames `fused` neighbours were fused. Messages of `ego`, if given, are its own
+    /// agent's. `sent_bytes` is the size of all messages that were sent, if known.
     pub(crate) fn of(
         frames: u64,
         fused: usize,
-        ego: &CavId,
+        ego: Option<&CavId>,
         ledger: &Ledger,
         sent_bytes: Option<u64>,
     ) -> Self {
@@ -56,10 +56,10 @@ impl Contribution {
 }
 
 /// True if a topic carries perception data of another vehicle than `ego`.
-fn shares(topic: &Topic, ego: &CavId) -> bool {
+fn shares(topic: &Topic, ego: Option<&CavId>) -> bool {
     match topic {
         Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
-            cav != ego && matches!(stream, Stream::Bev | Stream::Boxes | Stream::Points)
+            ego != Some(cav) && matches!(stream, Stream::Bev | Stream::Boxes | Stream::Points)
         }
         _ => false,
     }
@@ -67,9 +67,12 @@ fn shares(topic: &Topic, ego: &CavId) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use dataset::ground_truth::GroundTruthRule;
     use protocol::{Account, DropReason, ProcessId};
 
     use super::*;
+    use crate::score::FrameScores;
+    use crate::score::metrics::Metrics;
 
     fn ledger() -> (Ledger, CavId) {
         let (ego, to) = (CavId::new("1").unwrap(), ProcessId::new("ego-1").unwrap());
@@ -93,12 +96,23 @@ mod tests {
     #[test]
     fn maps_of_neighbours_are_counted_and_neither_poses_nor_the_egos_own() {
         let (ledger, ego) = ledger();
-        let contribution = Contribution::of(4, 2, &ego, &ledger, Some(800));
+        let contribution = Contribution::of(4, 2, Some(&ego), &ledger, Some(800));
         assert_eq!((contribution.sent, contribution.used), (8, 2));
         assert_eq!(
             (contribution.fused_per_frame, contribution.sent_bytes_mean),
             (Some(0.5), Some(100.0))
         );
+    }
+
+    #[test]
+    fn in_an_evaluation_the_ego_of_the_last_scenario_is_a_neighbour_of_others() {
+        let (ledger, ego) = ledger();
+        let scores = FrameScores::new(ego, GroundTruthRule::OPV2V, 1);
+        let sent = |bytes: Option<u64>| {
+            let metrics = Metrics::of(&scores, "", ["max", "recorded"], 1.0, &ledger, bytes);
+            (metrics.contribution.sent, metrics.contribution.used)
+        };
+        assert_eq!((sent(Some(800)), sent(None)), ((12, 3), (8, 2)));
     }
 
     #[test]
@@ -111,7 +125,7 @@ mod tests {
             };
             (0..3).for_each(|_| ledger.sent(&Account::published(boxes.clone())));
         }
-        let contribution = Contribution::of(4, 2, &ego, &ledger, Some(800));
+        let contribution = Contribution::of(4, 2, Some(&ego), &ledger, Some(800));
         assert_eq!(
             (contribution.sent, contribution.sent_bytes_mean),
             (14, Some(100.0))
@@ -136,14 +150,13 @@ mod tests {
         ));
         ledger.sent(&Account::published(passed.clone()));
         ledger.received(&Account::towards(passed, &ProcessId::new("ego-1").unwrap()));
-        let contribution = Contribution::of(4, 2, &ego, &ledger, None);
+        let contribution = Contribution::of(4, 2, Some(&ego), &ledger, None);
         assert_eq!((contribution.sent, contribution.used), (8, 3));
     }
 
     #[test]
     fn without_frames_and_network_all_values_are_absent() {
-        let nothing =
-            Contribution::of(0, 0, &CavId::new("1").unwrap(), &Ledger::default(), Some(0));
+        let nothing = Contribution::of(0, 0, None, &Ledger::default(), Some(0));
         assert_eq!(nothing, Contribution::default());
     }
 }

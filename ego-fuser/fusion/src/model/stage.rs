@@ -16,9 +16,7 @@ use crate::channel_mixing::{self, ChannelMixing};
 use crate::classes::Classes;
 use crate::f64_tensor::{Order, are_numbers};
 use crate::full_resolution::FullResolutionMap;
-use crate::maps::{
-    AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, larger_cells, with_cells_of,
-};
+use crate::maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, larger_cells};
 use crate::method::{Exchange, Method};
 use crate::settings::{FUSION_KEY, FusionConfig, Requirements};
 use crate::warp::{WarpError, WarpedMaps, check, warp_cells, warp_to_ego};
@@ -299,7 +297,7 @@ impl FusionStage {
             return self.aligned(&together, None, metadata);
         };
         let of_earlier = metadata.split_off(count as usize);
-        let grid = with_cells_of(&self.grid, cells);
+        let grid = self.grid.downsampled(cells as u32);
         let (_, warped) = self.warped(&earlier, &of_earlier, &grid)?;
         let classes = self.classes.as_ref().map(Classes::shallow_clone);
         let earlier = EarlierMaps {

@@ -63,22 +63,18 @@ impl Block {
 /// Blocks, then a feed-forward network.
 #[derive(Debug)]
 pub struct Layer {
-    blocks: Vec<Block>,
-    feed_forward: FeedForwardBlock,
-}
-
-impl Layer {
     /// Its pairs of attentions.
-    pub fn blocks(&self) -> &[Block] {
-        &self.blocks
-    }
+    pub blocks: Vec<Block>,
+    feed_forward: FeedForwardBlock,
 }
 
 /// The whole encoder, on tokens in the order of [`BlockOrder`].
 #[derive(Debug)]
 pub struct Encoder {
-    layers: Vec<Layer>,
-    temporal: Option<TemporalEncoding>,
+    /// The layers, first to last.
+    pub layers: Vec<Layer>,
+    /// Encoding of delays; absent where the configuration has none.
+    pub temporal: Option<TemporalEncoding>,
 }
 
 impl Encoder {
@@ -102,16 +98,6 @@ impl Encoder {
                 .collect(),
             temporal,
         }
-    }
-
-    /// The layers, first to last.
-    pub fn layers(&self) -> &[Layer] {
-        &self.layers
-    }
-
-    /// Encoding of delays; absent where the configuration has none.
-    pub fn temporal(&self) -> Option<&TemporalEncoding> {
-        self.temporal.as_ref()
     }
 
     /// Output of the ego, the first agent.

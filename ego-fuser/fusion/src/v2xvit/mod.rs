@@ -72,7 +72,7 @@ impl V2xVit {
     /// The features with the code of each map's age where the map reaches.
     fn with_age(&self, maps: &AlignedMaps) -> Result<Tensor, TchError> {
         let warped = &maps.warped;
-        let Some(temporal) = self.encoder.temporal() else {
+        let Some(temporal) = &self.encoder.temporal else {
             return Ok(warped.features.shallow_clone());
         };
         let rows = maps.metadata.iter().map(|map| map.age_secs / ROW_SECS);

@@ -94,7 +94,8 @@ impl Gate {
 /// Window attention of several sizes side by side, merged.
 #[derive(Debug)]
 pub struct WindowAttention {
-    branches: Vec<WindowBranch>,
+    /// The branches, in the order of the configuration.
+    pub branches: Vec<WindowBranch>,
     gate: Option<Gate>,
     largest: i64,
     dropout: f64,
@@ -126,11 +127,6 @@ impl WindowAttention {
             largest,
             dropout,
         }
-    }
-
-    /// The branches, in the order of the configuration.
-    pub fn branches(&self) -> &[WindowBranch] {
-        &self.branches
     }
 
     /// The tokens of one agent, `[T, C]` in block order, to the same.

@@ -6,36 +6,31 @@ use protocol::message::{Boxes, Message};
 use protocol::{Box3d, Detection};
 
 use super::box_icp;
-use super::free_align::{self, FreeAlignConfig};
+use super::free_align::{self, MAX_BOXES, MIN_MATCHES};
 use super::method::{
     AlignError, AlignInput, Alignment, AlignmentMethod, AlignmentSpec, NotAligned,
 };
 
 /// Matches the graphs of both vehicles' boxes.
-#[derive(Debug, Clone, Default)]
-pub struct FreeAlign {
-    /// Settings of the matching.
-    pub config: FreeAlignConfig,
-}
+#[derive(Debug, Clone, Copy, Default)]
+pub struct FreeAlign;
 
 impl FreeAlign {
-    /// The method with some settings.
-    pub fn spec(config: FreeAlignConfig) -> AlignmentSpec {
-        AlignmentSpec::new("free-align", true, move || Self {
-            config: config.clone(),
-        })
+    /// The method.
+    pub fn spec() -> AlignmentSpec {
+        AlignmentSpec::new("free-align", true, || Self)
     }
 }
 
 impl AlignmentMethod for FreeAlign {
     fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
-        let sent = vehicle.boxes.len().min(self.config.max_boxes);
+        let sent = vehicle.boxes.len().min(MAX_BOXES);
         Ok(message(&vehicle.boxes[..sent]))
     }
 
     fn align(&self, _: &AlignInput<'_>, own: &Message, received: &Message) -> Alignment {
         let (ego, neighbour) = (boxes(own)?, boxes(received)?);
-        Ok(free_align::align(&ego, &neighbour, &self.config)?.ego_from_neighbour)
+        Ok(free_align::align(&ego, &neighbour, MIN_MATCHES)?.ego_from_neighbour)
     }
 }
 

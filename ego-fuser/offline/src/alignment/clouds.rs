@@ -13,24 +13,20 @@ use super::method::{
 /// Registers the neighbour's decimated sweep against the ego's own.
 #[derive(Debug, Clone)]
 pub struct CloudIcp {
-    config: IcpConfig,
     starts_at_gnss: bool,
 }
 
 impl CloudIcp {
     /// Starts at the identity, or (`starts_at_gnss`) at the difference of both receivers' poses.
-    pub fn spec(config: IcpConfig, starts_at_gnss: bool) -> AlignmentSpec {
+    pub fn spec(starts_at_gnss: bool) -> AlignmentSpec {
         let name = if starts_at_gnss { "icp-gnss" } else { "icp" };
-        AlignmentSpec::new(name, false, move || Self {
-            config: config.clone(),
-            starts_at_gnss,
-        })
+        AlignmentSpec::new(name, false, move || Self { starts_at_gnss })
     }
 }
 
 impl AlignmentMethod for CloudIcp {
     fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
-        let decimate = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
+        let decimate = IcpSource::of_sweep(&vehicle.frame.points.xyzi);
         let points = decimate.points_m().iter();
         let xyzi = points.map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]);
         let points = PointCloud {
@@ -50,9 +46,10 @@ impl AlignmentMethod for CloudIcp {
             true => pose_difference(&own.pose, &received.pose)?,
             false => Isometry3::identity(),
         };
+        let config = IcpConfig::default();
         // The ego has its own sweep at full density: flatter planes than from a decimated one.
-        let target = IcpTarget::of_sweep(&ego.frame.points.xyzi, &self.config);
-        let source = IcpSource::of_sweep(&received.points.xyzi, &self.config);
-        Ok(icp::register(&source, &target, &start, &self.config)?.target_from_source)
+        let target = IcpTarget::of_sweep(&ego.frame.points.xyzi, &config);
+        let source = IcpSource::of_sweep(&received.points.xyzi);
+        Ok(icp::register(&source, &target, &start, &config)?.target_from_source)
     }
 }

@@ -12,7 +12,6 @@
 
 use nalgebra::{Isometry3, Vector2, Vector3};
 use protocol::Box3d;
-use serde::{Deserialize, Serialize};
 
 use fusion::planar_fit;
 
@@ -21,39 +20,21 @@ const FINALISTS: usize = 8;
 /// Motions whose headings differ by less than this, radians, and positions by less than twice the tolerance of the fit,
 /// are one.
 const SAME_HEADING_RAD: f64 = 0.1;
-
-/// Settings of the matching.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct FreeAlignConfig {
-    /// Largest number of boxes of each vehicle, the first ones.
-    pub max_boxes: usize,
-    /// Edges shorter than this are ignored as ambiguous, metres.
-    pub min_edge_m: f64,
-    /// Largest difference between the lengths of an edge in both graphs, metres.
-    pub edge_tolerance_m: f64,
-    /// Largest distance between two matched boxes after alignment, metres.
-    pub fit_tolerance_m: f64,
-    /// Fewest boxes in common. Three agree by chance in every other frame.
-    pub min_matches: usize,
-    /// Number of boxes by which the best motion must lead any other.
-    pub min_lead: usize,
-}
-
-impl Default for FreeAlignConfig {
-    /// Chosen on detections of 160 pairs of validation scenes: 61 % are right to 3 m and 3 % wrong. With edges to 0.5
-    /// m, as in the published code, 42 % and 1 %; with three matches and a lead of one 66 % and 6 %.
-    fn default() -> Self {
-        Self {
-            max_boxes: 40,
-            min_edge_m: 2.0,
-            edge_tolerance_m: 1.2,
-            fit_tolerance_m: 1.0,
-            min_matches: 4,
-            min_lead: 2,
-        }
-    }
-}
+/// Largest number of boxes of each vehicle, the first ones.
+///
+/// This and the following were chosen on detections of 160 pairs of validation scenes: 61 % are right to 3 m and 3 %
+/// wrong. With edges to 0.5 m, as in the published code, 42 % and 1 %; with three matches and a lead of one 66 % and 6 %.
+pub(super) const MAX_BOXES: usize = 40;
+/// Edges shorter than this are ignored as ambiguous, metres.
+const MIN_EDGE_M: f64 = 2.0;
+/// Largest difference between the lengths of an edge in both graphs, metres.
+const EDGE_TOLERANCE_M: f64 = 1.2;
+/// Largest distance between two matched boxes after alignment, metres.
+const FIT_TOLERANCE_M: f64 = 1.0;
+/// Fewest boxes in common. Three agree by chance in every other frame.
+pub const MIN_MATCHES: usize = 4;
+/// Number of boxes by which the best motion must lead any other.
+const MIN_LEAD: usize = 2;
 
 /// Pose of a neighbour relative to the ego by boxes.
 #[derive(Debug, Clone, PartialEq)]
@@ -97,17 +78,18 @@ pub enum NoAlignment {
     },
 }
 
-/// Aligns two vehicles by their boxes, each in the frame of its own LiDAR, the most confident first.
+/// Aligns two vehicles by their boxes, each in the frame of its own LiDAR, the most confident first, if they have at least
+/// `min_matches` in common, usually [`MIN_MATCHES`].
 ///
 /// # Errors
 /// [`NoAlignment`] where the evidence is thin.
 pub fn align(
     ego: &[Box3d],
     neighbour: &[Box3d],
-    config: &FreeAlignConfig,
+    min_matches: usize,
 ) -> Result<BoxAlignment, NoAlignment> {
-    let (ego, neighbour) = (BoxGraph::new(ego, config), BoxGraph::new(neighbour, config));
-    let required = config.min_matches.max(2);
+    let (ego, neighbour) = (BoxGraph::new(ego), BoxGraph::new(neighbour));
+    let required = min_matches.max(2);
     if ego.len() < required || neighbour.len() < required {
         return Err(NoAlignment::TooFewBoxes {
             ego: ego.len(),
@@ -118,7 +100,7 @@ pub fn align(
     let mut search = MatchSearch {
         ego: &ego,
         neighbour: &neighbour,
-        config,
+        min_matches,
         largest: 0,
         motions: Vec::new(),
     };
@@ -137,11 +119,11 @@ pub fn align(
         .filter(|best| best.matches.len() >= required)
         .ok_or(too_few)?;
     // Repetitive scenes have several motions with many inliers: then none can be trusted.
-    let (motion, tolerance_m) = (&best.ego_from_neighbour, config.fit_tolerance_m);
+    let motion = &best.ego_from_neighbour;
     let mut others = finalists.iter();
-    let rival = others.find(|other| !same_motion(&other.ego_from_neighbour, motion, tolerance_m));
+    let rival = others.find(|other| !same_motion(&other.ego_from_neighbour, motion));
     let rival = rival.map_or(0, |rival| rival.matches.len());
-    if rival + config.min_lead > best.matches.len() {
+    if rival + MIN_LEAD > best.matches.len() {
         return Err(NoAlignment::Ambiguous {
             matches: best.matches.len(),
             rival,
@@ -156,10 +138,10 @@ pub fn align(
     })
 }
 
-fn same_motion(a: &Isometry3<f64>, b: &Isometry3<f64>, tolerance_m: f64) -> bool {
+fn same_motion(a: &Isometry3<f64>, b: &Isometry3<f64>) -> bool {
     // The length of its translation is the distance between the neighbour's two positions.
     let off = a.inv_mul(b);
-    off.translation.vector.norm() < 2.0 * tolerance_m && off.rotation.angle() < SAME_HEADING_RAD
+    off.translation.vector.norm() < 2.0 * FIT_TOLERANCE_M && off.rotation.angle() < SAME_HEADING_RAD
 }
 
 /// Boxes and the distances between them.
@@ -172,13 +154,13 @@ struct BoxGraph {
 }
 
 impl BoxGraph {
-    fn new(boxes: &[Box3d], config: &FreeAlignConfig) -> Self {
+    fn new(boxes: &[Box3d]) -> Self {
         // NaN fails the comparison and is left out too.
         let centres = boxes.iter().map(|node| Vector3::from(node.center_m));
         let nodes = centres
             .enumerate()
             .filter(|(_, at)| at.iter().all(|c| c.abs() < 1e6));
-        let (given, centres): (Vec<_>, Vec<_>) = nodes.take(config.max_boxes).unzip();
+        let (given, centres): (Vec<_>, Vec<_>) = nodes.take(MAX_BOXES).unzip();
         let edges = centres
             .iter()
             .flat_map(|a| centres.iter().map(move |b| (a - b).xy().norm()))
@@ -212,7 +194,7 @@ type BoxMatch = (usize, usize);
 struct MatchSearch<'a> {
     ego: &'a BoxGraph,
     neighbour: &'a BoxGraph,
-    config: &'a FreeAlignConfig,
+    min_matches: usize,
     /// Most inliers so far.
     largest: usize,
     /// Different motions, each with the most boxes that led to it.
@@ -230,7 +212,7 @@ impl MatchSearch<'_> {
                     let matches = self.grown([(a, b), second], &candidates);
                     self.largest = self.largest.max(matches.len());
                     // Two anchors agree by construction: only further nodes are evidence.
-                    if matches.len() >= self.config.min_matches.max(3) {
+                    if matches.len() >= self.min_matches.max(3) {
                         self.note(&matches);
                     }
                 }
@@ -244,12 +226,12 @@ impl MatchSearch<'_> {
         for k in 0..self.ego.len() {
             let length = self.ego.edge(anchor.0, k);
             // Short edges have about the same length everywhere.
-            if length < self.config.min_edge_m {
+            if length < MIN_EDGE_M {
                 continue;
             }
             for l in 0..self.neighbour.len() {
                 let difference = (length - self.neighbour.edge(anchor.1, l)).abs();
-                if difference < self.config.edge_tolerance_m && l != anchor.1 {
+                if difference < EDGE_TOLERANCE_M && l != anchor.1 {
                     found.push((difference, (k, l)));
                 }
             }
@@ -261,7 +243,6 @@ impl MatchSearch<'_> {
 
     /// The anchors and, greedily, all nodes with the same distances to every node of the subgraph, on the same side.
     fn grown(&self, anchors: [BoxMatch; 2], candidates: &[(f64, BoxMatch)]) -> Vec<BoxMatch> {
-        let tolerance = self.config.edge_tolerance_m;
         let [first, second] = anchors;
         let mut matches = anchors.to_vec();
         for &(_, (k, l)) in candidates {
@@ -272,8 +253,8 @@ impl MatchSearch<'_> {
             if matches.iter().all(|&(a, b)| {
                 a != k
                     && b != l
-                    && (self.ego.edge(a, k) - self.neighbour.edge(b, l)).abs() < tolerance
-            }) && sides.abs() < 2.0 * tolerance
+                    && (self.ego.edge(a, k) - self.neighbour.edge(b, l)).abs() < EDGE_TOLERANCE_M
+            }) && sides.abs() < 2.0 * EDGE_TOLERANCE_M
             {
                 matches.push((k, l));
             }
@@ -288,7 +269,7 @@ impl MatchSearch<'_> {
         match self
             .motions
             .iter_mut()
-            .find(|(_, known)| same_motion(known, &motion, self.config.fit_tolerance_m))
+            .find(|(_, known)| same_motion(known, &motion))
         {
             Some(known) if known.0 < matches.len() => *known = (matches.len(), motion),
             Some(_) => {}
@@ -333,7 +314,7 @@ impl MatchSearch<'_> {
     fn together(&self, motion: &Isometry3<f64>) -> Vec<BoxMatch> {
         let all = (0..self.ego.len()).flat_map(|a| (0..self.neighbour.len()).map(move |b| (a, b)));
         let distances = all.map(|pair| (self.apart(pair, motion), pair));
-        let near = distances.filter(|(distance, _)| *distance < self.config.fit_tolerance_m);
+        let near = distances.filter(|(distance, _)| *distance < FIT_TOLERANCE_M);
         planar_fit::one_to_one(near.collect())
     }
 
@@ -417,7 +398,7 @@ mod tests {
     fn shared_boxes_are_found_among_others() {
         for seed in 0..40 {
             let (truth, ego, neighbour) = views(seed, 7, 8, 0.1);
-            let found = align(&ego, &neighbour, &FreeAlignConfig::default()).unwrap();
+            let found = align(&ego, &neighbour, MIN_MATCHES).unwrap();
             let off = truth.inv_mul(&found.ego_from_neighbour);
             assert!(
                 off.translation.vector.norm() < 0.4 && off.rotation.angle() < 0.02,
@@ -434,13 +415,9 @@ mod tests {
 
     #[test]
     fn views_without_common_boxes_are_rarely_aligned() {
-        let config = FreeAlignConfig {
-            min_matches: 5,
-            ..FreeAlignConfig::default()
-        };
         let aligned = (0..60).filter(|seed| {
             let (_, ego, neighbour) = views(*seed, 0, 12, 0.0);
-            align(&ego, &neighbour, &config).is_ok()
+            align(&ego, &neighbour, 5).is_ok()
         });
         let count = aligned.count();
         assert!(count <= 6, "{count} of 60");
@@ -454,21 +431,15 @@ mod tests {
             neighbour: 3,
             required: 4,
         };
-        assert_eq!(
-            align(&ego, &neighbour, &FreeAlignConfig::default()),
-            Err(refused)
-        );
-        assert!(align(&[], &[], &FreeAlignConfig::default()).is_err());
+        assert_eq!(align(&ego, &neighbour, MIN_MATCHES), Err(refused));
+        assert!(align(&[], &[], MIN_MATCHES).is_err());
         let nowhere = boxes([Vector3::repeat(f64::NAN); 9]);
         let refused = NoAlignment::TooFewBoxes {
             ego: 0,
             neighbour: 3,
             required: 4,
         };
-        assert_eq!(
-            align(&nowhere, &neighbour, &FreeAlignConfig::default()),
-            Err(refused)
-        );
+        assert_eq!(align(&nowhere, &neighbour, MIN_MATCHES), Err(refused));
     }
 
     #[test]
@@ -482,14 +453,7 @@ mod tests {
                     ..*node
                 })
                 .collect();
-            let found = align(
-                &ego,
-                &mirrored,
-                &FreeAlignConfig {
-                    min_matches: 6,
-                    ..FreeAlignConfig::default()
-                },
-            );
+            let found = align(&ego, &mirrored, 6);
             assert!(
                 matches!(found, Err(NoAlignment::TooFewMatches { required: 6, .. })),
                 "{found:?}"
@@ -501,7 +465,7 @@ mod tests {
     fn a_row_of_parked_cars_could_be_anywhere_along_itself() {
         let [ego, neighbour] = [0..8, -3..5]
             .map(|row| boxes(row.map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0))));
-        let found = align(&ego, &neighbour, &FreeAlignConfig::default());
+        let found = align(&ego, &neighbour, MIN_MATCHES);
         assert!(
             matches!(found, Err(NoAlignment::Ambiguous { .. })),
             "{found:?}"
@@ -516,7 +480,7 @@ mod tests {
             [-30.0, 17.0],
         ];
         let cross = boxes(cross.map(|[x, y]| Vector3::new(x, y, -1.0)));
-        let found = align(&cross, &cross, &FreeAlignConfig::default());
+        let found = align(&cross, &cross, MIN_MATCHES);
         assert_eq!(
             found,
             Err(NoAlignment::Ambiguous {
@@ -539,12 +503,7 @@ mod tests {
         let moved = row
             .iter()
             .map(|point| truth.inverse().rotation * point + truth.inverse().translation.vector);
-        let found = align(
-            &boxes(row.clone()),
-            &boxes(moved),
-            &FreeAlignConfig::default(),
-        )
-        .unwrap();
+        let found = align(&boxes(row.clone()), &boxes(moved), MIN_MATCHES).unwrap();
         assert!(
             truth
                 .inv_mul(&found.ego_from_neighbour)

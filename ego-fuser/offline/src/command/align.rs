@@ -9,7 +9,6 @@ use anyhow::{Context, Result};
 use bus::config_file;
 use clap::ValueEnum;
 use dataset::{self, Dataset, LeftOut, Scenario};
-use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
 use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, GivenPose, Poses};
 use ego_fuser_offline::evaluation::alignment::table::{MethodRow, PairTally, markdown};
 use ego_fuser_offline::evaluation::alignment::{self, BoxSource};
@@ -159,11 +158,11 @@ impl Arguments {
     fn built_in(&self, method: BuiltIn, left_out: &mut LeftOut) -> Result<AlignmentSpec> {
         Ok(match method {
             BuiltIn::Gnss => Poses::spec("gnss", GivenPose::Gnss, || Ok(Box::new(RecordedPose))),
-            BuiltIn::Icp => CloudIcp::spec(IcpConfig::default(), false),
-            BuiltIn::IcpGnss => CloudIcp::spec(IcpConfig::default(), true),
+            BuiltIn::Icp => CloudIcp::spec(false),
+            BuiltIn::IcpGnss => CloudIcp::spec(true),
             BuiltIn::IcpMap => self.icp_map(left_out)?,
             BuiltIn::BoxIcp => BoxIcp::spec(),
-            BuiltIn::FreeAlign => FreeAlign::spec(FreeAlignConfig::default()),
+            BuiltIn::FreeAlign => FreeAlign::spec(),
         })
     }
 

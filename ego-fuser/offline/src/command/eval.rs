@@ -10,7 +10,7 @@ use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LeftOut, LoadOptions, Scenario};
-use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup};
+use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup, without_true_pose};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
 use perception::int8::InferencePrecision;
@@ -126,6 +126,10 @@ impl Arguments {
                 }
                 let frames: Vec<Frame> =
                     loaded.frames.into_iter().map(|(_, frame)| frame).collect();
+                if frames[0].world_from_lidar.is_none() {
+                    left_out.add_unreadable(0, without_true_pose(scenario, tick, &frames[0].cav));
+                    continue;
+                }
                 let truth = GroundTruth::of_tick(&frames.iter().collect::<Vec<_>>(), 0, &rule);
                 let (detections, sent_bytes) = match detector.detect(&frames) {
                     Err(error) if error.is_of_frame() => {

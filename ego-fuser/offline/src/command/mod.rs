@@ -59,10 +59,7 @@ impl Command {
 /// All scenarios of some datasets.
 impl DataSets {
     fn options(&self) -> OpenOptions {
-        OpenOptions {
-            intensity_scale: self.intensity.scale,
-            ..OpenOptions::default()
-        }
+        OpenOptions::with_intensity_scale(self.intensity.scale)
     }
 
     /// Each of them, with what is unused or implausible in it.

@@ -42,7 +42,8 @@ pub enum EvaluateError {
     Remote(#[from] Box<RemoteError>),
     /// The compute time of a process exceeds the period of the scene.
     #[error(
-        "{what} takes {takes_ms} ms, but the scene has a frame every {period_ms} ms: choose a smaller time in `compute`"
+        "{what} takes {takes_ms:.0} ms, but the scene has a frame every {period_ms:.0} ms: set a smaller time in \
+         `compute` (without one the times are measured on this machine)"
     )]
     TooSlow {
         /// Process or step that takes too long.

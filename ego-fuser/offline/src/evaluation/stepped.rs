@@ -21,7 +21,7 @@ pub use remote::{RemoteError, RemotePool};
 
 use super::participant::{Participant, stamp};
 use super::sent::Sent;
-use super::sweeps::AgentSweep;
+use super::sweeps::{AgentSweep, without_true_pose};
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
@@ -273,10 +273,15 @@ impl<'a> SteppedRun<'a> {
                 self.advance()?;
             },
         };
+        let ego = &computed.frames[0];
+        // The vehicle has driven on, but its result cannot be compared with anything.
+        if ego.world_from_lidar.is_none() {
+            let problem = without_true_pose(self.scenario, tick, &ego.cav);
+            self.evaluator.left_out.add_unreadable(0, problem);
+        }
         if let (Err(reason), None) = (&fused, &computed.failure) {
-            let cav = &computed.frames[0].cav;
             self.evaluator
-                .count_failure(self.scenario, tick, cav, reason);
+                .count_failure(self.scenario, tick, &ego.cav, reason);
         }
         Ok(Some(self.evaluated(tick, decided_nanos, computed, fused)))
     }

@@ -86,6 +86,18 @@ impl Evaluator {
     }
 }
 
+/// The finding that the recording has no true pose of the ego at a tick: nothing tells where the true boxes are.
+pub fn without_true_pose(scenario: &Scenario, tick: usize, ego: &CavId) -> Problem {
+    let place = scenario.agents.iter().position(|agent| agent == ego);
+    let sweep = place.and_then(|place| scenario.points_path(place, tick, None).ok());
+    Problem::from(&ReadError::Malformed {
+        path: sweep.unwrap_or_default(),
+        line: None,
+        field: Some("lidar_pose".to_owned()),
+        reason: format!("no true pose of the ego {ego}, so its result is not evaluated"),
+    })
+}
+
 /// Index of an agent among those that take part.
 fn rank(agent: usize, places: &[usize]) -> usize {
     let rank = places.iter().position(|&place| place == agent);

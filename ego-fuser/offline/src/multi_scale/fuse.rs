@@ -36,37 +36,31 @@ impl MapAlignment {
     }
 }
 
-/// Settings of the fusion of the levels.
-#[derive(Debug)]
-pub struct Levels<'a> {
-    /// The agents of each sample, which follow each other along dimension 0 of the maps.
-    pub samples: &'a [MapAlignment],
-    /// Operation that fuses the features of a cell; cells that were not received are zeros, as in the training of these
-    /// networks.
-    pub aggregation: MapAggregation,
-    /// `[sum of agents, 1, h, w]`: mask of the sent cells of the first level's maps, and thereby of those below.
-    pub sent: Option<&'a Tensor>,
-}
-
 /// Runs a backbone on canvases `[sum of agents, C, H, W]` and fuses at each level: `[samples, sum of C_up, H', W']`.
+///
+/// The agents of each of the `samples` follow each other along dimension 0 of the maps. `aggregation` fuses the features of
+/// a cell; cells that were not received are zeros, as in the training of these networks. `sent`, `[sum of agents, 1, h,
+/// w]`, is the mask of the sent cells of the first level's maps, and thereby of those below.
 ///
 /// # Errors
 /// [`TchError`] when the samples do not add up to the canvases.
 pub fn fuse_levels(
     backbone: &BevBackbone,
     canvas: &Tensor,
-    levels: &Levels<'_>,
+    samples: &[MapAlignment],
+    aggregation: MapAggregation,
+    sent: Option<&Tensor>,
 ) -> Result<Tensor, TchError> {
     let mut maps = canvas.shallow_clone();
     let mut fused = Vec::with_capacity(backbone.levels());
     for level in 0..backbone.levels() {
         maps = backbone.level(level, &maps, false);
-        if let (0, Some(sent)) = (level, levels.sent) {
+        if let (0, Some(sent)) = (level, sent) {
             let (_, _, height, width) = maps.size4()?;
             maps = maps.f_mul(&resized(sent, [height, width])?)?;
         }
         // Each agent's own map goes on to the next level, not the fused one.
-        fused.push(fuse_samples(&maps, levels)?);
+        fused.push(fuse_samples(&maps, samples, aggregation)?);
     }
     Ok(backbone.upsampled(&fused, false))
 }
@@ -80,15 +74,19 @@ pub(super) fn resized(mask: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>
     mask.f_upsample_bilinear2d(size, false, None, None)
 }
 
-fn fuse_samples(maps: &Tensor, levels: &Levels<'_>) -> Result<Tensor, TchError> {
-    let counts: Vec<i64> = levels.samples.iter().map(|sample| sample.agents).collect();
+fn fuse_samples(
+    maps: &Tensor,
+    samples: &[MapAlignment],
+    aggregation: MapAggregation,
+) -> Result<Tensor, TchError> {
+    let counts: Vec<i64> = samples.iter().map(|sample| sample.agents).collect();
     let of_samples = maps.f_split_with_sizes(&counts, 0)?.into_iter();
-    let fused = of_samples.zip(levels.samples).map(|(maps, sample)| {
+    let fused = of_samples.zip(samples).map(|(maps, sample)| {
         let maps = match &sample.theta {
             Some(theta) => coalign::warp_affine(&maps, theta)?,
             None => maps,
         };
-        match levels.aggregation {
+        match aggregation {
             MapAggregation::Attention => attend_ego(&maps, None),
             MapAggregation::Max => maps.f_amax([0i64].as_slice(), false),
         }
@@ -110,12 +108,7 @@ mod tests {
         samples: &[MapAlignment],
         aggregation: MapAggregation,
     ) -> Result<Tensor, TchError> {
-        let levels = Levels {
-            samples,
-            aggregation,
-            sent: None,
-        };
-        no_grad(|| fuse_levels(backbone, canvas, &levels))
+        no_grad(|| fuse_levels(backbone, canvas, samples, aggregation, None))
     }
 
     #[test]

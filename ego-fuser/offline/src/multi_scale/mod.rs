@@ -11,7 +11,7 @@ mod fuse;
 mod network;
 mod offline;
 
-pub use fuse::{Levels, MapAlignment, fuse_levels};
+pub use fuse::{MapAlignment, fuse_levels};
 pub use network::{
     MULTI_SCALE_KIND, MultiScaleConfig, MultiScaleNetwork, MultiScaleOutput, Senders,
 };

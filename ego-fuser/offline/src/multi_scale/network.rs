@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::fuse::{Levels, MapAlignment, fuse_levels, resized};
+use super::fuse::{MapAlignment, fuse_levels, resized};
 use fusion::FUSION_KEY;
 use fusion::model::ModelError;
 use fusion::where2comm::{CommunicationConfig, MapAggregation, SparseCommunication};
@@ -149,12 +149,8 @@ impl MultiScaleNetwork {
             None => (None, 1.0),
         };
         let sent_bytes = self.sent_bytes(sent.as_ref(), samples)?;
-        let levels = Levels {
-            samples,
-            aggregation: self.config.aggregation,
-            sent: sent.as_ref(),
-        };
-        let fused = fuse_levels(&network.backbone, &canvas, &levels)?;
+        let (aggregation, sent) = (self.config.aggregation, sent.as_ref());
+        let fused = fuse_levels(&network.backbone, &canvas, samples, aggregation, sent)?;
         let fused = match &network.shrink {
             Some(shrink) => shrink.forward(&fused, false),
             None => fused,

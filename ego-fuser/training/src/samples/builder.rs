@@ -105,7 +105,8 @@ pub struct Sample {
 /// Makes samples; one per loader thread, as it keeps the tables of the voxeliser.
 #[derive(Debug, Clone)]
 pub struct SampleBuilder {
-    scenes: Arc<SceneSet>,
+    /// The scenes it draws from.
+    pub(crate) scenes: Arc<SceneSet>,
     config: SampleConfig,
     /// Area of the network.
     lidar_range_m: [f64; 6],
@@ -150,11 +151,6 @@ impl SampleBuilder {
             voxeliser: Voxeliser::for_detector(detector),
             maps: None,
         })
-    }
-
-    /// The scenes it draws from.
-    pub fn scenes(&self) -> &SceneSet {
-        &self.scenes
     }
 
     /// The sample of a tick, seen from a random vehicle.

@@ -98,7 +98,7 @@ pub fn batches(
     run: &RunConfig,
     first: u64,
 ) -> Prefetch<Result<Batch, Error>> {
-    let mut order = TickOrder::new(builder.scenes().ticks().to_vec(), run.seed);
+    let mut order = TickOrder::new(builder.scenes.ticks.clone(), run.seed);
     let mut builder = builder.clone();
     let size = run.batch as u64;
     Prefetch::start(run.loader_threads, first, move |number| {

@@ -29,8 +29,10 @@ pub struct TickRef {
 /// needed, and the operating system's page cache keeps them.
 #[derive(Debug, Default)]
 pub struct SceneSet {
-    scenarios: Vec<Scenario>,
-    ticks: Vec<TickRef>,
+    /// All scenarios.
+    pub(crate) scenarios: Vec<Scenario>,
+    /// All ticks, scenario after scenario.
+    pub(crate) ticks: Vec<TickRef>,
     /// Problems of the datasets that could be left out.
     problems: Vec<String>,
     known: Mutex<HashMap<TickRef, Arc<Vec<Option<Frame>>>>>,
@@ -88,19 +90,9 @@ impl SceneSet {
         }
     }
 
-    /// All ticks, scenario after scenario.
-    pub fn ticks(&self) -> &[TickRef] {
-        &self.ticks
-    }
-
     /// The scenario of a tick.
     pub fn scenario(&self, tick: TickRef) -> &Scenario {
         &self.scenarios[tick.scenario]
-    }
-
-    /// All scenarios.
-    pub fn scenarios(&self) -> &[Scenario] {
-        &self.scenarios
     }
 
     /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; `None` for

@@ -24,7 +24,7 @@ pub(super) fn card(
             method.summary()
         ),
     );
-    let (ticks, scenarios) = (scenes.ticks().len(), scenes.scenarios().len());
+    let (ticks, scenarios) = (scenes.ticks.len(), scenes.scenarios.len());
     let data = format!("{ticks} ticks of {scenarios} scenarios");
     card.trained(run, &summary.trained, &data, "samples");
     let (rate, decay) = (run.learning_rate, run.optimizer.weight_decay);

@@ -51,7 +51,7 @@ impl<'a> FrozenEncoder<'a> {
         let store = FeatureStore::open(
             self.kept,
             &self.weights,
-            builder.scenes().scenarios(),
+            &builder.scenes.scenarios,
             &FileDigests::default(),
             self.threads,
             &mut |done, all| observer.encoded(done, all),

@@ -174,7 +174,7 @@ impl Task for FusionTraining<'_> {
     const REPORT_EVERY: u64 = 10;
 
     fn epoch(&self, steps: u64) -> f64 {
-        (steps * self.config.run.batch as u64) as f64 / self.scenes.ticks().len() as f64
+        (steps * self.config.run.batch as u64) as f64 / self.scenes.ticks.len() as f64
     }
 
     fn loss(&mut self, trainer: &Trainer) -> Result<Tensor> {

@@ -34,7 +34,7 @@ impl Validator {
         frames: usize,
     ) -> Result<Self, Error> {
         let scenes = Arc::new(scenes);
-        let ticks = evenly_spread(scenes.ticks(), frames.max(1));
+        let ticks = evenly_spread(&scenes.ticks, frames.max(1));
         let mut samples = samples.clone();
         samples.augmentation = Augmentation::OFF;
         samples.drop_neighbour = 0.0;

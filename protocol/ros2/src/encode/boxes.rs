@@ -53,9 +53,9 @@ fn array(nanos: u64, frame_id: &str, found: impl ExactSizeIterator<Item = Found>
             cdr.write_string(CLASS);
             cdr.write_f64(score);
             cdr::pose(cdr, &pose);
-            cdr::covariance(cdr, &covariance);
+            cdr::f64s(cdr, covariance.as_flattened());
             cdr::pose(cdr, &pose);
-            cdr::xyz(cdr, box3d.size_m);
+            cdr::f64s(cdr, &box3d.size_m);
             cdr.write_string(&id);
         }
     })
@@ -146,7 +146,7 @@ fn marker(
     cdr.write_i32(CUBE);
     cdr.write_i32(action);
     cdr::pose(cdr, &Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad));
-    cdr::xyz(cdr, box3d.size_m);
+    cdr::f64s(cdr, &box3d.size_m);
     rgb.into_iter()
         .chain([marked.alpha])
         .for_each(|value| cdr.write_f32(value));

@@ -19,7 +19,7 @@ pub fn pose(nanos: u64, world_from_lidar: &Pose, covariance: Option<&PlanarCovar
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, MAP_FRAME);
         cdr::pose(cdr, world_from_lidar);
-        cdr::covariance(cdr, &pose_covariance(covariance));
+        cdr::f64s(cdr, pose_covariance(covariance).as_flattened());
     })
 }
 
@@ -35,14 +35,14 @@ pub(crate) fn odometry(
         cdr::header(cdr, nanos, MAP_FRAME);
         cdr.write_string(lidar_frame);
         cdr::pose(cdr, world_from_lidar);
-        cdr::covariance(cdr, &pose_covariance(covariance));
-        cdr::xyz(cdr, [motion.speed_mps.unwrap_or(0.0), 0.0, 0.0]);
-        cdr::xyz(cdr, [0.0, 0.0, motion.yaw_rate_rad_s.unwrap_or(0.0)]);
-        cdr::covariance(cdr, &twist_covariance(motion));
+        cdr::f64s(cdr, pose_covariance(covariance).as_flattened());
+        cdr::f64s(cdr, &[motion.speed_mps.unwrap_or(0.0), 0.0, 0.0]);
+        cdr::f64s(cdr, &[0.0, 0.0, motion.yaw_rate_rad_s.unwrap_or(0.0)]);
+        cdr::f64s(cdr, twist_covariance(motion).as_flattened());
     })
 }
 
-/// Covariance of a pose of which position and yaw in the plane are measured.
+/// Covariance of a pose, rows of x, y, z and of the rotations about them, of which position and yaw in the plane are measured.
 fn pose_covariance(planar: Option<&PlanarCovariance>) -> [[f64; 6]; 6] {
     // Height, roll and pitch have no variance in a planar covariance.
     let mut rows = diagonal([UNMEASURED; 6]);

@@ -26,11 +26,9 @@ impl Default for Mount {
 /// Error of a text that is no mount.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{text:?} is no place of a LiDAR: X,Y,Z in metres within {MAX_M} and optionally its yaw in degrees, 1.5,0,1.9 for example"
+    "{0:?} is no place of a LiDAR: X,Y,Z in metres within {MAX_M} and optionally its yaw in degrees, 1.5,0,1.9 for example"
 )]
-pub struct MountError {
-    text: String,
-}
+pub struct MountError(String);
 
 /// `X,Y,Z` or `X,Y,Z,YAW`: metres in the frame of the body, degrees.
 impl FromStr for Mount {
@@ -47,8 +45,7 @@ impl FromStr for Mount {
         // A number that is none is in no range.
         let is_place = xyz.iter().all(|value| value.abs() <= MAX_M) && yaw_deg.abs() <= 360.0;
         if !is_place {
-            let text = text.chars().take(100).collect();
-            return Err(MountError { text });
+            return Err(MountError(text.chars().take(100).collect()));
         }
         let base_from_lidar = Pose::from_xyz_yaw(xyz, yaw_deg.to_radians());
         Ok(Self { base_from_lidar })

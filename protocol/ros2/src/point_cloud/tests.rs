@@ -5,9 +5,10 @@ use re_cdr::{BigEndian, ByteOrder, CdrWriter, LittleEndian};
 
 use super::*;
 
-const LIMITS: SweepLimits = SweepLimits {
+const LIMITS: Limits = Limits {
     max_points: 1 << 20,
     max_abs_value: 1e6,
+    ..Limits::DEFAULT
 };
 
 /// A cloud as a driver lays it out.
@@ -91,7 +92,7 @@ impl Cloud {
     }
 
     fn read(&self) -> Result<RosSweep, PointCloudError> {
-        read_point_cloud(&self.bytes::<LittleEndian>([0, 1, 0, 0]), LIMITS)
+        read_point_cloud(&self.bytes::<LittleEndian>([0, 1, 0, 0]), &LIMITS)
     }
 }
 
@@ -114,7 +115,7 @@ fn what_is_written_for_ros_is_read_back() {
         xyzi: vec![[1.5, -2.0, 0.25, 0.5], [-70.0, 3.0, -1.8, 1.0]],
     };
     let bytes = crate::encode::point_cloud(1_700_000_000_123_456_789, "cav_1/lidar", &points);
-    let sweep = read_point_cloud(&bytes, LIMITS).unwrap();
+    let sweep = read_point_cloud(&bytes, &LIMITS).unwrap();
     let expected = RosSweep {
         capture_nanos: 1_700_000_000_123_456_789,
         frame_id: "cav_1/lidar".into(),
@@ -219,7 +220,7 @@ fn layouts_of_drivers_are_read() {
         assert_eq!(cloud.read().unwrap().points.xyzi, expected, "{cloud:?}");
         let bytes = cloud.bytes::<BigEndian>([0, 0, 0, 0]);
         assert_eq!(
-            read_point_cloud(&bytes, LIMITS).unwrap().points.xyzi,
+            read_point_cloud(&bytes, &LIMITS).unwrap().points.xyzi,
             expected,
             "{cloud:?}"
         );
@@ -318,15 +319,15 @@ fn a_wrong_message_is_named_with_field_and_values() {
         assert!(error.contains(expected), "{error}");
     }
     let bytes = plain.bytes::<LittleEndian>([0, 1, 0, 0]);
-    let error = read_point_cloud(&bytes[..bytes.len() - 10], LIMITS)
+    let error = read_point_cloud(&bytes[..bytes.len() - 10], &LIMITS)
         .unwrap_err()
         .to_string();
     assert!(error.starts_with("data at byte "), "{error}");
     for bytes in [&[][..], &[0, 1], &[0, 3, 0, 0, 1], &[9; 40]] {
         assert!(
             matches!(
-                read_point_cloud(bytes, LIMITS),
-                Err(PointCloudError::Message(ReadError::Encoding { .. }))
+                read_point_cloud(bytes, &LIMITS),
+                Err(PointCloudError::Message(ReadError::Encoding(_)))
             ),
             "{bytes:?}"
         );
@@ -389,7 +390,7 @@ proptest! {
         let expected: Vec<[f32; 4]> = cloud.points.iter().map(|point| point.map(|value| value as f32)).collect();
         let sweeps = [cloud.bytes::<LittleEndian>([0, 1, 0, 0]), cloud.bytes::<BigEndian>([0, 0, 0, 0])];
         for bytes in sweeps {
-            prop_assert_eq!(&read_point_cloud(&bytes, LIMITS).unwrap().points.xyzi, &expected);
+            prop_assert_eq!(&read_point_cloud(&bytes, &LIMITS).unwrap().points.xyzi, &expected);
         }
     }
 
@@ -405,7 +406,7 @@ proptest! {
             bytes[place] = byte;
         }
         for bytes in [&bytes[..], &bytes[..cut.index(bytes.len())]] {
-            if let Ok(sweep) = read_point_cloud(bytes, LIMITS) {
+            if let Ok(sweep) = read_point_cloud(bytes, &LIMITS) {
                 prop_assert!(sweep.points.xyzi.iter().flatten().all(|value| value.abs() <= LIMITS.max_abs_value));
                 prop_assert!(sweep.points.len() <= bytes.len());
             }

@@ -1,6 +1,6 @@
 //! Columns of a file of poses: by the names of its header, or by their number.
 
-use super::keys::Unit;
+use crate::time_stamps::Unit;
 
 /// Places of the values in a row.
 #[derive(Debug, PartialEq)]

@@ -3,8 +3,8 @@
 use std::collections::{HashMap, HashSet};
 use std::hash::Hash;
 
-use super::keys::Keys;
 use super::pose_file::PoseFile;
+use crate::keys::Keys;
 
 /// Largest difference between the time of a pose and that of its cloud, nanoseconds.
 const SAME_TIME_NANOS: u64 = 1_000_000;
@@ -33,6 +33,7 @@ impl Join {
 /// # Errors
 /// A sentence with the keys of both where rows cannot be assigned to clouds.
 pub(super) fn join(stems: &[&str], clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
+    let mut most = 0;
     for keys in &poses.keys {
         let joined = match (clouds, keys) {
             (_, Keys::Names(names)) => by_name(stems, names),
@@ -46,13 +47,15 @@ pub(super) fn join(stems: &[&str], clouds: &Keys, poses: &PoseFile) -> Result<Jo
             (Keys::Times(clouds), Keys::Times(rows)) => by_time(clouds, rows),
             _ => continue,
         };
-        // At least half of the clouds have a row.
+        // At least half of the shorter list have a partner: there may be more poses than clouds, or fewer.
         let found = joined.rows.iter().flatten().count();
-        if 2 * found >= joined.rows.len() && found > 0 {
+        if 2 * found >= joined.rows.len().min(poses.poses.len()) && found > 0 {
             return Ok(joined);
         }
+        most = most.max(found);
     }
-    by_order(stems.len(), clouds, poses)
+    let have = format!("{most} of {} clouds have", stems.len());
+    by_order(stems.len(), clouds, poses, &have)
 }
 
 /// Stems or names of files; the endings and folders of the rows' names do not count.
@@ -112,8 +115,8 @@ fn shift(clouds: &[u64], rows: &[u64]) -> Option<String> {
     })
 }
 
-/// One row per cloud, in order.
-fn by_order(count: usize, clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
+/// One row per cloud, in order. `have` says how many clouds have the key of a pose.
+fn by_order(count: usize, clouds: &Keys, poses: &PoseFile, have: &str) -> Result<Join, String> {
     let rows = poses.poses.len();
     let (cloud, row) = (clouds.shown(), poses.keys.first().map(Keys::shown));
     let keys = match row {
@@ -129,7 +132,7 @@ fn by_order(count: usize, clouds: &Keys, poses: &PoseFile) -> Result<Join, Strin
         ));
     }
     if poses.keys.iter().any(|keys| matches!(keys, Keys::Names(_))) {
-        return Err(format!("no cloud has the name of a pose; {keys}"));
+        return Err(format!("{have} the name of a pose; {keys}"));
     }
     if let Some(times) = poses.times()
         && times.windows(2).any(|pair| pair.first() > pair.last())
@@ -141,7 +144,7 @@ fn by_order(count: usize, clouds: &Keys, poses: &PoseFile) -> Result<Join, Strin
     if let (Keys::Times(clouds), Some(times)) = (clouds, poses.times())
         && (clouds.len() != times.len() || !have_equal_steps(clouds, times))
     {
-        return Err(format!("no cloud has the time of a pose; {keys}"));
+        return Err(format!("{have} the time of a pose; {keys}"));
     }
     if rows == count && is_without_gap(clouds, poses.times()) {
         return Ok(Join::new("order", (0..count).map(Some)));
@@ -154,7 +157,7 @@ fn by_order(count: usize, clouds: &Keys, poses: &PoseFile) -> Result<Join, Strin
         false => "their numbers differ",
     };
     Err(format!(
-        "{rows} poses for {count} clouds, {numbers}, and no cloud has the name, number or time of a pose: lines cannot be \
+        "{rows} poses for {count} clouds, {numbers}, and {have} the name, number or time of a pose: lines cannot be \
          assigned; {keys}"
     ))
 }
@@ -237,7 +240,7 @@ mod tests {
     #[test]
     fn rows_belong_to_clouds_by_key_or_by_a_proven_order() {
         type Case<'a> = (&'a [&'a str], Vec<Keys>, usize, &'a [usize], &'a str);
-        let cases: [Case<'_>; 10] = [
+        let cases: [Case<'_>; 11] = [
             (
                 &["1", "2"],
                 vec![Keys::Numbers(vec![2, 1])],
@@ -250,6 +253,13 @@ mod tests {
                 vec![Keys::Numbers(vec![4, 1])],
                 2,
                 &[1, 99, 0],
+                "number",
+            ),
+            (
+                &["1", "3", "4", "5", "6"],
+                vec![Keys::Numbers(vec![4, 1])],
+                2,
+                &[1, 99, 0, 99, 99],
                 "number",
             ),
             (
@@ -302,7 +312,7 @@ mod tests {
 
     #[test]
     fn lists_that_contradict_each_other_are_refused() {
-        let cases: [(&[&str], Vec<Keys>, usize, &str); 8] = [
+        let cases: [(&[&str], Vec<Keys>, usize, &str); 9] = [
             (
                 &["1", "2"],
                 vec![Keys::Numbers(vec![0, 1])],
@@ -333,13 +343,19 @@ mod tests {
                 &["5.5", "6.5"],
                 times(&[1_000_000, 3_000_000]),
                 2,
-                "no cloud has the time of a pose",
+                "0 of 2 clouds have the time of a pose",
+            ),
+            (
+                &["5.5", "6.5", "7.5", "8.5"],
+                times_in_tenths(&[55, 100, 200]),
+                3,
+                "1 of 4 clouds have the time of a pose",
             ),
             (
                 &["1", "2"],
                 vec![Keys::Names(vec!["a".into(), "b".into()])],
                 2,
-                "no cloud has the name of a pose",
+                "0 of 2 clouds have the name of a pose",
             ),
         ];
         for (stems, keys, count, expected) in cases {

@@ -7,19 +7,18 @@
 
 mod columns;
 mod join;
-mod keys;
 mod pose_file;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use self::join::join;
-use self::keys::Keys;
 use self::pose_file::PoseFile;
 use super::faults::Faults;
+use super::keys::Keys;
 use super::layout::{LayoutReader, LayoutRow};
 use super::points::{SweepStorage, clouds_in};
-use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence};
+use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence, time_stamps};
 
 /// A folder of clouds and a file of poses.
 pub(crate) static CLOUDS: LayoutRow = LayoutRow {
@@ -117,6 +116,10 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
         timed.insert((nanos, index), cloud);
     }
     without.report("cloud", problems);
+    if matches!(keys, Keys::Times(_)) || poses.times().is_some() {
+        let nanos: Vec<u64> = timed.keys().map(|(nanos, _)| *nanos).collect();
+        problems.extend(time_stamps::step_problem(&path, &nanos));
+    }
     let of_poses = path.file_name().unwrap_or_default().display();
     let join = format!("{} poses of {of_poses} by {}", timed.len(), joined.by);
     let clouds = timed.into_values().collect();

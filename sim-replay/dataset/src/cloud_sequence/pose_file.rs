@@ -7,8 +7,8 @@ use nalgebra::Matrix4;
 use protocol::Pose;
 
 use super::columns::{Columns, PoseColumns, TimeColumns, quaternion_order};
-use super::keys::{Keys, stamp_nanos, whole_numbers};
 use crate::faults::Faults;
+use crate::keys::{Keys, stamp_nanos, whole_numbers};
 use crate::kitti_text::{counted_lines, malformed};
 use crate::{ReadError, Result, poses};
 
@@ -136,8 +136,7 @@ fn keys(rows: &[FileRow<'_>], columns: &Columns) -> Vec<Keys> {
 
 impl<'a> FileRow<'a> {
     fn of(line: u64, text: &'a str) -> Self {
-        // With a byte order mark the first word would be no number.
-        let text = text.trim_start_matches('\u{feff}').trim();
+        let text = text.trim();
         let mut words: Vec<&str> = match text.contains([',', ';']) {
             true => text.split([',', ';']).map(str::trim).collect(),
             false => text.split_ascii_whitespace().collect(),

@@ -5,7 +5,9 @@ use std::path::Path;
 
 use crate::faults::Faults;
 use crate::json::JsonField;
-use crate::{Layout, ReadError, Result, Tick, json_table, time_stamps};
+use crate::time_stamps::Unit;
+use crate::{Layout, ReadError, Result, Tick, json_table};
+use support::statistics;
 
 /// The pairs, below the root.
 pub(super) const COOPERATIVE: &str = "cooperative/data_info.json";
@@ -224,10 +226,11 @@ fn read_captures(
         let reason = "no time stamps: frames are taken as evenly spaced, in the order of the pairs";
         problems.push(ReadError::malformed(&path, reason));
     }
-    let unit = time_stamps::micros_per_unit(stamps.values().copied());
+    let in_order = statistics::sorted(&stamps.values().copied().collect::<Vec<f64>>());
+    let unit = Unit::of_file(&path, &in_order, problems);
     let captures = groups.into_iter().map(|(id, group)| {
         let stamp = stamps.get(&id);
-        let micros = stamp.map(|&stamp| time_stamps::micros(stamp, unit));
+        let micros = stamp.map(|&stamp| unit.micros(stamp));
         (id, Capture { micros, group })
     });
     captures.collect()

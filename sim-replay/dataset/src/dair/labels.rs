@@ -8,6 +8,7 @@ use protocol::Pose;
 use crate::frame::{Object, ObjectClass};
 use crate::ground_truth::upright_box;
 use crate::json::{self, JsonField};
+use crate::poses::box_angle_rad;
 use crate::{Problem, ReadError, Result, classes};
 use protocol::rotated_iou::Polygon;
 
@@ -64,7 +65,8 @@ pub(super) fn in_frame(
         let location = label.required("3d_location")?;
         let [x, y, z] = numbers_of(&location, ["x", "y", "z"])?;
         let center = Translation3::new(x, y, z);
-        let yaw_rad = label.required("rotation")?.number()?;
+        let rotation = label.required("rotation")?;
+        let yaw_rad = box_angle_rad(rotation.number()?).map_err(|reason| rotation.error(reason))?;
         let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad);
         let world_from_object: Pose =
             (world_from_lidar * Isometry3::from_parts(center, yaw)).into();

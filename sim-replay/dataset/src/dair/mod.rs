@@ -64,7 +64,7 @@ pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>>
     if let Some(root) = root.filter(|_| is_side(dir)) {
         let root = root.display();
         let reason = format!("this is a part of a DAIR-V2X data set: open {root}");
-        return Err(ReadError::layout(dir, reason));
+        return Err(ReadError::malformed(dir, reason));
     }
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
     for root in &roots::find(dir, is_root) {

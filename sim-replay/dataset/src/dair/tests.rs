@@ -420,12 +420,14 @@ fn labels_that_cannot_be_right_are_left_out_one_by_one() {
     huge["3d_dimensions"]["l"] = json!(1e6);
     let mut nowhere = label("Car", [5.0, 0.0, 0.0], 0.0);
     nowhere["3d_location"]["y"] = json!("left");
+    let turned = label("Car", [5.0, 0.0, 0.0], 178.5);
     set.write(
         "vehicle-side/label/lidar/000010.json",
         &json!([
             flat,
             huge,
             nowhere,
+            turned,
             label("Spaceship", [1.0, 2.0, 0.0], 0.0),
             3
         ]),
@@ -441,21 +443,22 @@ fn labels_that_cannot_be_right_are_left_out_one_by_one() {
     let (frame, problems) = set.problems_of(0);
     let own = "vehicle-side/label/lidar/000010.json: ";
     assert_eq!(
-        problems[..4],
+        problems[..5],
         [
             format!("{own}1.3d_dimensions: [1000000.0, 1.9, 1.5] are no sizes in metres, expected up to 200: the object is left out"),
             format!("{own}2.3d_location.y: the text \"left\", expected a finite number: the object is left out"),
+            format!("{own}3.rotation: 178.5 rad, expected -2 pi to 2 pi: degrees?: the object is left out"),
             "vehicle-side/label/lidar: type: \"Spaceship\" is an unknown type of object: it counts as other, not as a vehicle".into(),
-            format!("{own}4: 3, expected a map: the object is left out"),
+            format!("{own}5: 3, expected a map: the object is left out"),
         ]
     );
     let cooperative = "cooperative/label_world/000010.json: ";
     assert!(
-        problems[4].starts_with(&format!("{cooperative}0.world_8_points: no box: cosines")),
+        problems[5].starts_with(&format!("{cooperative}0.world_8_points: no box: cosines")),
         "{problems:?}"
     );
     assert_eq!(
-        problems[5],
+        problems[6],
         format!("{cooperative}1.world_8_points: 21 numbers, expected 24: the object is left out")
     );
     assert_eq!(frame.objects[0].class, ObjectClass::Other);

@@ -18,6 +18,7 @@ use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 use crate::{IntensityScale, LoadOptions, Problem, Scenario, overlap};
 use support::output;
+use support::sampling::evenly_spread;
 
 /// Largest number of scenarios of a sample.
 const MOST_SCENARIOS: usize = 4;
@@ -122,13 +123,13 @@ fn without_pose(
 /// Findings of some frames, evenly spread over the scenarios. Frames that cannot be read are left out: their reader
 /// reports them.
 pub fn sampled(scenarios: &[Scenario], scale: IntensityScale) -> Vec<Problem> {
-    let scenarios: Vec<&Scenario> = evenly(scenarios.len(), MOST_SCENARIOS)
-        .filter_map(|index| scenarios.get(index))
-        .collect();
+    let scenarios: Vec<&Scenario> = scenarios.iter().collect();
+    let scenarios = evenly_spread(&scenarios, MOST_SCENARIOS);
     let agents: usize = scenarios.iter().map(|scenario| scenario.agents.len()).sum();
     let ticks = (FRAMES / agents.max(1)).max(LEAST_TICKS);
     let problems = scenarios.into_iter().flat_map(|scenario| {
-        let ticks: Vec<usize> = evenly(scenario.ticks.len(), ticks).collect();
+        let indices: Vec<usize> = (0..scenario.ticks.len()).collect();
+        let ticks = evenly_spread(&indices, ticks);
         // Agent by agent, so that the results below fall into the lists of agents in order of time.
         let places: Vec<(usize, usize)> = (0..scenario.agents.len())
             .flat_map(|agent| ticks.iter().map(move |&tick| (agent, tick)))
@@ -153,12 +154,6 @@ fn read(scenario: &Scenario, agent: usize, tick: usize) -> Option<FrameFindings>
     let frame = scenario.load(agent, tick, &without_points).ok();
     let sweep = scenario.load_points(agent, tick, None).ok();
     (frame.is_some() || sweep.is_some()).then(|| FrameFindings::of(frame.as_ref(), sweep.as_ref()))
-}
-
-/// At most `most` indices of `count`, evenly spread.
-fn evenly(count: usize, most: usize) -> impl Iterator<Item = usize> {
-    let chosen = count.min(most);
-    (0..chosen).map(move |index| index * count / chosen)
 }
 
 /// Prints findings to standard error, a line each.

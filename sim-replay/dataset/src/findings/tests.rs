@@ -52,10 +52,3 @@ fn a_sample_has_the_findings_of_the_whole() {
         "{found:?}"
     );
 }
-
-#[test]
-fn samples_are_spread_from_the_first_on() {
-    assert_eq!(evenly(10, 4).collect::<Vec<_>>(), [0, 2, 5, 7]);
-    assert_eq!(evenly(2, 4).collect::<Vec<_>>(), [0, 1]);
-    assert_eq!(evenly(0, 4).count(), 0);
-}

@@ -130,7 +130,7 @@ fn layout(version: &Path, samples: &[SceneSample]) -> Result<Layout> {
             "nuScenes tables without a supported LiDAR: {channels:?}, expected LIDAR_TOP_id_<agent> (V2X-Sim), \
              LIDAR_FRONT_CENTER_<vehicle> (Open MARS), LIDAR_TOP (nuScenes) or LIDAR_CONCAT (T4)"
         );
-        ReadError::layout(version, reason)
+        ReadError::malformed(version, reason)
     })
 }
 

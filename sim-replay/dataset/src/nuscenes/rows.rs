@@ -8,12 +8,10 @@ use protocol::Pose;
 use protocol::text::excerpt;
 
 use crate::json::JsonField;
-use crate::{ReadError, Result, json_table};
+use crate::{ReadError, Result, json_table, poses};
 
 /// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
 pub(super) const MAX_BYTES: u64 = 4 << 30;
-/// Largest deviation of a published quaternion's length from 1; it is normalized.
-const QUATERNION_TOLERANCE: f64 = 0.01;
 
 /// Indices of rows by their tokens.
 pub(super) type Indices = HashMap<String, usize>;
@@ -39,19 +37,9 @@ pub(super) fn referred(row: &JsonField<'_>, key: &str, indices: &Indices) -> Res
 /// `translation` in metres and `rotation` as quaternion w, x, y, z.
 pub(super) fn transform(row: &JsonField<'_>) -> Result<Isometry3<f64>> {
     let translation_m = row.required("translation")?.numbers::<3>()?;
-    let rotation = row.required("rotation")?;
-    let rotation_wxyz = rotation.numbers::<4>()?;
-    let squares = rotation_wxyz.iter().map(|part| part * part);
-    let length = squares.sum::<f64>().sqrt();
-    let is_unit = (length - 1.0).abs() <= QUATERNION_TOLERANCE;
-    if !is_unit {
-        return Err(rotation.error(format!("a quaternion of length {length}, expected 1")));
-    }
     let pose = Pose {
         translation_m,
-        rotation_wxyz: rotation_wxyz.map(|part| part / length),
+        rotation_wxyz: row.required("rotation")?.numbers::<4>()?,
     };
-    let valid = pose.validate();
-    valid.map_err(|error| row.error(error.to_string()))?;
-    Ok(pose.isometry())
+    poses::of_rounded(&pose).map_err(|reason| row.error(reason))
 }

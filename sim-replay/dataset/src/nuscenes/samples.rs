@@ -23,6 +23,8 @@ pub(super) struct SceneSample {
 pub(super) struct SampleSweep {
     /// Path below the root of the data set.
     pub(super) file: String,
+    /// Time between it and its sample, microseconds; the largest where it is not known.
+    pub(super) off_micros: u64,
     pub(super) world_from_vehicle: Isometry3<f64>,
     pub(super) vehicle_from_lidar: Isometry3<f64>,
 }

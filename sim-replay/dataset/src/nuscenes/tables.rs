@@ -10,7 +10,8 @@ use super::annotations;
 use super::rows::{Indices, MAX_BYTES, read_all, referred, transform};
 use super::samples::{SampleSweep, SceneSample};
 use crate::json_table::{self, RowKeys};
-use crate::{ReadError, Result, time_stamps};
+use crate::time_stamps::Unit;
+use crate::{ReadError, Result};
 
 /// The tables that are read.
 pub(super) const NAMES: [&str; 9] = [
@@ -44,6 +45,8 @@ struct SensorMount {
 struct SweepRow {
     sample: usize,
     file: String,
+    /// Its time, microseconds, where the row has one.
+    micros: Option<u64>,
     mount: SensorMount,
 }
 
@@ -58,8 +61,8 @@ pub(super) fn read(
 ) -> Result<(Vec<Scene>, Vec<SceneSample>)> {
     let mounts = read_mounts(version, problems)?;
     let (scenes, scene_indices) = read_scenes(version, problems)?;
-    let (mut samples, sample_indices) = read_samples(version, &scene_indices, problems)?;
-    let rows = read_sweeps(version, &mounts, &sample_indices, problems)?;
+    let (mut samples, sample_indices, unit) = read_samples(version, &scene_indices, problems)?;
+    let rows = read_sweeps(version, &mounts, &sample_indices, unit, problems)?;
     place(version, rows, &mut samples, problems)?;
     annotations::read(version, &sample_indices, &mut samples, problems);
     Ok((scenes, samples))
@@ -115,24 +118,28 @@ fn read_samples(
     version: &Path,
     scenes: &Indices,
     problems: &mut Vec<ReadError>,
-) -> Result<(Vec<SceneSample>, Indices)> {
+) -> Result<(Vec<SceneSample>, Indices, Unit)> {
     let (mut samples, mut stamps, mut indices) = (Vec::new(), Vec::new(), Indices::new());
     read_all(version, "sample.json", problems, |row| {
         let scene = referred(row, "scene_token", scenes)?;
         let stamp = row.required("timestamp")?.time()?;
         indices.insert(row.required("token")?.id()?, samples.len());
-        stamps.push(stamp);
+        stamps.push((scene, stamp));
         samples.push(SceneSample {
             scene,
             ..SceneSample::default()
         });
         Ok(())
     })?;
-    let unit = time_stamps::micros_per_unit(stamps.iter().copied());
-    for (sample, stamp) in samples.iter_mut().zip(stamps) {
-        sample.micros = time_stamps::micros(stamp, unit);
+    // Scene by scene in the order of time: rows may have any order, and scenes the same times.
+    let mut in_order = stamps.clone();
+    in_order.sort_by(|(a, first), (b, second)| a.cmp(b).then(first.total_cmp(second)));
+    let in_order: Vec<f64> = in_order.into_iter().map(|(_, stamp)| stamp).collect();
+    let unit = Unit::of_file(&version.join("sample.json"), &in_order, problems);
+    for (sample, (_, stamp)) in samples.iter_mut().zip(stamps) {
+        sample.micros = unit.micros(stamp);
     }
-    Ok((samples, indices))
+    Ok((samples, indices, unit))
 }
 
 /// Sweeps of key frames by the token of their vehicle's pose.
@@ -140,6 +147,7 @@ fn read_sweeps(
     version: &Path,
     mounts: &HashMap<String, SensorMount>,
     samples: &Indices,
+    unit: Unit,
     problems: &mut Vec<ReadError>,
 ) -> Result<HashMap<String, Vec<SweepRow>>> {
     let mut sweeps: HashMap<String, Vec<SweepRow>> = HashMap::new();
@@ -159,9 +167,13 @@ fn read_sweeps(
         if !parts.all(|part| matches!(part, Component::Normal(_))) {
             return Err(file.error(format!("{name:?}, expected a path below the data set")));
         }
+        // One that cannot be read counts as missing: of a single sweep it is not needed.
+        let stamp = row.optional_of("timestamp", |stamp| stamp.time());
+        let stamp = stamp.unwrap_or_default();
         let sweep = SweepRow {
             sample: referred(row, "sample_token", samples)?,
             file: name.to_owned(),
+            micros: stamp.map(|stamp| unit.micros(stamp)),
             mount: mount.clone(),
         };
         let pose = row.required("ego_pose_token")?.id()?;
@@ -171,7 +183,8 @@ fn read_sweeps(
     Ok(sweeps)
 }
 
-/// Assigns the sweeps to the samples, with the poses of the vehicles.
+/// Assigns the sweeps to the samples, with the poses of the vehicles. Of several sweeps of a LiDAR that refer to one
+/// sample, the one nearest to it in time is used.
 fn place(
     version: &Path,
     mut rows: HashMap<String, Vec<SweepRow>>,
@@ -180,22 +193,38 @@ fn place(
 ) -> Result<()> {
     let tokens: std::collections::HashSet<String> = rows.keys().cloned().collect();
     let is_needed = |keys: &RowKeys<'_>| tokens.contains(&*keys.token);
-    let path = version.join("ego_pose.json");
+    let [path, of_sweeps] = ["ego_pose.json", "sample_data.json"].map(|name| version.join(name));
+    let mut further = 0;
     json_table::read(&path, MAX_BYTES, problems, is_needed, |row| {
         let world_from_vehicle = transform(row)?;
         let token = row.required("token")?.id()?;
         for row in rows.remove(&token).unwrap_or_default() {
+            let Some(sample) = samples.get_mut(row.sample) else {
+                continue;
+            };
+            let off_micros = row.micros.map(|micros| micros.abs_diff(sample.micros));
             let sweep = SampleSweep {
                 file: row.file,
+                off_micros: off_micros.unwrap_or(u64::MAX),
                 world_from_vehicle,
                 vehicle_from_lidar: row.mount.vehicle_from_lidar,
             };
-            if let Some(sample) = samples.get_mut(row.sample) {
+            let known = sample.sweeps.get(&row.mount.channel);
+            further += usize::from(known.is_some());
+            // Of equally near ones the name decides, not the order of the table.
+            let rank = |sweep: &SampleSweep| (sweep.off_micros, sweep.file.clone());
+            if known.is_none_or(|known| rank(&sweep) < rank(known)) {
                 sample.sweeps.insert(row.mount.channel, sweep);
             }
         }
         Ok(())
     })?;
+    if further > 0 {
+        let reason = format!(
+            "{further} sweeps of a sample and LiDAR that have one nearer in time: left out"
+        );
+        problems.push(ReadError::malformed(&of_sweeps, reason));
+    }
     let without_pose = rows.values().flatten().map(|row| row.file.as_str());
     if let Some(first) = without_pose.clone().min() {
         let count = without_pose.count();

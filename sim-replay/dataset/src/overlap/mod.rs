@@ -9,7 +9,7 @@ use nalgebra::Isometry3;
 use protocol::CavId;
 
 use self::structure::{Match, Structure};
-use super::{LoadOptions, Problem, Scenario};
+use super::{Layout, LoadOptions, Problem, Scenario};
 
 /// Pairs of each agent whose poses are read, evenly spread.
 const CANDIDATES: usize = 24;
@@ -57,8 +57,12 @@ struct Contradiction {
 }
 
 /// One problem for each agent of a scenario whose sweeps contradict its poses. Reads ten sweeps of each agent at most.
-/// Agents that stand, sweeps without structure and unreadable frames give none.
+/// Agents that stand, sweeps without structure and unreadable frames give none, nor do the independent frames of KITTI
+/// object.
 pub fn pose_problems(scenario: &Scenario) -> Vec<Problem> {
+    if scenario.layout == Layout::KITTI_OBJECT {
+        return Vec::new();
+    }
     let agents = scenario.agents.iter().enumerate();
     agents
         .filter_map(|(index, agent)| agent_problem(scenario, index, agent))

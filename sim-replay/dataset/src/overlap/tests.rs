@@ -140,6 +140,18 @@ fn dense_traffic_that_drives_along_is_no_problem_of_the_poses() {
 }
 
 #[test]
+fn independent_frames_have_no_poses_to_contradict() {
+    let poses = drive();
+    let dir = tempfile::tempdir().unwrap();
+    let backwards: Vec<_> = poses.iter().rev().copied().collect();
+    write(dir.path(), &poses, &backwards, 1);
+    let mut scenario = crate::open(dir.path()).unwrap().scenarios.swap_remove(0);
+    assert_eq!(pose_problems(&scenario).len(), 1);
+    scenario.layout = Layout::KITTI_OBJECT;
+    assert_eq!(pose_problems(&scenario), []);
+}
+
+#[test]
 fn wrong_joins_axes_and_units_are_found() {
     let poses = drive();
     let text_order: Vec<Isometry3<f64>> = {

@@ -1,8 +1,9 @@
 //! Scale of intensities of each source, normalised to 0 to 1.
 //!
 //! The red byte of a colour and a byte are divided by 255. The type of a wider number does not determine its scale; the
-//! largest value of the agent's first sweeps does: up to 1 it stays as it is, up to 255 it is divided by 255, and
-//! beyond that by the smallest 2^n - 1 that holds it, which `sim_replay::inspect` reports as a problem.
+//! 99 % quantile of the agent's first sweeps does ([`upper_intensity`]): up to 1 it stays as it is, up to 255 it is
+//! divided by 255, and beyond that by the smallest 2^n - 1 that holds it, which `sim_replay::inspect` reports as a
+//! problem.
 
 use std::fmt;
 use std::str::FromStr;
@@ -17,11 +18,13 @@ use crate::pcd::{IntensityKind, PcdCloud};
 const BYTE: f32 = 255.0;
 /// Number of sweeps of a LiDAR whose range determines the scale.
 pub(super) const SAMPLES: usize = 3;
+/// One of this many points may be above the range of its sweep: a reflector, or a fault.
+const POINTS_PER_OUTLIER: usize = 100;
 /// Finding about sweeps without intensities.
 pub(crate) const NO_INTENSITY: &str =
     "no intensity field (intensity, reflectivity, remission, rgb, ...): it is 0 for all points";
 
-/// Divisor of the intensities that a data set stores: [`Self::AUTO`], or a number parsed from text.
+/// Divisor of the intensities that a data set stores: `auto`, or a number parsed from text.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
 pub struct IntensityScale {
@@ -60,19 +63,7 @@ impl FromStr for IntensityScale {
     }
 }
 
-impl TryFrom<String> for IntensityScale {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        text.parse()
-    }
-}
-
-impl From<IntensityScale> for String {
-    fn from(scale: IntensityScale) -> Self {
-        scale.to_string()
-    }
-}
+protocol::written_as_text!(IntensityScale);
 
 impl fmt::Display for IntensityScale {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -105,14 +96,26 @@ impl IntensityScale {
     }
 
     /// The finding that no usual scale fits intensities that were divided by `divisor`.
-    pub(crate) fn unusual(self, divisor: f32, largest_stored: f32) -> Option<String> {
+    pub(crate) fn unusual(self, divisor: f32, upper_stored: f32) -> Option<String> {
         (self == Self::AUTO && ![1.0, BYTE].contains(&divisor)).then(|| {
             format!(
-                "intensities reach {largest_stored}, neither 0 to 1 nor 0 to 255: divided by {divisor} unless their \
+                "intensities reach {upper_stored}, neither 0 to 1 nor 0 to 255: divided by {divisor} unless their \
                  scale is stated"
             )
         })
     }
+}
+
+/// Upper end of the range of a sweep's intensities: their 99 % quantile, the largest of less than 100 points; 0 without
+/// points.
+pub(super) fn upper_intensity(points: &PointCloud) -> f32 {
+    let mut values: Vec<f32> = points.xyzi.iter().map(|point| point[3]).collect();
+    let outliers = values.len() / POINTS_PER_OUTLIER;
+    let Some(rank) = values.len().checked_sub(outliers + 1) else {
+        return 0.0;
+    };
+    let (_, upper, _) = values.select_nth_unstable_by(rank, f32::total_cmp);
+    upper.max(0.0)
 }
 
 fn divide(points: &mut PointCloud, divisor: f32) {
@@ -128,7 +131,8 @@ pub struct LiveIntensities {
     scale: IntensityScale,
     /// Number of sweeps that determined the range.
     samples: usize,
-    largest: f32,
+    /// The largest [`upper_intensity`] of these.
+    upper: f32,
     has_finding: bool,
 }
 
@@ -159,11 +163,11 @@ impl LiveIntensities {
                 // The range is fixed after some sweeps: a later change would shift all intensities.
                 if self.samples < SAMPLES && !points.is_empty() {
                     self.samples += 1;
-                    self.largest = self.largest.max(largest);
+                    self.upper = self.upper.max(upper_intensity(points));
                 }
-                let divisor = self.scale.divisor(kind, || intensity_divisor(self.largest));
+                let divisor = self.scale.divisor(kind, || intensity_divisor(self.upper));
                 divide(points, divisor);
-                (self.scale.unusual(divisor, self.largest))
+                (self.scale.unusual(divisor, self.upper))
                     .or_else(|| (largest > divisor).then(|| {
                     format!(
                         "field {name} reaches {largest}, {} divided by {divisor}: networks are trained on 0 to 1",
@@ -252,6 +256,21 @@ mod tests {
         let mut points = one_point(1.0);
         assert_eq!(live.scale(&mut points, byte), None);
         assert_eq!(points.xyzi[0][3], 1.0 / 255.0);
+    }
+
+    #[test]
+    fn single_bright_points_do_not_decide_the_scale_of_live_sweeps() {
+        let number = Some(("i".to_owned(), IntensityKind::Number));
+        for (bright, expected) in [(1, 0.5), (2, 0.5 / 255.0)] {
+            let mut points = PointCloud {
+                xyzi: vec![[1.0, 2.0, 3.0, 0.5]; 100],
+            };
+            points.xyzi[..bright].fill([1.0, 2.0, 3.0, 1.02]);
+            let mut live = LiveIntensities::new(IntensityScale::AUTO);
+            let finding = live.scale(&mut points, number.clone());
+            assert_eq!(points.xyzi[99][3], expected, "{bright} of 100");
+            assert_eq!(finding.is_some(), bright == 1, "above 1: {finding:?}");
+        }
     }
 
     #[test]

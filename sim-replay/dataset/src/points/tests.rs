@@ -280,6 +280,16 @@ fn intensities_of_all_files_are_scaled_alike() {
     );
 }
 
+#[test]
+fn a_single_bright_point_does_not_decide_the_scale_of_a_file() {
+    let bright = turn(200, |index| vec![if index == 7 { 1.02 } else { 0.5 }]);
+    let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", bright)]);
+    assert_eq!(
+        largest_intensity(&sweeps, &dir.path().join("0.bin")),
+        (1.02, 1.0)
+    );
+}
+
 /// A file with the bytes of one field behind x, y, z.
 fn pcd_of_one_point(name: &str, kind: char, bytes: &[u8]) -> Vec<u8> {
     let size = bytes.len();

@@ -22,8 +22,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
-use protocol::{CavId, Handedness};
-use ros2::{SweepLimits, read_point_cloud};
+use protocol::{CavId, Handedness, Limits};
+use ros2::read_point_cloud;
 
 pub(super) use self::files::is_bag;
 
@@ -48,9 +48,10 @@ pub(crate) static ROSBAG: LayoutRow = LayoutRow {
 };
 
 /// Limits of a sweep: those of a file.
-const LIMITS: SweepLimits = SweepLimits {
+const LIMITS: Limits = Limits {
     max_points: 1 << 26,
     max_abs_value: f32::MAX,
+    ..Limits::DEFAULT
 };
 
 /// Sweeps and poses of a bag.
@@ -97,7 +98,7 @@ impl Bag {
     /// The sweep of a stamp with the intensities as stored.
     fn read_stored(&self, nanos: u64, sweep: &JoinedSweep) -> Result<PcdCloud> {
         let bytes = self.storage.read(sweep.place)?;
-        let read = read_point_cloud(&bytes, LIMITS).map_err(|error| {
+        let read = read_point_cloud(&bytes, &LIMITS).map_err(|error| {
             let reason = format!("sweep {nanos}: {error}");
             ReadError::malformed(self.storage.path(sweep.place), reason)
         })?;

@@ -75,20 +75,20 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
         for (setting, found, wanted) in settings {
             let (found, wanted) = (found.to_string(), wanted.to_string());
             if found != wanted {
-                return differs(folder, setting, found, wanted);
+                return differs(folder, setting, &found, &wanted);
             }
         }
         if !maps.contains(&made.map) {
-            return differs(folder, "map", made.map.clone(), maps.join(" or "));
+            return differs(folder, "map", &made.map, &maps.join(" or "));
         }
         if !options.agents.contains(&made.agents) {
             let wanted = format!("{} to {}", options.agents.start(), options.agents.end());
-            return differs(folder, "agents", made.agents.to_string(), wanted);
+            return differs(folder, "agents", &made.agents.to_string(), &wanted);
         }
     }
     let (found, wanted) = (scenarios.len(), options.scenes);
     if found != wanted {
-        return differs(folder, "scenarios", found.to_string(), wanted.to_string());
+        return differs(folder, "scenarios", &found.to_string(), &wanted.to_string());
     }
     if options.copies.is_empty() {
         return Ok(true);
@@ -99,20 +99,17 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
         let found = &scenario.lidar_variants;
         let mut wanted = options.copies.iter().filter_map(|copy| copy.variant());
         if let Some(lacking) = wanted.find(|copy| !found.iter().any(|name| name == copy)) {
-            let found = format!("{found:?}");
-            return differs(folder, "weather_copies", found, lacking.into());
+            return differs(folder, "weather_copies", &format!("{found:?}"), lacking);
         }
     }
     Ok(true)
 }
 
-fn differs(folder: &Path, setting: &'static str, found: String, wanted: String) -> Result<bool> {
-    Err(SynthError::Kept {
-        folder: folder.to_owned(),
-        setting,
-        found,
-        wanted,
-    })
+fn differs(folder: &Path, setting: &str, found: &str, wanted: &str) -> Result<bool> {
+    let folder = folder.display();
+    Err(SynthError::Kept(format!(
+        "{folder} holds scenes made with {setting} {found}, not {wanted}; take another folder, or remove it"
+    )))
 }
 
 /// As [`generate`], but the folder is renamed to its final name when the data set is complete: an interrupted run

@@ -1,7 +1,7 @@
 //! Conversion: writes an opened data set in another layout.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -19,17 +19,6 @@ use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Sce
 /// Candidate lengths of a tick, nanoseconds: the step of a simulator, and resolutions of sensor clocks.
 const TICKS_NANOS: [u64; 4] = [50_000_000, 10_000_000, 1_000_000, 1_000];
 
-/// Output folder and layout of a conversion.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ConvertOptions {
-    /// Folder of the scenarios.
-    pub out: PathBuf,
-    /// Layout of the files.
-    pub layout: SceneLayout,
-    /// True to write into a folder that is not empty.
-    pub force: bool,
-}
-
 /// Summary of a conversion.
 #[derive(Debug, Default)]
 pub struct Converted {
@@ -43,19 +32,21 @@ pub struct Converted {
     pub left_out: LeftOut,
 }
 
-/// Writes all scenarios of a data set in a layout. `progress` is called with the number of completed capture times and
-/// their total, from any thread.
+/// Writes all scenarios of a data set in a layout into the folder `out`, with `force` even if it is not empty. `progress`
+/// is called with the number of completed capture times and their total, from any thread.
 ///
 /// # Errors
 /// [`SynthError`] if the layout cannot hold a scene or a file cannot be written. A frame that cannot be read is left
 /// out and listed in [`Converted::left_out`].
 pub fn convert(
     dataset: &Dataset,
-    options: &ConvertOptions,
+    out: &Path,
+    layout: SceneLayout,
+    force: bool,
     progress: &(dyn Fn(usize, usize) + Sync),
 ) -> Result<Converted, SynthError> {
-    let unfinished = begin_folder(&options.out, options.force)?;
-    let mut writer = options.layout.writer(&options.out);
+    let unfinished = begin_folder(out, force)?;
+    let mut writer = layout.writer(out);
     let (omitted, left_out) = (Omissions::default(), Mutex::new(LeftOut::default()));
     locked(&left_out).add_files(&dataset.problems);
     let mut converted = Converted::default();
@@ -64,7 +55,7 @@ pub fn convert(
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
-        let holds_images = options.layout == SceneLayout::Opv2v;
+        let holds_images = layout == SceneLayout::Opv2v;
         let losses = (&omitted, &left_out);
         let frames = write_moments(scenario, writer.as_ref(), holds_images, losses, &|| {
             progress(done.fetch_add(1, Ordering::Relaxed) + 1, total)
@@ -74,7 +65,7 @@ pub fn convert(
         converted.agent_frames += frames;
     }
     writer.finish()?;
-    end_folder(&options.out, unfinished)?;
+    end_folder(out, unfinished)?;
     converted.omitted = omitted.into_counts();
     converted.left_out = std::mem::take(&mut *locked(&left_out));
     Ok(converted)

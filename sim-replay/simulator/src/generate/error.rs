@@ -17,18 +17,9 @@ pub enum SynthError {
     /// The output folder is not empty.
     #[error("{} is not empty; --force writes into it anyway", .0.display())]
     NotEmpty(PathBuf),
-    /// Cached scenes do not match the options.
-    #[error("{} holds scenes made with {setting} {found}, not {wanted}; take another folder, or remove it", folder.display())]
-    Kept {
-        /// Folder of the cached scenes.
-        folder: PathBuf,
-        /// The first setting that differs.
-        setting: &'static str,
-        /// Value with which they were made.
-        found: String,
-        /// Requested value.
-        wanted: String,
-    },
+    /// Cached scenes do not match the options: their folder, the first setting that differs, and both values.
+    #[error("{0}")]
+    Kept(String),
     /// A file or folder could not be written.
     #[error(transparent)]
     Write(FileError),
@@ -46,18 +37,7 @@ pub enum SynthError {
     /// The road network has no place for a vehicle.
     #[error("map {0} has no lane long enough to start from")]
     NoRoad(String),
-    /// Too few vehicles stay near the ego.
-    #[error(
-        "scene {scenario}: {found} vehicles stay within {range_m} m of the ego, {wanted} are wanted; fewer --vehicles or --frames help"
-    )]
-    TooFewCompanions {
-        /// The scenario.
-        scenario: String,
-        /// Number of companions found.
-        found: usize,
-        /// Number of companions needed.
-        wanted: usize,
-        /// Distance from the ego within which they have to stay, metres.
-        range_m: f64,
-    },
+    /// Too few vehicles stay near the ego: the scenario, both numbers and the distance.
+    #[error("{0}")]
+    TooFewCompanions(String),
 }

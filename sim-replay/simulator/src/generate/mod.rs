@@ -39,7 +39,7 @@ mod world;
 
 pub use cache::{are_kept, generate_whole};
 pub use camera::ImageSize;
-pub use convert::{ConvertOptions, Converted, convert};
+pub use convert::{Converted, convert};
 pub(crate) use error::Result;
 pub use error::SynthError;
 pub use layout::SceneLayout;

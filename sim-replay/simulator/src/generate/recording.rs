@@ -102,12 +102,11 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<SceneRecordi
     let (_, vehicles, frames, agents) =
         best.ok_or_else(|| SynthError::NoRoad(world.map_model.name.clone()))?;
     if agents.len() < spec.agents {
-        return Err(SynthError::TooFewCompanions {
-            scenario: spec.name.clone(),
-            found: agents.len() - 1,
-            wanted: spec.agents - 1,
-            range_m: COMM_RANGE_M,
-        });
+        let (scenario, found, wanted) = (&spec.name, agents.len() - 1, spec.agents - 1);
+        return Err(SynthError::TooFewCompanions(format!(
+            "scene {scenario}: {found} vehicles stay within {COMM_RANGE_M} m of the ego, {wanted} are wanted; fewer \
+             --vehicles or --frames help"
+        )));
     }
     Ok(SceneRecording {
         vehicles,

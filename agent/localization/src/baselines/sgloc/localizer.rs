@@ -68,7 +68,7 @@ impl SgLocLocalizer {
             epsilon_m: vec![0.0; sensor_m.len()],
             sensor_m,
             world_m: world.as_chunks().0.to_vec(),
-            origin_m: self.network.config().origin_m,
+            origin_m: self.network.config.origin_m,
         })
     }
 }
@@ -77,14 +77,14 @@ impl Localize for SgLocLocalizer {
     fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
         let mut times = stopwatch();
-        let config = self.network.encoder().config();
+        let config = self.network.encoder.config();
         let sweep = SweepVoxels::new(cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]), config);
         times.lap(VOXELISE);
         if sweep.cells().len() < MIN_CELLS {
             return Ok(Localization::no_pose(NoPoseReason::TooFewPoints, times));
         }
         let batch = VoxelBatch::new(&[&sweep], config, self.device)?;
-        let features = self.network.encoder().encode(&batch, Kind::Float)?;
+        let features = self.network.encoder.encode(&batch, Kind::Float)?;
         times.lap(ENCODE);
         let coordinates = self.regress(&sweep, &features)?;
         times.lap(REGRESS);

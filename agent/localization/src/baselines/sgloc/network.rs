@@ -22,8 +22,8 @@ pub struct SgLocConfig {
 /// Encoder and head of one scene.
 #[derive(Debug)]
 pub struct SgLoc {
-    config: SgLocConfig,
-    encoder: SceneEncoder,
+    pub(super) config: SgLocConfig,
+    pub(super) encoder: SceneEncoder,
     norm: FeatureNorm,
     head: SgLocHead,
 }
@@ -42,16 +42,6 @@ impl SgLoc {
             head: SgLocHead::new(&below, &config.encoder),
             norm: FeatureNorm::new(&(&below / "norm"), config.encoder.cell_channels()),
         })
-    }
-
-    /// Configuration that it was built from.
-    pub fn config(&self) -> &SgLocConfig {
-        &self.config
-    }
-
-    /// Encoder.
-    pub fn encoder(&self) -> &SceneEncoder {
-        &self.encoder
     }
 
     /// `[N, 3]` world coordinates relative to the origin, metres, of some cells' features `[N, cell_channels]`, which

@@ -55,7 +55,7 @@ impl BackboneEncoder {
 
     /// Features of some sweeps, one after another.
     pub(super) fn encode(&self, sweeps: &[&BevCells]) -> Result<EncodedCells> {
-        let rows = ranges(sweeps.iter().map(|sweep| sweep.cells().len()));
+        let rows = ranges(sweeps.iter().map(|sweep| sweep.cells.len()));
         let (mut cells, mut of_sweeps) = (Vec::new(), Vec::new());
         for sweep in sweeps {
             let encoded = (self.detector.lock().unwrap_or_else(PoisonError::into_inner))

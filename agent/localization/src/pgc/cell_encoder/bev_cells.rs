@@ -35,7 +35,7 @@ struct LevelGrid {
 /// Occupied cells of one sweep.
 #[derive(Debug, Clone)]
 pub struct BevCells {
-    cells: Vec<SweepCell>,
+    pub(super) cells: Vec<SweepCell>,
     /// For each level the number of the cell that contains each of [`Self::cells`], `y * width + x`.
     pub(super) places: Vec<Vec<i64>>,
     /// Points in the detector's area.
@@ -154,11 +154,6 @@ impl BevCells {
             cloud,
         }
     }
-
-    /// The cells, row after row.
-    pub fn cells(&self) -> &[SweepCell] {
-        &self.cells
-    }
 }
 
 #[cfg(test)]
@@ -180,11 +175,11 @@ mod tests {
                 [99.0, 0.0, 0.0, 0.0],
             ];
             let sweep = BevCells::new(&points, &format);
-            let both = sweep.cells().iter().find(|cell| cell.points == 2).unwrap();
+            let both = sweep.cells.iter().find(|cell| cell.points == 2).unwrap();
             assert!((both.centroid_m[1] - 3.05).abs() < 1e-5 && (both.extent_m - 1.5).abs() < 1e-6);
-            assert_eq!((sweep.cells().len(), sweep.cloud.xyzi.len()), (2, 3));
+            assert_eq!((sweep.cells.len(), sweep.cloud.xyzi.len()), (2, 3));
             for (grid, places) in format.levels.iter().zip(&sweep.places) {
-                for (cell, &place) in sweep.cells().iter().zip(places) {
+                for (cell, &place) in sweep.cells.iter().zip(places) {
                     let [x, y, _] = cell.centroid_m;
                     let [column, row] =
                         grid.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
@@ -215,6 +210,6 @@ mod tests {
             &[[f32::NAN; 4]],
             &BevFormat::of_detector(&DetectorConfig::lean()),
         );
-        assert!(sweep.cells().is_empty() && sweep.places.iter().all(Vec::is_empty));
+        assert!(sweep.cells.is_empty() && sweep.places.iter().all(Vec::is_empty));
     }
 }

@@ -223,7 +223,7 @@ impl PreparedSweep {
     pub fn cells(&self) -> &[SweepCell] {
         match self {
             Self::Voxels(voxels) => voxels.cells(),
-            Self::Bev(cells) => cells.cells(),
+            Self::Bev(sweep) => &sweep.cells,
         }
     }
 

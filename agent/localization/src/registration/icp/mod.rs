@@ -12,7 +12,6 @@ mod surfels;
 use nalgebra::{
     Isometry3, Matrix6, Point3, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6,
 };
-use serde::{Deserialize, Serialize};
 
 pub(crate) use surfels::{Surfel as Plane, is_level};
 use surfels::{Surfels, decimate};
@@ -25,10 +24,18 @@ const CONVERGED_M: f64 = 1e-3;
 /// Largest distance of two planes that agree, metres, and smallest cosine between their normals.
 const AGREED_M: f64 = 0.2;
 const AGREED_COSINE: f64 = 0.85;
+/// Smallest and largest range of points that are used, metres: nearer ones are hits on the vehicle itself.
+const RANGE_M: [f64; 2] = [2.5, 80.0];
+/// Side of the voxels that the source is decimated with, one point per voxel, metres.
+const SOURCE_VOXEL_M: f64 = 0.5;
+/// Share of the source's points that must have a partner in the end. Vehicles 50 m apart share a tenth of what they
+/// measure.
+const MIN_OVERLAP: f64 = 0.05;
+/// Required constraint of the worst direction: 1 if every pair constrains it, 0 if none does.
+const MIN_CONSTRAINT: f64 = 2e-3;
 
 /// One level of resolution.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IcpLevel {
     /// Side of the target's voxels, metres. Points farther than one and a half of it from any plane have no partner.
     pub voxel_m: f64,
@@ -49,22 +56,12 @@ impl IcpLevel {
 }
 
 /// Settings of a registration.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct IcpConfig {
     /// From coarse to fine.
     pub levels: Vec<IcpLevel>,
-    /// Smallest and largest range of points that are used, metres: nearer ones are hits on the vehicle itself.
-    pub range_m: [f64; 2],
-    /// Side of the voxels that the source is decimated with, one point per voxel, metres.
-    pub source_voxel_m: f64,
     /// Approximate number of points of the source at each level.
     pub max_points: usize,
-    /// Share of the source's points that must have a partner in the end. Vehicles 50 m apart share a tenth of what they
-    /// measure.
-    pub min_overlap: f64,
-    /// Required constraint of the worst direction: 1 if every pair constrains it, 0 if none does.
-    pub min_constraint: f64,
 }
 
 impl Default for IcpConfig {
@@ -76,11 +73,7 @@ impl Default for IcpConfig {
                 IcpLevel::new(1.0, 0.4, 20),
                 IcpLevel::new(0.5, 0.15, 20),
             ],
-            range_m: [2.5, 80.0],
-            source_voxel_m: 0.5,
             max_points: 5000,
-            min_overlap: 0.05,
-            min_constraint: 2e-3,
         }
     }
 }
@@ -102,7 +95,7 @@ impl IcpTarget {
         Self {
             levels: levels.map(|level| Surfels::new(level.voxel_m)).collect(),
             origin_m: None,
-            range_m: config.range_m,
+            range_m: RANGE_M,
         }
     }
 
@@ -141,22 +134,26 @@ impl IcpTarget {
         })
     }
 
-    /// Planes of a sweep that lie on a plane of the same direction, of how many; level ones, which fit everywhere, do not
-    /// count.
+    /// Planes of a sweep that lie on a plane of the same direction, of how many: of level ones, which fit everywhere, those
+    /// that have a level one above or below them, or of the others.
     pub(crate) fn agreement(
         &self,
         planes: &[Plane],
         target_from_sensor: &Isometry3<f64>,
+        of_level: bool,
     ) -> [usize; 2] {
+        let Some(target) = self.levels.last() else {
+            return [0; 2];
+        };
         let origin_m = self.origin_m.unwrap_or_default();
         let (mut count, mut agreed) = (0, 0);
         for plane in planes {
             let centre_m = (target_from_sensor * Point3::from(plane.centre_m)).coords - origin_m;
             let normal = target_from_sensor * plane.normal;
-            if is_level(&normal) {
+            if is_level(&normal) != of_level || of_level && !target.has_level_at(&centre_m) {
                 continue;
             }
-            let near = self.levels.last().and_then(|planes| planes.near(&centre_m));
+            let near = target.near(&centre_m);
             count += 1;
             agreed += usize::from(near.is_some_and(|near| {
                 let distance_m = near.normal.dot(&(centre_m - near.centre_m));
@@ -180,9 +177,9 @@ pub struct IcpSource {
 
 impl IcpSource {
     /// Decimates a sweep.
-    pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
+    pub fn of_sweep(xyzi: &[[f32; 4]]) -> Self {
         Self {
-            points_m: decimate(within(xyzi, config.range_m), config.source_voxel_m),
+            points_m: decimate(within(xyzi, RANGE_M), SOURCE_VOXEL_M),
         }
     }
 
@@ -233,22 +230,18 @@ pub enum NoIcpFit {
         found: usize,
     },
     /// The clouds do not overlap at the resulting pose.
-    #[error("{overlap:.2} of the points have a partner, at least {required:.2} must")]
+    #[error("{overlap:.2} of the points have a partner, at least {MIN_OVERLAP:.2} must")]
     TooLittleOverlap {
         /// Share of points with a partner.
         overlap: f64,
-        /// Required share.
-        required: f64,
     },
     /// Some direction is unconstrained: nothing but ground, or a street between two walls.
     #[error(
-        "the planes constrain the worst direction to {constraint:.1e} only, at least {required:.1e} is needed"
+        "the planes constrain the worst direction to {constraint:.1e} only, at least {MIN_CONSTRAINT:.1e} is needed"
     )]
     Unconstrained {
         /// Constraint of the worst direction, 0..1.
         constraint: f64,
-        /// Required constraint.
-        required: f64,
     },
 }
 
@@ -297,7 +290,7 @@ pub fn register(
         }
     }
     // `last` is of the finest level by now: the wide kernel of a coarse one would overstate the overlap.
-    last.judge(points.len(), config)?;
+    last.judge(points.len())?;
     let points = points.len() as f64;
     let mean_square_m2 = last.squares / last.pairs;
     Ok(IcpFit {
@@ -394,21 +387,15 @@ impl NormalEquations {
         })
     }
 
-    fn judge(&self, points: usize, config: &IcpConfig) -> Result<(), NoIcpFit> {
+    fn judge(&self, points: usize) -> Result<(), NoIcpFit> {
         let overlap = self.pairs / points as f64;
-        if overlap < config.min_overlap.max(f64::EPSILON) {
-            return Err(NoIcpFit::TooLittleOverlap {
-                overlap,
-                required: config.min_overlap,
-            });
+        if overlap < MIN_OVERLAP {
+            return Err(NoIcpFit::TooLittleOverlap { overlap });
         }
         let eigen = SymmetricEigen::new(self.hessian / self.weight);
         let constraint = eigen.eigenvalues.min();
-        if constraint < config.min_constraint {
-            return Err(NoIcpFit::Unconstrained {
-                constraint,
-                required: config.min_constraint,
-            });
+        if constraint < MIN_CONSTRAINT {
+            return Err(NoIcpFit::Unconstrained { constraint });
         }
         Ok(())
     }
@@ -467,7 +454,7 @@ mod tests {
         let config = IcpConfig::default();
         let (here, there) = (pose(0.0, 0.0, 0.2), pose(3.0, -1.5, 0.6));
         let target = IcpTarget::of_sweep(&crossing(&here, 0.0), &config);
-        let source = IcpSource::of_sweep(&crossing(&there, 0.11), &config);
+        let source = IcpSource::of_sweep(&crossing(&there, 0.11));
         let truth = here.inv_mul(&there);
         let start = truth
             * Isometry3::new(
@@ -497,7 +484,7 @@ mod tests {
         }
         map.fit();
         let there = pose(1.0, 1.0, 0.3);
-        let source = IcpSource::of_sweep(&crossing(&there, 0.15), &config);
+        let source = IcpSource::of_sweep(&crossing(&there, 0.15));
         let start =
             far * there * Isometry3::new(Vector3::new(-0.7, 0.7, 0.0), Vector3::z() * -0.04);
         let fit = register(&source, &map, &start, &config).unwrap();
@@ -526,7 +513,7 @@ mod tests {
             lorry(5.0).map(|p| [p[0] as f32 - 1.0, p[1] as f32 - 0.3, p[2] as f32 - 2.0, 0.1]),
         );
         assert!(moved.len() > static_points);
-        let source = IcpSource::of_sweep(&moved, &config);
+        let source = IcpSource::of_sweep(&moved);
         let fit = register(
             &source,
             &IcpTarget::of_sweep(&target, &config),
@@ -579,7 +566,7 @@ mod tests {
         ] {
             let target = IcpTarget::of_sweep(&target, &config);
             let found = register(
-                &IcpSource::of_sweep(&source, &config),
+                &IcpSource::of_sweep(&source),
                 &target,
                 &Isometry3::identity(),
                 &config,
@@ -596,10 +583,10 @@ mod tests {
         let config = IcpConfig::default();
         let sweep = crossing(&pose(0.0, 0.0, 0.0), 0.0);
         let (source, target) = (
-            IcpSource::of_sweep(&sweep, &config),
+            IcpSource::of_sweep(&sweep),
             IcpTarget::of_sweep(&sweep, &config),
         );
-        let none = IcpSource::of_sweep(&[[f32::NAN; 4]; 1000], &config);
+        let none = IcpSource::of_sweep(&[[f32::NAN; 4]; 1000]);
         let start = Isometry3::identity();
         assert!(matches!(
             register(&none, &target, &start, &config),

@@ -62,7 +62,6 @@ impl SurfelMap {
                 IcpLevel::new(VOXEL_M, 0.1, 12),
             ],
             max_points: 2000,
-            ..IcpConfig::default()
         }
     }
 
@@ -303,7 +302,7 @@ pub(crate) mod tests {
         let (_folder, path, truth) = stored();
         let map = SurfelMap::load(&path).unwrap();
         let config = SurfelMap::registration();
-        let source = IcpSource::of_sweep(&yard(), &config);
+        let source = IcpSource::of_sweep(&yard());
         let start = truth * Isometry3::new(Vector3::new(0.3, -0.2, 0.1), Vector3::z() * 0.02);
         let fit = register(&source, map.target(), &start, &config).unwrap();
         let off = truth.inv_mul(&fit.target_from_source);

@@ -196,6 +196,15 @@ impl Surfels {
         let nearest = planes.min_by(|(_, a), (_, b)| a.total_cmp(b));
         nearest.map(|(plane, _)| plane)
     }
+
+    /// True if there is a level plane near a place, at most six voxels above or below the point.
+    pub(super) fn has_level_at(&self, point_m: &Vector3<f64>) -> bool {
+        (-6..=6).any(|step| {
+            let at_m = point_m + Vector3::z() * (f64::from(step) * self.voxel_m);
+            let near = self.near(&at_m);
+            near.is_some_and(|near| is_level(&near.normal))
+        })
+    }
 }
 
 /// One point for every occupied voxel: the mean of the points in it, in order of first appearance.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use agent_offline::TrainingBar;
 use agent_offline::training::{
-    LeaveOut, RedundancyConfig, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
+    LeaveOut, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
 };
 use perception::train::{ModelCard, TrainingOptions};
 
@@ -106,11 +106,7 @@ impl Args {
                 turn_rad: self.turn_deg.to_radians(),
                 keep: 0.7,
             },
-            redundancy: self.leave_out.map(|leave_out| RedundancyConfig {
-                leave_out,
-                seed: run.seed,
-                ..RedundancyConfig::default()
-            }),
+            redundancy: self.leave_out,
             run,
             validate_every: Duration::from_secs(self.validate_every_s),
         })

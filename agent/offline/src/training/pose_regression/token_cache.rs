@@ -89,7 +89,7 @@ impl PooledSweeps {
             if !sweeps.is_empty() {
                 let cells = encoder.encode(&batch, run.precision.kind())?.cells;
                 for (number, sweep) in sweeps.iter().enumerate() {
-                    let rows = batch.cell_rows(number);
+                    let rows = &batch.cell_rows[number];
                     let own = cells.f_narrow(0, rows.start, rows.end - rows.start)?;
                     // Half precision: the pooled features of all sweeps lie on the device at once.
                     parts.push(pool(sweep.voxels.cells(), &own)?.f_to_kind(Kind::Half)?);

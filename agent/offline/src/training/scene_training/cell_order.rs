@@ -124,7 +124,7 @@ mod tests {
     use tch::Device;
 
     use super::*;
-    use crate::training::RedundancyConfig;
+    use crate::training::LeaveOut;
 
     fn zeros(rows: i64, columns: i64) -> Tensor {
         Tensor::zeros([rows, columns], (Kind::Float, Device::Cpu))
@@ -146,7 +146,7 @@ mod tests {
 
     #[test]
     fn sweeps_are_left_out_from_the_end_of_a_window_and_used_again_later() {
-        let redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 10]);
+        let redundancy = Redundancy::new(LeaveOut::EvenLoss, 0, vec![0; 10]);
         let mut order = CellOrder::new(&cache(), Some(redundancy), 30, 1, 0).unwrap();
         let (mut steps, mut cells_of_pass) = (0, vec![0; 21]);
         while order.passes < 20.0 {
@@ -179,18 +179,9 @@ mod tests {
     #[test]
     fn all_are_used_again_in_the_middle_of_a_long_pass() {
         // The first two of four passes are recorded; the last is three eighths over when all are used again.
-        let config = RedundancyConfig {
-            windows: [[0.0, 0.5], [0.9, 0.95]],
-            ..RedundancyConfig::default()
-        };
-        let mut order = CellOrder::new(
-            &cache(),
-            Some(Redundancy::new(config, vec![0; 10])),
-            10,
-            1,
-            0,
-        )
-        .unwrap();
+        let mut redundancy = Redundancy::new(LeaveOut::EvenLoss, 0, vec![0; 10]);
+        redundancy.windows = [[0.0, 0.5], [0.9, 0.95]];
+        let mut order = CellOrder::new(&cache(), Some(redundancy), 10, 1, 0).unwrap();
         let mut cells = Vec::new();
         while order.passes < 4.0 {
             let share_done = order.passes / 4.0;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::training::{RedundancyConfig, SceneAccuracy, SweepAugmentation};
+use crate::training::{LeaveOut, SceneAccuracy, SweepAugmentation};
 use perception::train::{RunConfig, Trained};
 
 /// Configuration of a training of a head.
@@ -34,7 +34,7 @@ pub struct SceneTrainConfig {
     /// Augmentation of sweeps before they are encoded.
     pub augmentation: SweepAugmentation,
     /// Selection of sweeps that may be left out; `None`: none.
-    pub redundancy: Option<RedundancyConfig>,
+    pub redundancy: Option<LeaveOut>,
     /// Training run; a batch are cells, a time counts from the start, reading and encoding included.
     pub run: RunConfig,
     /// Time between two validations and checkpoints.

@@ -70,12 +70,11 @@ pub(super) fn crop(
 
 /// x and y below which a share of the cells lies.
 fn quantiles(targets_m: &Tensor, share: f64) -> Result<[f64; 2], TchError> {
-    let mut quantiles = [0.0; 2];
-    for (axis, quantile) in (0..).zip(&mut quantiles) {
+    let [x, y] = [0, 1].map(|axis| {
         let values = targets_m.f_select(1, axis)?;
         // `kthvalue` counts from 1.
         let rank = ((values.size()[0] - 1) as f64 * share).round() as i64 + 1;
-        *quantile = values.f_kthvalue(rank, 0, false)?.0.f_double_value(&[])?;
-    }
-    Ok(quantiles)
+        values.f_kthvalue(rank, 0, false)?.0.f_double_value(&[])
+    });
+    Ok([x?, y?])
 }

@@ -5,7 +5,6 @@ mod classifier;
 mod coarse_pose;
 mod config;
 mod continued;
-mod features;
 mod key_grid;
 mod losses;
 mod statistics;
@@ -21,16 +20,15 @@ pub use self::config::{SceneSummary, SceneTrainConfig};
 
 use self::cell_order::CellOrder;
 use self::classifier::train_classifier;
-use self::features::Features;
 use self::losses::{centre_loss, weighted_loss};
-use super::feature_cache::FeatureCache;
+use super::feature_cache::{FeatureCache, SweepAugmentation};
 use super::kmeans::kmeans;
 use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
 use crate::{Error, Result};
 use localization::pgc::driven_area::DrivenArea;
-use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
+use localization::pgc::{CellEncoder, LocalizerError, SceneHead, SceneHeadConfig, SweepFormat};
 use perception::train::{
     Curve, DataListing, Length, Means, Observe, SaveEvery, Task, Trainer, TrainingEvent,
 };
@@ -113,14 +111,20 @@ impl<'a> SceneTraining<'a> {
         let run = &config.run;
         // Seeds the tensor library: before the first variable is made.
         run.start()?;
-        let features = Features::compute(config, training, validation, observe)?;
-        let load =
-            |init: &PathBuf| continued::load(init, &config.encoder, &features.encoder_sha256);
+        let (encoder, sha256) = CellEncoder::load(&config.encoder, run.device)?;
+        let mut cache = FeatureCache::build(training, &encoder, config.augmentation, run, observe)?;
+        let unchanged = SweepAugmentation::NONE;
+        let validation = validation
+            .map(|list| FeatureCache::build(list, &encoder, unchanged, run, observe))
+            .transpose()?;
+        let format = encoder.format().clone();
+        // The encoder is frozen: only its features are needed from here on, and its memory is freed.
+        drop(encoder);
+        let load = |init: &PathBuf| continued::load(init, &config.encoder, &sha256);
         let stored = config.init.as_ref().map(load).transpose()?;
         let stored_config = stored.as_ref().map(|(_, config)| config);
-        let head_config = head_config(config, stored_config, &features)?;
+        let head_config = head_config(config, stored_config, &cache, &format, sha256)?;
         // Coordinates are relative to the origin of the head: f32 is exact enough near it only.
-        let mut cache = features.training;
         cache.move_origin(head_config.origin_m)?;
         let variables = VarStore::new(run.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
@@ -143,7 +147,7 @@ impl<'a> SceneTraining<'a> {
         let trainer = Trainer::begin(run, &variables, None, started)?;
         let redundancy = config
             .redundancy
-            .map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
+            .map(|leave_out| Redundancy::new(leave_out, run.seed, class_of_sweep));
         let training = Self {
             config,
             observe,
@@ -153,7 +157,7 @@ impl<'a> SceneTraining<'a> {
             order: CellOrder::new(&cache, redundancy, run.batch, run.seed, trainer.steps())?,
             headings: coarse_pose::headings(&cache.world_from_sensor, run.device)?,
             cache,
-            validation: features.validation,
+            validation,
             logits: None,
             latest: None,
             cells_shown: 0,
@@ -294,11 +298,12 @@ impl Task for SceneTraining<'_> {
 fn head_config(
     config: &SceneTrainConfig,
     stored: Option<&SceneHeadConfig>,
-    features: &Features,
+    cache: &FeatureCache,
+    format: &SweepFormat,
+    encoder_sha256: String,
 ) -> Result<SceneHeadConfig> {
-    let (training, format) = (&features.training, &features.format);
     // Median of the sweeps' numbers of points.
-    let mut sorted = training.points.to_vec();
+    let mut sorted = cache.points.to_vec();
     sorted.sort_unstable();
     let sweep_points = sorted.get(sorted.len() / 2).copied();
     if let Some(stored) = stored {
@@ -309,17 +314,17 @@ fn head_config(
     }
     let refiner = config
         .refiner
-        .then(|| key_grid::covering(&training.targets_m, format.local_channels()));
+        .then(|| key_grid::covering(&cache.targets_m, format.local_channels()));
     Ok(SceneHeadConfig {
         scene_name: config.scene_name.clone(),
-        encoder_sha256: features.encoder_sha256.clone(),
+        encoder_sha256,
         cell_channels: format.cell_channels(),
         sweep_channels: format.sweep_channels(),
         classes: config.classes,
         centres: config.centres,
         width: config.width,
         blocks: config.blocks,
-        origin_m: training.origin_m,
+        origin_m: cache.origin_m,
         max_cells: MAX_CELLS,
         refiner: refiner.transpose()?,
         sweep_points,

@@ -94,7 +94,14 @@ fn codec(point: &Point) -> Option<String> {
     }
     let kept = point.codec.keep;
     let kept = kept.map_or(String::new(), |keep| format!(" {} %", 100.0 * keep));
-    Some(point.codec.name() + &kept)
+    let level = point.codec.zstd_level;
+    let packed = level.map_or(String::new(), |level| format!(" zstd {level}"));
+    Some(point.codec.name() + &kept + &packed)
+}
+
+/// Names of all figures that a sweep may have.
+pub(super) fn names() -> impl Iterator<Item = &'static str> {
+    DIMENSIONS.iter().map(|dimension| dimension.name)
 }
 
 /// A figure for each field with several values, AP at 0.5 and at 0.7 side by side; means over seeds.
@@ -198,7 +205,21 @@ fn span(low: f64, high: f64, is_far_from_zero: bool) -> [f64; 2] {
 
 #[cfg(test)]
 mod tests {
+    use super::super::table::tests::runs;
     use super::*;
+
+    #[test]
+    fn levels_of_compression_are_points_of_their_own() {
+        let codecs = "[{dtype: i8}, {dtype: i8, zstd_level: 3}, {dtype: i8, zstd_level: 19}]";
+        let (experiment, runs) = runs(&format!("{{method: [max], codec: {codecs}}}"));
+        let figures = figures(&experiment, &runs);
+        assert_eq!(figures.len(), 1);
+        assert_eq!(
+            (figures[0].name, figures[0].charts[0].series[0].points.len()),
+            (BYTES, 3)
+        );
+        assert!(names().any(|name| name == BYTES));
+    }
 
     #[test]
     fn axes_begin_at_zero_unless_all_values_are_far_from_it() {

@@ -9,6 +9,7 @@ use simulator::generate::{self, Subset, SynthOptions};
 use support::output;
 use terminal::progress;
 
+use super::remove;
 use crate::experiment::spec::Experiment;
 
 /// Options with which the data set of the experiment is generated.
@@ -52,13 +53,7 @@ pub(in crate::experiment) fn generate(experiment: &Experiment) -> Result<()> {
     }
     drop(lock);
     // A process that waits at the removed file still gets its lock, and finds the data then.
-    match fs::remove_file(&path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            Err(error).with_context(|| path.display().to_string())
-        }
-        // Another slice has removed it.
-        Ok(()) | Err(_) => Ok(()),
-    }
+    remove(&path)
 }
 
 /// A lock that other processes wait for, on this host and on those that share the folder, until it is dropped.

@@ -153,8 +153,7 @@ impl Point {
             link.seed = self.seed;
         }
         setup.pool = self.vehicles.map_or(AgentPool::All, AgentPool::First);
-        // Kept in 32 bits whatever is sent: one cache serves all encodings of the grid.
-        trial.maps = Some(experiment.kept_maps(maps, Dtype::F32));
+        trial.maps = Some(experiment.kept_maps(maps));
         Ok(trial)
     }
 
@@ -177,7 +176,11 @@ impl Point {
     /// Pose source of this point.
     fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
         let Some(noise) = self.pose_noise else {
-            return experiment.poses.clone();
+            let mut poses = experiment.poses.clone();
+            if let (PoseSourceConfig::Noisy(noisy), Some(_)) = (&mut poses, &experiment.grid.seed) {
+                noisy.seed = self.seed;
+            }
+            return poses;
         };
         PoseSourceConfig::Noisy(NoisyPoseConfig {
             mode: experiment.noise_mode,
@@ -251,6 +254,23 @@ mod tests {
         assert_eq!((points.len(), count(&grid.grid)), (6, 6));
         assert!(points[4..].iter().all(|point| point.method == Method::LATE));
         assert!(points[4..].iter().all(|point| point.codec.keep.is_none()));
+    }
+
+    #[test]
+    fn a_seed_of_the_grid_is_that_of_noisy_poses_too() {
+        let seeds = |grid: &str| -> Vec<u64> {
+            let mut experiment = experiment(grid);
+            experiment.poses = PoseSourceConfig::Noisy(NoisyPoseConfig::default());
+            let points = points(&experiment).into_iter();
+            let poses = points.map(|point| match point.poses(&experiment) {
+                PoseSourceConfig::Noisy(noisy) => noisy.seed,
+                other => panic!("{}", other.name()),
+            });
+            poses.collect()
+        };
+        assert_eq!(seeds("{method: [max], seed: [3, 4]}"), [3, 4]);
+        let own = NoisyPoseConfig::default().seed;
+        assert_eq!(seeds("{method: [max]}"), [own], "unless the grid has one");
     }
 
     fn shaped_link(point: &Point) -> LinkConfig {

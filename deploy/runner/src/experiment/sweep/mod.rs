@@ -20,12 +20,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Result, ensure};
 use dataset::Scenario;
-use figures;
 use fusion::Exchange;
 use perception::weights::Weights;
-use protocol::Dtype;
 use serde::Serialize;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::cli::NotWritten;
@@ -76,6 +74,8 @@ pub struct Run {
 #[derive(Debug)]
 pub struct ExperimentSweep {
     file: PathBuf,
+    /// Text of the file when it was read; empty if there is no report to hold it.
+    text: String,
     experiment: Experiment,
     points: Vec<Point>,
     data: OpenedData,
@@ -88,9 +88,14 @@ impl ExperimentSweep {
     /// # Errors
     /// An error that names the file and the field.
     pub fn open(file: &Path, out: &Path) -> Result<Self> {
+        let text = bounded_file::read_text(file, MAX_TEXT_BYTES);
+        let text = text.with_context(|| file.display().to_string())?;
         let experiment = read(file)?;
         generate(&experiment)?;
-        Self::over(experiment, file, out)
+        Ok(Self {
+            text,
+            ..Self::over(experiment, file, out)?
+        })
     }
 
     /// Prints the number of runs and the time that they will take, and writes nothing: a data set that does not exist
@@ -129,10 +134,12 @@ impl ExperimentSweep {
             let problem = format!("dataset {dataset}: there is no frame in it");
             return Err(FileError::new(file, problem).into());
         }
-        check::check_scenes(&experiment, &scenarios)
+        let asked = experiment.grid.vehicles.iter().flatten().copied();
+        check::check_vehicles("grid.vehicles", asked, &scenarios)
             .map_err(|problem| FileError::new(file, problem))?;
         Ok(Self {
             file: file.to_owned(),
+            text: String::new(),
             points: points(&experiment),
             experiment,
             data,
@@ -142,9 +149,11 @@ impl ExperimentSweep {
 
     /// Identity of the run of each point.
     fn keys(&self) -> Result<Vec<CellKey>> {
-        let points = self.points.iter();
-        let keys = points.map(|point| self.trial(point)?.key(&self.data, point.method));
-        keys.collect()
+        self.points.iter().map(|point| self.key(point)).collect()
+    }
+
+    fn key(&self, point: &Point) -> Result<CellKey> {
+        self.trial(point)?.key(&self.data, point.method)
     }
 
     fn trial(&self, point: &Point) -> Result<Trial> {
@@ -255,7 +264,7 @@ impl ExperimentSweep {
     }
 
     fn kept_maps(&self) -> KeptMaps {
-        self.experiment.kept_maps(&self.maps(), Dtype::F32)
+        self.experiment.kept_maps(&self.maps())
     }
 
     /// Computes the feature maps of all sweeps, once for each encoder that is needed.
@@ -285,9 +294,7 @@ impl ExperimentSweep {
             let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
             files.insert(FeatureStore::file(&kept, &weights, scenarios, digests)?);
         }
-        for path in files.into_iter().filter(|file| file.exists()) {
-            fs::remove_file(&path).with_context(|| path.display().to_string())?;
-        }
+        files.iter().try_for_each(|file| remove(file))?;
         // The folder stays where it holds anything else.
         let _ = fs::remove_dir(self.maps());
         Ok(())
@@ -348,20 +355,26 @@ impl ExperimentSweep {
     pub fn work(&self) -> Result<()> {
         const PARENT: &str = "the parent sweep";
         for line in io::stdin().lock().lines() {
-            let request: Option<(usize, CellKey)> =
-                serde_json::from_str(&line.context(PARENT)?).ok();
-            let computed = match request.filter(|(index, _)| *index < self.points.len()) {
+            // A line that is no request is answered too, or the parent would wait for ever.
+            let request: Result<(usize, CellKey)> =
+                serde_json::from_str(&line.context(PARENT)?).context(PARENT);
+            let computed = request.and_then(|(index, key)| {
+                let point = self.points.get(index);
+                let own = point.map(|point| self.key(point)).transpose()?;
+                ensure!(
+                    own.is_some_and(|own| own.sha256 == key.sha256),
+                    "{} or a file that it names was changed while the sweep ran",
+                    self.file.display()
+                );
                 // The parent may have ended; then the answer to the run fails too.
-                Some((index, key)) => self.compute_one(index, key, &mut || {
+                self.compute_one(index, key, &mut || {
                     reply(workers::FRAME).unwrap_or_default()
-                }),
-                // A line that is no request is answered too, or the parent would wait for ever.
-                None => Err(anyhow!("that is no point of the grid")),
-            };
-            let answer = match computed {
-                Ok(()) => workers::DONE.to_owned(),
-                Err(error) => format!("{} {error:#}", workers::FAILED),
-            };
+                })
+            });
+            let answer = computed.map_or_else(
+                |error| workers::failure(&error),
+                |()| workers::DONE.to_owned(),
+            );
             reply(&answer).context(PARENT)?;
         }
         Ok(())
@@ -370,6 +383,11 @@ impl ExperimentSweep {
     /// Writes table, charts and report; returns the table for a terminal.
     fn write(&self, runs: &[Run]) -> Result<String> {
         let mut drawings = Vec::new();
+        // Those of axes that the experiment had before must not stay beside its table.
+        for name in charts::names() {
+            remove(&self.out.join(name).with_extension("svg"))?;
+            remove(&self.out.join(name).with_extension("png"))?;
+        }
         for figure in charts::figures(&self.experiment, runs) {
             let path = self.out.join(figure.name);
             write(&path.with_extension("svg"), &figures::svg(&figure.charts)?)?;
@@ -378,11 +396,10 @@ impl ExperimentSweep {
             let each = figure.charts.chunks(1).map(figures::svg);
             drawings.push(each.collect::<Result<Vec<_>, _>>()?);
         }
-        let spec = bounded_file::read_text(&self.file, MAX_TEXT_BYTES)
-            .with_context(|| self.file.display().to_string())?;
-        let (columns, lines) = table::rows(&self.experiment, runs);
-        let varying = VaryingTable::new(&columns, &lines);
-        let page = html::page(&self.experiment, &spec, runs, &drawings, &varying);
+        let columns: Vec<&str> = table::COLUMNS.split(',').collect();
+        let lines = runs.iter().map(|run| table::line(&self.experiment, run));
+        let varying = VaryingTable::new(&columns, &Vec::from_iter(lines));
+        let page = html::page(&self.experiment, &self.text, runs, &drawings, &varying);
         write(&self.out.join("report.html"), &page)?;
         let name = format!("{}.csv", self.experiment.name);
         write(&self.out.join(name), &csv(&self.experiment, runs))?;
@@ -419,4 +436,12 @@ fn missing(known: &[Option<Cell>], part: Range<usize>) -> Vec<usize> {
 /// Writes a file of the sweep.
 fn write(path: &Path, text: &str) -> Result<()> {
     atomic_file::write(path, text).with_context(|| path.display().to_string())
+}
+
+/// Removes a file, if it is there.
+fn remove(path: &Path) -> Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        removed => removed.with_context(|| path.display().to_string()),
+    }
 }

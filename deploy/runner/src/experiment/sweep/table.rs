@@ -17,7 +17,7 @@ const REASONS: [DropReason; 7] = {
 };
 
 /// Names of the columns.
-const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbps,loss,noise_t,noise_r,vehicles,seed,frames,\
+pub(super) const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbps,loss,noise_t,noise_r,vehicles,seed,frames,\
     ap_global_30,ap_global_50,ap_global_70,ap_frame_30,ap_frame_50,ap_frame_70,payload_bytes,wire_bytes,log2_payload,\
     log2_wire,log2_frame,log2_fp32,nominal_fp32_log2,e2e_ms_p50,e2e_ms_p95,e2e_ms_p99,age_ms_p50,age_ms_p95,frames_used,\
     stale,sent,received,in_flight,dropped_link_loss,dropped_link_queue,dropped_superseded,dropped_stale,dropped_duplicate,\
@@ -33,19 +33,15 @@ pub fn csv(experiment: &Experiment, runs: &[Run]) -> String {
     text.finish()
 }
 
-/// Names of the columns, and the fields of each line.
-pub(super) fn rows(experiment: &Experiment, runs: &[Run]) -> (Vec<&'static str>, Vec<Vec<String>>) {
-    (
-        COLUMNS.split(',').collect(),
-        runs.iter().map(|run| line(experiment, run)).collect(),
-    )
-}
-
-fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
+/// Fields of the line of a run.
+pub(super) fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
     let (metrics, used, messages) = (&cell.metrics, cell.used, &cell.messages);
     let codec = (point.method.exchange() == Exchange::Features).then_some(point.codec);
-    // The size of a compressed or fitted map has no fixed ratio to that in 32 bits.
-    let is_plain = codec.is_some_and(|codec| codec.fit.is_none() && codec.zstd_level.is_none());
+    // The size of a compressed, fitted or sparse map, and that of boxes, has no fixed ratio to the values of a map.
+    let is_plain = codec.is_some_and(|codec| {
+        let is_whole = codec.keep.is_none_or(|keep| keep >= 1.0) && point.method.gate().is_none();
+        is_whole && codec.fit.is_none() && codec.zstd_level.is_none() && codec.boxes.is_none()
+    });
     // A point has no rate where it is unlimited, and where the grid does not vary it.
     let bandwidth = match point.bandwidth_mbps {
         None if experiment.grid.bandwidth_mbps.is_some() => "inf".into(),
@@ -100,4 +96,61 @@ fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
     counts.push(all - dropped.iter().sum::<u64>());
     fields.extend(counts.iter().map(ToString::to_string));
     fields
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use deploy::score::metrics::{ByIou, Communication, Messages, Metrics};
+    use support::provenance::Provenance;
+
+    use super::*;
+    use crate::experiment::cell::{Cell, CellKey};
+    use crate::experiment::sweep::points;
+
+    /// An experiment with a grid, and its runs of 1024 bytes a message; each has a higher AP than the one before.
+    pub(in crate::experiment::sweep) fn runs(grid: &str) -> (Experiment, Vec<Run>) {
+        let text = format!("name: e\ndataset: d\nweights: w\ngrid: {grid}\n");
+        let experiment: Experiment = serde_saphyr::from_str(&text).unwrap();
+        let runs = points(&experiment).into_iter().zip(1..);
+        let runs = runs.map(|(point, place)| {
+            let precision = Some(0.1 * f64::from(place));
+            let ap_global = ByIou {
+                at_30: precision,
+                at_50: precision,
+                at_70: precision,
+            };
+            let key = CellKey {
+                method: point.method,
+                sha256: String::new(),
+                provenance: Provenance::default(),
+            };
+            let metrics = Metrics {
+                ap_global,
+                comm: Communication::of(&[(1024, 1100)], 1),
+                ..Metrics::default()
+            };
+            let cell = Cell {
+                key,
+                metrics,
+                used: 1,
+                messages: Messages::default(),
+                wall_seconds: 0.0,
+            };
+            Run { point, cell }
+        });
+        let runs = runs.collect();
+        (experiment, runs)
+    }
+
+    #[test]
+    fn the_values_of_a_map_are_counted_only_where_the_bytes_give_their_number() {
+        let codecs = "[{dtype: f16}, {dtype: f16, keep: 1}, {dtype: f16, keep: 0.5}, {dtype: f16, boxes: only}, \
+                      {dtype: f16, boxes: beside}, {dtype: f16, zstd_level: 3}]";
+        let grid = format!("{{method: [max], reference: [where2comm, late], codec: {codecs}}}");
+        let (experiment, runs) = runs(&grid);
+        let place = COLUMNS.split(',').position(|name| name == "log2_fp32");
+        let lines = runs.iter().map(|run| line(&experiment, run));
+        let values: Vec<String> = lines.map(|line| line[place.unwrap()].clone()).collect();
+        assert_eq!(values, ["11.0000", "11.0000", "", "", "", "", "", ""]);
+    }
 }

@@ -1,14 +1,17 @@
 //! Worker processes of a sweep, each with one compute thread.
 //!
 //! A worker is this program with `--worker`: it reads the number and the identity of a run from standard input, computes
-//! it, caches it, and answers on standard output: `frame` for each frame, then `done`, or `failed` with the reason.
+//! it, caches it, and answers on standard output: `frame` for each frame, then `done`, or `refused` or `failed` with the
+//! reason.
 
-use std::io::{BufRead, BufReader, Write};
+use std::io::{self, BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Error, Result};
+use support::cli::NotWritten;
+use support::file_error::NoSpace;
 use support::sync::lock;
 
 use super::WorkerError;
@@ -18,8 +21,10 @@ use crate::experiment::cell::CellKey;
 pub(super) const FRAME: &str = "frame";
 /// The run is cached.
 pub(super) const DONE: &str = "done";
-/// The run failed; the reason follows on the same line.
-pub(super) const FAILED: &str = "failed";
+/// The input of the run is at fault; the reason follows on the same line.
+const REFUSED: &str = "refused";
+/// The run failed without a fault of the input; the reason follows on the same line.
+const FAILED: &str = "failed";
 
 /// Number and identity of a run.
 type CellRequest<'r> = (usize, &'r CellKey);
@@ -53,7 +58,7 @@ fn serve<'r>(
     file: &Path,
     out: &Path,
     queue: &Mutex<impl Iterator<Item = CellRequest<'r>>>,
-    failure: &Mutex<Option<anyhow::Error>>,
+    failure: &Mutex<Option<Error>>,
     on_frame: &dyn Fn(),
     on_done: &dyn Fn(),
 ) -> Result<()> {
@@ -76,11 +81,23 @@ fn serve<'r>(
             match line.split_once(' ').unwrap_or((line.as_str(), "")) {
                 (FRAME, _) => on_frame(),
                 (DONE, _) => break on_done(),
+                // The error of this program without workers, so that exit code and message are the same.
+                (REFUSED, reason) => return Err(Error::msg(reason.to_owned())),
                 (FAILED, reason) => return Err(WorkerError(reason.to_owned()).into()),
                 _ => return Err(WorkerError(format!("unexpected answer {line:?}")).into()),
             }
         }
     }
+}
+
+/// Answer to a run that was not computed. Only a place that cannot be written is no fault of the input.
+pub(super) fn failure(error: &Error) -> String {
+    let cause = error.root_cause();
+    let of_system = cause.downcast_ref::<io::Error>();
+    let is_full = cause.is::<NoSpace>() || of_system.is_some_and(|it| NoSpace::of(it).is_some());
+    let is_of_writing = is_full || error.is::<NotWritten>();
+    let answer = if is_of_writing { FAILED } else { REFUSED };
+    format!("{answer} {error:#}")
 }
 
 fn silent() -> WorkerError {
@@ -105,5 +122,26 @@ impl Drop for Worker {
         // It ends by itself at the end of its input; one that hangs is killed.
         let _ = self.0.kill();
         let _ = self.0.wait();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::ErrorKind;
+
+    use super::*;
+
+    #[test]
+    fn an_answer_states_whether_the_input_is_at_fault() {
+        let full = Error::from(io::Error::from(ErrorKind::StorageFull)).context("out/cells");
+        assert!(failure(&full).starts_with("failed out/cells: "));
+        let denied = Error::from(io::Error::from(ErrorKind::PermissionDenied));
+        let denied = denied.context(NotWritten("out/maps".into()));
+        assert!(failure(&denied).starts_with("failed out/maps cannot be written: "));
+        let wrong = Error::msg("late.safetensors: cut off").context("weights");
+        assert_eq!(
+            failure(&wrong),
+            "refused weights: late.safetensors: cut off"
+        );
     }
 }

@@ -8,14 +8,13 @@ mod text;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use ego_fuser_offline::evaluation::AgentPool;
 use support::atomic_file;
-use support::cli::{BadInput, NotWritten};
+use support::cli::NotWritten;
 
 pub use text::{csv, markdown};
 
 use super::cell::Cell;
-use super::check::check_scenes;
+use super::check::check_vehicles;
 use super::evaluation::{OpenedData, Trial, compute};
 use super::slices::Slice;
 use super::spec::{Column, Experiment, Row, Table};
@@ -64,7 +63,12 @@ pub fn run(
     atomic_file::create_folder(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
-    check_scenes(experiment, data.chosen(experiment.scenarios)).map_err(BadInput::of)?;
+    for table in &experiment.tables {
+        let asked = table.rows.iter().filter_map(|row| row.vehicles);
+        let scenarios = data.chosen(table.scenarios.or(experiment.scenarios));
+        check_vehicles("vehicles", asked, scenarios)
+            .with_context(|| format!("table {:?}", table.name))?;
+    }
     let run = TableRun {
         experiment,
         cells,
@@ -168,17 +172,10 @@ impl TableRun<'_> {
         if let Some(poses) = row.poses.as_ref().or(column.poses.as_ref()) {
             setup.agents.pose.clone_from(poses);
         }
-        setup.pool = row.vehicles.map_or(AgentPool::All, AgentPool::First);
-        setup.agents.boxes = row.boxes;
-        setup.agents.weights.clone_from(&row.neighbour_weights);
-        // The setting of the experiment holds too: row and column only switch it on.
-        setup.ego.box_alignment |= row.box_alignment;
-        setup.delay_ms = column.delay_ms;
-        setup.attack = column.attack;
-        setup.ego.trust |= column.trust;
+        row.apply(setup);
+        column.apply(setup);
         let folder = self.experiment.feature_maps.as_ref();
-        // All cells send one number format, unlike those of a sweep, so maps are kept in that.
-        trial.maps = folder.map(|folder| self.experiment.kept_maps(folder, self.experiment.dtype));
+        trial.maps = folder.map(|folder| self.experiment.kept_maps(folder));
         Ok(trial)
     }
 }

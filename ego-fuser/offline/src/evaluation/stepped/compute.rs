@@ -23,7 +23,8 @@ const ESTIMATED_TICKS: usize = 5;
 /// Most ticks of it.
 const MOST_ESTIMATED_TICKS: usize = 50;
 
-/// Compute time of each step, milliseconds: the same for all vehicles and ticks.
+/// Compute time of each step, milliseconds: the same for all vehicles and ticks. Every sweep is computed, so an agent
+/// (`pose_ms` + `map_ms`) and the ego (`fuse_ms`) take at most the shortest time between two sweeps.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ComputeTimes {

@@ -13,21 +13,15 @@ use crate::scalar::{Scalar, ScalarKind};
 pub(super) fn read_dtype(field: &YamlField<'_>) -> Result<Scalar> {
     expect_tag(field, "python/object/apply:numpy.dtype")?;
     let [name, ..] = items::<3>(&field.required("args")?)?;
-    let (kind, size) = match name.text()? {
-        "f2" => (ScalarKind::Float, 2),
-        "f4" => (ScalarKind::Float, 4),
-        "f8" => (ScalarKind::Float, 8),
-        "i1" => (ScalarKind::Signed, 1),
-        "i2" => (ScalarKind::Signed, 2),
-        "i4" => (ScalarKind::Signed, 4),
-        "i8" => (ScalarKind::Signed, 8),
-        "b1" | "u1" => (ScalarKind::Unsigned, 1),
-        "u2" => (ScalarKind::Unsigned, 2),
-        "u4" => (ScalarKind::Unsigned, 4),
-        "u8" => (ScalarKind::Unsigned, 8),
-        other => {
+    let text = name.text()?;
+    let (kind, size) = match text.as_bytes() {
+        [b'f', size @ (b'2' | b'4' | b'8')] => (ScalarKind::Float, size),
+        [b'i', size @ (b'1' | b'2' | b'4' | b'8')] => (ScalarKind::Signed, size),
+        [b'u', size @ (b'1' | b'2' | b'4' | b'8')] => (ScalarKind::Unsigned, size),
+        [b'b', size @ b'1'] => (ScalarKind::Unsigned, size),
+        _ => {
             return Err(name.error(format!(
-                "dtype {other:?}, expected f2 to f8, i1 to i8, u1 to u8 or b1"
+                "dtype {text:?}, expected f2 to f8, i1 to i8, u1 to u8 or b1"
             )));
         }
     };
@@ -44,7 +38,7 @@ pub(super) fn read_dtype(field: &YamlField<'_>) -> Result<Scalar> {
             return Err(order.error(format!("byte order {other:?}, {expected}")));
         }
     };
-    Ok(Scalar::new(kind, size, is_big_endian))
+    Ok(Scalar::new(kind, usize::from(size - b'0'), is_big_endian))
 }
 
 /// Bytes in base64, on their own or as the one argument of `bytearray`.

@@ -24,8 +24,8 @@ pub(super) fn cooperative_type(class: ObjectClass) -> Option<&'static str> {
 /// Rotation as 3 rows and translation as 3 rows of one number.
 pub(super) fn transform(pose: &Pose) -> Value {
     let rotation = pose.isometry().rotation.to_rotation_matrix();
-    let rows: [[f64; 3]; 3] =
-        std::array::from_fn(|row| std::array::from_fn(|column| rotation[(row, column)]));
+    // Stored by columns.
+    let rows = rotation.matrix().transpose().data.0;
     json!({ "rotation": rows, "translation": pose.translation_m.map(|metres| [metres]) })
 }
 

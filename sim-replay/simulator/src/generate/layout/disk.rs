@@ -7,7 +7,7 @@ use super::SceneHeader;
 use crate::generate::error::SynthError;
 use dataset::UNFINISHED;
 use support::atomic_file;
-use support::file_error::{AtFile, FileError};
+use support::file_error::{AtFile, FileError, check_folder};
 
 /// Writes text or bytes.
 pub(crate) fn write_file(path: &Path, bytes: impl AsRef<[u8]>) -> Result<(), SynthError> {
@@ -16,6 +16,7 @@ pub(crate) fn write_file(path: &Path, bytes: impl AsRef<[u8]>) -> Result<(), Syn
 
 /// Makes a folder and those above it.
 pub(crate) fn make_folder(path: &Path) -> Result<(), SynthError> {
+    check_folder(path)?;
     fs::create_dir_all(path).at(path).map_err(SynthError::Write)
 }
 
@@ -108,6 +109,18 @@ mod tests {
             assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
             write_file(&folder.join("old"), "x").unwrap();
         }
+    }
+
+    #[test]
+    fn a_file_in_place_of_a_folder_is_an_error_of_the_options() {
+        let root = tempfile::tempdir().unwrap();
+        let file = root.path().join("base.yaml");
+        write_file(&file, "x").unwrap();
+        let error = make_folder(&file).unwrap_err();
+        assert!(
+            matches!(&error, SynthError::File(of) if of.problem.contains("must be a folder")),
+            "{error}"
+        );
     }
 
     #[test]

@@ -53,7 +53,6 @@ fn write_poses(root: &Path, sequence: &WrittenSequence<'_>) -> Result<(), SynthE
 
 /// The 3x4 matrix of a pose, row by row.
 fn row(sweep: &SweepPose) -> [f64; 12] {
-    let pose = pose_z_down(&sweep.world_from_lidar);
-    let matrix = pose.isometry().to_homogeneous();
-    std::array::from_fn(|place| matrix[(place / 4, place % 4)])
+    let rows = pose_z_down(&sweep.world_from_lidar).matrix_rows();
+    std::array::from_fn(|place| rows[place / 4][place % 4])
 }

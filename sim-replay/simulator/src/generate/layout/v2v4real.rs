@@ -82,10 +82,9 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
 
 /// The value of a key: the matrix with every bit of its numbers.
 fn pickled_matrix(pose: &Pose) -> String {
-    let matrix = pose.isometry().to_homogeneous();
-    // nalgebra keeps columns together, NumPy rows.
-    let rows = matrix.transpose();
-    let bytes: Vec<u8> = rows.iter().flat_map(|value| value.to_le_bytes()).collect();
+    // NumPy keeps rows together.
+    let numbers = pose.matrix_rows().into_iter().flatten();
+    let bytes: Vec<u8> = numbers.flat_map(f64::to_le_bytes).collect();
     let digits = STANDARD.encode(bytes);
     let lines = digits.as_bytes().chunks(BASE64_LINE);
     let lines = lines.map(|line| format!("    {}", String::from_utf8_lossy(line)));

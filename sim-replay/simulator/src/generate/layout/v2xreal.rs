@@ -1,7 +1,5 @@
 //! V2X-Real and V2XPnP: the folders of OPV2V with `.bin` sweeps, right-handed; objects in the world, with their type.
 
-use protocol::Pose;
-
 use super::AgentFrame;
 use super::agent_folders::TickFiles;
 use super::boxes::{float_bytes, real_type};
@@ -19,20 +17,14 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     let frame = &agent.frame;
     write_speed(yaml, "ego_speed", frame.speed_mps)?;
     for (key, pose) in keyed_poses(frame) {
-        write_list(yaml, "", key, &six(&pose))?;
+        let numbers: [f64; 6] = CarlaPose::from_right_handed(&pose).into();
+        write_list(yaml, "", key, &numbers)?;
     }
-    write_vehicles(yaml, agent, |object, anchor| {
-        let [.., roll, yaw, pitch] = six(&object.world_from_object);
-        ObjectEntry {
-            object,
-            angle_deg: [roll, yaw, pitch],
-            location_m: anchor.location_m,
-            center_m: anchor.center_offset_m,
-            more: vec![("obj_type", real_type(object.class).to_owned())],
-        }
+    write_vehicles(yaml, agent, |object, anchor| ObjectEntry {
+        object,
+        angle_deg: CarlaPose::from_right_handed(&object.world_from_object).roll_yaw_pitch_deg,
+        location_m: anchor.location_m,
+        center_m: anchor.center_offset_m,
+        more: vec![("obj_type", real_type(object.class).to_owned())],
     })
-}
-
-fn six(pose: &Pose) -> [f64; 6] {
-    CarlaPose::from_right_handed(pose).into()
 }

@@ -6,18 +6,14 @@ use std::str::FromStr;
 use roxmltree::Node;
 
 use super::super::finding::FindingLog;
+use super::MAX_BYTES;
 
 /// Reasons why a map cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OpenDriveError {
     /// The file is larger than the limit.
-    #[error("the file has {bytes} bytes, more than the limit of {limit}")]
-    TooLarge {
-        /// Size of the file.
-        bytes: usize,
-        /// Largest size read.
-        limit: usize,
-    },
+    #[error("the file has {0} bytes, more than the limit of {limit}", limit = MAX_BYTES)]
+    TooLarge(usize),
     /// The file is no well-formed XML, or XML of a kind that is refused (entities, too many nodes).
     #[error("not well-formed XML: {0}")]
     Xml(String),
@@ -54,9 +50,7 @@ impl OpenDriveError {
     /// Records the error as a finding: the affected part was handled by `action`.
     pub(super) fn note(&self, log: &mut FindingLog, action: &str) {
         match self {
-            Self::TooLarge { .. } | Self::Xml(_) => {
-                log.add(1, "OpenDRIVE", &self.to_string(), action)
-            }
+            Self::TooLarge(_) | Self::Xml(_) => log.add(1, "OpenDRIVE", &self.to_string(), action),
             Self::Element {
                 line,
                 element,

@@ -21,7 +21,7 @@ pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junctio
     }
     let connections = children(element, "connection").filter_map(|connection| {
         let read = read_connection(connection, ids, direct, log);
-        noted(read, log, "connection left out")?
+        noted(read, log, "connection left out")
     });
     Junction {
         id: element.optional_text("id").unwrap_or_default().to_owned(),
@@ -35,14 +35,13 @@ fn read_connection(
     ids: &Ids,
     direct: bool,
     log: &mut FindingLog,
-) -> Result<Option<Connection>> {
+) -> Result<Connection> {
     let onto = match direct {
         true => "linkedRoad",
         false => "connectingRoad",
     };
     if element.optional_text(onto).is_none() {
-        element.note(log, "names no road that it leads to", "connection left out");
-        return Ok(None);
+        return Err(element.error_element("names no road that it leads to"));
     }
     let mut lane_links = Vec::new();
     for link in children(element, "laneLink") {
@@ -55,10 +54,10 @@ fn read_connection(
     if lane_links.is_empty() && element.child("laneLink").is_some() {
         return Err(element.error_element("has no lane link that can be read"));
     }
-    Ok(Some(Connection {
+    Ok(Connection {
         incoming: read_road(element, "incomingRoad", ids)?,
         connecting: read_road(element, onto, ids)?,
         contact: read_contact(element)?,
         lane_links,
-    }))
+    })
 }

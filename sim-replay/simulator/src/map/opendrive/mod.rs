@@ -72,9 +72,8 @@ pub fn read_bytes(bytes: &[u8]) -> Result<RoadNetwork> {
 }
 
 fn check_size(bytes: usize) -> Result<()> {
-    let limit = MAX_BYTES;
-    match bytes > limit {
-        true => Err(OpenDriveError::TooLarge { bytes, limit }),
+    match bytes > MAX_BYTES {
+        true => Err(OpenDriveError::TooLarge(bytes)),
         false => Ok(()),
     }
 }

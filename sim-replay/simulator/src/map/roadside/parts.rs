@@ -66,18 +66,14 @@ impl PartFootprint {
         self.solid(kind, shape, [u, v, lift_m + height_m / 2.0], reflectivity)
     }
 
-    /// An ellipsoid with its middle `lift_m` over the foot.
-    pub(super) fn ellipsoid(
+    /// A solid with its middle at `at` from the foot.
+    pub(super) fn solid(
         &self,
         kind: SolidKind,
-        center_m: [f64; 3],
-        radii_m: [f64; 3],
+        shape: Shape,
+        at: [f64; 3],
         reflectivity: f32,
     ) -> Solid {
-        self.solid(kind, Shape::Ellipsoid { radii_m }, center_m, reflectivity)
-    }
-
-    fn solid(&self, kind: SolidKind, shape: Shape, at: [f64; 3], reflectivity: f32) -> Solid {
         let [u, v, w] = at;
         let Pose2 { x, y, .. } = self.pose.moved(u, v, 0.0);
         Solid {

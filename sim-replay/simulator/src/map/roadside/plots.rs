@@ -6,7 +6,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
-use super::super::{Solid, SolidKind};
+use super::super::{Shape, Solid, SolidKind};
 use super::buildings::{Lot, Style};
 use super::frontage::{RoadSide, Zone, sides};
 use super::lots::{self, LOT_HEIGHT_M};
@@ -219,7 +219,10 @@ pub(super) fn monument(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> 
                 parts.push(foot.standing(kind, lift, [side, side, 1.2], 0.5));
             }
         }
-        _ => parts.push(foot.ellipsoid(kind, [0.0, 0.0, 2.0], [0.8, 0.8, 1.4], 0.5)),
+        _ => {
+            let radii_m = [0.8, 0.8, 1.4];
+            parts.push(foot.solid(kind, Shape::Ellipsoid { radii_m }, [0.0, 0.0, 2.0], 0.5));
+        }
     }
     parts
 }

@@ -4,7 +4,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
-use super::super::{Solid, SolidKind};
+use super::super::{Shape, Solid, SolidKind};
 use super::frontage::{Zone, sides};
 use super::parts::PartFootprint;
 use super::site::Site;
@@ -80,8 +80,8 @@ pub(super) fn tree(
         Species::Bush => {
             let radius = rng.random_range(0.5..1.1) * size;
             let height = rng.random_range(0.5..1.0) * size;
-            let (at, radii) = ([0.0, 0.0, height * 0.7], [radius, radius * 0.9, height]);
-            vec![foot.ellipsoid(SolidKind::Hedge, at, radii, leaves)]
+            let (at, radii_m) = ([0.0, 0.0, height * 0.7], [radius, radius * 0.9, height]);
+            vec![foot.solid(SolidKind::Hedge, Shape::Ellipsoid { radii_m }, at, leaves)]
         }
     }
 }
@@ -90,8 +90,9 @@ fn trunk(foot: PartFootprint, radius_m: f64, height_m: f64) -> Solid {
     foot.post(SolidKind::TreeTrunk, -0.3, [radius_m, height_m + 0.3], 0.25)
 }
 
-fn crown(foot: PartFootprint, at: [f64; 3], radii: [f64; 3], leaves: f32) -> Solid {
-    foot.ellipsoid(SolidKind::TreeCrown, at, radii, leaves)
+fn crown(foot: PartFootprint, at: [f64; 3], radii_m: [f64; 3], leaves: f32) -> Solid {
+    let shape = Shape::Ellipsoid { radii_m };
+    foot.solid(SolidKind::TreeCrown, shape, at, leaves)
 }
 
 /// Plants a tree at a pose on the ground, if all of it finds room.

@@ -1,5 +1,7 @@
 //! Layouts that the readers of this crate open as the same scenarios, with boxes; and the text of OPV2V's files.
 
+use std::path::Path;
+
 use protocol::{CavId, Handedness, Pose};
 
 use super::{assert_same, expected, open, options, ticks, write};
@@ -9,7 +11,7 @@ use crate::generate::layout::{
 };
 use crate::generate::positioning::Fix;
 use crate::generate::raycast::Placement;
-use crate::generate::{ConvertOptions, SynthOptions, Weather, convert, generate};
+use crate::generate::{Converted, SynthError, SynthOptions, Weather, convert, generate};
 use dataset::Layout;
 use dataset::frame::{Frame, Object, ObjectClass};
 
@@ -36,22 +38,16 @@ fn a_scene_is_the_same_in_every_layout_that_is_read() {
     }
 }
 
+fn converted(layout: SceneLayout, from: &Path, out: &Path) -> Result<Converted, SynthError> {
+    convert(&open(from), out, layout, false, &|_, _| {})
+}
+
 #[test]
 fn a_converted_data_set_is_the_same_as_a_generated_one() {
     let expected = expected();
     let [first, second, third] = [(); 3].map(|()| tempfile::tempdir().unwrap());
     write(SceneLayout::Opv2v, first.path());
-    let into = |layout, out: &std::path::Path| ConvertOptions {
-        out: out.to_owned(),
-        layout,
-        force: false,
-    };
-    let there = convert(
-        &open(first.path()),
-        &into(SceneLayout::V2v4real, second.path()),
-        &|_, _| {},
-    )
-    .unwrap();
+    let there = converted(SceneLayout::V2v4real, first.path(), second.path()).unwrap();
     assert_eq!(
         (
             there.scenarios,
@@ -65,12 +61,7 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
         &expected,
         SceneLayout::V2v4real,
     );
-    convert(
-        &open(second.path()),
-        &into(SceneLayout::Opv2v, third.path()),
-        &|_, _| {},
-    )
-    .unwrap();
+    converted(SceneLayout::Opv2v, second.path(), third.path()).unwrap();
     let back = open(third.path());
     assert_eq!(back.layout, Layout::OPV2V);
     assert_same(&ticks(&back), &expected, SceneLayout::Opv2v);
@@ -83,11 +74,7 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
     };
     assert_eq!(names(first.path()), names(third.path()));
     // Existing files are not overwritten without `force`.
-    let again = convert(
-        &open(first.path()),
-        &into(SceneLayout::Opv2v, third.path()),
-        &|_, _| {},
-    );
+    let again = converted(SceneLayout::Opv2v, first.path(), third.path());
     assert!(again.unwrap_err().to_string().contains("is not empty"));
 }
 
@@ -105,12 +92,7 @@ fn copies_and_radar_come_through_a_conversion() {
         &|_| {},
     )
     .unwrap();
-    let into = ConvertOptions {
-        out: second.path().to_owned(),
-        layout: SceneLayout::Opv2v,
-        force: false,
-    };
-    convert(&open(first.path()), &into, &|_, _| {}).unwrap();
+    converted(SceneLayout::Opv2v, first.path(), second.path()).unwrap();
     let (from, to) = (open(first.path()), open(second.path()));
     let (from, to) = (&from.scenarios[0], &to.scenarios[0]);
     assert_eq!(

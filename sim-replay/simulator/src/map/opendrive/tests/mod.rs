@@ -267,10 +267,7 @@ fn deep_nesting_and_large_files_are_refused_or_read_without_overflow() {
     let large = " ".repeat(MAX_BYTES + 1);
     assert_eq!(
         read(&large).unwrap_err(),
-        OpenDriveError::TooLarge {
-            bytes: MAX_BYTES + 1,
-            limit: MAX_BYTES
-        }
+        OpenDriveError::TooLarge(MAX_BYTES + 1)
     );
 }
 

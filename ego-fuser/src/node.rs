@@ -2,8 +2,6 @@
 //!
 //! One thread receives, fuses and publishes; sending has threads of its own.
 
-mod receive;
-
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,16 +9,22 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{
-    Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription, unix_nanos,
+    Arrival, Bus, BusError, Event, Inbox, InboxLimits, LINK_TRANSIT_S, NETWORK_TRANSIT_S,
+    Publisher, PublisherOptions, Subscription, unix_nanos,
 };
-use protocol::message::{FrameReport, StageTiming};
-use protocol::{Body, CavId, Detections, Encoded, Payload, Role, Stamp, Stream, Topic, wire};
+use protocol::message::{Descriptor, FrameReport, StageTiming};
+use protocol::{
+    Body, CavId, Detections, Encoded, Limits, Payload, Role, Stamp, Stream, Topic, wire,
+};
 use serde::Serialize;
 
+use crate::capture_clock::SweepTime;
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::Ego;
 use crate::ego_loop::recorded::{EgoRecord, KIND, PublishedResult, WireMessage};
-use crate::ego_loop::{EgoLoop, Input, LoopOptions, LoopReport, Output, Source};
+use crate::ego_loop::{
+    EgoLoop, Input, LoopOptions, LoopReport, Output, Reception, Refusal, Source,
+};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
 use agent::input_log::{InputFile, InputLog};
 use agent::loop_clock::LoopClock;
@@ -259,6 +263,71 @@ impl<'a> EgoNode<'a> {
             self.bus.stats().set_problems("ego", problems);
         }
         Ok(())
+    }
+
+    /// Decodes a message and hands it to the loop.
+    fn admit(&mut self, arrival: &Arrival) {
+        let Some((cav, stream)) = sender_of(&arrival.topic) else {
+            return;
+        };
+        if stream == Stream::Descriptor {
+            return self.admit_descriptor(cav, arrival);
+        }
+        let (stats, began) = (self.bus.stats(), Instant::now());
+        let transport = stats.transport(arrival, self.longest_transit_s());
+        let reception = Reception {
+            cav: cav.clone(),
+            arrived_nanos: self.clock.nanos(arrival.at),
+            transport,
+            clock_offset_s: stats.measured_clock_offset_s(cav),
+        };
+        let (header, limits) = (&arrival.header, &Limits::DEFAULT);
+        let ego_loop = &self.ego_loop;
+        let decoded = ego_loop.decode(&reception, header, arrival.pieces(), limits);
+        let message = match decoded {
+            Ok(message) => message,
+            Err(Refusal::Unneeded(reason)) => return stats.dropped(&arrival.topic, reason),
+            Err(Refusal::Malformed(error)) => return stats.rejected(&arrival.topic, &error),
+        };
+        stats.timed("decode", began.elapsed());
+        if let Some(transport) = transport {
+            stats.timed(&format!("{stream} transport"), transport);
+        }
+        // Read after the decoding, and recorded: the replay gets the time that the loop gets.
+        let now_nanos = self.clock.now_nanos();
+        if let Some(log) = &self.log {
+            let bytes = arrival.pieces().flatten().copied().collect();
+            let input = Input::Message(WireMessage { reception, bytes });
+            log.add(&EgoRecord::Input { now_nanos, input });
+        }
+        self.decide(Input::Message(Box::new(message)), now_nanos);
+    }
+
+    /// Processes an agent's descriptor: its network, and the arrivals of its sweeps.
+    fn admit_descriptor(&mut self, cav: &CavId, arrival: &Arrival) {
+        let descriptor = self.inbox.decode::<Descriptor>(arrival, &Limits::DEFAULT);
+        let Some(descriptor) = descriptor else {
+            return;
+        };
+        let stats = self.bus.stats();
+        let offset_s = stats.system_clock_offset_s(cav, self.longest_transit_s());
+        let offset_nanos = (offset_s * 1e9) as i64;
+        let newest_nanos = arrival.header.stamp.capture_nanos;
+        // Arrivals are on the clock of the agent. Minus its lead they are on that of the ego.
+        let sweeps = descriptor.sweeps.iter().map(|sweep| SweepTime {
+            capture_nanos: newest_nanos.saturating_sub(sweep.before_nanos),
+            arrived_nanos: sweep.arrived_nanos.saturating_sub_signed(offset_nanos),
+        });
+        self.handle(Input::Sweeps(cav.clone(), sweeps.collect()));
+        self.handle(Input::Model(cav.clone(), descriptor));
+    }
+
+    /// Longest transit time of a message, seconds; the own agent's, which takes no link, has one clock with the ego.
+    fn longest_transit_s(&self) -> f64 {
+        match self.options.over_link {
+            true => LINK_TRANSIT_S,
+            false => NETWORK_TRANSIT_S,
+        }
     }
 
     fn end(&mut self, topic: &Topic) {

@@ -2,15 +2,10 @@
 
 use std::str::FromStr;
 
-use strum::IntoEnumIterator;
-use support::rounding;
+use super::time_stamps::Unit;
 
 /// Least value of a whole number that is a time: nine digits.
 const LEAST_WHOLE_TIME: f64 = 1e8;
-/// Largest time, seconds: three hundred years.
-const MOST_SECONDS: f64 = 1e10;
-/// Largest median step of times, seconds.
-const MOST_STEP_S: f64 = 60.0;
 /// Digits of nanoseconds.
 const NANOS_DIGITS: usize = 9;
 
@@ -23,47 +18,6 @@ pub(super) enum Keys {
     Numbers(Vec<u64>),
     /// Nanoseconds.
     Times(Vec<u64>),
-}
-
-/// Unit of a time.
-#[derive(Debug, Clone, Copy, PartialEq, strum::EnumIter)]
-pub(super) enum Unit {
-    Seconds,
-    Milliseconds,
-    Microseconds,
-    Nanoseconds,
-}
-
-impl Unit {
-    fn seconds(self) -> f64 {
-        match self {
-            Self::Seconds => 1.0,
-            Self::Milliseconds => 1e-3,
-            Self::Microseconds => 1e-6,
-            Self::Nanoseconds => 1e-9,
-        }
-    }
-
-    /// The first unit in which all values are times since an epoch or a start, at most a minute apart.
-    fn of(values: &[f64]) -> Option<Self> {
-        let most = values.iter().copied().fold(0.0, f64::max);
-        let steps = values.array_windows();
-        let mut steps: Vec<f64> = steps.map(|[value, next]| (next - value).abs()).collect();
-        steps.sort_unstable_by(f64::total_cmp);
-        // The median: a pause in the drive does not decide.
-        let step = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
-        Self::iter().find(|unit| {
-            most * unit.seconds() < MOST_SECONDS && step * unit.seconds() <= MOST_STEP_S
-        })
-    }
-
-    /// Nanoseconds of values in this unit.
-    pub(super) fn nanos(self, values: &[f64]) -> Vec<u64> {
-        // Doubles keep times since 1970 to a quarter of a microsecond.
-        let scale = self.seconds() * 1e9;
-        let nanos = values.iter().map(|value| rounding::to_u64(value * scale));
-        nanos.collect()
-    }
 }
 
 impl Keys {
@@ -158,7 +112,8 @@ impl Keys {
     pub(super) fn of_times(words: &[&str], unit: Option<Unit>) -> Option<Self> {
         let values = numbers(words)?;
         let unit = unit.or_else(|| Unit::of(&values))?;
-        Some(Self::Times(unit.nanos(&values)))
+        let nanos = values.iter().map(|value| unit.nanos(*value));
+        Some(Self::Times(nanos.collect()))
     }
 }
 

@@ -1,12 +1,9 @@
 //! Decoder: the context of the transformer and the aligned maps become one map, which the detection head of Eq. 3
 //! reads.
 
-mod confidence_gate;
-
 use tch::nn::{self, Module};
 use tch::{Kind, TchError, Tensor};
 
-use self::confidence_gate::TokenGate;
 use super::config::PastatConfig;
 use super::patches::{Tokens, channels_last};
 use super::spatial_alignment::FineMaps;
@@ -96,5 +93,38 @@ impl Decoder {
             .f_view([self.channels, self.patch * self.patch, each])?
             .f_transpose(0, 1)?
             .f_reshape([-1, each])
+    }
+}
+
+/// Predicts the weight of a neighbour's newest map, token by token: 1 before training, 0 to 2 after.
+#[derive(Debug)]
+struct TokenGate {
+    hidden: nn::Linear,
+    out: nn::Linear,
+    patch: i64,
+}
+
+impl TokenGate {
+    fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let dim = config.dim;
+        Self {
+            hidden: nn::linear(path / "hidden", 2 * dim, dim, nn::LinearConfig::default()),
+            out: nn::linear(path / "out", dim, 1, ZERO),
+            patch: config.patch,
+        }
+    }
+
+    /// `[M, 1, H, W]` from the neighbours' tokens `[M, h, w, D]` and the ego's after the transformer `[1, h, w, D]`.
+    fn forward(&self, others: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
+        // A layer of both, side by side; the ego's part is the same for all others.
+        let dim = ego.size4()?.3;
+        let (ws, bs) = (&self.hidden.ws, self.hidden.bs.as_ref());
+        let hidden = others.f_linear(&ws.f_narrow(1, 0, dim)?, None::<&Tensor>)?
+            + ego.f_linear(&ws.f_narrow(1, dim, dim)?, bs)?;
+        // The last layer is zero at first, of which the sigmoid is a half: the factor makes it 1.
+        let weight = self.out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
+        let (maps, rows, columns, _) = weight.size4()?;
+        let weight = weight.f_view([maps, 1, rows, columns])?;
+        weight.f_upsample_nearest2d([rows * self.patch, columns * self.patch], None, None)
     }
 }
