@@ -201,7 +201,7 @@ impl Sent {
             content,
         } = &self.view;
         let content = match &self.features {
-            Some(features) => Content::Features(features.clone().decode(&Limits::default())?),
+            Some(features) => Content::Features(features.clone().decode(&Limits::DEFAULT)?),
             None => content.clone(),
         };
         Ok(View {

@@ -172,7 +172,10 @@ impl Evidence {
             (true, true) => 2,
         };
         let most = if self.strange >= enough { -3.6 } else { 0.0 };
-        let plain = if self.in_full_view > 0 { FULL_VIEW } else { 0.0 };
+        let plain = match self.in_full_view {
+            0 => 0.0,
+            _ => FULL_VIEW,
+        };
         let odds = odds[(self.contradicted as usize).min(odds.len() - 1)];
         let odds = odds.min(most).min(plain);
         (odds < 0.0).then_some(odds)

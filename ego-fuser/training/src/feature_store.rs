@@ -191,7 +191,7 @@ impl FeatureStore {
         }
         let message = message_between(&self.file, start, end).at(&self.path)?;
         let message = message.at(&self.path)?;
-        let decoded = message.features.decode(&Limits::default());
+        let decoded = message.features.decode(&Limits::DEFAULT);
         let features = decoded.at(&self.path)?.features;
         let (channels, grid) = (features.channels, features.grid);
         let size = [1, channels, grid.height, grid.width].map(i64::from);
@@ -239,7 +239,7 @@ fn message_between(file: &File, start: u64, end: u64) -> io::Result<Result<Bev, 
     let mut bytes = vec![0; (end - start - LENGTH_BYTES) as usize];
     // At an offset of its own: threads share the file without moving a common position.
     file.read_exact_at(&mut bytes, start + LENGTH_BYTES)?;
-    let decoded = wire::decode([bytes.as_slice()], &Limits::default());
+    let decoded = wire::decode([bytes.as_slice()], &Limits::DEFAULT);
     Ok(decoded.map(|(_, message)| message))
 }
 

@@ -250,7 +250,7 @@ mod tests {
             pose: NO_POSE,
             objects: vec![object],
         };
-        let checked = received.check_values(&Limits::default());
+        let checked = received.check_values(&Limits::DEFAULT);
         assert_eq!(sent.objects[0].track.is_some(), checked.is_ok());
         checked
     }

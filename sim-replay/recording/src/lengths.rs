@@ -69,7 +69,8 @@ fn behind(record: &[u8], head: usize, count: usize) -> Option<&[u8]> {
     Some(rest)
 }
 
-/// The length of a chunk whose head is here, with the records that fill the rest; `None` if its compression is not known.
+/// The length of a chunk that begins here, from its head: its records fill the rest. `None` if its compression is not
+/// known.
 pub(super) fn chunk_len(bytes: &[u8]) -> Option<u64> {
     let (compression, rest) = text(bytes.get(CHUNK_HEAD..)?)?;
     let (&records_len, _) = rest.split_first_chunk()?;

@@ -10,17 +10,13 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::pairs::{Gain, PairColumns};
-use super::sampling;
+use super::sampling::{self, SampleTest};
 use super::{Correspondence, NoRegistration, Registration, check_enough, refine};
 
 /// Scales of the local optimisation, in thresholds: wide enough for a motion from few noisy points.
 const LOCAL_SCALES: [f64; 3] = [2.0, 1.2, 0.8];
 /// Largest number of steps of the final refinement.
 const FINAL_STEPS: usize = 20;
-/// Probability with which the best motion is found before drawing stops.
-const CONFIDENCE: f64 = 0.999;
-/// Smallest number of draws.
-const MIN_DRAWS: u32 = 64;
 /// Share of all-inlier samples that are assumed to give the motion: half of the draws ignore the weights, and samples
 /// may be too close together or too noisy.
 const SAMPLE_YIELD: f64 = 0.25;
@@ -48,6 +44,10 @@ pub struct RansacConfig {
     pub min_edge_m: f64,
     /// Fewest inliers of a result.
     pub min_inliers: usize,
+    /// Probability with which the best motion is found before drawing stops, 0..1.
+    pub confidence: f64,
+    /// Smallest number of draws.
+    pub min_draws: u32,
     /// Largest number of draws.
     pub max_draws: u32,
     /// Scale of the final refinement, metres: about the residual of good inliers.
@@ -65,6 +65,8 @@ impl Default for RansacConfig {
             max_tilt_deg: 12.0,
             min_edge_m: 6.0,
             min_inliers: 12,
+            confidence: 0.999,
+            min_draws: 64,
             max_draws: 20_000,
             refine_scale_m: 1.0,
             seed: 0,
@@ -96,10 +98,13 @@ impl RansacConfig {
         }
     }
 
-    /// Largest difference between an edge's lengths in both frames, metres: both of its ends may have an error of a
-    /// threshold.
-    pub(super) fn edge_tolerance_m(&self) -> f64 {
-        2.0 * self.inlier_threshold_m
+    fn sample_test(&self) -> SampleTest {
+        SampleTest {
+            min_edge_m: self.min_edge_m,
+            // Both ends of an edge may have an error of a threshold.
+            edge_tolerance_m: 2.0 * self.inlier_threshold_m,
+            max_tilt_rad: self.max_tilt_deg.to_radians(),
+        }
     }
 
     fn allows_tilt_of(&self, motion: &Isometry3<f64>) -> bool {
@@ -114,10 +119,10 @@ impl RansacConfig {
             MinimalSolver::ThreePoint => 3,
         };
         let ratio = inliers as f64 / count.max(1) as f64;
-        // n = ln(1 - confidence) / ln(1 - hit). The clamp keeps the second logarithm finite and other than 0.
+        // n = ln(1 - confidence) / ln(1 - hit). The clamps keep both logarithms finite and other than 0.
         let hit = (SAMPLE_YIELD * ratio.powi(sample_size)).clamp(1e-12, 1.0 - 1e-12);
-        let draws = (1.0 - CONFIDENCE).ln() / (1.0 - hit).ln();
-        (draws.ceil().min(f64::from(self.max_draws)) as u32).max(MIN_DRAWS)
+        let draws = (1.0 - self.confidence).max(1e-12).ln() / (1.0 - hit).ln();
+        (draws.ceil().min(f64::from(self.max_draws)) as u32).max(self.min_draws)
     }
 }
 
@@ -174,42 +179,45 @@ struct RansacSearch<'a> {
 
 impl RansacSearch<'_> {
     fn run(mut self, random: &mut ChaCha8Rng) -> Option<Isometry3<f64>> {
-        let (config, pairs) = (self.config, self.pairs);
+        let test = self.config.sample_test();
         // The best score of a motion as drawn, before any optimisation: the next draw has to exceed it.
         let mut best_drawn = Gain::default();
-        let mut enough = config.max_draws;
+        let mut enough = self.config.max_draws;
         let mut draw = 0;
         while draw < enough {
-            let drawn = match config.minimal {
-                MinimalSolver::UprightTwoPoint => sampling::two_points(pairs, draw, config, random),
-                MinimalSolver::ThreePoint => sampling::three_points(pairs, draw, config, random),
+            let pairs = self.pairs;
+            let drawn = match self.config.minimal {
+                MinimalSolver::UprightTwoPoint => sampling::two_points(pairs, draw, &test, random),
+                MinimalSolver::ThreePoint => sampling::three_points(pairs, draw, &test, random),
             };
             // Inconsistent samples count as draws too: a hopeless sweep would be searched forever otherwise.
             draw += 1;
             let Some(motion) = drawn else { continue };
-            let Some(gain) = pairs.gain(&motion, config.inlier_threshold_m, &best_drawn) else {
+            let Some(gain) = self.gain(&motion, &best_drawn) else {
                 continue;
             };
             if gain.total > best_drawn.total {
                 best_drawn = gain;
                 if self.optimise(&motion, gain) {
-                    enough = config.draws_needed(self.inliers(), pairs.count);
+                    enough = self.config.draws_needed(self.inliers(), self.pairs.count);
                 }
             }
         }
         self.best.map(|(_, motion)| motion)
     }
 
+    fn gain(&self, motion: &Isometry3<f64>, best: &Gain) -> Option<Gain> {
+        let threshold_m = self.config.inlier_threshold_m;
+        self.pairs.gain(motion, threshold_m, best)
+    }
+
     /// Optimises a motion on the pairs near it; true if it became the new best.
     fn optimise(&mut self, motion: &Isometry3<f64>, gain: Gain) -> bool {
-        let threshold_m = self.config.inlier_threshold_m;
-        let scales = LOCAL_SCALES.map(|scale| scale * threshold_m);
+        let scales = LOCAL_SCALES.map(|scale| scale * self.config.inlier_threshold_m);
         let near = self.pairs.near(motion, refine::CUTOFF_SCALES * scales[0]);
         let optimised = (refine::reweighted(&near, motion, scales).ok())
             .filter(|optimised| self.config.allows_tilt_of(optimised))
-            .and_then(|optimised| {
-                Some((self.pairs.gain(&optimised, threshold_m, &gain)?, optimised))
-            })
+            .and_then(|optimised| Some((self.gain(&optimised, &gain)?, optimised)))
             .filter(|(optimised, _)| optimised.total > gain.total);
         let candidate = optimised.unwrap_or((gain, *motion));
         let better = self

@@ -5,7 +5,6 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::pairs::PairColumns;
-use super::ransac::RansacConfig;
 
 /// Shares of the pairs of highest weight that successive draws are taken from. Half of the draws follow the weights,
 /// half do not, so that uninformative weights cost a factor of two and no more.
@@ -13,28 +12,38 @@ const POOLS: [f64; 4] = [0.1, 1.0, 0.3, 1.0];
 /// Fewest pairs in a pool.
 const MIN_POOL: usize = 12;
 
+/// Conditions on a sample before a motion is computed from it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SampleTest {
+    /// Shortest distance between two points of a sample, metres.
+    pub min_edge_m: f64,
+    /// Largest difference between an edge's lengths in both frames, metres.
+    pub edge_tolerance_m: f64,
+    /// Largest slope of the source frame's upright axis, radians.
+    pub max_tilt_rad: f64,
+}
+
 /// Draws a motion from three pairs, or `None` if they are inconsistent.
 pub(super) fn three_points(
     pairs: &PairColumns,
     draw: u32,
-    config: &RansacConfig,
+    test: &SampleTest,
     random: &mut ChaCha8Rng,
 ) -> Option<Isometry3<f64>> {
     let [a, b, c] = draw_distinct(pairs.count, draw, random);
     let source = [a, b, c].map(|index| pairs.source(index));
     let target = [a, b, c].map(|index| pairs.target(index));
     // A rigid motion keeps lengths: samples with an outlier are rejected before anything is solved.
-    let tolerance_m = config.edge_tolerance_m();
     for (from, to) in [(0, 1), (0, 2), (1, 2)] {
         let lengths = [&source, &target].map(|points| (points[to] - points[from]).norm());
-        if lengths[0] < config.min_edge_m || (lengths[0] - lengths[1]).abs() > tolerance_m {
+        if lengths[0] < test.min_edge_m || (lengths[0] - lengths[1]).abs() > test.edge_tolerance_m {
             return None;
         }
     }
     // Both bases are right-handed and orthonormal: the product is a rotation.
     let rotation = Rotation3::from_matrix_unchecked(axes(&target)? * axes(&source)?.transpose());
     // The entry is the cosine of the angle between both z axes.
-    if rotation[(2, 2)] < config.max_tilt_deg.to_radians().cos() {
+    if rotation[(2, 2)] < test.max_tilt_rad.cos() {
         return None;
     }
     Some(motion(rotation, &source, &target))
@@ -44,7 +53,7 @@ pub(super) fn three_points(
 pub(super) fn two_points(
     pairs: &PairColumns,
     draw: u32,
-    config: &RansacConfig,
+    test: &SampleTest,
     random: &mut ChaCha8Rng,
 ) -> Option<Isometry3<f64>> {
     let [a, b] = draw_distinct(pairs.count, draw, random);
@@ -53,12 +62,11 @@ pub(super) fn two_points(
     let [from, to] = [source[1] - source[0], target[1] - target[0]];
     // In the plane: a rotation about the vertical keeps horizontal lengths. Heights are compared below.
     let lengths = [from.xy().norm(), to.xy().norm()];
-    let tolerance_m = config.edge_tolerance_m();
-    if lengths[0] < config.min_edge_m || (lengths[0] - lengths[1]).abs() > tolerance_m {
+    if lengths[0] < test.min_edge_m || (lengths[0] - lengths[1]).abs() > test.edge_tolerance_m {
         return None;
     }
     // A small tilt lifts the far end.
-    if (from.z - to.z).abs() > tolerance_m + config.max_tilt_deg.to_radians().sin() * lengths[0] {
+    if (from.z - to.z).abs() > test.edge_tolerance_m + test.max_tilt_rad.sin() * lengths[0] {
         return None;
     }
     let yaw_rad = to.y.atan2(to.x) - from.y.atan2(from.x);
@@ -123,13 +131,14 @@ mod tests {
         .drawn(7);
         let mut random = ChaCha8Rng::seed_from_u64(2);
         let pairs = PairColumns::new(&problem.pairs, &mut random);
-        let config = RansacConfig {
-            inlier_threshold_m: 0.05,
-            ..RansacConfig::default()
+        let test = SampleTest {
+            min_edge_m: 6.0,
+            edge_tolerance_m: 0.1,
+            max_tilt_rad: 0.2,
         };
         for solver in [two_points, three_points] {
             let found: Vec<_> = (0..40)
-                .filter_map(|draw| solver(&pairs, draw, &config, &mut random))
+                .filter_map(|draw| solver(&pairs, draw, &test, &mut random))
                 .collect();
             assert!(found.len() > 10);
             for motion in found {

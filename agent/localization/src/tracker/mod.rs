@@ -4,6 +4,7 @@
 //! a row can be reached from each other, the vehicle is there: the tracker starts anew. Without measurements the
 //! covariance grows, until the vehicle counts as lost.
 
+mod contradictions;
 mod measurement;
 mod motion_filter;
 mod track;
@@ -12,8 +13,8 @@ mod yaw_rate_trust;
 use nalgebra::Isometry3;
 use protocol::{EgoMotion, PlanarCovariance};
 
+pub use contradictions::MotionContradiction;
 pub use measurement::PoseMeasurement;
-pub use track::MotionContradiction;
 use track::{SpeedTrust, VehicleTrack};
 use yaw_rate_trust::YawRateTrust;
 

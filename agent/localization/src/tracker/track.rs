@@ -2,6 +2,7 @@
 
 use protocol::EgoMotion;
 
+use super::contradictions::Contradictions;
 use super::measurement::PoseMeasurement;
 use super::motion_filter::MotionFilter;
 use super::seconds;
@@ -14,37 +15,6 @@ const SPEED_GATE: f64 = 16.0;
 const POSE_GATE: f64 = 16.27;
 /// Contradictions in a row after which a speed is not used any more: a second of sweeps, longer than wheels slip.
 const MOST_CONTRADICTIONS: u32 = 10;
-
-/// Speed (metres per second) or yaw rate (radians per second) that poses contradict.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MotionContradiction {
-    /// Value that the vehicle measures.
-    pub measured: f64,
-    /// Value that the poses of its sweeps give.
-    pub of_poses: f64,
-}
-
-/// Contradictions in a row of a measured quantity, over all tracks of a vehicle.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Contradictions {
-    in_a_row: u32,
-    pub(super) refuted: Option<MotionContradiction>,
-}
-
-impl Contradictions {
-    /// Counts the comparison of a measured value with that of the poses; `most` contradictions in a row refute it.
-    pub(super) fn count(
-        &mut self,
-        is_contradicted: bool,
-        most: u32,
-        [measured, of_poses]: [f64; 2],
-    ) {
-        self.in_a_row = (self.in_a_row + 1) * u32::from(is_contradicted);
-        if self.in_a_row >= most {
-            self.refuted = Some(MotionContradiction { measured, of_poses });
-        }
-    }
-}
 
 /// Trust in the speed that a vehicle measures.
 #[derive(Debug, Clone, Default)]

@@ -1,9 +1,9 @@
 //! Trust in the yaw rate that a vehicle measures: its turn from one pose to the next against that of the poses.
 
+use super::contradictions::Contradictions;
 use super::measurement::PoseMeasurement;
 use super::motion_filter::{BIAS_STD, RESIDUAL_YAW_ACCELERATION_STD, wrapped_rad};
 use super::seconds;
-use super::track::Contradictions;
 
 /// Shortest time between two poses whose turn is compared, seconds.
 const LEAST_TIME_S: f64 = 0.25;

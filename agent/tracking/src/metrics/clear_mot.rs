@@ -55,7 +55,7 @@ impl ClearMot {
         let mut counts = Self::default();
         for sequence in sequences {
             let mut histories = BTreeMap::<i64, ObjectHistory>::new();
-            for frame in sequence.frames() {
+            for frame in &sequence.frames {
                 counts.add(frame, &mut histories, max_distance_m);
             }
             for history in histories.values() {

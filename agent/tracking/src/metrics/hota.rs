@@ -75,7 +75,7 @@ fn add(sequence: &Sequence, sums: &mut [Sums; THRESHOLDS]) {
     let lengths = sequence.lengths();
     let alignment = alignment(sequence, &lengths);
     let mut matches: [PairValues; THRESHOLDS] = Default::default();
-    for frame in sequence.frames() {
+    for frame in &sequence.frames {
         let similarity = similarities(frame);
         let costs = DMatrix::from_fn(similarity.nrows(), similarity.ncols(), |object, track| {
             let ids = (frame.objects[object].id, frame.tracks[track].id);
@@ -109,7 +109,7 @@ fn add(sequence: &Sequence, sums: &mut [Sums; THRESHOLDS]) {
 /// the frame.
 fn alignment(sequence: &Sequence, lengths: &(Lengths<i64>, Lengths<u64>)) -> PairValues {
     let mut weights = PairValues::new();
-    for frame in sequence.frames() {
+    for frame in &sequence.frames {
         let similarity = similarities(frame);
         // The sum of all columns: one number per row, that is per object.
         let of_object = similarity.column_sum();

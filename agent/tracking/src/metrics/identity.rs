@@ -39,7 +39,7 @@ impl IdentityCounts {
         let rows: BTreeMap<i64, usize> = objects.into_keys().zip(0..).collect();
         let columns: BTreeMap<u64, usize> = tracks.into_keys().zip(0..).collect();
         let mut shared = DMatrix::<f64>::zeros(rows.len(), columns.len());
-        for frame in sequence.frames() {
+        for frame in &sequence.frames {
             for (object, true_point) in frame.objects.iter().enumerate() {
                 for (track, point) in frame.tracks.iter().enumerate() {
                     if frame.distance_m(object, track) < max_distance_m {

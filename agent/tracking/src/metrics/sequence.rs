@@ -39,7 +39,7 @@ pub struct DuplicateId(pub i128);
 /// Frames in the order of time.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Sequence {
-    frames: Vec<TrackedFrame>,
+    pub(crate) frames: Vec<TrackedFrame>,
 }
 
 impl Sequence {
@@ -55,11 +55,6 @@ impl Sequence {
         }
         self.frames.push(frame);
         Ok(())
-    }
-
-    /// The frames.
-    pub fn frames(&self) -> &[TrackedFrame] {
-        &self.frames
     }
 
     /// The sequence without track points of a lower score.

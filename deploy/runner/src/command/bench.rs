@@ -8,7 +8,7 @@ use fusion::Method;
 use runner::fleet::Fleet;
 use runner::run::capacity::estimate;
 use runner::scenario::{FieldOverride, Scenario};
-use serde::Serialize;
+use serde_json::Value;
 use support::cli::{BadInput, Outcome};
 use support::output;
 use terminal::text_table::TextTable;
@@ -62,7 +62,7 @@ impl Arguments {
             if !self.json {
                 print(&capacity, all.is_empty())?;
             }
-            all.push(Costs::of(capacity));
+            all.push(in_json(&capacity)?);
         }
         if self.json {
             output::line(serde_json::to_string_pretty(&all)?)?;
@@ -71,26 +71,17 @@ impl Arguments {
     }
 }
 
-/// Costs of a method, as printed in JSON: in milliseconds, and in units.
-#[derive(Debug, Serialize)]
-struct Costs {
-    #[serde(flatten)]
-    capacity: Capacity,
-    agent_units: f64,
-    ego_units: f64,
-    frame_units: f64,
-}
-
-impl Costs {
-    fn of(capacity: Capacity) -> Self {
-        let in_units = |ms: f64| ms / capacity.unit_ms;
-        Self {
-            agent_units: in_units(capacity.agent_ms),
-            ego_units: in_units(capacity.fuse_ms),
-            frame_units: in_units(capacity.needed_ms),
-            capacity,
-        }
+/// Costs of a method in milliseconds, and those of agent, ego and frame in units.
+fn in_json(capacity: &Capacity) -> anyhow::Result<Value> {
+    let mut costs = serde_json::to_value(capacity)?;
+    for (name, ms) in [
+        ("agent_units", capacity.agent_ms),
+        ("ego_units", capacity.fuse_ms),
+        ("frame_units", capacity.needed_ms),
+    ] {
+        costs[name] = (ms / capacity.unit_ms).into();
     }
+    Ok(costs)
 }
 
 /// Prints the costs of a method, the first one under the machine.

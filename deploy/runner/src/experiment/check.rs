@@ -316,7 +316,7 @@ fn values<T: PartialEq + Debug>(
     Ok(())
 }
 
-pub(super) fn number(field: &str, value: f64, low: f64, high: f64) -> Result<()> {
+fn number(field: &str, value: f64, low: f64, high: f64) -> Result<()> {
     // NaN is in no range, so it is refused here.
     let is_allowed = (low..=high).contains(&value);
     ensure!(is_allowed, "{field} is {value}, must be {low} to {high}");

@@ -29,7 +29,6 @@ use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
-use crate::experiment::check::number;
 use crate::experiment::frame_files::{self, FrameFiles};
 use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
@@ -160,7 +159,11 @@ impl Trial {
         let setup = &self.setup;
         let attackers = setup.attack.map(|attack| attack.attackers);
         ensure!(attackers != Some(0), "attackers is 0, must be 1 or more");
-        number("delay_ms", setup.delay_ms as f64, 0.0, 10_000.0)?;
+        let delay_ms = setup.delay_ms;
+        ensure!(
+            delay_ms <= 10_000,
+            "delay_ms is {delay_ms}, must be 0 to 10000"
+        );
         let names: Vec<&str> = methods.iter().map(|method| method.name()).collect();
         let contents: Vec<Exchange> = methods.iter().map(|one| one.exchange()).collect();
         let maps = contents.contains(&Exchange::Features);

@@ -84,7 +84,7 @@ impl Participant {
                 LoopOutput::Publish(message) if message.stream != Stream::Descriptor => {
                     let stamp = stamp(self.agent_loop.agent().cav(), message.capture_nanos);
                     let (encoded, _) = self.encoder.encode(message, &stamp, None)?;
-                    let (_, message) = wire::decode_any(encoded.pieces(), &Limits::default())?;
+                    let (_, message) = wire::decode_any(encoded.pieces(), &Limits::DEFAULT)?;
                     answer.note(message, encoded.wire_bytes() as u64)?;
                 }
                 LoopOutput::Timed(stages) => self.steps.push(stages),

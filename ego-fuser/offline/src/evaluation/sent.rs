@@ -49,7 +49,7 @@ impl Replies {
         let content = match message {
             Message::Bev(message) => {
                 rate = message.features.rate;
-                Content::Features(message.features.decode(&Limits::default())?)
+                Content::Features(message.features.decode(&Limits::DEFAULT)?)
             }
             Message::Boxes(message) => Content::Boxes(message.into_objects()),
             Message::Points(message) => Content::Points(message.points),

@@ -155,7 +155,7 @@ impl RemotePool {
                             && frame.capture_nanos == arrival.header.stamp.capture_nanos
                     });
                     if let Some(answer) = answers.get_mut(cav).filter(|_| asked) {
-                        let message = wire::decode_any(arrival.pieces(), &Limits::default());
+                        let message = wire::decode_any(arrival.pieces(), &Limits::DEFAULT);
                         message
                             .and_then(|(_, message)| answer.note(message, arrival.wire_bytes()))
                             .map_err(|source| RemoteError::Unsound {
