@@ -133,8 +133,11 @@ pub fn write_weights_with_box_input(path: &Path) {
 }
 
 fn write(path: &Path, model: &CooperativeModel) {
+    let mut about = model.about();
+    // For every method: weights that name one are refused for others.
+    about.remove(weights::METHOD_KEY);
     let precision = weights::Precision::Single;
-    weights::save(path, &model.variables, &model.about(), precision).expect("a writable folder");
+    weights::save(path, &model.variables, &about, precision).expect("a writable folder");
 }
 
 fn sighted(channels: i64) -> CooperativeModel {

@@ -114,7 +114,7 @@ impl Method {
     pub fn check_training(self, weights: &Weights) -> Result<(), FileError> {
         let names = self.weights_names();
         match weights.metadata(METHOD_KEY) {
-            Some(trained) if !names.contains(&trained) => {
+            Some(trained) if trained != self.name() && !names.contains(&trained) => {
                 let needed = format_args!("method {self} needs weights trained for {}", names[0]);
                 let problem = format_args!("trained for {trained}, and {needed}");
                 Err(FileError::new(weights.path(), problem))
