@@ -109,7 +109,8 @@ impl Ego {
         device: Device,
     ) -> Result<Self, EgoError> {
         let method = Method::of_weights(weights, method)?;
-        if !method.is_script() {
+        // Methods without a fusion of maps run with the detector of any network.
+        if method.exchange() == Exchange::Features && !method.is_script() {
             method.check_training(weights)?;
         }
         let detector = Detector::from_weights(weights, &weights.detector_config()?, device)?;

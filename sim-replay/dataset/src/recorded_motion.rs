@@ -20,9 +20,10 @@ const BACKWARD: f64 = 0.7;
 
 /// Smallest value that is compared (below it, noise of poses counts), smallest difference that counts, and largest ratio
 /// of two values that agree. Speeds, m/s: miles and kilometres per hour differ by 1.6. Yaw rates, degrees/s, change more
-/// within a stretch.
+/// within a stretch, so that one stretch alone decides nothing.
 const SPEED_LIMITS: [f64; 3] = [1.5, 1.0, 1.5];
 const YAW_RATE_LIMITS: [f64; 3] = [2.0, 2.0, 2.5];
+const LEAST_STRETCHES: [usize; 2] = [1, 2];
 
 /// Means of speed or yaw rate over a stretch, m/s or degrees/s.
 #[derive(Clone, Copy)]
@@ -50,10 +51,11 @@ fn check_scenario(scenario: &mut Scenario) -> Vec<ReadError> {
             ("speed", "m/s", SPEED_LIMITS, speeds),
             ("yaw rate", "degrees/s", YAW_RATE_LIMITS, yaw_rates),
         ]
-        .into_iter();
-        let contradiction = quantities.find_map(|(quantity, unit, limits, means)| {
+        .into_iter()
+        .zip(LEAST_STRETCHES);
+        let contradiction = quantities.find_map(|((quantity, unit, limits, means), least)| {
             let means: Vec<Means> = means.into_iter().flatten().collect();
-            let Means { recorded, of_poses } = contradiction(&means, limits)?;
+            let Means { recorded, of_poses } = contradiction(&means, limits, least)?;
             Some(format!(
                 "agent {id}: the recorded {quantity} is {recorded:.2} {unit} where the recorded poses give \
                  {of_poses:.2} {unit}: the recorded motion is not used"
@@ -68,8 +70,9 @@ fn check_scenario(scenario: &mut Scenario) -> Vec<ReadError> {
     problems
 }
 
-/// Medians of the means that disagree, if those are most of the stretches in which the agent moves.
-fn contradiction(stretches: &[Means], limits: [f64; 3]) -> Option<Means> {
+/// Medians of the means that disagree, if those are most of the stretches in which the agent moves, and `least_count` at
+/// least.
+fn contradiction(stretches: &[Means], limits: [f64; 3], least_count: usize) -> Option<Means> {
     let [least, least_difference, most_ratio] = limits;
     let moving = stretches
         .iter()
@@ -80,7 +83,7 @@ fn contradiction(stretches: &[Means], limits: [f64; 3]) -> Option<Means> {
         .unzip();
     // A quarter of all stretches as well: an agent that hardly moves is not judged by a single one.
     let is_most = 2 * recorded.len() > moving.count() && 4 * recorded.len() >= stretches.len();
-    is_most.then_some(Means {
+    (is_most && recorded.len() >= least_count).then_some(Means {
         recorded: statistics::median(&recorded)?,
         of_poses: statistics::median(&of_poses)?,
     })

@@ -172,7 +172,7 @@ fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
 fn half_precision_takes_half_the_bytes_of_a_message() {
     let (_generator, _scenes, scene) = begin();
     let folder = tempfile::tempdir().unwrap();
-    let (summary, _) = run(&config(&scene, folder.path(), Method::NONE, 5));
+    let (summary, _) = run(&config(&scene, folder.path(), Method::MAX, 5));
     let bytes = |dtype| {
         evaluate(summary.trained.weights.clone(), &scene, Method::MAX, dtype)[0]
             .result

@@ -402,7 +402,7 @@ fn an_interrupted_table_resumes_at_the_next_cell() {
     table::run(&spec(""), &out, None, &mut first).unwrap();
     assert_eq!((first.known, first.computed), (0, 2));
     let row = format!(
-        "  - {{name: best, method: max, weights: [{}, {}]}}\n",
+        "  - {{name: best, method: late, weights: [{}, {}]}}\n",
         init.display(),
         init.display()
     );
