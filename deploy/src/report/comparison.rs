@@ -57,7 +57,7 @@ const ROWS: [ReportRow; 16] = [
     }),
 ];
 
-/// What the precisions of a run depend on besides its settings.
+/// Data, ego, protocol and number of ticks of a run. Precisions of two runs are comparable only where these are equal.
 fn conditions(folder: &Path, metrics: &Metrics) -> Result<Value, FileError> {
     let scenario: Value = config_file::read(&folder.join("scenario.yaml"))?;
     let data = metrics.provenance.as_ref().map(|of| &of.data_sha256);

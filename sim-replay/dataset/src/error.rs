@@ -33,8 +33,8 @@ pub enum ReadError {
     /// The message names scenario, agent and tick.
     #[error("{0}")]
     Absent(String),
-    /// The requested agent, tick or variant does not exist in the scenario. The message names what was requested and
-    /// what is available.
+    /// The requested agent, tick or variant does not exist in the scenario. The message names the requested and the
+    /// available ones.
     #[error("{0}")]
     NoSuch(String),
 }

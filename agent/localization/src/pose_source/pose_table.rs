@@ -88,8 +88,8 @@ impl PoseTable {
         Ok(table)
     }
 
-    /// What the poses of a scenario (its name, or the path that ends in it) were computed from: empty if that is not stated,
-    /// `None` if there are none.
+    /// Origin of the poses of a scenario (its name, or the path that ends in it): digests of data and networks. Empty if the
+    /// table has none, `None` if it has no poses of this scenario.
     pub fn origin(&self, scenario: &str) -> Option<&str> {
         let name = Self::key(scenario);
         self.scenarios.get(name)?;
