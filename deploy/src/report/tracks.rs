@@ -131,10 +131,10 @@ impl TrackReport {
     fn notes(&self) -> impl Iterator<Item = String> {
         let rejected = self.rejected_detections as usize;
         [
-            (self.without_pose, "ticks without_pose: no tracks"),
-            (self.without_truth, "results without_truth: left out"),
-            (self.without_tracks, "ticks without_tracks: left out"),
-            (rejected, "rejected_detections: left out"),
+            (self.without_pose, "ticks without a pose: no tracks"),
+            (self.without_truth, "results without ground truth: left out"),
+            (self.without_tracks, "ticks without recorded tracks: left out"),
+            (rejected, "rejected detections: left out"),
         ]
         .into_iter()
         .filter(|(count, _)| *count > 0)
@@ -483,7 +483,7 @@ mod tests {
         assert!(cut.has_left_out_ticks() && !whole.has_left_out_ticks());
         let text = track_table(&[whole, cut]);
         assert!(
-            text.ends_with("\nrun: 10 ticks without_tracks: left out\n"),
+            text.ends_with("\nrun: 10 ticks without recorded tracks: left out\n"),
             "{text}"
         );
         // A tick without a result has no tracks, whatever the file of tracks says.

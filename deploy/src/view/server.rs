@@ -74,7 +74,7 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
 /// Answer of a recorded run.
 ///
 /// # Errors
-/// Answer to a request for a recorded run. The error is the text of a 404: the egos, vehicles or moments of the recording.
+/// The text of a 404: the egos, vehicles or moments of the recording.
 fn recorded(run: &RecordedRun, request: &Request) -> Result<Answer, String> {
     let (path, query) = (request.path.as_str(), request.query.as_str());
     let ego = ego_of(query);
