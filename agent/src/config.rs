@@ -5,17 +5,19 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use bus::{BusConfig, ProcessConfig};
+use protocol::codec::{HEAD_BYTES, smallest_message};
 use protocol::config::{FieldError, within};
-use protocol::{CavId, CodecConfig, ConfidenceGate, RunId, Stream};
+use protocol::{BevFeatures, CavId, CodecConfig, ConfidenceGate, RunId, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::agent_loop::LoopOptions;
 use crate::attack::Falsification;
 use crate::node::NodeOptions;
-use crate::rate::RateConfig;
+use crate::rate::{LONGEST_TRANSMISSION_NANOS, RateConfig};
 use localization::pose_source::PoseSourceConfig;
 use perception::compute_device::ComputeDevice;
+use perception::detector::Detector;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use perception::weights::{FileError, Weights};
@@ -296,6 +298,45 @@ impl AgentSettings {
             }
             _ => Ok(()),
         }
+    }
+
+    /// Checks that a feature map of this network is within the byte limits at least without cells.
+    ///
+    /// # Errors
+    /// [`FieldError`] of the first limit that is too small, with the smallest size.
+    pub fn check_limits(&self, sent: &[Stream], detector: &Detector) -> Result<(), FieldError> {
+        if !sent.contains(&Stream::Bev) {
+            return Ok(());
+        }
+        let empty = BevFeatures {
+            grid: detector.grid(),
+            channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
+            code_of: None,
+            values: Vec::new(),
+        };
+        // A map beyond the sender's own limits is refused where it is encoded.
+        let smallest = smallest_message(&empty).unwrap_or(0);
+        let (rate, a_second) = (self.rate, 1_000_000_000 / LONGEST_TRANSMISSION_NANOS);
+        let limits = [
+            (
+                "codec.budget_bytes",
+                self.codec.budget_bytes,
+                smallest.saturating_sub(HEAD_BYTES),
+            ),
+            ("rate.message_bytes", rate.message_bytes, smallest),
+            (
+                "rate.bytes_per_second",
+                rate.bytes_per_second,
+                smallest * a_second,
+            ),
+        ];
+        for (field, limit, smallest) in limits {
+            if let Some(bytes) = limit.filter(|bytes| *bytes < smallest) {
+                let rule = format!("must be at least {smallest}: a map without cells");
+                return Err(FieldError::new(field, bytes, rule));
+            }
+        }
+        Ok(())
     }
 
     /// Options of the loop of a vehicle that publishes these streams, and follows the pace of any ego.

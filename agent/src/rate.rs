@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 /// Longest transmission time of a message at a byte rate, nanoseconds: the period of a LiDAR. With a longer one it
 /// would arrive later than the map after it could have.
-const LONGEST_TRANSMISSION_NANOS: u64 = 100_000_000;
+pub(crate) const LONGEST_TRANSMISSION_NANOS: u64 = 100_000_000;
 /// Share of the time between two maps that one may wait for its turn before the queue counts as blocked.
 const BLOCKED_SHARE: f64 = 0.25;
 /// Share of the throughput of the blocked queue that is tried next: below one, so that the queue empties.

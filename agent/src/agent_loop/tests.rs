@@ -9,6 +9,7 @@ use protocol::{EgoMotion, PointCloud, Pose, Stamp};
 use tch::{Device, nn::VarStore};
 
 use super::*;
+use crate::config::AgentSettings;
 use crate::rate::Turn;
 
 /// A time on the loop's clock, nanoseconds.
@@ -206,4 +207,35 @@ fn the_same_inputs_give_the_same_bytes() {
         "the second has superseded the first"
     );
     assert_eq!(first, encoded(&options, &weights));
+}
+
+#[test]
+fn a_byte_limit_below_a_map_without_cells_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let agent = agent(&write_weights(folder.path()));
+    // 256 of header and metadata, 4 for each of 64 scales, one bit for each of 32 x 16 cells.
+    let smallest = 256 + 4 * 64 + 32 * 16 / 8;
+    let check = |limits: serde_json::Value, sent| {
+        let settings: AgentSettings = serde_json::from_value(limits).unwrap();
+        settings
+            .check_limits(&[sent], agent.detector().unwrap())
+            .map_err(|error| error.to_string())
+    };
+    for (section, field, least) in [
+        ("codec", "budget_bytes", smallest - 256),
+        ("rate", "message_bytes", smallest),
+        ("rate", "bytes_per_second", 10 * smallest),
+    ] {
+        let limit = |bytes: u64| serde_json::json!({section: {field: bytes}});
+        assert_eq!(check(limit(least), Stream::Bev), Ok(()));
+        assert_eq!(check(limit(1), Stream::Boxes), Ok(()));
+        let error = check(limit(least - 1), Stream::Bev).unwrap_err();
+        assert_eq!(
+            error,
+            format!(
+                "{section}.{field} is {}: must be at least {least}: a map without cells",
+                least - 1
+            )
+        );
+    }
 }

@@ -75,5 +75,7 @@ fn load(config: &AgentConfig) -> anyhow::Result<Agent> {
     let weights = config.models.load(inference).context("weights")?;
     let detector = Detector::from_weights(&weights, &weights.detector_config()?, inference.device)
         .context("weights")?;
+    let sent = config.options().of_loop.publish;
+    config.settings.check_limits(&sent, &detector)?;
     Ok(Agent::new(config.cav.clone(), pose_source, detector))
 }

@@ -133,7 +133,10 @@ impl TrackReport {
         [
             (self.without_pose, "ticks without a pose: no tracks"),
             (self.without_truth, "results without ground truth: left out"),
-            (self.without_tracks, "ticks without recorded tracks: left out"),
+            (
+                self.without_tracks,
+                "ticks without recorded tracks: left out",
+            ),
             (rejected, "rejected detections: left out"),
         ]
         .into_iter()

@@ -191,12 +191,13 @@ impl Evaluator {
             gate: self.ego.method().gate(),
         });
         let detector = self.detector_of(&settings)?;
+        let publish = needed.map_or_else(Vec::new, |stream| settings.sent_for(stream));
+        settings.check_limits(&publish, &detector)?;
         let cav = &scenario.agents[place];
         // A vehicle's own falsification takes precedence over the attack of the run.
         let attack = self.setup.attack.and_then(|attack| attack.of(place, cav));
         let inference = Inference::new(Device::Cpu, self.setup.models.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
-        let publish = needed.map_or_else(Vec::new, |stream| settings.sent_for(stream));
         let (agent, options) = (agent.with_attack(attack), settings.loop_options(publish));
         Ok(Participant::new(agent, options, settings.weights.is_some()))
     }

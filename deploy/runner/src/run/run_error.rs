@@ -73,7 +73,7 @@ impl RunError {
             Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) | Self::Live { .. } => true,
             Self::Evaluate(error) => matches!(
                 **error,
-                EvaluateError::TooSlow { .. } | EvaluateError::Link(_)
+                EvaluateError::TooSlow { .. } | EvaluateError::Link(_) | EvaluateError::Setting(_)
             ),
             _ => false,
         }

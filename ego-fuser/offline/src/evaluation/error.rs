@@ -6,6 +6,7 @@ use localization::pose_source::PoseSourceError;
 use perception::detector::DetectorError;
 use perception::weights::FileError;
 use protocol::WireError;
+use protocol::config::FieldError;
 
 use super::stepped::RemoteError;
 use ego_fuser::ego::EgoError;
@@ -16,6 +17,9 @@ pub enum EvaluateError {
     /// The weights are not readable.
     #[error(transparent)]
     Weights(#[from] FileError),
+    /// A setting of a vehicle does not suit its network.
+    #[error(transparent)]
+    Setting(#[from] FieldError),
     /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),
