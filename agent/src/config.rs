@@ -448,7 +448,9 @@ mod tests {
         let recorded = in_fleet(fixed.clone(), 0, true).pose;
         assert_eq!(recorded, PoseSourceConfig::Recorded);
         assert_eq!(in_fleet(fixed.clone(), 1, false).pose, fixed);
-        assert_eq!(in_fleet(independent.clone(), 0, true).pose, independent);
+        let of_scenario = independent.for_scenario("town1");
+        assert_eq!(in_fleet(independent.clone(), 0, true).pose, of_scenario);
+        assert_ne!(of_scenario, independent, "errors of the scenario");
     }
 
     fn phase(settings: &AgentSettings) -> u32 {

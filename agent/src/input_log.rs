@@ -49,15 +49,19 @@ pub struct InputLog<I, P>(Arc<Mutex<Writer<I, P>>>);
 type Writer<I, P> = Option<RecordWriter<Record<I, P>>>;
 
 impl<I: Serialize, P: Serialize> InputLog<I, P> {
-    /// Creates a log of that kind; a process that was restarted gets a file with the next number. `None` if it cannot be
-    /// written, which is logged.
+    /// Creates a log of that kind; a process that was restarted gets a file with the next number, which is logged. `None`
+    /// if it cannot be written, which is logged too.
     pub fn create(file: &InputFile, kind: &str, detector: Option<&Detector>) -> Option<Self> {
-        let (path, config) = file;
+        let (wanted, config) = file;
         // The path, or the first `NAME.N.log` beside it that does not exist.
-        let numbered = (2..).map(|number| path.with_extension(format!("{number}.log")));
-        let mut paths = std::iter::once(path.to_owned()).chain(numbered);
+        let numbered = (2..).map(|number| wanted.with_extension(format!("{number}.log")));
+        let mut paths = std::iter::once(wanted.to_owned()).chain(numbered);
         let free = paths.find(|path| !path.exists());
-        let path = free.unwrap_or_else(|| path.to_owned());
+        let path = free.unwrap_or_else(|| wanted.to_owned());
+        if path != *wanted {
+            let [wanted, used] = [wanted, &path].map(|path| path.display());
+            tracing::warn!("inputs are recorded in {used}, as {wanted} exists");
+        }
         let start = Record::Start(Start {
             config: config.clone(),
             model_hash: detector.map(Detector::model_hash),
@@ -166,7 +170,39 @@ impl<I: DeserializeOwned, P: DeserializeOwned> Iterator for RecordedInputs<I, P>
 
 #[cfg(test)]
 mod tests {
+    use tracing::span;
+
     use super::*;
+
+    /// Texts of the events that are logged.
+    #[derive(Clone, Default)]
+    struct Texts(Arc<Mutex<Vec<String>>>);
+
+    impl tracing::Subscriber for Texts {
+        fn enabled(&self, _: &tracing::Metadata<'_>) -> bool {
+            true
+        }
+
+        fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
+            span::Id::from_u64(1)
+        }
+
+        fn record(&self, _: &span::Id, _: &span::Record<'_>) {}
+
+        fn record_follows_from(&self, _: &span::Id, _: &span::Id) {}
+
+        fn event(&self, event: &tracing::Event<'_>) {
+            event.record(
+                &mut |_: &tracing::field::Field, value: &dyn std::fmt::Debug| {
+                    self.0.lock().unwrap().push(format!("{value:?}"));
+                },
+            );
+        }
+
+        fn enter(&self, _: &span::Id) {}
+
+        fn exit(&self, _: &span::Id) {}
+    }
 
     #[test]
     fn a_restarted_process_has_a_log_of_its_own_and_damage_is_reported() {
@@ -174,7 +210,14 @@ mod tests {
         let path = folder.path().join("inputs-agent-1.log");
         let file = (path.clone(), "[5]".to_owned());
         let first = InputLog::<u8, String>::create(&file, "words", None).unwrap();
-        let second = InputLog::create(&file, "words", None).unwrap();
+        let texts = Texts::default();
+        let second = tracing::subscriber::with_default(texts.clone(), || {
+            InputLog::create(&file, "words", None).unwrap()
+        });
+        let next = folder.path().join("inputs-agent-1.2.log");
+        let [wanted, used] = [&path, &next].map(|path| path.display());
+        let notice = format!("inputs are recorded in {used}, as {wanted} exists");
+        assert_eq!(*texts.0.lock().unwrap(), [notice]);
         for log in [&first, &second] {
             log.add(&Record::Input {
                 now_nanos: 9,
@@ -182,7 +225,6 @@ mod tests {
             });
             log.add(&Record::Published("three".to_owned()));
         }
-        let next = folder.path().join("inputs-agent-1.2.log");
         let bytes = std::fs::read(&next).unwrap();
         std::fs::write(&next, &bytes[..bytes.len() - 1]).unwrap();
         for (path, whole) in [(&path, true), (&next, false)] {

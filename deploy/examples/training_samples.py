@@ -43,20 +43,21 @@ class KeptMaps:
 class Samples:
     """Frames of a data set by number: features, mask, poses, confidence and age as a fusion gets them, and the labels.
 
-    Neighbours beyond `range_m` of the ego take no part.
+    Neighbours that are absent, or beyond `range_m` of the ego, take no part.
     """
 
     def __init__(self, dataset: pathlib.Path, maps: pathlib.Path, weights: pathlib.Path, range_m: float = 70.0):
-        self.frames = list(v2vloc.read(dataset, points=False))
+        scene = v2vloc.read(dataset, points=False)
+        self.agents, self.frames = scene.agents, list(scene)
         self.maps, self.range_m = KeptMaps(maps), range_m
         # Number of the first map of each frame's scenario, tick within it, and ticks of it.
         self.place: list[tuple[int, int, int]] = []
         first = 0
         while len(self.place) < len(self.frames):
-            frame = self.frames[len(self.place)]
-            ticks = sum(other.source == frame.source for other in self.frames)
+            source = self.frames[len(self.place)].source
+            ticks = sum(other.source == source for other in self.frames)
             self.place += [(first, tick, ticks) for tick in range(ticks)]
-            first += len(frame.agents) * ticks
+            first += len(self.agents[source]) * ticks
         if first != len(self.maps):
             raise SystemExit(f"{maps}: {len(self.maps)} maps, but {dataset} has {first} sweeps: maps of other data?")
         self.head = Head(weights, self.maps[0])
@@ -66,13 +67,18 @@ class Samples:
 
     def __getitem__(self, index: int) -> tuple[tuple[Tensor, ...], "Labels"]:
         frame, (first, tick, ticks) = self.frames[index], self.place[index]
-        poses = [agent.world_from_lidar for agent in frame.agents.values()]
+        agents = self.agents[frame.source]
+        ego_from_world = np.linalg.inv(frame.agents[agents[0]].world_from_lidar)
         maps, planar = [], []
-        for number, pose in enumerate(poses):
-            ego_from_cav = np.linalg.inv(poses[0]) @ pose
+        # The file has a place for each agent of the scenario, empty where it is absent.
+        for number, cav in enumerate(agents):
+            index = first + number * ticks + tick
+            if cav not in frame.agents or self.maps.length(self.maps.starts[index]) == 0:
+                continue
+            ego_from_cav = ego_from_world @ frame.agents[cav].world_from_lidar
             x, y, yaw = ego_from_cav[0, 3], ego_from_cav[1, 3], np.arctan2(ego_from_cav[1, 0], ego_from_cav[0, 0])
             if np.hypot(x, y) <= self.range_m:
-                bev = torch.from_numpy(self.maps[first + number * ticks + tick].features)
+                bev = torch.from_numpy(self.maps[index].features)
                 maps.append(self.head.align(bev, x, y, yaw) if number else (bev, torch.ones_like(bev[:1])))
                 planar.append([x, y, yaw])
         features, mask = (torch.stack(parts) for parts in zip(*maps))

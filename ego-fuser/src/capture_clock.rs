@@ -17,6 +17,8 @@ const LIMIT_NANOS: i64 = 50_000_000;
 const UNSTEADY_NANOS: i64 = 500_000_000;
 /// Time that an estimate looks back, nanoseconds.
 const WINDOW_NANOS: u64 = 1_300_000_000;
+/// Time in which sweeps that waited during a pause of the ego's own agent arrive after it, nanoseconds.
+const BACKLOG_NANOS: u64 = 500_000_000;
 /// Largest number of sweeps and of samples that are kept of a vehicle.
 const MAX_KEPT: usize = 64;
 /// Largest number of vehicles.
@@ -38,6 +40,8 @@ pub struct CaptureClocks {
     fewest: usize,
     /// The ego's own sweeps, by arrival.
     own: VecDeque<SweepTime>,
+    /// Arrival of the first own sweep after the last pause of its agent, nanoseconds.
+    resumed_nanos: u64,
     neighbours: BTreeMap<CavId, NeighbourClock>,
 }
 
@@ -59,16 +63,26 @@ impl CaptureClocks {
         Self {
             fewest: if has_exact_arrivals { 1 } else { 3 },
             own: VecDeque::new(),
+            resumed_nanos: u64::MAX,
             neighbours: BTreeMap::new(),
         }
     }
 
     /// Adds a sweep of the ego's own vehicle.
     pub fn note_own(&mut self, sweep: SweepTime) {
+        if sweep.arrived_nanos.abs_diff(self.resumed_nanos) < BACKLOG_NANOS {
+            return;
+        }
         match self.own.back() {
             Some(last) if last.arrived_nanos == sweep.arrived_nanos => return,
             // The system clock was set back.
             Some(last) if last.arrived_nanos > sweep.arrived_nanos => self.own.clear(),
+            // Neighbours' sweeps of a pause cannot be compared, nor those beside own ones that waited.
+            Some(last) if self.is_pause(last, &sweep) => {
+                self.own.clear();
+                self.resumed_nanos = sweep.arrived_nanos;
+                return;
+            }
             _ => {}
         }
         self.own.push_back(sweep);
@@ -92,8 +106,9 @@ impl CaptureClocks {
     /// Estimates anew and logs what changes. Returns the neighbours whose capture times are corrected otherwise than
     /// before: their waiting messages belong to other frames.
     pub fn update(&mut self) -> Vec<CavId> {
-        let (pace, newest) = (self.pace(), self.own.back());
-        let mut changed = Vec::new();
+        // At least 1: errors of arrival times grow with it.
+        let pace = self.pace().unwrap_or(1.0).clamp(1.0, 100.0);
+        let (newest, mut changed) = (self.own.back(), Vec::new());
         for (cav, clock) in &mut self.neighbours {
             // Interpolation needs an own sweep of this time or later, which a later report brings.
             while let Some(sweep) = clock.pending.pop_front_if(|sweep| {
@@ -147,14 +162,22 @@ impl CaptureClocks {
         self.neighbours.remove(cav);
     }
 
-    /// Seconds of the scene per second, at least 1: errors of arrival times grow with it.
-    fn pace(&self) -> f64 {
-        let (Some(first), Some(last)) = (self.own.front(), self.own.back()) else {
-            return 1.0;
-        };
+    /// Seconds of the scene per second; `None` before the second own sweep.
+    fn pace(&self) -> Option<f64> {
+        let (first, last) = (self.own.front()?, self.own.back()?);
         let captured = last.capture_nanos.saturating_sub(first.capture_nanos);
         let arrived = last.arrived_nanos.saturating_sub(first.arrived_nanos);
-        (captured as f64 / arrived.max(1) as f64).clamp(1.0, 100.0)
+        (arrived > 0).then(|| captured as f64 / arrived as f64)
+    }
+
+    /// True if the own agent paused between two sweeps: the pace does not explain their times. A shorter pause is outvoted
+    /// by the sweeps before it.
+    fn is_pause(&self, last: &SweepTime, next: &SweepTime) -> bool {
+        let arrived = next.arrived_nanos.saturating_sub(last.arrived_nanos);
+        let captured = next.capture_nanos as f64 - last.capture_nanos as f64;
+        let pace = self.pace().filter(|_| arrived > WINDOW_NANOS / 2);
+        let late = pace.map(|pace| (pace * arrived as f64 - captured) / pace.max(1.0));
+        late.is_some_and(|nanos| nanos.abs() > LIMIT_NANOS as f64)
     }
 }
 
@@ -310,6 +333,36 @@ mod tests {
         assert!((found[38].unwrap() + 1000).abs() <= 3, "{found:?}");
         assert_eq!(found[59], Some(0), "{found:?}");
         assert!(found.contains(&None), "left out in between");
+    }
+
+    /// A sweep of a scene at 10 Hz that arrives `late_ms` after its moment.
+    fn sweep(tick: u64, late_ms: u64) -> SweepTime {
+        SweepTime {
+            capture_nanos: (50_000 + tick * 100) * MS,
+            arrived_nanos: (1_000_000_000_000 + tick * 100 + late_ms) * MS,
+        }
+    }
+
+    #[test]
+    fn sweeps_that_waited_while_the_own_agent_was_paused_are_no_offset() {
+        let mut clocks = CaptureClocks::new(false);
+        let cav = CavId::new("9").unwrap();
+        for tick in 0..80 {
+            clocks.note(&cav, sweep(tick, 0));
+            match tick {
+                20..60 => {}
+                // The first two of the pause and the last two waited.
+                60 => {
+                    for (place, waited) in [20, 21, 58, 59, 60].into_iter().enumerate() {
+                        clocks.note_own(sweep(waited, (60 - waited) * 100 + place as u64));
+                    }
+                }
+                _ => clocks.note_own(sweep(tick, 0)),
+            }
+            assert!(clocks.update().is_empty(), "sweep {tick}");
+            assert_eq!(clocks.corrected(&cav, 5), Some(5), "sweep {tick}");
+        }
+        assert_eq!(clocks.neighbours[&cav].samples.len(), 14, "dated again");
     }
 
     #[test]

@@ -110,7 +110,7 @@ impl Ego {
     ) -> Result<Self, EgoError> {
         let method = Method::of_weights(weights, method)?;
         // Methods without a fusion of maps run with the detector of any network.
-        if method.exchange() == Exchange::Features && !method.is_script() {
+        if method.exchange() == Exchange::Features && method.script_file().is_none() {
             method.check_training(weights)?;
         }
         let detector = Detector::from_weights(weights, &weights.detector_config()?, device)?;

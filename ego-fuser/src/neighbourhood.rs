@@ -21,6 +21,8 @@ pub(crate) struct Neighbourhood {
     allowed: Option<BTreeSet<CavId>>,
     membership: Membership,
     members: BTreeMap<CavId, Vec<Subscription>>,
+    /// Those to vehicles that have left: the link may still deliver messages of theirs, each of which is counted.
+    departed: BTreeMap<CavId, Vec<Subscription>>,
     queue: Queue,
 }
 
@@ -67,6 +69,7 @@ impl Neighbourhood {
             allowed,
             membership,
             members: BTreeMap::new(),
+            departed: BTreeMap::new(),
             queue: Queue::default(),
         })
     }
@@ -79,8 +82,12 @@ impl Neighbourhood {
                 self.queue.add(cav);
             } else if !is_there {
                 self.queue.remove(&cav);
-                if self.members.remove(&cav).is_some() {
+                if let Some(subscriptions) = self.members.remove(&cav) {
                     tracing::info!(%cav, "a neighbour has left");
+                    // Bounded as the members are. Without a link nothing of it is still on its way.
+                    if self.over_link && self.departed.len() < MAX_NEIGHBOURS {
+                        self.departed.insert(cav.clone(), subscriptions);
+                    }
                     changes.push(Input::Left(cav));
                 }
             }
@@ -95,13 +102,22 @@ impl Neighbourhood {
 
     fn subscribe(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
         tracing::info!(%cav, "a neighbour has joined");
-        let subscriptions = self.streams.iter().map(|&stream| {
+        let subscribe = |&stream: &Stream| {
             let topic = topic_of(&self.ego, &cav, stream, self.over_link);
             bus.subscribe(topic, inbox)
-        });
-        let subscriptions = subscriptions.collect::<Result<_, _>>()?;
+        };
+        // A second subscription to a topic would receive every message again.
+        let subscriptions = match self.departed.remove(&cav) {
+            Some(kept) => kept,
+            None => (self.streams.iter().map(subscribe)).collect::<Result<_, _>>()?,
+        };
         self.members.insert(cav, subscriptions);
         Ok(())
+    }
+
+    /// True for a vehicle that has left while the link may still deliver messages of it.
+    pub(crate) fn has_left(&self, cav: &CavId) -> bool {
+        self.departed.contains_key(cav)
     }
 
     fn is_wanted(&self, cav: &CavId) -> bool {

@@ -14,7 +14,7 @@ use bus::{
 };
 use protocol::message::{Descriptor, FrameReport, StageTiming};
 use protocol::{
-    Body, CavId, Detections, Encoded, Limits, Payload, Role, Stamp, Stream, Topic, wire,
+    Body, CavId, Detections, DropReason, Encoded, Limits, Payload, Role, Stamp, Stream, Topic, wire,
 };
 use serde::Serialize;
 
@@ -250,6 +250,7 @@ impl<'a> EgoNode<'a> {
                 }
             }
             match self.inbox.take(Some(self.next_moment())) {
+                Pop::Item(_, Event::Message(arrival)) if self.is_of_departed(&arrival) => {}
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
                 Pop::Item(topic, Event::End { .. }) => self.end(&topic),
                 Pop::TimedOut => {}
@@ -286,7 +287,10 @@ impl<'a> EgoNode<'a> {
         let decoded = ego_loop.decode(&reception, header, arrival.pieces(), limits);
         let message = match decoded {
             Ok(message) => message,
-            Err(Refusal::Unneeded(reason)) => return stats.dropped(&arrival.topic, reason),
+            Err(Refusal::Unneeded(reason)) => {
+                let now_nanos = self.clock.now_nanos();
+                return self.account(&(cav.clone(), stream), Some(reason), now_nanos);
+            }
             Err(Refusal::Malformed(error)) => return stats.rejected(&arrival.topic, &error),
         };
         stats.timed("decode", began.elapsed());
@@ -301,6 +305,17 @@ impl<'a> EgoNode<'a> {
             log.add(&EgoRecord::Input { now_nanos, input });
         }
         self.decide(Input::Message(Box::new(message)), now_nanos);
+    }
+
+    /// True for a message that the link delivers after its sender has left, which is counted here: the loop has forgotten
+    /// the vehicle, and with it whether its maps are of another network.
+    fn is_of_departed(&self, arrival: &Arrival) -> bool {
+        let sender = self.neighbourhood.as_ref().zip(sender_of(&arrival.topic));
+        let is_departed = sender.is_some_and(|(known, (cav, _))| known.has_left(cav));
+        if is_departed && arrival.topic.is_counted() {
+            self.bus.stats().dropped(&arrival.topic, DropReason::Stale);
+        }
+        is_departed
     }
 
     /// Processes an agent's descriptor: its network, and the arrivals of its sweeps.
@@ -373,10 +388,8 @@ impl<'a> EgoNode<'a> {
                     capture_nanos,
                     error,
                 } => tracing::error!(capture_nanos, "a frame could not be fused: {error}"),
-                Output::Received(source) => self.bus.stats().received(&self.topic(&source)),
-                Output::Dropped(source, reason) => {
-                    self.bus.stats().dropped(&self.topic(&source), reason);
-                }
+                Output::Received(source) => self.account(&source, None, now_nanos),
+                Output::Dropped(source, reason) => self.account(&source, Some(reason), now_nanos),
                 Output::Pace(pace) => self.pace.submit(0, pace),
             }
         }
@@ -406,8 +419,14 @@ impl<'a> EgoNode<'a> {
             });
     }
 
-    fn topic(&self, (cav, stream): &Source) -> Topic {
-        topic_of(&self.cav, cav, *stream, self.options.over_link)
+    /// Counts that a message was used, or why not.
+    fn account(&mut self, (cav, stream): &Source, reason: Option<DropReason>, now_nanos: u64) {
+        self.ego_loop.note_use(cav, reason, now_nanos);
+        let topic = topic_of(&self.cav, cav, *stream, self.options.over_link);
+        match reason {
+            Some(reason) => self.bus.stats().dropped(&topic, reason),
+            None => self.bus.stats().received(&topic),
+        }
     }
 
     fn next_moment(&self) -> Instant {

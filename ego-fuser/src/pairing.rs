@@ -20,6 +20,9 @@ pub struct PairingConfig {
     pub depth: usize,
 }
 
+/// Shortest period of a LiDAR, nanoseconds: sweeps that follow each other faster are repeated ones.
+const SHORTEST_PERIOD_NANOS: u64 = 20_000_000;
+
 impl PairingConfig {
     /// Messages of at most that age, half a frame of 10 Hz of lead, and at least eight messages: at 10 Hz all that may
     /// still be fused.
@@ -87,6 +90,19 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
             config,
             waiting: BTreeMap::new(),
         }
+    }
+
+    /// Limits the lead to half the time between two sweeps of the ego, nanoseconds: at 20 Hz a message of the sweep before
+    /// is within 50 ms too.
+    pub(crate) fn limit_lead(&mut self, step_nanos: u64) {
+        if step_nanos >= SHORTEST_PERIOD_NANOS {
+            self.config.max_lead_nanos = self.config.max_lead_nanos.min(step_nanos / 2);
+        }
+    }
+
+    /// Largest lead of a message that counts as of the time of the ego's frame, nanoseconds.
+    pub(crate) fn max_lead_nanos(&self) -> u64 {
+        self.config.max_lead_nanos
     }
 
     /// Queues a message. The message that has to be dropped for it is returned: the message itself when it is a
@@ -238,6 +254,27 @@ mod tests {
         assert_eq!(pairing.turn_back(&cav("a"), 2 * FRAME, 20 * FRAME), 1);
         assert_eq!(pairing.insert(&cav("a"), 2 * FRAME, 2), None);
         assert_eq!(ages(&mut pairing, 2 * FRAME), (vec![0], vec![]));
+    }
+
+    #[test]
+    fn at_20_hz_the_sweep_before_does_not_stand_in_for_the_one_awaited() {
+        let mut pairing = pairing();
+        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10), None);
+        let next = 10 * FRAME + FRAME / 2;
+        assert!(pairing.has_reached(&cav("a"), next));
+        // A repeated sweep, one after a gap, and one of 20 Hz.
+        for (step, has_reached) in [(1, true), (3 * FRAME, true), (FRAME / 2, false)] {
+            pairing.limit_lead(step);
+            assert_eq!(
+                pairing.has_reached(&cav("a"), next),
+                has_reached,
+                "{step} ns"
+            );
+        }
+        assert_eq!(pairing.insert(&cav("a"), next, 11), None);
+        // Of two sweeps within 50 ms each frame has its own.
+        assert_eq!(ages(&mut pairing, 10 * FRAME).0, [0]);
+        assert_eq!(ages(&mut pairing, next).0, [0]);
     }
 
     #[test]

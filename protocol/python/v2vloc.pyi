@@ -254,7 +254,9 @@ class Frame:
         """Tracks by the id of the ego, if it tracks."""
     @property
     def ego(self) -> Optional[str]:
-        """The vehicle of the first result; without one the first agent."""
+        """The ego, the same in all frames, also where it is absent: of a data set the first agent that takes part by the
+        protocol of the layout, of a recorded run the scored one, of a recording alone the first by name. Of a frame of a live
+        run the vehicle of its first result. Without results the first agent."""
     @property
     def problems(self) -> list[str]:
         """Parts that were left out, each with its reason."""
@@ -265,15 +267,15 @@ class Frame:
         protocol: Optional[str] = None,
         area_m: Optional[Sequence[float]] = None,
     ) -> Objects:
-        """Objects that an ego is expected to find: the annotations of all agents in range, merged by id, in the frame of
-        the ego's LiDAR.
+        """Objects that an ego is expected to find: the annotations of all agents in range that take part by the protocol,
+        merged by id, in the frame of the ego's LiDAR. The boxes are read-only.
 
-        :param ego: default: :attr:`ego`.
-        :param protocol: evaluation protocol, for example ``opv2v``; default: the one of the data set's layout, of
-            ``opv2v`` for runs.
+        :param ego: takes part in any case; default: :attr:`ego`, and that of ``protocol`` in a data set.
+        :param protocol: evaluation protocol, for example ``opv2v``; default: the one of the data set's layout, or that by
+            which a recorded run was scored. Of live runs, and of recordings outside of a run folder, ``opv2v``.
         :param area_m: x, y, z low, then x, y, z high of the detector in the LiDAR frame: the range of the protocol ends
             there.
-        :raises Error: without a true pose of the ego.
+        :raises Error: without a true pose of the ego, or if ``area_m`` is no range.
         """
 
 Payload = Union[NDArray[np.float32], PoseEstimate, Bev, Detections, Camera, Agent, dict[str, Any], str]
@@ -318,6 +320,9 @@ class DataSet(Sequence[Frame]):
     @property
     def scenarios(self) -> list[str]:
         """Names of the scenarios, whose frames follow each other."""
+    @property
+    def agents(self) -> dict[str, list[str]]:
+        """Agents of each scenario that take part by the protocol of its layout, the ego first; empty for a recording."""
     @property
     def problems(self) -> list[str]:
         """Files that cannot be read, each with its reason. Those of a frame are in :attr:`Frame.problems`."""
@@ -397,7 +402,7 @@ def average_precision(
     iou: float = 0.5,
     *,
     ordering: Literal["global", "frame"] = "global",
-) -> float:
+) -> Optional[float]:
     """Average precision (area under the interpolated curve, VOC 2010), as ``v2vloc eval`` computes it.
 
     Footprints are matched as in OpenCOOD: detections of a frame by falling score, each takes the remaining object with
@@ -408,6 +413,7 @@ def average_precision(
     :param truth: of each frame: :class:`Objects`, or boxes ``[M, 7]`` in the same frame of reference, which all count.
     :param iou: overlap from which a detection counts; several give a dictionary.
     :param ordering: ``global``: by score over all frames; ``frame``: frame after frame (the default of OpenCOOD).
+    :return: 0 to 1; ``None`` where no object counts, also without frames.
     :raises Error: with the frame whose shape or value is wrong.
     """
 
@@ -418,4 +424,4 @@ def average_precision(
     iou: Sequence[float],
     *,
     ordering: Literal["global", "frame"] = "global",
-) -> dict[float, float]: ...
+) -> dict[float, Optional[float]]: ...

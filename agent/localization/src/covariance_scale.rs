@@ -110,6 +110,15 @@ impl PoseSample {
 }
 
 impl CovarianceScale {
+    /// The scale that changes nothing, without a bound.
+    pub const NONE: Self = Self {
+        planar: 1.0,
+        height: 1.0,
+        tilt: 1.0,
+        yaw: 1.0,
+        bound: None,
+    };
+
     /// Fits the factors so that 95 % of the errors lie within the ellipse in the plane and within 1.96 standard
     /// deviations of every other axis, and all positions within the bound.
     ///

@@ -4,7 +4,7 @@
 //! the vehicle and a receiver has to give the start.
 
 use crate::Error;
-use crate::sweep_database::{posed, present_sweeps};
+use crate::sweep_database::{add_faults, posed, present_sweeps};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -63,10 +63,11 @@ pub fn check_spacing(spacing_m: f64) -> Result<(), Error> {
 }
 
 /// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path. Sweeps that
-/// cannot be read or have no pose are left out and counted in `left_out`.
+/// cannot be read or have no pose are left out and counted in `left_out`, which also gets the findings about the drives.
 ///
 /// # Errors
-/// [`Error`] names the drive that cannot be opened, or all drives if no sweep has a pose; or the distance is not valid.
+/// [`Error`] names the drive that cannot be opened, or all drives if no sweep has a pose or none of them has a plane; or the
+/// distance is not valid.
 pub fn read_map(
     folders: &[impl AsRef<Path>],
     spacing_m: f64,
@@ -78,7 +79,7 @@ pub fn read_map(
     let mut sweeps = 0;
     for folder in folders {
         let drives = dataset::open(folder.as_ref())?;
-        left_out.add_files(&drives.problems);
+        add_faults(&drives, left_out);
         for scenario in drives.scenarios {
             let mut last: Option<(usize, Isometry3<f64>)> = None;
             for (agent, tick) in present_sweeps(&scenario) {
@@ -108,12 +109,18 @@ pub fn read_map(
             }
         }
     }
+    let folders = || Vec::from_iter(folders.iter().map(|folder| folder.as_ref().to_owned()));
     if sweeps == 0 {
-        let folders = folders.iter().map(|folder| folder.as_ref().to_owned());
-        return Err(Error::NoSweeps(folders.collect(), left_out.reasons()));
+        return Err(Error::NoSweeps(folders(), left_out.reasons()));
     }
     map.fit();
-    Ok(map)
+    match map.planes() {
+        0 => Err(Error::Input(format!(
+            "{:?}: the map of {sweeps} sweeps has no plane: their points are too few or too far apart",
+            folders()
+        ))),
+        _ => Ok(map),
+    }
 }
 
 #[cfg(test)]
@@ -180,6 +187,41 @@ mod tests {
         );
         let none = read_map(&[&without], 0.0, &config, &mut left_out).unwrap_err();
         assert!(matches!(none, Error::NoSweeps(..)), "{none}");
+    }
+
+    /// A KITTI sequence of two sweeps of two points each, whose intensities are below 0.
+    fn sparse_drive(folder: &Path) {
+        std::fs::create_dir_all(folder.join("velodyne")).unwrap();
+        let points = [[7.0_f32, 1.0, 0.5, -0.1], [-9.0, 4.0, 1.5, -0.1]];
+        let bytes: Vec<u8> = (points.iter().flatten())
+            .flat_map(|value| value.to_le_bytes())
+            .collect();
+        for scan in ["000000", "000001"] {
+            let file = folder.join("velodyne").join(scan).with_extension("bin");
+            std::fs::write(file, &bytes).unwrap();
+        }
+        std::fs::write(folder.join("calib.txt"), "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 2 0 1 0 0 0 0 1 0\n";
+        std::fs::write(folder.join("poses.txt"), poses).unwrap();
+    }
+
+    #[test]
+    fn a_map_without_a_plane_is_refused_and_findings_are_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let drive = folder.path().join("00");
+        sparse_drive(&drive);
+        let (config, mut left_out) = (IcpConfig::default(), LeftOut::default());
+        let refused = read_map(&[&drive], 0.0, &config, &mut left_out).unwrap_err();
+        let message = refused.to_string();
+        assert!(
+            refused.is_bad_input() && message.contains("the map of 2 sweeps has no plane"),
+            "{message}"
+        );
+        // A finding leaves nothing out.
+        assert!(
+            left_out.is_nothing() && left_out != LeftOut::default(),
+            "{left_out}"
+        );
     }
 
     #[test]

@@ -1,10 +1,13 @@
 //! Descriptors and true poses of the sweeps of drives, for retrieval.
 
 use crate::{Error, Result};
+use std::collections::HashMap;
 use std::path::PathBuf;
 
 use dataset::frame::Frame;
-use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
+use dataset::{
+    Dataset, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, Scenario, findings,
+};
 use localization::pgc::LocalizerError;
 use nalgebra::Isometry3;
 use protocol::{PointCloud, Pose};
@@ -23,7 +26,7 @@ pub fn described_sweeps<D, E: Into<LocalizerError>>(
     let datasets = folders.iter().map(|folder| dataset::open(folder));
     let datasets: Vec<_> = datasets.collect::<Result<_, _>>()?;
     for dataset in &datasets {
-        left_out.add_files(&dataset.problems);
+        add_faults(dataset, left_out);
     }
     let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
     let all: Vec<_> = scenarios
@@ -44,6 +47,41 @@ pub fn described_sweeps<D, E: Into<LocalizerError>>(
         true => Err(Error::NoSweeps(folders.to_vec(), left_out.reasons())),
         false => Ok(sweeps),
     }
+}
+
+/// Adds what is wrong with drives as a whole: files that are not used, and findings about those that are.
+pub fn add_faults(drives: &Dataset, left_out: &mut LeftOut) {
+    left_out.add_files(&drives.problems);
+    let findings = findings::sampled(&drives.scenarios, IntensityScale::AUTO, None);
+    left_out.add_findings(findings);
+}
+
+/// The statement that two of some folders have the same scenario; `None` if each scenario is there once.
+///
+/// # Errors
+/// [`Error`] names the folder that cannot be opened.
+pub fn repeated<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) -> Result<Option<String>> {
+    let mut folder_of = HashMap::new();
+    for folder in folders {
+        for scenario in dataset::open(folder)?.scenarios {
+            let other = first_sweep(&scenario).and_then(|first| folder_of.insert(first, folder));
+            if let Some(other) = other {
+                let (other, folder, name) = (other.display(), folder.display(), scenario.name);
+                let reason =
+                    format!("{other} and {folder} both have the sweeps of scenario {name}");
+                return Ok(Some(reason));
+            }
+        }
+    }
+    Ok(None)
+}
+
+/// File and capture time (nanoseconds) of a scenario's first sweep, by whatever path its folder was opened.
+fn first_sweep(scenario: &Scenario) -> Option<(PathBuf, u64)> {
+    let file = scenario.points_path(0, 0, None).ok()?;
+    let folder = file.parent()?.canonicalize().ok()?;
+    let nanos = scenario.ticks.first()?.capture_nanos;
+    Some((folder.join(file.file_name()?), nanos))
 }
 
 /// Agent and tick of all sweeps of a scenario, vehicle by vehicle, in the order of time.

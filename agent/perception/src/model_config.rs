@@ -1,10 +1,9 @@
 //! Configuration of a detector: area, pillars, backbone, head.
 
-use std::path::PathBuf;
-
 use protocol::BevGrid;
 use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
+use support::file_error::FileError;
 
 /// Number of values that describe a box relative to its anchor: x, y, z, h, w, l, yaw.
 pub const BOX_CODE: i64 = 7;
@@ -15,22 +14,9 @@ pub enum ConfigError {
     /// A setting is out of range, or contradicts another.
     #[error("detector configuration: {0}")]
     Value(#[from] FieldError),
-    /// A module's file cannot be read.
-    #[error("{}: {problem}", file.display())]
-    ScriptFile {
-        /// The file.
-        file: PathBuf,
-        /// Error of the operating system.
-        problem: String,
-    },
-    /// A module cannot be loaded.
-    #[error("{}: not a TorchScript module: {reason}", file.display())]
-    Script {
-        /// The file.
-        file: PathBuf,
-        /// First line of the tensor library's message.
-        reason: String,
-    },
+    /// A module's file cannot be read, or the module not loaded.
+    #[error(transparent)]
+    File(#[from] FileError),
 }
 
 /// Reduction of the concatenated backbone levels to the transmitted feature map.
@@ -85,16 +71,6 @@ pub struct AnchorConfig {
     pub center_z_m: f64,
     /// Headings, degrees, in the order of the head's channels.
     pub yaws_deg: Vec<f64>,
-}
-
-impl Default for AnchorConfig {
-    fn default() -> Self {
-        Self {
-            size_lwh_m: [3.9, 1.6, 1.56],
-            center_z_m: -1.0,
-            yaws_deg: vec![0.0, 90.0],
-        }
-    }
 }
 
 /// Configuration of a PointPillars detector, from its area to its head.
@@ -163,7 +139,11 @@ impl DetectorConfig {
                 stride: 2,
             }),
             compress_ratio: None,
-            anchors: AnchorConfig::default(),
+            anchors: AnchorConfig {
+                size_lwh_m: [3.9, 1.6, 1.56],
+                center_z_m: -1.0,
+                yaws_deg: vec![0.0, 90.0],
+            },
             own_body_m: Some(OWN_BODY_M),
         }
     }

@@ -5,8 +5,12 @@ use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::CavId;
 
-/// Scores a frame; if compute times are emulated, its stamp is the time of publication.
+/// Scores a frame; if compute times are emulated, its stamp is the time of publication. A frame without the ego's true
+/// pose is left out.
 pub(crate) fn judge(scores: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
+    if !frame.has_true_pose() {
+        return;
+    }
     let (stamp, frames) = (frame.stamp, frame.frames);
     let cavs = frames.iter().map(|frame| frame.cav.clone());
     let poses: Vec<_> = cavs.zip(frame.poses).collect();
@@ -40,5 +44,69 @@ pub(crate) fn metrics(
         left_out: evaluator.left_out().clone(),
         protocol: evaluator.protocol(),
         ..Metrics::of(scores, clock, names, seconds, ledger, sent_bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dataset::frame::Frame;
+    use dataset::ground_truth::{GroundTruth, GroundTruthRule};
+    use localization::pose_source::NO_SOURCE;
+    use protocol::{Detections, Handedness, Pose, Stamp};
+
+    use super::*;
+
+    const RULE: GroundTruthRule = GroundTruthRule::OPV2V;
+
+    fn ego() -> CavId {
+        CavId::new("1").unwrap()
+    }
+
+    /// A frame of the ego alone, without objects.
+    fn frame(tick: usize, world_from_lidar: Option<Pose>) -> EvaluatedFrame {
+        let capture_nanos = 100_000_000 * tick as u64;
+        let recorded = Frame {
+            world_from_lidar,
+            ..Frame::empty(ego(), capture_nanos, Handedness::Right)
+        };
+        EvaluatedFrame {
+            tick,
+            stamp: Stamp {
+                cav: ego(),
+                epoch: 0,
+                sequence: 0,
+                capture_nanos,
+                publish_nanos: capture_nanos,
+            },
+            result: Detections {
+                ego: ego(),
+                agent_frame: tick as u64,
+                method: "late".into(),
+                pose: NO_SOURCE,
+                detections: Vec::new(),
+                fused: Vec::new(),
+                skipped: Vec::new(),
+                neighbours: Vec::new(),
+                stages: Vec::new(),
+            },
+            tracks: None,
+            failure: None,
+            truth: GroundTruth::of_tick(&[&recorded], 0, &RULE),
+            frames: vec![recorded],
+            poses: vec![NO_SOURCE],
+        }
+    }
+
+    #[test]
+    fn a_frame_without_the_true_pose_of_the_ego_counts_in_no_score() {
+        let mut scores = FrameScores::new(ego(), RULE, 1);
+        for (tick, pose) in [Some(Pose::IDENTITY), None, Some(Pose::IDENTITY)]
+            .into_iter()
+            .enumerate()
+        {
+            judge(&mut scores, frame(tick, pose), true);
+        }
+        let ticks: Vec<u64> = scores.records().iter().map(|record| record.tick).collect();
+        assert_eq!((ticks, scores.ticks()), (vec![0, 2], (2, 2)));
     }
 }

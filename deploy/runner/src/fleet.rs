@@ -28,6 +28,7 @@ use support::provenance::Provenance;
 use tch::Device;
 
 pub use self::processes::SessionContext;
+use crate::cached_poses;
 use crate::scenario::Scenario;
 use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
@@ -148,6 +149,9 @@ impl Fleet {
             format!("protocol {name}: none of the agents {found:?} is of a kind that takes part")
         })?;
         check_poses(&scenario, recorded, &agents)?;
+        for pose in scenario.poses() {
+            cached_poses::check(&pose, [recorded].into_iter(), &FileDigests::default())?;
+        }
         let scene = &mut scenario.scene;
         // No underflow: scenario_of has refused a seek beyond the last tick.
         let left = recorded.ticks.len() - scene.seek;
@@ -157,7 +161,8 @@ impl Fleet {
         } else {
             Some(scene.frames.map_or(left, |frames| frames.min(left)))
         };
-        let findings = findings::sampled(std::slice::from_ref(recorded), scene.intensity_scale);
+        let (scale, rule) = (scene.intensity_scale, &protocol.ground_truth);
+        let findings = findings::sampled(std::slice::from_ref(recorded), scale, Some(rule));
         // What the file left open is filled in, so that the scenario.yaml of the run is complete.
         scene.scenario = Some(recorded.name.clone());
         scene.agents.clone_from(&agents);

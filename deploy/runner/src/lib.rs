@@ -21,6 +21,7 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+pub(crate) mod cached_poses;
 pub(crate) mod evaluated_frame;
 pub mod experiment;
 pub mod fleet;

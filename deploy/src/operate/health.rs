@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use bus::ROUTER;
 use serde::{Deserialize, Serialize};
 
+use crate::operate::router_watch::TimeSum;
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
 use crate::score::{Progress, SCORER};
 
@@ -79,6 +80,23 @@ struct Noted {
     started: Instant,
     /// Last report since this start.
     last_report: Option<Instant>,
+    /// Silence so far of a process that is or was suspended, until its next report.
+    silence: Option<Duration>,
+    /// Those that are over.
+    silences: TimeSum,
+}
+
+impl Noted {
+    /// Takes the time since the last report. One that computes a frame for long is silent too, so only the silence of a
+    /// suspended process counts.
+    fn note_silence(&mut self, since: Duration) {
+        let usage = || self.status.pid.and_then(Usage::of);
+        if self.status.state != State::Silent {
+            self.silences.add(self.silence.take());
+        } else if self.silence.is_some() || usage().is_some_and(|usage| usage.is_stopped) {
+            self.silence = Some(since);
+        }
+    }
 }
 
 /// Monitors the processes of a run.
@@ -115,12 +133,14 @@ impl Health {
             },
             started: now,
             last_report: None,
+            silence: None,
+            silences: TimeSum::default(),
         });
         let status = &mut noted.status;
         match &event.what {
             ProcessEventKind::Started { pid } => {
                 (status.state, status.pid) = (State::Starting, Some(*pid));
-                (noted.started, noted.last_report) = (now, None);
+                (noted.started, noted.last_report, noted.silence) = (now, None, None);
             }
             ProcessEventKind::Crashed { how, restart, .. } => {
                 (status.state, status.pid, status.restarts) = (State::Crashed, None, *restart);
@@ -188,6 +208,7 @@ impl Health {
                 Some(_) if noted.status.failure.is_some() => State::Failing,
                 Some(_) => State::Ready,
             };
+            noted.note_silence(since);
             if since > timeout && network_is_up {
                 let why = format!("has not reported for {:.1} s", since.as_secs_f64());
                 hanging.push((name.clone(), why));
@@ -214,6 +235,16 @@ impl Health {
             Some(format!("{name} {how}{times}"))
         });
         ends.collect()
+    }
+
+    /// Times without a report of processes that were suspended, as text: `replay was silent for 4.1 s`.
+    pub(crate) fn silences(&self) -> Vec<String> {
+        let silences = self.processes.iter().filter_map(|(name, noted)| {
+            let mut silences = noted.silences;
+            silences.add(noted.silence);
+            silences.sentence(&format!("{name} was silent"))
+        });
+        silences.collect()
     }
 
     /// Status of every process; `progress` has what they reported.
@@ -276,6 +307,8 @@ fn number_after(name: &str, text: &str) -> Option<u64> {
 
 #[cfg(test)]
 mod tests {
+    use std::process::{self, Command};
+
     use super::*;
 
     fn event(name: &str, what: ProcessEventKind) -> ProcessEvent {
@@ -287,17 +320,13 @@ mod tests {
 
     /// Monitor of one process that was started at the returned time.
     fn watch() -> (Health, Instant) {
+        watch_process(process::id())
+    }
+
+    fn watch_process(pid: u32) -> (Health, Instant) {
         let mut health = Health::new(Duration::from_secs(5), Duration::from_secs(60));
         let began = Instant::now();
-        health.note(
-            &event(
-                "ego",
-                ProcessEventKind::Started {
-                    pid: std::process::id(),
-                },
-            ),
-            began,
-        );
+        health.note(&event("ego", ProcessEventKind::Started { pid }), began);
         (health, began)
     }
 
@@ -357,6 +386,32 @@ mod tests {
     }
 
     #[test]
+    fn the_silence_of_a_suspended_process_is_a_cause_and_that_of_a_slow_one_is_none() {
+        let mut suspended = Command::new("sh")
+            .args(["-c", "kill -STOP $$"])
+            .spawn()
+            .unwrap();
+        while !Usage::of(suspended.id()).unwrap().is_stopped {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        for (pid, causes) in [
+            (suspended.id(), ["ego was silent for 4.1 s"].as_slice()),
+            (process::id(), &[]),
+        ] {
+            let (mut health, began) = watch_process(pid);
+            look(&mut health, began, [0, 900, 0]);
+            look(&mut health, began, [1000, 2500, 1000]);
+            assert!(health.silences().is_empty(), "not yet");
+            look(&mut health, began, [2600, 5100, 1000]);
+            assert_eq!(health.silences(), causes, "so far");
+            look(&mut health, began, [5200, 5200, 5200]);
+            assert_eq!(health.silences(), causes);
+        }
+        suspended.kill().unwrap();
+        suspended.wait().unwrap();
+    }
+
+    #[test]
     fn a_start_takes_its_time_but_not_for_ever() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 60_000, 0]).is_empty());
@@ -406,7 +461,7 @@ mod tests {
 
     #[test]
     fn resources_of_a_process_are_read() {
-        let usage = Usage::of(std::process::id()).unwrap();
+        let usage = Usage::of(process::id()).unwrap();
         assert!(
             usage.resident_mib.unwrap() > 1.0
                 && usage.threads.unwrap() >= 1

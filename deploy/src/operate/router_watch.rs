@@ -28,16 +28,18 @@ pub(crate) fn in_words(silence: Duration) -> String {
 }
 
 /// Times of one kind.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct TimeSum {
     count: usize,
     sum: Duration,
 }
 
 impl TimeSum {
-    pub(crate) fn add(&mut self, time: Duration) {
-        self.count += 1;
-        self.sum += time;
+    pub(crate) fn add(&mut self, times: impl IntoIterator<Item = Duration>) {
+        for time in times {
+            self.count += 1;
+            self.sum += time;
+        }
     }
 
     /// `router gone for 4.0 s`, with the number of times where there were several.
@@ -106,7 +108,7 @@ impl RouterWatch {
         let pause = now.saturating_duration_since(looked);
         // A gap in the own loop says nothing about the router.
         if pause > LIMIT {
-            self.pauses.add(pause);
+            self.pauses.add([pause]);
             let seconds = pause.as_secs_f64();
             let line = format!("the run was suspended for {seconds:.1} s");
             return Some(RouterFinding::Line(line));
@@ -121,7 +123,7 @@ impl RouterWatch {
             (Some(since), None) => {
                 let outage = now.saturating_duration_since(since);
                 self.gone_since = None;
-                self.outages.add(outage);
+                self.outages.add([outage]);
                 let seconds = outage.as_secs_f64();
                 format!("the router is back after {seconds:.1} s")
             }

@@ -58,7 +58,8 @@ pub struct RunStatus {
     pub neighbours: Vec<NeighbourState>,
     /// Number of messages dropped so far, by all processes.
     pub dropped: u64,
-    /// Observed causes of lost messages so far: outages of the router, pauses of the run, ends of processes.
+    /// Observed causes of lost messages so far: outages of the router, pauses of the run and of processes,
+    /// ends of processes.
     #[serde(default)]
     pub causes: Vec<String>,
     /// Time since which the router is gone, seconds.

@@ -88,10 +88,11 @@ impl StatusReporter {
         self.health.crashed()
     }
 
-    /// Observed causes of lost messages, as text: outages of the router, pauses of the run, ends of processes.
+    /// Observed causes of lost messages, as text: outages of the router, pauses of the run and of processes, ends of
+    /// processes.
     pub fn causes(&self) -> Vec<String> {
-        let ends = self.health.ends();
-        self.router.causes().into_iter().chain(ends).collect()
+        let (silences, ends) = (self.health.silences(), self.health.ends());
+        [self.router.causes(), silences, ends].concat()
     }
 
     /// True if messages of any process may have been lost while the router was gone or the run suspended.

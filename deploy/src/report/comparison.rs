@@ -19,16 +19,17 @@ pub struct Comparison(Vec<(RunReport, Metrics, Value)>);
 /// Name of a quantity, and its value in a run.
 type ReportRow = (&'static str, fn(&RunReport, &Metrics) -> String);
 
-const ROWS: [ReportRow; 16] = [
+const ROWS: [ReportRow; 17] = [
     ("method", |report, _| report.method.clone()),
     ("poses", |report, _| report.pose_source.clone()),
     ("clock", |report, _| report.clock.clone()),
     ("answered", |report, _| {
         format!("{}/{}", report.pace.answered, report.pace.ticks)
     }),
-    ("AP@0.3", |_, metrics| number(metrics.ap_global.at_30, 3)),
-    ("AP@0.5", |_, metrics| number(metrics.ap_global.at_50, 3)),
-    ("AP@0.7", |_, metrics| number(metrics.ap_global.at_70, 3)),
+    ("order of AP", |_, metrics| metrics.ap_order().name().into()),
+    ("AP@0.3", |_, metrics| number(metrics.headline().at_30, 3)),
+    ("AP@0.5", |_, metrics| number(metrics.headline().at_50, 3)),
+    ("AP@0.7", |_, metrics| number(metrics.headline().at_70, 3)),
     ("AP@0.5 all", |_, metrics| {
         number(metrics.ap_unanswered_empty.at_50, 3)
     }),

@@ -56,7 +56,8 @@ pub struct RunReport {
     pub processes: Vec<ProcessResources>,
     /// Published bytes by stream.
     pub streams: Vec<StreamBytes>,
-    /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
+    /// Observed causes of lost messages: outages of the router, pauses of the run and of processes, ends
+    /// of processes.
     #[serde(default)]
     pub causes: Vec<String>,
     /// Vehicles whose clocks differ from the ego's.

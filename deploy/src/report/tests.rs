@@ -339,6 +339,10 @@ fn what_differs_between_runs_whose_precisions_cannot_be_compared_is_named() {
         notes.unwrap_or_default()
     };
     assert_eq!(notes_of(&folders[..1]), "");
+    let both = Comparison::read(&folders[..2]).unwrap().to_string();
+    let orders = both.lines().find(|line| line.starts_with("order of AP "));
+    let orders: Vec<&str> = orders.unwrap().split_whitespace().skip(3).collect();
+    assert_eq!(orders, ["frame", "global"]);
     assert_eq!(
         notes_of(&folders[..2]),
         "Runs differ in protocol ap_order: one \"frame\", two \"global\"\n\

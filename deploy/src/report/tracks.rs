@@ -4,12 +4,15 @@
 //! its tracks are judged (`tracks.jsonl`), else those that its detections give: the tracker gets what a live one would
 //! have, detections and the ego's own pose, no truth.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use dataset::ground_truth::{GroundTruth, TrueBox};
-use protocol::{Box3d, DetectionsReport, Track, TracksReport, corners_within};
+use protocol::{
+    Box3d, CavId, Detections, DetectionsReport, FrameReport, Track, Tracks, TracksReport,
+    corners_within,
+};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use support::bounded_file;
@@ -51,14 +54,15 @@ pub struct TrackReport {
     pub quality: TrackQuality,
 }
 
-/// Scenario, ego and tick.
-type TickKey = (Option<String>, String, u64);
+/// Scenario, ego, tick, and capture time, nanoseconds: ticks alone repeat with every lap of a loop.
+type TickKey = (Option<String>, String, u64, u64);
 
 /// Tracks of one ego in one scenario.
 struct Followed {
     scenario: Option<String>,
     ego: String,
-    last_nanos: u64,
+    /// Tick and capture time of the last line, nanoseconds.
+    last: [u64; 2],
     tracker: Tracker,
     sequence: Sequence,
 }
@@ -69,35 +73,16 @@ impl TrackReport {
     /// # Errors
     /// [`FileError`] names file and line.
     pub fn read(folder: &Path) -> Result<Self, FileError> {
-        // No tracks where the ego did not track.
-        let (mut results, mut tracks) = (HashMap::new(), HashMap::new());
-        let mut method = None;
-        let mut without_truth = 0;
         let file = folder.join("detections.jsonl");
-        for_each_line(&file, |line: ScenarioLine<String, DetectionsReport>| {
-            let ScenarioLine { scenario, line } = line;
-            method.get_or_insert_with(|| line.result.method.clone());
-            match line.tick {
-                Some(tick) => {
-                    let key = (scenario, line.result.ego.to_string(), tick);
-                    // Of several results of a tick the first counts, as in the scores of a run.
-                    results.entry(key).or_insert(line);
-                }
-                None => without_truth += 1,
-            }
-            Ok(())
-        })?;
+        let (mut results, without_tick) = first_of_ticks(&file, |result: &Detections| &result.ego)?;
+        let earliest = results.values().min_by_key(|line| line.capture_nanos);
+        let method = earliest.map(|line| line.result.method.clone());
         let recorded = folder.join(TRACKS);
-        if recorded.exists() {
-            for_each_line(&recorded, |line: ScenarioLine<String, TracksReport>| {
-                let ScenarioLine { scenario, line } = line;
-                if let Some(tick) = line.tick {
-                    let key = (scenario, line.result.ego.to_string(), tick);
-                    tracks.entry(key).or_insert(line);
-                }
-                Ok(())
-            })?;
-        }
+        // No tracks where the ego did not track.
+        let mut tracks = match recorded.exists() {
+            true => first_of_ticks(&recorded, |tracks: &Tracks| &tracks.ego)?.0,
+            false => HashMap::new(),
+        };
         let name = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         let mut report = Self {
             run: name
@@ -107,16 +92,21 @@ impl TrackReport {
             recorded: !tracks.is_empty(),
             ..Self::default()
         };
-        let mut followed: Vec<Followed> = Vec::new();
+        let (mut followed, mut judged) = (Vec::new(), HashSet::new());
         let truth = folder.join("truth.jsonl");
         for_each_line(&truth, |line: ScenarioLine<String, TruthLine>| {
             let ScenarioLine { scenario, line } = line;
-            let key = (scenario, line.ego.to_string(), line.tick);
+            let ego = line.ego.to_string();
+            let key = (scenario, ego, line.tick, line.capture_nanos);
+            // A restarted replay plays its last tick once more.
+            if !judged.insert(key.clone()) {
+                return Ok(());
+            }
             let found = (results.remove(&key), tracks.remove(&key));
             report.follow(&mut followed, key, &line, found)
         })?;
         // Results with a line of truth were taken out on the way.
-        report.without_truth = without_truth + results.len();
+        report.without_truth = without_tick + results.len();
         let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
         report.quality = TrackQuality::of(&sequences);
         Ok(report)
@@ -149,15 +139,17 @@ impl TrackReport {
     fn follow(
         &mut self,
         followed: &mut Vec<Followed>,
-        (scenario, ego, _): TickKey,
+        (scenario, ego, tick, capture_nanos): TickKey,
         line: &TruthLine,
         (result, recorded): (Option<DetectionsReport>, Option<TracksReport>),
     ) -> Result<(), String> {
         let last = followed
             .iter()
             .rposition(|one| (&one.scenario, &one.ego) == (&scenario, &ego));
-        // A scene that is played once more begins a new sequence.
-        let index = match last.filter(|&last| followed[last].last_nanos < line.capture_nanos) {
+        let now = [tick, capture_nanos];
+        // A scene that is played once more, and a lap of a loop, begins a new sequence.
+        let goes_on = |last: &usize| followed[*last].last.iter().zip(&now).all(|(a, b)| a < b);
+        let index = match last.filter(goes_on) {
             Some(last) => last,
             None => {
                 let config = TrackerConfig {
@@ -167,7 +159,7 @@ impl TrackReport {
                 followed.push(Followed {
                     scenario,
                     ego,
-                    last_nanos: 0,
+                    last: now,
                     tracker: Tracker::new(config),
                     sequence: Sequence::default(),
                 });
@@ -175,7 +167,7 @@ impl TrackReport {
             }
         };
         let one = &mut followed[index];
-        one.last_nanos = line.capture_nanos;
+        one.last = now;
         self.ticks += 1;
         self.answered += usize::from(result.is_some());
         if self.recorded && result.is_some() && recorded.is_none() {
@@ -187,7 +179,7 @@ impl TrackReport {
         self.without_pose += usize::from(is_unposed);
         let tracks = result.and_then(|of| match self.recorded {
             true => recorded.map(|line| line.result),
-            false => Some(one.tracker.follow(line.capture_nanos, &of.result)),
+            false => Some(one.tracker.follow(capture_nanos, &of.result)),
         });
         let (tracks, left_out) =
             tracks.map_or_else(Default::default, |of| (of.tracks, of.left_out));
@@ -232,6 +224,28 @@ fn nearest_m(others: &[TrueBox], box3d: &Box3d) -> f64 {
 fn center_m(box3d: &Box3d) -> [f64; 2] {
     let [x, y, _] = box3d.center_m;
     [x, y]
+}
+
+/// The results in a file, and the number of those whose tick is unknown. Of several results of a tick the first counts,
+/// as in the scores of a run.
+fn first_of_ticks<T: DeserializeOwned>(
+    path: &Path,
+    ego: fn(&T) -> &CavId,
+) -> Result<(HashMap<TickKey, FrameReport<T>>, usize), FileError> {
+    let (mut results, mut without_tick) = (HashMap::new(), 0);
+    for_each_line(path, |line: ScenarioLine<String, FrameReport<T>>| {
+        let ScenarioLine { scenario, line } = line;
+        let ego = ego(&line.result).to_string();
+        match line.tick {
+            Some(tick) => {
+                let key = (scenario, ego, tick, line.capture_nanos);
+                results.entry(key).or_insert(line);
+            }
+            None => without_tick += 1,
+        }
+        Ok(())
+    })?;
+    Ok((results, without_tick))
 }
 
 /// Reads a file of JSON lines, one at a time.
@@ -294,7 +308,7 @@ pub fn track_table(reports: &[TrackReport]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{CavId, Detection, Detections, Pose, PoseEstimate, Stamp};
+    use protocol::{Detection, Pose, PoseEstimate, Stamp};
 
     use super::*;
 
@@ -547,22 +561,50 @@ mod tests {
         );
     }
 
+    /// A line of truth or of a result, of another tick and capture time.
+    fn at(line: &str, tick: u64, capture_nanos: u64) -> String {
+        let mut line: serde_json::Value = serde_json::from_str(line).unwrap();
+        (line["tick"], line["capture_nanos"]) = (tick.into(), capture_nanos.into());
+        line.to_string()
+    }
+
+    /// Report of a car that is detected at ticks with these numbers and capture times.
+    fn read_at(ticks: &[(u64, u64)]) -> TrackReport {
+        let car = car(10.0, 0.0);
+        let lines = [truth(0, &[(7, car)], &[]), result(0, posed(0.0), &[car])];
+        let [truths, results] = lines.map(|line| {
+            let ticks = ticks.iter();
+            ticks
+                .map(|&(tick, nanos)| at(&line, tick, nanos))
+                .collect::<Vec<_>>()
+        });
+        read(&truths, &results).unwrap()
+    }
+
+    /// Ten ticks: number and capture time.
+    fn ticks(tick: fn(u64) -> (u64, u64)) -> Vec<(u64, u64)> {
+        (0..10).map(tick).collect()
+    }
+
     #[test]
     fn a_scene_that_is_played_again_begins_a_new_sequence() {
-        let car = car(10.0, 0.0);
-        let truths: Vec<String> = (0..10)
-            .map(|tick: u64| {
-                let mut line: serde_json::Value =
-                    serde_json::from_str(&truth(tick, &[(7, car)], &[])).unwrap();
-                line["capture_nanos"] = ((tick % 5 + 1) * 100_000_000).into();
-                line.to_string()
-            })
-            .collect();
-        let results: Vec<String> = (0..10)
-            .map(|tick| result(tick, posed(0.0), &[car]))
-            .collect();
-        let quality = read(&truths, &results).unwrap().quality;
-        assert_eq!((quality.true_tracks, quality.ids), (Some(2), Some(0)));
+        let again = ticks(|index| (index, (index % 5 + 1) * 100_000_000));
+        // A loop repeats its ticks, and its capture times go on.
+        let laps = ticks(|index| (index % 5, (index + 1) * 100_000_000));
+        for ticks in [again, laps] {
+            let report = read_at(&ticks);
+            assert_eq!((report.answered, report.without_truth), (10, 0));
+            let quality = report.quality;
+            assert_eq!((quality.true_tracks, quality.ids), (Some(2), Some(0)));
+        }
+    }
+
+    #[test]
+    fn a_tick_that_a_restarted_replay_plays_again_counts_once() {
+        let once = ticks(|index| (index, (index + 1) * 100_000_000));
+        let again = [&once[..5], &once[4..]].concat();
+        assert_eq!(again.len(), 11);
+        assert_eq!(read_at(&again), read_at(&once));
     }
 
     #[test]

@@ -94,10 +94,11 @@ impl FrameScores {
 
     /// Adds the pose estimate of a vehicle at a tick.
     pub fn pose(&mut self, stamp: &Stamp, estimate: PoseEstimate) {
+        let posed_nanos = (stamp.cav == self.ego).then_some(stamp.publish_nanos);
         self.add(stamp, |tick| {
             if tick.poses.iter().all(|(known, _)| *known != stamp.cav) {
                 tick.poses.push((stamp.cav.clone(), estimate));
-                tick.posed_nanos.push(stamp.publish_nanos);
+                tick.posed_nanos = tick.posed_nanos.or(posed_nanos);
             }
         });
     }
@@ -188,10 +189,8 @@ impl FrameScores {
             self.unplaced.push(truth.tick);
         }
         let objects = ground_truth(&truth, &self.ego, &self.rule);
-        let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
-        let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
         let answer = tick.result.map(|(done_nanos, result)| {
-            let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
+            let stamps = StageStamps::of(began_nanos, tick.posed_nanos, done_nanos, &result.stages);
             (stamps, Some(done_nanos), result)
         });
         let at = (truth.tick, capture_nanos, began_nanos);

@@ -82,6 +82,10 @@ impl LivePrecision {
             self.is_untimed = true;
             return streamed;
         };
+        // Boxes of unknown motion would displace those of the tick before, which can be moved to a later tick.
+        if tick.world_from_ego.is_none() {
+            return streamed;
+        }
         self.published.push_back(PublishedAnswer {
             nanos,
             tick,
@@ -121,11 +125,9 @@ impl LivePrecision {
         let index = published.rposition(|published| published.nanos <= tick.began_nanos)?;
         self.published.drain(..index);
         let newest = self.published.front()?;
-        // Without both poses the motion is unknown, and the boxes stay where they are.
-        let now_from_then = match (tick.world_from_ego, newest.tick.world_from_ego) {
-            (Some(now), Some(then)) => now.from_world(&then).isometry(),
-            _ => Pose::IDENTITY.isometry(),
-        };
+        // Without both poses the motion is unknown.
+        let (now, then) = (tick.world_from_ego?, newest.tick.world_from_ego?);
+        let now_from_then = now.from_world(&then).isometry();
         let moved = newest.detections.iter().map(|found| Detection {
             box3d: found.box3d.transformed(&now_from_then),
             ..found.clone()
@@ -270,6 +272,39 @@ mod tests {
         live.forget();
         assert_eq!((live.published.len(), live.ticks), (0, 2));
         assert!(LivePrecision::default().streaming().is_none());
+    }
+
+    #[test]
+    fn a_result_without_the_true_pose_of_the_ego_is_not_moved_to_a_later_tick() {
+        let mut live = LivePrecision::default();
+        let nowhere = GroundTruth {
+            area_m: [f64::MAX, f64::MAX, f64::MIN, f64::MIN],
+            ..GroundTruth::of_boxes([])
+        };
+        // The ego drives 5 m a tick, towards a car at 20 m; the recording does not say where it is at the second tick.
+        let truths = [truth_at(20.0), nowhere, truth_at(10.0)];
+        let streamed = (0..).zip(&truths).map(|(tick, truth)| {
+            let ego_x = 5.0 * tick as f64;
+            let began_nanos = tick * 100_000_000;
+            let found = [Detection {
+                box3d: car(20.0 - ego_x),
+                score: 0.9,
+                source: None,
+            }];
+            let answer = TickAnswer {
+                published_nanos: Some(began_nanos + 50_000_000),
+                detections: &found,
+            };
+            let tick = EgoTick {
+                number: tick,
+                began_nanos,
+                world_from_ego: (tick != 1).then(|| Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0)),
+            };
+            let streamed = live.add(tick, truth, Some(answer));
+            streamed.map(|streamed| (streamed.tick, streamed.found))
+        });
+        assert_eq!(streamed.collect::<Vec<_>>(), [None, None, Some((0, 1))]);
+        assert_eq!(live.streaming().unwrap().at_70, Some(0.5));
     }
 
     #[test]

@@ -5,7 +5,7 @@ mod contribution;
 use std::collections::BTreeMap;
 
 use dataset::LeftOut;
-use dataset::evaluation_protocol::EvaluationProtocol;
+use dataset::evaluation_protocol::{ApOrder, EvaluationProtocol};
 use protocol::{CavId, Counts, DropReason, Ledger, PoseError, Topic};
 use serde::{Deserialize, Serialize};
 use support::provenance::Provenance;
@@ -41,7 +41,7 @@ pub struct Metrics {
     /// Name of the pose source.
     pub pose_source: String,
     /// Average precision over the answered ticks, with detections ordered by score over all frames, by IoU threshold.
-    /// The headline of runs that answer all.
+    /// The headline of runs that answer all, unless the protocol has the other order.
     pub ap_global: ByIou,
     /// Average precision with detections in frame order, by score only within a frame, as the reference code does.
     pub ap_frame_order: ByIou,
@@ -138,6 +138,24 @@ impl Metrics {
             neighbours: scores.neighbours.clone(),
             messages,
             ..Self::default()
+        }
+    }
+
+    /// Order of the average precision that is reported first.
+    pub fn ap_order(&self) -> ApOrder {
+        ApOrder::of(self.protocol.as_ref())
+    }
+
+    /// Average precision over the answered ticks that is reported first.
+    pub fn headline(&self) -> ByIou {
+        self.ap_in(self.ap_order())
+    }
+
+    /// Average precision over the answered ticks in an order.
+    pub fn ap_in(&self, order: ApOrder) -> ByIou {
+        match order {
+            ApOrder::Global => self.ap_global,
+            ApOrder::Frame => self.ap_frame_order,
         }
     }
 }
@@ -377,6 +395,22 @@ pub(crate) mod tests {
             .map(|name| json[name]["0.5"].as_f64());
         assert_eq!(at_50, [Some(0.9), Some(0.5), Some(0.25)]);
         assert_eq!(serde_json::from_value::<Metrics>(json).unwrap(), metrics);
+    }
+
+    #[test]
+    fn the_precision_of_the_protocols_order_comes_first() {
+        let by_score = Metrics {
+            ap_global: precision(0.9),
+            ap_frame_order: precision(0.6),
+            ..metrics("max")
+        };
+        assert_eq!(by_score.headline().at_50, Some(0.9));
+        let by_frame = Metrics {
+            protocol: EvaluationProtocol::preset("v2v4real"),
+            ..by_score
+        };
+        assert_eq!(by_frame.ap_order(), ApOrder::Frame);
+        assert_eq!(by_frame.headline().at_50, Some(0.6));
     }
 
     #[test]

@@ -22,7 +22,7 @@ use support::sync::{lock, spawn};
 use zenoh::Session;
 
 use super::FrameScores;
-use super::numbered_results::{RecentTick, numbered};
+use super::numbered_results::{RecentMessages, RecentTick, numbered};
 use super::result_lines::ResultLines;
 use super::stage_stamps::ms_between;
 use crate::score::offline_intervals::OfflineIntervals;
@@ -188,6 +188,7 @@ impl ScorerNode {
             waiting: VecDeque::new(),
             waiting_tracks: VecDeque::new(),
             recent: BTreeMap::new(),
+            counted: RecentMessages::default(),
         };
         let thread = spawn(SCORER, move || worker.run());
         let thread = thread.map_err(io("the scorer's thread".into()))?;
@@ -296,6 +297,8 @@ struct ScorerWorker {
     waiting_tracks: VecDeque<FrameReport<Tracks>>,
     /// Recent ticks, by capture time: for results, and for the latency that is displayed during the run.
     recent: BTreeMap<u64, RecentTick>,
+    /// Truth, results and tracks that count.
+    counted: RecentMessages,
 }
 
 impl ScorerWorker {
@@ -321,15 +324,18 @@ impl ScorerWorker {
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
+        let capture_nanos = arrival.header.stamp.capture_nanos;
         let used = match topic {
+            Topic::Stats(sender) => return self.stats(sender, arrival),
+            Topic::Stream { stream, .. } if *stream == Stream::Pose => self.pose(arrival),
+            // The tick of a replay that was restarted counts once.
+            _ if !self.counted.is_first(topic, capture_nanos) => Some(()),
             Topic::Truth => self.truth(arrival),
             Topic::Stream { stream, .. } => match stream {
                 Stream::Detections => self.result(arrival),
                 Stream::Tracks => self.tracks(arrival),
-                Stream::Pose => self.pose(arrival),
                 _ => None,
             },
-            Topic::Stats(sender) => return self.stats(sender, arrival),
             _ => None,
         };
         // An invalid message is counted where it is decoded.

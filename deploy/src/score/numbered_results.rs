@@ -1,8 +1,8 @@
 //! Results with the tick of the scene, from the truth of the same capture time.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use protocol::FrameReport;
+use protocol::{FrameReport, Topic};
 
 /// Largest number of results that wait for their truth.
 const PLACES: usize = 256;
@@ -13,6 +13,22 @@ pub(super) struct RecentTick {
     pub(super) tick: u64,
     /// Time of its publication, Unix nanoseconds.
     pub(super) publish_nanos: u64,
+}
+
+/// Capture times and topics of the last messages: a restarted replay plays its last tick once more, and the ego answers
+/// it once more.
+#[derive(Default)]
+pub(super) struct RecentMessages(BTreeSet<(u64, Topic)>);
+
+impl RecentMessages {
+    /// Adds a message; true if it is the first of its topic and capture time.
+    pub(super) fn is_first(&mut self, topic: &Topic, capture_nanos: u64) -> bool {
+        let is_first = self.0.insert((capture_nanos, topic.clone()));
+        if self.0.len() > PLACES {
+            self.0.pop_first();
+        }
+        is_first
+    }
 }
 
 /// The next of the results that wait to be written whose tick is known, or will not be: a later truth has arrived, too
@@ -37,7 +53,7 @@ pub(super) fn numbered<T>(
 
 #[cfg(test)]
 mod tests {
-    use protocol::{CavId, Detections, Pose, PoseEstimate, Stamp};
+    use protocol::{CavId, Detections, Pose, PoseEstimate, Stamp, Stream};
 
     use super::*;
 
@@ -105,6 +121,21 @@ mod tests {
         results.tick(200, 8);
         results.tick(300, 9);
         assert_eq!(results.ticks(false), [(200, Some(8))]);
+    }
+
+    #[test]
+    fn a_message_that_is_repeated_is_not_the_first_of_its_capture_time() {
+        let mut recent = RecentMessages::default();
+        let detections = Topic::stream(&CavId::new("e").unwrap(), Stream::Detections);
+        let mut are_first =
+            |nanos| [&Topic::Truth, &detections].map(|topic| recent.is_first(topic, nanos));
+        let captures = [300, 400, 400, 500, 300];
+        assert_eq!(
+            captures.map(|nanos| are_first(nanos)),
+            [true, true, false, true, false].map(|is_first| [is_first; 2])
+        );
+        (0..1_000).for_each(|nanos| _ = are_first(1_000 + nanos));
+        assert_eq!(recent.0.len(), PLACES, "a long run keeps few");
     }
 
     #[test]

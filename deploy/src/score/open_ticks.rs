@@ -16,8 +16,8 @@ pub(super) struct OpenTick {
     pub(super) result: Option<(u64, Detections)>,
     /// Pose estimates of the vehicles.
     pub(super) poses: Vec<(CavId, PoseEstimate)>,
-    /// Times of publication of these, nanoseconds.
-    pub(super) posed_nanos: Vec<u64>,
+    /// Time of publication of that of the ego, nanoseconds.
+    pub(super) posed_nanos: Option<u64>,
 }
 
 /// Incomplete ticks, by capture time.

@@ -13,8 +13,8 @@ const FOUND_IOU: f64 = 0.5;
 /// AP at the three IoU thresholds; `None` without a true object.
 pub(super) fn by_iou(tallies: &[Tally], ordering: Ordering) -> ByIou {
     let [at_30, at_50, at_70] = [0, 1, 2].map(|index: usize| {
-        let tally = tallies.get(index).filter(|tally| tally.objects > 0);
-        tally.map(|tally| tally.curve(ordering).average_precision)
+        let tally = tallies.get(index)?;
+        tally.curve(ordering).average_precision
     });
     ByIou {
         at_30,

@@ -8,7 +8,7 @@ pub struct StageStamps {
     /// Time of publication of the tick, Unix nanoseconds: origin of all others.
     #[serde(skip)]
     pub began_nanos: Option<u64>,
-    /// Publication of the pose by the ego's agent.
+    /// Publication of the pose by the ego's agent; unknown, as the next, where the agent has another clock.
     pub posed_ms: Option<f64>,
     /// Publication of its feature map, boxes or points.
     pub published_ms: Option<f64>,
@@ -24,7 +24,8 @@ pub struct StageStamps {
 
 impl StageStamps {
     /// Stamps of a tick with publication times, Unix nanoseconds: of the tick `began_nanos`, of the ego's pose
-    /// `posed_nanos`, of its detections `detected_nanos`. `stages` are the durations of the ego's stages.
+    /// `posed_nanos`, of its detections `detected_nanos`. `stages` are the durations of the ego's stages, without
+    /// `transport` where its agent has another clock.
     pub(crate) fn of(
         began_nanos: u64,
         posed_nanos: Option<u64>,
@@ -41,9 +42,11 @@ impl StageStamps {
         let decided = fused.map(|fused| fused - fusing_ms);
         let arrived = before_stage(stages, "wait", decided);
         let published = before_stage(stages, "transport", arrived);
+        // Of one clock with the publication.
+        let posed = published.and(posed_nanos);
         Self {
             began_nanos: Some(began_nanos),
-            posed_ms: posed_nanos.map(|posed_nanos| ms_between(began_nanos, posed_nanos)),
+            posed_ms: posed.map(|posed_nanos| ms_between(began_nanos, posed_nanos)),
             published_ms: published,
             arrived_ms: arrived,
             decided_ms: decided,
@@ -92,6 +95,17 @@ mod tests {
             detected_ms: Some(100.0),
         };
         assert_eq!(stamps, expected);
+    }
+
+    #[test]
+    fn times_of_an_agent_with_another_clock_are_absent() {
+        let stages = [("wait", 20), ("fuse", 7), ("send", 1)]
+            .map(|(name, ms)| StageTiming::new(name, Duration::from_millis(ms)));
+        for posed_nanos in [4_030_000_000, 10_000_000] {
+            let stamps = StageStamps::of(1_000_000_000, Some(posed_nanos), 1_100_000_000, &stages);
+            assert_eq!((stamps.posed_ms, stamps.published_ms), (None, None));
+            assert_eq!(stamps.arrived_ms, Some(72.0));
+        }
     }
 
     #[test]

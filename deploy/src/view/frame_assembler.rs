@@ -18,7 +18,7 @@ use super::scene_frame::{
     ShownVehicle, decimate,
 };
 use super::trails::Trails;
-use crate::score::ms_between;
+use crate::score::{StageStamps, ms_between};
 
 /// Largest number of incomplete scene frames.
 const MOST_OPEN: usize = 16;
@@ -317,10 +317,12 @@ impl OpenFrame {
     fn frame(&self, capture_nanos: u64, ledgers: &Ledgers, judgement: &Judgement) -> SceneFrame {
         let result = self.result();
         let (vehicles, points) = self.vehicles();
-        let began = self.truth.as_ref().map(|(began, _)| *began);
-        let done = self.result.as_ref().map(|(done, _)| *done);
-        let posed = result.and_then(|result| Some(self.poses.get(&result.ego)?.0));
-        let [latency_ms, posed_ms] = [done, posed].map(|nanos| Some(ms_between(began?, nanos?)));
+        let ends = self.truth.as_ref().zip(self.result.as_ref());
+        let stamps = ends.map(|((began, _), (done, result))| {
+            let posed = self.poses.get(&result.ego).map(|(posed, _)| *posed);
+            StageStamps::of(*began, posed, *done, &result.stages)
+        });
+        let stamps = stamps.unwrap_or_default();
         let processes = ledgers.iter().map(|(process, (_, stages))| Process {
             process: process.clone(),
             stages: stages.clone(),
@@ -330,8 +332,8 @@ impl OpenFrame {
             tick: self.truth.as_ref().map(|(_, truth)| truth.tick),
             ego: result.map(|result| result.ego.clone()),
             method: result.map(|result| result.method.clone()),
-            latency_ms,
-            posed_ms,
+            latency_ms: stamps.detected_ms,
+            posed_ms: stamps.posed_ms,
             vehicles,
             truth: self.true_boxes(judgement),
             detections: self.detections(judgement),

@@ -119,12 +119,11 @@ impl Judge {
         Judgement { verdicts, found }
     }
 
-    /// Average precision of the frames so far; `None` without an object.
+    /// Average precision of the frames so far, in the order of the protocol; `None` without an object.
     pub(super) fn average_precision(&self) -> Option<f64> {
         let tally = self.scorer.tallies().first()?;
-        let protocol = self.protocol.as_ref();
-        let ordering = protocol.map_or(Ordering::Global, |protocol| protocol.ap_order);
-        (tally.objects > 0).then(|| tally.curve(ordering).average_precision)
+        let ordering = Ordering::of(self.protocol.as_ref());
+        tally.curve(ordering).average_precision
     }
 }
 
@@ -214,6 +213,23 @@ mod tests {
         assert_eq!(judgement.counts(&result, 0.2), [2, 1, 0]);
         assert_eq!(judgement.counts(&result, 0.5), [1, 1, 1]);
         assert!(judge.average_precision().unwrap() > 0.8);
+
+        let mut by_frame = EvaluationProtocol::preset("opv2v").unwrap();
+        by_frame.ap_order = Ordering::Frame;
+        let wrong = Detections {
+            detections: vec![Detection {
+                score: 0.1,
+                ..result.detections[1].clone()
+            }],
+            ..result.clone()
+        };
+        let by_order = [None, Some(by_frame)].map(|protocol| {
+            let mut judge = Judge::new(protocol);
+            judge.judge(&wrong, &truth, &DetectionArea::from(&grid));
+            judge.judge(&result, &truth, &DetectionArea::from(&grid));
+            judge.average_precision().unwrap()
+        });
+        assert!(by_order[0] > by_order[1] + 0.1, "{by_order:?}");
 
         let mut protocol = EvaluationProtocol::preset("v2v4real").unwrap();
         protocol.ground_truth.x_m = [-15.0, 15.0];

@@ -125,7 +125,7 @@ impl RouterConnection {
             let silent_since = last_received.filter(|last| now.duration_since(*last) > LIMIT);
             self.lost = Some(silent_since.unwrap_or(now));
         } else if is_there && let Some(lost) = self.lost.take() {
-            self.outages.add(now.duration_since(lost));
+            self.outages.add([now.duration_since(lost)]);
         }
         self.is_there = is_there;
     }

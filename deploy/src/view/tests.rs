@@ -103,10 +103,9 @@ fn detections_of(ego: &str, tick: u64) -> Detections {
             clock_offset_s: Some(-0.25),
             capture_offset_s: Some(0.3),
         }],
-        stages: vec![
-            StageTiming::new("wait", Duration::from_millis(12)),
-            StageTiming::new("fuse", Duration::from_millis(8)),
-        ],
+        stages: [("transport", 2), ("wait", 12), ("fuse", 8), ("send", 1)]
+            .map(|(stage, ms)| StageTiming::new(stage, Duration::from_millis(ms)))
+            .into(),
     }
 }
 

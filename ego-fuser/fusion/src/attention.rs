@@ -3,11 +3,9 @@
 use perception::layers::agent_attention::attend_ego;
 use tch::{TchError, Tensor};
 
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
 use super::settings::without_settings;
-use super::spec::MethodSpec;
 use crate::warp::WarpedMaps;
+use crate::{AlignedMaps, Fusion, FusionOutput, MethodSpec};
 
 /// AttFuse.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<AttentionConfig>(

@@ -8,11 +8,9 @@ use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 
-use super::interface::Fusion;
-use super::settings::{FusionSettings, Requirements};
-use super::spec::MethodSpec;
 use super::where2comm::{MapAggregation, Missing, Where2comm, Where2commConfig};
 use crate::pose_graph::PoseGraphConfig;
+use crate::{Fusion, FusionSettings, MethodSpec, Requirements};
 
 /// CoAlign.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<CoAlignConfig>(
@@ -50,7 +48,7 @@ impl FusionSettings for CoAlignConfig {
     }
 
     fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        Ok(Box::new(Where2comm::new(&Where2commConfig {
+        Ok(Box::new(Where2comm(Where2commConfig {
             aggregation: self.aggregation,
             missing: self.missing,
         })))

@@ -9,13 +9,11 @@ use perception::model_config::{ConfigError, DetectorConfig};
 use tch::{TchError, nn};
 
 use super::f64_tensor::picked;
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
 use super::padding::Padding;
-use super::settings::{FusionSettings, of_size};
-use super::spec::MethodSpec;
+use super::settings::of_size;
 use super::swap_fusion::{Slots, SwapFusion, SwapFusionConfig};
 use super::warp::WarpedMaps;
+use crate::{AlignedMaps, Fusion, FusionOutput, FusionSettings, MethodSpec};
 
 /// CoBEVT.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<SwapFusionConfig>(

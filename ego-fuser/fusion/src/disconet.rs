@@ -12,10 +12,7 @@ use tch::{TchError, Tensor};
 
 use super::conv_gru::Conv;
 use super::f64_tensor::sum_over_first;
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
-use super::settings::FusionSettings;
-use super::spec::MethodSpec;
+use crate::{AlignedMaps, Fusion, FusionOutput, FusionSettings, MethodSpec};
 
 /// DiscoNet.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<DiscoNetConfig>(

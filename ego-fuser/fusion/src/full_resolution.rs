@@ -12,23 +12,13 @@ use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, Samples, places_of};
 
 /// A feature map on the BEV grid of its sender, in axes of the ego.
 #[derive(Debug)]
-pub(crate) enum FullResolutionMap {
-    /// Cell by cell, where no gradient flows.
-    Numbers {
-        /// `[H * W, C]`: features, the channels of a cell contiguous.
-        cells: Tensor,
-        /// Rows and columns.
-        size: [usize; 2],
-        /// `[H * W]`, 1 where a cell was sent.
-        sent: Arc<[f32]>,
-    },
-    /// Tensors, where a gradient flows.
-    Tensors {
-        /// `[1, C, H, W]`.
-        map: Tensor,
-        /// `[1, 1, H, W]`, 1 where a cell was sent.
-        sent: Tensor,
-    },
+pub(crate) struct FullResolutionMap {
+    /// `[1, C, H, W]`; the channels of a cell are contiguous where no gradient flows.
+    map: Tensor,
+    /// `[1, 1, H, W]`, 1 where a cell was sent.
+    sent: Tensor,
+    /// The same in plain floats `[H * W]`, where no gradient flows.
+    sent_cells: Option<Arc<[f32]>>,
 }
 
 /// Features of maps at some cells of the ego.
@@ -48,42 +38,31 @@ impl FullResolutionMap {
             Some(sent) => sent.f_to_kind(Kind::Float)?,
             None => map.f_narrow(1, 0, 1)?.f_ones_like()?,
         };
-        let (_, channels, height, width) = map.size4()?;
-        Ok(match are_numbers(map) {
-            true => Self::Numbers {
-                cells: map
-                    .f_permute([0, 2, 3, 1])?
-                    .f_contiguous()?
-                    .f_view([-1, channels])?,
-                size: [height, width].map(|cells| cells as usize),
-                sent: numbers(&sent)?.into(),
-            },
-            false => Self::Tensors {
+        if !are_numbers(map) {
+            return Ok(Self {
                 map: map.shallow_clone(),
                 sent,
-            },
+                sent_cells: None,
+            });
+        }
+        let by_cell = map.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        Ok(Self {
+            map: by_cell.f_permute([0, 3, 1, 2])?,
+            sent_cells: Some(numbers(&sent)?.into()),
+            sent,
         })
     }
 
     /// Sent cells in plain floats, where no gradient flows.
     pub(crate) fn sent(&self) -> Option<&[f32]> {
-        match self {
-            Self::Numbers { sent, .. } => Some(sent),
-            Self::Tensors { .. } => None,
-        }
+        self.sent_cells.as_deref()
     }
 
     fn shallow_clone(&self) -> Self {
-        match self {
-            Self::Numbers { cells, size, sent } => Self::Numbers {
-                cells: cells.shallow_clone(),
-                size: *size,
-                sent: Arc::clone(sent),
-            },
-            Self::Tensors { map, sent } => Self::Tensors {
-                map: map.shallow_clone(),
-                sent: sent.shallow_clone(),
-            },
+        Self {
+            map: self.map.shallow_clone(),
+            sent: self.sent.shallow_clone(),
+            sent_cells: self.sent_cells.clone(),
         }
     }
 
@@ -114,28 +93,28 @@ impl FullResolutionMap {
     /// Features at positions in `grid_sampler`'s coordinates, two for each: `[R, C]`, and their validity, `[R, 1]`; those
     /// in plain floats times their `shares` `[R]`, if there are such.
     pub(crate) fn at(&self, places: &[f32], shares: Option<&[f32]>) -> Result<CellSamples> {
-        match self {
-            Self::Numbers { cells, size, sent } => {
-                let mut samples = Samples::default();
-                samples.add((0, *size), sent, places, shares);
-                Ok(CellSamples {
-                    features: samples.read(cells)?,
-                    mask: Tensor::f_from_slice(&samples.valid)?.f_unsqueeze(1)?,
-                })
-            }
-            Self::Tensors { map, sent } => {
-                let sampling_grid = tensor(places, &[1, 1, -1, 2], map.device())?;
-                let [features, mask] = [(map, BILINEAR), (sent, NEAREST)].map(|(map, how)| {
-                    let read = map.f_grid_sampler(&sampling_grid, how, PADDING_ZEROS, false)?;
-                    read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)
-                });
-                let mask = mask?.f_ceil()?;
-                Ok(CellSamples {
-                    features: features? * &mask,
-                    mask,
-                })
-            }
+        let Self { map, sent, .. } = self;
+        if let Some(sent) = &self.sent_cells {
+            let (_, channels, height, width) = map.size4()?;
+            let size = [height, width].map(|cells| cells as usize);
+            let mut samples = Samples::default();
+            samples.add((0, size), sent, places, shares);
+            let cells = map.f_permute([0, 2, 3, 1])?.f_view([-1, channels])?;
+            return Ok(CellSamples {
+                features: samples.read(&cells)?,
+                mask: Tensor::f_from_slice(&samples.valid)?.f_unsqueeze(1)?,
+            });
         }
+        let sampling_grid = tensor(places, &[1, 1, -1, 2], map.device())?;
+        let [features, mask] = [(map, BILINEAR), (sent, NEAREST)].map(|(map, how)| {
+            let read = map.f_grid_sampler(&sampling_grid, how, PADDING_ZEROS, false)?;
+            read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)
+        });
+        let mask = mask?.f_ceil()?;
+        Ok(CellSamples {
+            features: features? * &mask,
+            mask,
+        })
     }
 }
 

@@ -2,11 +2,9 @@
 
 use tch::{TchError, Tensor};
 
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
 use super::settings::without_settings;
-use super::spec::MethodSpec;
 use crate::warp::WarpedMaps;
+use crate::{AlignedMaps, Fusion, FusionOutput, MethodSpec};
 
 /// F-Cooper.
 pub static METHOD: MethodSpec =

@@ -71,7 +71,7 @@ impl Method {
         self.0.name
     }
 
-    /// The TorchScript file of a method `script:FILE.pt`.
+    /// The TorchScript file of a method `script:FILE.pt`, a fusion of a user's, which may stand on any encoder.
     pub fn script_file(self) -> Option<&'static Path> {
         self.name().strip_prefix(script::PREFIX).map(Path::new)
     }
@@ -121,11 +121,6 @@ impl Method {
             }
             _ => Ok(()),
         }
-    }
-
-    /// True if it is the TorchScript file of a user, which may stand on any encoder.
-    pub fn is_script(self) -> bool {
-        self.0.fusion.kind == script::FUSION.kind
     }
 
     /// The method to run with a weights file: `named`, or else the one that the file names.

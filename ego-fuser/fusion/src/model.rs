@@ -25,7 +25,7 @@ use tch::{Device, Kind, TchError, Tensor};
 use crate::box_input::{self, PlacedBox};
 use crate::method::{Method, UnknownMethod};
 use crate::own::OwnConfig;
-use crate::targets::{AnchorGridError, TargetAssigner, TargetRule};
+use crate::targets::{AnchorGridError, TargetAssigner};
 use crate::warp::WarpError;
 use crate::where2comm::most_confident;
 use crate::{FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing};
@@ -392,6 +392,6 @@ impl CooperativeModel {
         let anchors = &self.anchors;
         let boxes = (0..anchors.len()).map(|index| anchors.box_at(index));
         let shape = [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len()];
-        TargetAssigner::new(boxes.collect(), shape, TargetRule::default())
+        TargetAssigner::new(boxes.collect(), shape)
     }
 }

@@ -2,10 +2,8 @@
 
 use tch::TchError;
 
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
 use super::settings::without_settings;
-use super::spec::{Exchange, MethodSpec};
+use crate::{AlignedMaps, Exchange, Fusion, FusionOutput, MethodSpec};
 
 /// Ego-only, no collaboration: the baseline of every method.
 pub static NONE: MethodSpec = MethodSpec {

@@ -9,14 +9,14 @@ use perception::model_config::{ConfigError, DetectorConfig};
 use perception::tensor_values::tensor;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
+use support::file_error::AtFile;
 use tch::{CModule, Device, TchError, nn};
 use zip::ZipArchive;
 
-use crate::interface::{Fusion, FusionOutput};
-use crate::maps::AlignedMaps;
 use crate::planar_pose::planar;
-use crate::settings::{FusionConfig, FusionSettings};
-use crate::spec::{FusionSpec, MethodSpec};
+use crate::{
+    AlignedMaps, Fusion, FusionConfig, FusionOutput, FusionSettings, FusionSpec, MethodSpec,
+};
 
 /// Most bytes that the files of a module may have beyond their compressed size: its source is compressed, its tensors are
 /// not.
@@ -72,15 +72,10 @@ impl FusionSettings for ScriptConfig {
     }
 
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        check_size(&self.file).map_err(|error| ConfigError::ScriptFile {
-            file: self.file.clone(),
-            problem: error.to_string(),
-        })?;
-        let script = ScriptFusion::load(&self.file, path.device());
-        Ok(Box::new(script.map_err(|source| ConfigError::Script {
-            file: self.file.clone(),
-            reason: first_line(&source),
-        })?))
+        check_size(&self.file).at(&self.file)?;
+        let script = ScriptFusion::load(&self.file, path.device())
+            .map_err(|error| format!("not a TorchScript module: {}", first_line(&error)));
+        Ok(Box::new(script.at(&self.file)?))
     }
 }
 

@@ -10,23 +10,10 @@ use protocol::Box3d;
 /// Numbers of one box that the head predicts: x, y, z, h, w, l, yaw.
 pub const BOX_CODE: usize = 7;
 
-/// Overlap thresholds between object and background.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TargetRule {
-    /// Above it an anchor is an object.
-    pub positive_iou: f32,
-    /// Below it, for every object, an anchor is background.
-    pub negative_iou: f32,
-}
-
-impl Default for TargetRule {
-    fn default() -> Self {
-        Self {
-            positive_iou: 0.6,
-            negative_iou: 0.45,
-        }
-    }
-}
+/// Overlap above which an anchor is an object.
+pub const POSITIVE_IOU: f32 = 0.6;
+/// Overlap below which, for every object, an anchor is background.
+pub const NEGATIVE_IOU: f32 = 0.45;
 
 /// A positive anchor.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -74,7 +61,6 @@ pub enum AnchorGridError {
 /// Assigns the objects of a frame to the anchors of a head.
 #[derive(Debug, Clone)]
 pub struct TargetAssigner {
-    rule: TargetRule,
     anchors: Vec<Box3d>,
     standing: Vec<Standing>,
     column_x: Vec<f64>,
@@ -89,11 +75,7 @@ impl TargetAssigner {
     ///
     /// # Errors
     /// [`AnchorGridError`] when the anchors do not fill the shape or are not on a grid.
-    pub fn new(
-        anchors: Vec<Box3d>,
-        shape: [usize; 3],
-        rule: TargetRule,
-    ) -> Result<Self, AnchorGridError> {
+    pub fn new(anchors: Vec<Box3d>, shape: [usize; 3]) -> Result<Self, AnchorGridError> {
         let [height, width, per_cell] = shape;
         if anchors.len() != height * width * per_cell || anchors.is_empty() {
             return Err(AnchorGridError::Count {
@@ -124,7 +106,6 @@ impl TargetAssigner {
             .map(|anchor| anchor.size_m[0].hypot(anchor.size_m[1]) / 2.0)
             .fold(0.0, f64::max);
         Ok(Self {
-            rule,
             standing: anchors.iter().map(Standing::of).collect(),
             anchors,
             column_x,
@@ -150,10 +131,10 @@ impl TargetAssigner {
                 if iou > highest.0 {
                     highest = (iou, Some(index));
                 }
-                if iou > self.rule.positive_iou && owner[index] == FREE {
+                if iou > POSITIVE_IOU && owner[index] == FREE {
                     owner[index] = owner_id;
                 }
-                near[index] |= iou >= self.rule.negative_iou;
+                near[index] |= iou >= NEGATIVE_IOU;
             });
             best.push(highest.1);
         }
@@ -285,7 +266,7 @@ mod tests {
     }
 
     fn assigner() -> TargetAssigner {
-        TargetAssigner::new(anchor_grid(20, 30), [20, 30, 2], TargetRule::default()).unwrap()
+        TargetAssigner::new(anchor_grid(20, 30), [20, 30, 2]).unwrap()
     }
 
     #[test]
@@ -367,11 +348,10 @@ mod tests {
     #[test]
     fn anchors_off_a_grid_are_rejected() {
         let mut anchors = anchor_grid(4, 5);
-        let error =
-            TargetAssigner::new(anchors.clone(), [4, 4, 2], TargetRule::default()).unwrap_err();
+        let error = TargetAssigner::new(anchors.clone(), [4, 4, 2]).unwrap_err();
         assert!(matches!(error, AnchorGridError::Count { found: 40, .. }));
         anchors[13].center_m[0] += 0.1;
-        let error = TargetAssigner::new(anchors, [4, 5, 2], TargetRule::default()).unwrap_err();
+        let error = TargetAssigner::new(anchors, [4, 5, 2]).unwrap_err();
         assert_eq!(error, AnchorGridError::NotSeparable(13));
     }
 }

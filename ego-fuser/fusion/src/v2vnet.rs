@@ -16,11 +16,10 @@ use tch::{Device, Kind, TchError, Tensor};
 
 use super::conv_gru::{Conv, ConvGru};
 use super::f64_tensor::picked;
-use super::interface::{Fusion, FusionOutput};
-use super::maps::{AlignedMaps, MapMetadata, reaching};
-use super::settings::{FusionSettings, of_size};
-use super::spec::MethodSpec;
+use super::maps::reaching;
+use super::settings::of_size;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, cav_from_ego_normalized};
+use crate::{AlignedMaps, Fusion, FusionOutput, FusionSettings, MapMetadata, MethodSpec};
 
 /// V2VNet.
 pub static METHOD: MethodSpec =

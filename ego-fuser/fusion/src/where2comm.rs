@@ -14,12 +14,9 @@ use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
 use super::attention::attended;
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
 use super::max::maximum;
-use super::settings::{FusionSettings, Requirements};
-use super::spec::MethodSpec;
 use crate::warp::WarpedMaps;
+use crate::{AlignedMaps, Fusion, FusionOutput, FusionSettings, MethodSpec, Requirements};
 
 /// Where2comm.
 pub static METHOD: MethodSpec = MethodSpec {
@@ -81,7 +78,7 @@ impl FusionSettings for Where2commConfig {
     }
 
     fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        Ok(Box::new(Where2comm::new(self)))
+        Ok(Box::new(Where2comm(self.clone())))
     }
 
     fn requirements(&self) -> Requirements {
@@ -92,16 +89,9 @@ impl FusionSettings for Where2commConfig {
     }
 }
 
-/// Fuses the cells that agents selected.
+/// Fuses the cells that agents selected. It has no parameters.
 #[derive(Debug)]
-pub struct Where2comm(Where2commConfig);
-
-impl Where2comm {
-    /// It has no parameters.
-    pub fn new(config: &Where2commConfig) -> Self {
-        Self(config.clone())
-    }
-}
+pub struct Where2comm(pub Where2commConfig);
 
 impl Fusion for Where2comm {
     fn fuse(&self, AlignedMaps { warped, .. }: &AlignedMaps) -> Result<FusionOutput, TchError> {
@@ -224,7 +214,7 @@ mod tests {
                 missing,
                 ..Where2commConfig::default()
             };
-            let fused = Where2comm::new(&config).fuse(&maps).unwrap().map;
+            let fused = Where2comm(config).fuse(&maps).unwrap().map;
             assert!((fused.double_value(&[0, 0, 0]) - 1.0).abs() < 1e-6);
             assert!(
                 (fused.double_value(&[0, 0, 1]) - expected).abs() < 1e-6,

@@ -60,6 +60,15 @@ pub struct EvaluatedFrame {
     pub truth: GroundTruth,
 }
 
+impl EvaluatedFrame {
+    /// True if the recording has the ego's true pose. Without it nothing tells where the true boxes are: the frame counts
+    /// in no score, and [`Evaluator::left_out`] names it.
+    pub fn has_true_pose(&self) -> bool {
+        let ego = self.frames.first();
+        ego.is_some_and(|ego| ego.world_from_lidar.is_some())
+    }
+}
+
 /// Evaluates scenarios one after another.
 #[derive(Debug)]
 pub struct Evaluator {

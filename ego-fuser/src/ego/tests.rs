@@ -297,7 +297,7 @@ fn leaves_one_map_as_it_is(method: Method) -> bool {
 }
 
 /// AP@0.3, 0.5 and 0.7 of one frame.
-fn average_precisions(detections: &[Detection], objects: &[protocol::Box3d]) -> Vec<f64> {
+fn average_precisions(detections: &[Detection], objects: &[protocol::Box3d]) -> Vec<Option<f64>> {
     let mut scorer = Scorer::new(&[0.3, 0.5, 0.7]);
     scorer.add(detections, &GroundTruth::of_boxes(objects.iter().copied()));
     scorer.average_precisions(Ordering::Global)

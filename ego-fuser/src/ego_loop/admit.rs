@@ -98,7 +98,7 @@ impl EgoLoop {
             Err(reason) => return self.drop_message(source, reason),
         }
         // A map that comes after the ego's next sweep is no reason to wait for the next one.
-        let lead_nanos = self.options.pairing.max_lead_nanos;
+        let lead_nanos = self.pairing.max_lead_nanos();
         let latest_nanos = message.view.capture_nanos.saturating_add(lead_nanos);
         if source.1 == self.stream && self.own_nanos.is_none_or(|own| own <= latest_nanos) {
             self.late_maps.reset(&cav);
@@ -123,6 +123,10 @@ impl EgoLoop {
     /// Begins a frame with the own agent's message.
     fn begin(&mut self, ego: &mut Ego, message: Message, now_nanos: u64) {
         let capture_nanos = message.view.capture_nanos;
+        if let Some(own_nanos) = self.own_nanos {
+            self.pairing
+                .limit_lead(capture_nanos.saturating_sub(own_nanos));
+        }
         self.keep_time(ego, capture_nanos);
         // In the inbox, while another frame was fused, or behind one that waits for its neighbours.
         let waited_nanos = match self.frames.is_empty() {

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use protocol::message::{FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming};
-use protocol::{Detections, DropReason, Stream};
+use protocol::{Detections, DropReason, HEADER_LEN, Stream};
 
 use super::{EgoLoop, Output, OwnFrame, Source};
 use crate::ego::{Ego, Skipped, View};
@@ -216,9 +216,13 @@ impl EgoLoop {
             // A neighbour is one, also by two messages: its boxes are read beside its map.
             match described.iter_mut().find(|known| known.cav == view.cav) {
                 Some(known) => {
+                    // Two messages of one sweep share its pose message, which counts once.
+                    known.wire_bytes += match known.age_nanos == age_nanos {
+                        true => message.payload_bytes + HEADER_LEN as u64,
+                        false => message.wire_bytes,
+                    };
                     known.age_nanos = known.age_nanos.max(age_nanos);
                     known.payload_bytes += message.payload_bytes;
-                    known.wire_bytes += message.wire_bytes;
                 }
                 None => described.push(FusedNeighbour {
                     cav: view.cav.clone(),

@@ -16,7 +16,7 @@ mod waits;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
-use protocol::{CavId, Stream};
+use protocol::{CavId, DropReason, Stream};
 use serde::Serialize;
 
 use crate::capture_clock::CaptureClocks;
@@ -219,7 +219,12 @@ impl EgoLoop {
         std::iter::once(self.stream).chain(self.reads_boxes.then_some(Stream::Boxes))
     }
 
-    /// Problems of the ego: missing messages and streams, each with the time of its beginning, nanoseconds.
+    /// Records that a message was used, or why not, for [`Self::problems`].
+    pub(crate) fn note_use(&mut self, cav: &CavId, reason: Option<DropReason>, now_nanos: u64) {
+        self.waits.note(cav, reason, now_nanos);
+    }
+
+    /// Problems of the ego: missing and untimely messages, and streams, each with the time of its beginning, nanoseconds.
     pub fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         self.waits.problems(now_nanos)
     }

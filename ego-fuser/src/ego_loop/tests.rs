@@ -1,12 +1,15 @@
 use fusion::method::Method;
 use protocol::message::{Descriptor, ModelHash};
-use protocol::{Box3d, Detection, DropReason, Dtype};
+use protocol::{Box3d, Detection, DropReason, Dtype, HEADER_LEN};
 
 use super::*;
 use crate::ego::Content;
 use crate::ego::tests::{HERE, NOW, egos_of_files, near, view};
 
 const PERIOD: u64 = 100_000_000;
+/// Bytes of metadata and body of every message, and of every pose message with its header.
+const PAYLOAD_BYTES: u64 = 1000;
+const POSE_BYTES: u64 = 154;
 
 /// A loop of vehicle `a` with the neighbour `b`, whose boxes it reads.
 struct Case {
@@ -67,8 +70,8 @@ impl Case {
             },
             view,
             sequence: 0,
-            payload_bytes: 0,
-            wire_bytes: 0,
+            payload_bytes: PAYLOAD_BYTES,
+            wire_bytes: PAYLOAD_BYTES + HEADER_LEN as u64 + POSE_BYTES,
         })))
     }
 
@@ -116,6 +119,36 @@ fn a_neighbour_of_another_network_counts_by_its_boxes() {
     assert_eq!(result.fused[0].cav, boxes.cav);
     assert!(result.skipped.is_empty(), "{:?}", result.skipped);
     assert_eq!(case.ego_loop.report().fused_boxes, 1);
+}
+
+#[test]
+fn a_pose_message_counts_once_for_all_messages_of_its_sweep() {
+    let mut case = Case::new();
+    let (own, map, boxes) = (case.own.clone(), case.map.clone(), case.boxes.clone());
+    let sent_bytes = 2 * (PAYLOAD_BYTES + HEADER_LEN as u64);
+    // At the second sweep the boxes are those of the first: two sweeps have two poses.
+    for (sweep, expected) in [
+        (0, sent_bytes + POSE_BYTES),
+        (1, sent_bytes + 2 * POSE_BYTES),
+    ] {
+        case.receive(&map, sweep);
+        if sweep == 0 {
+            case.receive(&boxes, sweep);
+        }
+        case.receive(&own, sweep);
+        let outputs = case.handle(Input::Wake);
+        let fused = outputs.iter().find_map(|output| match output {
+            Output::Publish { result, .. } => Some(result.fused.clone()),
+            _ => None,
+        });
+        let fused = fused.unwrap();
+        assert_eq!(
+            (fused.len(), fused[0].wire_bytes),
+            (1, expected),
+            "sweep {sweep}"
+        );
+        assert_eq!(fused[0].payload_bytes, 2 * PAYLOAD_BYTES);
+    }
 }
 
 #[test]

@@ -1,12 +1,16 @@
-//! Waits of an ego: missing messages and streams, for its status.
+//! Waits of an ego: missing messages and streams, and messages that all come untimely, for its status.
 
 use std::collections::BTreeMap;
 
 use protocol::message::Descriptor;
-use protocol::{CavId, Stream};
+use protocol::{CavId, DropReason, Stream};
 
 /// Time after which a wait is a problem, nanoseconds.
 const AFTER_NANOS: u64 = 3_000_000_000;
+/// The same for the own agent's next message while its period is not known or is long, nanoseconds.
+const LONGEST_NANOS: u64 = 30_000_000_000;
+/// Time after which messages that are all untimely are a problem, and after which they are forgotten, nanoseconds.
+const UNTIMELY_NANOS: u64 = 5_000_000_000;
 /// Largest number of vehicles of a kind.
 const MAX_VEHICLES: usize = 64;
 
@@ -20,6 +24,12 @@ pub(super) struct Waits {
     reads_boxes: bool,
     /// Last message of its own agent, or the first report of a sweep that it has.
     own_nanos: Option<u64>,
+    /// Last message of its own agent.
+    own_message_nanos: Option<u64>,
+    /// Time after which the wait for the next one is a problem, nanoseconds.
+    own_after_nanos: u64,
+    /// Neighbours whose messages are all dropped for their time: time of the first and of the last of these, and reason.
+    untimely: BTreeMap<CavId, (u64, u64, DropReason)>,
     /// Vehicles that do not publish the stream, with those that they publish.
     without: BTreeMap<CavId, (String, u64)>,
     /// Vehicles that left without announcing their end.
@@ -34,6 +44,9 @@ impl Waits {
             stream,
             reads_boxes,
             own_nanos: None,
+            own_message_nanos: None,
+            own_after_nanos: AFTER_NANOS,
+            untimely: BTreeMap::new(),
             without: BTreeMap::new(),
             gone: BTreeMap::new(),
         }
@@ -45,6 +58,24 @@ impl Waits {
         self.without.remove(cav);
         if *cav == self.ego {
             self.own_nanos = Some(now_nanos);
+            // A slow scene has a long period.
+            let last = self.own_message_nanos.replace(now_nanos);
+            let period = last.map_or(LONGEST_NANOS, |last| now_nanos.saturating_sub(last));
+            self.own_after_nanos = period.saturating_mul(3).clamp(AFTER_NANOS, LONGEST_NANOS);
+        }
+    }
+
+    /// Records that a neighbour's message was used, or why not.
+    pub(super) fn note(&mut self, cav: &CavId, reason: Option<DropReason>, now_nanos: u64) {
+        use DropReason::{Clock, Future, Stale};
+        let has_room = self.untimely.len() < MAX_VEHICLES;
+        let reason = reason.filter(|why| has_room && matches!(why, Clock | Future | Stale));
+        let known = self.untimely.remove(cav);
+        if let Some(reason) = reason {
+            let known = known.filter(|(_, last, _)| is_recent(*last, now_nanos));
+            let first_nanos = known.map_or(now_nanos, |(first, ..)| first);
+            let untimely = (first_nanos, now_nanos, reason);
+            self.untimely.insert(cav.clone(), untimely);
         }
     }
 
@@ -69,18 +100,27 @@ impl Waits {
     /// Records that a vehicle has left, and whether it announced its end.
     pub(super) fn left(&mut self, cav: &CavId, has_ended: bool, now_nanos: u64) {
         self.without.remove(cav);
+        self.untimely.remove(cav);
         if !has_ended && self.gone.len() < MAX_VEHICLES {
             self.gone.insert(cav.clone(), now_nanos);
         }
     }
 
-    /// Waits of three seconds and more, and streams that are missing.
+    /// Waits of three seconds and more, streams that are missing, and neighbours of which no message is in time.
     pub(super) fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         let Self { ego, stream, .. } = self;
         let late_before = now_nanos.saturating_sub(AFTER_NANOS);
         // An agent that publishes other streams is named for that instead.
         let own_nanos = self.own_nanos.filter(|_| !self.without.contains_key(ego));
-        let no_own = own_nanos.filter(|since| *since < late_before);
+        let own_before = now_nanos.saturating_sub(self.own_after_nanos);
+        let no_own = own_nanos.filter(|since| *since < own_before);
+        let untimely = self.untimely.iter().filter(|(_, (first, last, _))| {
+            is_recent(*last, now_nanos) && !is_recent(*first, *last)
+        });
+        let untimely = untimely.map(|(cav, (first, _, reason))| {
+            let problem = format!("fuses no {stream} of agent {cav}, drop reason {reason}");
+            (problem, *first)
+        });
         let no_own = no_own.map(|since| (format!("no {stream} of agent {ego}"), since));
         let without = self.without.iter().map(|(cav, (published, since))| {
             let method = &self.method;
@@ -89,8 +129,14 @@ impl Waits {
         });
         let gone = self.gone.iter().filter(|(_, since)| **since < late_before);
         let gone = gone.map(|(cav, since)| (format!("vehicle {cav} is gone"), *since));
-        no_own.into_iter().chain(without).chain(gone).collect()
+        let missing = no_own.into_iter().chain(without).chain(gone);
+        missing.chain(untimely).collect()
     }
+}
+
+/// True if a message was dropped lately: successive ones are of one problem.
+fn is_recent(dropped_nanos: u64, now_nanos: u64) -> bool {
+    now_nanos.saturating_sub(dropped_nanos) < UNTIMELY_NANOS
 }
 
 #[cfg(test)]
@@ -101,6 +147,48 @@ mod tests {
     use super::*;
 
     const SECOND: u64 = 1_000_000_000;
+
+    #[test]
+    fn a_neighbour_whose_messages_are_all_untimely_is_named() {
+        let [own, other] = ["1", "2"].map(|name| CavId::new(name).unwrap());
+        let mut waits = Waits::new(&own, "max", Stream::Bev, true);
+        let stale = Some(DropReason::Stale);
+        for second in 1..=5 {
+            waits.note(&other, stale, second * SECOND);
+            assert_eq!(waits.problems(second * SECOND), []);
+        }
+        waits.note(&other, Some(DropReason::Clock), 6 * SECOND);
+        let named = "fuses no bev of agent 2, drop reason clock".to_owned();
+        assert_eq!(waits.problems(6 * SECOND), [(named, SECOND)]);
+        assert_eq!(waits.problems(11 * SECOND), [], "it sends no more");
+
+        // A message that was used, one that is left out rightly, and a pause: each is a new beginning.
+        for (second, reason) in [(6, None), (11, Some(DropReason::OutOfRange)), (20, stale)] {
+            waits.note(&other, reason, second * SECOND);
+            for later in second + 1..second + 5 {
+                waits.note(&other, stale, later * SECOND);
+                assert_eq!(waits.problems(later * SECOND), [], "{reason:?}");
+            }
+        }
+        waits.note(&other, stale, 25 * SECOND);
+        assert_eq!(waits.problems(25 * SECOND).len(), 1);
+        waits.left(&other, true, 25 * SECOND);
+        assert_eq!(waits.problems(25 * SECOND), []);
+    }
+
+    #[test]
+    fn the_own_agent_of_a_slow_scene_is_late_after_three_of_its_periods() {
+        let own = CavId::new("1").unwrap();
+        let mut waits = Waits::new(&own, "max", Stream::Bev, true);
+        let is_late = |waits: &Waits, second: u64| !waits.problems(second * SECOND).is_empty();
+        waits.received(&own, SECOND);
+        assert!(!is_late(&waits, 30), "its period is not known");
+        assert!(is_late(&waits, 32));
+        waits.received(&own, 5 * SECOND);
+        assert!(!is_late(&waits, 16) && is_late(&waits, 18));
+        waits.received(&own, 5 * SECOND + SECOND / 10);
+        assert!(!is_late(&waits, 8) && is_late(&waits, 9));
+    }
 
     #[test]
     fn a_missing_stream_a_silent_agent_and_a_vehicle_that_is_gone_are_named() {
@@ -127,6 +215,7 @@ mod tests {
         waits.described(&other, &descriptor, 2 * SECOND);
         assert_eq!(waits.problems(2 * SECOND), []);
 
+        waits.received(&own, SECOND);
         waits.received(&own, 2 * SECOND);
         waits.left(&other, false, 4 * SECOND);
         assert_eq!(waits.problems(5 * SECOND), []);

@@ -27,8 +27,6 @@ const HIDDEN_M: f64 = 1.5;
 const FULL_VIEW: f64 = -1.2;
 /// A confidence of a vehicle below this means that the ego observes an empty place.
 const EMPTY: f32 = 0.06;
-/// Messages with a higher similarity are the same one. Two vehicles reach 0.92 at most.
-const COPY: f64 = 0.98;
 /// Maps of one vehicle 0.1 s apart have a higher similarity than this: 0.92 nearly always. Noise does not.
 const SUCCESSIVE: f64 = 0.85;
 /// Log odds of points without a single vehicle, where the ego detects some: rare for an honest neighbour, always so for
@@ -48,15 +46,15 @@ pub(super) struct Evidence {
     pub(super) in_full_view: u32,
     /// Vehicles of the neighbour further away where the ego detects none.
     pub(super) strange: u32,
-    /// Vehicles of the ego near both where the neighbour detects none.
+    /// Vehicles of the ego near both where the neighbour detects none, in cells that it sent.
     pub(super) missed: u32,
     /// Confidence of the ego in a vehicle at the neighbour's reported position, 0..1; `None` where it cannot observe
     /// it.
     pub(super) ego_sees_it: Option<f32>,
-    /// Confidence of the neighbour in a vehicle at the ego's position, 0..1.
+    /// Confidence of the neighbour in a vehicle at the ego's position, 0..1; `None` where it did not send it.
     pub(super) it_sees_ego: Option<f32>,
-    /// Similarity of the message to the most similar one of any other sender, now or before.
-    pub(super) like_another: f64,
+    /// True if the message is one of another sender, now or before.
+    pub(super) is_copied: bool,
     /// Similarity to the neighbour's own previous message.
     pub(super) like_before: Option<f64>,
     /// True if its pose is not reachable from the previous one.
@@ -91,26 +89,26 @@ impl Evidence {
             ..Self::default()
         };
         let sender = Point2::from(ego_from_cav.translation.vector);
-        let [mine, theirs] = [own, theirs].map(|seen| -> Vec<Point2<f64>> {
-            seen.vehicles.iter().map(|at| Point2::from(*at)).collect()
-        });
-        let theirs: Vec<_> = theirs.into_iter().map(|at| ego_from_cav * at).collect();
-        for at in theirs.iter().filter(|at| at.coords.norm() >= OWN_BODY_M) {
-            let is_mine = is_among(at, &mine, radius_m);
+        let sent = |at: &Point2<f64>| theirs.sure_at((cav_from_ego * at).into(), radius_m);
+        let mine = &own.vehicles;
+        let there: Vec<_> = theirs.vehicles.iter().map(|at| ego_from_cav * at).collect();
+        for at in there.iter().filter(|at| at.coords.norm() >= OWN_BODY_M) {
+            let is_mine = is_among(at, mine, radius_m);
             let sure = own.sure_at([at.x, at.y], radius_m);
             let is_empty = sure.is_some_and(|sure| sure < EMPTY);
             match (is_near_both(at, &sender), is_mine) {
                 (true, true) => evidence.matched += 1,
                 (true, false) if is_empty => {
                     evidence.contradicted += 1;
-                    evidence.in_full_view += u32::from(is_in_full_view(at, &mine));
+                    evidence.in_full_view += u32::from(is_in_full_view(at, mine));
                 }
                 (true, false) => {}
                 (false, is_mine) => evidence.strange += u32::from(!is_mine && is_empty),
             }
         }
         let near = mine.iter().filter(|at| is_near_both(at, &sender));
-        let missed = near.filter(|at| !is_among(at, &theirs, radius_m));
+        // What the neighbour did not send it may have detected.
+        let missed = near.filter(|at| !is_among(at, &there, radius_m) && sent(at).is_some());
         evidence.missed = missed.count() as u32;
         evidence
     }
@@ -185,10 +183,9 @@ impl Evidence {
     fn against_other_attacks(&self) -> Option<(f64, MisbehaviourReason)> {
         use MisbehaviourReason::{Duplicated, ImplausibleMotion, ImplausibleValues, Inconsistent};
         let is_torn = !self.boxes_only && self.like_before.is_some_and(|like| like < SUCCESSIVE);
-        let is_copied = self.like_another > COPY;
         let sure = [
             (self.is_out_of_range, -8.0, ImplausibleValues),
-            (is_copied, -8.0, Duplicated),
+            (self.is_copied, -8.0, Duplicated),
             (self.jumped, -4.0, ImplausibleMotion),
             (is_torn, -3.0, Inconsistent),
         ];
@@ -280,6 +277,14 @@ mod tests {
         [14.0, 12.0],
     ];
 
+    const GRID: protocol::BevGrid = protocol::BevGrid {
+        x_min_m: -40.0,
+        y_min_m: -40.0,
+        cell_m: 1.0,
+        width: 80,
+        height: 80,
+    };
+
     /// Evidence about a neighbour that invents a vehicle.
     fn with_invented(vehicle: [f64; 2]) -> Evidence {
         let mut echo = WORLD.to_vec();
@@ -311,15 +316,19 @@ mod tests {
     }
 
     #[test]
+    fn what_a_neighbour_did_not_send_it_has_not_missed() {
+        let own = seen(&boxes(&WORLD, WORLD[0]));
+        for (sure, missed) in [(Some(0.0), 4), (None, 0)] {
+            let theirs = SeenMessage::of_cells(GRID, vec![sure; GRID.cells()]);
+            let evidence =
+                Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
+            assert_eq!((evidence.missed, evidence.it_sees_ego), (missed, sure));
+        }
+    }
+
+    #[test]
     fn boxes_of_a_neighbour_are_judged_as_boxes_beside_an_own_map() {
-        let grid = protocol::BevGrid {
-            x_min_m: -40.0,
-            y_min_m: -40.0,
-            cell_m: 1.0,
-            width: 80,
-            height: 80,
-        };
-        let own = SeenMessage::of_cells(grid, vec![0.0; grid.cells()]);
+        let own = SeenMessage::of_cells(GRID, vec![Some(0.0); GRID.cells()]);
         let theirs = seen(&boxes(&WORLD, WORLD[1]));
         let mut evidence =
             Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
@@ -374,7 +383,7 @@ mod tests {
         };
         assert!(fine.log_odds().unwrap() > 4.0);
         let copied = Evidence {
-            like_another: 1.0,
+            is_copied: true,
             ..fine.clone()
         };
         let jumped = Evidence {

@@ -9,6 +9,7 @@
 //! count as received, are accepted only with evidence in their favour.
 
 mod evidence;
+mod fingerprint;
 mod seen;
 mod value_range;
 
@@ -20,8 +21,9 @@ use protocol::{CavId, MisbehaviourReason, PointCloud, Pose};
 
 use crate::view::View;
 use evidence::Evidence;
+use fingerprint::Fingerprint;
 use fusion::method::Exchange;
-use seen::{SeenMessage, cosine_similarity};
+use seen::SeenMessage;
 use value_range::ValueRange;
 
 /// Weight of a frame against all before it.
@@ -33,6 +35,8 @@ const MAX_PEERS: usize = 64;
 const FORGOTTEN_NANOS: u64 = 60_000_000_000;
 /// Messages further apart than this are not compared with each other, seconds.
 const SUCCESSIVE_S: f64 = 0.25;
+/// A sender that moves by less than this between two maps selects much the same cells of both, metres.
+const STAYS_M: f64 = 2.0;
 /// Largest speed of a vehicle, metres per second.
 const MAX_SPEED_MPS: f64 = 70.0;
 /// Largest error between successive poses, metres.
@@ -64,7 +68,7 @@ struct Reputation {
     /// Capture time of the ego's own view at its last message, nanoseconds.
     last_message_nanos: u64,
     /// Capture time, pose and fingerprint of the last judged map or points, and of the last judged boxes.
-    last: [Option<(u64, Pose, Vec<f32>)>; 2],
+    last: [Option<(u64, Pose, Fingerprint)>; 2],
 }
 
 /// Assessment of a neighbour.
@@ -130,12 +134,10 @@ impl MisbehaviourDetector {
         let fits: Vec<f64> = log_odds.map(|odds| odds.unwrap_or(0.0)).collect();
         for (index, evidence) in evidence.iter_mut().enumerate() {
             let Some(evidence) = evidence else { continue };
-            for other in
-                (0..all.len()).filter(|&other| other != index && fits[other] >= fits[index])
-            {
-                let likeness = alike(&all[index].fingerprint, &all[other].fingerprint);
-                evidence.like_another = evidence.like_another.max(likeness);
-            }
+            let message = &all[index].fingerprint;
+            evidence.is_copied |= (0..all.len())
+                .filter(|&other| other != index && fits[other] >= fits[index])
+                .any(|other| message.is_copy_of(&all[other].fingerprint));
         }
         // Of a neighbour's map and boxes the worse counts, once: true boxes are no excuse for a false map.
         let mut judgements: BTreeMap<&CavId, Option<(f64, MisbehaviourReason)>> = BTreeMap::new();
@@ -163,7 +165,7 @@ impl MisbehaviourDetector {
         Ok(assessments)
     }
 
-    fn last_of(&self, view: &View) -> Option<&(u64, Pose, Vec<f32>)> {
+    fn last_of(&self, view: &View) -> Option<&(u64, Pose, Fingerprint)> {
         self.peers.get(&view.cav)?.last[kind(view)].as_ref()
     }
 
@@ -184,16 +186,18 @@ impl MisbehaviourDetector {
         let others = self.peers.iter().filter(|(cav, _)| **cav != view.cav);
         let earlier = others.flat_map(|(_, peer)| peer.last.iter().flatten());
         let fingerprints = earlier.map(|(_, _, fingerprint)| fingerprint);
-        let others = fingerprints.chain([&mine.fingerprint]);
-        let likeness = others.map(|other| alike(&seen.fingerprint, other));
-        evidence.like_another = likeness.fold(0.0, f64::max);
+        let mut others = fingerprints.chain([&mine.fingerprint]);
+        evidence.is_copied = others.any(|other| seen.fingerprint.is_copy_of(other));
         if let (Some((capture_nanos, before, fingerprint)), Some(now)) =
             (self.last_of(view), view.pose.world_from_cav())
         {
             let elapsed_s = (view.capture_nanos as f64 - *capture_nanos as f64).abs() * 1e-9;
             evidence.jumped = is_jump(before, now, elapsed_s);
-            evidence.like_before = (elapsed_s < SUCCESSIVE_S)
-                .then(|| cosine_similarity(&seen.fingerprint, fingerprint));
+            let [x, y, _] = before.from_world(now).translation_m;
+            let is_torn = x.hypot(y) < STAYS_M && seen.fingerprint.is_unrelated(fingerprint);
+            let torn = is_torn.then_some(0.0);
+            let likeness = torn.or_else(|| seen.fingerprint.likeness(fingerprint));
+            evidence.like_before = likeness.filter(|_| elapsed_s < SUCCESSIVE_S);
         }
         evidence
     }
@@ -262,15 +266,6 @@ fn kind(view: &View) -> usize {
     usize::from(view.content.exchange() == Exchange::Boxes)
 }
 
-/// Similarity of two messages with enough content to be a copy: two vehicles that detect a single box may well agree.
-fn alike(one: &[f32], other: &[f32]) -> f64 {
-    const ENOUGH: usize = 9;
-    if one.len() < ENOUGH {
-        return 0.0;
-    }
-    cosine_similarity(one, other)
-}
-
 /// True if no vehicle can drive from one pose to the other in that time, with the largest pose errors added.
 fn is_jump(before: &Pose, now: &Pose, elapsed_s: f64) -> bool {
     let moved = before.from_world(now);
@@ -286,6 +281,7 @@ mod tests {
 
     use super::*;
     use crate::ego::tests::{HERE, detector, near, view};
+    use crate::view::Content;
 
     fn trust() -> MisbehaviourDetector {
         MisbehaviourDetector {
@@ -457,6 +453,45 @@ mod tests {
                 "{:?}: {like_before}",
                 later.content.exchange()
             );
+        }
+    }
+
+    #[test]
+    fn partial_maps_of_unrelated_cells_are_inconsistent_unless_their_sender_drives() {
+        let mut detector = detector();
+        let mut trust = MisbehaviourDetector::new(&mut detector).unwrap();
+        let own = view("a", HERE, Method::MAX, 0.0);
+        let whole = view("b", near(), Method::MAX, 0.15);
+        let cells = detector.grid().cells();
+        let partial = |first: usize| {
+            let mut partial = whole.clone();
+            let Content::Features(map) = &mut partial.content else {
+                panic!("a map")
+            };
+            let sent = (0..cells).map(|cell| (first..first + 210).contains(&cell));
+            map.sent = Some(sent.collect());
+            partial
+        };
+        let before = partial(0);
+        trust
+            .judge(&own, &[(&before, near())], &mut detector)
+            .unwrap();
+        let empty = trust.empty.clone();
+        let mine = SeenMessage::in_message(&own.content, &mut detector, &empty).unwrap();
+        for (first, moved_m, is_alike) in [
+            (250, 0.5, Some(false)),
+            (250, 5.0, None),
+            (5, 0.5, Some(true)),
+        ] {
+            let mut later = partial(first);
+            later.capture_nanos += 100_000_000;
+            let mut pose = near();
+            pose.translation_m[0] += moved_m;
+            later.pose = protocol::PoseEstimate::new(pose, 1.0);
+            let seen = SeenMessage::in_message(&later.content, &mut detector, &empty).unwrap();
+            let evidence = trust.evidence(&own, &mine, &later, &near(), &seen);
+            let found = evidence.like_before.map(|like| like > 0.99);
+            assert_eq!(found, is_alike, "from cell {first}, {moved_m} m further");
         }
     }
 }

@@ -1,11 +1,13 @@
 //! Observation: content of one vehicle's message, evaluated separately and in its own frame.
 
+use nalgebra::Point2;
 use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::detector::{Detector, DetectorError};
 use perception::model_config::YAxis;
 use protocol::BevGrid;
 use tch::Tensor;
 
+use super::fingerprint::Fingerprint;
 use crate::view::Content;
 
 /// Boxes below this score are no evidence about their sender.
@@ -13,8 +15,6 @@ const SURE: f32 = 0.3;
 /// Boxes at or below this score are no evidence for or against their sender. It is independent of the boxes that are
 /// scored.
 const EVIDENT: f32 = 0.2;
-/// Values of a map that are compared to detect copies, spread over it.
-const FINGERPRINT_VALUES: usize = 4096;
 /// Range of a detector when there is no map that gives it, metres.
 const REACH_M: f64 = 35.0;
 
@@ -22,11 +22,11 @@ const REACH_M: f64 = 35.0;
 #[derive(Debug)]
 pub(super) struct SeenMessage {
     /// Positions of confidently detected vehicles, metres.
-    pub(super) vehicles: Vec<[f64; 2]>,
+    pub(super) vehicles: Vec<Point2<f64>>,
     /// Confidence of the head in a vehicle at each cell; or all boxes and their scores, where there are boxes only.
     sure: Sure,
-    /// Fingerprint: enough values to detect a copy.
-    pub(super) fingerprint: Vec<f32>,
+    /// Enough values to detect a copy.
+    pub(super) fingerprint: Fingerprint,
     /// True for points that contain no vehicle.
     pub(super) is_blind: bool,
     /// The map, `[C, H, W]`; empty where there are boxes only.
@@ -35,7 +35,8 @@ pub(super) struct SeenMessage {
 
 #[derive(Debug)]
 enum Sure {
-    Cells(BevGrid, Vec<f32>),
+    /// `None` for cells that were not sent.
+    Cells(BevGrid, Vec<Option<f32>>),
     Boxes(Vec<([f64; 2], f32)>),
 }
 
@@ -83,8 +84,8 @@ impl SeenMessage {
             .iter()
             .flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]);
         Self {
-            vehicles: sure.map(|(at_m, _)| *at_m).collect(),
-            fingerprint: values.collect(),
+            vehicles: sure.map(|(at_m, _)| Point2::from(*at_m)).collect(),
+            fingerprint: Fingerprint::of_values(values.collect()),
             sure: Sure::Boxes(all),
             is_blind: false,
             map: Vec::new(),
@@ -104,35 +105,26 @@ impl SeenMessage {
             score_threshold: SURE,
             ..PostprocessConfig::for_late_fusion(detector.config())
         };
+        let cells = known_cells(detector, &heads.confidence, sent);
         let boxes = detector.boxes(&heads, SURE)?;
         let mut found = Vec::new();
         for detection in detections(&boxes, &limits) {
             let [x, y, _] = detection.box3d.center_m;
             // Cells that were not sent have no features that a head can interpret.
-            if cell_of(&grid, x, y).is_none_or(|cell| sent.is_none_or(|sent| sent[cell])) {
+            if cell_of(&grid, x, y).is_none_or(|cell| cells[cell].is_some()) {
                 found.push(([x, y], detection.score));
             }
         }
         let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
-        let step = (empty.len() / FINGERPRINT_VALUES).max(1);
-        let compared = values.iter().zip(empty).step_by(step);
-        let fingerprint = compared.map(|(value, nothing)| value - nothing).collect();
         let mut seen = Self {
-            fingerprint,
+            fingerprint: Fingerprint::of_map(&values, empty, grid.cells(), sent),
             map: values,
             ..Self::of_boxes(found)
         };
-        // The cells of a mirrored network lie elsewhere; its boxes do not.
-        if detector.config().y_axis == YAxis::Right {
-            return Ok(seen);
+        // Boxes say enough of a whole map of a mirrored network.
+        if detector.config().y_axis == YAxis::Left || sent.is_some() {
+            seen.sure = Sure::Cells(grid, cells);
         }
-        let mut cells = heads.confidence;
-        for (cell, sure) in cells.iter_mut().enumerate() {
-            if sent.is_some_and(|sent| !sent[cell]) {
-                *sure = 0.0;
-            }
-        }
-        seen.sure = Sure::Cells(grid, cells);
         Ok(seen)
     }
 
@@ -141,12 +133,13 @@ impl SeenMessage {
         matches!(self.sure, Sure::Boxes(_))
     }
 
-    /// Confidence of the detector in a vehicle within `radius_m` of a position, 0..1; `None` outside its range.
+    /// Confidence of the detector in a vehicle within `radius_m` of a position, 0..1; `None` outside its range, and where
+    /// no cell was sent: a place that is not sent is not empty.
     pub(super) fn sure_at(&self, at_m: [f64; 2], radius_m: f64) -> Option<f32> {
         match &self.sure {
             Sure::Cells(grid, cells) => {
                 let near = around(grid, at_m, radius_m);
-                near.map(|cell| cells[cell]).reduce(f32::max)
+                near.filter_map(|cell| cells[cell]).reduce(f32::max)
             }
             Sure::Boxes(_) if at_m[0].hypot(at_m[1]) > REACH_M => None,
             Sure::Boxes(all) => {
@@ -157,6 +150,19 @@ impl SeenMessage {
             }
         }
     }
+}
+
+/// Confidence of each cell in the vehicle's frame, `None` where it was not sent: the rows of a mirrored network are in
+/// reverse order.
+fn known_cells(detector: &Detector, confidence: &[f32], sent: Option<&[bool]>) -> Vec<Option<f32>> {
+    let known = confidence.iter().enumerate();
+    let known = known.map(|(cell, sure)| sent.is_none_or(|sent| sent[cell]).then_some(*sure));
+    let mut cells: Vec<Option<f32>> = known.collect();
+    if detector.config().y_axis == YAxis::Right {
+        let rows = cells.chunks(detector.grid().width as usize).rev();
+        cells = rows.flatten().copied().collect();
+    }
+    cells
 }
 
 /// The cell of a grid that contains a point.
@@ -181,34 +187,51 @@ fn around(grid: &BevGrid, [x, y]: [f64; 2], radius_m: f64) -> impl Iterator<Item
         .filter_map(move |[down, right]| cell_of(&grid, x + right, y + down))
 }
 
-/// Cosine similarity of two messages, -1..1; 1 for copies.
-pub(super) fn cosine_similarity(one: &[f32], other: &[f32]) -> f64 {
-    if one.len() != other.len() || one.is_empty() {
-        return 0.0;
-    }
-    dot(one, other) / (dot(one, one) * dot(other, other)).sqrt().max(1e-12)
-}
-
-fn dot(a: &[f32], b: &[f32]) -> f64 {
-    let products = a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b));
-    products.sum()
-}
-
 #[cfg(test)]
 mod tests {
     use perception::model_config::DetectorConfig;
     use perception::pillars::point_pillars::PointPillars;
-    use protocol::{Box3d, Detection};
+    use protocol::{Box3d, DecodedFeatures, Detection};
     use tch::nn::VarStore;
 
     use super::*;
 
     impl SeenMessage {
-        pub(in crate::misbehaviour) fn of_cells(grid: BevGrid, sure: Vec<f32>) -> Self {
+        pub(in crate::misbehaviour) fn of_cells(grid: BevGrid, sure: Vec<Option<f32>>) -> Self {
             Self {
                 sure: Sure::Cells(grid, sure),
                 ..Self::of_boxes(Vec::new())
             }
+        }
+    }
+
+    fn detector(y_axis: YAxis) -> Detector {
+        let network = VarStore::new(tch::Device::Cpu);
+        let config = DetectorConfig {
+            lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
+            y_axis,
+            ..DetectorConfig::lean()
+        };
+        Detector::from_network(PointPillars::new(&network.root(), &config).unwrap())
+    }
+
+    #[test]
+    fn cells_that_were_not_sent_are_not_empty() {
+        for (y_axis, sent_y_m) in [(YAxis::Left, -3.0), (YAxis::Right, 3.0)] {
+            let mut detector = detector(y_axis);
+            let [channels, height, width] = detector.sent_shape();
+            let map = Tensor::zeros(
+                [1, channels, height, width],
+                (tch::Kind::Float, tch::Device::Cpu),
+            );
+            let features = detector.to_message(&map).unwrap();
+            let (cells, empty) = (features.grid.cells(), features.values.clone());
+            // The rows that the network has at negative y.
+            let sent = Some((0..cells).map(|cell| cell < cells / 2).collect());
+            let content = Content::Features(DecodedFeatures { features, sent });
+            let seen = SeenMessage::in_message(&content, &mut detector, &empty).unwrap();
+            assert!(seen.sure_at([4.0, sent_y_m], 1.0).is_some(), "{y_axis:?}");
+            assert_eq!(seen.sure_at([4.0, -sent_y_m], 1.0), None, "{y_axis:?}");
         }
     }
 
@@ -225,8 +248,8 @@ mod tests {
         assert_eq!(cell_of(&grid, 3.9, 1.9), Some(127));
         assert_eq!(around(&grid, [0.1, 0.1], 0.5).count(), 5);
         assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
-        let mut sure = vec![0.0; 128];
-        sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
+        let mut sure = vec![Some(0.0); 128];
+        sure[cell_of(&grid, 1.2, 0.7).unwrap()] = Some(0.8);
         let seen = SeenMessage::of_cells(grid, sure);
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
@@ -235,13 +258,7 @@ mod tests {
 
     #[test]
     fn boxes_that_are_judged_but_hardly_seen_are_no_evidence() {
-        let network = VarStore::new(tch::Device::Cpu);
-        let config = DetectorConfig {
-            lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
-            ..DetectorConfig::lean()
-        };
-        let mut detector =
-            Detector::from_network(PointPillars::new(&network.root(), &config).unwrap());
+        let mut detector = detector(YAxis::Left);
         let found = [(4.0, 0.7), (8.0, 0.25), (12.0, 0.15)].map(|(x, score)| Detection {
             box3d: Box3d {
                 center_m: [x, 0.0, -1.0],
@@ -257,7 +274,7 @@ mod tests {
             &[],
         )
         .unwrap();
-        assert_eq!(seen.vehicles, [[4.0, 0.0]]);
+        assert_eq!(seen.vehicles, [Point2::new(4.0, 0.0)]);
         assert_eq!(
             (
                 seen.sure_at([8.0, 0.0], 1.0),
@@ -265,22 +282,7 @@ mod tests {
             ),
             (Some(0.25), Some(0.0))
         );
-        assert_eq!(seen.fingerprint.len(), 2 * 3);
-    }
-
-    #[test]
-    fn copies_are_alike_and_others_are_not() {
-        let one: Vec<f32> = (0..100).map(|step| (step as f32 * 0.37).sin()).collect();
-        let other: Vec<f32> = (0..100).map(|step| (step as f32 * 0.91).cos()).collect();
-        assert!(
-            cosine_similarity(&one, &one) > 0.9999 && cosine_similarity(&one, &other).abs() < 0.5
-        );
-        assert_eq!(
-            (
-                cosine_similarity(&one, &one[1..]),
-                cosine_similarity(&[], &[])
-            ),
-            (0.0, 0.0)
-        );
+        let expected = Fingerprint::of_values(vec![4.0, 0.0, 0.7, 8.0, 0.0, 0.25]);
+        assert_eq!(seen.fingerprint, expected);
     }
 }

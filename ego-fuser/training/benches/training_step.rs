@@ -87,7 +87,7 @@ fn training_step(criterion: &mut Criterion) {
         let labels = LabelTensors::gather(&labels, Unassigned::Ignored, Device::Cpu);
         let batch = PillarBatch::new(
             &pillars.iter().collect::<Vec<_>>(),
-            model.network().pillar_grid(),
+            &model.network().pillar_grid,
         );
         group.bench_function(name, |bencher| {
             bencher.iter(|| {

@@ -10,7 +10,7 @@ use pyo3::{Bound, IntoPyObject, PyAny, PyResult, Python, pyfunction};
 use crate::error::error;
 use crate::payload::{Objects, PyDetections};
 
-/// Average precision of detections over frames.
+/// Average precision of detections over frames; `None` without objects.
 #[pyfunction]
 #[pyo3(signature = (detections, truth, iou=None, *, ordering="global"))]
 pub(crate) fn average_precision<'py>(

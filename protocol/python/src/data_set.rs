@@ -1,11 +1,14 @@
 //! Data sets: folders of every layout, and recordings of runs, as sequences of frames.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
-use dataset::{Dataset, Layout, LoadOptions};
+use dataset::{Layout, LoadOptions, Scenario};
 use pyo3::exceptions::PyIndexError;
-use pyo3::{Py, PyRef, PyResult, Python, pyclass, pyfunction, pymethods};
+use pyo3::types::PyAnyMethods;
+use pyo3::{Bound, PyAny, PyResult, Python, pyclass, pyfunction, pymethods};
 
 use crate::error::error;
 use crate::frame::FleetFrame;
@@ -21,6 +24,9 @@ pub(crate) struct DataSet {
     layout: &'static str,
     #[pyo3(get)]
     scenarios: Vec<String>,
+    /// Agents of each scenario that take part by the protocol of the layout, the ego first; none of a recording.
+    #[pyo3(get)]
+    agents: BTreeMap<String, Vec<String>>,
     #[pyo3(get)]
     problems: Vec<String>,
     /// Number of frames.
@@ -31,18 +37,18 @@ pub(crate) struct DataSet {
 }
 
 enum FrameSet {
-    Folder(Dataset),
+    Folder(Vec<Arc<Scenario>>),
     Recording(Box<RecordingFrames>),
 }
 
 impl DataSet {
     fn load(&self, index: usize) -> Option<FrameParts> {
-        let dataset = match &self.source {
-            FrameSet::Folder(dataset) => dataset,
+        let scenarios = match &self.source {
+            FrameSet::Folder(scenarios) => scenarios,
             FrameSet::Recording(recording) => return recording.load(index, &self.protocol),
         };
         let mut tick = index;
-        for scenario in &dataset.scenarios {
+        for scenario in scenarios {
             let Some(at) = scenario.ticks.get(tick) else {
                 // The index runs over all scenarios, the tick over one.
                 tick -= scenario.ticks.len();
@@ -51,6 +57,9 @@ impl DataSet {
             let loaded = scenario.load_tick(tick, scenario.present_agents(tick), &self.options);
             let mut parts = FrameParts::empty(&scenario.name, at.capture_nanos, &self.protocol);
             parts.tick = Some(tick as u64);
+            let agents = self.agents.get(&scenario.name);
+            parts.ego = agents.and_then(|agents| agents.first().cloned());
+            parts.scenario = Some(Arc::clone(scenario));
             let unreadable = loaded.unreadable.into_iter();
             parts
                 .problems
@@ -90,19 +99,14 @@ impl DataSet {
         frame.ok_or_else(|| PyIndexError::new_err(format!("frame {index} of {count}")))
     }
 
-    fn __iter__(slf: Py<Self>) -> DataSetIterator {
-        DataSetIterator {
-            data_set: slf,
-            next: 0,
-        }
+    fn __iter__<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        let builtins = slf.py().import("builtins")?;
+        let indices = builtins.call_method1("range", (slf.len()?,))?;
+        builtins.call_method1("map", (slf.getattr("__getitem__")?, indices))
     }
 
     /// Copies open the data set again: worker processes of a data loader.
-    fn __reduce__<'py>(
-        &self,
-        py: Python<'py>,
-    ) -> PyResult<(pyo3::Bound<'py, pyo3::PyAny>, ReadArguments)> {
-        use pyo3::types::PyAnyMethods;
+    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, ReadArguments)> {
         let (path, options) = (self.path.clone(), &self.options);
         Ok((
             py.import("v2vloc")?.getattr("read")?,
@@ -119,25 +123,6 @@ impl DataSet {
 }
 
 type ReadArguments = (PathBuf, bool, bool, bool);
-
-/// The frames of a data set in order.
-#[pyclass(module = "v2vloc")]
-pub(crate) struct DataSetIterator {
-    data_set: Py<DataSet>,
-    next: usize,
-}
-
-#[pymethods]
-impl DataSetIterator {
-    fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
-        slf
-    }
-
-    fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<FleetFrame>> {
-        self.next += 1;
-        self.data_set.get().frame(py, self.next - 1)
-    }
-}
 
 /// Opens a data set, or a recording of a run.
 #[pyfunction]
@@ -165,25 +150,33 @@ pub(crate) fn read(
                 path,
                 layout: Layout::RECORDING.name(),
                 scenarios: vec![recording.run.clone()],
-                problems: recording.problems(),
+                agents: BTreeMap::new(),
+                problems: recording.problems.clone(),
                 count: recording.frames.len(),
                 options,
-                protocol: of_recording,
+                protocol: recording.protocol.clone().unwrap_or(of_recording),
                 source: FrameSet::Recording(Box::new(recording)),
             });
         }
         // A recording that cannot be read gives the same error here.
         let dataset = dataset::open(&path).map_err(error)?;
+        let protocol = protocols.resolve(dataset.layout).map_err(error)?;
         let scenarios = &dataset.scenarios;
+        let arranged = { scenarios.iter() }.filter_map(|scenario| protocol.arrange(scenario));
+        let agents = arranged.map(|one| {
+            let agents = one.agents.iter().map(ToString::to_string);
+            (one.name, agents.collect())
+        });
         Ok(DataSet {
             path,
             layout: dataset.layout.name(),
             scenarios: scenarios.iter().map(|one| one.name.clone()).collect(),
+            agents: agents.collect(),
             problems: dataset.problems.iter().map(ToString::to_string).collect(),
             count: scenarios.iter().map(|one| one.ticks.len()).sum(),
             options,
-            protocol: protocols.resolve(dataset.layout).map_err(error)?,
-            source: FrameSet::Folder(dataset),
+            protocol,
+            source: FrameSet::Folder(dataset.scenarios.into_iter().map(Arc::new).collect()),
         })
     })
 }

@@ -1,10 +1,13 @@
 //! Frames: everything of one capture time, by agent, and the ground truth of an ego.
 
-use dataset::evaluation_protocol::EvaluationProtocol;
+use std::sync::Arc;
+
+use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig, intervals};
 use dataset::frame;
 use dataset::ground_truth::{self, GroundTruth};
+use dataset::{Layout, Scenario};
 use numpy::{PyArray2, PyUntypedArrayMethods};
-use protocol::Box3d;
+use protocol::{Box3d, CavId};
 use pyo3::types::{PyDict, PyDictMethods};
 use pyo3::{Py, PyResult, Python, pyclass, pymethods};
 
@@ -105,6 +108,7 @@ pub(crate) struct FleetFrame {
     #[pyo3(get)]
     ego: Option<String>,
     truth: Vec<frame::Frame>,
+    scenario: Option<Arc<Scenario>>,
     protocol: EvaluationProtocol,
 }
 
@@ -125,7 +129,8 @@ impl FleetFrame {
         }
         // Without detections the first agent: the ego comes first in the order of a scene.
         let first = parts.detections.first().map(|result| &result.ego);
-        let ego = first.or(truth.first().map(|agent| &agent.cav));
+        let first = first.or(truth.first().map(|agent| &agent.cav));
+        let first = first.map(ToString::to_string);
         Ok(Self {
             source: parts.source,
             tick: parts.tick,
@@ -134,10 +139,29 @@ impl FleetFrame {
             detections: detections.unbind(),
             tracks: tracks.unbind(),
             problems: parts.problems,
-            ego: ego.map(ToString::to_string),
+            ego: parts.ego.or(first),
             truth,
+            scenario: parts.scenario,
             protocol: parts.protocol,
         })
+    }
+
+    /// The agents that take part by a protocol, the ego first; of a run all.
+    fn participants(&self, protocol: &EvaluationProtocol) -> Vec<CavId> {
+        let Some(scenario) = &self.scenario else {
+            return self.truth.iter().map(|agent| agent.cav.clone()).collect();
+        };
+        let arranged = protocol.arrange(scenario);
+        arranged.map_or_else(Vec::new, |arranged| arranged.agents)
+    }
+
+    /// The frames of these agents in their order, then that of an ego that is named and not among them.
+    fn frames_of(&self, agents: &[CavId], ego: &str) -> Vec<&frame::Frame> {
+        let place = |cav: &CavId| agents.iter().position(|agent| agent == cav);
+        let mut frames: Vec<&frame::Frame> = self.truth.iter().collect();
+        frames.retain(|agent| agent.cav.as_str() == ego || agents.contains(&agent.cav));
+        frames.sort_by_key(|agent| place(&agent.cav).unwrap_or(agents.len()));
+        frames
     }
 }
 
@@ -152,24 +176,32 @@ impl FleetFrame {
         protocol: Option<&str>,
         area_m: Option<[f64; 6]>,
     ) -> PyResult<Py<Objects>> {
-        let protocol = match protocol {
-            None => self.protocol.clone(),
-            Some(name) => EvaluationProtocol::preset(name).ok_or_else(|| {
-                let known = dataset::evaluation_protocol::PRESETS.map(|(name, _)| name);
-                let known = known.join(", ");
-                error(format!("unknown protocol {name:?}; there are {known}"))
-            })?,
-        };
+        let named = protocol.map(|name| {
+            let preset = Some(name.to_owned());
+            let (of_all, layout) = (ProtocolConfig::default(), Layout::RECORDING);
+            ProtocolConfig { preset, ..of_all }.resolve(layout)
+        });
+        let named = named.transpose().map_err(error)?;
+        let protocol = named.unwrap_or_else(|| self.protocol.clone());
+        if let Some(area_m) = &area_m {
+            intervals("area_m", area_m).map_err(error)?;
+        }
         let rule = area_m.map_or(protocol.ground_truth, |area_m| protocol.rule_within(area_m));
-        let ego = ego.or_else(|| self.ego.clone()).unwrap_or_default();
-        let mut agents = self.truth.iter();
-        let index = agents.position(|agent| agent.cav.as_str() == ego);
-        let index = index.filter(|&index| self.truth[index].world_from_lidar.is_some());
+        let agents = self.participants(&protocol);
+        let default = match self.scenario {
+            // The ego of a data set follows from the protocol.
+            Some(_) => agents.first().map(ToString::to_string),
+            None => self.ego.clone(),
+        };
+        let ego = ego.or(default).unwrap_or_default();
+        let frames = self.frames_of(&agents, &ego);
+        let is_ego = |agent: &frame::Frame| agent.cav.as_str() == ego;
+        let mut known = frames.iter();
+        let index = known.position(|agent| is_ego(agent) && agent.world_from_lidar.is_some());
         let index = index.ok_or_else(|| {
             let frame = self.__repr__(py);
             error(format!("no true pose of agent {ego:?} in {frame}"))
         })?;
-        let frames: Vec<&frame::Frame> = self.truth.iter().collect();
         let (objects, boxes): (Vec<&frame::Object>, Vec<Box3d>) =
             ground_truth::merged_objects(&frames, index, &rule)
                 .into_iter()

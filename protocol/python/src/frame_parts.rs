@@ -1,5 +1,8 @@
 //! Parts of a frame before Python sees them: collected from messages in any order, or read from a data set.
 
+use std::sync::Arc;
+
+use dataset::Scenario;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use protocol::{
@@ -21,6 +24,10 @@ pub(crate) struct FrameParts {
     pub(crate) detections: Vec<Detections>,
     /// Tracks of egos.
     pub(crate) tracks: Vec<Tracks>,
+    /// The ego of all frames of the scenario or recording; `None`: that of the first result, or the first agent.
+    pub(crate) ego: Option<String>,
+    /// Scenario of a data set, from which follows who takes part; `None`: all do, as in a run.
+    pub(crate) scenario: Option<Arc<Scenario>>,
     /// Reasons for which parts were left out.
     pub(crate) problems: Vec<String>,
     /// The rule of the ground truth.
@@ -49,6 +56,8 @@ impl FrameParts {
             agents: Vec::new(),
             detections: Vec::new(),
             tracks: Vec::new(),
+            ego: None,
+            scenario: None,
             problems: Vec::new(),
             protocol: protocol.clone(),
         }

@@ -29,7 +29,7 @@ mod package {
     #[pymodule_export]
     use crate::average_precision::average_precision;
     #[pymodule_export]
-    use crate::data_set::{DataSet, DataSetIterator, read};
+    use crate::data_set::{DataSet, read};
     #[pymodule_export]
     use crate::decode::{PyMessage, decode};
     #[pymodule_export]

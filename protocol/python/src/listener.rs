@@ -41,6 +41,8 @@ pub(crate) struct Listener {
     last_data: Instant,
     messages: u64,
     undecodable: u64,
+    /// Counts of messages that a closed connection had lost.
+    lost: [u64; 2],
     #[pyo3(get)]
     problems: Vec<String>,
     /// The replay has published its end.
@@ -112,6 +114,7 @@ impl Listener {
 
     fn disconnect(&mut self) {
         if let Some((bus, subscriber)) = self.connection.take() {
+            self.lost = lost(&subscriber);
             // Subscriptions have to end before the bus is left.
             drop(subscriber);
             // A connection that does not close in time closes with the process.
@@ -184,9 +187,8 @@ impl Listener {
     #[getter]
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let connection = self.connection.as_ref();
-        let subscriber = connection.map(|(_, subscriber)| subscriber);
-        let overwritten = subscriber.map_or(0, PassiveSubscriber::overwritten);
-        let undelivered = subscriber.map_or(0, PassiveSubscriber::undelivered);
+        let [overwritten, undelivered] =
+            connection.map_or(self.lost, |(_, subscriber)| lost(subscriber));
         let counts = [
             ("messages", self.messages),
             ("undecodable", self.undecodable),
@@ -285,9 +287,15 @@ pub(crate) fn listen(
         last_data: Instant::now(),
         messages: 0,
         undecodable: 0,
+        lost: [0; 2],
         problems: Vec::new(),
         is_over: false,
     })
+}
+
+/// Messages that were overwritten in the queue, and that the router did not deliver.
+fn lost(subscriber: &PassiveSubscriber) -> [u64; 2] {
+    [subscriber.overwritten(), subscriber.undelivered()]
 }
 
 fn seconds_of(name: &str, seconds: f64) -> PyResult<Duration> {

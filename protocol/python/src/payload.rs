@@ -323,7 +323,7 @@ impl Objects {
     }
 
     /// Objects with their boxes in the frame of a LiDAR, if its true pose is known; `truth` if they are the ground truth
-    /// of an ego.
+    /// of an ego. Its boxes are read-only then: average precision is of the ground truth.
     pub(crate) fn new(
         py: Python<'_>,
         objects: &[&Object],
@@ -331,10 +331,14 @@ impl Objects {
         truth: Option<GroundTruth>,
     ) -> PyResult<Py<Self>> {
         let poses = objects.iter().map(|object| &object.world_from_object);
+        let boxes = optional(boxes, |boxes| arrays::boxes(py, boxes.iter()))?;
+        if let (Some(boxes), Some(_)) = (&boxes, &truth) {
+            boxes.bind(py).try_readwrite()?.make_nonwriteable();
+        }
         let made = Self {
             ids: column(py, objects, |object| object.id),
             classes: PyList::new(py, objects.iter().map(|object| object.class.name()))?.unbind(),
-            boxes: optional(boxes, |boxes| arrays::boxes(py, boxes.iter()))?,
+            boxes,
             world_from_object: arrays::matrices(py, poses.map(Pose::matrix_rows))?,
             sizes_m: arrays::rows(py, objects.iter().map(|object| object.size_m).collect())?,
             // NaN where unknown: an array of numbers has no `None`.

@@ -1,12 +1,16 @@
 //! Frames of a recording: its messages by capture time, in any order of access.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{self, BufReader};
 use std::path::Path;
 
 use dataset::LoadOptions;
 use dataset::evaluation_protocol::EvaluationProtocol;
-use protocol::{Kind, Topic};
+use protocol::{Kind, Stream, Topic};
 use recording::{Entry, Recording};
+use serde::Deserialize;
+use serde_json::Value;
 
 use crate::frame_parts::{FrameParts, is_part_of_frames};
 
@@ -17,6 +21,12 @@ pub(crate) struct RecordingFrames {
     pub(crate) run: String,
     /// Capture times and indices of their messages, in order.
     pub(crate) frames: Vec<(u64, Vec<usize>)>,
+    /// Protocol by which the run was scored; `None` outside of a run folder.
+    pub(crate) protocol: Option<EvaluationProtocol>,
+    /// The scored ego; outside of a run folder the first by name.
+    ego: Option<String>,
+    /// Parts of the files that cannot be read, and several egos of which none is the scored one.
+    pub(crate) problems: Vec<String>,
 }
 
 impl RecordingFrames {
@@ -26,31 +36,46 @@ impl RecordingFrames {
     ) -> Result<Self, recording::RecordingError> {
         let recording = Recording::open(path)?;
         let mut frames: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
+        let mut egos = BTreeSet::new();
         for (index, Entry { key, header, .. }) in recording.entries().iter().enumerate() {
             if is_part_of_frames(&key.topic) && is_wanted(&key.topic, options) {
                 let messages = frames.entry(header.stamp.capture_nanos).or_default();
                 messages.push(index);
             }
+            if let Topic::Stream { cav, stream } = &key.topic
+                && *stream == Stream::Detections
+            {
+                egos.insert(cav.to_string());
+            }
         }
         let first = recording.entries().first();
         let run = first.map_or_else(String::new, |entry| entry.key.run.to_string());
+        let damage = recording.damage().iter().map(ToString::to_string);
+        let mut problems: Vec<String> = damage.collect();
+        let scores = scores_beside(path);
+        let (protocol, ego) = scores.unwrap_or_else(|cause| {
+            problems.push(format!("scores beside {}: {cause}", path.display()));
+            (None, None)
+        });
+        let scored = ego.filter(|ego| egos.contains(ego));
+        if scored.is_none() && egos.len() > 1 {
+            problems.push(format!("results of {egos:?}: Frame.ego is the first"));
+        }
         Ok(Self {
             recording,
             run,
             frames: frames.into_iter().collect(),
+            protocol,
+            ego: scored.or_else(|| egos.pop_first()),
+            problems,
         })
-    }
-
-    /// Parts of the file that cannot be read.
-    pub(crate) fn problems(&self) -> Vec<String> {
-        let damage = self.recording.damage().iter();
-        damage.map(ToString::to_string).collect()
     }
 
     /// Reads the messages of a frame. One that cannot be read or decoded is left out and named.
     pub(crate) fn load(&self, index: usize, protocol: &EvaluationProtocol) -> Option<FrameParts> {
         let (capture_nanos, messages) = self.frames.get(index)?;
         let mut parts = FrameParts::empty(&self.run, *capture_nanos, protocol);
+        parts.ego.clone_from(&self.ego);
         let entries = self.recording.entries();
         for entry in messages.iter().filter_map(|&index| entries.get(index)) {
             let bytes = self.recording.read(entry);
@@ -64,6 +89,26 @@ impl RecordingFrames {
         }
         Some(parts)
     }
+}
+
+/// Protocol, with the ground-truth range as it was applied, and ego by which a recorded run was scored: they are in the
+/// files beside its recording.
+fn scores_beside(path: &Path) -> io::Result<(Option<EvaluationProtocol>, Option<String>)> {
+    let metrics = first_value(&path.with_file_name("metrics.json"))?;
+    let result = first_value(&path.with_file_name("detections.jsonl"))?;
+    let protocol = Option::deserialize(&metrics["protocol"])?;
+    Ok((protocol, Option::deserialize(&result["ego"])?))
+}
+
+/// The first JSON value of a file; null if there is no such file.
+fn first_value(path: &Path) -> io::Result<Value> {
+    let file = match File::open(path) {
+        Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(Value::Null),
+        opened => BufReader::new(opened?),
+    };
+    let values = serde_json::Deserializer::from_reader(file);
+    let first = values.into_iter().next().transpose()?;
+    Ok(first.unwrap_or_default())
 }
 
 fn is_wanted(topic: &Topic, options: &LoadOptions) -> bool {

@@ -16,6 +16,9 @@ def test_small_cases(run):
     assert v2vloc.average_precision([(CAR, [0.9])], [CAR]) == 1.0
     assert v2vloc.average_precision([(FAR, [0.9]), (CAR, [0.8])], [CAR, CAR], iou=0.5) == 0.25
     assert v2vloc.average_precision([([], [])], [CAR], iou=[0.5, 0.7]) == {0.5: 0.0, 0.7: 0.0}
+    for frames, truth in (([(CAR, [0.9])], [[]]), ([], [])):
+        assert v2vloc.average_precision(frames, truth) is None
+        assert v2vloc.average_precision(frames, truth, iou=[0.5, 0.7]) == {0.5: None, 0.7: None}
     frames = [(FAR, [0.2]), (CAR, [0.9])]
     assert v2vloc.average_precision(frames, [[], CAR]) == 1.0
     assert v2vloc.average_precision(frames, [[], CAR], ordering="frame") == 0.5

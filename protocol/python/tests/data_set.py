@@ -1,5 +1,7 @@
 """Data sets on disk and recordings."""
+import json
 import pickle
+import shutil
 
 import numpy as np
 import v2vloc
@@ -38,6 +40,48 @@ def test_ground_truth_merges_the_agents(run):
     assert len(frame.ground_truth(other)) > 0
     for arguments, text in [({"protocol": "x"}, "unknown protocol"), ({"ego": "7"}, "no true pose of agent \"7\"")]:
         refuses(lambda: frame.ground_truth(**arguments), text)
+
+
+def test_agents_that_do_not_take_part_annotate_nothing(run):
+    scene = v2vloc.read(run.scene, points=False)
+    frame = scene[0]
+    assert scene.agents == {frame.source: list(frame.agents)}, scene.agents
+    # Roadside units only: there are none.
+    refuses(lambda: frame.ground_truth(protocol="v2xreal-i2i"), "no true pose of agent \"\"")
+    alone = frame.ground_truth(frame.ego, protocol="v2xreal-i2i")
+    assert 0 < len(alone) and set(alone.ids) <= set(frame.agents[frame.ego].objects.ids), alone
+
+
+def test_what_is_no_area_is_refused(run):
+    frame = v2vloc.read(run.scene, points=False)[0]
+    for area_m in [(-51.2, 51.2, -38.4, 38.4, -3, 1), (np.nan,) * 6]:
+        refuses(lambda: frame.ground_truth(area_m=area_m), "area_m: from ")
+
+
+def test_boxes_of_a_ground_truth_are_read_only(run):
+    frame = v2vloc.read(run.scene, points=False)[0]
+    truth = frame.ground_truth()
+    try:
+        truth.boxes[:, 0] += 100
+    except ValueError as error:
+        assert "read-only" in str(error), error
+    else:
+        raise AssertionError("a ground truth was changed")
+    frame.agents[frame.ego].objects.boxes[:, 0] += 100
+
+
+def test_a_run_has_the_protocol_by_which_it_was_scored(run):
+    folder = run.work / "scored"
+    assert run.live and not folder.mkdir()
+    shutil.copy(run.work / "runs/fleet/recording.mcap", folder)
+    alone = v2vloc.read(folder)
+    assert not alone.problems and {frame.ego for frame in alone} == {run.recording[0].ego}
+    protocol = run.metrics["protocol"]
+    near = {**protocol["ground_truth"], "x_m": [-10, 10]}
+    (folder / "metrics.json").write_text(json.dumps({"protocol": {**protocol, "ground_truth": near}}))
+    assert len(v2vloc.read(folder)[0].ground_truth()) < len(alone[0].ground_truth())
+    (folder / "detections.jsonl").write_text("{")
+    assert "scores beside" in v2vloc.read(folder).problems[0]
 
 
 def test_a_copy_opens_the_scene_again(run):

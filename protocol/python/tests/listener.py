@@ -79,6 +79,17 @@ def test_a_certificate_permits_its_streams(run):
             assert [list(frame.agents) for frame in listener] == [list(v2vloc.read(run.scene)[0].agents)] * 2
 
 
+def test_losses_are_counted_after_the_end_too(run):
+    endpoint = free_endpoint()
+    with background("v2vloc", "router", "--listen", endpoint):
+        with v2vloc.listen(endpoint, run="fast", timeout_s=30) as listener:
+            # More than 64 messages of a topic, of which none is taken.
+            for _ in range(64 // FRAMES + 1):
+                call("sim-replay", "stream", run.scene, "--run", "fast", "--connect", endpoint, "--rate", 0, "--await-agents=false")
+            inside = listener.counts
+    assert inside["overwritten"] > 0 and listener.counts == inside, (inside, listener.counts)
+
+
 def test_a_silent_run_ends_and_ctrl_c_interrupts(run):
     endpoint = free_endpoint()
     with background("v2vloc", "router", "--listen", endpoint):

@@ -50,7 +50,13 @@ fn average_precision(criterion: &mut Criterion) {
             }
             let found = [Ordering::Global, Ordering::Frame]
                 .map(|ordering| scorer.average_precisions(ordering));
-            assert!(found.iter().flatten().all(|ap| (0.0..=1.0).contains(ap)));
+            assert!(
+                found
+                    .iter()
+                    .flatten()
+                    .flatten()
+                    .all(|ap| (0.0..=1.0).contains(ap))
+            );
             black_box(found)
         });
     });

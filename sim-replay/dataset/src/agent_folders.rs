@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 use protocol::CavId;
 
 use super::files::Listing;
-use super::frame_files::{AgentFolder, BIN, PCD, holds_pairs};
-use super::keys::Keys;
+use super::frame_files::{AgentFolder, BIN, PCD, holds_pairs, yaml_ending};
+use super::keys::{self, Keys, LEAST_PER_STRAY};
 use super::points::{SweepStorage, Sweeps};
-use super::yaml::{self, YamlField};
+use super::problem::listed;
+use super::yaml::{self, Value, YamlField};
 use super::{MissingFrame, OpenOptions, ReadError, Result, Tick, files};
 use support::rounding;
 
@@ -23,6 +24,7 @@ pub(super) struct ScenarioFolder {
     pub(super) dir: PathBuf,
     /// Ego first, roadside units last.
     pub(super) agents: Vec<CavId>,
+    pub(super) roadside_units: Vec<CavId>,
     /// Stems of frames of any agent.
     pub(super) stems: Vec<String>,
     /// Stems of frames of some agents, by the agent that lacks them.
@@ -41,7 +43,7 @@ pub(super) fn find(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<Path
         return Ok(found);
     }
     find_below(dir, &files::list(dir)?, MAX_DEPTH, &mut found, problems);
-    Ok(found)
+    Ok(files::each_once(found, problems))
 }
 
 fn find_below(
@@ -72,7 +74,7 @@ pub(super) fn is_agent(dir: &Path) -> bool {
 fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
     if is_number(&files::last_name(dir)) {
         let mut names = listing.files.iter();
-        return names.any(|name| name.ends_with(".yaml") || name.ends_with(PCD));
+        return yaml_ending(listing).is_some() || names.any(|name| name.ends_with(PCD));
     }
     // In this order: the second test lists every folder below.
     let mut folders = listing.folders.iter().map(|folder| dir.join(folder));
@@ -143,7 +145,11 @@ impl ScenarioFolder {
                 by_agent.insert(id.clone(), agent);
             }
         }
-        let agents = in_order(by_agent.keys());
+        // No unit is the ego if there is a vehicle; OpenCOOD moves the first of them only. Text order, as OpenCOOD
+        // sorts: `1045` before `650`.
+        let (roadside_units, vehicles): (Vec<CavId>, Vec<CavId>) =
+            (by_agent.keys().cloned()).partition(|id| is_roadside_unit(dir, id, &by_agent));
+        let agents = [vehicles, roadside_units.clone()].concat();
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
         let mut missing = Vec::new();
         for stem in &all {
@@ -160,6 +166,7 @@ impl ScenarioFolder {
         Ok(Self {
             dir: dir.to_owned(),
             agents,
+            roadside_units,
             stems,
             missing,
             by_agent,
@@ -172,15 +179,19 @@ impl ScenarioFolder {
         self.dir.join(agent.as_str())
     }
 
+    fn yaml_ending(&self, agent: &CavId) -> Option<&'static str> {
+        self.by_agent.get(agent)?.yaml_ending
+    }
+
     /// True for an agent that has sweeps and nothing else.
     pub(super) fn is_without_yaml(&self, agent: &CavId) -> bool {
-        let contents = self.by_agent.get(agent);
-        contents.is_some_and(|contents| contents.is_without_yaml)
+        self.yaml_ending(agent).is_none()
     }
 
     /// The metadata file of a frame.
     pub(super) fn yaml(&self, agent: &CavId, stem: &str) -> PathBuf {
-        self.agent_dir(agent).join(format!("{stem}.yaml"))
+        let ending = self.yaml_ending(agent).unwrap_or(".yaml");
+        self.agent_dir(agent).join(format!("{stem}{ending}"))
     }
 
     /// The plain sweep of a frame, or a variant of it.
@@ -209,18 +220,24 @@ impl ScenarioFolder {
 
     /// Capture times of all stems. Stems that are times give them, from the first on. Others count simulator ticks: if
     /// `data_protocol.yaml` gives the length of a tick, time is tick times length; else the smallest step between stems
-    /// is one `period_nanos`, from 0 on.
+    /// is one `period_nanos`, from 0 on, once strays are left out.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
             problems.push(error);
             None
         });
-        let stems: Vec<&str> = self.stems.iter().map(String::as_str).collect();
+        let mut stems: Vec<&str> = self.stems.iter().map(String::as_str).collect();
+        problems.extend(self.leave_unlike_out(&mut stems));
         let keys = Keys::of_stems(&stems);
         let numbers = match &keys {
             Keys::Times(nanos) => nanos.clone(),
             _ => (0..stems.len()).map(|index| keys.count(index)).collect(),
         };
+        let mut frames: Vec<(&str, u64)> = stems.into_iter().zip(numbers).collect();
+        if tick_nanos.is_none() && !matches!(keys, Keys::Times(_)) {
+            problems.extend(self.leave_strays_out(&mut frames));
+        }
+        let numbers: Vec<u64> = frames.iter().map(|(_, number)| *number).collect();
         let first = numbers.iter().min().copied().unwrap_or(0);
         let (first, step, nanos) = match (&keys, tick_nanos) {
             (Keys::Times(_), _) => (first, 1, 1),
@@ -231,7 +248,7 @@ impl ScenarioFolder {
                 (first, step, period_nanos)
             }
         };
-        let ticks = stems.into_iter().zip(numbers).map(|(stem, number)| {
+        let ticks = frames.into_iter().map(|(stem, number)| {
             let steps = number.saturating_sub(first) / step;
             Tick::new(stem, steps.saturating_mul(nanos))
         });
@@ -239,6 +256,36 @@ impl ScenarioFolder {
         // Natural order compares fractions as whole numbers: 1.5 would come before 1.25.
         ticks.sort_by_key(|tick| tick.capture_nanos);
         ticks
+    }
+
+    /// Leaves out the few frames with a time where the others have numbers, or the other way round.
+    fn leave_unlike_out(&self, stems: &mut Vec<&str>) -> Option<ReadError> {
+        let strays = keys::strays(stems)?;
+        stems.retain(|stem| !strays.contains(stem));
+        let strays = listed(strays);
+        let reason = format!("numbers of another size than the other frames': left out: {strays}");
+        Some(ReadError::malformed(&self.dir, reason))
+    }
+
+    /// Leaves out the few frames between two steps of the others: one alone would halve the step of all.
+    fn leave_strays_out(&self, frames: &mut Vec<(&str, u64)>) -> Option<ReadError> {
+        let steps = frames.array_windows();
+        let steps = steps.map(|[(_, a), (_, b)]| b.saturating_sub(*a));
+        let mut steps: Vec<u64> = steps.filter(|&step| step > 0).collect();
+        steps.sort_unstable();
+        let step = *steps.get(steps.len() / 2)?;
+        // Where the one in the middle is the stray itself, all others are too many to leave out.
+        let (_, middle) = frames.get(frames.len() / 2)?;
+        let usual = middle % step;
+        let (kept, strays): (Vec<_>, Vec<_>) =
+            (frames.iter().copied()).partition(|(_, number)| number % step == usual);
+        if strays.is_empty() || strays.len() * LEAST_PER_STRAY > frames.len() {
+            return None;
+        }
+        *frames = kept;
+        let strays = listed(strays.into_iter().map(|(stem, _)| stem));
+        let reason = format!("between two steps of {step} of the other frames: left out: {strays}");
+        Some(ReadError::malformed(&self.dir, reason))
     }
 
     /// The file that may state the length of a tick.
@@ -292,13 +339,17 @@ fn without_common_frame(
     problems.collect()
 }
 
-/// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the
-/// ego if there is a vehicle; OpenCOOD moves the first of them only.
-fn in_order<'a>(ids: impl Iterator<Item = &'a CavId>) -> Vec<CavId> {
-    let (units, mut agents): (Vec<CavId>, Vec<CavId>) =
-        ids.cloned().partition(|id| id.as_str().starts_with('-'));
-    agents.extend(units);
-    agents
+/// True for a negative id, and for an agent whose first frame says so: `RSU: true`.
+fn is_roadside_unit(dir: &Path, id: &CavId, by_agent: &BTreeMap<CavId, AgentFolder>) -> bool {
+    let stated = || {
+        let contents = by_agent.get(id)?;
+        let name = format!("{}{}", contents.stems.first()?, contents.yaml_ending?);
+        let path = dir.join(id.as_str()).join(name);
+        let node = yaml::read(&path).ok()?;
+        let stated = YamlField::root(&path, &node).optional("RSU").ok()??;
+        Some(stated.node.value == Value::Bool(true))
+    };
+    id.as_str().starts_with('-') || stated() == Some(true)
 }
 
 #[cfg(test)]
@@ -370,6 +421,12 @@ mod tests {
             );
         }
         assert_eq!(ids(&scan(dir.path()).0), ["1045", "650", "-1", "-2"]);
+        fs::write(dir.path().join("1045/0.yaml"), "RSU: true\n").unwrap();
+        fs::write(dir.path().join("650/0.yaml"), "RSU: false\n").unwrap();
+        let folder = scan(dir.path()).0;
+        assert_eq!(ids(&folder), ["650", "-1", "-2", "1045"]);
+        let units: Vec<&str> = folder.roadside_units.iter().map(CavId::as_str).collect();
+        assert_eq!(units, ["-1", "-2", "1045"], "one of them by its files");
     }
 
     #[test]
@@ -494,6 +551,46 @@ mod tests {
             let found: Vec<&str> = ticks.iter().map(|tick| tick.stem.as_str()).collect();
             assert_eq!((found, problems.len()), (stems.to_vec(), 0));
         }
+    }
+
+    #[test]
+    fn a_stray_frame_does_not_change_the_step_of_the_others() {
+        let dir = tempfile::tempdir().unwrap();
+        let frame = |stem: u32| {
+            let stem = format!("1/{stem:06}");
+            touch(
+                dir.path(),
+                &[&format!("{stem}.yaml"), &format!("{stem}.pcd")],
+            );
+        };
+        let times = || {
+            let mut problems = Vec::new();
+            let ticks = scan(dir.path()).0.ticks(100_000_000, &mut problems);
+            let last = ticks.last().unwrap().capture_nanos / 1_000_000;
+            (ticks.len(), last, problems)
+        };
+        (0..20).for_each(|index| frame(68 + 2 * index));
+        let (frames, last, problems) = times();
+        assert_eq!((frames, last, problems.len()), (20, 1900, 0));
+        frame(65);
+        let (frames, last, problems) = times();
+        assert_eq!((frames, last, problems.len()), (20, 1900, 1));
+        let problem = problems[0].to_string();
+        assert!(
+            problem.ends_with("between two steps of 2 of the other frames: left out: 000065"),
+            "{problem}"
+        );
+        frame(123_456_789);
+        let (frames, last, problems) = times();
+        assert_eq!((frames, last, problems.len()), (20, 1900, 2));
+        let problem = problems[0].to_string();
+        let end = "numbers of another size than the other frames': left out: 123456789";
+        assert!(problem.ends_with(end), "{problem}");
+        fs::remove_file(dir.path().join("1/123456789.pcd")).unwrap();
+        // As many are off the step as are on it.
+        (0..20).for_each(|index| frame(109 + 2 * index));
+        let (frames, _, problems) = times();
+        assert_eq!((frames, problems.len()), (41, 0));
     }
 
     #[test]

@@ -15,8 +15,6 @@ use crate::frame::{Frame, Object, ObjectClass};
 const KMH_PER_MPS: f64 = 3.6;
 /// Largest half size of an object, metres. Simulators have written bicycles of 500 m.
 const MAX_HALF_SIZE_M: f64 = 50.0;
-/// Largest angle, degrees: sums of turns occur in files, larger values are errors.
-const MAX_ANGLE_DEG: f64 = 1e5;
 /// Largest speed of an object, metres per second.
 const MAX_SPEED_MPS: f64 = 1000.0;
 /// Keys of an object's type in related formats; the first key present is used.
@@ -188,11 +186,9 @@ fn place(field: &YamlField<'_>) -> Result<CarlaPose> {
         .map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
     let location = field.required("location")?.numbers()?;
     let angle = field.required("angle")?;
-    let angle_deg = angle.numbers::<3>()?;
-    if angle_deg.iter().any(|angle| angle.abs() > MAX_ANGLE_DEG) {
-        return Err(angle.error(format!("{angle_deg:?}, expected angles in degrees")));
-    }
-    Ok(CarlaPose::of_box(location, angle_deg, center))
+    let place = CarlaPose::of_box(location, angle.numbers()?, center);
+    let place = place.in_degrees().and_then(CarlaPose::upright);
+    place.map_err(|reason| angle.error(reason))
 }
 
 /// `extent` holds half sizes.

@@ -21,7 +21,7 @@
 //! let car = Box3d { center_m: [10.0, 2.0, -1.0], size_m: [4.5, 1.9, 1.6], heading_rad: 0.1 };
 //! let mut scorer = Scorer::new(&[0.5, 0.7]);
 //! scorer.add(&[Detection { box3d: car, score: 0.9, source: None }], &GroundTruth::of_boxes([car]));
-//! assert_eq!(scorer.average_precisions(Ordering::Global), [1.0, 1.0]);
+//! assert_eq!(scorer.average_precisions(Ordering::Global), [Some(1.0), Some(1.0)]);
 //! ```
 
 #![expect(
@@ -69,8 +69,8 @@ pub struct Matched {
 /// Precision over recall, and the area under it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PrecisionRecallCurve {
-    /// Average precision, 0..1; 0 without objects.
-    pub average_precision: f64,
+    /// Average precision, 0..1; unknown without objects.
+    pub average_precision: Option<f64>,
     /// Recall after each detection, with 0 in front and 1 at the end.
     pub recall: Vec<f64>,
     /// Precision at each of `recall`, made non-increasing from the right, with a 0 at the end.
@@ -126,7 +126,7 @@ impl Tally {
         let mut found = 0usize;
         for (index, entry) in order.into_iter().enumerate() {
             found += usize::from(entry.is_true);
-            // Without objects nothing is found: 0 / 1 instead of NaN.
+            // Without objects nothing is found: a recall of 0 / 1 instead of NaN.
             recall.push(found as f64 / self.objects.max(1) as f64);
             precision.push(found as f64 / (index + 1) as f64);
         }
@@ -138,11 +138,9 @@ impl Tally {
         }
         // Step: the area under it. Where recall does not rise the width is 0.
         let steps = recall.windows(2).zip(&precision[1..]);
-        let average_precision = steps
-            .map(|(recall, precision)| (recall[1] - recall[0]) * precision)
-            .sum();
+        let widths = steps.map(|(recall, precision)| (recall[1] - recall[0]) * precision);
         PrecisionRecallCurve {
-            average_precision,
+            average_precision: (self.objects > 0).then(|| widths.sum()),
             recall,
             precision,
         }
@@ -221,8 +219,8 @@ impl Scorer {
         &self.parts
     }
 
-    /// AP at every threshold, in their order.
-    pub fn average_precisions(&self, ordering: Ordering) -> Vec<f64> {
+    /// AP at every threshold, in their order; unknown without objects.
+    pub fn average_precisions(&self, ordering: Ordering) -> Vec<Option<f64>> {
         self.tallies
             .iter()
             .map(|tally| tally.curve(ordering).average_precision)

@@ -7,6 +7,11 @@
 use nalgebra::{Isometry3, Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 use protocol::Pose;
 
+/// Largest angle, degrees: sums of turns occur in files, larger values are errors.
+const MAX_ANGLE_DEG: f64 = 1e5;
+/// Largest inclination of a box, degrees: no street is as steep.
+const MAX_TILT_DEG: f64 = 45.0;
+
 /// x, y, z in metres and roll, yaw, pitch in degrees, left-handed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CarlaPose {
@@ -41,6 +46,23 @@ impl CarlaPose {
             position_m: [x + dx, y + dy, z + dz],
             roll_yaw_pitch_deg,
         }
+    }
+
+    /// The pose, if its angles can be degrees.
+    pub(crate) fn in_degrees(self) -> Result<Self, String> {
+        let angles = self.roll_yaw_pitch_deg;
+        let are_sound = angles.iter().all(|angle| angle.abs() <= MAX_ANGLE_DEG);
+        let fault = || format!("{angles:?}, expected angles in degrees");
+        are_sound.then_some(self).ok_or_else(fault)
+    }
+
+    /// The pose, if its z axis is at most [`MAX_TILT_DEG`] from that of the world.
+    pub(crate) fn upright(self) -> Result<Self, String> {
+        let angles = self.roll_yaw_pitch_deg;
+        let [roll, _, pitch] = angles.map(|angle| angle.to_radians().cos());
+        let is_upright = roll * pitch >= MAX_TILT_DEG.to_radians().cos();
+        let fault = || format!("{angles:?}, expected roll and pitch within {MAX_TILT_DEG} degrees");
+        is_upright.then_some(self).ok_or_else(fault)
     }
 
     /// Local-to-world matrix, still left-handed.
@@ -160,6 +182,21 @@ mod tests {
         let pose = CarlaPose::from([1.0, 2.0, 3.0, 0.0, 90.0, 0.0]).to_pose();
         assert_eq!(pose.translation_m, [1.0, -2.0, 3.0]);
         assert!((pose.yaw_rad().to_degrees() + 90.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn boxes_are_upright_whatever_angles_say_so() {
+        for (angles_deg, is_upright) in [
+            ([0.0, 170.0, 0.0], true),
+            ([180.0, 20.0, -180.0], true),
+            ([30.0, 20.0, 30.0], true),
+            ([-90.0, 20.0, 0.0], false),
+            ([180.0, 20.0, 0.0], false),
+            ([3.0, 0.0, 46.0], false),
+        ] {
+            let pose = CarlaPose::of_box([0.0; 3], angles_deg, [0.0; 3]);
+            assert_eq!(pose.upright().is_ok(), is_upright, "{angles_deg:?}");
+        }
     }
 
     #[test]

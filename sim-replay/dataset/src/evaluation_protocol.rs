@@ -13,7 +13,7 @@ use std::fmt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use config::ProtocolConfig;
+pub use config::{ProtocolConfig, intervals};
 pub use preset::PRESETS;
 
 use crate::Scenario;
@@ -76,6 +76,21 @@ pub enum ApOrder {
     Frame,
 }
 
+impl ApOrder {
+    /// Order of the average precision that is reported first: that of the protocol, the default without one.
+    pub fn of(protocol: Option<&EvaluationProtocol>) -> Self {
+        protocol.map_or(Self::default(), |protocol| protocol.ap_order)
+    }
+
+    /// Name in headings and in the columns of sweeps.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Global => "global",
+            Self::Frame => "frame",
+        }
+    }
+}
+
 impl EvaluationProtocol {
     /// The rule for a network that covers `area_m`: x, y, z low, then x, y, z high, metres in the ego's LiDAR frame. No
     /// network finds objects outside its area, so the ground-truth range ends there, unless `exact_range` is set.
@@ -136,10 +151,11 @@ impl fmt::Display for EvaluationProtocol {
             min_corners,
             classes,
         } = self.ground_truth;
+        let order = self.ap_order.name();
         write!(
             f,
             "protocol {}: {classes} with {min_corners} of 8 corners in x {x0} to {x1}, y {y0} to {y1}, z {z0} to {z1} m of \
-             the ego's LiDAR; at most {} agents within {comm_range_m} m",
+             the ego's LiDAR; at most {} agents within {comm_range_m} m; AP@0.3, 0.5, 0.7 in {order} order",
             self.name, self.max_agents
         )
     }

@@ -80,6 +80,22 @@ pub(super) fn list_below(
     below
 }
 
+/// Folders of data in text order, each once: a link beside a folder leads to the same frames. The folder itself is kept,
+/// or the first of several links.
+pub(super) fn each_once(mut found: Vec<PathBuf>, problems: &mut Vec<ReadError>) -> Vec<PathBuf> {
+    let target = |dir: &Path| dir.canonicalize().unwrap_or_else(|_| dir.to_owned());
+    let is_link = |dir: &Path| target(dir).file_name() != dir.file_name();
+    found.sort_by_cached_key(|dir| (target(dir), is_link(dir), dir.clone()));
+    found.dedup_by(|again, first| {
+        let is_same = target(again) == target(first);
+        let reason = format!("leads to the frames of {}: left out", first.display());
+        problems.extend(is_same.then(|| ReadError::malformed(again, reason)));
+        is_same
+    });
+    found.sort_unstable();
+    found
+}
+
 /// Reads a file of at most `max_bytes`.
 pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
     bounded_file::read(path, max_bytes).map_err(|error| match error.kind() {
@@ -189,6 +205,28 @@ mod tests {
                 vec!["4279".into(), "4288".into()]
             )
         );
+    }
+
+    #[test]
+    fn a_folder_and_the_links_to_it_are_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let [latest, scene, newest] =
+            ["latest", "scene", "newest"].map(|name| dir.path().join(name));
+        fs::create_dir(&scene).unwrap();
+        for link in [&latest, &newest] {
+            std::os::unix::fs::symlink("scene", link).unwrap();
+        }
+        let mut problems = Vec::new();
+        let found = vec![latest.clone(), newest, scene.clone()];
+        assert_eq!(each_once(found, &mut problems), [scene.clone()]);
+        let expected = format!(
+            "{}: leads to the frames of {}: left out",
+            latest.display(),
+            scene.display()
+        );
+        assert_eq!((problems.len(), problems[0].to_string()), (2, expected));
+        let alone = each_once(vec![latest.clone()], &mut Vec::new());
+        assert_eq!(alone, [latest], "a link without its folder");
     }
 
     #[test]

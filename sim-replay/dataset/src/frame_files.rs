@@ -8,6 +8,8 @@ use super::{ReadError, camera_files};
 
 /// Text in the names of YAML files that are no frames (OpenCOOD, V2V4Real).
 const NOT_FRAMES: [&str; 2] = ["additional", "camera_gt"];
+/// Endings of YAML files; a folder's files have the first of these that any of them has.
+const YAMLS: [&str; 4] = [".yaml", ".yml", ".YAML", ".YML"];
 pub(super) const RADAR: &str = "radar";
 /// Suffixes of sweeps: PCD, and bare floats as V2X-Real stores them.
 pub(super) const PCD: &str = ".pcd";
@@ -18,7 +20,8 @@ pub(super) const BIN: &str = ".bin";
 pub(super) struct AgentFolder {
     /// Stems with both YAML and sweep; with a sweep alone if there is no YAML at all.
     pub(super) stems: BTreeSet<String>,
-    pub(super) is_without_yaml: bool,
+    /// Ending of the YAML files; `None` if there are none.
+    pub(super) yaml_ending: Option<&'static str>,
     pub(super) variants: BTreeSet<String>,
     pub(super) has_radar: bool,
     /// Numbers of the cameras that have images.
@@ -27,12 +30,19 @@ pub(super) struct AgentFolder {
 
 /// True if a folder has a frame's YAML and its sweep of the given suffix.
 pub(super) fn holds_pairs(listing: &Listing, suffix: &str) -> bool {
-    let yamls: BTreeSet<&str> = yaml_stems(listing).collect();
+    let ending = yaml_ending(listing).unwrap_or(YAMLS[0]);
+    let yamls: BTreeSet<&str> = yaml_stems(listing, ending).collect();
     files::stems(&listing.files, suffix).any(|stem| yamls.contains(stem))
 }
 
-fn yaml_stems(listing: &Listing) -> impl Iterator<Item = &str> {
-    files::stems(&listing.files, ".yaml")
+/// Ending of a folder's YAML files.
+pub(super) fn yaml_ending(listing: &Listing) -> Option<&'static str> {
+    let mut endings = YAMLS.into_iter();
+    endings.find(|ending| yaml_stems(listing, ending).next().is_some())
+}
+
+fn yaml_stems<'a>(listing: &'a Listing, ending: &'a str) -> impl Iterator<Item = &'a str> {
+    files::stems(&listing.files, ending)
         .filter(|stem| !NOT_FRAMES.iter().any(|text| stem.contains(text)))
 }
 
@@ -80,19 +90,19 @@ impl AgentFolder {
         suffix: &str,
         problems: &mut Vec<ReadError>,
     ) -> Self {
-        let mut listed: BTreeSet<&str> = yaml_stems(listing).collect();
-        let is_without_yaml = listed.is_empty();
-        if is_without_yaml {
+        let yaml_ending = yaml_ending(listing);
+        let yaml = yaml_ending.unwrap_or(YAMLS[0]);
+        let mut listed: BTreeSet<&str> = yaml_stems(listing, yaml).collect();
+        if listed.is_empty() {
             // Sweeps alone are frames without poses and boxes.
             let sweeps = files::stems(&listing.files, suffix);
             // A name with an underscore is that of a variant, `<stem>_<variant>`, and no frame.
             listed.extend(sweeps.filter(|stem| !stem.contains('_')));
         }
-        let ending = if is_without_yaml { suffix } else { ".yaml" };
-        let (yamls, mut strays) = usual_stems(listed, ending);
+        let (yamls, mut strays) = usual_stems(listed, yaml_ending.unwrap_or(suffix));
         let are_numbers = !yamls.is_empty() && yamls.iter().all(|stem| is_number(stem));
         let mut agent = Self {
-            is_without_yaml,
+            yaml_ending,
             cameras: camera_files::numbers(&listing.files),
             ..Self::default()
         };
@@ -118,9 +128,9 @@ impl AgentFolder {
         }
         problems.extend(named_once(dir, &strays));
         let without_yaml = without_yaml.into_iter();
-        let alone = without_yaml.map(|stem| (stem, ".yaml", suffix));
+        let alone = without_yaml.map(|stem| (stem, yaml, suffix));
         let without_sweep = yamls.iter().filter(|stem| !agent.stems.contains(**stem));
-        let alone = alone.chain(without_sweep.map(|&stem| (stem, suffix, ".yaml")));
+        let alone = alone.chain(without_sweep.map(|&stem| (stem, suffix, yaml)));
         problems.extend(alone.map(|(stem, missing, there)| {
             let reason = format!("does not exist beside {stem}{there}: the frame is left out");
             ReadError::malformed(&dir.join(format!("{stem}{missing}")), reason)
@@ -177,6 +187,34 @@ mod tests {
             problems,
             ["1/a.yaml: does not exist beside a.pcd: the frame is left out"]
         );
+    }
+
+    #[test]
+    fn yaml_has_the_ending_that_the_folder_uses() {
+        for ending in [".yml", ".YAML"] {
+            let names = ["000070.pcd", "000071.pcd", "000070", "000072"];
+            let [sweep, alone, first, second] = names;
+            let yamls = [first, second].map(|stem| format!("{stem}{ending}"));
+            let (agent, problems) = scan(
+                &[sweep, alone, &yamls[0], &yamls[1], "000070_additional.yaml"],
+                PCD,
+            );
+            assert_eq!(
+                (stems(&agent), agent.yaml_ending),
+                (vec!["000070"], Some(ending))
+            );
+            assert_eq!(
+                problems,
+                [
+                    format!(
+                        "1/000071{ending}: does not exist beside 000071.pcd: the frame is left out"
+                    ),
+                    format!(
+                        "1/000072.pcd: does not exist beside 000072{ending}: the frame is left out"
+                    ),
+                ]
+            );
+        }
     }
 
     #[test]

@@ -2,10 +2,17 @@
 
 use std::str::FromStr;
 
+use support::statistics;
+
 use super::time_stamps::Unit;
 
 /// Least value of a whole number that is a time: nine digits.
 const LEAST_WHOLE_TIME: f64 = 1e8;
+/// Least number of names for each one that is left out as a stray. Where more differ from the others, nothing tells
+/// which of them are wrong.
+pub(super) const LEAST_PER_STRAY: usize = 10;
+/// Least distance of a stray from the median, in ranges of the other numbers. Times from a start are nearer.
+const LEAST_STRAY_RANGES: f64 = 10.0;
 /// Digits of nanoseconds.
 const NANOS_DIGITS: usize = 9;
 
@@ -24,18 +31,11 @@ impl Keys {
     /// Keys of clouds by the stems of their files: the last number of each name, if all else in the names is equal.
     /// It is a time if it has a fraction or at least nine digits.
     pub(super) fn of_stems(stems: &[&str]) -> Self {
-        let numbered: Option<Vec<Numbered<'_>>> =
-            stems.iter().map(|stem| Numbered::of(stem)).collect();
-        let keys = numbered.and_then(|numbered| Self::of_numbered(&numbered));
+        let keys = numbered(stems).and_then(|numbered| Self::of_numbered(&numbered));
         keys.unwrap_or_else(|| Self::Names(stems.iter().map(|&stem| stem.to_owned()).collect()))
     }
 
-    /// `None` for names that differ in more than a number.
     fn of_numbered(numbered: &[Numbered<'_>]) -> Option<Self> {
-        let around = numbered.first()?.around;
-        if numbered.iter().any(|name| name.around != around) {
-            return None;
-        }
         let stamps = numbered.iter();
         let stamps = stamps.map(|name| stamp_nanos(name.seconds?, name.number));
         if let Some(times) = stamps.collect() {
@@ -148,6 +148,34 @@ fn parsed<T: FromStr>(words: &[&str], is_valid: impl Fn(&T) -> bool) -> Option<V
     numbers.collect()
 }
 
+/// The few stems with a time where the median is a number, or the other way round: one alone would decide what all are.
+/// `None` without any.
+pub(super) fn strays<'a>(stems: &[&'a str]) -> Option<Vec<&'a str>> {
+    let are_whole = |names: &Vec<Numbered<'_>>| names.iter().all(|name| name.seconds.is_none());
+    let names = numbered(stems).filter(are_whole)?;
+    let words: Vec<&str> = names.iter().map(|name| name.number).collect();
+    let numbers = numbers(&words)?;
+    let median = statistics::median(&numbers)?;
+    let is_time = |number: f64| number >= LEAST_WHOLE_TIME;
+    let (others, usual): (Vec<_>, Vec<_>) =
+        (stems.iter().zip(numbers)).partition(|(_, number)| is_time(*number) != is_time(median));
+    let usual = usual.iter().map(|(_, number)| *number);
+    let range = usual.clone().fold(0.0, f64::max) - usual.fold(f64::INFINITY, f64::min);
+    let mut distances = others.iter().map(|(_, number)| (number - median).abs());
+    let are_few = !others.is_empty() && others.len() * LEAST_PER_STRAY <= stems.len();
+    (are_few && distances.all(|distance| distance > LEAST_STRAY_RANGES * range))
+        .then(|| others.iter().map(|(stem, _)| **stem).collect())
+}
+
+/// The numbers of names; `None` for names that differ in more than a number.
+fn numbered<'a>(stems: &[&'a str]) -> Option<Vec<Numbered<'a>>> {
+    let names = stems.iter().copied().map(Numbered::of);
+    let names: Vec<Numbered<'a>> = names.collect::<Option<_>>()?;
+    let around = names.first()?.around;
+    let are_alike = names.iter().all(|name| name.around == around);
+    are_alike.then_some(names)
+}
+
 /// A name with a number in it.
 struct Numbered<'a> {
     /// The text before and after the number.
@@ -237,6 +265,38 @@ mod tests {
         ];
         for (stems, expected) in cases {
             assert_eq!(Keys::of_stems(&stems), expected, "{stems:?}");
+        }
+    }
+
+    #[test]
+    fn a_few_numbers_of_another_size_are_strays() {
+        let strays_of = |usual: [u64; 3], other: &str| {
+            let [first, step, count] = usual;
+            let usual = (0..count).map(|index| format!("{:06}", first + step * index));
+            let stems: Vec<String> = usual.chain([other.to_owned()]).collect();
+            let stems: Vec<&str> = stems.iter().map(String::as_str).collect();
+            strays(&stems).map(|strays| strays.concat())
+        };
+        let numbers = [60, 2, 20];
+        let times = [1_600_000_000_000, 100, 20];
+        for (usual, other) in [
+            (numbers, "123456789"),
+            (numbers, "99999999999999999999"),
+            (times, "000007"),
+        ] {
+            assert_eq!(strays_of(usual, other).as_deref(), Some(other));
+        }
+        for (usual, other) in [
+            (numbers, "000100"),
+            (numbers, "scan_123456789"),
+            (times, "1600000009999"),
+            // Too few others.
+            ([60, 2, 8], "123456789"),
+            // Times from 0 on, nanoseconds and microseconds.
+            ([100_000_000, 100_000_000, 20], "000000000"),
+            ([0, 100_000, 1000], "100000000"),
+        ] {
+            assert_eq!(strays_of(usual, other), None, "{usual:?} {other}");
         }
     }
 

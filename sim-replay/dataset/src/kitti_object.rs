@@ -15,7 +15,7 @@ use super::points::{SweepStorage, Sweeps};
 use super::poses::box_angle_rad;
 use super::{
     FrameSource, Layout, OpenOptions, Problem, ReadError, Result, Scenario, Tick, classes, files,
-    single_vehicle,
+    repeats, single_vehicle,
 };
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
@@ -32,6 +32,8 @@ pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
 
 /// Numbers after the type in a line of labels; detections have a score as well.
 const LABEL_NUMBERS: usize = 14;
+/// What separates the words of a line of labels.
+const BLANKS: [char; 2] = [' ', '\t'];
 /// Largest size of an object, metres.
 const MAX_SIZE_M: f64 = 100.0;
 
@@ -119,7 +121,7 @@ impl Split {
 fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Object>, Vec<Problem>)> {
     let (mut objects, mut problems) = (Vec::new(), Vec::new());
     for (line, text) in kitti_text::lines(path)? {
-        let (kind, numbers) = text.trim().split_once(' ').unwrap_or((text.trim(), ""));
+        let (kind, numbers) = text.trim().split_once(BLANKS).unwrap_or((text.trim(), ""));
         if kind == "DontCare" {
             continue;
         }
@@ -132,6 +134,7 @@ fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Objec
             Err(error) => problems.push(Problem::left_out("object", error)),
         }
     }
+    repeats::leave_out(path, &mut objects, &mut problems);
     Ok((objects, problems))
 }
 
@@ -147,25 +150,25 @@ fn object(
     let count = numbers.split_ascii_whitespace().count();
     // A score may follow.
     let has_score = count == LABEL_NUMBERS + 1;
-    let without_score = numbers.trim().rsplit_once(' ').filter(|_| has_score);
+    let without_score = numbers.trim().rsplit_once(BLANKS).filter(|_| has_score);
     let numbers = without_score.map_or(numbers, |(numbers, _)| numbers);
     let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(&field), numbers)?;
     // KITTI has height, width, length. Sizes here are length, width, height.
     let [.., height, width, length, x, y, z, rotation_y] = values;
-    let rotation_y = box_angle_rad(rotation_y).map_err(|reason| {
-        let reason = format!("rotation_y: {reason}");
-        kitti_text::malformed(path, line, Some(&field), reason)
-    })?;
+    let fault = |reason: String| kitti_text::malformed(path, line, Some(&field), reason);
+    let rotation_y = box_angle_rad(rotation_y);
+    let rotation_y = rotation_y.map_err(|reason| fault(format!("rotation_y: {reason}")))?;
     let size_m = [length, width, height];
     if size_m.iter().any(|&size| size <= 0.0 || size > MAX_SIZE_M) {
-        let reason = format!("{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m");
-        return Err(kitti_text::malformed(path, line, Some(&field), reason));
+        return Err(fault(format!(
+            "{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m"
+        )));
     }
     let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
     let camera_from_object = camera_from_object([x, y, z], height, rotation_y);
     let world_from_object: Pose = (lidar_from_camera * camera_from_object).into();
     let valid = world_from_object.validate();
-    valid.map_err(|error| kitti_text::malformed(path, line, Some(&field), error.to_string()))?;
+    valid.map_err(|error| fault(error.to_string()))?;
     Ok(Object::new(id, class, world_from_object, size_m))
 }
 
@@ -213,7 +216,8 @@ mod tests {
     fn labels_become_boxes_in_the_lidar_frame() {
         let line = "Car 0.00 0 -1.57 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 -1.5707963267948966";
         let dir = build(&format!(
-            "{line}\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n{line} 0.9\n"
+            "{line}\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n{} 0.9\n",
+            line.replace(" 9.7 ", "\t19.7\t").replace("Car ", "Car\t")
         ));
         let dataset = crate::open(dir.path()).unwrap();
         assert_eq!(
@@ -273,7 +277,8 @@ mod tests {
                 "0 numbers, expected 14: the object is left out",
             ),
         ] {
-            let dir = build(&format!("{sound}{bad}\n{sound}"));
+            let other = sound.replace(" 9.7 ", " 19.7 ");
+            let dir = build(&format!("{sound}{bad}\n{other}"));
             let frame = crate::open(dir.path()).unwrap().scenarios[0]
                 .load(0, 0, &LoadOptions::default())
                 .unwrap();
@@ -285,6 +290,22 @@ mod tests {
             );
             assert!(problem.message.ends_with(expected), "{problem:?}");
         }
+    }
+
+    #[test]
+    fn a_box_that_is_listed_twice_is_one_object() {
+        let line = "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n";
+        let dir = build(&line.repeat(2));
+        let frame = crate::open(dir.path()).unwrap().scenarios[0]
+            .load(0, 0, &LoadOptions::default())
+            .unwrap();
+        assert_eq!((frame.objects.len(), frame.problems.len()), (1, 1));
+        let message = &frame.problems[0].message;
+        assert!(
+            message.contains("with the id or the box of object 0 at ")
+                && message.ends_with("m: the object is left out"),
+            "{message}"
+        );
     }
 
     #[test]

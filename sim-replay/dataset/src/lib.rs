@@ -67,6 +67,7 @@ mod presence;
 mod problem;
 mod recorded;
 mod recorded_motion;
+mod repeats;
 mod roots;
 mod rosbag;
 mod scalar;
@@ -91,7 +92,7 @@ pub use generated_map::GeneratedMap;
 pub use layout::{Layout, LayoutRow};
 pub use layouts::{LAYOUTS, layouts_text};
 pub use left_out::LeftOut;
-pub use listing::{content_sha256, provenance};
+pub use listing::{content_sha256, provenance, scenario_sha256};
 pub use open::{open, open_with};
 pub use options::OpenOptions;
 pub use points::{IntensityOption, IntensityScale, LiveIntensities, Plausibility};
@@ -351,6 +352,12 @@ impl Scenario {
     ) -> Result<PathBuf> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         Ok(self.source.points_path(agent, tick, variant))
+    }
+
+    /// Stem of a tick; empty if there is none.
+    fn stem(&self, tick_index: usize) -> &str {
+        let tick = self.ticks.get(tick_index);
+        tick.map_or("", |tick| tick.stem.as_str())
     }
 
     fn frame_of(&self, agent_index: usize, tick_index: usize) -> Result<(&CavId, &Tick)> {

@@ -61,6 +61,14 @@ pub fn content_sha256<'a>(
     hex(&hash.finalize())
 }
 
+/// [`content_sha256`] of one scenario, whichever folder above it was opened.
+pub fn scenario_sha256(scenario: &Scenario, digests: &FileDigests) -> String {
+    let mut unnamed = scenario.clone();
+    // The name depends on the folder that was opened.
+    unnamed.name.clear();
+    content_sha256([&unnamed], None, digests)
+}
+
 /// Every file that the frames of a scenario are read from; images and radar points are not evaluated.
 fn files_of(scenario: &Scenario, variant: Option<&str>) -> BTreeSet<PathBuf> {
     let mut files = BTreeSet::new();

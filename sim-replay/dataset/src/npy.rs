@@ -6,7 +6,7 @@
 use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
-use crate::scalar::{Scalar, ScalarKind, find, place, read_point, size_of};
+use crate::scalar::{Scalar, ScalarKind, check_end, find, place, read_point, size_of};
 
 /// Numbers of a point that are accepted.
 const COLUMNS: std::ops::RangeInclusive<usize> = 3..=32;
@@ -42,6 +42,12 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         return Err(format!(
             "shape {shape:?} stated, {found} bytes found: the file is cut off"
         ));
+    }
+    let rest = body.get(stated.unwrap_or_default()..).unwrap_or_default();
+    let size = stated.and_then(|stated| stated.checked_div(columns.points));
+    // Another array may follow, as NumPy itself writes several into one file.
+    if !rest.starts_with(MAGIC) {
+        check_end(rest, columns.points, size.unwrap_or_default())?;
     }
     let points = (0..columns.points).map(|index| {
         let bytes = body.get(index * columns.step..).unwrap_or_default();
@@ -276,6 +282,19 @@ mod tests {
             (cloud.points.xyzi, cloud.intensity.unwrap().kind),
             (vec![[1.0, 2.0, 3.0, 7.0]], IntensityKind::Byte)
         );
+    }
+
+    #[test]
+    fn further_rows_than_stated_are_an_error() {
+        let rows = floats(&[1.0, 2.0, 3.0, 0.5, 4.0, 5.0, 6.0, 0.25]);
+        assert_eq!(
+            array("<f4", false, "1, 4", &rows),
+            Err("1 points stated, 2 found: the header is not of this file".into())
+        );
+        let filled = [&rows[..], b"\n\0\0"].concat();
+        assert_eq!(array("<f4", false, "2, 4", &filled).unwrap().len(), 2);
+        let two_arrays = [&rows[..], &file("{}", &rows)].concat();
+        assert_eq!(array("<f4", false, "2, 4", &two_arrays).unwrap().len(), 2);
     }
 
     #[test]

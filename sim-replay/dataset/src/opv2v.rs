@@ -13,7 +13,7 @@ use super::frame_files::RADAR;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, YamlField};
-use super::{FrameSource, Problem, Result, Tick, camera_files, points};
+use super::{FrameSource, Problem, Result, Tick, camera_files, points, repeats};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Frame;
 use crate::pcd::{self, PcdCloud};
@@ -43,6 +43,7 @@ impl FrameSource for Opv2v {
         annotations.add_vehicle(&mut frame, |field| self.six_numbers(field));
         frame.objects = annotations.objects(|id, _| Ok(id), |place| self.world_from(place));
         frame.problems = annotations.problems;
+        repeats::leave_out(&path, &mut frame.objects, &mut frame.problems);
         Ok(frame)
     }
 

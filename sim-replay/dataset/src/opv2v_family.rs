@@ -90,6 +90,7 @@ fn agent_folder_scenario(
     };
     let moments = folder.ticks(options.period_nanos, problems);
     let (agents, missing) = (folder.agents.clone(), folder.missing.clone());
+    let roadside_units = folder.roadside_units.clone();
     let name = files::name_below(root, &folder.dir);
     let variants = folder.by_agent.values().flat_map(|agent| &agent.variants);
     let variants: BTreeSet<String> = variants.cloned().collect();
@@ -107,6 +108,7 @@ fn agent_folder_scenario(
         }),
     };
     Scenario {
+        roadside_units,
         lidar_variants: variants.into_iter().collect(),
         has_radar,
         cameras: cameras.into_iter().collect(),

@@ -6,7 +6,7 @@
 use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
-use crate::scalar::{Scalar, ScalarKind, find, place, read_point, size_of};
+use crate::scalar::{Scalar, ScalarKind, check_end, find, place, read_point, size_of};
 
 /// Longest header that is read, bytes.
 const MAX_HEADER: usize = 64 << 10;
@@ -38,14 +38,17 @@ struct PlyElement {
 /// The fault with the found and the expected value. No allocation relies on the header alone.
 pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let (storage, elements, body) = header(bytes)?;
-    let place = elements.iter().position(|element| element.name == "vertex");
-    let (before, vertex) = place
-        .and_then(|place| Some((elements.get(..place)?, elements.get(place)?)))
-        .ok_or_else(|| {
-            let names = elements.iter().map(|element| element.name.as_str());
-            let names: Vec<&str> = names.collect();
-            format!("no element vertex, there are {names:?}")
-        })?;
+    let mut from_vertex = elements
+        .iter()
+        .skip_while(|element| element.name != "vertex");
+    let vertex = from_vertex.next().ok_or_else(|| {
+        let names = elements.iter().map(|element| element.name.as_str());
+        let names: Vec<&str> = names.collect();
+        format!("no element vertex, there are {names:?}")
+    })?;
+    let is_last = from_vertex.all(|element| element.count == 0);
+    let before = elements.split(|element| element.name == "vertex").next();
+    let around = (before.unwrap_or_default(), is_last);
     if let Some(list) = &vertex.list {
         return Err(format!(
             "element vertex has the list {list:?}, expected numbers only"
@@ -58,8 +61,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let intensity = find(&vertex.properties, &INTENSITY_FIELDS);
     let columns = [Some(x?), Some(y?), Some(z?), intensity];
     let (points, form) = match storage {
-        PlyFormat::Ascii => (ascii(vertex, before, body, &columns)?, "PLY, ascii"),
-        _ => (binary(vertex, before, body, &columns)?, "PLY, binary"),
+        PlyFormat::Ascii => (ascii(vertex, around, body, &columns)?, "PLY, ascii"),
+        _ => (binary(vertex, around, body, &columns)?, "PLY, binary"),
     };
     let intensity = intensity
         .and_then(|index| vertex.properties.get(index))
@@ -153,7 +156,7 @@ fn scalar_of(name: &str) -> Option<Scalar> {
 #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
 fn ascii(
     vertex: &PlyElement,
-    before: &[PlyElement],
+    (before, is_last): (&[PlyElement], bool),
     body: &[u8],
     columns: &[Option<usize>; 4],
 ) -> Result<Vec<[f32; 4]>, String> {
@@ -162,8 +165,9 @@ fn ascii(
     let skipped = counts.fold(0, usize::saturating_add);
     let text = String::from_utf8_lossy(body);
     let lines = text.lines().filter(|line| !line.trim().is_empty());
+    let is_vertex = |(index, _): &(usize, &str)| is_last || *index < vertex.count;
     let mut points = Vec::new();
-    for (index, line) in lines.skip(skipped).take(vertex.count).enumerate() {
+    for (index, line) in lines.skip(skipped).enumerate().take_while(is_vertex) {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         let mut point = [0.0; 4];
         for (value, column) in point.iter_mut().zip(columns) {
@@ -179,15 +183,13 @@ fn ascii(
     }
     match (points.len(), vertex.count) {
         (found, stated) if found == stated => Ok(points),
-        (found, stated) => Err(format!(
-            "{stated} vertices stated, {found} found: the file is cut off"
-        )),
+        (found, stated) => Err(format!("{stated} vertices stated, {found} found")),
     }
 }
 
 fn binary(
     vertex: &PlyElement,
-    before: &[PlyElement],
+    (before, is_last): (&[PlyElement], bool),
     body: &[u8],
     columns: &[Option<usize>; 4],
 ) -> Result<Vec<[f32; 4]>, String> {
@@ -205,12 +207,15 @@ fn binary(
     let stride = size_of(&vertex.properties);
     let body = body.get(skipped..).unwrap_or_default();
     let length = vertex.count.checked_mul(stride);
-    let Some(body) = length.and_then(|length| body.get(..length)) else {
+    let Some((body, rest)) = length.and_then(|length| body.split_at_checked(length)) else {
         let (count, found) = (vertex.count, body.len());
         return Err(format!(
             "{count} vertices of {stride} bytes stated, {found} bytes found: the file is cut off"
         ));
     };
+    if is_last {
+        check_end(rest, vertex.count, stride)?;
+    }
     let places = columns.map(|index| place(&vertex.properties, index?));
     let points = body.chunks_exact(stride.max(1));
     Ok(points.map(|bytes| read_point(bytes, &places)).collect())
@@ -276,6 +281,26 @@ mod tests {
 
     fn refusal(bytes: &[u8]) -> String {
         decode(bytes).unwrap_err()
+    }
+
+    #[test]
+    fn further_vertices_than_stated_are_an_error_unless_another_element_follows() {
+        let points = body(f64::to_le_bytes, u16::to_le_bytes);
+        let lines = b"1.25 -2 3.5e0 9 7\nnan -2 3.5 9 8\n".to_vec();
+        for (format, points, expected) in [
+            (
+                "binary_little_endian",
+                points,
+                "2 points stated, 4 found: the header is not of this file",
+            ),
+            ("ascii", lines, "2 vertices stated, 4 found"),
+        ] {
+            let more = file(format, &points.repeat(2));
+            assert_eq!(refusal(&more), expected);
+            let faces = String::from_utf8_lossy(&file(format, &[])).replace("face 0", "face 2");
+            let followed = [faces.as_bytes(), &points.repeat(2)].concat();
+            assert_eq!(decode(&followed).unwrap().points.len(), 1);
+        }
     }
 
     #[test]

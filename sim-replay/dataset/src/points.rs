@@ -13,8 +13,8 @@ use std::sync::OnceLock;
 
 use protocol::{CavId, intensity_divisor};
 
-pub(crate) use intensity::NO_INTENSITY;
 pub use intensity::{IntensityOption, IntensityScale, LiveIntensities};
+pub(crate) use intensity::{NO_INTENSITY, faint};
 pub use plausibility::Plausibility;
 
 use floats::FloatForm;

@@ -100,9 +100,33 @@ pub(super) fn read_point(bytes: &[u8], places: &[Option<(usize, Scalar)>; 4]) ->
     })
 }
 
+/// An error if `rest`, the bytes behind the `stated` points of `size` bytes each, holds further points. Zeros, blanks
+/// and line ends alone are none: writers fill up pages with them.
+pub(super) fn check_end(rest: &[u8], stated: usize, size: usize) -> Result<(), String> {
+    let further = rest.len().checked_div(size).unwrap_or(0);
+    let mut bytes = rest.iter();
+    if further == 0 || bytes.all(|&byte| byte == 0 || byte.is_ascii_whitespace()) {
+        return Ok(());
+    }
+    let found = stated.saturating_add(further);
+    Err(format!(
+        "{stated} points stated, {found} found: the header is not of this file"
+    ))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_fills_up_a_file_is_no_point() {
+        for rest in [&b""[..], b" \r\n\0\0\0\0\0\0", b"\0\0\x01"] {
+            assert_eq!(check_end(rest, 7, 4), Ok(()), "{rest:?}");
+        }
+        let fault = check_end(b"\0\0\0\x01\0\0\0\x01\0", 7, 4).unwrap_err();
+        assert!(fault.starts_with("7 points stated, 9 found"), "{fault}");
+        assert_eq!(check_end(b"point", 7, 0), Ok(()));
+    }
 
     #[test]
     fn numbers_of_every_type_and_order_are_read() {

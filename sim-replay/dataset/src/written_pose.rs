@@ -28,7 +28,9 @@ impl WrittenPose {
         // Axes of length 1 say nothing: (6, 1) and (1, 6) are six numbers.
         let sizes: Vec<usize> = shape.iter().copied().filter(|&size| size != 1).collect();
         match (&sizes[..], values.first_chunk::<6>()) {
-            ([6], Some(numbers)) => Ok(Self::SixNumbers(CarlaPose::from(*numbers))),
+            ([6], Some(numbers)) => (CarlaPose::from(*numbers).in_degrees())
+                .map(Self::SixNumbers)
+                .map_err(|reason| field.error(reason)),
             // Row by row in the file, while nalgebra stores columns.
             ([4, 4] | [16], _) => Ok(Self::Matrix(Matrix4::from_row_slice(&values))),
             _ if numpy_tags::is_call(field.node) => Err(field.error(format!(
@@ -115,6 +117,10 @@ mod tests {
             (
                 "pose: [1, 2, .inf, 4, 5, 6]\n".into(),
                 "pose.2: inf, expected a finite number",
+            ),
+            (
+                "pose: [1, 2, 3, 0, 3.6e15, 0]\n".into(),
+                "pose: [0.0, 3.6e15, 0.0], expected angles in degrees",
             ),
             (
                 "pose: far\n".into(),

@@ -7,7 +7,7 @@ use bus::log_to_stderr;
 use dataset::{self, OpenOptions, Scenario};
 use protocol::{CavId, DropReason, Role};
 use sim_replay::config::{ReplayConfig, SceneConfig};
-use sim_replay::stream::{Replay, StreamError, StreamReport};
+use sim_replay::stream::{Place, Replay, StreamError, StreamReport};
 use support::output;
 
 use super::{ProcessArgs, join, leave, print_json};
@@ -25,18 +25,9 @@ pub(crate) fn run(args: ProcessArgs<ReplayConfig>) -> anyhow::Result<Outcome> {
     let (stop, bus) = join(&config.bus, &config.run, Role::Replay, &name)?;
     let replay = match Replay::prepare(&bus, &scenario, config.options(), &stop) {
         Ok(replay) => replay,
-        // Faults of the input, exit code 2. All other errors are failures of the run.
-        Err(
-            error @ (StreamError::NoAgent(_)
-            | StreamError::NoTick { .. }
-            | StreamError::Rate(_)
-            | StreamError::Checkpoint(_)
-            | StreamError::Link(_)
-            | StreamError::LinkInLockstep),
-        ) => {
-            return Ok(Outcome::bad_input(&error));
-        }
-        Err(error) => return Err(error.into()),
+        // Failures of the run. All other errors are faults of the input, exit code 2.
+        Err(error @ (StreamError::Bus(_) | StreamError::Thread(_))) => return Err(error.into()),
+        Err(error) => return Ok(Outcome::bad_input(&error)),
     };
     match replay.wait_until_ready() {
         Ok(()) => {}
@@ -52,6 +43,11 @@ pub(crate) fn run(args: ProcessArgs<ReplayConfig>) -> anyhow::Result<Outcome> {
     let report = replay.play();
     print(&report, args.json)?;
     leave(bus);
+    // Not before: a replay that crashes while it leaves is restarted, and announces its end.
+    let checkpoint = config.checkpoint.filter(|_| !stop.requested());
+    if let Some(Err(error)) = checkpoint.map(|path| Place::end(&path)) {
+        tracing::warn!("{error}; remove the checkpoint before the next replay");
+    }
     Ok(Outcome::of(!report.is_complete()))
 }
 

@@ -135,7 +135,7 @@ fn options(args: Args) -> Result<SynthOptions, BadInput> {
 
 fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) -> io::Result<()> {
     let (scenarios, agent_frames) = (summary.scenarios, summary.agent_frames);
-    let (layout, omitted) = (summary.layout, &summary.omitted);
+    let (layout, omitted) = (options.layout, &summary.omitted);
     let [points, vehicles] = [summary.points, summary.annotations]
         .map(|count| count as f64 / agent_frames.max(1) as f64);
     if json {

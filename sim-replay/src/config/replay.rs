@@ -22,7 +22,7 @@ pub struct ReplayConfig {
     #[arg(long, required_unless_present = "config")]
     pub run: RunId,
     /// Checkpoint: file to which the state of the replay is written after each tick, and from which it resumes if the
-    /// file exists.
+    /// file exists. It must be of a replay with the same seek, frames and loop that has not ended.
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
     pub checkpoint: Option<PathBuf>,

@@ -32,8 +32,6 @@ struct FrameSurvey {
 #[derive(Debug)]
 struct TickFindings {
     agents: Vec<FrameSurvey>,
-    /// Objects of all agents that are of the protocol's classes.
-    targets: usize,
     merged: Vec<TickReport>,
 }
 
@@ -74,8 +72,8 @@ pub fn inspect(
             })
             .collect();
         report.scenarios.push(summarize(scenario, &findings));
-        let scale = open.intensity_scale;
-        problems.extend(scenario_problems(scenario, &findings, scale));
+        let (scale, rule) = (open.intensity_scale, &protocol.ground_truth);
+        problems.extend(scenario_problems(scenario, &findings, scale, rule));
         for tick in findings {
             report.ticks.extend(tick.merged);
             problems.extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
@@ -102,27 +100,19 @@ fn counted(problems: Vec<Problem>) -> Vec<Problem> {
     problems.collect()
 }
 
-/// Problems of a scenario as a whole. Without poses no ground truth is a consequence.
+/// Problems of a scenario as a whole.
 fn scenario_problems(
     scenario: &Scenario,
     ticks: &[TickFindings],
     scale: IntensityScale,
+    rule: &GroundTruthRule,
 ) -> Vec<Problem> {
     let agents = (0..scenario.agents.len()).map(|agent| {
         let frames = ticks.iter().map(|tick| &tick.agents[agent].findings);
         frames.enumerate().collect()
     });
     let agents: Vec<Vec<(usize, &FrameFindings)>> = agents.collect();
-    let mut problems = findings::of_scenario(scenario, &agents, scale);
-    let frames = agents.iter().flatten().map(|(_, frame)| frame);
-    if !frames.into_iter().any(|frame| frame.is_without_pose()) {
-        let targets = ticks.iter().map(|tick| tick.targets).sum();
-        let merged = ticks.iter().flat_map(|tick| &tick.merged);
-        let merged = merged.map(|tick| tick.merged_boxes).sum();
-        let problem = findings::without_ground_truth(&scenario.name, targets, merged);
-        problems.extend(problem);
-    }
-    problems
+    findings::of_scenario(scenario, &agents, scale, Some(rule))
 }
 
 fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> TickFindings {
@@ -130,20 +120,14 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
         let is_present = scenario.is_present(agent, tick);
         is_present.then(|| survey_frame(scenario, agent, tick))
     });
-    let (agents, frames): (Vec<FrameSurvey>, Vec<Option<Frame>>) =
-        surveys.map(Option::unwrap_or_default).unzip();
-    let frames: Vec<&Frame> = frames.iter().flatten().collect();
-    let objects = frames.iter().flat_map(|frame| &frame.objects);
-    let targets = objects.filter(|object| rule.classes.contains(object.class));
+    let agents: Vec<FrameSurvey> = surveys.map(Option::unwrap_or_default).collect();
+    let frames = agents.iter().map(|agent| &agent.findings.frame);
+    let frames: Vec<&Frame> = frames.flatten().collect();
     let merged = merged_counts(scenario, tick, &frames, rule);
-    TickFindings {
-        agents,
-        targets: targets.count(),
-        merged,
-    }
+    TickFindings { agents, merged }
 }
 
-fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey, Option<Frame>) {
+fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> FrameSurvey {
     let mut survey = FrameSurvey::default();
     // The sweep is read by `survey_points`, which also counts the points that are not finite.
     let without_points = dataset::LoadOptions {
@@ -151,22 +135,24 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey,
         ..dataset::LoadOptions::without_points()
     };
     let frame = scenario.load(agent, tick, &without_points);
-    let frame = or_problem(frame, &mut survey.problems);
+    let mut frame = or_problem(frame, &mut survey.problems);
     // Read apart from the frame: a fault of the annotations must not hide one of the sweep.
     let sweep = survey_points(scenario, agent, tick, None, &mut survey.problems);
     for variant in &scenario.lidar_variants {
         survey_points(scenario, agent, tick, Some(variant), &mut survey.problems);
     }
-    survey.findings = FrameFindings::of(frame.as_ref(), sweep.as_ref());
-    survey.dropped = sweep.map_or(0, |sweep| sweep.dropped);
-    if let Some(frame) = &frame {
-        survey.problems.extend(frame.problems.iter().cloned());
+    if let Some(frame) = &mut frame {
+        survey.problems.append(&mut frame.problems);
+        // The frame is kept; its images were only tried.
+        frame.cameras.clear();
     }
+    survey.findings = FrameFindings::of(frame, sweep.as_ref());
+    survey.dropped = sweep.map_or(0, |sweep| sweep.dropped);
     if scenario.has_radar {
         let radar = or_problem(scenario.load_radar(agent, tick), &mut survey.problems);
         survey.radar_points = radar.map(|cloud| cloud.points.len());
     }
-    (survey, frame)
+    survey
 }
 
 /// Value of a result; its error is added to the problems.
@@ -272,7 +258,7 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
 fn summarize_agent(id: &CavId, frames: &[&FrameSurvey]) -> AgentReport {
     let findings = frames.iter().map(|frame| &frame.findings);
     let positions: Vec<[f64; 3]> = (findings.clone())
-        .filter_map(|frame| Some(frame.world_from_lidar?.translation_m))
+        .filter_map(|frame| Some(frame.frame.as_ref()?.world_from_lidar?.translation_m))
         .collect();
     let steps = positions.windows(2).map(|pair| {
         let squares = (0..3).map(|axis| (pair[1][axis] - pair[0][axis]).powi(2));
@@ -287,7 +273,9 @@ fn summarize_agent(id: &CavId, frames: &[&FrameSurvey]) -> AgentReport {
         dropped_points: frames.iter().map(|frame| frame.dropped).sum(),
         radar_points: summary_of(frames, |frame| frame.radar_points),
         sweeps: SweepReport::of(&sweeps),
-        boxes: summary_of(frames, |frame| frame.findings.boxes),
+        boxes: summary_of(frames, |frame| {
+            Some(frame.findings.frame.as_ref()?.objects.len())
+        }),
         boxes_without_points: findings.map(|frame| frame.boxes_without_points).sum(),
         frames: sweeps.len(),
         // An empty sum is -0.
@@ -539,7 +527,7 @@ mod tests {
             [
                 "scene: agent 1: 20 of 20 boxes (100 %) hold none of its points: frames (axes, order of the pose's \
                  numbers) or units of the boxes may be wrong",
-                "scene: ground truth 0 for every ego and tick, though agents list 20 objects of its classes: frames (axes, order of \
+                "scene: ground truth 0 for every ego in 1 of 1 ticks, though agents list 20 objects of its classes: frames (axes, order of \
                  the pose's numbers) or units of the boxes may be wrong",
             ]
         );

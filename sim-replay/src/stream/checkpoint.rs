@@ -12,7 +12,7 @@ use super::schedule::Position;
 use bus::bounded_queue::{BoundedQueue, Pop};
 use support::atomic_file;
 use support::bounded_file;
-use support::file_error::FileError;
+use support::file_error::{AtFile, FileError};
 
 /// Largest file that is read: a checkpoint is a few numbers.
 const MAX_BYTES: u64 = 64 << 10;
@@ -23,6 +23,10 @@ const MAX_BYTES: u64 = 64 << 10;
 pub struct Place {
     /// The scenario.
     pub scenario: String,
+    /// The options that give the order of ticks, as text: a replay resumes with the same.
+    pub plan: String,
+    /// True once the replay has ended and has left the run.
+    pub has_ended: bool,
     /// Position in the scenario.
     pub position: Position,
     /// True if the clock is halted.
@@ -39,25 +43,50 @@ impl Place {
     /// The state left by the previous process instance in a scenario of `ticks` ticks; `None` if there was none.
     ///
     /// # Errors
-    /// [`FileError`] if the file holds no state, or that of another scene.
-    pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, FileError> {
+    /// [`FileError`] if the file holds no state, or that of another scene, of other options or of a replay that has
+    /// ended.
+    pub fn read(
+        path: &Path,
+        (scenario, ticks): (&str, usize),
+        plan: &str,
+    ) -> Result<Option<Self>, FileError> {
+        let Some(place) = Self::load(path)? else {
+            return Ok(None);
+        };
+        let (tick, of, planned) = (place.position.next_tick, &place.scenario, &place.plan);
+        // A next tick equal to `ticks` is valid: the scene was played to its end.
+        let problem = if of != scenario || tick > ticks {
+            format!("tick {tick} of scenario {of}, but scenario {scenario} has {ticks} ticks")
+        } else if place.has_ended {
+            "of a replay that has ended".to_owned()
+        } else if planned != plan {
+            format!("of a replay with {planned}, and this one has {plan}")
+        } else {
+            return Ok(Some(place));
+        };
+        let problem = format!("the checkpoint is {problem}: remove the file, or choose another");
+        Err(FileError::new(path, problem))
+    }
+
+    /// Notes in the file that the replay has ended: not before a crash needs no restart any more.
+    ///
+    /// # Errors
+    /// [`FileError`] if it cannot be read or written. Without a file there is nothing to note.
+    pub fn end(path: &Path) -> Result<(), FileError> {
+        Self::load(path)?.map_or(Ok(()), |mut place| {
+            place.has_ended = true;
+            write(path, &place).at(path)
+        })
+    }
+
+    fn load(path: &Path) -> Result<Option<Self>, FileError> {
         let text = match bounded_file::read_text(path, MAX_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(FileError::new(path, error)),
         };
-        let place: Self = serde_json::from_str(&text).map_err(|error| {
-            FileError::new(path, format_args!("not a replay checkpoint: {error}"))
-        })?;
-        // A next tick equal to `ticks` is valid: the scene was played to its end.
-        if place.scenario != scenario || place.position.next_tick > ticks {
-            let (tick, of) = (place.position.next_tick, place.scenario);
-            let problem = format_args!(
-                "the checkpoint is tick {tick} of scenario {of}, but scenario {scenario} has {ticks} ticks: remove the file, or choose another"
-            );
-            return Err(FileError::new(path, problem));
-        }
-        Ok(Some(place))
+        let read = serde_json::from_str(&text).map(Some);
+        read.map_err(|error| FileError::new(path, format!("not a replay checkpoint: {error}")))
     }
 
     /// Report of the previous process instances.
@@ -143,9 +172,13 @@ mod tests {
 
     use super::*;
 
+    const PLAN: &str = "seek 0, frames 10, loop false";
+
     fn place() -> Place {
         Place {
             scenario: "town1".into(),
+            plan: PLAN.into(),
+            has_ended: false,
             position: Position {
                 next_tick: 7,
                 left: Some(3),
@@ -163,13 +196,14 @@ mod tests {
     fn the_last_checkpoint_is_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
-        assert_eq!(Place::read(&path, "town1", 10).unwrap(), None);
+        assert_eq!(Place::read(&path, ("town1", 10), PLAN).unwrap(), None);
         let checkpoint = Checkpoint::open(path.clone()).unwrap();
         for ticks in 0..=7 {
             checkpoint.note(Place { ticks, ..place() });
         }
         drop(checkpoint);
-        assert_eq!(Place::read(&path, "town1", 10).unwrap(), Some(place()));
+        let read = Place::read(&path, ("town1", 10), PLAN).unwrap();
+        assert_eq!(read, Some(place()));
         assert_eq!(
             fs::read_dir(folder.path()).unwrap().count(),
             1,
@@ -183,7 +217,31 @@ mod tests {
     }
 
     fn read_error(path: &Path, scenario: &str, ticks: usize) -> String {
-        Place::read(path, scenario, ticks).unwrap_err().to_string()
+        Place::read(path, (scenario, ticks), PLAN)
+            .unwrap_err()
+            .to_string()
+    }
+
+    #[test]
+    fn a_replay_resumes_with_the_same_options_until_it_has_ended() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("place.json");
+        Place::end(&path).unwrap();
+        assert!(!path.exists(), "nothing was played");
+        write(&path, &place()).unwrap();
+        let other = "seek 5, frames all, loop true";
+        let error = Place::read(&path, ("town1", 10), other).unwrap_err();
+        let expected = format!(
+            "{}: the checkpoint is of a replay with {PLAN}, and this one has {other}: remove the file, or choose another",
+            path.display()
+        );
+        assert_eq!(error.to_string(), expected);
+        Place::end(&path).unwrap();
+        let error = read_error(&path, "town1", 10);
+        assert!(
+            error.contains("the checkpoint is of a replay that has ended: remove the file"),
+            "{error}"
+        );
     }
 
     #[test]
@@ -212,7 +270,7 @@ mod tests {
         checkpoint.note(place());
         drop(checkpoint);
         assert!(
-            Place::read(Path::new("/nowhere/place.json"), "town1", 10)
+            Place::read(Path::new("/nowhere/place.json"), ("town1", 10), PLAN)
                 .unwrap()
                 .is_none()
         );

@@ -60,7 +60,7 @@ pub struct StreamOptions {
     /// Link emulation between sensors and agents, and its seed; `None`: frames arrive at once.
     pub link: Option<(LinkConfig, u64)>,
     /// Checkpoint file, written after each tick; if it exists, the replay resumes from it instead of starting at
-    /// `seek`.
+    /// `seek`. It is one of the same `seek`, `frames` and `repeats`, of a replay that has not ended.
     pub checkpoint: Option<PathBuf>,
 }
 
@@ -85,6 +85,13 @@ impl Default for StreamOptions {
 }
 
 impl StreamOptions {
+    /// The options that give the order of ticks, as text.
+    fn plan(&self) -> String {
+        let (seek, repeats) = (self.seek, self.repeats);
+        let frames = self.frames.map_or("all".into(), |count| count.to_string());
+        format!("seek {seek}, frames {frames}, loop {repeats}")
+    }
+
     /// True if the subscribers set the pace: nothing is published before they can accept it.
     fn is_paced(&self) -> bool {
         self.rate == 0.0 || !self.lockstep.is_empty()
@@ -174,10 +181,9 @@ impl<'a> Replay<'a> {
             agents: cavs.collect(),
             ..options
         };
-        let place = match &options.checkpoint {
-            Some(path) => Place::read(path, &scenario.name, scenario.ticks.len())?,
-            None => None,
-        };
+        let scene = (scenario.name.as_str(), scenario.ticks.len());
+        let read = |path: &PathBuf| Place::read(path, scene, &options.plan());
+        let place = options.checkpoint.as_ref().map(read).transpose()?.flatten();
         let (seek, frames) = (options.seek, options.frames);
         let mut schedule = Schedule::new(&scenario.ticks, seek, frames, options.repeats);
         if let Some(place) = &place {
@@ -187,7 +193,7 @@ impl<'a> Replay<'a> {
         if place.as_ref().is_some_and(|place| place.is_halted) {
             clock.pause();
         }
-        let reading = ReadAhead::start(scenario.clone(), agents, options.load.clone())
+        let mut reading = ReadAhead::start(scenario.clone(), agents, options.load.clone())
             .map_err(StreamError::Thread)?;
         reading.want(&schedule.ahead(READ_AHEAD));
 
@@ -357,6 +363,8 @@ impl<'a> Replay<'a> {
         if let Some(checkpoint) = &self.checkpoint {
             checkpoint.note(Place {
                 scenario: self.scenario.clone(),
+                plan: self.options.plan(),
+                has_ended: false,
                 position: self.schedule.position,
                 is_halted: self.clock.is_halted(),
                 ticks: self.report.ticks,
@@ -512,6 +520,24 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_options_that_give_the_order_of_ticks_are_in_the_plan() {
+        let whole = StreamOptions::default();
+        let part = StreamOptions {
+            seek: 5,
+            frames: Some(40),
+            repeats: true,
+            ..whole.clone()
+        };
+        assert_eq!(
+            [whole.plan(), part.plan()],
+            [
+                "seek 0, frames all, loop false",
+                "seek 5, frames 40, loop true"
+            ]
+        );
+    }
 
     #[test]
     fn unlimited_timeout_waits_for_the_subscribers() {

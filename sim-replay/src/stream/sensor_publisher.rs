@@ -1,5 +1,7 @@
 //! Publishers of a replayed scene: each vehicle's sensors, and the ground truth.
 
+use std::collections::BTreeMap;
+
 use protocol::message::{AgentTruth, Payload, TrueObject};
 use protocol::{CavId, Lidar, Radar, Stream, Topic, TopicCount, Truth};
 
@@ -16,9 +18,9 @@ const PREVIEW_POINTS: usize = 4_000;
 /// All publishers of a replay.
 pub(super) struct SensorPublisher {
     /// By index of the vehicle among those that take part, and by stream.
-    sensors: Vec<((usize, Stream), Publisher)>,
+    sensors: BTreeMap<(usize, Stream), Publisher>,
     truth: Publisher,
-    sent: Vec<TopicCount>,
+    sent: BTreeMap<Topic, u64>,
 }
 
 impl SensorPublisher {
@@ -46,7 +48,7 @@ impl SensorPublisher {
         // Waits for a place even in a replay that is not paced: a tick without truth cannot be scored.
         let waiting = PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES);
         let truth = bus.publisher(Topic::Truth, waiting)?;
-        let mut sensors = Vec::new();
+        let mut sensors = BTreeMap::new();
         for (agent, cav) in agents.iter().enumerate() {
             for &(stream, options) in &streams {
                 // Previews are never paced: a slow viewer must not hold back the replay.
@@ -55,13 +57,13 @@ impl SensorPublisher {
                     false => options,
                 };
                 let publisher = bus.publisher(Topic::stream(cav, stream), options)?;
-                sensors.push(((agent, stream), publisher));
+                sensors.insert((agent, stream), publisher);
             }
         }
         Ok(Self {
             sensors,
             truth,
-            sent: Vec::new(),
+            sent: BTreeMap::new(),
         })
     }
 
@@ -74,7 +76,7 @@ impl SensorPublisher {
         // Empty where nothing is recorded: the agent need not wait for it.
         self.send((agent, Stream::Imu), capture_nanos, frame.motion());
         // Not counted as sent, since zenoh may drop previews.
-        let preview = publisher_of(&self.sensors, (agent, Stream::Preview));
+        let preview = self.sensors.get(&(agent, Stream::Preview));
         if let Some(preview) = preview.filter(|preview| preview.is_wanted()) {
             let points = frame.points.decimate(PREVIEW_POINTS);
             preview.submit(capture_nanos, Lidar { points });
@@ -96,43 +98,27 @@ impl SensorPublisher {
         capture_nanos: u64,
         message: M,
     ) {
-        if let Some(publisher) = publisher_of(&self.sensors, of) {
+        if let Some(publisher) = self.sensors.get(&of) {
             publisher.submit(capture_nanos, message);
-            count(&mut self.sent, publisher.topic());
+            *self.sent.entry(publisher.topic().clone()).or_default() += 1;
         }
     }
 
     /// Submits the ground truth of one tick.
     pub(super) fn submit_truth(&mut self, capture_nanos: u64, truth: Truth) {
         self.truth.submit(capture_nanos, truth);
-        count(&mut self.sent, self.truth.topic());
+        *self.sent.entry(self.truth.topic().clone()).or_default() += 1;
     }
 
     /// Sends queued messages and ends every topic; returns the number of submitted messages by topic.
     pub(super) fn finish(self) -> Vec<TopicCount> {
-        for (_, publisher) in self.sensors {
+        for publisher in self.sensors.into_values() {
             publisher.finish();
         }
         self.truth.finish();
-        self.sent
-    }
-}
-
-fn publisher_of(
-    sensors: &[((usize, Stream), Publisher)],
-    of: (usize, Stream),
-) -> Option<&Publisher> {
-    let found = sensors.iter().find(|(known, _)| *known == of);
-    found.map(|(_, publisher)| publisher)
-}
-
-fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
-    match sent.iter_mut().find(|count| count.topic == *topic) {
-        Some(count) => count.messages += 1,
-        None => sent.push(TopicCount {
-            topic: topic.clone(),
-            messages: 1,
-        }),
+        let sent = self.sent.into_iter();
+        sent.map(|(topic, messages)| TopicCount { topic, messages })
+            .collect()
     }
 }
 

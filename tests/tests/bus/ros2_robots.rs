@@ -183,7 +183,8 @@ impl Drive {
                 fused += usize::from(!result.fused.is_empty());
             }
         }
-        let precision = scorers.map(|scorer| scorer.average_precisions(Ordering::Global)[0]);
+        let precision =
+            scorers.map(|scorer| scorer.average_precisions(Ordering::Global)[0].unwrap());
         let last = results.last().map(|(_, result)| result);
         let neighbour = last.and_then(|result| result.neighbours.first());
         Phase {

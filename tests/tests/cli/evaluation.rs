@@ -2,13 +2,14 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::GroundTruth;
 use protocol::Detection;
 use serde_json::Value;
 use simulator::generate::{Subset, SynthOptions, generate};
-use tests::fleet::{deploy_file, v2vloc, write_scenario};
+use tests::fleet::{deploy_file, programs, v2vloc, write_scenario};
 
 const FRAMES: usize = 3;
 
@@ -176,10 +177,43 @@ fn a_tick_without_the_true_pose_of_the_ego_is_left_out_as_if_it_were_not_there()
         (&unposed["frames"], &unposed["left_out"]["ticks"]),
         (&(FRAMES - 1).into(), &1.into())
     );
+    check_other_commands(folder.path(), &finding);
     fs::remove_file(sweep).unwrap();
     fs::remove_file(yaml).unwrap();
     let (_, without, _) = evaluated(&scene);
     assert_eq!(unposed["ap_global"], without["ap_global"]);
+}
+
+/// `ego-fuser eval` and `v2vloc up` in simulation time leave the same tick out, with the same words.
+fn check_other_commands(folder: &Path, finding: &str) {
+    let weights = deploy_file("weights/lean-max.safetensors");
+    let mut eval = Command::new(programs().join("ego-fuser"));
+    eval.args(["eval", "--method", "late", "--json", "--weights", &weights]);
+    let output = eval.arg("--dataset").arg(folder.join("scene")).output();
+    let output = output.unwrap();
+    let notes = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(3), "{notes}");
+    assert!(notes.contains(finding), "{notes}");
+    let rows: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(rows[0]["frames"], FRAMES - 1);
+
+    let (scenario, runs) = (folder.join("scenario.yaml"), folder.join("runs"));
+    let text = format!(
+        "run: test\nscene: {{dir: scene}}\nmodels: {{weights: {weights}}}\nmethod: late\nclock: stepped\n\
+         stepped: {{compute: {{pose_ms: 5, map_ms: 30, fuse_ms: 10}}}}\n"
+    );
+    fs::write(&scenario, text).unwrap();
+    let [scenario, in_runs] = [&scenario, &runs].map(|path| path.display().to_string());
+    let output = v2vloc(&["up", &scenario, "--runs", &in_runs]);
+    let notes = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(3), "{notes}");
+    assert!(notes.contains(finding), "{notes}");
+    let metrics = fs::read_to_string(runs.join("test/metrics.json")).unwrap();
+    let metrics: Value = serde_json::from_str(&metrics).unwrap();
+    assert_eq!(
+        (&metrics["ticks"], &metrics["answered"]),
+        (&(FRAMES - 1).into(), &(FRAMES - 1).into())
+    );
 }
 
 #[test]

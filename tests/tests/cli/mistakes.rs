@@ -15,7 +15,7 @@ type Row = (&'static str, i32, &'static str);
 const EVAL: &str = "v2vloc eval --dataset {s} --weights {w} --method max";
 
 /// Mistakes in options of an evaluation: what follows [`EVAL`].
-const OF_AN_EVALUATION: [Row; 28] = [
+const OF_AN_EVALUATION: [Row; 29] = [
     (
         "--noise-position-std-m 2",
         2,
@@ -49,6 +49,11 @@ const OF_AN_EVALUATION: [Row; 28] = [
     ("--seed 3", 2, "--link"),
     ("--attackers 2", 2, "--attack"),
     ("--attack noise --attackers 0", 2, "attackers is 0"),
+    (
+        "--attack noise --attackers 5",
+        2,
+        "attackers is 5, but no scenario has",
+    ),
     (
         "--delay-ms 20000",
         2,

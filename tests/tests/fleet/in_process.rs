@@ -29,7 +29,7 @@ use recording::{Recording, RecordingOptions};
 use sim_replay::recorder::{self, RecordReport, RecorderOptions};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
-use tests::bus::{TIMEOUT, TestRouter, ego_options, next_event};
+use tests::bus::{TIMEOUT, TestRouter, ego_options, next_event, wait_for};
 use tests::{networks, scene};
 use zenoh::Wait;
 
@@ -450,7 +450,8 @@ struct ScriptedAgent {
     index: usize,
     /// Offset of its capture times, nanoseconds.
     ahead_nanos: u64,
-    _presence: bus::LivelinessToken,
+    /// Until it leaves.
+    _presence: Option<bus::LivelinessToken>,
 }
 
 impl ScriptedAgent {
@@ -469,7 +470,7 @@ impl ScriptedAgent {
             agent: agent(AGENTS[index], Method::MAX),
             index,
             ahead_nanos: 0,
-            _presence: presence,
+            _presence: Some(presence),
         }
     }
 
@@ -678,6 +679,56 @@ fn late_killed_and_faulty_neighbours_are_named_and_the_ego_continues() {
         &process_id(protocol::Role::Ego, &cav("10")),
     ));
     assert_eq!(own.unwrap().received, 6);
+}
+
+#[test]
+fn a_map_that_the_link_delivers_after_its_sender_has_left_is_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let [mut own, mut neighbour] = [0, 1].map(|index| ScriptedAgent::new(&router, index));
+    // The link publishes under the stamp of the sender.
+    let link = router.join("link-10", "20");
+    let received = Topic::Received {
+        ego: cav("10"),
+        cav: cav("20"),
+        stream: Stream::Bev,
+    };
+    let options = PublisherOptions::FEATURES.lossless(8);
+    neighbour.publisher = link.publisher(received.clone(), options).unwrap();
+    let results = Results::of_10(&router);
+    let bus = router.join("ego-10", "10");
+    std::thread::scope(|scope| {
+        let ego = scope.spawn(|| {
+            let options = ego_node::NodeOptions {
+                over_link: true,
+                keeps_running: true,
+                ..ego_options(TIMEOUT)
+            };
+            ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
+        });
+        own.wait_for_route("ego-10");
+        neighbour.wait_for_route("ego-10");
+        neighbour.send(&scenario, 0);
+        own.send(&scenario, 0);
+        assert_eq!(fused(&results.next()), ["20"]);
+
+        // Decided when the ego knows that 20 has left.
+        neighbour._presence = None;
+        own.send(&scenario, 1);
+        assert!(results.next().fused.is_empty());
+
+        neighbour.send(&scenario, 1);
+        let account = Account::towards(received, &process_id(protocol::Role::Ego, &cav("10")));
+        wait_for("the late map is counted", || {
+            let ledger = bus.stats().ledger();
+            let counts = ledger.get(&account);
+            counts.is_some_and(|counts| counts.dropped.get(&DropReason::Stale) == Some(&1))
+        });
+        stop.request();
+        ego.join().unwrap();
+    });
 }
 
 #[test]

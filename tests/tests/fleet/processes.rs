@@ -11,7 +11,9 @@ use protocol::{Stream, Topic, TracksReport};
 use recording::Recording;
 use runner::scenario::Scenario;
 use serde_json::Value;
+use sim_replay::config::LinkProcessConfig;
 use support::file_digests::FileDigests;
+use support::random::scenario_seed;
 use tests::fleet::{
     TIMEOUT, Up, check_origin, fused, is_running, programs, results, signal, write_scenario,
     write_sighted_weights, write_weights_with_box_input,
@@ -164,7 +166,7 @@ fn a_fleet_runs_over_an_emulated_link() {
     // 131 kB at 20 Mbit/s take 53 ms; the next message has to wait.
     let link = "capacity: {token_bucket: {bandwidth_mbps: 20}}\nlatency: {constant_ms: 30}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
-    let rest = "link: {model: link.yaml}\nego: {deadline_ms: 5000}";
+    let rest = "link: {model: link.yaml, seed: 5}\nego: {deadline_ms: 5000}";
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", rest);
     let mut up = Up::start(folder.path(), &scenario);
     let status = up.wait();
@@ -186,6 +188,13 @@ fn a_fleet_runs_over_an_emulated_link() {
         "{latency_ms} ms are less than the link takes"
     );
     assert!(run.join("log/link-4279.log").exists());
+    // The seed of simulation time: the same messages are lost on both clocks.
+    let config = fs::read_to_string(run.join("config/link-4279.yaml")).unwrap();
+    let config: LinkProcessConfig = serde_saphyr::from_str(&config).unwrap();
+    let scenario = Scenario::load(&run.join("scenario.yaml")).unwrap();
+    let expected = scenario_seed(5, &scenario.scene.scenario.unwrap());
+    assert_eq!(config.link.seed, expected);
+    assert_eq!(scenario.link.unwrap().seed, 5, "as configured");
 }
 
 #[test]

@@ -7,7 +7,7 @@ use perception::boxes::nms::rotated_nms;
 use perception::boxes::postprocess::{
     self, AgentBoxes, Candidate, PostprocessConfig, corners_to_box,
 };
-use perception::model_config::AnchorConfig;
+use perception::model_config::{AnchorConfig, DetectorConfig};
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Pose};
 use serde_json::Value;
@@ -24,13 +24,7 @@ fn golden_c3_anchors_full() {
             continue;
         }
         let voxel = [0.4, 0.4, 4.0];
-        let anchors = Anchors::new(
-            range,
-            voxel,
-            pillar_grid(range, voxel),
-            stride,
-            &AnchorConfig::default(),
-        );
+        let anchors = anchors(range, voxel, stride, DetectorConfig::full().anchors);
         assert_close(
             name,
             &anchors.x_m,
@@ -193,16 +187,9 @@ impl PostprocessCase {
                 .iter()
                 .filter_map(Value::as_f64)
                 .collect(),
-            ..AnchorConfig::default()
+            ..DetectorConfig::full().anchors
         };
-        let stride = integer(&config["stride"]) as usize;
-        let anchors = Anchors::new(
-            range,
-            voxel,
-            pillar_grid(range, voxel),
-            stride,
-            &anchor_config,
-        );
+        let anchors = anchors(range, voxel, integer(&config["stride"]), anchor_config);
         let (_, expected) = golden.f64("anchors");
         assert_eq!(expected.len(), anchors.len() * 7);
         for (index, expected) in expected.as_chunks::<7>().0.iter().enumerate() {
@@ -404,6 +391,15 @@ fn array<const N: usize>(value: &Value) -> [f64; N] {
         .unwrap_or_else(|_| panic!("{value} has not {N} numbers"))
 }
 
-fn pillar_grid(range: [f64; 6], voxel: [f64; 3]) -> [usize; 3] {
-    std::array::from_fn(|axis| ((range[axis + 3] - range[axis]) / voxel[axis]).round() as usize)
+/// The anchors of a head whose cells cover `stride` pillars along an axis.
+fn anchors(range: [f64; 6], voxel: [f64; 3], stride: i64, anchors: AnchorConfig) -> Anchors {
+    Anchors::for_detector(&DetectorConfig {
+        lidar_range_m: range,
+        voxel_size_m: voxel,
+        layer_strides: vec![stride],
+        upsample_strides: vec![1],
+        shrink: None,
+        anchors,
+        ..DetectorConfig::full()
+    })
 }

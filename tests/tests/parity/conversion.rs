@@ -72,7 +72,7 @@ fn golden_converted_multi_scale_networks_answer_as_the_reference() {
         let (sweeps, _) = pillars(&golden);
         let batch = PillarBatch::new(
             &sweeps.iter().collect::<Vec<_>>(),
-            network.network().pillar_grid(),
+            &network.network().pillar_grid,
         );
         let [width, height, _] = network
             .network()

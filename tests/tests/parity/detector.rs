@@ -153,13 +153,15 @@ fn golden_c2_voxelise() {
         let grid: [usize; 3] = array(&config["grid"]).map(|count| count as usize);
         let caps = [&config["max_points_per_voxel"], &config["max_voxels"]]
             .map(|cap| integer(cap) as usize);
-        let mut voxeliser = Voxeliser::new(
-            array(&config["lidar_range"]),
-            array(&config["voxel_size"]),
-            grid,
-            caps[0],
-            caps[1],
-        );
+        let config = DetectorConfig {
+            lidar_range_m: array(&config["lidar_range"]),
+            voxel_size_m: array(&config["voxel_size"]),
+            max_points_per_pillar: caps[0],
+            max_pillars: caps[1],
+            ..DetectorConfig::full()
+        };
+        assert_eq!(config.pillar_grid(), grid, "{name}");
+        let mut voxeliser = Voxeliser::for_detector(&config);
         let (_, points) = golden.f32(&format!("{name}.in.points"));
         let points: Vec<[f32; 4]> = points.as_chunks().0.to_vec();
         let pillars = voxeliser.voxelise(&points);

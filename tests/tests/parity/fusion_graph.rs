@@ -204,7 +204,7 @@ fn golden_c6_where2comm_opencood() {
     assert_codec_agrees(&single["communication"], "threshold", &logits, &sent);
     let sent = exempt(&sent, &agents, |agent| agent == 0);
     let maps = tensor(&golden, "single.in.x") * sent;
-    let fusion = Where2comm::new(&Where2commConfig {
+    let fusion = Where2comm(Where2commConfig {
         aggregation: MapAggregation::Attention,
         missing: Missing::Zero,
     });
@@ -285,7 +285,7 @@ fn golden_c6_where2comm_orig_single() {
         [height, width],
         &config["downsample_rate"],
     );
-    let fusion = Where2comm::new(&Where2commConfig {
+    let fusion = Where2comm(Where2commConfig {
         aggregation: MapAggregation::Attention,
         missing: Missing::Zero,
     });
@@ -371,14 +371,14 @@ fn golden_c6_e2e_where2comm_single() {
     let network = PointPillars::new(&variables.root(), &detector).unwrap();
     load(&variables, &golden, "");
     let (sweeps, _) = pillars(&golden);
-    let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.pillar_grid());
+    let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &network.pillar_grid);
     let maps = no_grad(|| network.features(&batch, false));
     let confidence = no_grad(|| network.heads(&maps)).unwrap().confidence();
     let gate = gate(&fusion["communication"], "threshold");
     let (_, agents) = golden.i64("in.record_len");
     let [fused, rates] = [0, 1].map(|_| Vec::<Tensor>::new());
     let (mut fused, mut rates) = (fused, rates);
-    let fusion = Where2comm::new(&Where2commConfig {
+    let fusion = Where2comm(Where2commConfig {
         aggregation: MapAggregation::Attention,
         missing: Missing::Zero,
     });
@@ -473,7 +473,7 @@ fn check_heads(golden: &Golden, network: &MultiScaleNetwork, samples: &[MapAlign
     let (sweeps, _) = pillars(golden);
     let batch = PillarBatch::new(
         &sweeps.iter().collect::<Vec<_>>(),
-        network.network().pillar_grid(),
+        &network.network().pillar_grid,
     );
     let output = no_grad(|| network.forward(&batch, samples)).unwrap();
     assert_close(

@@ -401,14 +401,17 @@ fn an_interrupted_table_resumes_at_the_next_cell() {
     let mut first = Cells::default();
     table::run(&spec(""), &out, None, &mut first).unwrap();
     assert_eq!((first.known, first.computed), (0, 2));
+    // The same file twice is refused; a copy is another training with the same contents.
+    let copy = folder.path().join("copy.safetensors");
+    fs::copy(&init, &copy).unwrap();
     let row = format!(
         "  - {{name: best, method: late, weights: [{}, {}]}}\n",
         init.display(),
-        init.display()
+        copy.display()
     );
     let mut second = Cells::default();
     let filled = table::run(&spec(&row), &out, None, &mut second).unwrap();
-    // The second training is the same file: its cells are those of the first.
+    // The second training has the contents of the first: its cells are those of the first.
     assert_eq!((second.known, second.computed), (4, 2));
     assert_eq!(filled[0].rows[1].cells[0].len(), 2);
     let text = fs::read_to_string(out.join("noise.md")).unwrap();

@@ -51,6 +51,11 @@ impl DrivenArea {
                 .entry(position.map(|metres| (metres / cell_m).floor() as i64))
                 .or_default() += 1;
         }
+        Self::of_counts(cell_m, counts)
+    }
+
+    /// Area of the cells of this edge, metres, with their numbers of sweeps.
+    fn of_counts(cell_m: f64, counts: BTreeMap<[i64; 2], usize>) -> Self {
         let cells = counts.into_iter().map(|(cell, sweeps)| DrivenCell {
             corner_m: cell.map(|k| k as f64 * cell_m),
             sweeps,
@@ -61,9 +66,27 @@ impl DrivenArea {
         }
     }
 
-    /// The area that a head states, if it states one.
+    /// This area together with that of earlier drives, on the coarser of the two grids.
+    pub fn merged(&self, earlier: &Self) -> Self {
+        let cell_m = self.cell_m.max(earlier.cell_m);
+        let mut counts = BTreeMap::new();
+        for area in [self, earlier] {
+            for cell in &area.cells {
+                // By its middle, as grids need not have corners in common.
+                let middle = cell.corner_m.map(|metres| metres + 0.5 * area.cell_m);
+                let count: &mut usize = counts
+                    .entry(middle.map(|metres| (metres / cell_m).floor() as i64))
+                    .or_default();
+                *count = count.saturating_add(cell.sweeps);
+            }
+        }
+        Self::of_counts(cell_m, counts)
+    }
+
+    /// The area that a head states, if it states a valid one.
     pub fn of_head(head: &Weights) -> Option<Self> {
-        head.metadata_json(DRIVEN_AREA_KEY).ok()
+        let area: Self = head.metadata_json(DRIVEN_AREA_KEY).ok()?;
+        area.check().is_ok().then_some(area)
     }
 
     /// Writes the area into the file of a head; returns the digest of the file.
@@ -165,6 +188,24 @@ mod tests {
             "one cell"
         );
         assert!(!DrivenArea::of(&[]).covers([0.0, 0.0]));
+    }
+
+    #[test]
+    fn areas_are_merged_on_the_coarser_grid() {
+        let [west, east] =
+            [[0.0, 60.0], [60.0, 100.0]].map(|xs| DrivenArea::of(&xs.map(|x| [x, 30.0])));
+        let both = west.merged(&east);
+        assert_eq!((both.picture().as_str(), both.cell_m), ("#.#.#\n", 25.0));
+        let sweeps = Vec::from_iter(both.cells.iter().map(|cell| cell.sweeps));
+        assert_eq!(sweeps, [1, 2, 1]);
+        let large = DrivenArea::of(&[[0.0, 0.0], [9_000.0, 0.0]]);
+        let all = both.merged(&large);
+        assert_eq!(all, large.merged(&both));
+        // All of the road lies in the first cell of 150 m.
+        assert_eq!(
+            (all.cell_m, all.cells[0].sweeps, all.cells.len()),
+            (150.0, 5, 2)
+        );
     }
 
     #[test]

@@ -107,11 +107,20 @@ pub fn is_name(head: &Path) -> bool {
     head.components().count() == 1 && head.extension().is_none()
 }
 
-/// The encoder that a head names, or its digest if no file has it.
-fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>> {
+/// The file of a head and its configuration.
+///
+/// # Errors
+/// [`FileError`] for a missing file, and for one of another kind.
+pub fn head_config(head: &Path) -> Result<(Weights, SceneHeadConfig)> {
     let weights = Weights::load(head)?;
     weights.check_kind(SceneHead::KIND)?;
-    let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;
+    let config = weights.config()?;
+    Ok((weights, config))
+}
+
+/// The encoder that a head names, or its digest if no file has it.
+fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>> {
+    let sha256 = head_config(head)?.1.encoder_sha256;
     let folders = head
         .parent()
         .map(Path::to_owned)

@@ -23,7 +23,7 @@ use super::head_config::SceneHeadConfig;
 use super::localization::{ENCODE, REGRESS, VOXELISE, stopwatch};
 use super::localize::LocalizerInput;
 use super::pose_refinement::SweepCells;
-use super::pose_solver::PoseSolver;
+use super::pose_solver::{MIN_CELLS, PoseSolver};
 use super::scene_coordinates::SceneCoordinates;
 use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
@@ -116,7 +116,8 @@ impl Localizer {
         Ok((localizer, weights))
     }
 
-    /// Adds the activations of a sweep to a search for their scales; a sweep without cells has none.
+    /// Adds the activations of a sweep to a search for their scales, unless it has too few cells to be localized: theirs are no
+    /// evidence for those of others.
     ///
     /// # Errors
     /// [`LocalizerError::Tensor`](super::LocalizerError::Tensor) when the tensor library fails.
@@ -125,6 +126,9 @@ impl Localizer {
             return Ok(());
         };
         let (sweep, features) = (&encoded.sweep, &encoded.features);
+        if sweep.cells().len() < MIN_CELLS {
+            return Ok(());
+        }
         self.encoder.observe(sweep, search)?;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
         let cells = SweepCells::pick(sweep.cells(), features, &chosen)?.features;
@@ -271,6 +275,7 @@ mod tests {
     use tch::nn::VarStore;
 
     use super::*;
+    use crate::pgc::{SceneEncoder, SceneEncoderConfig};
 
     /// The file of a head with this metadata.
     fn head(folder: &Path, metadata: &[(&str, String)]) -> Weights {
@@ -304,6 +309,59 @@ mod tests {
         let calibrated = head(folder.path(), &[(CONFIDENCE_KEY, model), covariance]);
         let (_, scale) = stored_fits(&calibrated).unwrap();
         assert_eq!(scale.unwrap().bound, Some(4.0));
+    }
+
+    /// A small localizer with random parameters.
+    fn small() -> Localizer {
+        let config = SceneEncoderConfig {
+            voxel_m: 1.0,
+            range_m: 40.0,
+            widths: vec![8, 12, 16],
+            residual_widths: vec![16],
+            ..SceneEncoderConfig::lean()
+        };
+        let head = SceneHeadConfig {
+            scene_name: "test".into(),
+            encoder_sha256: String::new(),
+            cell_channels: config.cell_channels(),
+            sweep_channels: config.sweep_channels(),
+            classes: 2,
+            centres: 3,
+            width: 8,
+            blocks: 1,
+            origin_m: [0.0; 3],
+            max_cells: 500,
+            refiner: None,
+            sweep_points: None,
+        };
+        let [of_encoder, of_head] = [(); 2].map(|()| VarStore::new(Device::Cpu));
+        let encoder = SceneEncoder::new(&of_encoder.root(), &config).unwrap();
+        Localizer {
+            encoder: CellEncoder::sparse(encoder, Device::Cpu),
+            head: SceneHead::new(&of_head.root(), &head).unwrap(),
+            solver: PoseSolver::default(),
+            most_parts: MOST_PARTS,
+            encoder_sha256: String::new(),
+            driven_area: None,
+        }
+    }
+
+    #[test]
+    fn sweeps_of_too_few_cells_are_no_evidence_for_scales() {
+        let localizer = small();
+        for (points, is_observed) in [(20, false), (4000, true)] {
+            let xyzi = (0..points).map(|k| {
+                let (x, y, z) = (k % 80, k / 80, k % 7);
+                [x as f32 * 0.5 - 20.0, y as f32 - 25.0, z as f32 * 0.5, 0.1]
+            });
+            let cloud = PointCloud {
+                xyzi: xyzi.collect(),
+            };
+            let mut search = ScaleSearch::default();
+            localizer.observe(&cloud, &mut search).unwrap();
+            let is_empty = search.scales().is_empty();
+            assert_eq!(is_empty, !is_observed, "{points} points");
+        }
     }
 
     #[test]

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use perception::weights::Weights;
 use protocol::PointCloud;
 
 use super::head_config::SceneHeadConfig;
+use super::head_files::head_config;
 use crate::registration::icp::surfel_map::SurfelMap;
 
 /// Smallest ratio of numbers of points, and the inverse of the largest, at which sweeps count as those of one LiDAR: the
@@ -28,9 +28,7 @@ pub fn sweep_points(head: &Path) -> Option<usize> {
 }
 
 fn config_of(head: &Path) -> Option<SceneHeadConfig> {
-    Weights::load(head)
-        .and_then(|weights| weights.config())
-        .ok()
+    Some(head_config(head).ok()?.1)
 }
 
 /// The hint that sweeps are those of another LiDAR, if their median number of points is far from that of

@@ -138,7 +138,7 @@ impl PoseSourceConfig {
         self
     }
 
-    /// The same for one scenario of many: only tables of poses differ between scenarios.
+    /// The same for one scenario of many: tables of poses and seeds of errors differ between scenarios.
     pub fn for_scenario(&self, name: &str) -> Self {
         self.clone().changed(|settings| settings.set_scenario(name))
     }

@@ -58,9 +58,9 @@ impl NoisyPoseConfig {
         self.scaled([x, y, z, yaw])
     }
 
-    /// The error of a vehicle at a step of time, independent of all others.
-    pub(super) fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
-        self.scaled(draw(&self.random(cav), step))
+    /// The error of a vehicle at a capture time, nanoseconds, independent of all others.
+    pub(super) fn independent(&self, cav: &CavId, capture_nanos: u64) -> PlanarError {
+        self.scaled(draw(&self.random(cav), capture_nanos))
     }
 
     /// The error of a vehicle at a step of time, correlated by `rho` from one step to the next.
@@ -106,11 +106,11 @@ pub(super) fn key(seed: u64, cav: &CavId) -> [u8; 32] {
     hash.finalize().into()
 }
 
-/// Four standard normals, those of `step`.
-fn draw(random: &ChaCha8Rng, step: u64) -> [f64; 4] {
+/// Four standard normals, those of this number.
+fn draw(random: &ChaCha8Rng, number: u64) -> [f64; 4] {
     let mut random = random.clone();
-    // The generator goes to any step at once: no draw depends on those before it.
-    random.set_word_pos(u128::from(step) * WORDS_PER_DRAW);
+    // The generator goes to any draw at once: none depends on those before it.
+    random.set_word_pos(u128::from(number) * WORDS_PER_DRAW);
     std::array::from_fn(|_| random.sample(StandardNormal))
 }
 

@@ -8,6 +8,7 @@ use protocol::config::{FieldError, within};
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use support::random::scenario_seed;
 
 use super::error_table::{ErrorTable, TableRow};
 use super::noise;
@@ -30,10 +31,10 @@ pub struct NoisyPoseConfig {
     #[arg(id = "noise_heading_std_deg", long = "noise-heading-std-deg")]
     #[arg(value_name = "DEG")]
     pub heading_std_deg: f64,
-    /// Seed of the errors (pose source noisy).
+    /// Seed of the errors, from which every scenario of a run derives its own (pose source noisy).
     #[arg(id = "noise_seed", long = "noise-seed", value_name = "SEED")]
     pub seed: u64,
-    /// Time between two draws of the modes that depend on time, seconds (pose source noisy).
+    /// Time between two autoregressive or replayed errors, seconds (pose source noisy).
     #[arg(id = "noise_step_s", long = "noise-step-s", value_name = "S")]
     pub step_s: f64,
     /// Time after which an autoregressive error has decayed to 1/e, seconds (pose source noisy).
@@ -100,10 +101,17 @@ impl PoseSettings for NoisyPoseConfig {
     fn has_use_for(&self, option: &str) -> bool {
         match option {
             "noise_position_std_m" | "noise_heading_std_deg" => self.mode != NoiseMode::Replayed,
-            "noise_step_s" => self.mode != NoiseMode::Fixed,
+            "noise_step_s" => !matches!(self.mode, NoiseMode::Fixed | NoiseMode::Independent),
             "noise_decay_s" => self.mode == NoiseMode::Autoregressive,
             // A table that is not replayed is refused with the other values.
             _ => true,
+        }
+    }
+
+    fn set_scenario(&mut self, name: &str) {
+        // OpenCOOD takes the same seed in every scenario.
+        if self.mode != NoiseMode::Fixed {
+            self.seed = scenario_seed(self.seed, name);
         }
     }
 
@@ -149,9 +157,10 @@ impl NoiseMode {
 
 /// The measured pose with an error of one of four kinds.
 ///
-/// The error depends on seed, vehicle and capture time alone, so a live run and an offline one get the same poses, and
-/// so does a run that lost frames. The confidence of a drawn error is `1 / (1 + e^2)` of its length in metres, as in
-/// Eq. 6 of the paper and in its experiments on recorded data; a replayed error has a confidence of its own.
+/// The error depends on seed, scenario, vehicle and capture time alone, so a live run and an offline one get the same
+/// poses, and so does a run that lost frames. A vehicle that is started alone belongs to no scenario. The confidence of a
+/// drawn error is `1 / (1 + e^2)` of its length in metres, as in Eq. 6 of the paper and in its experiments on recorded
+/// data; a replayed error has a confidence of its own.
 #[derive(Debug, Clone)]
 pub struct NoisyPose {
     config: NoisyPoseConfig,
@@ -176,7 +185,7 @@ impl NoisyPose {
 
     /// The pose of a vehicle at a capture time when the true one is `pose`.
     pub fn disturbed(&self, cav: &CavId, capture_nanos: u64, pose: &Pose) -> PoseEstimate {
-        // To the nearest step: capture times that jitter about a step keep its error.
+        // To the nearest step: capture times that jitter about a step keep their place in the sequence.
         let step_nanos = self.config.step_s * 1e9;
         let step = (capture_nanos as f64 / step_nanos).round() as u64;
         if let Some(table) = &self.table {
@@ -194,7 +203,9 @@ impl NoisyPose {
                 self.config.autoregressive(cav, step, rho)
             }
             // Replayed errors are those of the table.
-            NoiseMode::Independent | NoiseMode::Replayed => self.config.independent(cav, step),
+            NoiseMode::Independent | NoiseMode::Replayed => {
+                self.config.independent(cav, capture_nanos)
+            }
         };
         // Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
         let confidence = 1.0 / (1.0 + error.distance_m().powi(2));
@@ -261,6 +272,30 @@ mod tests {
             assert_eq!(first, disturbed(mode, "a", 1), "{mode:?}");
             assert_ne!(first, disturbed(mode, "a", 2), "{mode:?}");
             assert_ne!(first, disturbed(mode, "b", 1), "{mode:?}");
+        }
+    }
+
+    #[test]
+    fn independent_errors_are_of_one_frame_at_any_rate() {
+        // 20 Hz: two frames in a step of 0.1 s.
+        let errors = [0, 50, 100].map(|ms| {
+            let capture_nanos = ms * 1_000_000;
+            source(NoiseMode::Independent).disturbed(&cav("a"), capture_nanos, &TRUE_POSE)
+        });
+        assert!(errors[0] != errors[1] && errors[1] != errors[2]);
+    }
+
+    #[test]
+    fn each_scenario_has_errors_of_its_own_but_for_the_fixed_one() {
+        for mode in NoiseMode::value_variants() {
+            let [one, again, other] = ["one", "one", "two"].map(|name| {
+                let mut config = source(NoiseMode::Fixed).config;
+                config.mode = *mode;
+                config.set_scenario(name);
+                config.seed
+            });
+            assert_eq!(one, again, "{mode:?}");
+            assert_eq!(one == other, *mode == NoiseMode::Fixed, "{mode:?}");
         }
     }
 

@@ -195,6 +195,10 @@ mod tests {
                 "--pose-source=noisy --noise-mode=fixed --noise-step-s=1",
                 "--noise-step-s",
             ),
+            (
+                "--pose-source=noisy --noise-step-s=1",
+                "--noise-step-s has no effect on pose source noisy, noise mode independent",
+            ),
         ] {
             let words = ["p"].into_iter().chain(words.split(' '));
             let error = Cli::try_parse_from(words).unwrap_err();

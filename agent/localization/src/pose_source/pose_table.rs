@@ -1,6 +1,6 @@
 //! Table of poses on disk, one row per sweep, found by scenario, vehicle and capture time.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs::{self, OpenOptions};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -96,6 +96,23 @@ impl PoseTable {
         Some(self.origins.get(name).map_or("", String::as_str))
     }
 
+    /// Refuses poses of a scenario that were computed from other data than these, whose digest `sha256` computes. A table
+    /// without origin is not refused.
+    ///
+    /// # Errors
+    /// [`FileError`] with both digests.
+    pub fn check_data(&self, scenario: &str, sha256: impl FnOnce() -> String) -> Result<()> {
+        let stated = self.origin(scenario).unwrap_or_default();
+        let stated = { stated.strip_prefix("data ") }.and_then(|digests| digests.split(' ').next());
+        match stated.map(|stated| (stated, sha256())) {
+            Some((stated, found)) if stated != found => {
+                let wrong = format!("poses of {scenario} are of data {stated}, not of {found}");
+                Err(FileError::new(&self.path, wrong))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Scenarios are identified by the name of their folder, wherever that folder lies.
     pub fn key(scenario: &str) -> &str {
         scenario.rsplit('/').next().unwrap_or(scenario)
@@ -170,6 +187,8 @@ pub struct CachedPoseConfig {
 #[derive(Debug, Clone)]
 pub(crate) struct CachedPose {
     poses: HashMap<SweepKey, PoseEstimate>,
+    /// Vehicles of the table, and those that were named because it has none of them.
+    known: HashSet<CavId>,
 }
 
 impl PoseSettings for CachedPoseConfig {
@@ -179,7 +198,8 @@ impl PoseSettings for CachedPoseConfig {
 
     fn build(&self, _: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
         let poses = PoseTable::read(&self.file)?.of_scenario(self.scenario.as_deref())?;
-        Ok(Box::new(CachedPose { poses }))
+        let known = poses.keys().map(|(cav, _)| cav.clone()).collect();
+        Ok(Box::new(CachedPose { poses, known }))
     }
 
     fn validate(&self) -> Result<(), FieldError> {
@@ -198,6 +218,9 @@ impl PoseSettings for CachedPoseConfig {
 impl PoseSource for CachedPose {
     /// Ignores sweep and measured pose; a sweep that is not in the table has no source.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
+        if self.known.insert(input.cav.clone()) {
+            tracing::warn!(cav = %input.cav, "no pose: the table of poses has no row of this vehicle");
+        }
         let pose = self.poses.get(&(input.cav.clone(), input.capture_nanos));
         pose.copied().unwrap_or(NO_SOURCE)
     }
@@ -354,6 +377,45 @@ mod tests {
             config(&file, None).for_scenario("two"),
             config(&file, Some("two"))
         );
+    }
+
+    #[test]
+    fn poses_of_other_data_are_refused_with_both_digests() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("poses.csv");
+        let a = cav("a");
+        for (scenario, origin) in [("one", "data d1 head h"), ("two", "")] {
+            PoseTable::append(&file, scenario, origin, &[row(&a, 100, LOST)]).unwrap();
+        }
+        let table = PoseTable::read(&file).unwrap();
+        for scenario in ["elsewhere/one", "two", "three"] {
+            table.check_data(scenario, || "d1".to_owned()).unwrap();
+        }
+        let refused = table.check_data("one", || "d2".to_owned());
+        let message = refused.unwrap_err().to_string();
+        let parts = ["poses.csv: poses of one", "data d1", "d2"];
+        assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    }
+
+    #[test]
+    fn a_vehicle_without_rows_is_named_and_has_no_pose() {
+        let (a, b) = (cav("a"), cav("b"));
+        let poses = HashMap::from([((a.clone(), 100), found())]);
+        let known = HashSet::from([a.clone()]);
+        let mut source = CachedPose { poses, known };
+        for (cav, expected) in [(&a, found()), (&b, NO_SOURCE), (&b, NO_SOURCE)] {
+            let estimate = source.estimate(&PoseInput {
+                cav,
+                capture_nanos: 100,
+                cloud: &PointCloud::default(),
+                levels: None,
+                measured: None,
+                motion: protocol::EgoMotion::default(),
+            });
+            assert_eq!(estimate, expected);
+        }
+        // Named are those that become known by being asked for.
+        assert_eq!(source.known, HashSet::from([a, b]));
     }
 
     #[test]

@@ -65,7 +65,7 @@ pub(crate) trait PoseSettings {
         None
     }
 
-    /// Chooses one scenario of many.
+    /// Chooses one scenario of many, once: a seed is derived from the one before.
     fn set_scenario(&mut self, _name: &str) {}
 
     /// Lets several vehicles on one machine measure in turn.

@@ -9,17 +9,18 @@ use agent_offline::evaluation::{
     evaluate_nearest, evaluate_source, reliability_charts,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
+use agent_offline::sweep_database::repeated;
 use anyhow::Context;
 use clap::{ArgGroup, ValueEnum};
 use dataset::{self, LeftOut};
 use localization::baselines::{LightLoc, ScanContext, load_baseline, load_descriptor};
-use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
+use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale, NoScale};
 use localization::map_registration::MapRegistration;
 use localization::map_search::MapSearch;
 use localization::pgc::confidence::{
-    CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Labelled, Rejection,
+    BAD_M, CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Labelled, Rejection,
 };
-use localization::pgc::head_files::encoder_or_named;
+use localization::pgc::head_files::{encoder_or_named, head_config};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer, stored_confidence};
@@ -42,7 +43,9 @@ use support::provenance::Provenance;
 use terminal::progress;
 
 use super::retrieval::{self, RetrievalBy, shown_on};
-use super::scene_heads::{SceneHeadFile, by_head, surfel_map, with_files};
+use super::scene_heads::{
+    SceneHeadFile, by_head, check_place, generated_maps, is_elsewhere, surfel_map, with_files,
+};
 use support::cli::{BadInput, Outcome};
 
 /// Options that change the tracker alone.
@@ -204,6 +207,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         let reason = format!("one head is fitted, {count} are given");
         return Err(BadInput::new(reason).into());
     }
+    args.note_own_drives()?;
     let (mut sweeps, mut tracked, mut left_out) = (Vec::new(), Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
         let evaluated = args.evaluate(args.subject(head, &mut left_out)?, scenes)?;
@@ -218,7 +222,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         args.fit(head, &mut sweeps)?;
     }
     args.write(if args.tracked { &tracked } else { &sweeps })?;
-    let summary = LocalizationSummary::of(&sweeps);
+    let mut summary = LocalizationSummary::of(&sweeps);
+    let registered = sweeps.iter().filter(|sweep| sweep.is_registered());
+    summary.registered = args.surfel_map.as_ref().map(|_| registered.count());
+    if let (Some(map), Some(0)) = (&args.surfel_map, summary.registered) {
+        let map = map.display();
+        output::note(format_args!(
+            "{map}: registered no pose: is it a surfel map of this place, in the frame of the head?"
+        ));
+    }
     let is_lost = summary.no_pose == summary.sweeps && args.uses_head();
     if let ([(head, scenes)], true) = (&groups[..], is_lost) {
         let (sweeps, map) = (summary.sweeps as u64, map_text(scenes));
@@ -261,6 +273,20 @@ impl Args {
         let map = read_map(&self.icp_map, spacing_m, &config, left_out).map_err(BadInput::of)?;
         let source = IcpMapPose::new(Arc::new(map), config);
         Ok(Subject::Source(Box::new(source)))
+    }
+
+    /// Notes sweeps that are compared with themselves.
+    fn note_own_drives(&self) -> Result<(), BadInput> {
+        let drives = self.retrieval.iter().chain(&self.icp_map);
+        if drives.clone().next().is_some()
+            && let Some(reason) =
+                repeated(self.dataset.iter().chain(drives)).map_err(BadInput::of)?
+        {
+            output::note(format_args!(
+                "{reason}: a comparison with itself measures nothing"
+            ));
+        }
+        Ok(())
     }
 
     /// Command, and digests of the program, the networks and all data that are read.
@@ -429,7 +455,9 @@ impl Args {
         if let (true, Err(reason)) = (self.fit_covariance, &scale) {
             return Err(BadInput::of(reason.clone()).into());
         }
+        self.check_place(head)?;
         if let Some((model, report)) = fitted {
+            check_good(&report)?;
             write_fit(head, CONFIDENCE_KEY, &model)?;
             output::note(report_line(&report));
         }
@@ -441,10 +469,20 @@ impl Args {
         };
         match scale {
             Ok(scale) => write_fit(fitted, COVARIANCE_KEY, &scale),
-            Err(reason) => {
-                output::note(format_args!("the covariances are not fitted: {reason}"));
-                Ok(())
-            }
+            Err(reason) => reset_scale(head, &reason),
+        }
+    }
+
+    /// Refuses to fit a head to drives none of which is of its place: those of others give the wrong poses of a fit.
+    fn check_place(&self, head: &Path) -> Result<(), BadInput> {
+        // A surfel map in place of a head has no configuration.
+        let Ok((_, config)) = head_config(head) else {
+            return Ok(());
+        };
+        let maps = generated_maps(&self.dataset)?;
+        match maps.iter().all(|map| is_elsewhere(map.as_ref(), &config)) {
+            true => check_place((head, &config), &maps, &[]),
+            false => Ok(()),
         }
     }
 
@@ -496,10 +534,27 @@ fn write_fit(file: &Path, key: &str, fitted: &impl Serialize) -> anyhow::Result<
     Ok(())
 }
 
-/// Name of the generated map of the first scenario.
-fn map_text(scenes: &[PathBuf]) -> Option<String> {
-    let dataset = dataset::open(scenes.first()?).ok()?;
-    Some(dataset.scenarios.first()?.generated_map().ok()?.to_string())
+/// Refuses a threshold that was fitted to wrong poses alone: it would reject every pose.
+fn check_good(report: &FitReport) -> Result<(), BadInput> {
+    let poses = report.sweeps;
+    match report.bad < poses {
+        true => Ok(()),
+        false => Err(BadInput::new(format!(
+            "none of {poses} poses is within {BAD_M} m of the true one: a confidence that is fitted to them rejects all"
+        ))),
+    }
+}
+
+/// Notes why there is no scale for a new sigma. One that the head has was fitted to another sigma: it is reset.
+fn reset_scale(head: &Path, reason: &NoScale) -> anyhow::Result<()> {
+    output::note(format_args!(
+        "the covariances are not fitted: {reason}; the head keeps no factors and no bound of another sigma"
+    ));
+    let stored = Weights::load(head).map_err(BadInput::of)?;
+    match stored.metadata(COVARIANCE_KEY) {
+        None => Ok(()),
+        Some(_) => write_fit(head, COVARIANCE_KEY, &CovarianceScale::NONE),
+    }
 }
 
 fn report_line(report: &FitReport) -> String {
@@ -511,6 +566,12 @@ fn report_line(report: &FitReport) -> String {
         "fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones; of the \
          others at most {limit:.2} % are bad (95 % limit)"
     )
+}
+
+/// Name of the first generated map.
+fn map_text(scenes: &[PathBuf]) -> Option<String> {
+    let maps = generated_maps(scenes).ok()?;
+    Some(maps.into_iter().flatten().next()?.to_string())
 }
 
 /// Report as text: the numbers of all rows first, a dash for a missing one; then the rows, some only where there is
@@ -560,6 +621,12 @@ fn table(summary: &LocalizationSummary) -> String {
             "coverage   {sweeps} sweeps of low coverage (few training sweeps nearby), {no_pose} of them without a pose"
         ));
     }
+    if let Some(registered) = summary.registered {
+        let poses = summary.sweeps - summary.no_pose + rejected.poses;
+        rows.push(format!(
+            "registered {registered} of {poses} poses, to the surfel map"
+        ));
+    }
     if !summary.beyond_95.is_empty() {
         let shares = summary.beyond_95.iter();
         let shares = joined(shares.map(|(axis, share)| format!("{axis} {}", percent(*share))));
@@ -590,4 +657,58 @@ fn numbers<const N: usize>(values: [Option<f64>; N], digits: usize) -> [String; 
 
 fn percent(share: f64) -> String {
     format!("{:.1} %", 100.0 * share)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use perception::weights::{Precision, save};
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+
+    #[test]
+    fn a_confidence_is_not_fitted_to_wrong_poses_alone() {
+        let mut report = FitReport {
+            sweeps: 57,
+            bad: 56,
+            bad_rejected: 56,
+            good_rejected: 0,
+            wrong_limit: 0.0,
+        };
+        check_good(&report).unwrap();
+        report.bad = 57;
+        let message = check_good(&report).unwrap_err().to_string();
+        assert!(message.contains("none of 57 poses"), "{message}");
+    }
+
+    #[test]
+    fn factors_of_another_sigma_do_not_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let head = folder.path().join("head.safetensors");
+        let factors = r#"{"planar":2.0,"height":2.0,"tilt":2.0,"yaw":2.0,"bound":4.0}"#;
+        let metadata = BTreeMap::from([(COVARIANCE_KEY.to_owned(), factors.to_owned())]);
+        let none = VarStore::new(Device::Cpu);
+        save(&head, &none, &metadata, Precision::Single).unwrap();
+        reset_scale(&head, &NoScale::TooFew(45)).unwrap();
+        let stored = Weights::load(&head).unwrap();
+        let scale: CovarianceScale = stored.metadata_json(COVARIANCE_KEY).unwrap();
+        assert_eq!(scale, CovarianceScale::NONE);
+        // A head without factors gets none.
+        save(&head, &none, &BTreeMap::new(), Precision::Single).unwrap();
+        reset_scale(&head, &NoScale::TooFew(45)).unwrap();
+        let stored = Weights::load(&head).unwrap();
+        assert_eq!(stored.metadata(COVARIANCE_KEY), None);
+    }
+
+    #[test]
+    fn the_registered_poses_have_a_row_where_there_is_a_surfel_map() {
+        let mut summary = LocalizationSummary::of(&[]);
+        assert!(!table(&summary).contains("registered"));
+        (summary.sweeps, summary.no_pose, summary.registered) = (60, 5, Some(0));
+        summary.rejected.poses = 2;
+        assert!(table(&summary).contains("registered 0 of 57 poses"));
+    }
 }

@@ -78,6 +78,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     for scenario in &scenarios {
         let config = args.config(head_of(&files, scenario)?)?;
         let origin = origin(scenario, &config, &digests).map_err(BadInput::of)?;
+        let origin = origin + precision_text(args.precision);
         match done.origin(&scenario.name) {
             None => tasks.push((scenario, config, origin)),
             Some(before) if before == origin => {}
@@ -98,7 +99,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let bar = progress::bar(sweeps, "sweeps");
     let mut found = 0;
     let mut left_out = LeftOut::default();
-    left_out.add_findings(findings::sampled(&scenarios, IntensityScale::AUTO));
+    left_out.add_findings(findings::sampled(&scenarios, IntensityScale::AUTO, None));
     let inference = Inference::new(Device::Cpu, args.precision);
     for of_head in tasks.chunk_by(|(_, one, _), (_, next, _)| one == next) {
         let mut source = LocalizedPose::pgc(&of_head[0].1, inference).map_err(BadInput::of)?;
@@ -137,11 +138,7 @@ impl Args {
 
 /// Digests of all that the poses of a scenario are computed from.
 fn origin(scenario: &Scenario, config: &PgcConfig, digests: &FileDigests) -> io::Result<String> {
-    let mut unnamed = scenario.clone();
-    // The name depends on the folder that was opened.
-    unnamed.name.clear();
-    let data = dataset::content_sha256([&unnamed], None, digests);
-    let mut text = format!("data {data}");
+    let mut text = format!("data {}", dataset::scenario_sha256(scenario, digests));
     let (head, encoder, map) = (&config.head, &config.encoder, &config.surfel_map);
     let files = [("head", head), ("encoder", encoder), ("surfel map", map)];
     for (name, file) in files {
@@ -150,6 +147,14 @@ fn origin(scenario: &Scenario, config: &PgcConfig, digests: &FileDigests) -> io:
         }
     }
     Ok(text)
+}
+
+/// Number format at the end of an origin; tables of before, of the default, state none.
+fn precision_text(precision: InferencePrecision) -> &'static str {
+    match precision {
+        InferencePrecision::Int8 => "",
+        InferencePrecision::Float => " precision float",
+    }
 }
 
 /// Localizes a scenario, vehicle by vehicle in the order of time.
@@ -184,4 +189,16 @@ fn localized<'a>(
 /// Number of frames of a scenario.
 fn frames(scenario: &Scenario) -> usize {
     scenario.agents.len() * scenario.ticks.len() - scenario.absent_frames()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn poses_in_another_number_format_have_another_origin() {
+        let [default, float] = [InferencePrecision::default(), InferencePrecision::Float];
+        assert_eq!(precision_text(default), "", "as in the tables of before");
+        assert_eq!(precision_text(float), " precision float");
+    }
 }

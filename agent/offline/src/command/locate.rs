@@ -122,6 +122,8 @@ struct LocatedPose {
     bound_m: Option<f64>,
     /// Confidence, 0..=1.
     confidence: f64,
+    /// True if it was registered to a surfel map: then it is accurate to millimetres.
+    registered: bool,
 }
 
 /// Localizes every cloud and prints a line for each.
@@ -283,6 +285,7 @@ impl LocatedPose {
             covariance: pose_covariance(&found),
             bound_m: position_bound_m(&found),
             confidence: found.sigma,
+            registered: found.is_registered,
         }
     }
 }
@@ -344,6 +347,7 @@ mod tests {
             covariance,
             bound_m: None,
             confidence: 0.9876,
+            registered: false,
         };
         assert_eq!(
             located(Some(pose), None).text(),

@@ -19,7 +19,7 @@ use support::cli::{BadInput, Outcome};
 use support::file_error::AtFile;
 use support::{atomic_file, output};
 
-use super::train::options::check_folders;
+use super::scene_heads::check_one_map;
 
 /// Choice of the threshold without `--max-wrong`.
 const GOOD_LOSS: Rejection = Rejection::GoodLoss(0.01);
@@ -93,7 +93,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     check_spacing(args.surfel_spacing_m).map_err(BadInput::of)?;
     check_voxel(args.surfel_voxel_m).map_err(BadInput::of)?;
     if args.surfels_only {
-        check_folders(&args.drives)?;
+        check_one_map(&args.drives)?;
         check_out(&args.out, false, args.force).map_err(BadInput::of)?;
         atomic_file::create_folder(&args.out).at(&args.out)?;
         return Ok(args.write_surfels()?.print());
@@ -124,7 +124,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(left_out) = &report.left_out {
         output::note(format_args!("left out: {left_out}"));
     }
-    // The training may have read some of the sweeps only: what the others lack is named here.
+    // The training may have read some of the sweeps only: what the others lack is named here. Findings are, once more.
     let surfels = args.write_surfels()?.print();
     Ok(report.left_out.map_or(surfels, |_| Outcome::DataLost))
 }
@@ -153,7 +153,7 @@ impl Args {
     }
 
     fn config(&self) -> anyhow::Result<MapConfig> {
-        check_folders(&self.drives)?;
+        check_one_map(&self.drives)?;
         let minutes = self.minutes;
         let time = Duration::try_from_secs_f64(60.0 * minutes).ok();
         let time = time.filter(|time| !time.is_zero());

@@ -2,14 +2,17 @@
 
 use std::path::PathBuf;
 
+use agent_offline::sweep_database::add_faults;
 use dataset::{LeftOut, LoadOptions};
 use localization::pgc::Localizer;
-use localization::pgc::head_files::encoder_or_named;
+use localization::pgc::head_files::{encoder_or_named, head_config};
 use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};
 use perception::weights::annotate;
 use support::cli::{BadInput, Outcome};
 use support::output;
+
+use super::scene_heads::{check_place, generated_maps};
 
 /// Search the scales of activations on a few training sweeps of a scene and store them in its head, which is then
 /// computed in 8-bit integers, as is its encoder.
@@ -36,9 +39,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     // The confidence of a new head is fitted after this: its absence is no news.
     let localizer = Localizer::load_without_confidence(&encoder, &args.head, Inference::FLOAT);
     let localizer = localizer.map_err(BadInput::of)?;
+    // By the names of maps alone: poses may be in a frame of their own, they are not used here.
+    let (_, config) = head_config(&args.head).map_err(BadInput::of)?;
+    check_place((&args.head, &config), &generated_maps(&args.dataset)?, &[])?;
     let (mut search, mut left_out, mut observed) = (ScaleSearch::default(), LeftOut::default(), 0);
     for folder in &args.dataset {
-        for scenario in dataset::open(folder).map_err(BadInput::of)?.scenarios {
+        let drives = dataset::open(folder).map_err(BadInput::of)?;
+        add_faults(&drives, &mut left_out);
+        for scenario in &drives.scenarios {
             let (ticks, agents) = (scenario.ticks.len(), scenario.agents.len());
             let count = (ticks * agents).min(args.sweeps.into());
             for number in 0..count {
@@ -56,7 +64,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let scales = search.scales();
     if scales.is_empty() {
         return Err(BadInput::new(format!(
-            "none of {observed} sweeps has cells: nothing to search scales on"
+            "none of {observed} sweeps has as many cells as a pose needs: nothing to search scales on"
         ))
         .into());
     }

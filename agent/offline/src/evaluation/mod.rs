@@ -4,11 +4,11 @@ mod summary;
 mod table;
 
 use crate::Error;
-use crate::sweep_database::{posed, present_sweeps};
+use crate::sweep_database::{add_faults, posed, present_sweeps, repeated};
 use std::path::PathBuf;
 
 use dataset::frame::Frame;
-use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, findings};
+use dataset::{self, LeftOut, LoadOptions, Problem, ReadError};
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{
@@ -133,8 +133,8 @@ pub struct Evaluated {
 /// Localizes every sweep of the scenes in turn; `on_sweep` gets the number done and the number of all.
 ///
 /// # Errors
-/// [`Error`] when a data set cannot be opened, and where no sweep is left. Sweeps that cannot be read or have no true pose
-/// are left out and counted.
+/// [`Error`] when a data set cannot be opened or is there twice, and where no sweep is left. Sweeps that cannot be read or
+/// have no true pose are left out and counted.
 pub fn evaluate(
     localizer: &mut dyn Localize,
     options: &SweepSelection,
@@ -217,6 +217,10 @@ fn evaluate_with(
     on_sweep: &mut dyn FnMut(usize, usize),
     mut localize: impl FnMut(&Frame, &Pose, bool) -> Result<Localization, LocalizerError>,
 ) -> Result<Evaluated, Error> {
+    // Sweeps that count twice are no further evidence: a fit asks for a number of poses.
+    if let Some(reason) = repeated(&options.scenes)? {
+        return Err(Error::Input(reason));
+    }
     let datasets = options.scenes.iter().map(|dir| dataset::open(dir));
     let datasets = datasets.collect::<Result<Vec<_>, _>>()?;
     let mut all = Vec::new();
@@ -233,9 +237,7 @@ fn evaluate_with(
     let mut evaluated = Evaluated::default();
     let mut last = None;
     for dataset in &datasets {
-        evaluated.left_out.add_files(&dataset.problems);
-        let findings = findings::sampled(&dataset.scenarios, IntensityScale::AUTO);
-        evaluated.left_out.add_findings(findings);
+        add_faults(dataset, &mut evaluated.left_out);
     }
     for (place, &(scenario, (agent, tick))) in chosen.iter().enumerate() {
         on_sweep(place + 1, chosen.len());
@@ -380,6 +382,32 @@ pub(crate) mod tests {
         let mut source = Counting::default();
         let evaluated = evaluate_source(&mut source, &options, &mut |_, _| ()).unwrap();
         assert_eq!((source.0, evaluated.left_out.ticks), (vec![3, 2], 1));
+    }
+
+    #[test]
+    fn sweeps_that_are_given_twice_are_refused_by_whatever_path() {
+        let folder = tempfile::tempdir().unwrap();
+        let drive = folder.path().join("drive");
+        let options = SynthOptions {
+            frames: 1,
+            ..SynthOptions::new(Subset::Town1loc, 11, drive.clone())
+        };
+        generate(&options, &|_| {}).unwrap();
+        let name = dataset::open(&drive).unwrap().scenarios[0].name.clone();
+        for again in [drive.join("."), drive.join(&name)] {
+            let options = SweepSelection {
+                scenes: vec![drive.clone(), again],
+                variant: None,
+                every: 1,
+                sweeps: None,
+            };
+            let refused = evaluate_source(&mut Counting::default(), &options, &mut |_, _| ());
+            let message = refused.unwrap_err().to_string();
+            assert!(
+                message.contains("both have the sweeps of scenario"),
+                "{message}"
+            );
+        }
     }
 
     #[test]

@@ -45,6 +45,8 @@ pub struct LocalizationSummary {
     pub no_pose: usize,
     /// Sweeps with few or no training sweeps of the head nearby; absent if it does not state its drives.
     pub low_coverage: Option<CoverageSummary>,
+    /// Number of estimated poses that a surfel map registered; absent without one.
+    pub registered: Option<usize>,
     /// Number of sweeps by outcome.
     pub outcomes: BTreeMap<&'static str, usize>,
     /// Spearman's correlation of sigma and distance error over all estimated poses, rejected ones included; -1 is
@@ -169,6 +171,7 @@ impl LocalizationSummary {
             max_deg: degrees.last().copied(),
             no_pose: sweeps.len() - metres.len(),
             low_coverage: low_coverage(sweeps),
+            registered: None,
             outcomes,
             sigma_spearman: spearman(&sigmas, &errors),
             inlier_ratio_spearman: spearman(&ratios, &errors),

@@ -207,10 +207,9 @@ impl MapMaking<'_> {
     /// Measures the time of a sweep, plans and announces; or takes the plan of the map that is resumed.
     fn plan(&mut self, sweeps: &MapSweeps) -> Result<Plan> {
         let run = &self.config.run;
-        let with_pose = sweeps.training.len() + sweeps.held_out.len();
         // A new measurement could give another plan, and with it another batch, which the checkpoint refuses.
         if run.resume {
-            let plan = StoredPlan::read(&run.out, with_pose)?;
+            let plan = StoredPlan::read(&run.out, &sweeps.list.data().sha256)?;
             let (encoded, encoding_s) = (plan.training * plan.copies, plan.encoding_s);
             self.note(format!(
                 "resuming: {encoded} sweeps are encoded again, in {encoding_s:.0} s, before the training"
@@ -253,8 +252,8 @@ impl MapMaking<'_> {
             )));
         }
         self.announce(sweeps, &plan, wanted);
-        let sweeps = with_pose;
-        StoredPlan { sweeps, plan }.write(&run.out)?;
+        let data_sha256 = sweeps.list.data().sha256;
+        StoredPlan { data_sha256, plan }.write(&run.out)?;
         Ok(plan)
     }
 

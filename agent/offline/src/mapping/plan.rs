@@ -93,11 +93,11 @@ impl Plan {
 
 /// A plan and the data that it is for, in the folder of the results: the measured time of a sweep differs from run to run,
 /// and a resumed map needs the sweeps of the stopped one.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct StoredPlan {
-    /// Number of sweeps with a pose, before any is left out.
-    pub(super) sweeps: usize,
+    /// Identity of the drives.
+    pub(super) data_sha256: String,
     /// The plan.
     pub(super) plan: Plan,
 }
@@ -114,16 +114,18 @@ impl StoredPlan {
         Ok(written.at(&path)?)
     }
 
-    /// The plan of a stopped map of `sweeps` sweeps.
-    pub(super) fn read(out: &Path, sweeps: usize) -> Result<Plan, Error> {
+    /// The plan of a stopped map of drives with this identity.
+    pub(super) fn read(out: &Path, data_sha256: &str) -> Result<Plan, Error> {
         let path = out.join(Self::FILE);
         let text = bounded_file::read_text(&path, MAX_TEXT_BYTES).at(&path);
         let stored = text.and_then(|text| serde_json::from_str::<Self>(&text).at(&path));
-        let plan = stored.and_then(|stored| match stored.sweeps {
-            before if before == sweeps => Ok(stored.plan),
+        let plan = stored.and_then(|stored| match stored.data_sha256 {
+            before if before == data_sha256 => Ok(stored.plan),
             before => Err(FileError::new(
                 &path,
-                format_args!("the stopped map was of {before} sweeps, the drives have {sweeps}"),
+                format_args!(
+                    "the stopped map was of drives of SHA-256 {before}, these have {data_sha256}"
+                ),
             )),
         });
         plan.map_err(|error| Error::Input(format!("--resume: {error}")))
@@ -179,20 +181,19 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_is_read_back_for_the_same_sweeps_only() {
+    fn a_plan_is_read_back_for_the_same_drives_only() {
         let folder = tempfile::tempdir().unwrap();
-        let missing = StoredPlan::read(folder.path(), 680).unwrap_err();
+        let missing = StoredPlan::read(folder.path(), "12ab").unwrap_err();
         assert!(missing.to_string().contains("plan.json"), "{missing}");
         let plan = Plan::new(600, 80, 0.1, 600.0);
-        StoredPlan { sweeps: 680, plan }
-            .write(folder.path())
-            .unwrap();
-        assert_eq!(StoredPlan::read(folder.path(), 680).unwrap(), plan);
-        let message = StoredPlan::read(folder.path(), 681)
-            .unwrap_err()
-            .to_string();
+        let data_sha256 = "12ab".to_owned();
+        let stored = StoredPlan { data_sha256, plan };
+        stored.write(folder.path()).unwrap();
+        assert_eq!(StoredPlan::read(folder.path(), "12ab").unwrap(), plan);
+        let other = StoredPlan::read(folder.path(), "34cd").unwrap_err();
+        let message = other.to_string();
         assert!(
-            message.contains("of 680 sweeps, the drives have 681"),
+            message.contains("of drives of SHA-256 12ab, these have 34cd"),
             "{message}"
         );
     }

@@ -67,7 +67,8 @@ pub fn train_encoder(
         // Other random numbers than those of the training pairs.
         folders => Some(read(folders, u64::MAX - run.seed, &config.encoder, observe)?.0),
     };
-    let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
+    let trainer = Trainer::begin(run, &variables, None, Instant::now())?;
+    let mut trainer = trainer.on_data(&store.data.sha256)?;
     let (batch, anchors) = (run.batch as u64, maker.anchors());
     let mut training = Training {
         config,

@@ -55,7 +55,8 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     let sample = cache.drawn_rows(run.seed, 0, STATISTICS_CELLS)?;
     network.set_statistics(&cache.cells.f_index_select(0, &sample)?)?;
     adopt_encoder(&variables, &config.encoder, &network_config.encoder)?;
-    let mut trainer = Trainer::begin(run, &variables, None, started)?;
+    let trainer = Trainer::begin(run, &variables, None, started)?;
+    let mut trainer = trainer.on_data(&list.data().sha256)?;
     let mut training = SgLocTraining {
         run,
         observe,

@@ -109,7 +109,8 @@ impl SweepList {
         let mut drive = 0;
         for (world, folder) in folders.iter().enumerate() {
             let dataset = dataset::open(folder)?;
-            findings::note(&findings::sampled(&dataset.scenarios, IntensityScale::AUTO));
+            let found = findings::sampled(&dataset.scenarios, IntensityScale::AUTO, None);
+            findings::note(&found);
             problems.extend(dataset.problems.iter().map(ToString::to_string));
             for scenario in dataset.scenarios.into_iter().map(Arc::new) {
                 places.extend(present_sweeps(&scenario).map(|(agent, tick)| SweepPlace {

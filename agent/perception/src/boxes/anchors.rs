@@ -2,7 +2,7 @@
 
 use protocol::Box3d;
 
-use crate::model_config::{AnchorConfig, DetectorConfig};
+use crate::model_config::DetectorConfig;
 
 /// Anchors of a head: a regular grid with the same boxes at every point.
 ///
@@ -22,29 +22,17 @@ pub struct Anchors {
 }
 
 impl Anchors {
-    /// The anchors of a detector.
-    pub fn for_detector(config: &DetectorConfig) -> Self {
-        let stride = usize::try_from(config.feature_stride()).unwrap_or(1).max(1);
-        let (range_m, voxel_m) = (config.lidar_range_m, config.voxel_size_m);
-        let grid = config.pillar_grid();
-        Self::new(range_m, voxel_m, grid, stride, &config.anchors)
-    }
-
-    /// Anchors over an area with `grid` pillars (x, y, z) of which each cell of the head covers `stride` along an axis.
+    /// The anchors of a detector, each cell of whose head covers a stride of pillars along an axis.
     ///
     /// As in the reference they are evenly spaced from one pillar inside the lower edge to one inside the upper. For
     /// stride 2 these are the centres of the cells; for stride 4 they lie 1.6046 m apart on cells of 1.6 m. Trained
     /// weights depend on it, so it is kept.
-    pub fn new(
-        lidar_range_m: [f64; 6],
-        voxel_size_m: [f64; 3],
-        grid: [usize; 3],
-        stride: usize,
-        anchors: &AnchorConfig,
-    ) -> Self {
+    pub fn for_detector(config: &DetectorConfig) -> Self {
+        let stride = usize::try_from(config.feature_stride()).unwrap_or(1).max(1);
+        let (grid, anchors) = (config.pillar_grid(), &config.anchors);
         let [x_m, y_m] = [0, 1].map(|axis: usize| {
-            let low = lidar_range_m[axis] + voxel_size_m[axis];
-            let high = lidar_range_m[axis + 3] - voxel_size_m[axis];
+            let low = config.lidar_range_m[axis] + config.voxel_size_m[axis];
+            let high = config.lidar_range_m[axis + 3] - config.voxel_size_m[axis];
             linspace(low, high, grid[axis] / stride)
         });
         let yaws_deg = anchors.yaws_deg.iter();

@@ -91,7 +91,10 @@ mod tests {
         let map = Tensor::arange(32, (Kind::Float, Device::Cpu)).view([1, 2, 4, 4]);
         // The largest level is 31.9, 15.9 (which clamps 16 of the 31 values above zero), 8.0, 0.06.
         for (exponent, is_saturated) in [(-3, false), (-4, true), (-5, true), (-12, true)] {
-            let quantisation = Quantisation::unsigned(Scale::of_exponent(exponent));
+            let quantisation = Quantisation {
+                scale: Scale::of_exponent(exponent),
+                zero_point: 0,
+            };
             let values = quantisation.quantise(&map).unwrap();
             let level = BackboneLevel::new(values, Some(quantisation));
             assert_eq!(level.is_saturated().unwrap(), is_saturated, "{exponent}");

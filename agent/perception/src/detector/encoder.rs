@@ -42,7 +42,7 @@ impl BevEncoder {
         pillar_grid: PillarGrid,
         projection: PillarProjection,
         backbone: BevBackbone,
-        shrink: Option<Shrink>,
+        shrink: Shrink,
         device: Device,
     ) -> Self {
         let canvas = vec![0.0; canvas_len(&pillar_grid, &projection)];
@@ -53,7 +53,7 @@ impl BevEncoder {
             layers: Layers::Float {
                 canvas,
                 backbone,
-                shrink: shrink.unwrap_or_default(),
+                shrink,
             },
         }
     }

@@ -28,7 +28,7 @@ use crate::boxes::refinement::{self, BoxRefinement};
 use crate::crop::Crop;
 use crate::int8::{ActivationScales, QuantiseError, ScaleSearch};
 use crate::layers::head::{DetectionHead, HeadOutput};
-use crate::layers::shrink::{Compressor, Shrink};
+use crate::layers::shrink::Compressor;
 use crate::model_config::{DetectorConfig, YAxis};
 use crate::pillars::point_pillars::PointPillars;
 use crate::pillars::projection::PillarProjection;
@@ -123,10 +123,10 @@ impl Detector {
             crop: Crop::for_detector(&network.config),
             voxeliser: Voxeliser::for_detector(&network.config),
             encoder: BevEncoder::new(
-                *network.pillar_grid(),
+                network.pillar_grid,
                 PillarProjection::new(&network.encoder),
                 network.backbone.folded(),
-                network.shrink.as_ref().map(Shrink::folded),
+                network.shrink.folded(),
                 network.device(),
             ),
             compressor: network.compressor.as_ref().map(Compressor::folded),
@@ -603,7 +603,7 @@ mod tests {
         let mut cropped = Vec::new();
         Crop::for_detector(&config()).keep(&cloud.xyzi, &mut cropped);
         let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
-        let batch = PillarBatch::new(&[&sweep], pillars.pillar_grid());
+        let batch = PillarBatch::new(&[&sweep], &pillars.pillar_grid);
         let (expected, scores) = tch::no_grad(|| {
             let features = pillars.features(&batch, false);
             let scores = pillars.heads(&features).unwrap().scores;
@@ -637,7 +637,7 @@ mod tests {
         let mut cropped = Vec::new();
         Crop::for_detector(&config()).keep(&cloud().xyzi, &mut cropped);
         let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
-        let batch = PillarBatch::new(&[&sweep], pillars.pillar_grid());
+        let batch = PillarBatch::new(&[&sweep], &pillars.pillar_grid);
         let expected =
             tch::no_grad(|| pillars.through_compressor(&pillars.features(&batch, false), false));
         let mut detector = Detector::from_network(pillars);

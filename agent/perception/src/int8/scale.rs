@@ -55,12 +55,6 @@ fn is_zero(value: &u8) -> bool {
 }
 
 impl Quantisation {
-    /// Quantisation of values that are never negative.
-    pub const fn unsigned(scale: Scale) -> Self {
-        let zero_point = 0;
-        Self { scale, zero_point }
-    }
-
     /// Nearest quantised values, `u8`, in the memory order of `x`; values out of range become the nearest in range.
     ///
     /// # Errors

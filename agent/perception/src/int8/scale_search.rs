@@ -111,15 +111,11 @@ mod tests {
             search.observe(name, values).unwrap();
         }
         let scales = search.scales();
-        let signed = Quantisation {
-            scale: Scale::of_exponent(-8),
-            zero_point: MIDDLE,
-        };
-        for (name, expected) in [
-            ("even", Quantisation::unsigned(Scale::of_exponent(-8))),
-            ("outlier", Quantisation::unsigned(Scale::of_exponent(-7))),
-            ("signed", signed),
-        ] {
+        for (name, exponent, zero_point) in
+            [("even", -8, 0), ("outlier", -7, 0), ("signed", -8, MIDDLE)]
+        {
+            let scale = Scale::of_exponent(exponent);
+            let expected = Quantisation { scale, zero_point };
             assert_eq!(scales.get(name).unwrap(), expected, "{name}");
         }
     }

@@ -65,12 +65,9 @@ impl DetectionHead {
         let both = [&self.scores, &self.offsets];
         let weight = Tensor::f_cat(&both.map(|conv| &conv.ws), 0)?.f_flatten(1, 3)?;
         let cells = map.f_squeeze_dim(0)?.f_flatten(1, 2)?;
-        let output = match both.map(|conv| conv.bs.as_ref()) {
-            [Some(scores), Some(offsets)] => Tensor::f_cat(&[scores, offsets], 0)?
-                .f_unsqueeze(1)?
-                .f_addmm(&weight, &cells)?,
-            _ => weight.f_mm(&cells)?,
-        };
+        let biases: Vec<&Tensor> = both.iter().filter_map(|conv| conv.bs.as_ref()).collect();
+        let bias = Tensor::f_cat(&biases, 0)?.f_unsqueeze(1)?;
+        let output = bias.f_addmm(&weight, &cells)?;
         let anchors = self.scores.ws.size4()?.0;
         let scores = output.f_narrow(0, 0, anchors)?;
         let scores = scores.f_view([1, anchors, height, width])?;

@@ -1,6 +1,6 @@
 //! Pillar feature network: from ten values per point to one feature vector per pillar.
 
-use tch::{Device, Tensor, nn};
+use tch::{Tensor, nn};
 
 use crate::layers::convolution::Norm;
 use crate::pillars::batch::{POINT_FEATURES, PillarBatch};
@@ -13,7 +13,7 @@ use crate::pillars::batch::{POINT_FEATURES, PillarBatch};
 /// running statistics therefore differ from those of the reference, while a trained file is equivalent in both.
 #[derive(Debug)]
 pub struct PillarEncoder {
-    linear: Tensor,
+    pub(crate) linear: Tensor,
     norm: Norm,
 }
 
@@ -39,11 +39,6 @@ impl PillarEncoder {
         let best = segment_max(&rows.narrow(0, 0, points), &batch.counts);
         let floor = rows.narrow(0, points, 1);
         best.maximum(&floor).where_self(&batch.partial, &best)
-    }
-
-    /// Device of its parameters.
-    pub fn device(&self) -> Device {
-        self.linear.device()
     }
 
     /// The linear layer with the running statistics folded in: weight `[C, 10]`, bias `[C]`.

@@ -14,7 +14,8 @@ use crate::pillars::encoder::PillarEncoder;
 pub struct PointPillars {
     /// Configuration that it was built from.
     pub config: DetectorConfig,
-    pillar_grid: PillarGrid,
+    /// Grid of the pillars on the canvas.
+    pub pillar_grid: PillarGrid,
     /// Precision of the convolutions in training: `Float`, or `BFloat16` if the CPU computes it several times as fast.
     /// Parameters, norms, pillar features and heads are `f32` in any case.
     pub compute: Kind,
@@ -22,8 +23,8 @@ pub struct PointPillars {
     pub encoder: PillarEncoder,
     /// `backbone`: the 2D convolutions.
     pub backbone: BevBackbone,
-    /// `shrink_conv`: the last step before transmission.
-    pub shrink: Option<Shrink>,
+    /// `shrink_conv`: the last step before transmission; without layers where there is none.
+    pub shrink: Shrink,
     /// `naive_compressor`: fewer transmitted channels.
     pub compressor: Option<Compressor>,
     /// `cls_head` and `reg_head`.
@@ -38,15 +39,15 @@ impl PointPillars {
     pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Result<Self, ConfigError> {
         // Before anything is allocated: the numbers may come from any file.
         config.validate()?;
-        let channels = config.feature_channels();
+        let (wide, channels) = (config.backbone_channels(), config.feature_channels());
         Ok(Self {
             pillar_grid: PillarGrid::new(config),
             compute: Kind::Float,
             encoder: PillarEncoder::new(&(path / "pillar_vfe"), config.pillar_channels),
             backbone: BevBackbone::new(&(path / "backbone"), config),
-            shrink: config.shrink.as_ref().map(|shrink| {
-                Shrink::new(&(path / "shrink_conv"), config.backbone_channels(), shrink)
-            }),
+            shrink: (config.shrink.as_ref())
+                .map(|shrink| Shrink::new(&(path / "shrink_conv"), wide, shrink))
+                .unwrap_or_default(),
             compressor: (config.compress_ratio)
                 .map(|ratio| Compressor::new(&(path / "naive_compressor"), channels, ratio)),
             head: DetectionHead::new(path, channels, config.anchors.yaws_deg.len() as i64),
@@ -56,12 +57,7 @@ impl PointPillars {
 
     /// Device of its parameters.
     pub fn device(&self) -> Device {
-        self.encoder.device()
-    }
-
-    /// Grid of the pillars on the canvas.
-    pub fn pillar_grid(&self) -> &PillarGrid {
-        &self.pillar_grid
+        self.encoder.linear.device()
     }
 
     /// Feature map of every sweep: `[B, C, H, W]`, before the compressor.
@@ -73,11 +69,7 @@ impl PointPillars {
     /// Feature maps of the canvas `[B, C_pillar, H, W]`: backbone and shrink, `f32`.
     pub fn features_of_canvas(&self, canvas: &Tensor, train: bool) -> Tensor {
         let wide = self.backbone.forward(&canvas.to_kind(self.compute), train);
-        let features = match &self.shrink {
-            Some(shrink) => shrink.forward(&wide, train),
-            None => wide,
-        };
-        features.to_kind(Kind::Float)
+        self.shrink.forward(&wide, train).to_kind(Kind::Float)
     }
 
     /// Output of the compressor: `[B, C, H, W]` compressed and expanded again; unchanged without a compressor.

@@ -58,32 +58,18 @@ pub struct Voxeliser {
 }
 
 impl Voxeliser {
-    /// A voxeliser for cells of `voxel_size_m` from the lower corner of `lidar_range_m` on.
-    ///
-    /// `grid` is the number of cells along x, y, z; the limits are per pillar and per sweep.
-    pub fn new(
-        lidar_range_m: [f64; 6],
-        voxel_size_m: [f64; 3],
-        grid: [usize; 3],
-        max_points: usize,
-        max_pillars: usize,
-    ) -> Self {
+    /// The voxeliser of a detector: its cells begin at the lower corner of the area.
+    pub fn for_detector(config: &DetectorConfig) -> Self {
+        let grid = config.pillar_grid();
         Self {
-            low: std::array::from_fn(|axis| lidar_range_m[axis] as f32),
-            size: voxel_size_m.map(|size| size as f32),
+            low: std::array::from_fn(|axis| config.lidar_range_m[axis] as f32),
+            size: config.voxel_size_m.map(|size| size as f32),
             grid,
-            max_points: u32::try_from(max_points).unwrap_or(u32::MAX),
-            max_pillars,
+            max_points: u32::try_from(config.max_points_per_pillar).unwrap_or(u32::MAX),
+            max_pillars: config.max_pillars,
             pillar_of_cell: vec![NONE; grid.iter().product()],
             pillar_of_point: Vec::new(),
         }
-    }
-
-    /// The voxeliser of a detector.
-    pub fn for_detector(config: &DetectorConfig) -> Self {
-        let (range_m, voxel_m) = (config.lidar_range_m, config.voxel_size_m);
-        let (points, pillars) = (config.max_points_per_pillar, config.max_pillars);
-        Self::new(range_m, voxel_m, config.pillar_grid(), points, pillars)
     }
 
     /// Sorts the points of one sweep into pillars; points outside the area and points that are not finite are dropped.
@@ -170,13 +156,13 @@ mod tests {
     use super::*;
 
     fn voxeliser(max_points: usize, max_pillars: usize) -> Voxeliser {
-        Voxeliser::new(
-            [0.0, 0.0, -3.0, 4.0, 2.0, 1.0],
-            [1.0, 1.0, 4.0],
-            [4, 2, 1],
-            max_points,
+        Voxeliser::for_detector(&DetectorConfig {
+            lidar_range_m: [0.0, 0.0, -3.0, 4.0, 2.0, 1.0],
+            voxel_size_m: [1.0, 1.0, 4.0],
+            max_points_per_pillar: max_points,
             max_pillars,
-        )
+            ..DetectorConfig::lean()
+        })
     }
 
     #[test]

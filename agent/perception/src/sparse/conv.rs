@@ -44,7 +44,14 @@ impl SparseConv {
     /// # Errors
     /// Those of the tensor library; [`TchError::Shape`] unless the input channels are a multiple of four.
     pub fn int8(&self, format: LayerFormat) -> Result<Int8SparseConv, TchError> {
-        Int8SparseConv::new(&self.weight, &self.bias, format)
+        let inputs = self.weight.size2()?.0 / KERNEL_VOLUME as i64;
+        if inputs % WORD_BYTES != 0 {
+            return Err(TchError::Shape(format!(
+                "{inputs} input channels, must be a multiple of {WORD_BYTES}"
+            )));
+        }
+        let linear = Int8Linear::new(&self.weight, Some(&self.bias), format)?;
+        Ok(Int8SparseConv(linear))
     }
 }
 
@@ -53,17 +60,6 @@ impl SparseConv {
 pub struct Int8SparseConv(Int8Linear);
 
 impl Int8SparseConv {
-    /// Quantises a weight `[27 * C_in, C_out]` with bias `[C_out]`.
-    fn new(weight: &Tensor, bias: &Tensor, format: LayerFormat) -> Result<Self, TchError> {
-        let inputs = weight.size2()?.0 / KERNEL_VOLUME as i64;
-        if inputs % WORD_BYTES != 0 {
-            return Err(TchError::Shape(format!(
-                "{inputs} input channels, must be a multiple of {WORD_BYTES}"
-            )));
-        }
-        Ok(Self(Int8Linear::new(weight, Some(bias), format)?))
-    }
-
     /// `[N_in, C_in]`, `u8`, to `[N_out, C_out]`.
     ///
     /// # Errors
@@ -194,7 +190,10 @@ mod tests {
         let index = Rulebook::stacked([&Rulebook::submanifold(&sites)], Device::Cpu).unwrap();
         let network = VarStore::new(Device::Cpu);
         let conv = SparseConv::new(&network.root(), 8, 12);
-        let input = Quantisation::unsigned(Scale::of_exponent(-6));
+        let input = Quantisation {
+            scale: Scale::of_exponent(-6),
+            zero_point: 0,
+        };
         let x = Tensor::rand([sites.len() as i64, 8], (Kind::Float, Device::Cpu)) * 3.0;
         let expected = tch::no_grad(|| conv.forward(&x, &index).unwrap());
         let int8 = tch::no_grad(|| conv.int8(LayerFormat::last(input))).unwrap();

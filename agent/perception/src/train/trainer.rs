@@ -36,6 +36,9 @@ struct CheckpointState {
     batch: usize,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     method: Option<String>,
+    /// Identity of the data; absent where it was not stated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    data_sha256: Option<String>,
 }
 
 impl CheckpointState {
@@ -110,6 +113,7 @@ impl Trainer {
             seed: run.seed,
             batch: run.batch,
             method: method.map(str::to_owned),
+            data_sha256: None,
         };
         if run.resume {
             let stored: CheckpointState =
@@ -131,6 +135,21 @@ impl Trainer {
             seconds_before,
             steps,
         })
+    }
+
+    /// The same training on data with this identity ([`DataListing::sha256`]), which checkpoints state.
+    ///
+    /// # Errors
+    /// [`TrainingError::OtherTraining`] when the checkpoint that is resumed states other data.
+    pub fn on_data(mut self, sha256: &str) -> Result<Self, TrainingError> {
+        match self.progress.data_sha256.replace(sha256.to_owned()) {
+            Some(found) if found != sha256 => Err(TrainingError::OtherTraining {
+                field: "data of SHA-256",
+                found,
+                asked: sha256.to_owned(),
+            }),
+            _ => Ok(self),
+        }
     }
 
     /// Training curve, in `curve.csv` of the folder of the results.
@@ -257,7 +276,10 @@ impl Trainer {
 
 #[cfg(test)]
 mod tests {
+    use tch::Device;
+
     use super::*;
+    use crate::train::Length;
 
     #[test]
     fn progress_of_localizers_and_detectors_is_read_and_another_training_rejected() {
@@ -301,5 +323,29 @@ mod tests {
             let message = detector.check(&requested).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");
         }
+    }
+
+    #[test]
+    fn a_checkpoint_is_not_resumed_on_other_data() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunConfig::new(Length::Steps(1), folder.path());
+        let variables = VarStore::new(Device::Cpu);
+        let _ = variables.root().ones("a", &[3]);
+        let begin = |run: &RunConfig| Trainer::begin(run, &variables, None, Instant::now());
+        // A checkpoint of before, without data, goes on with any.
+        begin(&run).unwrap().checkpoint().unwrap();
+        let run = RunConfig {
+            resume: true,
+            ..run
+        };
+        let mut trainer = begin(&run).unwrap().on_data("12ab").unwrap();
+        trainer.checkpoint().unwrap();
+        begin(&run).unwrap().on_data("12ab").unwrap();
+        let refused = begin(&run).unwrap().on_data("34cd").unwrap_err();
+        let message = refused.to_string();
+        assert!(
+            message.contains("data of SHA-256 12ab, not 34cd"),
+            "{message}"
+        );
     }
 }

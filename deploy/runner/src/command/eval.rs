@@ -180,6 +180,7 @@ impl Arguments {
         }
         let trial = self.trial()?;
         let data = OpenedData::open(&trial).map_err(BadInput::of)?;
+        trial.check_participants(&data).map_err(BadInput::of)?;
         // Before the first is evaluated: weights that are wrong must not cost the results of others.
         for &method in &self.method {
             trial.evaluator(&data, method).map_err(BadInput::of)?;

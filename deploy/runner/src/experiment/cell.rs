@@ -1,5 +1,6 @@
 //! Cells: results of evaluations, cached on disk by everything that they were made of. Sweeps and tables print them.
 
+use std::collections::BTreeSet;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -78,6 +79,23 @@ impl Cell {
         let text = serde_json::to_string_pretty(self)?;
         atomic_file::write(&path, text).with_context(|| path.display().to_string())
     }
+}
+
+/// Programs, data and all other files that cells were made of, a line each.
+pub(super) fn sources<'c>(cells: impl Iterator<Item = &'c Cell>) -> BTreeSet<String> {
+    let mut lines = BTreeSet::new();
+    for Cell { key, .. } in cells {
+        let of = &key.provenance;
+        let (version, commit, sha256) = (&of.version, &of.commit, &of.program_sha256);
+        lines.insert(format!(
+            "program {version}, commit {commit}, SHA-256 {sha256}"
+        ));
+        lines.insert(format!("data SHA-256 {}", of.data_sha256));
+        for (file, sha256) in &of.files_sha256 {
+            lines.insert(format!("{} SHA-256 {sha256}", file.display()));
+        }
+    }
+    lines
 }
 
 /// Name of a method as a name of files: that of a TorchScript file has its path in it.

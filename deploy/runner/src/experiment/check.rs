@@ -4,13 +4,13 @@ use std::fmt::Debug;
 
 use anyhow::{Result, anyhow, bail, ensure};
 use bus::InboxConfig;
-use dataset::Scenario;
+use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::{Exchange, Method};
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 
 use super::evaluation::Trial;
-use super::spec::{CodecSpec, Experiment, Grid, Table};
+use super::spec::{CodecSpec, Experiment, Grid, Row, Table};
 use super::sweep::grid::{count, sizes};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
@@ -19,7 +19,7 @@ const MOST_RUNS: usize = 10_000;
 
 /// Checks everything that does not depend on the data.
 pub(super) fn check(experiment: &Experiment) -> Result<()> {
-    let (grid, compute) = (&experiment.grid, experiment.compute);
+    let grid = &experiment.grid;
     if experiment.tables.is_empty() {
         check_name("name", &experiment.name)?;
     }
@@ -37,20 +37,10 @@ pub(super) fn check(experiment: &Experiment) -> Result<()> {
         .poses
         .validate()
         .map_err(|error| anyhow!("poses: {error}"))?;
-    compute.validate("compute")?;
+    experiment.compute.validate("compute")?;
     let limit_gb = experiment.feature_maps_limit_gb;
     number("feature_maps_limit_gb", limit_gb, 0.0, 10_000.0)?;
-    if let Some(ego) = &experiment.ego.id {
-        bail!("ego.id is {ego}: choose by protocol.ego_kind instead");
-    }
-    ensure!(
-        experiment.ego.inbox == InboxConfig::default(),
-        "ego.inbox is given, but receive limits do not apply in simulation time"
-    );
-    ensure!(
-        experiment.link().is_some() || compute == ComputeTimes::default(),
-        "compute is given, but without link no time passes"
-    );
+    check_used(experiment)?;
     let link = experiment.link().map(LinkConfig::open).transpose();
     let link = link.map_err(|error| anyhow!("link: {error}"))?;
     if !experiment.tables.is_empty() {
@@ -68,18 +58,49 @@ pub(super) fn check(experiment: &Experiment) -> Result<()> {
     Ok(())
 }
 
+/// Refuses settings that no run of the experiment uses.
+fn check_used(experiment: &Experiment) -> Result<()> {
+    let (ego, unset) = (&experiment.ego, EgoSettings::default());
+    if let Some(ego) = &ego.id {
+        bail!("ego.id is {ego}: choose by protocol.ego_kind instead");
+    }
+    ensure!(
+        ego.inbox == InboxConfig::default(),
+        "ego.inbox is given, but receive limits do not apply in simulation time"
+    );
+    let (mode, has_axis) = (experiment.noise_mode, experiment.grid.pose_noise.is_some());
+    ensure!(
+        mode == NoiseMode::default() || (has_axis && mode != NoiseMode::Replayed),
+        "noise_mode is {}, but it is for grid.pose_noise, without a table of errors: name it in poses instead",
+        format!("{mode:?}").to_lowercase()
+    );
+    let is_timed = experiment.link().is_some();
+    ensure!(
+        is_timed || experiment.compute == ComputeTimes::default(),
+        "compute is given, but without link no time passes"
+    );
+    for (field, value_ms, unset_ms) in [
+        ("deadline_ms", ego.deadline_ms, unset.deadline_ms),
+        ("max_age_ms", ego.max_age_ms, unset.max_age_ms),
+    ] {
+        ensure!(
+            is_timed || value_ms == unset_ms,
+            "ego.{field} is {value_ms}, but without link no time passes"
+        );
+    }
+    Ok(())
+}
+
 /// Checks the tables, each by itself and beside the other settings.
 fn tables(experiment: &Experiment) -> Result<()> {
     let has_grid = experiment.grid != Grid::default();
     ensure!(!has_grid, "an experiment has a grid or tables, not both");
-    for (index, table) in experiment.tables.iter().enumerate() {
+    let names = experiment.tables.iter().map(|table| table.name.clone());
+    let names: Vec<String> = names.collect();
+    values("tables", Some(&names), |it| check_name("table name", it))?;
+    for table in &experiment.tables {
         let name = &table.name;
-        check_name("table name", name)?;
-        let mut before = experiment.tables[..index].iter();
-        let is_known = before.any(|other| other.name == *name);
-        ensure!(!is_known, "two tables are called {name:?}");
-        let is_empty = table.rows.is_empty() || table.columns.is_empty();
-        ensure!(!is_empty, "table {name:?} has no rows or no columns");
+        check_names(table)?;
         for vehicles in table.rows.iter().filter_map(|row| row.vehicles) {
             let field = format!("table {name:?}: vehicles");
             number(&field, vehicles as f64, 1.0, 64.0)?;
@@ -90,6 +111,27 @@ fn tables(experiment: &Experiment) -> Result<()> {
             experiment.link.is_none() || !is_late,
             "table {name:?}: delay_ms and link contradict each other"
         );
+    }
+    Ok(())
+}
+
+/// Refuses names that stand twice or divide a table, and trainings that are one file.
+fn check_names(table: &Table) -> Result<()> {
+    let (name, rows) = (&table.name, &table.rows);
+    let columns = table.columns.iter().map(|column| column.name.clone());
+    let columns: Vec<String> = columns.collect();
+    let labels = rows.iter().map(Row::label).collect();
+    for (what, names) in [("columns", columns), ("rows", labels)] {
+        let field = format!("table {name:?}: {what}");
+        let is_plain = |name: &String| !name.contains(['|', '\n', '\r']);
+        values(&field, Some(&names), |name| {
+            ensure!(is_plain(name), "{field}: {name:?} has | or a line end");
+            Ok(())
+        })?;
+    }
+    for row in rows.iter().filter(|row| !row.weights.is_empty()) {
+        let field = format!("table {name:?}, row {}: weights", row.label());
+        values(&field, Some(&row.weights), |_| Ok(()))?;
     }
     Ok(())
 }
@@ -124,23 +166,6 @@ fn check_name(field: &str, name: &str) -> Result<()> {
         !name.is_empty() && is_plain,
         "{field} {name:?} is to name files: letters, digits, - and _"
     );
-    Ok(())
-}
-
-/// Refuses a number of vehicles among `asked` that one of the scenarios does not have.
-pub(super) fn check_vehicles<'a>(
-    field: &str,
-    asked: impl Iterator<Item = usize>,
-    scenarios: impl IntoIterator<Item = &'a Scenario>,
-) -> Result<()> {
-    let asked = asked.max().unwrap_or(0);
-    for Scenario { name, agents, .. } in scenarios {
-        let found = agents.len();
-        ensure!(
-            asked <= found,
-            "{field} is {asked}, but scenario {name} has {found} vehicles"
-        );
-    }
     Ok(())
 }
 
@@ -202,10 +227,6 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
     ensure!(
         experiment.feature_maps.is_none(),
         "feature_maps is of tables: a sweep keeps its maps in the folder of --out"
-    );
-    ensure!(
-        experiment.noise_mode != NoiseMode::Replayed,
-        "noise_mode is replayed, which needs a table: name it in poses instead"
     );
     link_axes(experiment, link)?;
     ensure!(
@@ -290,24 +311,18 @@ fn is_random(Experiment { grid, poses, .. }: &Experiment, link: &LinkConfig) -> 
         LatencyModel::None | LatencyModel::ConstantMs(_) | LatencyModel::Trace
     );
     let (has_loss, reorders) = (link.loss != LossModel::None, link.reorder.is_some());
-    jitters
-        || loses
-        || errs
-        || is_noisy
-        || !is_steady
-        || has_loss
-        || reorders
-        || link.duplicate > 0.0
+    let of_link = !is_steady || has_loss || reorders || link.duplicate > 0.0;
+    jitters || loses || errs || is_noisy || of_link
 }
 
-/// Checks each value of an axis: at least one, and no duplicates.
+/// Checks each value of an axis, or of a list of a table: at least one, and no duplicates.
 fn values<T: PartialEq + Debug>(
     field: &str,
     values: Option<&Vec<T>>,
     check: impl Fn(&T) -> Result<()>,
 ) -> Result<()> {
     let Some(values) = values else { return Ok(()) };
-    ensure!(!values.is_empty(), "{field} is empty: the grid has no run");
+    ensure!(!values.is_empty(), "{field} is empty: there is no run");
     for (place, value) in values.iter().enumerate() {
         check(value)?;
         let is_known = values[..place].contains(value);
@@ -398,8 +413,12 @@ mod tests {
             ),
             ("ego: {id: '7'}\ngrid: {method: [max]}", "protocol.ego_kind"),
             (
-                "noise_mode: replayed\ngrid: {method: [max]}",
-                "noise_mode is replayed",
+                "noise_mode: replayed\ngrid: {method: [max], pose_noise: [{position_std_m: 1, heading_std_deg: 1}]}",
+                "noise_mode is replayed, but it is for grid.pose_noise, without a table",
+            ),
+            (
+                "noise_mode: fixed\nposes: {noisy: {position_std_m: 2}}\ngrid: {method: [late]}",
+                "noise_mode is fixed, but it is for grid.pose_noise",
             ),
             (
                 "poses: {noisy: {step_s: 0}}\ngrid: {method: [max]}",
@@ -450,6 +469,89 @@ mod tests {
         }
         let of_sweep = problem("ego: {trust: true}\ngrid: {method: [none]}");
         assert!(of_sweep.contains("none uses none"), "{of_sweep}");
+    }
+
+    #[test]
+    fn a_table_refuses_times_and_noise_that_no_run_uses() {
+        let of = |settings: &str| {
+            problem(&format!(
+                "{settings}\ntables: [{{name: t, rows: [{{method: late}}], columns: [{{name: c}}]}}]"
+            ))
+        };
+        let times = "ego: {deadline_ms: 20, max_age_ms: 100}";
+        assert_eq!(of(&format!("link: ideal\n{times}")), "");
+        for (settings, message) in [
+            (
+                times,
+                "ego.deadline_ms is 20, but without link no time passes",
+            ),
+            (
+                "ego: {max_age_ms: 100}",
+                "ego.max_age_ms is 100, but without link",
+            ),
+            (
+                "compute: {pose_ms: 0, map_ms: 0, fuse_ms: 9}",
+                "compute is given, but without link",
+            ),
+            (
+                "noise_mode: fixed",
+                "noise_mode is fixed, but it is for grid.pose_noise",
+            ),
+        ] {
+            let problem = of(settings);
+            assert!(problem.contains(message), "{settings}: {problem}");
+        }
+    }
+
+    #[test]
+    fn names_that_are_equal_or_divide_a_table_are_refused_and_so_is_a_training_named_twice() {
+        let of = |rows: &str, columns: &str| {
+            problem(&format!(
+                "tables: [{{name: t, rows: [{rows}], columns: [{columns}]}}]"
+            ))
+        };
+        let (two, noise) = (
+            "{name: c}",
+            ", attack: {falsification: noise, attackers: 3}",
+        );
+        let alone = "{method: late, vehicles: 1, name: alone}";
+        let attacked = format!("{{name: d{noise}}}");
+        assert_eq!(
+            of("{method: late}, {method: max, weights: [a, b]}", two),
+            ""
+        );
+        assert_eq!(of(&format!("{{method: late}}, {alone}"), &attacked), "");
+        for (rows, columns, message) in [
+            (
+                "{method: late}",
+                "{name: 0 ms | true poses}",
+                "columns: \"0 ms | true poses\" has |",
+            ),
+            (
+                "{method: late, name: \"a\\nb\"}",
+                two,
+                "rows: \"a\\nb\" has | or a line end",
+            ),
+            (
+                "{method: late}",
+                "{name: c}, {name: c, delay_ms: 9}",
+                "table \"t\": columns names \"c\" twice",
+            ),
+            (
+                "{method: late}, {method: late, vehicles: 2}",
+                two,
+                "rows names \"late\" twice",
+            ),
+            (
+                "{method: late, weights: [a, b, a]}",
+                two,
+                "row late: weights names \"a\" twice",
+            ),
+            ("", two, "table \"t\": rows is empty"),
+        ] {
+            let problem = of(rows, columns);
+            assert!(problem.contains(message), "{rows} {columns}: {problem}");
+        }
     }
 
     #[test]

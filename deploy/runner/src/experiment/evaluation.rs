@@ -16,7 +16,7 @@ use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario, findings};
 use deploy::score::FrameScores;
 use deploy::score::metrics::{Messages, Metrics};
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
-use ego_fuser_offline::evaluation::{Evaluator, Setup};
+use ego_fuser_offline::evaluation::{AgentPool, Evaluator, Setup};
 use fusion::{Exchange, Method};
 use perception::weights::Weights;
 use protocol::{CodecConfig, Stream, Topic};
@@ -27,6 +27,7 @@ use support::sampling::evenly_spread;
 use support::sync::lock;
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
+use crate::cached_poses;
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
 use crate::experiment::frame_files::{self, FrameFiles};
@@ -59,6 +60,8 @@ pub struct Trial {
 pub struct OpenedData {
     /// Scenarios, with the participating agents.
     pub scenarios: Vec<Scenario>,
+    /// The same with all their agents and ticks.
+    recorded: Vec<Scenario>,
     /// Evaluation protocol.
     pub protocol: EvaluationProtocol,
     /// Parts of the data set that cannot be used.
@@ -92,6 +95,7 @@ impl OpenedData {
         }
         Ok(Self {
             scenarios,
+            recorded: dataset.scenarios,
             protocol,
             problems: dataset.problems,
             digests: FileDigests::default(),
@@ -191,6 +195,32 @@ impl Trial {
         bail!(rule.replace("METHODS", &names.join(", ")))
     }
 
+    /// Refuses vehicles that a scenario does not have, and more attackers than any scenario has neighbours.
+    ///
+    /// # Errors
+    /// An error with both numbers.
+    pub fn check_participants(&self, data: &OpenedData) -> Result<()> {
+        let mut neighbours = 0;
+        for Scenario { name, agents, .. } in data.chosen(self.scenarios) {
+            let found = agents.len();
+            let asked = match self.setup.pool {
+                AgentPool::First(vehicles) => vehicles,
+                AgentPool::All | AgentPool::Named(_) => found,
+            };
+            ensure!(
+                asked <= found,
+                "vehicles is {asked}, but scenario {name} has {found} vehicles"
+            );
+            neighbours = neighbours.max(asked.saturating_sub(1));
+        }
+        let attackers = self.setup.attack.map_or(0, |attack| attack.attackers);
+        ensure!(
+            attackers <= neighbours,
+            "attackers is {attackers}, but no scenario has more than {neighbours} neighbours"
+        );
+        Ok(())
+    }
+
     /// The evaluator of a method, with its weights.
     ///
     /// # Errors
@@ -202,6 +232,13 @@ impl Trial {
             ..self.setup.clone()
         };
         setup.models.weights = self.weights(method)?;
+        let chosen = data.chosen(self.scenarios).map(|one| &one.name);
+        let chosen: Vec<&String> = chosen.collect();
+        for settings in self.settings() {
+            let recorded = data.recorded.iter();
+            let recorded = recorded.filter(|one| chosen.contains(&&one.name));
+            cached_poses::check(&settings.pose, recorded, &data.digests)?;
+        }
         Ok(Evaluator::new(setup)?)
     }
 
@@ -299,7 +336,8 @@ fn judged(
     if let Some(kept) = kept.filter(|_| method.exchange() != Exchange::Points) {
         evaluator = evaluator.with_maps(maps(trial, kept, data, method)?);
     }
-    let findings = findings::sampled(&data.scenarios, trial.intensity_scale);
+    let (scale, rule) = (trial.intensity_scale, &data.protocol.ground_truth);
+    let findings = findings::sampled(&data.scenarios, scale, Some(rule));
     evaluator.add_data_set(&data.problems, findings);
     let detector = evaluator.ego().detector().config();
     let map_values = detector.feature_grid().cells() as u64 * detector.sent_channels() as u64;
@@ -350,4 +388,61 @@ fn maps(trial: &Trial, kept: &KeptMaps, data: &OpenedData, method: Method) -> Re
     let (scenarios, digests) = (&data.scenarios, &data.digests);
     let store = FeatureStore::open(kept, &weights, scenarios, digests, 1, &mut |_, _| {})?;
     Ok(MapSource::new(Arc::new(store), weights))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use agent::attack::AttackConfig;
+
+    use super::*;
+
+    /// A data set of three scenarios: of one, two and three vehicles.
+    fn write_scenarios(root: &Path) {
+        for (scenario, vehicles) in [("alone", 1), ("pair", 2), ("three", 3)] {
+            for id in 1..=vehicles {
+                let folder = root.join(scenario).join(id.to_string());
+                fs::create_dir_all(&folder).unwrap();
+                let pose = "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles: {}\n";
+                fs::write(folder.join("000000.yaml"), pose).unwrap();
+                fs::write(folder.join("000000.pcd"), "").unwrap();
+            }
+        }
+    }
+
+    #[test]
+    fn vehicles_and_attackers_that_the_data_do_not_have_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        write_scenarios(folder.path());
+        let problem = |dataset: PathBuf, attackers, pool| {
+            let mut trial = Trial {
+                dataset,
+                ..Trial::default()
+            };
+            trial.setup.attack = Some(AttackConfig {
+                falsification: Falsification::Noise,
+                attackers,
+                seed: 0,
+            });
+            trial.setup.pool = pool;
+            let data = OpenedData::open(&trial).unwrap();
+            let checked = trial.check_participants(&data).err();
+            checked.map_or(String::new(), |problem| problem.to_string())
+        };
+        let all = || folder.path().to_owned();
+        assert_eq!(problem(all(), 2, AgentPool::All), "");
+        let none = "attackers is 3, but no scenario has more than 2 neighbours";
+        assert_eq!(problem(all(), 3, AgentPool::All), none);
+        let lacking = "vehicles is 2, but scenario alone has 1 vehicles";
+        assert_eq!(problem(all(), 1, AgentPool::First(2)), lacking);
+        let one = "attackers is 2, but no scenario has more than 1 neighbours";
+        let three = folder.path().join("three");
+        assert_eq!(problem(three, 2, AgentPool::First(2)), one);
+        let alone = problem(folder.path().join("alone"), 1, AgentPool::All);
+        assert_eq!(
+            alone,
+            "attackers is 1, but no scenario has more than 0 neighbours"
+        );
+    }
 }

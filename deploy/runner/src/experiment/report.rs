@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::Path;
 
+use dataset::evaluation_protocol::ApOrder;
 use deploy::operate::progress::bytes;
 use deploy::score::metrics::{Contribution, Metrics, PartPrecision, Percentiles};
 use fusion::{Exchange, Method};
@@ -35,11 +36,9 @@ pub fn run_report(result: &RunResult) -> String {
 pub fn print_loss(result: &RunResult, with_method: bool) {
     result.metrics.left_out.print();
     if let Some(sentence) = loss::sentence(result) {
-        let method = &result.metrics.method;
-        match with_method {
-            true => output::note(format_args!("exit 3: {method}: {sentence}")),
-            false => output::note(format_args!("exit 3: {sentence}")),
-        }
+        let method = with_method.then(|| format!("{}: ", result.metrics.method));
+        let method = method.unwrap_or_default();
+        output::note(format_args!("exit 3: {method}{sentence}"));
     }
 }
 
@@ -110,36 +109,7 @@ type MetricColumn = (bool, &'static str, Side, fn(&Metrics) -> String);
 
 /// One line per run or evaluation, and the facts that are needed to compare the lines.
 pub fn table(all: &[Metrics]) -> String {
-    use Side::{Left, Right};
-    // Streaming AP exists only where results have a time of publication.
-    let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
-    let has_network = all.iter().any(|metrics| metrics.contribution.sent > 0);
-    let name = if is_live { "answered" } else { "frames" };
-    let columns: [MetricColumn; 13] = [
-        (true, "method", Left, |of| of.method.clone()),
-        (true, "poses", Left, |of| of.pose_source.clone()),
-        (true, name, Right, frames),
-        (true, "AP@0.3", Right, |of| number(of.ap_global.at_30, 3)),
-        (true, "AP@0.5", Right, |of| number(of.ap_global.at_50, 3)),
-        (true, "AP@0.7", Right, |of| number(of.ap_global.at_70, 3)),
-        (is_live, "AP@0.5 all", Right, |of| {
-            number(of.ap_unanswered_empty.at_50, 3)
-        }),
-        (is_live, "sAP@0.5", Right, |of| {
-            number(of.ap_streaming.and_then(|ap| ap.at_50), 3)
-        }),
-        (!is_live, "frame order 0.5", Right, |of| {
-            number(of.ap_frame_order.at_50, 3)
-        }),
-        (has_network, "fused", Right, |of| {
-            number(of.contribution.fused_per_frame, 2)
-        }),
-        (true, "pose m", Right, |of| number(of.pose.mean_m, 2)),
-        (true, "latency ms", Right, latency),
-        (true, "bytes", Right, wire_bytes),
-    ];
-    let columns = columns.into_iter().filter(|(is_shown, ..)| *is_shown);
-    let columns: Vec<MetricColumn> = columns.collect();
+    let columns = columns(all);
     let mut table = TextTable::new(columns.iter().map(|(_, name, side, _)| (*name, *side)));
     for metrics in all {
         table.row(columns.iter().map(|(.., cell)| cell(metrics)));
@@ -147,7 +117,47 @@ pub fn table(all: &[Metrics]) -> String {
     table.to_string() + &comparison(all)
 }
 
-/// AP by distance and by class, a line for each part of each method.
+/// The columns that are shown.
+fn columns(all: &[Metrics]) -> Vec<MetricColumn> {
+    use Side::{Left, Right};
+    // Streaming AP exists only where results have a time of publication.
+    let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
+    let has_network = all.iter().any(|metrics| metrics.contribution.sent > 0);
+    let name = if is_live { "answered" } else { "frames" };
+    let by_frame = all.iter().any(|of| of.ap_order() == ApOrder::Frame);
+    let columns: [MetricColumn; 14] = [
+        (true, "method", Left, |of| of.method.clone()),
+        (true, "poses", Left, |of| of.pose_source.clone()),
+        (true, name, Right, frames),
+        (true, "AP@0.3", Right, |of| number(of.headline().at_30, 3)),
+        (true, "AP@0.5", Right, |of| number(of.headline().at_50, 3)),
+        (true, "AP@0.7", Right, |of| number(of.headline().at_70, 3)),
+        (is_live, "AP@0.5 all", Right, |of| {
+            number(of.ap_unanswered_empty.at_50, 3)
+        }),
+        (is_live, "sAP@0.5", Right, |of| {
+            number(of.ap_streaming.and_then(|ap| ap.at_50), 3)
+        }),
+        (!is_live && !by_frame, "frame order 0.5", Right, |of| {
+            number(of.ap_frame_order.at_50, 3)
+        }),
+        (!is_live && by_frame, "global order 0.5", Right, |of| {
+            number(of.ap_global.at_50, 3)
+        }),
+        (has_network, "fused", Right, |of| {
+            number(of.contribution.fused_per_frame, 2)
+        }),
+        (true, "pose m", Right, |of| number(of.pose.mean_m, 2)),
+        (true, "latency ms", Right, latency),
+        (true, "bytes", Right, |of| {
+            of.comm.wire_bytes_mean.map_or("-".into(), bytes)
+        }),
+    ];
+    let columns = columns.into_iter().filter(|(is_shown, ..)| *is_shown);
+    columns.collect()
+}
+
+/// AP by distance and by class, in the global order, a line for each part of each method.
 pub fn breakdown(all: &[Metrics]) -> String {
     let numbers = ["objects", "AP@0.3", "AP@0.5", "AP@0.7"];
     let mut table = TextTable::of(&["method", "part"], &numbers);
@@ -192,10 +202,7 @@ fn comparison(all: &[Metrics]) -> String {
         if let Some(what) = shared(method).filter(|_| used < sent) {
             let mean = metrics.contribution.sent_bytes_mean;
             let size = mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
-            let _ = writeln!(
-                text,
-                "{method}: of {sent} {what}{size} {used} arrived in time"
-            );
+            let _ = writeln!(text, "{method}: of {sent} {what}{size} {used} were fused");
         }
     }
     text
@@ -226,16 +233,10 @@ fn latency(metrics: &Metrics) -> String {
     }
 }
 
-/// Wire bytes of the fused messages, or if there were none, of all messages sent.
-fn wire_bytes(metrics: &Metrics) -> String {
-    let sent = metrics.contribution.sent_bytes_mean;
-    let mean = metrics.comm.wire_bytes_mean.or(sent);
-    mean.map_or("-".into(), bytes)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dataset::evaluation_protocol::EvaluationProtocol;
     use deploy::score::metrics::{ByIou, Latencies};
 
     fn precision(at_50: Option<f64>) -> ByIou {
@@ -292,6 +293,24 @@ mod tests {
     }
 
     #[test]
+    fn the_order_of_the_protocol_is_reported_first() {
+        let by_frame = Metrics {
+            ap_frame_order: precision(Some(0.25)),
+            protocol: EvaluationProtocol::preset("v2v4real"),
+            ..metrics("max", Some(0.75))
+        };
+        let text = table(&[by_frame]);
+        let head = text.lines().next().unwrap();
+        assert!(
+            head.contains("global order 0.5") && !head.contains("frame order"),
+            "{text}"
+        );
+        assert!(text.find("0.250") < text.find("0.750"), "{text}");
+        assert!(text.contains("AP@0.3, 0.5, 0.7 in frame order\n"), "{text}");
+        assert!(table(&[metrics("max", Some(0.5))]).contains("frame order 0.5"));
+    }
+
+    #[test]
     fn a_live_table_gives_the_answered_ticks_and_warns_where_they_differ() {
         let text = table(&[answered("max", 33, 0.8), answered("pastat", 29, 0.9)]);
         let lines: Vec<&str> = text.lines().collect();
@@ -311,6 +330,19 @@ mod tests {
     }
 
     #[test]
+    fn bytes_are_those_of_fused_messages_and_a_dash_where_none_was_fused() {
+        let row = |wire_bytes_mean| {
+            let mut metrics = metrics("max", Some(0.8));
+            metrics.contribution.sent_bytes_mean = Some(1_600_000.0);
+            metrics.comm.wire_bytes_mean = wire_bytes_mean;
+            table(&[metrics]).lines().nth(1).unwrap().to_owned()
+        };
+        let [fused, nothing] = [Some(1229.0), None].map(row);
+        assert!(fused.ends_with(" 1.2 kB"), "{fused}");
+        assert!(nothing.ends_with(" -"), "{nothing}");
+    }
+
+    #[test]
     fn undelivered_messages_are_reported() {
         let contribution = Contribution {
             fused_per_frame: Some(0.05),
@@ -324,7 +356,7 @@ mod tests {
             ..metrics("none", Some(0.7))
         };
         assert!(
-            !table(&[ego_only]).contains("arrived in time"),
+            !table(&[ego_only]).contains("were fused"),
             "it fuses nothing in any case"
         );
         let text = table(&[Metrics {
@@ -337,7 +369,7 @@ mod tests {
             "{text}"
         );
         assert!(
-            text.contains("max: of 38 feature maps of 3.1 MB each 2 arrived in time"),
+            text.contains("max: of 38 feature maps of 3.1 MB each 2 were fused"),
             "{text}"
         );
         assert!(!text.contains(" / "), "no latency is known: {text}");

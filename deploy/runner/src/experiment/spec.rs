@@ -59,10 +59,11 @@ pub struct Experiment {
     /// Pose source, unless the grid has pose noise, or a row or column of a table its own.
     #[serde(default)]
     pub poses: PoseSourceConfig,
-    /// Correlation of the errors of successive frames, if the grid has pose noise.
+    /// Correlation of the errors of successive frames of `grid.pose_noise`; refused without it.
     #[serde(default)]
     pub noise_mode: NoiseMode,
-    /// Deadline, age and trust of the ego; `protocol.ego_kind` selects the vehicle.
+    /// Deadline, age and trust of the ego; `protocol.ego_kind` selects the vehicle. Without a link no time passes, and
+    /// deadline and age are refused.
     #[serde(default)]
     pub ego: EgoSettings,
     /// Compute times of the stages, over a link.
@@ -201,12 +202,12 @@ pub struct Table {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Row {
-    /// First column of the row; absent: the method.
+    /// First column of the row; absent: the method. Different for each row, without `|` and line ends.
     #[serde(default)]
     pub name: Option<String>,
     /// Fusion method.
     pub method: Method,
-    /// Its weights, several for a mean over trainings; absent: those of the folder.
+    /// Its weights, several different files for a mean over trainings; absent: those of the folder.
     #[serde(default)]
     pub weights: Vec<PathBuf>,
     /// Pose source of this row, in place of that of the columns.
@@ -230,7 +231,7 @@ pub struct Row {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Column {
-    /// Title of the column.
+    /// Title of the column: different for each, without `|` and line ends.
     pub name: String,
     /// Pose source; absent: that of the experiment.
     #[serde(default)]
@@ -238,7 +239,8 @@ pub struct Column {
     /// Delay of the messages of neighbours without a link, milliseconds.
     #[serde(default)]
     pub delay_ms: u64,
-    /// Attack by neighbours; absent: none.
+    /// Attack by neighbours; absent: none. More attackers than any scenario has neighbours are refused; the ego alone has
+    /// none.
     #[serde(default)]
     pub attack: Option<AttackConfig>,
     /// Misbehaviour detection of the ego.

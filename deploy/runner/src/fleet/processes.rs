@@ -15,8 +15,9 @@ use fusion::Exchange;
 use protocol::{CavId, RunId, Stream};
 use serde::Serialize;
 use sim_replay::config::{
-    LinkProcessConfig, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig,
+    LinkProcessConfig, LinkSelection, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig,
 };
+use support::random::scenario_seed;
 
 use super::Fleet;
 use crate::scenario::Clock;
@@ -164,10 +165,14 @@ impl Fleet {
         let contents = self.neighbours().flat_map(|cav| self.streams_of(cav));
         let contents: BTreeSet<Stream> = contents.collect();
         let streams = [Stream::Pose].into_iter().chain(contents);
+        let link = self.scenario.link.clone().unwrap_or_default();
         LinkProcessConfig {
             run: context.run.clone(),
             ego: self.ego.clone(),
-            link: self.scenario.link.clone().unwrap_or_default(),
+            link: LinkSelection {
+                seed: scenario_seed(link.seed, &self.recorded.name),
+                ..link
+            },
             streams: streams.chain([Stream::Descriptor]).collect(),
             keep_running: false,
             inbox: self.scenario.ego.inbox,

@@ -30,14 +30,12 @@ use self::consensus::FeatureConsensus;
 use self::global_attention::{GlobalHalf, REDUCTION};
 use self::sampling::Sampler;
 use super::cobevt::nearest_first;
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
 use super::padding::Padding;
 use super::partition::Partition;
-use super::settings::{FusionSettings, of_size};
-use super::spec::MethodSpec;
+use super::settings::of_size;
 use super::swap_fusion::{HalfBlock, MeanHead, Slots, SwapFusionConfig};
 use super::warp::WarpedMaps;
+use crate::{AlignedMaps, Fusion, FusionOutput, FusionSettings, MethodSpec};
 
 /// ERMVP.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<ErmvpConfig>(

@@ -31,19 +31,9 @@ pub enum StageError {
     /// The configuration is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The weights do not fit.
+    /// The weights do not fit; the method of the file is named if it is another one.
     #[error(transparent)]
     Weights(#[from] FileError),
-    /// The weights of another method do not fit.
-    #[error("{source}; the file was trained for method {trained}, not {method}")]
-    OtherMethod {
-        /// Method in the file.
-        trained: String,
-        /// Required method.
-        method: &'static str,
-        /// Tensor that does not fit.
-        source: Box<FileError>,
-    },
 }
 
 /// Channel mixing, warp and fusion of one network.
@@ -424,14 +414,15 @@ fn step_of(entry: usize, facts: &[MapMetadata]) -> usize {
 }
 
 /// Names the method of the weights beside an error, if it is another one.
-fn of_method(error: FileError, weights: &Weights, method: Method) -> StageError {
+fn of_method(error: FileError, weights: &Weights, method: Method) -> FileError {
     match weights.metadata(METHOD_KEY) {
-        Some(trained) if trained != method.name() => StageError::OtherMethod {
-            trained: trained.to_owned(),
-            method: method.name(),
-            source: Box::new(error),
-        },
-        _ => error.into(),
+        Some(trained) if trained != method.name() => {
+            let problem = &error.problem;
+            let problem =
+                format!("{problem}; the file was trained for method {trained}, not {method}");
+            FileError { problem, ..error }
+        }
+        _ => error,
     }
 }
 

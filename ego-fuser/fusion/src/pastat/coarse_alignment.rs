@@ -15,15 +15,6 @@ use crate::maps::{AlignedMaps, MapMetadata, reaching};
 use crate::padding::Padding;
 use crate::warp::WarpedMaps;
 
-/// Selects and pads the entries of a sample.
-#[derive(Debug)]
-pub(super) struct CoarseAlignment {
-    /// Rows and columns of the newest maps are padded to multiples of so many cells.
-    padding_cells: i64,
-    /// The same of earlier maps.
-    earlier_padding_cells: i64,
-}
-
 /// Coarsely aligned maps: the entries of a sample that reach any cell. A map that reaches none is left out and has no
 /// share of the confidence either.
 #[derive(Debug)]
@@ -57,18 +48,11 @@ pub(super) struct Origins {
     pub(super) steps_back: Vec<usize>,
 }
 
-impl CoarseAlignment {
-    pub(super) fn new(config: &PastatConfig) -> Self {
-        let padding_cells = config.padding_cells();
-        Self {
-            padding_cells,
-            // Both grids cover the same area after padding: tokens of all ages lie in the same places.
-            earlier_padding_cells: padding_cells / config.earlier_cells,
-        }
-    }
-
+impl CoarseMaps {
     /// The entries of `maps` that reach any cell; the ego's newest is always one.
-    pub(super) fn pick(&self, maps: &AlignedMaps) -> Result<CoarseMaps, TchError> {
+    pub(super) fn pick(maps: &AlignedMaps, config: &PastatConfig) -> Result<Self, TchError> {
+        // Rows and columns are padded to multiples of so many cells.
+        let padding_cells = config.padding_cells();
         let (warped, received, earlier) = (&maps.warped, &maps.received, &maps.earlier);
         let newest = reaching(&warped.mask, true)?;
         let sent = match &received.sent {
@@ -92,10 +76,11 @@ impl CoarseAlignment {
         let earlier = earlier.as_ref().filter(|_| !earlier_entries.is_empty());
         let earlier = earlier.map(|earlier| {
             let entries = rows_of(&earlier.warped, &earlier_entries)?;
-            Padding::to_multiples_of(self.earlier_padding_cells, &entries)
+            // Both grids cover the same area after padding: tokens of all ages lie in the same places.
+            Padding::to_multiples_of(padding_cells / config.earlier_cells, &entries)
         });
-        Ok(CoarseMaps {
-            newest: Padding::to_multiples_of(self.padding_cells, &rows_of(warped, &newest)?)?,
+        Ok(Self {
+            newest: Padding::to_multiples_of(padding_cells, &rows_of(warped, &newest)?)?,
             received: rows_of(&received_maps, &newest)?,
             received_cells: FullResolutionMap::shallow_clones(cells),
             earlier: earlier.transpose()?,
@@ -105,9 +90,7 @@ impl CoarseAlignment {
             all: metadata.len() as i64,
         })
     }
-}
 
-impl CoarseMaps {
     /// `[N - 1, 3]` of all entries of the input but the first, given `corrections` of the selected ones: others have
     /// none.
     pub(super) fn among_all(&self, corrections: &Tensor) -> Result<Tensor, TchError> {

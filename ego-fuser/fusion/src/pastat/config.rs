@@ -81,15 +81,6 @@ pub(crate) struct MemoryConfig {
     pub share: f64,
 }
 
-impl Default for MemoryConfig {
-    fn default() -> Self {
-        Self {
-            hidden: 24,
-            share: 0.125,
-        }
-    }
-}
-
 /// A PASTAT from its tokens to its output. `ce`, `fsa`, `te`, `temporal_memory` and `frames` are the switches of
 /// the ablation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -145,7 +136,10 @@ impl PastatConfig {
             windows: vec![4, 8],
             rows: Rows::Ego,
             map_refinement: Some(96),
-            temporal_memory: Some(MemoryConfig::default()),
+            temporal_memory: Some(MemoryConfig {
+                hidden: 24,
+                share: 0.125,
+            }),
             frames: 3,
             earlier_cells: 2,
             frame_secs: 0.1,
@@ -342,14 +336,14 @@ mod tests {
             (
                 with_memory(MemoryConfig {
                     hidden: 0,
-                    ..MemoryConfig::default()
+                    share: 0.125,
                 }),
                 "temporal memory hidden is 0",
             ),
             (
                 with_memory(MemoryConfig {
+                    hidden: 24,
                     share: f64::NAN,
-                    ..MemoryConfig::default()
                 }),
                 "temporal memory share is NaN",
             ),

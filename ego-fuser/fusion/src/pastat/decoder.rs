@@ -14,7 +14,8 @@ use crate::layers::ZERO;
 /// map, of which the maximum is taken, and as an additive change of that; neutral before training.
 #[derive(Debug)]
 pub(super) struct Decoder {
-    gate: TokenGate,
+    gate_hidden: nn::Linear,
+    gate_out: nn::Linear,
     norm: nn::LayerNorm,
     cells: nn::Linear,
     channels: i64,
@@ -25,10 +26,10 @@ impl Decoder {
     /// Its variables are `gate.*` and `decoder.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         let (channels, dim, patch) = (config.channels, config.dim, config.patch);
-        let gate = TokenGate::new(&(path / "gate"), config);
-        let path = path / "decoder";
+        let (gate, path) = (path / "gate", path / "decoder");
         Self {
-            gate,
+            gate_hidden: nn::linear(&gate / "hidden", 2 * dim, dim, nn::LinearConfig::default()),
+            gate_out: nn::linear(&gate / "out", dim, 1, ZERO),
             norm: nn::layer_norm(&path / "norm", vec![dim], nn::LayerNormConfig::default()),
             cells: nn::linear(&path / "cells", dim, channels * patch * patch, ZERO),
             channels,
@@ -53,8 +54,23 @@ impl Decoder {
             return f64_tensor::by_cell(own);
         }
         let others = channels_last(&tokens.values.f_narrow(0, 1, count)?)?;
-        let weight = self.gate.forward(&others, context)?;
+        let weight = self.weight(&others, context)?;
         neighbours.maximum_with(own, &weight)
+    }
+
+    /// Weight of the neighbours' newest maps, token by token, 1 before training, 0 to 2 after: `[M, 1, H, W]` from their
+    /// tokens `[M, h, w, D]` and the ego's after the transformer `[1, h, w, D]`.
+    fn weight(&self, others: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
+        // A layer of both, side by side; the ego's part is the same for all others.
+        let dim = ego.size4()?.3;
+        let (ws, bs) = (&self.gate_hidden.ws, self.gate_hidden.bs.as_ref());
+        let hidden = others.f_linear(&ws.f_narrow(1, 0, dim)?, None::<&Tensor>)?
+            + ego.f_linear(&ws.f_narrow(1, dim, dim)?, bs)?;
+        // The last layer is zero at first, of which the sigmoid is a half: the factor makes it 1.
+        let weight = self.gate_out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
+        let (maps, rows, columns, _) = weight.size4()?;
+        let weight = weight.f_view([maps, 1, rows, columns])?;
+        weight.f_upsample_nearest2d([rows * self.patch, columns * self.patch], None, None)
     }
 
     /// A map `[1, C, H, W]` with the additive change by the context, tokens `[1, h, w, D]`; the channels of a cell are
@@ -93,38 +109,5 @@ impl Decoder {
             .f_view([self.channels, self.patch * self.patch, each])?
             .f_transpose(0, 1)?
             .f_reshape([-1, each])
-    }
-}
-
-/// Predicts the weight of a neighbour's newest map, token by token: 1 before training, 0 to 2 after.
-#[derive(Debug)]
-struct TokenGate {
-    hidden: nn::Linear,
-    out: nn::Linear,
-    patch: i64,
-}
-
-impl TokenGate {
-    fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let dim = config.dim;
-        Self {
-            hidden: nn::linear(path / "hidden", 2 * dim, dim, nn::LinearConfig::default()),
-            out: nn::linear(path / "out", dim, 1, ZERO),
-            patch: config.patch,
-        }
-    }
-
-    /// `[M, 1, H, W]` from the neighbours' tokens `[M, h, w, D]` and the ego's after the transformer `[1, h, w, D]`.
-    fn forward(&self, others: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
-        // A layer of both, side by side; the ego's part is the same for all others.
-        let dim = ego.size4()?.3;
-        let (ws, bs) = (&self.hidden.ws, self.hidden.bs.as_ref());
-        let hidden = others.f_linear(&ws.f_narrow(1, 0, dim)?, None::<&Tensor>)?
-            + ego.f_linear(&ws.f_narrow(1, dim, dim)?, bs)?;
-        // The last layer is zero at first, of which the sigmoid is a half: the factor makes it 1.
-        let weight = self.out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
-        let (maps, rows, columns, _) = weight.size4()?;
-        let weight = weight.f_view([maps, 1, rows, columns])?;
-        weight.f_upsample_nearest2d([rows * self.patch, columns * self.patch], None, None)
     }
 }

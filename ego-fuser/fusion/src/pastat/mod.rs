@@ -22,19 +22,18 @@ use tch::{TchError, Tensor, nn};
 pub use ablation::{Part, ablated};
 pub(crate) use config::PastatConfig;
 
-use self::coarse_alignment::CoarseAlignment;
+use self::coarse_alignment::CoarseMaps;
 use self::confidence_embedding::ConfidenceEmbedding;
 use self::decoder::Decoder;
 use self::extensions::map_refinement::MapRefinement;
 use self::extensions::temporal_memory::TemporalMemory;
 use self::patches::Patches;
 use self::spatial_alignment::SpatialAlignment;
-use self::temporal_encoding::AgeEncoding;
 use self::transformer::Transformer;
-use super::interface::{Fusion, FusionOutput};
-use super::maps::AlignedMaps;
-use super::settings::{FusionSettings, HistorySpec, Requirements, of_size};
-use super::spec::MethodSpec;
+use super::settings::of_size;
+use crate::{
+    AlignedMaps, Fusion, FusionOutput, FusionSettings, HistorySpec, MethodSpec, Requirements,
+};
 
 /// PASTAT.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<PastatConfig>(
@@ -67,11 +66,10 @@ impl FusionSettings for PastatConfig {
 /// PASTAT between encoder and detection head.
 #[derive(Debug)]
 pub(crate) struct Pastat {
-    coarse_alignment: CoarseAlignment,
+    config: PastatConfig,
     patches: Patches,
     confidence_embedding: ConfidenceEmbedding,
     spatial_alignment: SpatialAlignment,
-    temporal_encoding: AgeEncoding,
     transformer: Transformer,
     decoder: Decoder,
     temporal_memory: Option<TemporalMemory>,
@@ -88,11 +86,10 @@ impl Pastat {
         let (memory, hidden) = (config.temporal_memory.as_ref(), config.map_refinement);
         // Random parameters are drawn in this order.
         Ok(Self {
-            coarse_alignment: CoarseAlignment::new(config),
+            config: config.clone(),
             patches: Patches::new(path, config),
             confidence_embedding: ConfidenceEmbedding::new(path, config),
             spatial_alignment: SpatialAlignment::new(path, config),
-            temporal_encoding: AgeEncoding::new(path, config),
             transformer: Transformer::new(path, config),
             decoder: Decoder::new(path, config),
             temporal_memory: memory.map(|memory| TemporalMemory::new(path, config, memory)),
@@ -102,7 +99,7 @@ impl Pastat {
 
     /// The fused map before its refinement, `[1, C, H, W]`, and the corrections of the poses.
     fn unrefined(&self, maps: &AlignedMaps) -> Result<(Tensor, Option<Tensor>), TchError> {
-        let coarse = self.coarse_alignment.pick(maps)?; // Eq. 2
+        let coarse = CoarseMaps::pick(maps, &self.config)?; // Eq. 2
         let confidences = self.confidence_embedding.embed(&coarse.origins)?; // Eq. 7
         let patches = self.patches.flatten(&coarse)?;
         let (fine, aligned, fit) = self.spatial_alignment.align(
@@ -113,9 +110,8 @@ impl Pastat {
             maps.is_training,
         )?; // FSA
         let of_maps = [&confidences.of_tokens, &fit];
-        let tokens = self
-            .temporal_encoding
-            .encode(aligned, of_maps, &coarse.origins.age_secs)?; // Eq. 10-12
+        let ages = &coarse.origins.age_secs;
+        let tokens = temporal_encoding::encode(aligned, of_maps, ages, &self.config)?; // Eq. 10-12
         let context = self.transformer.forward(&tokens)?; // Eq. 8, 9
         let mut fused = self.decoder.maximum(&fine, &tokens, &context)?;
         if let Some(memory) = &self.temporal_memory {

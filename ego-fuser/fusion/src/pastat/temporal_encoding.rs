@@ -1,7 +1,7 @@
 //! TE, Temporal Encoding (Eq. 10-12): encodes the true age of a map.
 
 use perception::tensor_values::tensor;
-use tch::{Device, Kind, TchError, Tensor, nn};
+use tch::{Device, Kind, TchError, Tensor};
 
 use super::config::PastatConfig;
 use super::patches::Tokens;
@@ -9,45 +9,29 @@ use super::patches::Tokens;
 /// Ages are clamped to this, seconds.
 const MAX_AGE_SECS: f64 = 10.0;
 
-/// Adds the encodings of each map to its tokens.
-#[derive(Debug)]
-pub(super) struct AgeEncoding {
-    config: PastatConfig,
-    device: Device,
+/// Adds the encodings of each map to its tokens, Eq. 10: `z^(0) = Flatten(F) + E_t`, with the terms `of_maps` `[N, D]`: of
+/// the confidence (Eq. 7) and of the match quality from FSA. It has no variables.
+pub(super) fn encode(
+    Tokens { values, valid }: Tokens,
+    of_maps: [&Option<Tensor>; 2],
+    age_secs: &[f64],
+    config: &PastatConfig,
+) -> Result<Tokens, TchError> {
+    let of_ages = of_ages(age_secs, config, values.device())?;
+    let mut terms = of_maps.into_iter().flatten();
+    let of_map = terms.try_fold(of_ages, |sum, term| sum.f_add(term))?;
+    let values = values + of_map.f_unsqueeze(2)?.f_unsqueeze(3)?;
+    Ok(Tokens { values, valid })
 }
 
-impl AgeEncoding {
-    /// It has no variables; `path` is that of the module.
-    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        Self {
-            config: config.clone(),
-            device: path.device(),
-        }
+/// `[N, D]`: `E_t` of each map; zeros without the encoding, for the ablation.
+fn of_ages(age_secs: &[f64], config: &PastatConfig, device: Device) -> Result<Tensor, TchError> {
+    let size = [age_secs.len() as i64, config.dim];
+    if config.te.is_none() {
+        return Tensor::f_zeros(size, (Kind::Float, device));
     }
-
-    /// Eq. 10: `z^(0) = Flatten(F) + E_t`, with the terms `of_maps` `[N, D]`: of the confidence (Eq. 7) and of the match
-    /// quality from FSA.
-    pub(super) fn encode(
-        &self,
-        Tokens { values, valid }: Tokens,
-        of_maps: [&Option<Tensor>; 2],
-        age_secs: &[f64],
-    ) -> Result<Tokens, TchError> {
-        let mut terms = of_maps.into_iter().flatten();
-        let of_map = terms.try_fold(self.of_ages(age_secs)?, |sum, term| sum.f_add(term))?;
-        let values = values + of_map.f_unsqueeze(2)?.f_unsqueeze(3)?;
-        Ok(Tokens { values, valid })
-    }
-
-    /// `[N, D]`: `E_t` of each map; zeros without the encoding, for the ablation.
-    fn of_ages(&self, age_secs: &[f64]) -> Result<Tensor, TchError> {
-        let size = [age_secs.len() as i64, self.config.dim];
-        if self.config.te.is_none() {
-            return Tensor::f_zeros(size, (Kind::Float, self.device));
-        }
-        let values = age_secs.iter().flat_map(|&age| encoding(age, &self.config));
-        tensor(&values.collect::<Vec<f32>>(), &size, self.device)
-    }
+    let values = age_secs.iter().flat_map(|&age| encoding(age, config));
+    tensor(&values.collect::<Vec<f32>>(), &size, device)
 }
 
 /// Eq. 11 and 12: `E_t` of a map of this age, `D` values.

@@ -246,7 +246,7 @@ fn every_parameter_gets_a_gradient() {
 
 /// The maps after FSA.
 fn fine(pastat: &Pastat, maps: &AlignedMaps) -> FineMaps {
-    let coarse = pastat.coarse_alignment.pick(maps).unwrap();
+    let coarse = CoarseMaps::pick(maps, &pastat.config).unwrap();
     let confidences = pastat.confidence_embedding.embed(&coarse.origins).unwrap();
     let patches = pastat.patches.flatten(&coarse).unwrap();
     pastat

@@ -21,12 +21,10 @@ pub use temporal_encoding::TemporalEncoding;
 pub use window_attention::{WindowAttention, WindowBranch};
 
 use super::block_order::BlockOrder;
-use super::interface::{Fusion, FusionOutput};
 use super::layers::unseen;
-use super::maps::AlignedMaps;
 use super::padding::Padding;
-use super::settings::{FusionSettings, of_size};
-use super::spec::MethodSpec;
+use super::settings::of_size;
+use crate::{AlignedMaps, Fusion, FusionOutput, FusionSettings, MethodSpec};
 
 /// V2X-ViT.
 pub static METHOD: MethodSpec = MethodSpec::of_features::<V2xVitConfig>(

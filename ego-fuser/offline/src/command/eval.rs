@@ -19,6 +19,7 @@ use serde_json::{Value, json};
 use support::cli::{BadInput, Outcome};
 use support::output;
 use terminal::progress;
+use terminal::text_table::number;
 
 /// A data set with its evaluation protocol.
 struct EvalSet {
@@ -82,7 +83,7 @@ impl Arguments {
     /// The data sets, each with the agents of its protocol.
     fn open(&self, left_out: &mut LeftOut) -> Result<Vec<EvalSet>> {
         let mut all = Vec::with_capacity(self.data.data.len());
-        for opened in self.data.open(left_out)? {
+        for opened in self.data.open(left_out, Some(&self.protocol))? {
             let protocol = self.protocol.resolve(opened.layout);
             let protocol = protocol.map_err(BadInput::new)?;
             let scenarios = opened.scenarios.iter();
@@ -189,8 +190,8 @@ impl Arguments {
         let row = tally.row(method);
         if !self.json {
             let [global, frame] = ["ap_global", "ap_frame_order"].map(|name| {
-                let aps = THRESHOLDS.map(|iou| row[name][format!("{iou}")].as_f64().unwrap_or(0.0));
-                aps.map(|ap| format!("{ap:.4}")).join(" ")
+                let aps = THRESHOLDS.map(|iou| row[name][format!("{iou}")].as_f64());
+                aps.map(|ap| number(ap, 4)).join(" ")
             });
             output::line(format_args!(
                 "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
@@ -227,9 +228,9 @@ struct MethodTotals {
 }
 
 impl MethodTotals {
-    /// Adds a frame; one that failed has no result to add.
+    /// Adds a frame. One that failed has no result to add, one without the ego's true pose nothing to compare it with.
     fn add(&mut self, frame: &EvaluatedFrame) {
-        if frame.failure.is_some() {
+        if frame.failure.is_some() || !frame.has_true_pose() {
             return;
         }
         self.frames += 1;
@@ -264,6 +265,15 @@ mod tests {
     use support::cli::exit_code;
 
     use super::*;
+
+    #[test]
+    fn without_objects_ap_is_null() {
+        let row = MethodTotals::default().row("late");
+        assert_eq!(
+            row["ap_global"],
+            json!({"0.3": null, "0.5": null, "0.7": null})
+        );
+    }
 
     #[test]
     fn weights_that_are_not_there_are_bad_input() {

@@ -10,6 +10,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use bus::malloc_settings;
+use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::{self, Dataset, IntensityOption, LeftOut, OpenOptions, Scenario, findings};
 use serde::Serialize;
 use serde_json::json;
@@ -62,20 +63,27 @@ impl DataSets {
         OpenOptions::with_intensity_scale(self.intensity.scale)
     }
 
-    /// Each of them, with what is unused or implausible in it.
-    fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Dataset>, BadInput> {
+    /// Each of them, with what is unused or implausible in it; also by the protocol, if that is asked for.
+    fn open(
+        &self,
+        left_out: &mut LeftOut,
+        protocol: Option<&ProtocolConfig>,
+    ) -> Result<Vec<Dataset>, BadInput> {
         let mut all = Vec::with_capacity(self.data.len());
         for folder in &self.data {
             let opened = dataset::open_with(folder, &self.options()).map_err(BadInput::of)?;
             left_out.add_files(&opened.problems);
-            left_out.add_findings(findings::sampled(&opened.scenarios, self.intensity.scale));
+            let protocol = protocol.map(|protocol| protocol.resolve(opened.layout));
+            let protocol = protocol.transpose().map_err(BadInput::new)?;
+            let (scale, rule) = (self.intensity.scale, protocol.map(|it| it.ground_truth));
+            left_out.add_findings(findings::sampled(&opened.scenarios, scale, rule.as_ref()));
             all.push(opened);
         }
         Ok(all)
     }
 
     fn scenarios(&self, left_out: &mut LeftOut) -> Result<Vec<Scenario>, BadInput> {
-        let all = self.open(left_out)?;
+        let all = self.open(left_out, None)?;
         Ok(all.into_iter().flat_map(|data| data.scenarios).collect())
     }
 }

@@ -25,6 +25,7 @@ use training::train::{self, Accuracy, TrainConfig, TrainObserver, TrainingReport
 use super::DataSets;
 use support::bounded_file;
 use support::cli::BadInput;
+use terminal::text_table::number;
 
 /// Largest file of a network, bytes.
 const MAX_NETWORK_BYTES: u64 = 1 << 20;
@@ -362,9 +363,9 @@ impl TrainObserver for BarObserver {
     }
 
     fn validated(&mut self, step: u64, accuracy: &Accuracy) {
-        let [ap_30, ap_50, ap_70] = accuracy.ap_global;
+        let aps = accuracy.ap_global.map(|ap| number(ap, 3)).join(" ");
         self.0.print_line(&format!(
-            "step {step}: AP@0.3/0.5/0.7 global {ap_30:.3} {ap_50:.3} {ap_70:.3} on {} frames",
+            "step {step}: AP@0.3/0.5/0.7 global {aps} on {} frames",
             accuracy.frames
         ));
     }

@@ -13,7 +13,7 @@ use ego_fuser::pairing::PairingConfig;
 use fusion::method::Method;
 use link::{LatencyModel, LinkConfig, LinkEmulator, LinkError};
 use protocol::CavId;
-use support::random::derive_seed;
+use support::random::scenario_seed;
 
 use super::stepped::ComputeTimes;
 
@@ -102,9 +102,7 @@ impl Setup {
             };
             return LinkEmulator::new(config, Path::new("."), 0);
         };
-        // By name: the result of a scenario does not depend on those before it.
-        let seed_words: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
-        let seed = derive_seed(link.seed, &seed_words);
+        let seed = scenario_seed(link.seed, &scenario.name);
         LinkEmulator::new(link.config.clone(), &link.folder, seed)
     }
 

@@ -196,7 +196,7 @@ impl<'a> SteppedRun<'a> {
                 failure = self.send_own(tick, sent)?;
             } else if !sent.messages.is_empty() && is_exchanged {
                 let distance_m = distance_m(&frames[0], &frames[place]);
-                self.delivery.enqueue(tick, sent, &self.compute, distance_m);
+                self.delivery.enqueue(sent, &self.compute, distance_m);
             }
         }
         load.points = false;
@@ -273,17 +273,18 @@ impl<'a> SteppedRun<'a> {
                 self.advance()?;
             },
         };
-        let ego = &computed.frames[0];
+        if let (Err(reason), None) = (&fused, &computed.failure) {
+            let ego = &computed.frames[0].cav;
+            self.evaluator
+                .count_failure(self.scenario, tick, ego, reason);
+        }
+        let frame = self.evaluated(tick, decided_nanos, computed, fused);
         // The vehicle has driven on, but its result cannot be compared with anything.
-        if ego.world_from_lidar.is_none() {
-            let problem = without_true_pose(self.scenario, tick, &ego.cav);
+        if !frame.has_true_pose() {
+            let problem = without_true_pose(self.scenario, tick, &frame.stamp.cav);
             self.evaluator.left_out.add_unreadable(0, problem);
         }
-        if let (Err(reason), None) = (&fused, &computed.failure) {
-            self.evaluator
-                .count_failure(self.scenario, tick, &ego.cav, reason);
-        }
-        Ok(Some(self.evaluated(tick, decided_nanos, computed, fused)))
+        Ok(Some(frame))
     }
 
     /// Time at which the ego's own map of a tick arrives, nanoseconds.

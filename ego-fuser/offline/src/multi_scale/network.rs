@@ -132,7 +132,7 @@ impl MultiScaleNetwork {
     ) -> Result<MultiScaleOutput, TchError> {
         let network = &self.network;
         let encoded = network.encoder.forward(pillars, false);
-        let canvas = pillars.scatter(&encoded, network.pillar_grid());
+        let canvas = pillars.scatter(&encoded, &network.pillar_grid);
         let (sent, rate) = match &self.communication {
             Some(communication) => {
                 // Which cells an agent sends depends on the scores of its own map.
@@ -151,12 +151,8 @@ impl MultiScaleNetwork {
         let sent_bytes = self.sent_bytes(sent.as_ref(), samples)?;
         let (aggregation, sent) = (self.config.aggregation, sent.as_ref());
         let fused = fuse_levels(&network.backbone, &canvas, samples, aggregation, sent)?;
-        let fused = match &network.shrink {
-            Some(shrink) => shrink.forward(&fused, false),
-            None => fused,
-        };
         Ok(MultiScaleOutput {
-            heads: network.heads(&fused)?,
+            heads: network.heads(&network.shrink.forward(&fused, false))?,
             rate,
             sent_bytes,
         })
@@ -168,7 +164,7 @@ impl MultiScaleNetwork {
         sent: Option<&Tensor>,
         samples: &[MapAlignment],
     ) -> Result<Vec<u64>, TchError> {
-        let (pillar_grid, config) = (self.network.pillar_grid(), &self.network.config);
+        let (pillar_grid, config) = (&self.network.pillar_grid, &self.network.config);
         let stride = config.layer_strides[0];
         // A strided convolution with padding rounds up.
         let [height, width] = [pillar_grid.height, pillar_grid.width]

@@ -105,7 +105,7 @@ impl OfflineDetector {
         poses: &[Pose],
     ) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
         let network = self.network.network();
-        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.pillar_grid());
+        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &network.pillar_grid);
         let mirrored: Vec<Pose> = poses.iter().map(Pose::mirrored_y).collect();
         let poses = if self.is_mirrored() { &mirrored } else { poses };
         let placement = if self.network.config().one_frame {

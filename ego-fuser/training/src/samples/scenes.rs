@@ -56,14 +56,14 @@ impl SceneSet {
         let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
             let dataset = dataset::open_with(folder, options)?;
-            let sampled = findings::sampled(&dataset.scenarios, options.intensity_scale);
-            findings::note(&sampled);
             let protocol = protocol.resolve(dataset.layout);
             // Samples have a limit of their own, counted from an ego that is drawn.
             let protocol = EvaluationProtocol {
                 max_agents: usize::MAX,
                 ..protocol.map_err(|error| Error::Data(format!("evaluation protocol: {error}")))?
             };
+            let (scale, rule) = (options.intensity_scale, &protocol.ground_truth);
+            findings::note(&findings::sampled(&dataset.scenarios, scale, Some(rule)));
             let found = dataset.scenarios.iter();
             scenarios.extend(found.filter_map(|scenario| protocol.arrange(scenario)));
             problems.extend(dataset.problems.iter().map(ToString::to_string));

@@ -100,8 +100,10 @@ pub(super) fn card(
             "Validation on {} frames, ground truth of all vehicles within {comm_range_m} m, area of the network:",
             accuracy.frames
         ));
-        let [global, frame_order] = [accuracy.ap_global, accuracy.ap_frame_order]
-            .map(|[ap_30, ap_50, ap_70]| format!("{ap_30:.4} | {ap_50:.4} | {ap_70:.4}"));
+        let [global, frame_order] = [accuracy.ap_global, accuracy.ap_frame_order].map(|aps| {
+            aps.map(|ap| ap.map_or("-".into(), |ap| format!("{ap:.4}")))
+                .join(" | ")
+        });
         card.paragraph(&format!(
             "| AP | 0.3 | 0.5 | 0.7 |\n| --- | --- | --- | --- |\n| global | {global} |\n| frame order | {frame_order} |"
         ));

@@ -43,9 +43,10 @@ impl DetectorCurve {
         seconds: f64,
         accuracy: &Accuracy,
     ) -> Result<()> {
-        let [ap_30, ap_50, ap_70] = accuracy.ap_global;
+        let aps = accuracy.ap_global;
+        let [ap_30, ap_50, ap_70] = aps.map(|ap| ap.map_or(String::new(), |ap| format!("{ap:.4}")));
         self.0.row(&format!(
-            "{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"
+            "{step},,{seconds:.1},,,,,,,{ap_30},{ap_50},{ap_70}"
         ))
     }
 
@@ -155,8 +156,8 @@ mod tests {
                 4.0,
                 &Accuracy {
                     frames: 5,
-                    ap_global: [0.6, 0.5, 0.25],
-                    ap_frame_order: [0.0; 3],
+                    ap_global: [None, Some(0.5), Some(0.25)],
+                    ap_frame_order: [None; 3],
                 },
             )
             .unwrap();
@@ -172,6 +173,7 @@ mod tests {
             panic!("{drawn:?}")
         };
         assert_eq!(losses.series[0].points, [(10.0, 2.5), (30.0, 1.5)]);
+        assert!(accuracies.series[0].points.is_empty(), "unknown");
         assert_eq!(accuracies.series[2].points, [(30.0, 0.25)]);
     }
 

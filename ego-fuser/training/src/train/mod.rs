@@ -117,10 +117,11 @@ impl<'a> FusionTraining<'a> {
         }
         let method = Some(config.method.name());
         // The time of the training begins here: encoding maps does not count.
-        let trainer = Trainer::begin(run, &model.variables, method, Instant::now())?;
+        let trainer = Trainer::begin(run, &model.variables, method, Instant::now())?
+            .on_data(&scenes.data().sha256)?;
         let curve = DetectorCurve::open(&trainer)?;
         observer.opened(&scenes.data());
-        let pillar_grid = *model.network().pillar_grid();
+        let pillar_grid = model.network().pillar_grid;
         let training = Self {
             config,
             observer,

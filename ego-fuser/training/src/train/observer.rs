@@ -31,10 +31,10 @@ pub struct TrainingReport {
 pub struct Accuracy {
     /// Frames.
     pub frames: usize,
-    /// AP at 0.3, 0.5 and 0.7, sorted over all frames.
-    pub ap_global: [f64; 3],
+    /// AP at 0.3, 0.5 and 0.7, sorted over all frames; unknown without objects.
+    pub ap_global: [Option<f64>; 3],
     /// The same in the order of frames.
-    pub ap_frame_order: [f64; 3],
+    pub ap_frame_order: [Option<f64>; 3],
 }
 
 /// Receives the progress of a training.

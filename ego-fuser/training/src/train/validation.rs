@@ -64,7 +64,7 @@ impl Validator {
             let mut truth = sample.truth.clone();
             let (objects, area_m) = (&mut truth.objects, truth.area_m);
             objects.retain(|object| corners_within(&object.box3d.corners(), area_m));
-            let batch = Batch::collate(vec![sample], model.network().pillar_grid())?;
+            let batch = Batch::collate(vec![sample], &model.network().pillar_grid)?;
             let head = no_grad(|| match with_boxes {
                 true => {
                     let (samples, _) = batch.with_boxes(model, None::<&mut ChaCha8Rng>)?;

@@ -54,7 +54,7 @@ fn perfect_boxes_have_ap_one() {
         &GroundTruth::of_boxes([car(10.0), car(0.0)]),
     );
     for ordering in [Ordering::Global, Ordering::Frame] {
-        assert_eq!(scorer.average_precisions(ordering), [1.0, 1.0, 1.0]);
+        assert_eq!(scorer.average_precisions(ordering), [Some(1.0); 3]);
     }
 }
 
@@ -94,7 +94,7 @@ fn frames_without_detections_still_count_their_objects() {
     let mut scorer = Scorer::new(&[0.5]);
     scorer.add(&[found(0.0, 0.9)], &GroundTruth::of_boxes([car(0.0)]));
     scorer.add(&[], &GroundTruth::of_boxes([car(0.0)]));
-    assert_eq!(scorer.average_precisions(Ordering::Global), [0.5]);
+    assert_eq!(scorer.average_precisions(Ordering::Global), [Some(0.5)]);
 }
 
 #[test]
@@ -102,16 +102,16 @@ fn orderings_differ_where_a_bad_frame_comes_first() {
     let mut scorer = Scorer::new(&[0.5]);
     scorer.add(&[found(50.0, 0.2)], &GroundTruth::of_boxes([]));
     scorer.add(&[found(0.0, 0.9)], &GroundTruth::of_boxes([car(0.0)]));
-    assert_eq!(scorer.average_precisions(Ordering::Global), [1.0]);
-    assert_eq!(scorer.average_precisions(Ordering::Frame), [0.5]);
+    assert_eq!(scorer.average_precisions(Ordering::Global), [Some(1.0)]);
+    assert_eq!(scorer.average_precisions(Ordering::Frame), [Some(0.5)]);
 }
 
 #[test]
-fn nothing_to_find_is_zero_and_not_a_crash() {
+fn without_objects_ap_is_unknown() {
     let mut scorer = Scorer::default();
-    assert_eq!(scorer.average_precisions(Ordering::Global), [0.0; 3]);
+    assert_eq!(scorer.average_precisions(Ordering::Global), [None; 3]);
     scorer.add(&[found(0.0, 0.9)], &GroundTruth::of_boxes([]));
-    assert_eq!(scorer.average_precisions(Ordering::Global), [0.0; 3]);
+    assert_eq!(scorer.average_precisions(Ordering::Global), [None; 3]);
 }
 
 proptest! {
@@ -126,7 +126,8 @@ proptest! {
         scorer.add(&detections, &GroundTruth::of_boxes(objects.clone()));
         for ordering in [Ordering::Global, Ordering::Frame] {
             let first = scorer.average_precisions(ordering);
-            prop_assert!(first.iter().all(|ap| (0.0..=1.0).contains(ap)));
+            prop_assert!(first.iter().flatten().all(|ap| (0.0..=1.0).contains(ap)));
+            prop_assert!(first.iter().all(|ap| ap.is_none() == objects.is_empty()));
             prop_assert_eq!(&first, &scorer.average_precisions(ordering));
             prop_assert!(first.windows(2).all(|pair| pair[0] >= pair[1] || objects.len() > 1));
         }
@@ -173,7 +174,7 @@ fn detections_with_a_corner_beyond_the_range_count_neither_way() {
         Verdict::FalsePositive,
     ];
     assert_eq!(verdicts, [expected]);
-    assert_eq!(scorer.average_precisions(Ordering::Global), [1.0]);
+    assert_eq!(scorer.average_precisions(Ordering::Global), [Some(1.0)]);
 }
 
 #[test]
@@ -310,12 +311,10 @@ fn ap_by_distance_and_by_class_is_that_of_a_plain_computation() {
             }
         };
         let ap = tallies[0].curve(Ordering::Global).average_precision;
-        match tallies[0].objects {
-            0 => assert_eq!(ap, 0.0, "{part}"),
-            _ => assert!(
-                (ap - expected).abs() < 1e-9 && ap > 0.05 && ap < 1.0,
-                "{part}: {ap}, {expected}"
-            ),
-        }
+        assert_eq!(ap.is_some(), tallies[0].objects > 0, "{part}");
+        assert!(
+            ap.is_none_or(|ap| (ap - expected).abs() < 1e-9 && ap > 0.05 && ap < 1.0),
+            "{part}: {ap:?}, {expected}"
+        );
     }
 }

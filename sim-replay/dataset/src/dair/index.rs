@@ -1,6 +1,7 @@
 //! Index of DAIR-V2X and V2X-Seq: pairs of frames with time and batch or sequence, from two files `data_info.json`.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
+use std::ops::Range;
 use std::path::Path;
 
 use crate::faults::Faults;
@@ -13,8 +14,13 @@ use support::statistics;
 pub(super) const COOPERATIVE: &str = "cooperative/data_info.json";
 /// Capture times of the vehicle's frames, below the root.
 const CAPTURES: &str = "vehicle-side/data_info.json";
+/// Capture times of the roadside unit's frames, below the root.
+const UNIT_CAPTURES: &str = "infrastructure-side/data_info.json";
 /// Files of the index, below the root.
-pub(super) const FILES: [&str; 2] = [COOPERATIVE, CAPTURES];
+pub(super) const FILES: [&str; 3] = [COOPERATIVE, CAPTURES, UNIT_CAPTURES];
+/// Times between two sweeps that are no pair, seconds. Those published are up to some 50 ms apart. Clocks with other
+/// starts or time zones are an hour apart or more, and say nothing of pairs.
+const APART_S: Range<f64> = 0.2..3600.0;
 /// Largest `data_info.json` that is read, bytes. Those published have up to 20 MB.
 const MAX_BYTES: u64 = 512 << 20;
 
@@ -53,13 +59,16 @@ pub(super) struct FramePair {
     sequence: Option<String>,
 }
 
-/// Capture time and batch or sequence of a frame of the vehicle.
+/// Capture time and batch or sequence of a frame of one side.
 #[derive(Debug)]
 struct Capture {
     /// `None` where the time cannot be read.
     micros: Option<u64>,
     group: Option<String>,
 }
+
+/// Captures of one side by the ids of their frames.
+type Captures = HashMap<String, Capture>;
 
 /// The pairs of a data set, in the order of their time.
 #[derive(Debug)]
@@ -86,11 +95,18 @@ impl Index {
                 "lists no pair of frames of vehicle and roadside unit that can be read (DAIR-V2X)";
             return Err(ReadError::malformed(&path, reason));
         }
-        let captures = read_captures(root, kind, problems);
+        let captures = read_captures(&root.join(CAPTURES), kind, problems);
+        // The times of the unit only tell which pairs are none: a data set without them is whole.
+        let of_unit = read_captures(&root.join(UNIT_CAPTURES), kind, &mut Vec::new());
+        let mut faults = Faults::default();
         let has_times = captures.values().any(|capture| capture.micros.is_some());
         let mut groups: BTreeMap<String, Vec<(u64, FramePair)>> = BTreeMap::new();
         let (noun, _) = kind.group();
         for pair in pairs {
+            if let Some(reason) = apart(&pair, &captures, &of_unit) {
+                faults.push(ReadError::malformed(&path, reason));
+                continue;
+            }
             let capture = captures.get(&pair.vehicle);
             let group = capture.and_then(|capture| capture.group.as_ref());
             let name = match group.or(pair.sequence.as_ref()) {
@@ -98,21 +114,18 @@ impl Index {
                 None => noun.to_owned(),
             };
             let group = groups.entry(name).or_default();
-            match capture.and_then(|capture| capture.micros) {
+            // Without any time stamp the order of the list is the best available.
+            let in_list = || (group.len() as u64).saturating_mul(period_nanos / 1000);
+            let micros = capture.and_then(|capture| capture.micros);
+            match micros.or_else(|| (!has_times).then(in_list)) {
                 Some(micros) => group.push((micros, pair)),
-                // Without any time stamp the order of the list is the best available.
-                None if !has_times => {
-                    let micros = (group.len() as u64).saturating_mul(period_nanos / 1000);
-                    group.push((micros, pair));
-                }
                 None => {
-                    let vehicle = pair.vehicle;
-                    let reason =
-                        format!("no time stamp of vehicle frame {vehicle}: the pair is left out");
-                    problems.push(ReadError::malformed(&root.join(CAPTURES), reason));
+                    let reason = format!("no time stamp of vehicle frame {}", pair.vehicle);
+                    faults.push(ReadError::malformed(&root.join(CAPTURES), reason));
                 }
             }
         }
+        faults.report("pair", problems);
         groups.retain(|_, pairs| !pairs.is_empty());
         let groups = groups.into_iter();
         let groups = groups
@@ -120,6 +133,20 @@ impl Index {
             .collect();
         Ok(Self { kind, groups })
     }
+}
+
+/// The reason why the frames of a pair are not of one time, where both times are known.
+fn apart(pair: &FramePair, captures: &Captures, of_unit: &Captures) -> Option<String> {
+    let time_s = |captures: &Captures, id: &str| Some(captures.get(id)?.micros? as f64 * 1e-6);
+    let [vehicle, unit] = [&pair.vehicle, &pair.infrastructure];
+    let (time_s, unit_s) = (time_s(captures, vehicle)?, time_s(of_unit, unit)?);
+    APART_S.contains(&(time_s - unit_s).abs()).then(|| {
+        format!(
+            "vehicle frame {vehicle} at {time_s:.3} s with frame {unit} of the unit at {unit_s:.3} s, expected at \
+             most {} s apart",
+            APART_S.start
+        )
+    })
 }
 
 /// Ticks by time, from the first on.
@@ -202,16 +229,11 @@ fn checked_id(field: &JsonField<'_>, id: &str) -> Result<String> {
     Ok(id.to_owned())
 }
 
-/// Captures of the vehicle by frame id. Entries that cannot be read are left out, with a problem; of entries without a
+/// Captures of a side by frame id. Entries that cannot be read are left out, with a problem; of entries without a
 /// readable time stamp the batch or sequence is kept.
-fn read_captures(
-    root: &Path,
-    kind: Kind,
-    problems: &mut Vec<ReadError>,
-) -> HashMap<String, Capture> {
-    let path = root.join(CAPTURES);
+fn read_captures(path: &Path, kind: Kind, problems: &mut Vec<ReadError>) -> Captures {
     let (mut stamps, mut faults, mut groups) = (HashMap::new(), Faults::default(), Vec::new());
-    let read = json_table::read_all(&path, MAX_BYTES, problems, |entry| {
+    let read = json_table::read_all(path, MAX_BYTES, problems, |entry| {
         let (id, group) = frame_and_group(entry, kind)?;
         let stamp = entry.required("pointcloud_timestamp");
         if let Some(stamp) = faults.take(stamp.and_then(|stamp| stamp.time())) {
@@ -224,10 +246,10 @@ fn read_captures(
     faults.report("time stamp", problems);
     if stamps.is_empty() {
         let reason = "no time stamps: frames are taken as evenly spaced, in the order of the pairs";
-        problems.push(ReadError::malformed(&path, reason));
+        problems.push(ReadError::malformed(path, reason));
     }
     let in_order = statistics::sorted(&stamps.values().copied().collect::<Vec<f64>>());
-    let unit = Unit::of_file(&path, &in_order, problems);
+    let unit = Unit::of_file(path, &in_order, problems);
     let captures = groups.into_iter().map(|(id, group)| {
         let stamp = stamps.get(&id);
         let micros = stamp.map(|&stamp| unit.micros(stamp));

@@ -9,7 +9,7 @@ use crate::frame::{Object, ObjectClass};
 use crate::ground_truth::upright_box;
 use crate::json::{self, JsonField};
 use crate::poses::box_angle_rad;
-use crate::{Problem, ReadError, Result, classes};
+use crate::{Problem, ReadError, Result, classes, repeats};
 use protocol::rotated_iou::Polygon;
 
 /// Most boxes of a file.
@@ -25,7 +25,7 @@ const SAME_OBJECT_IOU: f64 = 0.05;
 /// Valid objects, and the faults of the others.
 pub(super) type LabelledObjects = (Vec<Object>, Vec<Problem>);
 
-/// Id, pose in the world and size of a labelled box.
+/// Number in the list or track, pose in the world and size of a labelled box.
 type LabelledBox = (i64, Pose, [f64; 3]);
 
 /// Source of a list. The lists number their objects independently, so each has its own range of ids.
@@ -45,9 +45,9 @@ impl LabelList {
 /// Cooperative labels of DAIR-V2X: eight corners in the world. They have no ids: the number in the list serves as one,
 /// and does not identify the object at another tick.
 pub(super) fn in_world(path: &Path) -> Result<LabelledObjects> {
-    read(path, |number, label| {
+    read(path, LabelList::Cooperative, |number, label| {
         let found = from_corners(&label.required("world_8_points")?)?;
-        Ok(found.map(|(pose, size_m)| (LabelList::Cooperative.id(number), pose, size_m)))
+        Ok(found.map(|(pose, size_m)| (number, pose, size_m)))
     })
 }
 
@@ -58,7 +58,7 @@ pub(super) fn in_frame(
     world_from_lidar: &Isometry3<f64>,
     block: LabelList,
 ) -> Result<LabelledObjects> {
-    read(path, |number, label| {
+    read(path, block, |number, label| {
         let Some(size_m) = size_m(&label.required("3d_dimensions")?)? else {
             return Ok(None);
         };
@@ -72,27 +72,35 @@ pub(super) fn in_frame(
             (world_from_lidar * Isometry3::from_parts(center, yaw)).into();
         let valid = world_from_object.validate();
         valid.map_err(|error| location.error(error.to_string()))?;
-        let track = label.optional("track_id")?;
-        let track = track.and_then(|track| i64::try_from(track.count().ok()?).ok());
-        // A larger track id would reach into the ids of another list.
-        let number = track.filter(|track| *track < BLOCK).unwrap_or(number);
-        Ok(Some((block.id(number), world_from_object, size_m)))
+        let number = track(label).unwrap_or(number);
+        Ok(Some((number, world_from_object, size_m)))
     })
 }
 
+/// The track of an object, if it has one. A larger number would reach into the ids of another list.
+fn track(label: &JsonField<'_>) -> Option<i64> {
+    let track = label.optional("track_id").ok()??;
+    let track = i64::try_from(track.count().ok()?).ok()?;
+    (track < BLOCK - MAX_BOXES as i64).then_some(track)
+}
+
+/// Reads a list. Objects without a track are numbered from 0 on, above all tracks.
 fn read(
     path: &Path,
+    block: LabelList,
     labelled: impl Fn(i64, &JsonField<'_>) -> Result<Option<LabelledBox>>,
 ) -> Result<LabelledObjects> {
     let value = json::read(path)?;
-    let labels = JsonField::root(path, &value);
-    let labels = labels.items()?;
+    let root = JsonField::root(path, &value);
+    let labels = root.items()?;
     if labels.len() > MAX_BOXES {
         let reason = format!("{} boxes, expected at most {MAX_BOXES}", labels.len());
         return Err(ReadError::malformed(path, reason));
     }
     let (mut objects, mut problems) = (Vec::with_capacity(labels.len()), Vec::new());
-    for (number, label) in (0..).zip(labels) {
+    let highest = root.items()?.filter_map(|label| track(&label)).max();
+    let free = highest.map_or(0, |track| track + 1);
+    for (number, label) in (free..).zip(labels) {
         let Some(found) = labelled(number, &label).transpose() else {
             continue;
         };
@@ -105,6 +113,10 @@ fn read(
             }
             Err(error) => problems.push(Problem::left_out("object", error)),
         }
+    }
+    repeats::leave_out(path, &mut objects, &mut problems);
+    for object in &mut objects {
+        object.id = block.id(object.id);
     }
     Ok((objects, problems))
 }

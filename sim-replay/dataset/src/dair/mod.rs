@@ -4,7 +4,8 @@
 //!
 //! Frames of the two sides have different ids. A tick is a pair of `cooperative/data_info.json` and is named by the id
 //! of the vehicle; frames without partner are left out, as the data sets' own protocols do. The vehicle is the ego. The
-//! two sweeps of a pair are up to some 50 ms apart; both are given the time of the vehicle's.
+//! two sweeps of a pair are up to some 50 ms apart; both are given the time of the vehicle's. Pairs more than 0.2 s apart
+//! are left out.
 //!
 //! The cooperative labels are the ground truth of a pair ([`Frame::cooperative_objects`]). Labels of the two sides
 //! ([`Frame::objects`]) are independent of each other: see [`labels::share_ids`].
@@ -19,6 +20,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use nalgebra::Isometry3;
 use protocol::{CavId, Handedness};
 
 use self::index::{FramePair, Index, Kind};
@@ -67,7 +69,7 @@ pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>>
         return Err(ReadError::malformed(dir, reason));
     }
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
-    for root in &roots::find(dir, is_root) {
+    for root in &files::each_once(roots::find(dir, is_root), &mut problems) {
         match open_root(dir, root, options, &mut problems) {
             Ok(found) => scenarios.extend(found),
             Err(error) => problems.push(error),
@@ -261,9 +263,24 @@ impl DairSource {
             Kind::Dair => labels::in_world(&path),
             Kind::V2xSeq => labels::in_frame(&path, &world_from_lidar, LabelList::Cooperative),
         };
-        // Without a readable list the annotations of the two sides are merged instead.
+        // Without a usable list the annotations of the two sides are merged instead.
         frame.cooperative_objects = usable(cooperative, &mut frame.problems);
+        let listed = frame.cooperative_objects.as_ref();
+        let is_empty = listed.is_some_and(Vec::is_empty);
+        if is_empty && (!frame.objects.is_empty() || self.unit_lists_objects(pair)) {
+            let reason = "no object, but the two sides list some: their lists are merged instead";
+            let problem = ReadError::malformed(&path, reason);
+            frame.problems.push(Problem::from(&problem));
+            frame.cooperative_objects = None;
+        }
         Ok(frame)
+    }
+
+    fn unit_lists_objects(&self, pair: &FramePair) -> bool {
+        let path = self.sides.labels(pair, PairSide::Infrastructure);
+        // In whatever frame.
+        let list = labels::in_frame(&path, &Isometry3::identity(), LabelList::Infrastructure);
+        list.is_ok_and(|(objects, _)| !objects.is_empty())
     }
 
     fn infrastructure_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {

@@ -339,6 +339,29 @@ fn without_cooperative_labels_both_sides_count_and_common_objects_once() {
 }
 
 #[test]
+fn an_empty_cooperative_list_is_none_where_a_side_lists_objects() {
+    let set = DataSet::new(Kind::Dair);
+    set.write("cooperative/label_world/000010.json", &json!([]));
+    let (vehicle, problems) = set.problems_of(0);
+    assert_eq!(
+        problems,
+        [
+            "cooperative/label_world/000010.json: no object, but the two sides list some: their lists are merged instead"
+        ]
+    );
+    assert_eq!(vehicle.cooperative_objects, None);
+    for side in [
+        "vehicle-side/label/lidar/000010.json",
+        "infrastructure-side/label/virtuallidar/000500.json",
+    ] {
+        set.write(side, &json!([]));
+    }
+    let (vehicle, problems) = set.problems_of(0);
+    assert!(problems.is_empty(), "{problems:?}");
+    assert_eq!(vehicle.cooperative_objects, Some(vec![]), "an empty road");
+}
+
+#[test]
 fn sequences_have_track_ids_and_their_offset_in_the_frame_of_the_vehicle() {
     let set = DataSet::new(Kind::V2xSeq);
     let dataset = set.open();
@@ -472,6 +495,39 @@ fn labels_that_cannot_be_right_are_left_out_one_by_one() {
 }
 
 #[test]
+fn objects_without_a_track_have_numbers_above_all_tracks() {
+    let set = DataSet::new(Kind::V2xSeq);
+    let tracked = |x: f64, track: u64| {
+        let mut car = label("Car", [x, 0.0, -1.0], 0.0);
+        car["track_id"] = json!(track);
+        car
+    };
+    let untracked = label("Car", [30.0, 0.0, -1.0], 0.0);
+    set.write(
+        "cooperative/label/000010.json",
+        &json!([
+            tracked(10.0, 1),
+            untracked,
+            tracked(20.0, 7),
+            tracked(40.0, 7)
+        ]),
+    );
+    let (frame, problems) = set.problems_of(0);
+    let objects = frame.cooperative_objects.unwrap();
+    let ids: Vec<i64> = objects.iter().map(|object| object.id).collect();
+    assert_eq!(ids, [1, 9, 7]);
+    let [problem] = &problems[..] else {
+        panic!("{problems:?}")
+    };
+    assert!(
+        problem.starts_with("cooperative/label/000010.json: object 7: at ")
+            && problem.contains(", with the id or the box of object 7 at ")
+            && problem.ends_with(": the object is left out"),
+        "{problem}"
+    );
+}
+
+#[test]
 fn either_order_of_corners_is_the_same_box() {
     let set = DataSet::new(Kind::Dair);
     let mut mirrored = world_label();
@@ -585,6 +641,40 @@ fn pairs_that_cannot_be_used_are_left_out() {
             "{index}lists no pair of frames of vehicle and roadside unit that can be read (DAIR-V2X)"
         )
     );
+}
+
+#[test]
+fn pairs_of_two_times_are_left_out() {
+    let set = DataSet::new(Kind::Dair);
+    let capture = |frame: &str, micros: u64| {
+        json!({
+            "pointcloud_path": format!("velodyne/{frame}.pcd"),
+            "pointcloud_timestamp": micros.to_string(),
+        })
+    };
+    let of_unit = |times: [u64; 2]| {
+        let [first, second] = times;
+        let captures = json!([capture("000500", first), capture("000501", second)]);
+        set.write("infrastructure-side/data_info.json", &captures);
+        let dataset = set.open();
+        (
+            dataset.scenarios[0].ticks.len(),
+            set.shown(&dataset.problems),
+        )
+    };
+    let expected = "cooperative/data_info.json: vehicle frame 000011 at 1626155000.100 s with frame 000501 of the unit \
+                    at 1626155001.100 s, expected at most 0.2 s apart: the pair is left out";
+    assert_eq!(
+        of_unit([T0_MICROS + 30_000, T0_MICROS + 1_100_000]),
+        (1, vec![expected.to_owned()])
+    );
+    for sound in [
+        [T0_MICROS + 30_000, T0_MICROS + 60_000],
+        // A clock of its own.
+        [7_000_000, 7_100_000],
+    ] {
+        assert_eq!(of_unit(sound), (2, vec![]));
+    }
 }
 
 #[test]

@@ -66,7 +66,7 @@ impl ProtocolConfig {
             checked("min_corners", self.min_corners, 1..=8)?.unwrap_or(rule.min_corners);
         rule.classes = self.classes.unwrap_or(rule.classes);
         if let Some(range) = &self.ground_truth_range_m {
-            [rule.x_m, rule.y_m, rule.z_m] = intervals(range)?;
+            [rule.x_m, rule.y_m, rule.z_m] = intervals("ground_truth_range_m", range)?;
             protocol.exact_range = true;
         }
         protocol.max_agents =
@@ -93,17 +93,19 @@ fn checked<T: PartialOrd + fmt::Display>(
     }
 }
 
-/// Low and high of x, y and z.
-fn intervals(range: &[f64]) -> Result<[[f64; 2]; 3], String> {
+/// Low and high of x, y and z, metres, from x, y, z low, then x, y, z high, the value of the option `name`.
+///
+/// # Errors
+/// A message with the option and both values where they are no range.
+pub fn intervals(name: &str, range: &[f64]) -> Result<[[f64; 2]; 3], String> {
     let &[x_low, y_low, z_low, x_high, y_high, z_high] = range else {
         let count = range.len();
-        return Err(format!("ground_truth_range_m: {count} numbers, expected 6"));
+        return Err(format!("{name}: {count} numbers, expected 6"));
     };
     let intervals = [[x_low, x_high], [y_low, y_high], [z_low, z_high]];
     for [low, high] in intervals {
         if !(low.is_finite() && high.is_finite() && low < high) {
-            let reason = format!("ground_truth_range_m: from {low} to {high} is no range");
-            return Err(reason);
+            return Err(format!("{name}: from {low} to {high} is no range"));
         }
     }
     Ok(intervals)

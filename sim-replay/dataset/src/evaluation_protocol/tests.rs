@@ -66,6 +66,18 @@ fn the_layout_decides_without_options() {
 }
 
 #[test]
+fn the_order_of_the_precisions_is_named() {
+    assert_eq!(ApOrder::of(None), ApOrder::Global);
+    for (name, order) in [("v2v4real", ApOrder::Frame), ("opv2v", ApOrder::Global)] {
+        let protocol = EvaluationProtocol::preset(name).unwrap();
+        assert_eq!(ApOrder::of(Some(&protocol)), order);
+        let text = protocol.to_string();
+        let named = format!("; AP@0.3, 0.5, 0.7 in {} order", order.name());
+        assert!(text.ends_with(&named), "{text}");
+    }
+}
+
+#[test]
 fn single_options_change_the_preset() {
     let config: ProtocolConfig = serde_json::from_str(
         r#"{"preset": "dair", "comm_range_m": 80, "classes": ["car"], "ground_truth_range_m": [0, -1, -2, 1, 2, 3]}"#,

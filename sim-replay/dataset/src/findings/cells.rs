@@ -40,20 +40,27 @@ impl PointCells {
         Self { points, begins }
     }
 
-    /// True if a box contains a point; arguments are its transform from the LiDAR frame and its half sizes.
-    pub(super) fn holds_point(&self, box_from_lidar: &Isometry3<f32>, half: [f32; 3]) -> bool {
+    /// True if a box contains a point, once x and y of the points are multiplied by the signs; other arguments are its
+    /// transform from the LiDAR frame and its half sizes.
+    pub(super) fn holds_point(
+        &self,
+        box_from_lidar: &Isometry3<f32>,
+        half: [f32; 3],
+        [sign_x, sign_y]: [f32; 2],
+    ) -> bool {
         // Slightly larger than the box, to allow for rounding.
         let radius = 1.0 + half.iter().map(|half| half * half).sum::<f32>().sqrt();
         let center = box_from_lidar.inverse().translation.vector;
-        let columns = index(center.x - radius)..=index(center.x + radius);
-        let mut rows = index(center.y - radius)..=index(center.y + radius);
+        let (x, y) = (sign_x * center.x, sign_y * center.y);
+        let columns = index(x - radius)..=index(x + radius);
+        let mut rows = index(y - radius)..=index(y + radius);
         rows.any(|row| {
             // Neighbouring columns of a row are neighbours in memory: one range of points.
             let (first, last) = (row * ACROSS + columns.start(), row * ACROSS + columns.end());
             self.points[self.begins[first]..self.begins[last + 1]]
                 .iter()
                 .any(|&[x, y, z]| {
-                    let local = box_from_lidar * Point3::new(x, y, z);
+                    let local = box_from_lidar * Point3::new(sign_x * x, sign_y * y, z);
                     (0..3).all(|axis| local[axis].abs() <= half[axis])
                 })
         })
@@ -88,14 +95,15 @@ mod tests {
             center in prop::array::uniform3(-200.0..200.0f32),
             yaw in -3.2..3.2f32,
             half in prop::array::uniform3(0.1..60.0f32),
+            signs in prop::sample::select(vec![[1.0f32, 1.0], [1.0, -1.0], [-1.0, 1.0]]),
         ) {
             let box_from_lidar = Isometry3::new(center.into(), nalgebra::Vector3::new(0.0, 0.0, yaw)).inverse();
             let cells = PointCells::new(&PointCloud { xyzi: points.clone() });
             let expected = points.iter().any(|point| {
-                let local = box_from_lidar * Point3::new(point[0], point[1], point[2]);
+                let local = box_from_lidar * Point3::new(signs[0] * point[0], signs[1] * point[1], point[2]);
                 (0..3).all(|axis| local[axis].abs() <= half[axis])
             });
-            prop_assert_eq!(cells.holds_point(&box_from_lidar, half), expected);
+            prop_assert_eq!(cells.holds_point(&box_from_lidar, half, signs), expected);
         }
     }
 }

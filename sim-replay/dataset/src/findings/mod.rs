@@ -4,17 +4,20 @@
 
 mod boxes;
 mod cells;
+mod lists;
 mod sweeps;
 
 use std::path::Path;
 
-use protocol::{CavId, Pose};
+use protocol::CavId;
 use rayon::prelude::*;
 
-pub use boxes::without_ground_truth;
+use boxes::EmptyBoxes;
+use lists::FramesOfTicks;
 pub use sweeps::{SweepFindings, SweepReport};
 
 use crate::frame::Frame;
+use crate::ground_truth::GroundTruthRule;
 use crate::pcd::PcdCloud;
 use crate::{IntensityScale, LoadOptions, Problem, Scenario, overlap};
 use support::output;
@@ -32,55 +35,53 @@ const LEAST_TICKS: usize = 3;
 pub struct FrameFindings {
     /// Findings of its sweep, if that was read.
     pub sweep: Option<SweepFindings>,
-    /// Annotated objects, if they were read.
-    pub boxes: Option<usize>,
+    /// The frame without points, if it was read.
+    pub frame: Option<Frame>,
     /// Objects of a frame with a pose whose sweep was read.
     placed_boxes: usize,
     /// Those of them that hold none of the agent's own points.
     pub boxes_without_points: usize,
-    /// Pose of the LiDAR.
-    pub world_from_lidar: Option<Pose>,
+    /// The same, and with axes of the points negated.
+    empty_boxes: EmptyBoxes,
 }
 
 impl FrameFindings {
     /// Findings of a frame and its plain sweep, as far as they could be read.
-    pub fn of(frame: Option<&Frame>, sweep: Option<&PcdCloud>) -> Self {
+    pub fn of(frame: Option<Frame>, sweep: Option<&PcdCloud>) -> Self {
         let mut findings = Self {
             sweep: sweep.map(SweepFindings::of),
-            boxes: frame.map(|frame| frame.objects.len()),
-            world_from_lidar: frame.and_then(|frame| frame.world_from_lidar),
+            frame,
             ..Self::default()
         };
-        if let Some((frame, sweep)) = frame.zip(sweep)
-            && let Some(pose) = &findings.world_from_lidar
+        if let Some((frame, sweep)) = findings.frame.as_ref().zip(sweep)
+            && let Some(pose) = &frame.world_from_lidar
         {
             findings.placed_boxes = frame.objects.len();
-            findings.boxes_without_points = boxes::without_points(frame, pose, &sweep.points);
+            findings.empty_boxes = boxes::without_points(frame, pose, &sweep.points);
+            [findings.boxes_without_points, ..] = findings.empty_boxes;
         }
         findings
-    }
-
-    /// True if there are objects whose place relative to the LiDAR is unknown.
-    pub fn is_without_pose(&self) -> bool {
-        self.boxes > Some(0) && self.world_from_lidar.is_none()
     }
 }
 
 /// Findings of the frames of a scenario together: `frames` are those of each agent, in the order of
-/// [`Scenario::agents`], with their ticks. Intensities were divided by `scale`.
+/// [`Scenario::agents`], with their ticks. Intensities were divided by `scale`. By the `rule`, if one is given, it is
+/// judged whether there is any ground truth.
 pub fn of_scenario(
     scenario: &Scenario,
     frames: &[Vec<(usize, &FrameFindings)>],
     scale: IntensityScale,
+    rule: Option<&GroundTruthRule>,
 ) -> Vec<Problem> {
     let mut problems = Vec::new();
     for (agent, (id, frames)) in scenario.agents.iter().zip(frames).enumerate() {
         problems.extend(without_pose(scenario, (agent, id), frames));
-        let sum =
-            |count: fn(&FrameFindings) -> usize| frames.iter().map(|(_, one)| count(one)).sum();
-        let boxes = sum(|one| one.placed_boxes);
-        let empty = sum(|one| one.boxes_without_points);
-        problems.extend(boxes::mostly_empty(&scenario.name, id, boxes, empty));
+        let (mut boxes, mut empty) = (0, EmptyBoxes::default());
+        for (_, one) in frames {
+            boxes += one.placed_boxes;
+            (empty.iter_mut().zip(one.empty_boxes)).for_each(|(sum, count)| *sum += count);
+        }
+        problems.extend(boxes::empty(&scenario.name, id, (boxes, empty)));
         let sweeps: Vec<&SweepFindings> = (frames.iter())
             .filter_map(|(_, one)| one.sweep.as_ref())
             .collect();
@@ -90,7 +91,28 @@ pub fn of_scenario(
         let folder = path.parent().unwrap_or(&path);
         problems.extend(sweeps::problems(folder, &named, &sweeps, scale));
     }
+    problems.extend(of_objects(scenario, frames, rule));
     problems.extend(overlap::pose_problems(scenario));
+    problems
+}
+
+/// Findings of the objects that the agents of a scenario list.
+fn of_objects(
+    scenario: &Scenario,
+    frames: &[Vec<(usize, &FrameFindings)>],
+    rule: Option<&GroundTruthRule>,
+) -> Vec<Problem> {
+    let mut ticks = FramesOfTicks::new();
+    for (tick, findings) in frames.iter().flatten() {
+        ticks.entry(*tick).or_default().extend(&findings.frame);
+    }
+    let mut problems = lists::contradictions(scenario, &ticks);
+    for (id, frames) in scenario.agents.iter().zip(frames) {
+        let read = frames.iter().flat_map(|(_, one)| &one.frame);
+        let objects = read.flat_map(|frame| &frame.objects);
+        problems.extend(boxes::unlike_cars(&scenario.name, id, objects));
+    }
+    problems.extend(rule.and_then(|rule| boxes::without_ground_truth(scenario, &ticks, rule)));
     problems
 }
 
@@ -105,7 +127,8 @@ fn without_pose(
     (agent, id): (usize, &CavId),
     frames: &[(usize, &FrameFindings)],
 ) -> Option<Problem> {
-    let mut lacking = frames.iter().filter(|(_, one)| one.is_without_pose());
+    let frames_read = frames.iter().map(|(tick, one)| (tick, one.frame.as_ref()));
+    let mut lacking = frames_read.filter(|(_, frame)| frame.is_some_and(boxes::is_without_pose));
     let count = lacking.clone().count();
     let (tick, _) = lacking.next()?;
     let stem = scenario.ticks.get(*tick)?;
@@ -120,9 +143,13 @@ fn without_pose(
     Some(Problem::about(&path, "lidar_pose", &reason))
 }
 
-/// Findings of some frames, evenly spread over the scenarios. Frames that cannot be read are left out: their reader
-/// reports them.
-pub fn sampled(scenarios: &[Scenario], scale: IntensityScale) -> Vec<Problem> {
+/// Findings of some frames, evenly spread over the scenarios, as [`of_scenario`]. Frames that cannot be read are left
+/// out: their reader reports them.
+pub fn sampled(
+    scenarios: &[Scenario],
+    scale: IntensityScale,
+    rule: Option<&GroundTruthRule>,
+) -> Vec<Problem> {
     let scenarios: Vec<&Scenario> = scenarios.iter().collect();
     let scenarios = evenly_spread(&scenarios, MOST_SCENARIOS);
     let agents: usize = scenarios.iter().map(|scenario| scenario.agents.len()).sum();
@@ -144,7 +171,7 @@ pub fn sampled(scenarios: &[Scenario], scale: IntensityScale) -> Vec<Problem> {
                 of_agent.push((tick, frame));
             }
         }
-        of_scenario(scenario, &of_agents, scale)
+        of_scenario(scenario, &of_agents, scale, rule)
     });
     problems.collect()
 }
@@ -153,7 +180,7 @@ fn read(scenario: &Scenario, agent: usize, tick: usize) -> Option<FrameFindings>
     let without_points = LoadOptions::without_points();
     let frame = scenario.load(agent, tick, &without_points).ok();
     let sweep = scenario.load_points(agent, tick, None).ok();
-    (frame.is_some() || sweep.is_some()).then(|| FrameFindings::of(frame.as_ref(), sweep.as_ref()))
+    (frame.is_some() || sweep.is_some()).then(|| FrameFindings::of(frame, sweep.as_ref()))
 }
 
 /// Prints findings to standard error, a line each.

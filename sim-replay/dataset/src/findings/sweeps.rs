@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
-use crate::points::NO_INTENSITY;
+use crate::points::{NO_INTENSITY, faint};
 use crate::{IntensityScale, Plausibility, Problem};
 use support::statistics;
 
@@ -145,7 +145,7 @@ fn intensity_fault(
             "all {points} intensities are {min} ({from}), expected a sensor's, which differ"
         ));
     }
-    scale.unusual(origin.divisor, max * origin.divisor)
+    (scale.unusual(origin.divisor, max * origin.divisor)).or_else(|| faint(points, max, &from))
 }
 
 impl std::fmt::Display for SweepReport {

@@ -2,10 +2,18 @@ use std::fs;
 
 use super::*;
 use crate::OpenOptions;
+use crate::frame::{Object, ObjectClass};
+
+const HEAD: &str = "FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 20\nDATA ascii\n";
 
 /// Findings in a scene of one agent with 20 boxes around the sensor in each of 60 frames, of which `empty` hold no
 /// point.
-fn scene_findings(dir: &Path, empty: usize, intensity: f32) -> Vec<String> {
+fn scene_findings(
+    dir: &Path,
+    empty: usize,
+    intensity: f32,
+    rule: Option<&GroundTruthRule>,
+) -> Vec<String> {
     let folder = dir.join("scene/1");
     fs::create_dir_all(&folder).unwrap();
     let cars: String = (0..20)
@@ -21,17 +29,20 @@ fn scene_findings(dir: &Path, empty: usize, intensity: f32) -> Vec<String> {
     let points: String = (0..20)
         .map(|id| format!("10 {} 0 {}\n", 4 * id, intensity * id as f32))
         .collect();
-    let head = "FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 20\nDATA ascii\n";
     for frame in 0..60 {
         fs::write(folder.join(format!("{frame:06}.yaml")), &yaml).unwrap();
         fs::write(
             folder.join(format!("{frame:06}.pcd")),
-            format!("{head}{points}"),
+            format!("{HEAD}{points}"),
         )
         .unwrap();
     }
+    messages(dir, rule)
+}
+
+fn messages(dir: &Path, rule: Option<&GroundTruthRule>) -> Vec<String> {
     let dataset = crate::open_with(dir, &OpenOptions::default()).unwrap();
-    sampled(&dataset.scenarios, IntensityScale::AUTO)
+    sampled(&dataset.scenarios, IntensityScale::AUTO, rule)
         .into_iter()
         .map(|finding| finding.message)
         .collect()
@@ -40,8 +51,8 @@ fn scene_findings(dir: &Path, empty: usize, intensity: f32) -> Vec<String> {
 #[test]
 fn a_sample_has_the_findings_of_the_whole() {
     let dir = tempfile::tempdir().unwrap();
-    assert!(scene_findings(dir.path(), 10, 0.05).is_empty());
-    let found = scene_findings(dir.path(), 11, -1.0);
+    assert!(scene_findings(dir.path(), 10, 0.05, None).is_empty());
+    let found = scene_findings(dir.path(), 11, -1.0, None);
     assert_eq!(found.len(), 2, "{found:?}");
     assert!(
         found[0].starts_with("scene: agent 1: 440 of 800 boxes (55 %) hold none of its points"),
@@ -51,4 +62,184 @@ fn a_sample_has_the_findings_of_the_whole() {
         found[1].contains("sweeps of agent 1: 760 of 800 intensities are below 0"),
         "{found:?}"
     );
+}
+
+#[test]
+fn mirrored_points_are_named() {
+    // The only error is the sign of one axis.
+    let findings = |signs: [f64; 2]| {
+        let pose = |x: f64, y: f64| protocol::Pose::from_xyz_yaw([x, y, 0.0], 0.3);
+        let frame = Frame {
+            world_from_lidar: Some(pose(0.0, 0.0)),
+            objects: (0..30)
+                .map(|id| {
+                    let pose = pose(f64::from(id), 4.0 * f64::from(id));
+                    Object::new(i64::from(id), ObjectClass::Car, pose, [1.0; 3])
+                })
+                .collect(),
+            ..Frame::empty(CavId::new("1").unwrap(), 0, protocol::Handedness::Right)
+        };
+        let from_world = pose(0.0, 0.0).isometry().inverse();
+        let points = frame.objects.iter().map(|object| {
+            let place = from_world * nalgebra::Point3::from(object.world_from_object.translation_m);
+            [
+                (signs[0] * place.x) as f32,
+                (signs[1] * place.y) as f32,
+                0.0,
+                0.5,
+            ]
+        });
+        let points = protocol::PointCloud {
+            xyzi: points.collect(),
+        };
+        let counts = boxes::without_points(&frame, &pose(0.0, 0.0), &points);
+        let found = boxes::empty("scene", &CavId::new("1").unwrap(), (30, counts));
+        found.map(|finding| finding.message)
+    };
+    assert_eq!(findings([1.0, 1.0]), None);
+    for (signs, axis) in [([1.0, -1.0], "y"), ([-1.0, 1.0], "x")] {
+        let found = findings(signs).unwrap();
+        let part =
+            format!("hold none of its points, but only 0 once {axis} of the points is negated");
+        assert!(found.contains(&part), "{found}");
+    }
+    let agent = CavId::new("1").unwrap();
+    let found = |counts| boxes::empty("scene", &agent, (100, counts));
+    for counts in [[19, 0, 0], [40, 14, 20], [30, 30, 30]] {
+        assert_eq!(found(counts), None, "{counts:?}");
+    }
+    assert!(found([42, 14, 20]).is_some());
+}
+
+#[test]
+fn intensities_far_below_one_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let found = scene_findings(dir.path(), 0, 0.0002, None);
+    assert_eq!(found.len(), 1, "{found:?}");
+    let part = "the largest of 800 intensities is 3.80e-3 (field intensity divided by 1), expected 0.02 to 1";
+    assert!(found[0].contains(part), "{found:?}");
+    assert!(scene_findings(dir.path(), 0, 0.002, None).is_empty());
+}
+
+#[test]
+fn a_sample_without_ground_truth_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let rule = Some(&GroundTruthRule::V2V4REAL);
+    assert_eq!(
+        scene_findings(dir.path(), 0, 0.05, rule),
+        Vec::<String>::new()
+    );
+    let found = scene_findings(dir.path(), 20, 0.05, rule);
+    assert_eq!(found.len(), 2, "{found:?}");
+    assert!(
+        found[1].starts_with(
+            "scene: ground truth 0 for every ego in 40 of 60 ticks, though agents list 800 objects"
+        ),
+        "{found:?}"
+    );
+    assert_eq!(
+        scene_findings(dir.path(), 20, 0.05, None).len(),
+        1,
+        "nobody asks for ground truth"
+    );
+}
+
+/// The finding about 20 objects of a class and a size.
+fn form_finding(class: ObjectClass, size_m: [f64; 3]) -> Option<String> {
+    let pose = protocol::Pose::from_xyz_yaw([0.0; 3], 0.0);
+    let objects: Vec<Object> = (0..20)
+        .map(|id| Object::new(id, class, pose, size_m))
+        .collect();
+    let agent = CavId::new("1").unwrap();
+    let few = boxes::unlike_cars("scene", &agent, objects.iter().skip(1));
+    assert_eq!(few, None, "few objects are not judged");
+    boxes::unlike_cars("scene", &agent, objects.iter()).map(|finding| finding.message)
+}
+
+#[test]
+fn cars_that_do_not_have_the_form_of_cars_are_named() {
+    use ObjectClass::{Car, Pedestrian, Truck};
+    for (class, size_m) in [
+        (Car, [4.5, 1.9, 1.5]),
+        (Car, [2.2, 1.5, 1.5]),
+        (Car, [12.0, 2.6, 3.2]),
+        (Car, [0.5, 0.6, 1.8]),
+        (Pedestrian, [1.3, 1.5, 1.8]),
+        (Truck, [16.0, 3.4, 4.0]),
+    ] {
+        assert_eq!(form_finding(class, size_m), None, "{class:?} {size_m:?}");
+    }
+    for (size_m, part) in [
+        (
+            [1.9, 4.5, 1.5],
+            "scene: agent 1: 20 of 20 cars, first of 1.9 x 4.5 x 1.5 m, are shorter than wide or high",
+        ),
+        ([1.5, 1.7, 4.2], "shorter than wide or high"),
+        ([9.0, 3.9, 3.1], "larger than any car"),
+    ] {
+        let found = form_finding(Car, size_m).unwrap();
+        assert!(found.contains(part), "{found}");
+    }
+}
+
+/// Place of a car along the road, metres: that with number 0 drives.
+fn x_m(car: usize, frame: usize) -> f64 {
+    let driven = if car == 0 { 2 * frame } else { 0 };
+    (10 * car + driven) as f64
+}
+
+/// Findings about the lists of agents 1 and 2 in 16 frames, of which the second lists the cars with these ids and
+/// places.
+fn list_findings(second: impl Fn(usize, usize) -> (usize, f64)) -> Vec<String> {
+    let dir = tempfile::tempdir().unwrap();
+    let first = |car, frame| (car, x_m(car, frame));
+    let lists: [(&str, &dyn Fn(usize, usize) -> (usize, f64)); 2] = [("1", &first), ("2", &second)];
+    for (agent, listed) in lists {
+        let folder = dir.path().join("scene").join(agent);
+        fs::create_dir_all(&folder).unwrap();
+        for frame in 0..16 {
+            let cars = (0..5).map(|car| {
+                let (id, x) = listed(car, frame);
+                let place = format!("location: [{x}, {}, 0], angle: [0, 0, 0]", 8 * car);
+                format!("  {id}: {{{place}, extent: [2.2, 1, 0.8]}}\n")
+            });
+            let cars: String = cars.collect();
+            let yaml = format!("lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles:\n{cars}");
+            fs::write(folder.join(format!("{frame:06}.yaml")), yaml).unwrap();
+            let points: String = (0..20)
+                .map(|point| format!("{point} {frame} 0 0.5\n"))
+                .collect();
+            let cloud = format!("{HEAD}{points}");
+            fs::write(folder.join(format!("{frame:06}.pcd")), cloud).unwrap();
+        }
+    }
+    let mut found = messages(dir.path(), None);
+    found.retain(|message| message.contains("agents 1 and 2"));
+    found
+}
+
+#[test]
+fn lists_of_two_agents_that_contradict_each_other_are_named() {
+    assert_eq!(
+        list_findings(|car, frame| (car, x_m(car, frame))),
+        Vec::<String>::new()
+    );
+    // Places that differ a little, an object of two ids, and lists that share nothing are usual.
+    let sound = |car: usize, frame| (if car == 4 { 9 } else { car }, x_m(car, frame) - 0.9);
+    assert_eq!(list_findings(sound), Vec::<String>::new());
+    assert_eq!(
+        list_findings(|car, frame| (car + 50, x_m(car, frame) + 500.0)),
+        Vec::<String>::new()
+    );
+    let other_ids = list_findings(|car, frame| (car + 50, x_m(car, frame)));
+    assert_eq!(other_ids.len(), 1, "{other_ids:?}");
+    let start =
+        "scene: agents 1 and 2: 80 of 80 boxes that both list contradict each other, first ";
+    assert!(other_ids[0].starts_with(start), "{other_ids:?}");
+    let own_numbers = list_findings(|car, frame| ((car + 1) % 5, x_m(car, frame)));
+    assert_eq!(own_numbers.len(), 1, "{own_numbers:?}");
+    let other_world = list_findings(|car, frame| (car, x_m(car, frame) + 8.5));
+    assert!(other_world[0].contains("80 of 80 boxes"), "{other_world:?}");
+    let late = list_findings(|car, frame| (car, x_m(car, frame.saturating_sub(3))));
+    assert!(late[0].contains("14 of 14 boxes"), "{late:?}");
 }

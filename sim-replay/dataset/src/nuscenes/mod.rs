@@ -27,7 +27,7 @@ use super::layout::{LayoutReader, LayoutRow, opened};
 use super::points::{SweepStorage, Sweeps};
 use super::{
     Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
-    files, roots,
+    files, repeats, roots,
 };
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
@@ -64,13 +64,15 @@ pub(crate) static NUSCENES: LayoutRow = LayoutRow {
 
 /// Tables that identify the layout: a folder with these is a version of a data set.
 const TABLES: [&str; 2] = ["sample.json", "sample_data.json"];
+/// The table of annotated objects.
+const ANNOTATIONS: &str = "sample_annotation.json";
 /// Width up to which a vehicle of V2X-Sim has two wheels, metres (the public converter drops narrower ones).
 const TWO_WHEELER_WIDTH_M: f64 = 1.5;
 
 /// Opens the data sets at or below `dir`; `None` if there are none.
 pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>> {
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
-    for version in &roots::find(dir, is_version) {
+    for version in &files::each_once(roots::find(dir, is_version), &mut problems) {
         match open_version(dir, version, options, &mut problems) {
             Ok(found) => scenarios.extend(found),
             Err(error) => problems.push(error),
@@ -349,7 +351,9 @@ impl FrameSource for SceneSource {
         frame.world_from_vehicle = Some(sweep.world_from_vehicle.into());
         if !moment.objects.is_empty() {
             let cloud = self.points(agent, tick, None)?;
-            let seen = annotations::seen(&moment.objects, &cloud.points, &world_from_lidar);
+            let (table, mut objects) = (self.version.join(ANNOTATIONS), moment.objects.clone());
+            repeats::leave_out(&table, &mut objects, &mut frame.problems);
+            let seen = annotations::seen(&objects, &cloud.points, &world_from_lidar);
             frame.objects = seen.map(|object| self.with_class(object)).collect();
         }
         Ok(frame)

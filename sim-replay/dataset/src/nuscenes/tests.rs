@@ -578,6 +578,30 @@ fn rows_that_cannot_be_used_are_left_out_one_by_one() {
 }
 
 #[test]
+fn an_instance_that_a_sample_lists_twice_is_left_out_once() {
+    let set = v2x_sim();
+    let mut rows = set.rows("sample_annotation");
+    let mut again = rows[0].clone();
+    again["translation"][0] = json!(-60.0);
+    rows.push(again);
+    set.table("sample_annotation", json!(rows));
+    let dataset = set.open();
+    let [first, second] = [0, 1].map(|tick| load(&dataset.scenarios[0], tick).remove(0));
+    let [problem] = &first.problems[..] else {
+        panic!("{:?}", first.problems)
+    };
+    assert!(
+        problem.message.ends_with(
+            "v1.0-mini/sample_annotation.json: object 0: at [-60.00, 40.00, 0.75] m, with the id or the box of object \
+             0 at [10.00, 40.00, 0.75] m: the object is left out"
+        ),
+        "{problem}"
+    );
+    assert!(second.problems.is_empty());
+    assert_eq!(first.objects, second.objects, "the first one stays");
+}
+
+#[test]
 fn of_several_sweeps_of_a_sample_the_nearest_in_time_is_used() {
     let set = v2x_sim();
     let mut data = set.rows("sample_data");

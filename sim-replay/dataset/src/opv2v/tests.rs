@@ -219,6 +219,11 @@ fn a_part_that_cannot_be_right_is_left_out_and_named() {
             ":10: vehicles.4335.angle: [0.0, 1e300, 0.0], expected angles in degrees",
         ),
         (
+            "angle: [0, 90, 0]",
+            "angle: [90, 0, 0]",
+            ":10: vehicles.4335.angle: [90.0, 0.0, 0.0], expected roll and pitch within 45 degrees",
+        ),
+        (
             "location: [10, 30, 0]",
             "location: [1e30, 30, 0]",
             ":10: vehicles.4335: pose component",

@@ -1,4 +1,5 @@
-//! Overlap of sweeps at their stated poses: finds poses of other sweeps, other axes and other units.
+//! Overlap of sweeps at their stated poses: finds poses of other sweeps, other axes and other units,
+//! and LiDARs that repeat a sweep.
 //!
 //! Walls, poles, trees and vehicles of two sweeps shortly after one another must coincide where the poses say so. For a
 //! few pairs of each agent the overlap at the stated motion is compared with the best one around no motion.
@@ -39,6 +40,9 @@ const LEAST_OVERLAP: f32 = 0.2;
 const ALONGSIDE: f64 = 0.4;
 /// The same overlap for sweeps that are farther apart than the search reaches.
 const FAR_OVERLAP: f32 = 0.1;
+
+/// Overlap from which two sweeps are one: traffic is never all of the structure.
+const REPEATED: f32 = 0.98;
 
 /// Two sweeps of an agent, by their ticks.
 #[derive(Debug, Clone, Copy)]
@@ -85,13 +89,11 @@ fn agent_problem(scenario: &Scenario, index: usize, agent: &CavId) -> Option<Pro
         .points_path(index, first.pair.ticks[0], None)
         .ok()?;
     let path = path.parent().unwrap_or(&path).display().to_string();
-    let [from, to] = first.pair.ticks.map(|tick| {
-        let tick = scenario.ticks.get(tick);
-        tick.map_or("", |tick| tick.stem.as_str())
-    });
+    let [from, to] = first.pair.ticks.map(|tick| scenario.stem(tick));
     let reason = format!(
         "agent {agent}: {} of {count} pairs of sweeps contradict the poses: from {from} to {to} the poses have {} \
-         ({:.0} % of the structure overlap), the sweeps {} ({:.0} %): poses of other sweeps, other axes or other units",
+         ({:.0} % of the structure overlap), the sweeps {} ({:.0} %): poses of other sweeps, other axes or other units, \
+         or a LiDAR that repeats a sweep",
         wrong.len(),
         shown(&first.pair.stated.cast()),
         100.0 * first.overlap,
@@ -162,13 +164,12 @@ fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Sweep
 /// `None` if the pair cannot be judged; `Some(None)` if the sweeps agree with the poses.
 #[expect(clippy::cast_possible_truncation, reason = "a radius of some metres")]
 fn judge(scenario: &Scenario, agent: usize, pair: SweepPair) -> Option<Option<Contradiction>> {
-    let [first, second] = pair.ticks.map(|tick| {
-        let cloud = scenario.load_points(agent, tick, None).ok()?;
-        Structure::of(&cloud.points)
-    });
-    let (first, second) = (first?, second?);
-    let overlap = first.overlap(&second, &pair.stated.cast());
+    let [first, second] = (pair.ticks).map(|tick| scenario.load_points(agent, tick, None));
+    let (first, second) = (first.ok()?.points, second.ok()?.points);
     let moved_m = pair.stated.translation.vector.norm();
+    let is_repeated = moved_m > MOVED_M && first == second;
+    let (first, second) = (Structure::of(&first)?, Structure::of(&second)?);
+    let overlap = first.overlap(&second, &pair.stated.cast());
     let radius_m = (1.5 * moved_m).clamp(SEARCH_M[0], SEARCH_M[1]);
     let best = first.best_overlap(&second, radius_m as f32);
     let between = best.first_from_second.inv_mul(&pair.stated.cast());
@@ -179,18 +180,17 @@ fn judge(scenario: &Scenario, agent: usize, pair: SweepPair) -> Option<Option<Co
     let is_judged = moved_m <= SEARCH_M[1] || overlap < FAR_OVERLAP;
     // Vehicles that move as the sensor does suggest no motion; static structure still overlaps at the stated motion.
     let best_m = f64::from(best.first_from_second.translation.vector.norm());
-    let is_traffic = best_m < ALONGSIDE * moved_m && overlap >= LEAST_OVERLAP;
+    let is_traffic =
+        best_m < ALONGSIDE * moved_m && overlap >= LEAST_OVERLAP && best.overlap < REPEATED;
     // No motion overlaps, although the poses are close: the sweeps are of two places.
     let is_elsewhere = moved_m < NEAR_M && overlap.max(best.overlap) < LEAST_OVERLAP;
-    Some(
-        ((is_better && is_other && is_judged && !is_traffic) || is_elsewhere).then_some(
-            Contradiction {
-                pair,
-                overlap,
-                best,
-            },
-        ),
-    )
+    let is_wrong =
+        is_repeated || (is_better && is_other && is_judged && !is_traffic) || is_elsewhere;
+    Some(is_wrong.then_some(Contradiction {
+        pair,
+        overlap,
+        best,
+    }))
 }
 
 #[cfg(test)]

@@ -140,6 +140,18 @@ fn dense_traffic_that_drives_along_is_no_problem_of_the_poses() {
 }
 
 #[test]
+fn a_lidar_that_repeats_its_sweep_is_no_traffic() {
+    let poses = &drive()[..10];
+    let found = problems(&vec![poses[3]; poses.len()], poses);
+    assert_eq!(found.len(), 1, "{found:?}");
+    assert!(
+        found[0].contains("or a LiDAR that repeats a sweep"),
+        "{}",
+        found[0]
+    );
+}
+
+#[test]
 fn independent_frames_have_no_poses_to_contradict() {
     let poses = drive();
     let dir = tempfile::tempdir().unwrap();

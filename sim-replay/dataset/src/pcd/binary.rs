@@ -1,11 +1,11 @@
 //! Points as little-endian numbers, plain or packed.
 //!
-//! The points may be followed by more bytes: PCL's writers extend files to whole pages. So lengths are checked as "at
-//! least", except for the unpacked one, which determines the positions of fields.
+//! The points may be followed by zeros: PCL's writers extend files to whole pages. Further points are an error. The
+//! unpacked length determines the positions of fields.
 
 use super::header::{IntensitySource, PcdField, PcdHeader};
 use super::{MAX_BYTES, PcdCloud, PcdError, lzf, unpack_rgb};
-use crate::scalar::ScalarKind;
+use crate::scalar::{ScalarKind, check_end};
 
 /// Position of a field's numbers: that of point `i` at `first + i * step`.
 #[derive(Debug, Clone, Copy)]
@@ -26,6 +26,9 @@ pub(super) fn decode(header: &PcdHeader, body: &[u8]) -> Result<PcdCloud, PcdErr
         );
         return Err(PcdError::of("POINTS", reason));
     }
+    let rest = body.get(expected.unwrap_or_default()..);
+    let end = check_end(rest.unwrap_or_default(), points, stride);
+    end.map_err(|reason| PcdError::of("POINTS", reason))?;
     Ok(gather(header, body, |(field, first)| BinaryColumn {
         field,
         first,
@@ -250,8 +253,13 @@ pub(crate) mod tests {
         );
         file.extend([0; 4]);
         assert_eq!(decode(&file).unwrap().points.len(), 2);
-        file.extend([7; 4096]);
-        assert_eq!(decode(&file).unwrap().points.len(), 2, "more may follow");
+        file.extend([0; 4096]);
+        assert_eq!(decode(&file).unwrap().points.len(), 2, "a page of zeros");
+        file.extend([7; 8]);
+        assert_eq!(
+            decode(&file).unwrap_err().to_string(),
+            "POINTS: 2 points stated, 344 found: the header is not of this file"
+        );
     }
 
     #[test]

@@ -20,6 +20,9 @@ const BYTE: f32 = 255.0;
 pub(super) const SAMPLES: usize = 3;
 /// One of this many points may be above the range of its sweep: a reflector, or a fault.
 const POINTS_PER_OUTLIER: usize = 100;
+/// Of at least this many points, one has at least this intensity: sensors measure lane markings and number plates.
+const ENOUGH_POINTS: usize = 500;
+const LEAST_LARGEST: f32 = 0.02;
 /// Finding about sweeps without intensities.
 pub(crate) const NO_INTENSITY: &str =
     "no intensity field (intensity, reflectivity, remission, rgb, ...): it is 0 for all points";
@@ -106,6 +109,17 @@ impl IntensityScale {
     }
 }
 
+/// The finding that the largest intensity of a number of points is too small but not 0; `from` states field and
+/// divisor.
+pub(crate) fn faint(points: usize, largest: f32, from: &str) -> Option<String> {
+    (points >= ENOUGH_POINTS && 0.0 < largest && largest < LEAST_LARGEST).then(|| {
+        format!(
+            "the largest of {points} intensities is {largest:.2e} ({from}), expected {LEAST_LARGEST} to 1: see \
+             --intensity-scale"
+        )
+    })
+}
+
 /// Upper end of the range of a sweep's intensities: their 99 % quantile, the largest of less than 100 points; 0 without
 /// points.
 pub(super) fn upper_intensity(points: &PointCloud) -> f32 {
@@ -146,7 +160,7 @@ impl LiveIntensities {
     }
 
     /// Scales the intensities of the next sweep to 0..1; `field` has their name and type. Returns the first finding: no
-    /// field, an unusual range, or intensities above 1.
+    /// field, an unusual range, or intensities above 1 or far below it.
     pub fn scale(
         &mut self,
         points: &mut PointCloud,
@@ -174,6 +188,10 @@ impl LiveIntensities {
                         largest / divisor
                     )
                 }))
+                .or_else(|| {
+                    let from = format!("field {name} divided by {divisor}");
+                    faint(points.len(), largest / divisor, &from)
+                })
             }
         };
         // Filtered last: only a finding sets the flag.
@@ -270,6 +288,22 @@ mod tests {
             let finding = live.scale(&mut points, number.clone());
             assert_eq!(points.xyzi[99][3], expected, "{bright} of 100");
             assert_eq!(finding.is_some(), bright == 1, "above 1: {finding:?}");
+        }
+    }
+
+    #[test]
+    fn live_intensities_far_below_one_are_named() {
+        let number = Some(("i".to_owned(), IntensityKind::Number));
+        for (count, stored, is_named) in [(500, 0.9, true), (499, 0.9, false), (500, 6.0, false)] {
+            let mut points = PointCloud {
+                xyzi: vec![[1.0, 2.0, 3.0, stored]; count],
+            };
+            let mut live = LiveIntensities::new("255".parse().unwrap());
+            let finding = live.scale(&mut points, number.clone());
+            assert_eq!(finding.is_some(), is_named, "{finding:?}");
+            let is_scale =
+                |text: String| text.contains("is 3.53e-3 (field i divided by 255), expected 0.02");
+            assert!(finding.is_none_or(is_scale));
         }
     }
 

@@ -166,14 +166,17 @@ mod tests {
 
     #[test]
     fn the_last_of_two_equal_keys_counts_as_in_python() {
-        let node = parsed("a: 1\na: 2\n");
+        let node = parsed("a:\n  b: 1\n  b: 2\n");
+        let root = YamlField::root(Path::new("a.yaml"), &node);
+        let b = root.required("a").unwrap().required("b").unwrap();
+        assert_eq!(b.integer().unwrap(), 2);
+    }
+
+    #[test]
+    fn a_key_of_the_document_stands_there_once() {
         assert_eq!(
-            YamlField::root(Path::new("a.yaml"), &node)
-                .required("a")
-                .unwrap()
-                .integer()
-                .unwrap(),
-            2
+            refusal("vehicles: {7: {}}\nego_speed: 1\nvehicles: {}\n"),
+            "a.yaml:3: no sound YAML: the key vehicles is here again, expected once"
         );
     }
 

@@ -3,6 +3,7 @@
 use std::collections::{HashMap, HashSet};
 
 use granit_parser::{Event, Parser, ScalarStyle, StrInput, Tag};
+use protocol::text::excerpt;
 
 use super::node::{Value, YamlNode};
 use super::{numpy_tags, scalar};
@@ -152,7 +153,7 @@ impl<'t> TreeBuilder<'t> {
 
     fn map(&mut self, depth: usize) -> Result<Value, Unsound> {
         let mut entries = Vec::new();
-        let mut merged = Vec::new();
+        let (mut merged, mut of_root) = (Vec::new(), HashSet::new());
         loop {
             let key = match self.next()? {
                 Event::MappingEnd => break,
@@ -162,6 +163,11 @@ impl<'t> TreeBuilder<'t> {
                     numpy_tags::key_text(&node).unwrap_or_else(|| node.value.kind())
                 }
             };
+            // Programs use the last one, and lose what the others hold: all objects of a frame, for example.
+            if depth == 0 && !of_root.insert(key.clone()) {
+                let key = excerpt(&key, 40);
+                return Err(self.unsound(format!("the key {key} is here again, expected once")));
+            }
             let event = self.next()?;
             let node = self.node(event, depth + 1)?;
             match node.value {

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::error::SynthError;
-use super::layout::{PROTOCOL_FILE, SceneLayout, remove_folder};
+use super::layout::{PROTOCOL_FILE, SceneLayout, remove_folder, written};
 use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
 use crate::generate::Result;
@@ -127,10 +127,9 @@ pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -
     };
     let summary = generate(&aside, progress)?;
     // Its files are on the disk by now: a folder with its final name has them all, also after a power cut.
-    fs::rename(&unfinished, &options.out)
-        .and_then(|()| atomic_file::sync_name(&options.out))
-        .at(&options.out)
-        .map_err(SynthError::Write)?;
+    let renamed = fs::rename(&unfinished, &options.out);
+    let renamed = renamed.and_then(|()| atomic_file::sync_name(&options.out));
+    written(&options.out, renamed)?;
     Ok(summary)
 }
 

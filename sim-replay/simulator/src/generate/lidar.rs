@@ -10,11 +10,11 @@ use support::random::SplitMix64;
 pub const LIDAR_MOUNT_M: [f64; 3] = [-0.5, 0.0, 1.95];
 
 /// Channels of the LiDAR.
-const CHANNELS: usize = 64;
+pub(super) const CHANNELS: usize = 64;
 /// Columns of one turn: 1.3 million rays a second over 64 channels and 20 turns a second, rounded as CARLA does.
 const COLUMNS: usize = 1016;
 /// Elevations of the lowest and the highest channel, degrees.
-const ELEVATIONS_DEG: [f32; 2] = [-25.0, 2.0];
+pub(super) const ELEVATIONS_DEG: [f32; 2] = [-25.0, 2.0];
 /// Range, metres.
 const RANGE_M: f32 = 120.0;
 /// Deviation of the range noise, metres.

@@ -4,15 +4,14 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
-use support::file_error::AtFile;
 
 use protocol::CavId;
 
 use super::data_protocol::protocol_yaml;
 use super::error::SynthError;
 use super::layout::{
-    Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, locked,
-    make_folder,
+    Moment, Omissions, SceneAgent, SceneHeader, SceneWriter, Unfinished, locked, make_folder,
+    written,
 };
 use super::options::{Subset, SynthOptions};
 use super::positioning::Positioning;
@@ -28,8 +27,6 @@ use support::random::derive_seed;
 /// Summary of generation.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Summary {
-    /// Layout of the files.
-    pub layout: SceneLayout,
     /// Scenarios.
     pub scenarios: usize,
     /// Frames of all agents together.
@@ -62,10 +59,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
     let unfinished = begin_folder(&options.out, options.force)?;
     let mut writer = options.layout.writer(&options.out);
     let omitted = Omissions::default();
-    let mut total = Summary {
-        layout: options.layout,
-        ..Summary::default()
-    };
+    let mut total = Summary::default();
     for (place, source) in sources(options).iter().enumerate() {
         let map_model = map::build(source, options.map_seed)?;
         total.findings.extend(map_model.findings.iter().cloned());
@@ -120,7 +114,7 @@ fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpe
 /// Creates the output folder and marks it as unfinished; refuses one that is not empty.
 pub(super) fn begin_folder(out: &std::path::Path, force: bool) -> Result<Unfinished> {
     make_folder(out)?;
-    let mut entries = fs::read_dir(out).at(out).map_err(SynthError::Write)?;
+    let mut entries = written(out, fs::read_dir(out))?;
     if entries.next().is_some() && !force {
         return Err(SynthError::NotEmpty(out.to_owned()));
     }
@@ -130,11 +124,9 @@ pub(super) fn begin_folder(out: &std::path::Path, force: bool) -> Result<Unfinis
 /// Removes the mark of the output folder when all its files are on the disk: until then readers report it as unfinished,
 /// also after a power cut.
 pub(super) fn end_folder(out: &std::path::Path, unfinished: Unfinished) -> Result<()> {
-    atomic_file::sync(out).at(out).map_err(SynthError::Write)?;
+    written(out, atomic_file::sync(out))?;
     unfinished.clear()?;
-    atomic_file::sync_name(&out.join(UNFINISHED))
-        .at(out)
-        .map_err(SynthError::Write)
+    written(out, atomic_file::sync_name(&out.join(UNFINISHED)))
 }
 
 impl SynthScene<'_, '_> {

@@ -2,11 +2,13 @@
 
 use std::f32::consts::PI;
 
+use strum::VariantArray;
+
 use super::raycast::{Bounds, Convex, SolidShape};
 use support::random::SplitMix64;
 
-/// Kinds of road vehicles.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// Kinds of road vehicles, in the order of `DRIVING` and `PARKED`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, VariantArray)]
 pub enum VehicleKind {
     /// Three boxes: bonnet, cabin, boot.
     Sedan,
@@ -37,11 +39,8 @@ pub struct Vehicle {
     pub shape: SolidShape,
 }
 
-/// All kinds, in the order of [`DRIVING`] and [`PARKED`].
-const KINDS: [VehicleKind; 7] = {
-    use VehicleKind::{Bus, Hatchback, Pickup, Sedan, Suv, Truck, Van};
-    [Sedan, Hatchback, Suv, Pickup, Van, Truck, Bus]
-};
+/// All kinds.
+const KINDS: &[VehicleKind] = VehicleKind::VARIANTS;
 /// Frequencies of [`KINDS`] in moving traffic and among parked vehicles. Trucks and buses are rare: the clean-up of
 /// detections in OpenCOOD's protocol drops boxes longer than 6 m.
 const DRIVING: [f64; 7] = [0.36, 0.21, 0.25, 0.05, 0.085, 0.03, 0.015];
@@ -92,12 +91,12 @@ impl Vehicle {
     /// A random vehicle, with one weight for each of [`KINDS`].
     fn random(random: &mut SplitMix64, weights: [f64; 7]) -> Self {
         let mut draw = random.unit() * weights.iter().sum::<f64>();
-        let chosen = KINDS.into_iter().zip(weights).find(|(_, weight)| {
+        let chosen = KINDS.iter().zip(weights).find(|(_, weight)| {
             draw -= weight;
             draw < 0.0
         });
         // Rounding may leave a rest after the last weight.
-        let kind = chosen.map_or(KINDS[0], |(kind, _)| kind);
+        let kind = chosen.map_or(KINDS[0], |(kind, _)| *kind);
         let [mean_m, spread] = kind.mean_and_spread();
         let size_m = std::array::from_fn(|axis| {
             mean_m[axis] * (1.0 + spread[axis] * random.between(-1.0, 1.0))
@@ -296,7 +295,7 @@ mod tests {
     #[test]
     fn every_kind_occurs_and_fills_its_box() {
         let fleet = fleet();
-        for kind in &KINDS {
+        for kind in KINDS {
             assert!(
                 fleet.iter().any(|vehicle| vehicle.kind == *kind),
                 "{kind:?}"

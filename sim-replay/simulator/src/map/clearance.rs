@@ -36,9 +36,8 @@ impl MapModel {
                 let middle = Pose2::new(x, y, dy.atan2(dx));
                 let piece = PlanRectangle::around(middle, half_m).corners();
                 index.any(bounds(piece), |number| {
-                    let solid = &self.solids[number as usize];
-                    let clear = solid.bottom_m() > from[2] + LANE_HEADROOM_M
-                        || solid.top_m() < from[2] + SURFACE_M;
+                    let [bottom_m, top_m] = self.solids[number as usize].z_m();
+                    let clear = bottom_m > from[2] + LANE_HEADROOM_M || top_m < from[2] + SURFACE_M;
                     if !clear && overlap(&outlines[number as usize], &piece) {
                         found.push((lane.id, number as usize));
                     }

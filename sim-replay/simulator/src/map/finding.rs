@@ -47,7 +47,7 @@ impl fmt::Display for Finding {
 /// Findings in the order of their first occurrence; the same again in one road is counted.
 #[derive(Debug, Default)]
 pub(super) struct FindingLog {
-    list: Vec<Finding>,
+    pub(super) list: Vec<Finding>,
     places: BTreeMap<[String; 3], usize>,
     /// Road or junction that is being read.
     within: Option<String>,
@@ -100,10 +100,6 @@ impl FindingLog {
             });
         }
     }
-
-    pub(super) fn into_list(self) -> Vec<Finding> {
-        self.list
-    }
 }
 
 fn shortened(text: &str) -> String {
@@ -135,7 +131,7 @@ mod tests {
             log.enter("road", &road.to_string());
             log.add(1, "speed", "max=\"-1\"", "treated as absent");
         }
-        let list = log.into_list();
+        let list = log.list;
         assert_eq!(list.len(), MAX_FINDINGS + 1);
         assert_eq!(
             list.iter().map(|finding| finding.count).sum::<usize>(),

@@ -1,10 +1,8 @@
 //! Links between the lanes of a map: neighbours, successors, and links that are refused.
 
-use std::fmt;
-
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
-use super::road::{Connection, Contact, RoadEnd, RoadLink, RoadNetwork};
+use super::road::{Contact, RoadEnd, RoadLink, RoadNetwork};
 
 /// A link whose lanes are farther apart than this is refused, metres.
 const LINK_GAP_M: f64 = 0.5;
@@ -51,25 +49,20 @@ pub(super) struct Linker<'a> {
 
 impl Linker<'_> {
     /// The lane of the graph that was made from a lane of the network.
-    fn find(&self, road: usize, section: usize, lane: i32) -> Option<LaneId> {
-        let origin = LaneOrigin {
-            road,
-            section,
-            lane,
-        };
+    fn find(&self, origin: LaneOrigin) -> Option<LaneId> {
         let place = self.origins.binary_search(&origin).ok()?;
         Some(LaneId(place as u32))
     }
 
     /// Fills [`Lane::left`] and [`Lane::right`].
     pub(super) fn link_neighbours(&self, graph: &mut LaneGraph) {
-        for (lane, origin) in graph.lanes.iter_mut().zip(&self.origins) {
+        for (lane, &origin) in graph.lanes.iter_mut().zip(&self.origins) {
             let (section, id) = (origin.section, origin.lane);
             let road = &self.network.roads[origin.road];
             let along = road.leads_along(section, id);
-            let [inner, outer] = [id - id.signum(), id + id.signum()].map(|other| {
-                let found = self.find(origin.road, section, other);
-                found.filter(|_| road.leads_along(section, other) == along)
+            let [inner, outer] = [id - id.signum(), id + id.signum()].map(|lane| {
+                let found = self.find(LaneOrigin { lane, ..origin });
+                found.filter(|_| road.leads_along(section, lane) == along)
             });
             // Seen along the road, the reference line is to the left of lanes with negative ids.
             (lane.left, lane.right) = match (id < 0) == along {
@@ -98,8 +91,11 @@ impl Linker<'_> {
                 } else {
                     counts.refused += 1;
                     let onto = self.origins[next.0 as usize];
+                    let (beside_m, step_m, turn_rad) =
+                        (joint.beside_m, joint.step_m, joint.turn_rad);
                     let found = format!(
-                        "leads from lane {} onto lane {} of road {}, {joint}",
+                        "leads from lane {} onto lane {} of road {}, {beside_m:.2} m away, {step_m:.2} m in height, \
+                         turned by {turn_rad:.2} rad",
                         origin.lane, onto.lane, roads[onto.road].id
                     );
                     log.add(0, "laneLink", &found, "link left out");
@@ -121,7 +117,7 @@ impl Linker<'_> {
             }
             graph.lanes[index].successors = successors;
         }
-        counts.findings = log.into_list();
+        counts.findings = log.list;
         counts
     }
 
@@ -133,8 +129,8 @@ impl Linker<'_> {
         let own = road.sections[origin.section].lane(origin.lane)?;
         let next = road.sections.get(section)?.lane(origin.lane)?;
         let links = [own.linked(forward), next.linked(!forward)];
-        let own = self.find(origin.road, origin.section, origin.lane)?;
-        let next = self.find(origin.road, section, origin.lane)?;
+        let own = self.find(origin)?;
+        let next = self.find(LaneOrigin { section, ..origin })?;
         let (own, onto) = (graph.lane(own), graph.lane(next));
         let widths = [own.widths_m[own.widths_m.len() - 1], onto.widths_m[0]];
         // A lane that ends in a point and one that begins in a point are two.
@@ -182,8 +178,21 @@ impl Linker<'_> {
         section: usize,
         ids: impl IntoIterator<Item = i32>,
     ) -> Vec<LaneId> {
-        let ids = ids.into_iter();
-        ids.filter_map(|id| self.find(road, section, id)).collect()
+        let origins = ids.into_iter().map(|lane| LaneOrigin {
+            road,
+            section,
+            lane,
+        });
+        origins.filter_map(|origin| self.find(origin)).collect()
+    }
+
+    /// Lanes at an end of a road onto which the links of a connection lead from `lane`: pairs of ids; without any, the
+    /// lane of the same id.
+    fn linked_at(&self, road: usize, at: Contact, lane: i32, links: &[(i32, i32)]) -> Vec<LaneId> {
+        let own = links.iter().filter(|(from, _)| *from == lane);
+        let onto = own.map(|&(_, to)| to);
+        let onto = onto.chain(links.is_empty().then_some(lane));
+        self.lanes_of(road, self.end_section(road, at), onto)
     }
 
     /// Lanes that the connections of a junction name for the lane of `origin`, which leads into it at `end` of its road.
@@ -193,36 +202,25 @@ impl Linker<'_> {
         let connections = junction.connections.iter();
         let onward = connections.clone();
         for connection in onward.filter(|one| one.incoming == origin.road) {
-            let links = connection.lane_links.iter();
-            let onto = links.filter(|(from, _)| *from == origin.lane);
-            let onto = onto.map(|&(_, to)| to).chain(same_id(connection, origin));
-            let (road, contact) = (connection.connecting, connection.contact);
-            lanes.extend(self.lanes_of(road, self.end_section(road, contact), onto));
+            let (road, links) = (connection.connecting, &connection.lane_links);
+            lanes.extend(self.linked_at(road, connection.contact, origin.lane, links));
         }
         // A direct junction is passed both ways: from the linked road onto the incoming one too.
         let back = connections.filter(|connection| {
             junction.direct && connection.connecting == origin.road && connection.contact == end
         });
         for connection in back {
+            let (road, links) = (connection.incoming, connection.lane_links.iter());
+            let links: Vec<_> = links.map(|&(from, to)| (to, from)).collect();
             for contact in [Contact::Start, Contact::End] {
-                let link = self.network.roads[connection.incoming].link(contact);
+                let link = self.network.roads[road].link(contact);
                 if link == Some(RoadLink::Junction(place)) {
-                    let links = connection.lane_links.iter();
-                    let onto = links.filter(|(_, to)| *to == origin.lane);
-                    let onto = onto.map(|&(from, _)| from);
-                    let onto = onto.chain(same_id(connection, origin));
-                    let section = self.end_section(connection.incoming, contact);
-                    lanes.extend(self.lanes_of(connection.incoming, section, onto));
+                    lanes.extend(self.linked_at(road, contact, origin.lane, &links));
                 }
             }
         }
         lanes
     }
-}
-
-/// The lane onto which a connection without links leads: that of the same id.
-fn same_id(connection: &Connection, origin: LaneOrigin) -> Option<i32> {
-    connection.lane_links.is_empty().then_some(origin.lane)
 }
 
 /// How the end of a lane and the start of the next one lie to each other.
@@ -252,15 +250,5 @@ impl Joint {
             false => self.beside_m.hypot(self.step_m) < LINK_GAP_M,
         };
         near && self.turn_rad.abs() < LINK_TURN_RAD
-    }
-}
-
-impl fmt::Display for Joint {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "{:.2} m away, {:.2} m in height, turned by {:.2} rad",
-            self.beside_m, self.step_m, self.turn_rad
-        )
     }
 }

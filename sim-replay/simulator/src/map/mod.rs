@@ -35,7 +35,6 @@ pub use ground::{Ground, HeightGrid, Terrain};
 pub use lane::{Lane, LaneGraph, LaneId};
 pub(crate) use lane_queries::LaneIndex;
 use layout::RoadLayout;
-pub use opendrive::OpenDriveError;
 use road::RoadNetwork;
 pub use solid::{Shape, Solid, SolidKind};
 use std::path::{Path, PathBuf};

@@ -54,7 +54,7 @@ pub struct Road {
     /// Objects beside or on the road in the map.
     pub objects: Vec<RoadObject>,
     /// Traffic lights and signs in the map.
-    pub signals: Vec<RoadSignal>,
+    pub signals: Vec<RoadObject>,
     /// Stretches on bridges and in tunnels in the map.
     pub structures: Vec<RoadStructure>,
 }
@@ -177,38 +177,19 @@ pub struct Connection {
     pub lane_links: Vec<(i32, i32)>,
 }
 
-/// An object of the map beside or on a road.
-#[derive(Debug, Clone)]
+/// An object, a traffic light or a sign of the map beside or on a road.
+#[derive(Debug, Clone, Default)]
 pub struct RoadObject {
-    /// Type and name in the map.
+    /// Type and name of an object in the map; traffic lights and signs have none.
     pub label: String,
-    /// Place along the road, metres.
-    pub s_m: f64,
-    /// Place across the road, metres.
-    pub t_m: f64,
-    /// Height over the road's surface, metres.
-    pub z_offset_m: f64,
-    /// Heading against the road, radians.
-    pub heading_rad: f64,
-    /// Length, width, height, metres.
-    pub size_m: [f64; 3],
-}
-
-/// A traffic light or sign of the map.
-#[derive(Debug, Clone)]
-pub struct RoadSignal {
     /// True if it changes (a traffic light).
     pub dynamic: bool,
     /// Place along the road, metres.
     pub s_m: f64,
     /// Place across the road, metres.
     pub t_m: f64,
-    /// Height of its foot over the road's surface, metres.
-    pub z_offset_m: f64,
     /// Heading against the road, radians.
     pub heading_rad: f64,
-    /// Height, metres; 0 if the map gives none.
-    pub height_m: f64,
 }
 
 /// A stretch of road on a bridge or in a tunnel.

@@ -60,19 +60,14 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// Half of the height, metres.
-    pub(crate) fn half_height_m(&self) -> f64 {
+    /// Half lengths along the shape's own x, y and z of the box around it, metres.
+    pub(crate) fn half_m(&self) -> [f64; 3] {
         match *self {
-            Self::Box { half_m: [_, _, z] } | Self::Ellipsoid { radii_m: [_, _, z] } => z,
-            Self::Cylinder { half_height_m, .. } => half_height_m,
-        }
-    }
-
-    /// Half lengths along the shape's own x and y of the rectangle around its outline seen from above, metres.
-    pub(crate) fn half_footprint_m(&self) -> [f64; 2] {
-        match *self {
-            Self::Box { half_m: [x, y, _] } | Self::Ellipsoid { radii_m: [x, y, _] } => [x, y],
-            Self::Cylinder { radius_m, .. } => [radius_m, radius_m],
+            Self::Box { half_m } | Self::Ellipsoid { radii_m: half_m } => half_m,
+            Self::Cylinder {
+                radius_m,
+                half_height_m,
+            } => [radius_m, radius_m, half_height_m],
         }
     }
 }
@@ -95,22 +90,18 @@ pub struct Solid {
 impl Solid {
     /// Outline seen from above.
     pub(crate) fn outline(&self) -> PlanRectangle {
-        let half_m = self.shape.half_footprint_m();
+        let [half_x, half_y, _] = self.shape.half_m();
         // A round outline needs no turning.
         let is_round = matches!(self.shape, Shape::Cylinder { .. });
         let [x, y, _] = self.center_m;
         let yaw_rad = if is_round { 0.0 } else { self.yaw_rad };
-        PlanRectangle::around(Pose2::new(x, y, yaw_rad), half_m)
+        PlanRectangle::around(Pose2::new(x, y, yaw_rad), [half_x, half_y])
     }
 
-    /// Height of its lowest point, metres in the world frame.
-    pub(crate) fn bottom_m(&self) -> f64 {
-        self.center_m[2] - self.shape.half_height_m()
-    }
-
-    /// Height of its highest point, metres in the world frame.
-    pub(crate) fn top_m(&self) -> f64 {
-        self.center_m[2] + self.shape.half_height_m()
+    /// Heights of its lowest and its highest point, metres in the world frame.
+    pub(crate) fn z_m(&self) -> [f64; 2] {
+        let (middle, [_, _, half]) = (self.center_m[2], self.shape.half_m());
+        [middle - half, middle + half]
     }
 }
 
@@ -121,7 +112,7 @@ mod tests {
     impl Solid {
         /// Axis-aligned bounds in the world frame: lowest and highest corner, metres.
         pub(crate) fn bounds_m(&self) -> ([f64; 3], [f64; 3]) {
-            let [half_x, half_y] = self.shape.half_footprint_m();
+            let [half_x, half_y, half_z] = self.shape.half_m();
             let (sin, cos) = self.yaw_rad.sin_cos();
             let half = match self.shape {
                 Shape::Box { .. } => [
@@ -134,7 +125,7 @@ mod tests {
                     (half_x * sin).hypot(half_y * cos),
                 ],
             };
-            let half = [half[0], half[1], self.shape.half_height_m()];
+            let half = [half[0], half[1], half_z];
             (
                 std::array::from_fn(|axis| self.center_m[axis] - half[axis]),
                 std::array::from_fn(|axis| self.center_m[axis] + half[axis]),

@@ -1,6 +1,6 @@
 //! Road surfaces: quadrilaterals across every road, by use.
 
-use super::convex::{CellIndex, PlanRectangle, Quad, bounds, overlap};
+use super::convex::{CellIndex, PlanRectangle, Quad, bounds, overlap, range};
 use super::curve::Pose2;
 use super::road::{LaneKind, Road, RoadNetwork};
 
@@ -124,14 +124,9 @@ impl Patch {
         right_z + across_m.clamp(-BESIDE_M, width_m + BESIDE_M) / width_m * (left_z - right_z)
     }
 
-    /// Lowest corner, metres.
-    pub(crate) fn low_m(&self) -> f64 {
-        self.z_m.into_iter().fold(f64::INFINITY, f64::min)
-    }
-
-    /// Highest corner, metres.
-    pub(crate) fn high_m(&self) -> f64 {
-        self.z_m.into_iter().fold(f64::NEG_INFINITY, f64::max)
+    /// Heights of its lowest and its highest corner, metres.
+    pub(crate) fn range_m(&self) -> [f64; 2] {
+        range(self.z_m.into_iter())
     }
 }
 
@@ -171,8 +166,7 @@ impl RoadSurface {
                     }
                 }
                 let own = &mut patches[before..];
-                let heights = own.iter().map(Patch::high_m);
-                let top_m = heights.fold(f64::NEG_INFINITY, f64::max);
+                let [_, top_m] = range(own.iter().flat_map(|patch| patch.z_m));
                 own.iter_mut().for_each(|patch| patch.top_m = top_m);
             }
         }
@@ -211,7 +205,7 @@ impl RoadSurface {
         pavements: bool,
     ) -> bool {
         !self.any(rectangle, |patch| {
-            let (low, high) = (patch.low_m(), patch.high_m());
+            let [low, high] = patch.range_m();
             (pavements || patch.carriageway) && bottom_m < high + headroom_m && top_m > low - 0.05
         })
     }

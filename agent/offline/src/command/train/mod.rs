@@ -1,7 +1,7 @@
 //! `agent train`: the two stages of PGC, and the baselines.
 
 mod encoder;
-pub(super) mod options;
+mod options;
 mod pose_regression;
 mod scene;
 mod sgloc;

@@ -6,7 +6,9 @@ use agent_offline::training::{PoseRegressionConfig, PoseRegressionSummary};
 use agent_offline::{Error, TrainingBar};
 use perception::train::{ModelCard, Observe, RateSchedule, TrainingOptions};
 
-use super::options::{SceneOptions, bad, check_folders, run_config, with_bar};
+use crate::command::scene_heads::check_one_map;
+
+use super::options::{SceneOptions, bad, run_config, with_bar};
 
 /// Decoupled weight decay: sweeps are few beside the parameters.
 const WEIGHT_DECAY: f64 = 0.05;
@@ -72,7 +74,7 @@ impl Args {
                 "--turn-deg is {turn_deg}, must be 0 to 180 degrees"
             )));
         }
-        check_folders(self.sweeps.dataset.iter().chain(&self.validation))?;
+        check_one_map(&[&self.sweeps.dataset[..], &self.validation[..]].concat())?;
         let mut run = run_config(&self.options, self.batch, self.lr)?;
         run.optimizer.weight_decay = WEIGHT_DECAY;
         run.optimizer.max_gradient_norm = MAX_GRADIENT_NORM;

@@ -9,7 +9,9 @@ use agent_offline::training::{
 };
 use perception::train::{ModelCard, TrainingOptions};
 
-use super::options::{SceneOptions, bad, check_folders, run_config, with_bar};
+use crate::command::scene_heads::check_one_map;
+
+use super::options::{SceneOptions, bad, run_config, with_bar};
 
 /// Train the head of one scene on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors
 /// and model-card.md.
@@ -87,7 +89,7 @@ impl Args {
         if self.copies == 0 || self.validation_sweeps == 0 {
             return Err(bad("--copies and --validation-sweeps must be above zero"));
         }
-        check_folders(self.sweeps.dataset.iter().chain(&self.validation))?;
+        check_one_map(&[&self.sweeps.dataset[..], &self.validation[..]].concat())?;
         let run = run_config(&self.options, self.batch, self.lr)?;
         Ok(SceneTrainConfig {
             scenes: self.sweeps.dataset.clone(),

@@ -6,7 +6,9 @@ use agent_offline::TrainingBar;
 use agent_offline::training::{SgLocTrainConfig, train_sgloc};
 use perception::train::{ModelCard, TrainingOptions};
 
-use super::options::{SceneOptions, check_folders, run_config, with_bar};
+use crate::command::scene_heads::check_one_map;
+
+use super::options::{SceneOptions, run_config, with_bar};
 
 /// Train SGLoc's head on one scene, on a frozen encoder; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
@@ -27,7 +29,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    check_folders(&args.sweeps.dataset)?;
+    check_one_map(&args.sweeps.dataset)?;
     let config = SgLocTrainConfig {
         scenes: args.sweeps.dataset.clone(),
         scene_name: args.sweeps.scene_name.clone(),

@@ -129,7 +129,8 @@ fn train<N: PoseLoss>(
     // Only tokens are needed from here on: the memory of the pooled features is freed.
     drop(sweeps);
     // The time of the training begins here: reading and encoding do not count.
-    let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
+    let trainer = Trainer::begin(run, &variables, None, Instant::now())?;
+    let mut trainer = trainer.on_data(&data.sha256)?;
     let mut training = PoseTraining {
         run,
         sectors: (config.turn_rad / std::f64::consts::TAU * SECTORS as f64).round() as i64,

@@ -7,6 +7,7 @@ use tch::{Kind, TchError, Tensor, no_grad};
 use crate::training::FeatureCache;
 use crate::training::kmeans::nearest;
 use crate::{Error, Result};
+use localization::pgc::head_files::head_config;
 use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
 use perception::weights::Weights;
 
@@ -21,9 +22,7 @@ pub(super) fn load(
     encoder: &Path,
     encoder_sha256: &str,
 ) -> Result<(Weights, SceneHeadConfig), LocalizerError> {
-    let weights = Weights::load(path)?;
-    weights.check_kind(SceneHead::KIND)?;
-    let config: SceneHeadConfig = weights.config()?;
+    let (weights, config) = head_config(path)?;
     config.check_encoder(path, encoder, encoder_sha256)?;
     Ok((weights, config))
 }

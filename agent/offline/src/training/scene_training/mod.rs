@@ -96,6 +96,8 @@ struct SceneTraining<'a> {
     accuracy: Option<SceneAccuracy>,
     curve: Curve,
     data: DataListing,
+    /// Driven area of the head that the training started from; empty without one.
+    earlier_drives: DrivenArea,
     preparing_seconds: f64,
 }
 
@@ -144,7 +146,9 @@ impl<'a> SceneTraining<'a> {
             train_classifier(&head, &variables, &cache, &class_of_sweep, run, observe)?;
         }
         // After the classifier: where a checkpoint is resumed, it replaces all variables.
-        let trainer = Trainer::begin(run, &variables, None, started)?;
+        let earlier_drives = stored.and_then(|(weights, _)| DrivenArea::of_head(&weights));
+        let data = training.data();
+        let trainer = Trainer::begin(run, &variables, None, started)?.on_data(&data.sha256)?;
         let redundancy = config
             .redundancy
             .map(|leave_out| Redundancy::new(leave_out, run.seed, class_of_sweep));
@@ -165,7 +169,8 @@ impl<'a> SceneTraining<'a> {
             reported: None,
             accuracy: None,
             curve: trainer.curve(CURVE)?,
-            data: training.data(),
+            data,
+            earlier_drives: earlier_drives.unwrap_or_else(|| DrivenArea::of(&[])),
             preparing_seconds: started.elapsed().as_secs_f64(),
         };
         Ok((training, trainer))
@@ -182,6 +187,7 @@ impl<'a> SceneTraining<'a> {
         let mut trained = trainer.save_network(&variables, kind, head_config, self.data)?;
         let positions_m = self.cache.positions_m();
         let area = DrivenArea::of(&Vec::from_iter(positions_m.iter().map(|&[x, y, _]| [x, y])));
+        let area = area.merged(&self.earlier_drives);
         trained.sha256 = area.state_in(&trained.weights)?;
         Ok(SceneSummary {
             trained,

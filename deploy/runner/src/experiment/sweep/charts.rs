@@ -56,8 +56,8 @@ const DIMENSIONS: [Dimension; 7] = [
         text: |point| point.loss.map(|share| format!("loss {share}")),
     },
     Dimension {
-        name: "ap_pose_noise",
-        label: "pose noise, m (degrees alike)",
+        name: POSE_NOISE,
+        label: "position noise, m (degrees alike, unless named)",
         value: |run| run.point.pose_noise.map(|noise| noise.position_std_m),
         text: |point| {
             let noise = point.pose_noise?;
@@ -83,6 +83,8 @@ const DIMENSIONS: [Dimension; 7] = [
     },
 ];
 
+/// The one figure whose values are two numbers each.
+const POSE_NOISE: &str = "ap_pose_noise";
 /// The one figure with a logarithmic axis.
 const BANDWIDTH: &str = "ap_bandwidth";
 /// The one figure whose values are far from zero.
@@ -134,29 +136,7 @@ fn chart(
     title: &str,
     iou: usize,
 ) -> Option<Chart> {
-    // Along bytes, the cells of all values of a codec form one line.
-    let mut series: Vec<(String, GroupedPoints)> = Vec::new();
-    for run in runs {
-        let precision = run.cell.metrics.ap_global.values()[iou];
-        let (Some(x), Some(y)) = ((dimension.value)(run), precision) else {
-            continue;
-        };
-        let point = &run.point;
-        let others = varying.iter().filter(|other| other.name != dimension.name);
-        let mut names = vec![point.method.name().to_owned()];
-        names.extend(others.filter_map(|other| (other.text)(point)));
-        let name = names.join(", ");
-        let known = series.iter().position(|(known, _)| *known == name);
-        let known = known.unwrap_or_else(|| {
-            series.push((name.clone(), BTreeMap::new()));
-            series.len() - 1
-        });
-        // Runs that differ in nothing but their seed share a key and become one point.
-        let key = (dimension.text)(point).unwrap_or_else(|| x.to_bits().to_string());
-        series[known].1.entry(key).or_default().push((x, y));
-    }
-    let series = series.into_iter().map(|(name, points)| line(name, points));
-    let series: Vec<Series> = series.collect();
+    let series = series(runs, dimension, varying, iou);
     let xs = series
         .iter()
         .flat_map(|series| series.points.iter().map(|(x, _)| (*x, *x)));
@@ -170,12 +150,49 @@ fn chart(
         Axis::linear(dimension.label, span(low, high, dimension.name == BYTES))
     };
     let title = format!("{}: {title}", experiment.name);
+    let order = runs.first()?.cell.metrics.ap_order().name();
     Some(Chart {
         title,
         x,
-        y: Axis::linear("AP, ordered by score", [0.0, 1.0]),
+        y: Axis::linear(&format!("AP, {order} order"), [0.0, 1.0]),
         series,
     })
+}
+
+/// Lines of a chart. Along bytes, the cells of all values of a codec form one line; along the noise of the position there
+/// is a line for each noise of the heading, unless they are alike.
+fn series(runs: &[Run], dimension: &Dimension, varying: &[&Dimension], iou: usize) -> Vec<Series> {
+    let names_heading = dimension.name == POSE_NOISE && !is_alike(runs);
+    let mut series: Vec<(String, GroupedPoints)> = Vec::new();
+    for run in runs {
+        let precision = run.cell.metrics.headline().values()[iou];
+        let (Some(x), Some(y)) = ((dimension.value)(run), precision) else {
+            continue;
+        };
+        let point = &run.point;
+        let others = varying.iter().filter(|other| other.name != dimension.name);
+        let mut names = vec![point.method.name().to_owned()];
+        names.extend(others.filter_map(|other| (other.text)(point)));
+        let noise = point.pose_noise.filter(|_| names_heading);
+        names.extend(noise.map(|noise| format!("heading {} deg", noise.heading_std_deg)));
+        let name = names.join(", ");
+        let known = series.iter().position(|(known, _)| *known == name);
+        let known = known.unwrap_or_else(|| {
+            series.push((name.clone(), BTreeMap::new()));
+            series.len() - 1
+        });
+        // Runs that differ in nothing but their seed share a key and become one point.
+        let key = (dimension.text)(point).unwrap_or_else(|| x.to_bits().to_string());
+        series[known].1.entry(key).or_default().push((x, y));
+    }
+    let series = series.into_iter().map(|(name, points)| line(name, points));
+    series.collect()
+}
+
+/// True if the noise of each heading, degrees, is the number of that of its position, metres.
+fn is_alike(runs: &[Run]) -> bool {
+    let mut noises = runs.iter().filter_map(|run| run.point.pose_noise);
+    noises.all(|noise| noise.heading_std_deg == noise.position_std_m)
 }
 
 /// Points of a line, grouped for the mean over seeds: by their label, or else by the bits of their x.
@@ -205,6 +222,8 @@ fn span(low: f64, high: f64, is_far_from_zero: bool) -> [f64; 2] {
 
 #[cfg(test)]
 mod tests {
+    use dataset::evaluation_protocol::EvaluationProtocol;
+
     use super::super::table::tests::runs;
     use super::*;
 
@@ -219,6 +238,43 @@ mod tests {
             (BYTES, 3)
         );
         assert!(names().any(|name| name == BYTES));
+    }
+
+    #[test]
+    fn every_heading_noise_has_a_line_of_its_own_unless_it_is_that_of_the_position() {
+        let chart_of = |noises: [[f64; 2]; 4]| {
+            let noises = noises.map(|[position_m, heading_deg]| {
+                format!("{{position_std_m: {position_m}, heading_std_deg: {heading_deg}}}")
+            });
+            let noises = noises.join(", ");
+            let (experiment, runs) = runs(&format!("{{method: [max], pose_noise: [{noises}]}}"));
+            figures(&experiment, &runs).remove(0).charts.remove(0)
+        };
+        let apart = chart_of([[1.0, 0.0], [1.0, 10.0], [2.0, 0.0], [2.0, 10.0]]);
+        let lines: Vec<_> = apart
+            .series
+            .iter()
+            .map(|line| (line.name.as_str(), line.points.len()))
+            .collect();
+        assert_eq!(
+            lines,
+            [("max, heading 0 deg", 2), ("max, heading 10 deg", 2)]
+        );
+        let alike = chart_of([[0.0, 0.0], [0.2, 0.2], [0.4, 0.4], [0.6, 0.6]]);
+        assert_eq!((alike.series.len(), alike.series[0].points.len()), (1, 4));
+        assert_eq!(alike.series[0].name, "max");
+    }
+
+    #[test]
+    fn the_order_of_the_protocol_is_drawn_and_named() {
+        let (experiment, mut runs) = runs("{method: [max], loss: [0, 0.5]}");
+        for run in &mut runs {
+            run.cell.metrics.protocol = EvaluationProtocol::preset("v2v4real");
+            run.cell.metrics.ap_frame_order.at_50 = Some(0.625);
+        }
+        let chart = &figures(&experiment, &runs)[0].charts[0];
+        assert_eq!(chart.y.label, "AP, frame order");
+        assert_eq!(chart.series[0].points, [(0.0, 0.625), (0.5, 0.625)]);
     }
 
     #[test]

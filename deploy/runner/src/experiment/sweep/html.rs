@@ -1,11 +1,11 @@
 //! `report.html`: figures, table and provenance, in one self-contained file.
 
-use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::Run;
 use super::table::NOTES;
 use super::varying::VaryingTable;
+use crate::experiment::cell::sources;
 use crate::experiment::spec::Experiment;
 
 const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;\
@@ -53,7 +53,7 @@ pub(super) fn page(
         let _ = writeln!(page, "<dt>{column}</dt><dd>{}</dd>", escaped(note));
     }
     page += "</dl>\n<h2>What it was made of</h2>\n<ul>\n";
-    for line in provenance(runs) {
+    for line in sources(runs.iter().map(|run| &run.cell)) {
         let _ = writeln!(page, "<li>{}</li>", escaped(&line));
     }
     let _ = writeln!(
@@ -101,21 +101,4 @@ fn escaped(text: &str) -> String {
         .replace('<', "&lt;")
         .replace('>', "&gt;")
         .replace('"', "&quot;")
-}
-
-/// Program, data and all other files, each once.
-fn provenance(runs: &[Run]) -> Vec<String> {
-    let mut lines = BTreeSet::new();
-    for run in runs {
-        let of = &run.cell.key.provenance;
-        let (version, commit, sha256) = (&of.version, &of.commit, &of.program_sha256);
-        lines.insert(format!(
-            "program {version}, commit {commit}, SHA-256 {sha256}"
-        ));
-        lines.insert(format!("data SHA-256 {}", of.data_sha256));
-        for (file, sha256) in &of.files_sha256 {
-            lines.insert(format!("{} SHA-256 {sha256}", file.display()));
-        }
-    }
-    lines.into_iter().collect()
 }

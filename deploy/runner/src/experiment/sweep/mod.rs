@@ -21,7 +21,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
-use dataset::Scenario;
+use ego_fuser_offline::evaluation::AgentPool;
 use fusion::Exchange;
 use perception::weights::Weights;
 use serde::Serialize;
@@ -127,16 +127,18 @@ impl ExperimentSweep {
     }
 
     fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self> {
-        let data = OpenedData::open(&experiment.trial().context("link")?)?;
-        let scenarios: Vec<Scenario> = data.chosen(experiment.scenarios).cloned().collect();
-        if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) {
+        let mut trial = experiment.trial().context("link")?;
+        let data = OpenedData::open(&trial)?;
+        if data.frame_count(experiment.scenarios) == 0 {
             let dataset = experiment.dataset.display();
             let problem = format!("dataset {dataset}: there is no frame in it");
             return Err(FileError::new(file, problem).into());
         }
-        let asked = experiment.grid.vehicles.iter().flatten().copied();
-        check::check_vehicles("grid.vehicles", asked, &scenarios)
-            .map_err(|problem| FileError::new(file, problem))?;
+        for &vehicles in experiment.grid.vehicles.iter().flatten() {
+            trial.setup.pool = AgentPool::First(vehicles);
+            let checked = trial.check_participants(&data);
+            checked.map_err(|problem| FileError::new(file, format!("grid.{problem}")))?;
+        }
         Ok(Self {
             file: file.to_owned(),
             text: String::new(),
@@ -398,7 +400,8 @@ impl ExperimentSweep {
         }
         let columns: Vec<&str> = table::COLUMNS.split(',').collect();
         let lines = runs.iter().map(|run| table::line(&self.experiment, run));
-        let varying = VaryingTable::new(&columns, &Vec::from_iter(lines));
+        let order = self.data.protocol.ap_order;
+        let varying = VaryingTable::new(&columns, &Vec::from_iter(lines), order);
         let page = html::page(&self.experiment, &self.text, runs, &drawings, &varying);
         write(&self.out.join("report.html"), &page)?;
         let name = format!("{}.csv", self.experiment.name);

@@ -59,7 +59,8 @@ pub(super) fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<St
         plain(point.pose_noise.map(|noise| noise.position_std_m)),
         plain(point.pose_noise.map(|noise| noise.heading_std_deg)),
         plain(point.vehicles),
-        point.seed.to_string(),
+        // Without seeds in the grid each random part keeps its own.
+        plain(experiment.grid.seed.as_ref().map(|_| point.seed)),
         metrics.frames.to_string(),
     ];
     for ap in [metrics.ap_global, metrics.ap_frame_order] {
@@ -140,6 +141,15 @@ pub(super) mod tests {
         });
         let runs = runs.collect();
         (experiment, runs)
+    }
+
+    #[test]
+    fn a_seed_that_the_grid_does_not_have_is_empty() {
+        let place = COLUMNS.split(',').position(|name| name == "seed").unwrap();
+        for (grid, seed) in [("{method: [max]}", ""), ("{method: [max], seed: [7]}", "7")] {
+            let (experiment, runs) = runs(grid);
+            assert_eq!(line(&experiment, &runs[0])[place], seed, "{grid}");
+        }
     }
 
     #[test]

@@ -1,11 +1,8 @@
 //! Columns of a sweep's table that vary, as its report and the terminal show them, and what is seen in them.
 
+use dataset::evaluation_protocol::ApOrder;
 use terminal::text_table::{GAP, Side, TextTable};
 
-/// Columns that are shown first, and in whose highest value a reader is interested.
-const PRECISIONS: [&str; 3] = ["ap_global_30", "ap_global_50", "ap_global_70"];
-/// The one that the sentence is about.
-const MAIN: &str = "ap_global_50";
 /// Characters of a line of a terminal.
 const TERMINAL: usize = 120;
 /// Further results, shown as far as a line has room for them.
@@ -22,19 +19,23 @@ pub(super) struct VaryingTable {
     pub(super) constants: Vec<(String, String)>,
     /// Number of the columns that the experiment sets.
     settings: usize,
+    /// First letters of the columns that are shown first, and in whose highest value a reader is interested.
+    precisions: String,
 }
 
 impl VaryingTable {
-    /// The varying settings, then precisions, then the other varying results.
-    pub(super) fn new(columns: &[&str], lines: &[Vec<String>]) -> Self {
+    /// The varying settings, then the precisions in the order of the protocol, then the other varying results.
+    pub(super) fn new(columns: &[&str], lines: &[Vec<String>], order: ApOrder) -> Self {
+        let prefix = format!("ap_{}_", order.name());
+        let is_precision = |place: usize| columns[place].starts_with(&prefix);
         let varies: Vec<bool> = (0..columns.len())
             .map(|place| column(lines, place).any(|it| Some(it) != column(lines, place).next()))
             .collect();
         let settings = columns.iter().position(|column| *column == LAST_SETTING);
         let settings = settings.map_or(0, |last| last + 1);
         let (precisions, others): (Vec<usize>, Vec<usize>) = (settings..columns.len())
-            .filter(|&place| varies[place] || PRECISIONS.contains(&columns[place]))
-            .partition(|&place| PRECISIONS.contains(&columns[place]));
+            .filter(|&place| varies[place] || is_precision(place))
+            .partition(|&place| is_precision(place));
         let varied: Vec<usize> = (0..settings).filter(|&place| varies[place]).collect();
         let kept: Vec<usize> = [&varied[..], &precisions, &others].concat();
         let names = kept.iter().map(|&place| columns[place].to_owned());
@@ -53,12 +54,13 @@ impl VaryingTable {
             lines: cells.collect(),
             constants: constants.collect(),
             settings: varied.len(),
+            precisions: prefix,
         }
     }
 
     /// True if a field is the highest of a column of precisions, where they differ.
     pub(super) fn is_best(&self, line: usize, column: usize) -> bool {
-        PRECISIONS.contains(&self.columns[column].as_str())
+        self.columns[column].starts_with(&self.precisions)
             && self
                 .range(column)
                 .is_some_and(|(low, high)| low < high && self.number(line, column) == Some(high))
@@ -66,7 +68,8 @@ impl VaryingTable {
 
     /// One sentence: the runs with the highest and the lowest AP@0.5.
     pub(super) fn sentence(&self) -> Option<String> {
-        let column = self.columns.iter().position(|column| column == MAIN)?;
+        let main = format!("{}50", self.precisions);
+        let column = self.columns.iter().position(|column| *column == main)?;
         let (low, high) = self.range(column).filter(|(low, high)| low < high)?;
         // Both numbers were read from the same text, so they are equal bit by bit.
         let [worst, best] = [low, high].map(|value| {
@@ -74,14 +77,14 @@ impl VaryingTable {
         });
         let [worst, best] = [worst?, best?].map(|run| self.settings_of(run));
         Some(format!(
-            "AP@0.5 is between {low:.3} ({worst}) and {high:.3} ({best})."
+            "{main} is between {low:.3} ({worst}) and {high:.3} ({best})."
         ))
     }
 
     /// The table for a terminal: settings, precisions, and of the other results those that fit; then the sentence.
     pub(super) fn text(&self) -> String {
         let mut shown: Vec<usize> = (0..self.columns.len())
-            .filter(|&at| at < self.settings || PRECISIONS.contains(&self.columns[at].as_str()))
+            .filter(|&at| at < self.settings || self.columns[at].starts_with(&self.precisions))
             .collect();
         let mut used: usize = shown.iter().map(|&place| self.width(place)).sum();
         let results = self.settings..self.columns.len();
@@ -165,7 +168,7 @@ mod tests {
             ["max", "", "0.1", "1", "10", "0.8000", "30"],
         ]
         .map(|fields| fields.map(str::to_owned).to_vec());
-        let table = VaryingTable::new(&columns, &lines);
+        let table = VaryingTable::new(&columns, &lines, ApOrder::Global);
         assert_eq!(table.columns, ["loss", "ap_global_50", "e2e_ms_p50"]);
         let constants = [("method", "max"), ("seed", "1"), ("frames", "10")];
         assert_eq!(
@@ -175,7 +178,7 @@ mod tests {
         assert!(table.is_best(0, 1) && !table.is_best(1, 1) && !table.is_best(0, 2));
         assert_eq!(
             table.sentence().unwrap(),
-            "AP@0.5 is between 0.800 (loss 0.1) and 0.900 (loss 0)."
+            "ap_global_50 is between 0.800 (loss 0.1) and 0.900 (loss 0)."
         );
         let text = table.text();
         assert_eq!(
@@ -186,6 +189,29 @@ mod tests {
             text.ends_with("0.900 (loss 0).\n") && text.lines().count() == 4,
             "{text}"
         );
-        assert_eq!(VaryingTable::new(&columns, &lines[..1]).sentence(), None);
+        let one = VaryingTable::new(&columns, &lines[..1], ApOrder::Global);
+        assert_eq!(one.sentence(), None);
+    }
+
+    #[test]
+    fn the_order_of_the_protocol_is_the_one_that_is_shown() {
+        let columns = ["loss", "seed", "ap_global_50", "ap_frame_50"];
+        let lines = [
+            ["0", "1", "0.9000", "0.6000"],
+            ["0.1", "1", "0.9500", "0.5000"],
+        ]
+        .map(|fields| fields.map(str::to_owned).to_vec());
+        let table = VaryingTable::new(&columns, &lines, ApOrder::Frame);
+        assert_eq!(table.columns, ["loss", "ap_frame_50", "ap_global_50"]);
+        assert!(table.is_best(0, 1) && !table.is_best(1, 2));
+        assert!(
+            table.text().starts_with("loss  ap_frame_50\n"),
+            "{}",
+            table.text()
+        );
+        assert_eq!(
+            table.sentence().unwrap(),
+            "ap_frame_50 is between 0.500 (loss 0.1) and 0.600 (loss 0)."
+        );
     }
 }

@@ -14,7 +14,6 @@ use support::cli::NotWritten;
 pub use text::{csv, markdown};
 
 use super::cell::Cell;
-use super::check::check_vehicles;
 use super::evaluation::{OpenedData, Trial, compute};
 use super::slices::Slice;
 use super::spec::{Column, Experiment, Row, Table};
@@ -63,18 +62,13 @@ pub fn run(
     atomic_file::create_folder(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
-    for table in &experiment.tables {
-        let asked = table.rows.iter().filter_map(|row| row.vehicles);
-        let scenarios = data.chosen(table.scenarios.or(experiment.scenarios));
-        check_vehicles("vehicles", asked, scenarios)
-            .with_context(|| format!("table {:?}", table.name))?;
-    }
     let run = TableRun {
         experiment,
         cells,
         data,
     };
     let places = run.places()?;
+    run.check_participants(&places)?;
     let part = slice.map_or(0..places.len(), |slice| slice.part(places.len()));
     let cells = places[part].iter().map(|place| run.cell(place, observer));
     let cells = cells.collect::<Result<Vec<_>>>()?;
@@ -128,6 +122,19 @@ impl TableRun<'_> {
             }
         }
         Ok(places)
+    }
+
+    /// Refuses vehicles and attackers that the data do not have, before the first cell is computed.
+    fn check_participants(&self, places: &[CellPlace<'_>]) -> Result<()> {
+        for place in places {
+            let mut trial = self.trial(place)?;
+            // The ego alone is a reference beside rows that are attacked.
+            let is_alone = place.row.vehicles == Some(1);
+            trial.setup.attack = trial.setup.attack.filter(|_| !is_alone);
+            let checked = trial.check_participants(&self.data);
+            checked.with_context(|| format!("table {:?}", place.table.name))?;
+        }
+        Ok(())
     }
 
     /// The table with the next of `cells`, which are in the order of [`Self::places`].

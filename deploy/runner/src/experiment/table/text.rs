@@ -3,22 +3,28 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+use dataset::evaluation_protocol::ApOrder;
 use deploy::operate::run_folder::fixed;
-use deploy::score::metrics::ByIou;
 use support::csv_file::CsvText;
+use support::statistics;
 
 use super::{FilledRow, FilledTable};
-use crate::experiment::cell::Cell;
+use crate::experiment::cell::{Cell, sources};
 
 /// Markdown table: AP@0.3/0.5/0.7 in per cent. A single column of conditions is expanded into both orderings and bytes;
-/// several show the global ordering only. The provenance follows below.
+/// several show the ordering of the protocol only. The provenance follows below.
 pub fn markdown(table: &FilledTable) -> String {
+    let order = cells_of(table).next().map(|cell| cell.metrics.ap_order());
+    let mut orders = [ApOrder::Global, ApOrder::Frame];
+    // That of the protocol first.
+    orders.sort_by_key(|it| Some(*it) != order);
+    let [first, other] = orders.map(ApOrder::name);
     let mut text = format!("# {}\n\n", table.name);
     let heads: Vec<String> = match &table.columns[..] {
         [only] => {
-            let global = format!("{}: AP@0.3 / 0.5 / 0.7, global order", only.name);
-            let others = ["frame order", "bytes per message", "log2"].map(str::to_owned);
-            [global].into_iter().chain(others).collect()
+            let headline = format!("{}: AP@0.3 / 0.5 / 0.7, {first} order", only.name);
+            let other = format!("{other} order");
+            vec![headline, other, "bytes per message".into(), "log2".into()]
         }
         several => several.iter().map(|column| column.name.clone()).collect(),
     };
@@ -26,14 +32,13 @@ pub fn markdown(table: &FilledTable) -> String {
     let _ = writeln!(text, "| method | {} |", heads.join(" | "));
     let _ = writeln!(text, "| --- |{}", " --- |".repeat(heads.len()));
     for FilledRow { row, cells } in &table.rows {
-        let global = cells.iter();
-        let global = global.map(|of| precision(of, |cell| cell.metrics.ap_global));
-        let mut values: Vec<String> = global.collect();
+        let headlines = cells.iter().map(|cells| precision(cells, orders[0]));
+        let mut values: Vec<String> = headlines.collect();
         if let [cells] = &cells[..] {
             let payload = mean(cells, &|cell| cell.metrics.comm.payload_bytes_mean);
             let log2 = mean(cells, &|cell| cell.metrics.comm.log2_payload);
             values.extend([
-                precision(cells, |cell| cell.metrics.ap_frame_order),
+                precision(cells, orders[1]),
                 number(&payload, 0),
                 number(&log2, 2),
             ]);
@@ -41,30 +46,26 @@ pub fn markdown(table: &FilledTable) -> String {
         let _ = writeln!(text, "| {} | {} |", row.label(), values.join(" | "));
     }
     if table.columns.len() != 1 {
-        text += "\nAP@0.3 / 0.5 / 0.7 in the global order.\n";
+        let _ = writeln!(text, "\nAP@0.3 / 0.5 / 0.7 in the {first} order.");
     }
     text + &provenance(table)
 }
 
+fn cells_of(table: &FilledTable) -> impl Iterator<Item = &Cell> {
+    let rows = table.rows.iter();
+    rows.flat_map(|row| row.cells.iter().flatten())
+}
+
 /// Provenance of the values: frames, programs, data, and every other file.
 fn provenance(table: &FilledTable) -> String {
-    let (mut frames, mut programs, mut data) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
-    let mut files = BTreeSet::new();
-    for cell in table.rows.iter().flat_map(|row| row.cells.iter().flatten()) {
-        let of = &cell.key.provenance;
-        let (version, commit, sha256) = (&of.version, &of.commit, &of.program_sha256);
-        frames.insert(cell.metrics.frames.to_string());
-        programs.insert(format!("{version}, commit {commit}, SHA-256 `{sha256}`"));
-        data.insert(format!("`{}`", of.data_sha256));
-        files.extend(&of.files_sha256);
-    }
-    let [frames, programs, data] =
-        [frames, programs, data].map(|values| Vec::from_iter(values).join(", "));
+    let frames = cells_of(table).map(|cell| cell.metrics.frames.to_string());
+    let frames: BTreeSet<String> = frames.collect();
     let mut text = format!(
-        "\nFrames: {frames}. Program: {programs}. Data: contents SHA-256 {data}. Weights and other files:\n\n"
+        "\nFrames: {}. Made of:\n\n",
+        Vec::from_iter(frames).join(", ")
     );
-    for (file, sha256) in files {
-        let _ = writeln!(text, "- `{}`, SHA-256 `{sha256}`", file.display());
+    for line in sources(cells_of(table)) {
+        let _ = writeln!(text, "- {line}");
     }
     text
 }
@@ -124,12 +125,11 @@ fn cell_fields(cell: &Cell) -> Vec<String> {
 fn mean(cells: &[Cell], value: &dyn Fn(&Cell) -> Option<f64>) -> Option<(f64, Option<f64>)> {
     // One training without a value makes the mean unknown: that of the others would mislead.
     let values: Option<Vec<f64>> = cells.iter().map(value).collect();
-    let values = values.filter(|values| !values.is_empty())?;
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
+    let values = values?;
+    let mean = statistics::mean(&values)?;
     let square: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
     // Sample standard deviation, divided by the number of trainings less one.
-    let deviation = (values.len() > 1).then(|| (square / (count - 1.0)).sqrt());
+    let deviation = (values.len() > 1).then(|| (square / (values.len() - 1) as f64).sqrt());
     Some((mean, deviation))
 }
 
@@ -142,9 +142,11 @@ fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {
 }
 
 /// Three precisions in per cent.
-fn precision(cells: &[Cell], of: impl Fn(&Cell) -> ByIou) -> String {
+fn precision(cells: &[Cell], order: ApOrder) -> String {
     let precisions = [0, 1, 2].map(|index: usize| {
-        let percent = mean(cells, &|cell| Some(100.0 * of(cell).values()[index]?));
+        let percent = mean(cells, &|cell| {
+            Some(100.0 * cell.metrics.ap_in(order).values()[index]?)
+        });
         number(&percent, 2)
     });
     precisions.join(" / ")
@@ -157,7 +159,8 @@ mod tests {
     use super::*;
     use crate::experiment::cell::CellKey;
     use crate::experiment::spec::{Column, Row};
-    use deploy::score::metrics::{Communication, Metrics};
+    use dataset::evaluation_protocol::EvaluationProtocol;
+    use deploy::score::metrics::{ByIou, Communication, Metrics};
     use support::provenance::Provenance;
 
     fn cell(method: Method, at_50: f64) -> Cell {
@@ -185,6 +188,8 @@ mod tests {
             method,
             sha256: "c".into(),
             provenance: Provenance {
+                program_sha256: "p".into(),
+                version: "1".into(),
                 commit: "abc".into(),
                 data_sha256: "d".into(),
                 files_sha256: [weights].into(),
@@ -242,6 +247,34 @@ mod tests {
     #[test]
     fn one_condition_shows_both_orderings_and_bytes() {
         insta::assert_snapshot!(markdown(&table(&["true poses"])));
+    }
+
+    #[test]
+    fn the_order_of_the_protocol_is_the_one_of_the_headings() {
+        let by_frame = |columns: &[&str]| {
+            let mut table = table(columns);
+            for cell in table
+                .rows
+                .iter_mut()
+                .flat_map(|row| row.cells.iter_mut().flatten())
+            {
+                cell.metrics.protocol = EvaluationProtocol::preset("v2v4real");
+                cell.metrics.ap_frame_order.at_50 = Some(0.125);
+            }
+            markdown(&table)
+        };
+        let one = by_frame(&["true poses"]);
+        let head = "true poses: AP@0.3 / 0.5 / 0.7, frame order | global order | bytes";
+        assert!(
+            one.contains(head) && one.contains("| 90.00 / 12.50 / - | 90.00 / 50.00 / - |"),
+            "{one}"
+        );
+        let several = by_frame(&["0 m", "1 m"]);
+        assert!(several.contains("0.7 in the frame order.\n"), "{several}");
+        assert!(
+            several.contains("| 90.00 / 12.50 / - | 90.00 / 12.50 / - |"),
+            "{several}"
+        );
     }
 
     #[test]

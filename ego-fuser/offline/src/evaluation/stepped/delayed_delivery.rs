@@ -48,6 +48,8 @@ pub(super) struct DelayedDelivery {
     /// Messages that were submitted and neither arrived nor were lost yet.
     kept: BTreeMap<u64, (Topic, Option<Envelope>)>,
     next_id: u64,
+    /// Number of messages of each stream so far: as in a live run, where a sender counts what it publishes.
+    sequences: BTreeMap<Source, u64>,
     /// The message accounting.
     pub(super) ledger: Ledger,
     /// Bytes of all that was sent so far, poses included.
@@ -65,25 +67,20 @@ impl DelayedDelivery {
             pending: BTreeMap::new(),
             kept: BTreeMap::new(),
             next_id: 0,
+            sequences: BTreeMap::new(),
             ledger: Ledger::default(),
             sent_bytes: 0,
         }
     }
 
     /// Hands over a neighbour's messages for a tick: its pose as soon as it is known, the rest when it is computed.
-    pub(super) fn enqueue(
-        &mut self,
-        tick: usize,
-        mut sent: Sent,
-        compute: &ComputeTimes,
-        distance_m: f64,
-    ) {
+    pub(super) fn enqueue(&mut self, mut sent: Sent, compute: &ComputeTimes, distance_m: f64) {
         let pose = Packet {
             id: 0,
             from: sent.cav.clone(),
             to: self.ego.clone(),
             stream: Stream::Pose,
-            sequence: tick as u64,
+            sequence: 0,
             bytes: sent.pose_bytes,
             submitted_nanos: nanos::of_ms(compute.pose_ms).saturating_add(sent.capture_nanos),
             distance_m,
@@ -123,6 +120,10 @@ impl DelayedDelivery {
         adapted: Option<RateReason>,
         envelope: Option<Envelope>,
     ) {
+        let source = (packet.from.clone(), packet.stream);
+        let count = self.sequences.entry(source).or_default();
+        packet.sequence = *count;
+        *count += 1;
         packet.id = self.next_id;
         packet.submitted_nanos = packet.submitted_nanos.saturating_sub(self.began_nanos);
         self.next_id += 1;
@@ -221,11 +222,13 @@ mod tests {
     use super::super::super::sent::SentMessage;
     use super::*;
 
-    #[test]
-    fn a_message_that_is_not_submitted_is_not_counted_as_adapted() {
-        let [ego, cav] = ["1", "2"].map(|name| CavId::new(name).unwrap());
+    fn delivery() -> DelayedDelivery {
         let link = LinkEmulator::new(LinkConfig::default(), Path::new("."), 0).unwrap();
-        let mut delivery = DelayedDelivery::new(link, &ego, 0);
+        DelayedDelivery::new(link, &CavId::new("1").unwrap(), 0)
+    }
+
+    /// A pose and boxes of a vehicle, which are adapted.
+    fn sent(cav: &CavId, capture_nanos: u64) -> Sent {
         let message = SentMessage {
             content: Content::Boxes(Vec::new()),
             bytes: 100,
@@ -234,15 +237,45 @@ mod tests {
                 limit_bytes: 100,
             }),
         };
-        let sent = Sent {
+        Sent {
             cav: cav.clone(),
-            capture_nanos: 1,
+            capture_nanos,
             pose: NO_SOURCE,
             pose_bytes: 100,
             messages: vec![message],
             failure: None,
-        };
-        delivery.enqueue(0, sent, &ComputeTimes::default(), 1.0);
+        }
+    }
+
+    #[test]
+    fn messages_are_counted_by_stream_from_the_first_of_the_run_as_live_senders_do() {
+        let mut delivery = delivery();
+        let [one, other] = ["2", "3"].map(|name| CavId::new(name).unwrap());
+        // The second vehicle has no sweep at the first of the two times.
+        for (cav, nanos) in [(&one, 500), (&one, 600), (&other, 600)] {
+            delivery.enqueue(sent(cav, nanos), &ComputeTimes::default(), 1.0);
+        }
+        let packets = delivery.pending.values().map(|(packet, ..)| packet);
+        let numbers: Vec<_> = packets
+            .map(|packet| (packet.from.as_str(), packet.stream, packet.sequence))
+            .collect();
+        let (pose, boxes) = (Stream::Pose, Stream::Boxes);
+        let expected = [
+            ("2", pose, 0),
+            ("2", boxes, 0),
+            ("2", pose, 1),
+            ("2", boxes, 1),
+            ("3", pose, 0),
+            ("3", boxes, 0),
+        ];
+        assert_eq!(numbers, expected);
+    }
+
+    #[test]
+    fn a_message_that_is_not_submitted_is_not_counted_as_adapted() {
+        let mut delivery = delivery();
+        let cav = CavId::new("2").unwrap();
+        delivery.enqueue(sent(&cav, 1), &ComputeTimes::default(), 1.0);
         let account = Account::published(Topic::stream(&cav, Stream::Boxes));
         assert_eq!(delivery.ledger.get(&account), None);
         delivery.until(1);

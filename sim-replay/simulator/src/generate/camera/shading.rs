@@ -31,12 +31,11 @@ pub(super) struct Shader<'a> {
     elevations: Vec<(f32, f32)>,
     world_from_sensor: Matrix3<f32>,
     origin_m: Vector3<f64>,
-    paints: &'a [Paint],
-    weather: Weather,
+    around: &'a Surroundings<'a>,
 }
 
 impl<'a> Shader<'a> {
-    pub(super) fn new(caster: &'a Caster, sensor: &Course, around: &Surroundings<'a>) -> Self {
+    pub(super) fn new(caster: &'a Caster, sensor: &Course, around: &'a Surroundings<'a>) -> Self {
         Self {
             image: &caster.image,
             channels: caster.pattern.channels,
@@ -44,8 +43,7 @@ impl<'a> Shader<'a> {
             elevations: caster.elevations().collect(),
             world_from_sensor: sensor.end.rotation().cast(),
             origin_m: sensor.end.position_m,
-            paints: around.paints,
-            weather: around.weather,
+            around,
         }
     }
 
@@ -60,7 +58,7 @@ impl<'a> Shader<'a> {
         let mut rgb = Vec::with_capacity(3 * rays.len());
         for &(column, channel) in rays {
             let mut colour = self.colour(column as usize, channel as usize, ground);
-            if self.weather == Weather::Snow && random.chance(FLAKES) {
+            if self.around.weather == Weather::Snow && random.chance(FLAKES) {
                 colour = mix(colour, SNOW, 0.7);
             }
             // Light adds up linearly, the values of an image do not: gamma 1.8.
@@ -85,12 +83,12 @@ impl<'a> Shader<'a> {
         let place = self.origin_m
             + (self.world_from_sensor * self.point(column, channel, depth_m)).cast::<f64>();
         let material = match hit {
-            GROUND => ground.colour(&place, self.weather),
+            GROUND => ground.colour(&place, self.around.weather),
             body => self.paint(body as usize, place.z as f32),
         };
         let normal = self.normal(column, channel);
         let facing = normal.dot(&Vector3::from(SUN).normalize()).max(0.0);
-        let is_sunny = self.weather == Weather::Sunny;
+        let is_sunny = self.around.weather == Weather::Sunny;
         let sun = if is_sunny { 1.0 - AMBIENT } else { 0.3 };
         let lit = material
             .map(|part| part * (AMBIENT + (1.0 - AMBIENT - sun) * 0.5 + sun * facing * 1.3));
@@ -98,7 +96,7 @@ impl<'a> Shader<'a> {
     }
 
     fn paint(&self, body: usize, height_m: f32) -> Colour {
-        match self.paints.get(body) {
+        match self.around.paints.get(body) {
             Some(Paint::Vehicle(colour) | Paint::Plain(colour)) => *colour,
             Some(Paint::Wall(colour)) => {
                 let share = (height_m / STOREY_M).rem_euclid(1.0);
@@ -114,7 +112,7 @@ impl<'a> Shader<'a> {
 
     /// Distance at which 1/e of the contrast remains, metres.
     fn haze_m(&self) -> f32 {
-        match self.weather {
+        match self.around.weather {
             Weather::Sunny => 900.0,
             Weather::Fog => 17.0,
             Weather::Snow => 120.0,
@@ -123,7 +121,7 @@ impl<'a> Shader<'a> {
 
     fn sky(&self, channel: usize) -> Colour {
         let (_, sine) = self.elevations[channel.min(self.channels - 1)];
-        match self.weather {
+        match self.around.weather {
             Weather::Sunny => mix(HORIZON, ZENITH, sine.max(0.0).sqrt()),
             Weather::Fog | Weather::Snow => CLOUD,
         }

@@ -4,14 +4,12 @@ use nalgebra::{Isometry3, Point3};
 use protocol::Box3d;
 
 use super::AgentFrame;
+use crate::generate::lidar::{CHANNELS, ELEVATIONS_DEG};
 use dataset::frame::{Object, ObjectClass};
 use dataset::ground_truth::upright_box;
 
 /// Intensity value that corresponds to 1.
 const FULL_BYTE: f32 = 255.0;
-/// Channels of the LiDAR of generated scenes, and the elevations of the lowest and the highest, degrees.
-const CHANNELS: f32 = 64.0;
-const ELEVATIONS_DEG: [f32; 2] = [-25.0, 2.0];
 
 /// An intensity of 0 to 1 as a number of 0 to 255 that comes back bit by bit when it is divided by 255: always for
 /// multiples of 1/255, and for all but one number in 250 else, which comes back one step beside.
@@ -34,8 +32,9 @@ pub(super) fn byte(intensity: f32) -> u8 {
 pub(super) fn ring([x, y, z, _]: [f32; 4]) -> u8 {
     let elevation_deg = z.atan2(x.hypot(y)).to_degrees();
     let [low, high] = ELEVATIONS_DEG;
-    let channel = (elevation_deg - low) / (high - low) * (CHANNELS - 1.0);
-    channel.round().clamp(0.0, CHANNELS - 1.0) as u8
+    let highest = (CHANNELS - 1) as f32;
+    let channel = (elevation_deg - low) / (high - low) * highest;
+    channel.round().clamp(0.0, highest) as u8
 }
 
 /// Little-endian numbers, one after another.

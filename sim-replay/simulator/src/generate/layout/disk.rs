@@ -9,15 +9,20 @@ use dataset::UNFINISHED;
 use support::atomic_file;
 use support::file_error::{AtFile, FileError, check_folder};
 
+/// The result of changing a file or folder on the disk, with its path in the error.
+pub(crate) fn written<T>(path: &Path, result: io::Result<T>) -> Result<T, SynthError> {
+    result.at(path).map_err(SynthError::Write)
+}
+
 /// Writes text or bytes.
 pub(crate) fn write_file(path: &Path, bytes: impl AsRef<[u8]>) -> Result<(), SynthError> {
-    fs::write(path, bytes).at(path).map_err(SynthError::Write)
+    written(path, fs::write(path, bytes))
 }
 
 /// Makes a folder and those above it.
 pub(crate) fn make_folder(path: &Path) -> Result<(), SynthError> {
     check_folder(path)?;
-    fs::create_dir_all(path).at(path).map_err(SynthError::Write)
+    written(path, fs::create_dir_all(path))
 }
 
 /// Creates a folder; an existing one is removed with its contents.
@@ -70,16 +75,13 @@ impl Unfinished {
         let mark = folder.join(UNFINISHED);
         let text = "This folder is being written, or the run that wrote it was interrupted.\n";
         // On the disk before the files that it speaks of.
-        atomic_file::write(&mark, text)
-            .at(&mark)
-            .map_err(SynthError::Write)?;
+        written(&mark, atomic_file::write(&mark, text))?;
         Ok(Self(mark))
     }
 
     /// Removes the marker: all files are written.
     pub(crate) fn clear(self) -> Result<(), SynthError> {
-        let mark = &self.0;
-        fs::remove_file(mark).at(mark).map_err(SynthError::Write)
+        written(&self.0, fs::remove_file(&self.0))
     }
 }
 

@@ -38,7 +38,7 @@ use super::positioning::Fix;
 use dataset::frame::{Frame, Object};
 
 use agent_folders::AgentFolderWriter;
-pub(crate) use disk::{Unfinished, make_folder, remove_folder};
+pub(crate) use disk::{Unfinished, make_folder, remove_folder, written};
 use sequences::Sequences;
 pub(crate) use support::sync::lock as locked;
 

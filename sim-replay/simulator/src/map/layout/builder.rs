@@ -8,13 +8,6 @@ use super::super::road::{
     RoadNetwork,
 };
 
-/// Lanes across a road, each outwards from the reference line: kind and width in metres.
-#[derive(Debug, Clone, Default)]
-pub(super) struct CrossProfile {
-    pub left: Vec<(LaneKind, f64)>,
-    pub right: Vec<(LaneKind, f64)>,
-}
-
 /// A lane that leads into or out of a junction.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LaneEnd {
@@ -50,13 +43,15 @@ struct LaneEdge {
     width_m: f64,
 }
 
-impl CrossProfile {
-    /// Width of the wider side, metres.
-    pub(super) fn half_width_m(&self) -> f64 {
-        let [left, right] =
-            [&self.left, &self.right].map(|side| side.iter().map(|&(_, width)| width).sum::<f64>());
-        left.max(right)
-    }
+/// Lanes across a road, each outwards from the reference line: kind and width in metres.
+pub(super) fn section(left: &[(LaneKind, f64)], right: &[(LaneKind, f64)]) -> LaneSection {
+    let [left, right] = [left, right].map(|side| {
+        let lanes = side.iter();
+        let lanes = lanes.map(|&(kind, width)| RoadLane::new(kind, Profile::constant(width)));
+        lanes.collect()
+    });
+    let s_m = 0.0;
+    LaneSection { s_m, left, right }
 }
 
 /// A line of clothoids through `poses`.
@@ -81,17 +76,20 @@ impl Builder {
         &mut self,
         plan_view: Vec<PlanCurve>,
         elevation: Profile,
-        profile: &CrossProfile,
+        section: LaneSection,
         limit_mps: f64,
     ) -> usize {
-        let [left, right] = [&profile.left, &profile.right].map(|side| {
-            side.iter()
-                .map(|&(kind, width)| RoadLane::new(kind, Profile::constant(width)))
-                .collect()
+        let place = self.network.roads.len();
+        self.network.roads.push(Road {
+            id: format!("r{place}"),
+            length_m: path_length_m(&plan_view),
+            plan_view,
+            elevation,
+            sections: vec![section],
+            speed_limits: vec![(0.0, limit_mps)],
+            ..Road::default()
         });
-        let s_m = 0.0;
-        let section = LaneSection { s_m, left, right };
-        self.push(plan_view, elevation, section, limit_mps)
+        place
     }
 
     /// Adds a junction without connections.
@@ -132,7 +130,7 @@ impl Builder {
             right: vec![only],
             ..LaneSection::default()
         };
-        let connecting = self.push(vec![curve], elevation, section, limit_mps);
+        let connecting = self.road(vec![curve], elevation, section, limit_mps);
         let road = &mut self.network.roads[connecting];
         road.junction = Some(junction);
         road.predecessor = Some(RoadLink::Road(from.end));
@@ -206,25 +204,5 @@ impl Builder {
             height_and_slope: [road.elevation.at(s), sign * road.elevation.slope_at(s)],
             width_m: high - low,
         }
-    }
-
-    fn push(
-        &mut self,
-        plan_view: Vec<PlanCurve>,
-        elevation: Profile,
-        section: LaneSection,
-        limit_mps: f64,
-    ) -> usize {
-        let place = self.network.roads.len();
-        self.network.roads.push(Road {
-            id: format!("r{place}"),
-            length_m: path_length_m(&plan_view),
-            plan_view,
-            elevation,
-            sections: vec![section],
-            speed_limits: vec![(0.0, limit_mps)],
-            ..Road::default()
-        });
-        place
     }
 }

@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use super::super::curve::Pose2;
 use super::super::profile::Profile;
-use super::super::road::{LaneKind, RoadEnd};
-use super::builder::{Builder, CrossProfile, path};
+use super::super::road::{Contact, LaneKind, RoadEnd};
+use super::builder::{Builder, path, section};
 use super::ring::Ring;
 
 /// Distance between the poses that a carriageway's clothoids connect, metres.
@@ -63,9 +63,8 @@ impl Motorway {
         let elevation = Profile { records };
         let mut right = vec![(LaneKind::Driving, LANE_M); self.lanes];
         right.push((LaneKind::Shoulder, 2.5));
-        let left = vec![(LaneKind::Shoulder, 0.75)];
-        let profile = CrossProfile { left, right };
-        builder.road(curves, elevation, &profile, LIMIT_MPS)
+        let lanes = section(&[(LaneKind::Shoulder, 0.75)], &right);
+        builder.road(curves, elevation, lanes, LIMIT_MPS)
     }
 
     /// Carriageways one after the other through `stops_m`, linked; returns the first and the last.
@@ -85,20 +84,19 @@ impl Motorway {
         [roads[0], roads[roads.len() - 1]]
     }
 
-    /// Lets `ramp` leave between two carriageways: all lanes continue, the outermost one also into the ramp.
-    pub(super) fn diverge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
-        let junction = self.extend(builder, before, after);
-        let outer = RoadEnd::end(before).lane(-(self.lanes as i32));
-        let ramp = RoadEnd::start(ramp).lane(-1);
-        builder.connect(junction, outer, ramp, LIMIT_MPS);
-    }
-
-    /// Lets `ramp` join between two carriageways.
-    pub(super) fn merge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
-        let junction = self.extend(builder, before, after);
-        let ramp = RoadEnd::end(ramp).lane(-1);
-        let outer = RoadEnd::start(after).lane(-(self.lanes as i32));
-        builder.connect(junction, ramp, outer, LIMIT_MPS);
+    /// Lets all lanes of a carriageway continue into the next one; between them a ramp leaves the outermost lane, if its
+    /// start is given, or joins it, if its end is.
+    pub(super) fn join(&self, builder: &mut Builder, before: usize, after: usize, ramp: RoadEnd) {
+        let (junction, outermost) = (builder.junction(), self.lanes as i32);
+        let (from, to) = (RoadEnd::end(before), RoadEnd::start(after));
+        for lane in 1..=outermost {
+            builder.connect(junction, from.lane(-lane), to.lane(-lane), LIMIT_MPS);
+        }
+        let (from, to) = match ramp.contact {
+            Contact::Start => (from.lane(-outermost), ramp.lane(-1)),
+            Contact::End => (ramp.lane(-1), to.lane(-outermost)),
+        };
+        builder.connect(junction, from, to, LIMIT_MPS);
     }
 
     /// The end of a ramp at `s_m`, where it leaves (`turn` -1) or joins (1).
@@ -114,10 +112,9 @@ impl Motorway {
     pub(super) fn ramp(builder: &mut Builder, from: RampEnd, to: RampEnd) -> usize {
         let curves = path(&[from.0, to.0]);
         let elevation = Profile::between(curves[0].length_m, from.1, to.1);
-        let left = vec![(LaneKind::Shoulder, 0.4)];
-        let right = vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)];
-        let profile = CrossProfile { left, right };
-        builder.road(curves, elevation, &profile, RAMP_LIMIT_MPS)
+        let right = [(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)];
+        let lanes = section(&[(LaneKind::Shoulder, 0.4)], &right);
+        builder.road(curves, elevation, lanes, RAMP_LIMIT_MPS)
     }
 
     /// Left edge of the first lane, in driving direction.
@@ -128,15 +125,5 @@ impl Motorway {
         } else {
             middle.moved(0.0, self.median_m, PI)
         }
-    }
-
-    /// Lets all lanes of a carriageway continue through a junction, which is returned.
-    fn extend(&self, builder: &mut Builder, before: usize, after: usize) -> usize {
-        let junction = builder.junction();
-        for lane in 1..=self.lanes as i32 {
-            let (from, to) = (RoadEnd::end(before), RoadEnd::start(after));
-            builder.connect(junction, from.lane(-lane), to.lane(-lane), LIMIT_MPS);
-        }
-        junction
     }
 }

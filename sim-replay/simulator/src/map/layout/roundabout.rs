@@ -5,7 +5,7 @@ use std::f64::consts::{FRAC_PI_2, PI};
 use super::super::curve::{CurveShape, PlanCurve, Pose2};
 use super::super::profile::Profile;
 use super::super::road::{LaneKind, RoadEnd};
-use super::builder::{Builder, CrossProfile};
+use super::builder::{Builder, section};
 
 /// Width of the ring's lane, metres.
 const LANE_M: f64 = 5.0;
@@ -67,11 +67,10 @@ impl Roundabout {
         let inner = self.radius_m - LANE_M / 2.0;
         let [x, y] = self.center_m;
         let start = Pose2::new(x, y, from).moved(inner, 0.0, FRAC_PI_2);
-        let left = vec![(LaneKind::Shoulder, 1.0)];
-        let right = vec![(LaneKind::Driving, LANE_M), (LaneKind::Shoulder, 0.6)];
-        let profile = CrossProfile { left, right };
+        let right = [(LaneKind::Driving, LANE_M), (LaneKind::Shoulder, 0.6)];
+        let lanes = section(&[(LaneKind::Shoulder, 1.0)], &right);
         let curvature = 1.0 / inner;
         let arc = PlanCurve::new(0.0, start, inner * turn, CurveShape::Arc { curvature });
-        builder.road(vec![arc], Profile::default(), &profile, LIMIT_MPS)
+        builder.road(vec![arc], Profile::default(), lanes, LIMIT_MPS)
     }
 }

@@ -6,8 +6,8 @@ use rand_chacha::ChaCha8Rng;
 use super::super::curve::Pose2;
 use super::super::lane::wrap_angle;
 use super::super::profile::Profile;
-use super::super::road::{LaneKind, RoadEnd};
-use super::builder::{Builder, CrossProfile, path};
+use super::super::road::{LaneKind, LaneSection, RoadEnd};
+use super::builder::{Builder, path, section};
 
 /// Half of the largest angle by which a street leaves its edge's direction, radians.
 const WIGGLE_RAD: f64 = 0.16;
@@ -42,7 +42,7 @@ pub(super) struct StreetGraph {
 struct Chain {
     /// Nodes in order.
     nodes: Vec<usize>,
-    profile: CrossProfile,
+    lanes: LaneSection,
     /// Angles by which it leaves its first and its last edge's direction, radians.
     wiggle_rad: [f64; 2],
 }
@@ -107,7 +107,7 @@ pub(super) fn lay_out(
     // overlap.
     let mut arms: Vec<Vec<(f64, f64)>> = vec![Vec::new(); graph.nodes.len()];
     for chain in &chains {
-        let half = chain.profile.half_width_m();
+        let half = half_width_m(&chain.lanes);
         for [node, next] in chain.ends() {
             arms[node].push((graph.angle(node, next), half));
         }
@@ -117,7 +117,8 @@ pub(super) fn lay_out(
     let mut ends: Vec<Vec<RoadEnd>> = vec![Vec::new(); graph.nodes.len()];
     for chain in &chains {
         let curves = path(&poses(graph, chain, &radii));
-        let road = builder.road(curves, Profile::default(), &chain.profile, limit_mps);
+        let lanes = chain.lanes.clone();
+        let road = builder.road(curves, Profile::default(), lanes, limit_mps);
         let [[first, _], [last, _]] = chain.ends();
         ends[first].push(RoadEnd::start(road));
         ends[last].push(RoadEnd::end(road));
@@ -179,7 +180,7 @@ fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
             let wiggle_rad = [(); 2].map(|()| rng.random_range(-WIGGLE_RAD..WIGGLE_RAD));
             chains.push(Chain {
                 nodes,
-                profile: street_profile(rng),
+                lanes: street_lanes(rng),
                 wiggle_rad,
             });
         }
@@ -188,7 +189,7 @@ fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
 }
 
 /// Lanes of one street: a lane each way, with or without parking, verge and broad pavements.
-fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
+fn street_lanes(rng: &mut ChaCha8Rng) -> LaneSection {
     let has_verge = rng.random_bool(0.3);
     let verge_m = has_verge.then(|| rng.random_range(1.2..2.4));
     let sidewalk_m = rng.random_range(1.6..3.4);
@@ -202,7 +203,16 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
         lanes.push((LaneKind::Sidewalk, sidewalk_m));
         lanes
     });
-    CrossProfile { left, right }
+    section(&left, &right)
+}
+
+/// Width of the wider side of a street, metres.
+fn half_width_m(lanes: &LaneSection) -> f64 {
+    let [left, right] = [&lanes.left, &lanes.right].map(|side| {
+        let widths = side.iter().map(|lane| lane.width.at(0.0));
+        widths.sum::<f64>()
+    });
+    left.max(right)
 }
 
 /// Distance from a junction's middle at which its roads begin, metres, from the directions and half widths of its arms.

@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::super::profile::Profile;
 use super::super::road::{LaneKind, RoadEnd, RoadStructure};
-use super::builder::{Builder, CrossProfile, path};
+use super::builder::{Builder, path, section};
 use super::grid::{GridPlan, grid, spread};
 use super::motorway::{Motorway, RAMP_ZONE_M};
 use super::ring::Ring;
@@ -38,15 +38,14 @@ pub(crate) fn lay_out(seed: u64) -> RoadLayout {
     };
     let [inside, outside] = roundabouts(&motorway, &mut rng);
     // The road below the motorway.
-    let lanes = vec![
+    let side = [
         (LaneKind::Driving, 3.5),
         (LaneKind::Shoulder, 0.8),
         (LaneKind::Sidewalk, 2.2),
     ];
     let curves = path(&[inside.port(0.0), outside.port(PI).reversed()]);
-    let (left, right) = (lanes.clone(), lanes);
-    let profile = CrossProfile { left, right };
-    let link = builder.road(curves, Profile::default(), &profile, LINK_LIMIT_MPS);
+    let lanes = section(&side, &side);
+    let link = builder.road(curves, Profile::default(), lanes, LINK_LIMIT_MPS);
     // Arms by rising angle: 0 is away from the town inside, and away from the ring outside.
     let ramps = interchange(&mut builder, &motorway, &inside, &outside, &mut rng);
     let map_model = map_model(&mut builder, &motorway, &inside, &mut rng);
@@ -128,8 +127,8 @@ fn interchange(
         // Ports look away from their roundabouts, which lie level on the ground.
         let off = Motorway::ramp(builder, start, (from.reversed(), [0.0; 2]));
         let on = Motorway::ramp(builder, (to, [0.0; 2]), end);
-        motorway.diverge(builder, arriving, inner, off);
-        motorway.merge(builder, inner, leaving, on);
+        motorway.join(builder, arriving, inner, RoadEnd::start(off));
+        motorway.join(builder, inner, leaving, RoadEnd::end(on));
         [off, on]
     })
 }

@@ -1,7 +1,9 @@
 //! `<objects>` and `<signals>`: objects beside a road, and its bridges and tunnels.
 
+use std::f64::consts::PI;
+
 use super::super::finding::FindingLog;
-use super::super::road::{RoadObject, RoadSignal, RoadStructure};
+use super::super::road::{RoadObject, RoadStructure};
 use super::element::{Element, MAX_LENGTH_M, Result, children, noted};
 
 /// Every element named `name` in the list `list` of a road; elements that cannot be read are left out.
@@ -21,36 +23,37 @@ pub(super) fn read_all<T>(
 }
 
 pub(super) fn read_object(element: Element) -> Result<RoadObject> {
-    let label = [element.optional_text("type"), element.optional_text("name")]
+    let mut object = read_place(element, "hdg")?;
+    for size in ["length", "width", "height"] {
+        element.number_or_0(size, 0.0, 1e4)?;
+    }
+    object.label = [element.optional_text("type"), element.optional_text("name")]
         .map(Option::unwrap_or_default)
         .join(" ");
-    Ok(RoadObject {
-        label,
-        s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
-        t_m: element.number("t", -1e4, 1e4)?,
-        z_offset_m: element.number_or_0("zOffset", -1e4, 1e4)?,
-        heading_rad: element.number_or_0("hdg", -1e4, 1e4)?,
-        size_m: [
-            element.number_or_0("length", 0.0, 1e4)?,
-            element.number_or_0("width", 0.0, 1e4)?,
-            element.number_or_0("height", 0.0, 1e4)?,
-        ],
-    })
+    Ok(object)
 }
 
-pub(super) fn read_signal(element: Element) -> Result<RoadSignal> {
+pub(super) fn read_signal(element: Element) -> Result<RoadObject> {
+    let mut signal = read_place(element, "hOffset")?;
+    element.number_or_0("height", 0.0, 100.0)?;
     // The signal faces against the direction it is for; `+` is for traffic along the road.
-    let flip = match element.optional_text("orientation") {
-        Some("-") => std::f64::consts::PI,
-        _ => 0.0,
-    };
-    Ok(RoadSignal {
-        dynamic: element.optional_text("dynamic") == Some("yes"),
-        s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
-        t_m: element.number("t", -1e4, 1e4)?,
-        z_offset_m: element.number_or_0("zOffset", -1e4, 1e4)?,
-        heading_rad: flip + element.number_or_0("hOffset", -1e4, 1e4)?,
-        height_m: element.number_or_0("height", 0.0, 100.0)?,
+    let is_against = element.optional_text("orientation") == Some("-");
+    signal.heading_rad += if is_against { PI } else { 0.0 };
+    signal.dynamic = element.optional_text("dynamic") == Some("yes");
+    Ok(signal)
+}
+
+/// Place and heading of an object or a signal. Its height over the road and its sizes are checked, but nothing is built
+/// from them.
+fn read_place(element: Element, heading: &'static str) -> Result<RoadObject> {
+    let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
+    let t_m = element.number("t", -1e4, 1e4)?;
+    element.number_or_0("zOffset", -1e4, 1e4)?;
+    Ok(RoadObject {
+        s_m,
+        t_m,
+        heading_rad: element.number_or_0(heading, -1e4, 1e4)?,
+        ..RoadObject::default()
     })
 }
 

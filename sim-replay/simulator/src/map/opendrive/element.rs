@@ -17,29 +17,17 @@ pub enum OpenDriveError {
     /// The file is no well-formed XML, or XML of a kind that is refused (entities, too many nodes).
     #[error("not well-formed XML: {0}")]
     Xml(String),
-    /// An element is missing, misplaced or at odds with others.
+    /// An element is missing, misplaced or at odds with others, or an attribute of it has an invalid value.
     #[error("line {line}: <{element}> {problem}")]
     Element {
         /// Line in the file.
         line: u32,
         /// Name of the element.
         element: String,
-        /// The fault.
+        /// The fault; for a value its attribute, the value in the file and the valid ones.
         problem: String,
-    },
-    /// An attribute has an invalid value.
-    #[error("line {line}: <{element}> has {attribute}=\"{value}\"; expected {expected}")]
-    Value {
-        /// Line in the file.
-        line: u32,
-        /// Name of the element.
-        element: String,
-        /// Name of the attribute.
-        attribute: &'static str,
-        /// Value in the file.
-        value: String,
-        /// Valid values.
-        expected: String,
+        /// The same as a finding tells it.
+        found: String,
     },
 }
 
@@ -54,18 +42,9 @@ impl OpenDriveError {
             Self::Element {
                 line,
                 element,
-                problem,
-            } => log.add(*line, element, problem, action),
-            Self::Value {
-                line,
-                element,
-                attribute,
-                value,
-                expected,
-            } => {
-                let found = format!("{attribute}=\"{value}\", expected {expected}");
-                log.add(*line, element, &found, action);
-            }
+                found,
+                ..
+            } => log.add(*line, element, found, action),
         }
     }
 }
@@ -238,6 +217,7 @@ impl<'a, 'input> Element<'a, 'input> {
             line: self.line(),
             element: self.name().to_owned(),
             problem: problem.to_owned(),
+            found: problem.to_owned(),
         }
     }
 
@@ -247,12 +227,12 @@ impl<'a, 'input> Element<'a, 'input> {
         value: impl ToString,
         expected: &str,
     ) -> OpenDriveError {
-        OpenDriveError::Value {
+        let value: String = value.to_string().chars().take(80).collect();
+        OpenDriveError::Element {
             line: self.line(),
             element: self.name().to_owned(),
-            attribute,
-            value: value.to_string().chars().take(80).collect(),
-            expected: expected.to_owned(),
+            problem: format!("has {attribute}=\"{value}\"; expected {expected}"),
+            found: format!("{attribute}=\"{value}\", expected {expected}"),
         }
     }
 

@@ -71,10 +71,7 @@ mod tests {
     fn decoded(bytes: &[u8]) -> (String, Vec<String>) {
         let mut log = FindingLog::default();
         let text = decode(bytes, &mut log).into_owned();
-        (
-            text,
-            log.into_list().iter().map(ToString::to_string).collect(),
-        )
+        (text, log.list.iter().map(ToString::to_string).collect())
     }
 
     #[test]

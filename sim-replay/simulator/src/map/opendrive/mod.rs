@@ -117,7 +117,7 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork> {
     Ok(RoadNetwork {
         roads,
         junctions,
-        findings: log.into_list(),
+        findings: log.list,
     })
 }
 

@@ -88,14 +88,12 @@ fn between_directions(site: &mut Site, road: usize) {
     }
     // Inside a junction only where no lane leads across.
     parts.retain(|part| {
-        let [a, b] = [part.bottom_m(), part.top_m()];
-        let outline = part.outline();
+        let ([a, b], outline) = (part.z_m(), part.outline());
         network.roads[road].junction.is_none()
             && !site.surface.any(&outline, |patch| {
-                patch.road as usize != road
-                    && patch.carriageway
-                    && a < patch.high_m() + 4.5
-                    && b > patch.low_m() - 0.05
+                let [low, high] = patch.range_m();
+                let is_crossed = patch.road as usize != road && patch.carriageway;
+                is_crossed && a < high + 4.5 && b > low - 0.05
             })
     });
     site.place(&parts);

@@ -90,7 +90,8 @@ fn parapet(site: &mut Site, road: usize, from: &CrossSection, to: &CrossSection)
         let part = wall(SolidKind::Barrier, a, b, z, 0.25, 0.45);
         let joined = site.surface.any(&part.outline(), |patch| {
             let own = patch.road as usize == road && !patch.carriageway;
-            !own && z[0] < patch.high_m() + HEADROOM_M && z[1] > patch.low_m() - 0.05
+            let [low, high] = patch.range_m();
+            !own && z[0] < high + HEADROOM_M && z[1] > low - 0.05
         });
         if !joined {
             site.place(&[part]);
@@ -110,12 +111,17 @@ fn pillars(site: &mut Site, cut: &CrossSection, thickness_m: f64) {
             continue;
         }
         let pillar = foot.post(SolidKind::Pillar, -0.5, [0.55, height + 0.5], 0.4);
-        let around = pillar.outline().grown(0.5);
         // Clear of the lanes below; its own slab above does not count.
-        let z = [pillar.bottom_m(), pillar.top_m() - 0.2];
-        if site.surface.is_clear(&around, z, HEADROOM_M, true) {
-            site.place(&[pillar]);
-        }
+        let [bottom, top] = pillar.z_m();
+        place_clear(site, pillar, [bottom, top - 0.2], 0.5);
+    }
+}
+
+/// Places a part, if it keeps clear of every road between two heights, with `margin_m` around.
+fn place_clear(site: &mut Site, part: Solid, z_m: [f64; 2], margin_m: f64) {
+    let around = part.outline().grown(margin_m);
+    if site.surface.is_clear(&around, z_m, HEADROOM_M, true) {
+        site.place(&[part]);
     }
 }
 
@@ -142,7 +148,7 @@ fn retaining_walls(site: &mut Site, road: usize) {
             let around = PlanRectangle::around(middle, [1.0, 1.0]);
             let mut above = f64::INFINITY;
             site.surface.any(&around, |patch| {
-                let z = patch.low_m();
+                let [z, _] = patch.range_m();
                 if z > road_z + 3.0 {
                     above = above.min(z);
                 }
@@ -173,17 +179,11 @@ fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
             let [p, q] = [a, b].map(|cut| cut.at(cut.paved_m[side] + out));
             let height = [z[0] - 0.3, z[1] + TUNNEL_M];
             let part = wall(SolidKind::TunnelWall, p, q, height, 0.4, 0.4);
-            let z = [z[0], z[1] + 1.0];
-            if site.surface.is_clear(&part.outline(), z, HEADROOM_M, true) {
-                site.place(&[part]);
-            }
+            place_clear(site, part, [z[0], z[1] + 1.0], 0.0);
         }
         let height = [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8];
         let roof = slab(a, b, height, 1.3);
-        let z = [roof.bottom_m(), roof.top_m()];
-        if site.surface.is_clear(&roof.outline(), z, HEADROOM_M, true) {
-            site.place(&[roof]);
-        }
+        place_clear(site, roof, roof.z_m(), 0.0);
         s = next;
     }
 }

@@ -414,8 +414,7 @@ mod tests {
                         inside,
                         "{style:?} {seed}: {part:?} in {width_m} x {depth_m}"
                     );
-                    let half = part.shape.half_footprint_m();
-                    assert!(half[0] > 0.0 && half[1] > 0.0 && part.shape.half_height_m() > 0.0);
+                    assert!(part.shape.half_m().iter().all(|&half| half > 0.0));
                 }
             }
         }

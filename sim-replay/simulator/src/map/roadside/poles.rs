@@ -43,19 +43,17 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
     let mut lights = false;
     for index in 0..site.network.roads.len() {
         let road = &site.network.roads[index];
-        let signals = road.signals.iter();
-        let signals = signals.map(|one| (one.s_m, one.t_m, one.heading_rad, one.dynamic));
         let signs = road.objects.iter().filter(|one| is_sign(&one.label));
-        let signs = signs.map(|one| (one.s_m, one.t_m, one.heading_rad, false));
-        for (s_m, t_m, heading_rad, is_light) in signals.chain(signs) {
-            lights |= is_light;
-            let [aside_m, _] = road.aside_m(road.section_at(s_m), s_m, t_m);
-            let foot = site.foot(road.pose_at(s_m).moved(0.0, aside_m, heading_rad));
-            let parts = match is_light {
+        for one in road.signals.iter().chain(signs) {
+            lights |= one.dynamic;
+            let [aside_m, _] = road.aside_m(road.section_at(one.s_m), one.s_m, one.t_m);
+            let pose = road.pose_at(one.s_m);
+            let foot = site.foot(pose.moved(0.0, aside_m, one.heading_rad));
+            let parts = match one.dynamic {
                 true => light(foot),
                 false => sign(foot, rng),
             };
-            beside_carriageway(site, &parts, t_m);
+            beside_carriageway(site, &parts, one.t_m);
         }
     }
     lights

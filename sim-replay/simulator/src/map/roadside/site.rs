@@ -67,7 +67,7 @@ impl<'a> Site<'a> {
     pub(super) fn try_place(&mut self, parts: &[Solid], margin_m: f64, pavements: bool) -> bool {
         let free = parts.iter().all(|part| {
             let outline = part.outline().grown(margin_m);
-            self.is_free(&outline, [part.bottom_m(), part.top_m()], pavements)
+            self.is_free(&outline, part.z_m(), pavements)
         });
         if free {
             self.place(parts);
@@ -78,7 +78,7 @@ impl<'a> Site<'a> {
     /// Places parts without a check: for parts of a road, or parts on ground reserved before.
     pub(super) fn place(&mut self, parts: &[Solid]) {
         for part in parts {
-            self.take(&part.outline(), [part.bottom_m(), part.top_m()]);
+            self.take(&part.outline(), part.z_m());
             self.solids.push(*part);
         }
     }

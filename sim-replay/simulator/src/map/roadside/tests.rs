@@ -61,9 +61,8 @@ fn parking_spots_are_free() {
             }
             .corners();
             let blocked = map_model.solids.iter().find(|solid| {
-                solid.bottom_m() < z + 2.0
-                    && solid.top_m() > z + 0.1
-                    && overlap(&solid.outline().corners(), &car)
+                let [bottom_m, top_m] = solid.z_m();
+                bottom_m < z + 2.0 && top_m > z + 0.1 && overlap(&solid.outline().corners(), &car)
             });
             assert!(blocked.is_none(), "{source:?}: {spot:?} holds {blocked:?}");
         }

@@ -38,7 +38,7 @@ pub(crate) struct TemporalMemory {
     now: nn::Conv2D,
     past: nn::Conv2D,
     token: nn::Linear,
-    /// `[1 + steps, hidden]`: of the ego's own newest and of earlier time steps.
+    /// `[frames, hidden]`: of the ego's own newest and of earlier time steps.
     step: Tensor,
     gate: nn::Conv2D,
     patch: i64,
@@ -48,9 +48,25 @@ pub(crate) struct TemporalMemory {
 impl TemporalMemory {
     /// Its variables are `recall.*` below `path`.
     pub(crate) fn new(path: &nn::Path<'_>, config: &PastatConfig, memory: &MemoryConfig) -> Self {
-        let steps = config.frames as i64 - 1;
-        let sizes = [config.channels, config.dim, config.patch, steps];
-        Self::of_size(&(path / "recall"), sizes, memory)
+        let (path, channels, hidden) = (path / "recall", config.channels, memory.hidden);
+        let bare = nn::ConvConfig {
+            bias: false,
+            ..around()
+        };
+        let neutral = nn::ConvConfig {
+            ws_init: Init::Const(0.0),
+            bs_init: Init::Const(0.0),
+            ..Default::default()
+        };
+        Self {
+            now: nn::conv2d(&path / "now", channels, hidden, 3, around()),
+            past: nn::conv2d(&path / "past", channels, hidden, 3, bare),
+            token: nn::linear(&path / "token", config.dim, hidden, BARE),
+            step: path.var("step", &[config.frames as i64, hidden], Init::Const(0.0)),
+            gate: nn::conv2d(&path / "gate", hidden, channels, 1, neutral),
+            patch: config.patch,
+            share: memory.share,
+        }
     }
 
     /// `fused` `[1, C, H, W]`, the maximum of all agents' newest maps, with the ego's own and earlier maps blended in
@@ -98,34 +114,6 @@ impl TemporalMemory {
             (step < steps).then_some((step, pose, map))
         });
         Ok(placed.collect())
-    }
-
-    /// Its variables lie below `path`. For maps of `channels`, tokens of `dim` with `patch` cells along each edge, and
-    /// `steps` time steps before the newest.
-    fn of_size(
-        path: &nn::Path<'_>,
-        [channels, dim, patch, steps]: [i64; 4],
-        config: &MemoryConfig,
-    ) -> Self {
-        let MemoryConfig { hidden, share } = *config;
-        let bare = nn::ConvConfig {
-            bias: false,
-            ..around()
-        };
-        let neutral = nn::ConvConfig {
-            ws_init: Init::Const(0.0),
-            bs_init: Init::Const(0.0),
-            ..Default::default()
-        };
-        Self {
-            now: nn::conv2d(path / "now", channels, hidden, 3, around()),
-            past: nn::conv2d(path / "past", channels, hidden, 3, bare),
-            token: nn::linear(path / "token", dim, hidden, BARE),
-            step: path.var("step", &[1 + steps, hidden], Init::Const(0.0)),
-            gate: nn::conv2d(path / "gate", hidden, channels, 1, neutral),
-            patch,
-            share,
-        }
     }
 
     /// `[1, C, H, W]` of `now`, the maximum of all agents' newest maps, of that shape, and the ego's `own`,
@@ -360,14 +348,17 @@ mod tests {
             height: 16,
         };
         let variables = VarStore::new(Device::Cpu);
-        let mut memory = TemporalMemory::of_size(
-            &variables.root(),
-            [4, 6, 2, 2],
-            &MemoryConfig {
-                hidden: 5,
-                share: 0.25,
-            },
-        );
+        let config = PastatConfig {
+            dim: 6,
+            patch: 2,
+            frames: 3,
+            ..PastatConfig::lean(4)
+        };
+        let sizes = MemoryConfig {
+            hidden: 5,
+            share: 0.25,
+        };
+        let mut memory = TemporalMemory::new(&variables.root(), &config, &sizes);
         redraw(&variables, &["now", "past", "token", "step", "gate"], 0.3);
         let whole: Vec<FullResolutionMap> = (0..3)
             .map(|seed| FullResolutionMap::of(&uniform(seed, &[1, 4, 16, 32]), None).unwrap())
