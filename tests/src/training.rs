@@ -4,33 +4,33 @@ use std::path::Path;
 
 use ::training::loss::LossConfig;
 use ::training::samples::{SampleConfig, SampleKind};
-use ::training::train::{Accuracy, TrainConfig, TrainObserver, TrainingReport};
+use ::training::train::TrainConfig;
 use dataset::OpenOptions;
 use dataset::evaluation_protocol::ProtocolConfig;
 use fusion::Method;
 use perception::model_config::DetectorConfig;
-use perception::train::{Length, RunConfig};
+use perception::train::{Length, RunConfig, TrainingEvent};
 
 /// Observer of a training.
 #[derive(Default)]
 pub struct Ear {
     /// Loss of each reported step.
     pub losses: Vec<f64>,
-    /// Steps of the validations.
-    pub validations: Vec<u64>,
+    /// Results of the validations in words.
+    pub validations: Vec<String>,
     /// Number of encoded sweeps.
     pub encoded: usize,
 }
 
-impl TrainObserver for Ear {
-    fn encoded(&mut self, _: usize, _: usize) {
-        self.encoded += 1;
-    }
-    fn stepped(&mut self, report: &TrainingReport) {
-        self.losses.push(report.score_loss + report.box_loss);
-    }
-    fn validated(&mut self, step: u64, _: &Accuracy) {
-        self.validations.push(step);
+impl Ear {
+    /// Takes an event in.
+    pub fn hear(&mut self, event: &TrainingEvent) {
+        match event {
+            TrainingEvent::Encoding(..) => self.encoded += 1,
+            TrainingEvent::Stepped(report) => self.losses.push(report.means[0]),
+            TrainingEvent::Validated(text) => self.validations.push(text.clone()),
+            TrainingEvent::Read(_) | TrainingEvent::Note(_) => {}
+        }
     }
 }
 

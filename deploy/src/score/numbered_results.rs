@@ -131,7 +131,7 @@ mod tests {
             |nanos| [&Topic::Truth, &detections].map(|topic| recent.is_first(topic, nanos));
         let captures = [300, 400, 400, 500, 300];
         assert_eq!(
-            captures.map(|nanos| are_first(nanos)),
+            captures.map(&mut are_first),
             [true, true, false, true, false].map(|is_first| [is_first; 2])
         );
         (0..1_000).for_each(|nanos| _ = are_first(1_000 + nanos));

@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn boxes_are_upright_whatever_angles_say_so() {
+    fn a_box_is_upright_by_its_axis_and_not_by_single_angles() {
         for (angles_deg, is_upright) in [
             ([0.0, 170.0, 0.0], true),
             ([180.0, 20.0, -180.0], true),

@@ -218,7 +218,10 @@ mod tests {
         }
         let mut problems = Vec::new();
         let found = vec![latest.clone(), newest, scene.clone()];
-        assert_eq!(each_once(found, &mut problems), [scene.clone()]);
+        assert_eq!(
+            each_once(found, &mut problems),
+            std::slice::from_ref(&scene)
+        );
         let expected = format!(
             "{}: leads to the frames of {}: left out",
             latest.display(),

@@ -216,7 +216,7 @@ fn read_place(path: &Path, _: &[u8]) -> bool {
         capture_nanos: number * 100_000_000,
     };
     let ticks: Vec<Tick> = (0..10).map(tick).collect();
-    let Ok(Some(place)) = Place::read(path, "town", ticks.len()) else {
+    let Ok(Some(place)) = Place::read(path, ("town", ticks.len()), seeds::PLAN) else {
         return false;
     };
     Schedule::new(&ticks, 0, None, true)

@@ -384,7 +384,10 @@ pub(crate) const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";
 
 /// A checkpoint of a replay.
 pub(crate) const PLACE: &str = "{\"scenario\":\"town\",\"position\":{\"next_tick\":7,\"left\":12,\"shift_nanos\":1000000000,\
-    \"last_nanos\":1600000000},\"is_halted\":false,\"ticks\":17,\"unanswered\":0,\"unreadable_frames\":1}\n";
+    \"last_nanos\":1600000000},\"is_halted\":false,\"ticks\":17,\"unanswered\":0,\"unreadable_frames\":1,\"plan\":\"seek 0, frames all, loop true\",\
+    \"has_ended\":false}\n";
+/// Options of the replay of [`PLACE`].
+pub(crate) const PLAN: &str = "seek 0, frames all, loop true";
 
 /// Poses of a localizer.
 pub(crate) const POSES: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers\n\

@@ -89,6 +89,7 @@ fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_fr
         .iter()
         .zip(["0.3", "0.5", "0.7"])
     {
+        let computed = computed.unwrap();
         assert!(
             (computed - precision(&all[1], iou)).abs() < 1e-9,
             "{iou}: {computed}"

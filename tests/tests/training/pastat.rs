@@ -35,7 +35,7 @@ fn begin(folder: &Path) -> (PathBuf, PathBuf) {
     scene::write(&data, &AGENTS, TICKS);
     let summary = train::run(
         &config(&data, &folder.join("none"), Method::NONE, 5),
-        &mut Ear::default(),
+        &mut |_| {},
     )
     .unwrap();
     (data, summary.trained.weights)
@@ -134,7 +134,7 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     let (data, init) = begin(folder.path());
     let first = pastat(folder.path(), &data, &init, "pastat");
     let mut ear = Ear::default();
-    let summary = train::run(&first, &mut ear).unwrap();
+    let summary = train::run(&first, &mut |event| ear.hear(event)).unwrap();
     assert_eq!(ear.encoded, AGENTS.len() * TICKS, "every sweep once");
     assert!(
         ear.losses
@@ -161,7 +161,8 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
 
     // The same again, with its maps cached: the same weights.
     let mut again = Ear::default();
-    let repeated = train::run(&pastat(folder.path(), &data, &init, "again"), &mut again).unwrap();
+    let repeated = pastat(folder.path(), &data, &init, "again");
+    let repeated = train::run(&repeated, &mut |event| again.hear(event)).unwrap();
     assert_eq!(
         (again.encoded, repeated.trained.sha256),
         (0, summary.trained.sha256)
@@ -267,7 +268,7 @@ fn parts_are_left_out_by_the_configuration_and_stay_out() {
     let usual = Method::PASTAT.default_fusion(&small());
     let mut config = pastat(folder.path(), &data, &init, "ablation");
     config.fusion = Some(ablated(&usual, &[Part::Ce, Part::Fsa, Part::Te], Some(1)).unwrap());
-    let summary = train::run(&config, &mut Ear::default()).unwrap();
+    let summary = train::run(&config, &mut |_| {}).unwrap();
     let weights = Weights::load(&summary.trained.weights).unwrap();
     assert!(
         !weights
@@ -327,7 +328,7 @@ fn poses_that_were_found_once_serve_training_and_evaluation() {
     poses(&file, &dataset::open(&data).unwrap().scenarios[0]);
     let mut config = pastat(folder.path(), &data, &init, "found");
     config.samples.poses.tables = vec![PoseTable::read(&file).unwrap().into()];
-    let summary = train::run(&config, &mut Ear::default()).unwrap();
+    let summary = train::run(&config, &mut |_| {}).unwrap();
     let source = PoseSourceConfig::Cached(CachedPoseConfig {
         file: file.clone(),
         scenario: None,

@@ -13,19 +13,18 @@ use fusion::pastat::{Part, ablated};
 use fusion::{Exchange, FusionConfig, Method};
 use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseTable};
 use perception::model_config::DetectorConfig;
-use perception::train::{DataListing, TrainingOptions};
+use perception::train::{TrainingEvent, TrainingOptions};
 use perception::weights::Weights;
 use protocol::Dtype;
 use training::Error;
 use training::feature_store::KeptMaps;
 use training::loss::{LossConfig, Unassigned};
 use training::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
-use training::train::{self, Accuracy, TrainConfig, TrainObserver, TrainingReport};
+use training::train::{self, TrainConfig};
 
 use super::DataSets;
 use support::bounded_file;
 use support::cli::BadInput;
-use terminal::text_table::number;
 
 /// Largest file of a network, bytes.
 const MAX_NETWORK_BYTES: u64 = 1 << 20;
@@ -158,12 +157,16 @@ impl Arguments {
     /// Trains and reports the result.
     pub(crate) fn run(&self) -> Result<()> {
         let config = self.config()?;
-        let mut bar = BarObserver(TrainingBar::of(config.run.length));
+        let bar = TrainingBar::of(config.run.length);
         if let Some(hint) = self.hint() {
-            bar.0.print_line(hint);
+            bar.print_line(hint);
         }
-        let summary = train::run(&config, &mut bar).map_err(blamed)?;
-        bar.0.finish();
+        let summary = train::run(&config, &mut |event| match event {
+            TrainingEvent::Encoding(done, all) if !done.is_multiple_of(50) && done != all => {}
+            event => bar.show_progress(event),
+        });
+        let summary = summary.map_err(blamed)?;
+        bar.finish();
         let accuracy = serde_json::json!({"accuracy": summary.accuracy});
         self.options.print(&summary.trained, &accuracy)?;
         Ok(())
@@ -329,46 +332,6 @@ enum Exactness {
     F16,
     /// 1 byte a value and a scale per channel, packed.
     I8,
-}
-
-/// Progress on standard error.
-struct BarObserver(TrainingBar);
-
-impl TrainObserver for BarObserver {
-    fn opened(&mut self, data: &DataListing) {
-        data.left_out()
-            .iter()
-            .for_each(|text| self.0.print_line(text));
-    }
-
-    fn encoded(&mut self, done: usize, all: usize) {
-        if done.is_multiple_of(50) || done == all {
-            self.0.encoded(done, all);
-        }
-    }
-
-    fn stepped(&mut self, report: &TrainingReport) {
-        let text = format!(
-            "step {} epoch {:.2} loss {:.3} = scores {:.3} + boxes {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
-            report.step,
-            report.epoch,
-            report.score_loss + report.box_loss,
-            report.score_loss,
-            report.box_loss,
-            report.learning_rate,
-            report.samples_per_second,
-            100.0 * report.waiting
-        );
-        self.0.report(report.progress, report.seconds, &text);
-    }
-
-    fn validated(&mut self, step: u64, accuracy: &Accuracy) {
-        let aps = accuracy.ap_global.map(|ap| number(ap, 3)).join(" ");
-        self.0.print_line(&format!(
-            "step {step}: AP@0.3/0.5/0.7 global {aps} on {} frames",
-            accuracy.frames
-        ));
-    }
 }
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
 //! Model card: data, settings and accuracy of a trained model.
 
-use perception::train::ModelCard;
+use perception::train::{ModelCard, Trained};
 
 use super::config::TrainConfig;
 use super::frozen::sample_config;
-use super::observer::TrainSummary;
+use super::validation::Accuracy;
 use crate::samples::{SceneSet, box_augmentation};
 use fusion::model::CooperativeModel;
 
@@ -13,7 +13,8 @@ pub(super) fn card(
     config: &TrainConfig,
     model: &CooperativeModel,
     scenes: &SceneSet,
-    summary: &TrainSummary,
+    trained: &Trained,
+    accuracy: Option<&Accuracy>,
 ) -> ModelCard {
     let (detector, method, run) = (model.config(), model.method, &config.run);
     let mut card = ModelCard::new(
@@ -26,7 +27,7 @@ pub(super) fn card(
     );
     let (ticks, scenarios) = (scenes.ticks.len(), scenes.scenarios.len());
     let data = format!("{ticks} ticks of {scenarios} scenarios");
-    card.trained(run, &summary.trained, &data, "samples");
+    card.trained(run, trained, &data, "samples");
     let (rate, decay) = (run.learning_rate, run.optimizer.weight_decay);
     let rate = format!("{rate:e}, weight decay {decay:e}");
     card.row("peak learning rate", rate);
@@ -95,7 +96,7 @@ pub(super) fn card(
         card.row("frozen", trained);
         card.row("neighbours", box_augmentation());
     }
-    if let Some(accuracy) = &summary.accuracy {
+    if let Some(accuracy) = accuracy {
         card.paragraph(&format!(
             "Validation on {} frames, ground truth of all vehicles within {comm_range_m} m, area of the network:",
             accuracy.frames

@@ -7,12 +7,33 @@ use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::csv_file;
 use support::file_error::{AtFile, Result};
 
-use super::observer::{Accuracy, TrainingReport};
+use super::validation::Accuracy;
 use crate::Error;
 
 const HEADER: &str = "step,epoch,seconds,learning_rate,loss,score_loss,box_loss,samples_per_second,waiting,ap_30,ap_50,ap_70";
 /// Points of a line in the picture: losses of single batches are noisy and are averaged to about this number.
 const SMOOTH_POINTS: usize = 150;
+
+/// Report over some steps.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TrainingReport {
+    /// Steps done.
+    pub(super) step: u64,
+    /// Passes over the data.
+    pub(super) epoch: f64,
+    /// Seconds spent so far, in all runs together.
+    pub(super) seconds: f64,
+    /// Learning rate.
+    pub(super) learning_rate: f64,
+    /// Classification term.
+    pub(super) score_loss: f64,
+    /// Regression term.
+    pub(super) box_loss: f64,
+    /// Samples per second since the last report.
+    pub(super) samples_per_second: f64,
+    /// Share of that time spent waiting for samples, 0..1.
+    pub(super) waiting: f64,
+}
 
 /// Rows of reports and validations.
 #[derive(Debug)]
@@ -130,7 +151,6 @@ mod tests {
         TrainingReport {
             step,
             epoch: 0.5,
-            progress: 0.1,
             seconds: 3.0,
             learning_rate: 1e-3,
             score_loss,

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use perception::int8::InferencePrecision;
+use perception::train::{Observe, TrainingEvent};
 use perception::weights::Weights;
 
 use super::config::TrainConfig;
-use super::observer::TrainObserver;
 use crate::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use crate::samples::{Augmentation, SampleBuilder, SampleConfig};
 use crate::{Error, Result};
@@ -46,7 +46,7 @@ impl<'a> FrozenEncoder<'a> {
     pub(super) fn give_maps(
         &self,
         builder: &mut SampleBuilder,
-        observer: &mut dyn TrainObserver,
+        observe: &mut Observe<'_>,
     ) -> Result<()> {
         let store = FeatureStore::open(
             self.kept,
@@ -54,7 +54,7 @@ impl<'a> FrozenEncoder<'a> {
             &builder.scenes.scenarios,
             &FileDigests::default(),
             self.threads,
-            &mut |done, all| observer.encoded(done, all),
+            &mut |done, all| observe(&TrainingEvent::Encoding(done, all)),
         )?;
         let weights = Arc::clone(&self.weights);
         builder.maps = Some(MapSource::new(Arc::new(store), weights));

@@ -1,12 +1,11 @@
 //! Training of a method on recorded or generated scenes.
 //!
-//! [`run`] writes only files: the caller gets every step through [`TrainObserver`].
+//! [`run`] writes only files: the caller gets every step through [`Observe`].
 
 mod card;
 mod config;
 mod curve;
 mod frozen;
-mod observer;
 mod validation;
 
 use std::collections::BTreeMap;
@@ -15,29 +14,38 @@ use std::time::{Duration, Instant};
 
 use perception::compute_precision::ComputePrecision;
 use perception::int8::SCALES_KEY;
-use perception::train::{Prefetch, SaveEvery, Task, Trainer};
+use perception::train::{Observe, Prefetch, SaveEvery, Task, Trained, Trainer, TrainingEvent};
 use perception::weights::Weights;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
 pub use config::TrainConfig;
-pub use observer::{Accuracy, TrainObserver, TrainSummary, TrainingReport};
+pub use validation::Accuracy;
 pub(crate) use validation::Validator;
 
-use self::curve::DetectorCurve;
+use self::curve::{DetectorCurve, TrainingReport};
 use crate::loss::{LabelTensors, Loss, alignment_loss, detection_loss};
 use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleKind, SceneSet, batches};
 use crate::{Error, Result};
 use fusion::method::{Exchange, Method};
 use fusion::model::{CooperativeModel, ModelError};
 
+/// Result of a training.
+#[derive(Debug, Clone)]
+pub struct TrainSummary {
+    /// The weights and the cost of the training.
+    pub trained: Trained,
+    /// The last validation.
+    pub accuracy: Option<Accuracy>,
+}
+
 /// Trains a method and writes checkpoint, curve (CSV and PNG), weights and model card into `config.run.out`.
 ///
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
-pub fn run(config: &TrainConfig, observer: &mut dyn TrainObserver) -> Result<TrainSummary> {
-    let (mut training, mut trainer) = FusionTraining::prepare(config, observer)?;
+pub fn run(config: &TrainConfig, observe: &mut Observe<'_>) -> Result<TrainSummary> {
+    let (mut training, mut trainer) = FusionTraining::prepare(config, observe)?;
     trainer.run(&mut training, SaveEvery::Steps(config.validate_every))?;
     training.finish(&trainer)
 }
@@ -56,7 +64,7 @@ fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<Sam
 
 struct FusionTraining<'a> {
     config: &'a TrainConfig,
-    observer: &'a mut dyn TrainObserver,
+    observe: &'a mut Observe<'a>,
     model: CooperativeModel,
     scenes: Arc<SceneSet>,
     loader: Prefetch<Result<Batch>>,
@@ -69,10 +77,7 @@ struct FusionTraining<'a> {
 }
 
 impl<'a> FusionTraining<'a> {
-    fn prepare(
-        config: &'a TrainConfig,
-        observer: &'a mut dyn TrainObserver,
-    ) -> Result<(Self, Trainer)> {
+    fn prepare(config: &'a TrainConfig, observe: &'a mut Observe<'_>) -> Result<(Self, Trainer)> {
         let (is_frozen, merged) = (config.frozen_encoder.is_some(), config.samples.merged_truth);
         let kind = sample_kind(config.method, is_frozen, merged)?;
         let run = &config.run;
@@ -110,9 +115,9 @@ impl<'a> FusionTraining<'a> {
             validator = Some(Validator::open(scenes, &samples, &model, frames)?);
         }
         if let Some(frozen) = &frozen {
-            frozen.give_maps(&mut builder, observer)?;
+            frozen.give_maps(&mut builder, observe)?;
             if let Some(validator) = &mut validator {
-                frozen.give_maps(&mut validator.builder, observer)?;
+                frozen.give_maps(&mut validator.builder, observe)?;
             }
         }
         let method = Some(config.method.name());
@@ -120,11 +125,11 @@ impl<'a> FusionTraining<'a> {
         let trainer = Trainer::begin(run, &model.variables, method, Instant::now())?
             .on_data(&scenes.data().sha256)?;
         let curve = DetectorCurve::open(&trainer)?;
-        observer.opened(&scenes.data());
+        observe(&TrainingEvent::Read(scenes.data()));
         let pillar_grid = model.network().pillar_grid;
         let training = Self {
             config,
-            observer,
+            observe,
             scenes,
             // A resumed training goes on with the next batch.
             loader: batches(&builder, pillar_grid, run, trainer.steps()),
@@ -160,12 +165,11 @@ impl<'a> FusionTraining<'a> {
     fn finish(self, trainer: &Trainer) -> Result<TrainSummary> {
         self.draw_curve()?;
         let (config, model, scenes) = (self.config, &self.model, &self.scenes);
-        let summary = TrainSummary {
-            trained: trainer.save_weights(&model.variables, self.about()?, scenes.data())?,
-            accuracy: self.accuracy,
-        };
-        card::card(config, model, scenes, &summary).write(&config.run.out)?;
-        Ok(summary)
+        let trained = trainer.save_weights(&model.variables, self.about()?, scenes.data())?;
+        let accuracy = self.accuracy;
+        let card = card::card(config, model, scenes, &trained, accuracy.as_ref());
+        card.write(&config.run.out)?;
+        Ok(TrainSummary { trained, accuracy })
     }
 }
 
@@ -234,7 +238,6 @@ impl Task for FusionTraining<'_> {
         let report = TrainingReport {
             step: trainer.steps(),
             epoch: self.epoch(trainer.steps()),
-            progress: share_done.min(1.0),
             seconds: trainer.seconds(),
             learning_rate: trainer.learning_rate(share_done),
             score_loss,
@@ -243,7 +246,16 @@ impl Task for FusionTraining<'_> {
             waiting: window.waited.as_secs_f64() / seconds,
         };
         self.curve.step(&report)?;
-        self.observer.stepped(&report);
+        let text = format!(
+            "epoch {:.2} loss {:.3} = scores {score_loss:.3} + boxes {box_loss:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
+            report.epoch,
+            score_loss + box_loss,
+            report.learning_rate,
+            report.samples_per_second,
+            100.0 * report.waiting
+        );
+        let means = vec![score_loss + box_loss, score_loss, box_loss];
+        (self.observe)(&trainer.step_report(share_done, means, &text));
         Ok(())
     }
 
@@ -257,7 +269,13 @@ impl Task for FusionTraining<'_> {
         let (accuracy, step) = (accuracy?, trainer.steps());
         self.curve.validation(step, trainer.seconds(), &accuracy)?;
         self.draw_curve()?;
-        self.observer.validated(step, &accuracy);
+        let aps = accuracy.ap_global;
+        let aps = aps.map(|ap| ap.map_or("-".into(), |ap| format!("{ap:.3}")));
+        (self.observe)(&TrainingEvent::Validated(format!(
+            "step {step}: AP@0.3/0.5/0.7 global {} on {} frames",
+            aps.join(" "),
+            accuracy.frames
+        )));
         self.accuracy = Some(accuracy);
         Ok(())
     }

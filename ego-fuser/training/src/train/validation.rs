@@ -7,12 +7,23 @@ use fusion::model::CooperativeModel;
 use protocol::corners_within;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
 use support::sampling::evenly_spread;
 use tch::no_grad;
 
-use super::observer::Accuracy;
 use crate::Error;
 use crate::samples::{Augmentation, Batch, SampleBuilder, SampleConfig, SceneSet, TickRef};
+
+/// AP over the frames of a validation.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Accuracy {
+    /// Frames.
+    pub frames: usize,
+    /// AP at 0.3, 0.5 and 0.7, sorted over all frames; unknown without objects.
+    pub ap_global: [Option<f64>; 3],
+    /// The same in the order of frames.
+    pub ap_frame_order: [Option<f64>; 3],
+}
 
 /// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
 /// error.

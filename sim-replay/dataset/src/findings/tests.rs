@@ -193,13 +193,13 @@ fn x_m(car: usize, frame: usize) -> f64 {
 fn list_findings(second: impl Fn(usize, usize) -> (usize, f64)) -> Vec<String> {
     let dir = tempfile::tempdir().unwrap();
     let first = |car, frame| (car, x_m(car, frame));
-    let lists: [(&str, &dyn Fn(usize, usize) -> (usize, f64)); 2] = [("1", &first), ("2", &second)];
-    for (agent, listed) in lists {
+    for (agent, is_first) in [("1", true), ("2", false)] {
         let folder = dir.path().join("scene").join(agent);
         fs::create_dir_all(&folder).unwrap();
         for frame in 0..16 {
             let cars = (0..5).map(|car| {
-                let (id, x) = listed(car, frame);
+                let list: &dyn Fn(usize, usize) -> _ = if is_first { &first } else { &second };
+                let (id, x) = list(car, frame);
                 let place = format!("location: [{x}, {}, 0], angle: [0, 0, 0]", 8 * car);
                 format!("  {id}: {{{place}, extent: [2.2, 1, 0.8]}}\n")
             });
